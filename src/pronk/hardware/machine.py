@@ -1,0 +1,87 @@
+"""The boundary: one small interface to a machine, real or virtual.
+
+The servo side runs at the machine's own rate; pronk sends position commands and reads states.
+Times are the machine's own monotonic clock in seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What the machine measured at one instant."""
+
+    time: float
+    """Measured timestamp [s]."""
+    sequence: int
+    """Counts states from 0; a jump means states were lost."""
+    position: Array
+    """Joint positions in file order [rad], shape (joints,)."""
+    velocity: Array
+    """Joint velocities [rad/s], shape (joints,)."""
+    torque: Array
+    """Joint torques as the drive reports them [N m], shape (joints,)."""
+    gyro: Array
+    """Angular velocity of the trunk in its own frame [rad/s], shape (3,)."""
+    accelerometer: Array
+    """Specific force of the trunk in its own frame [m/s^2], shape (3,)."""
+    bus_voltage: float
+    """[V]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """What the drives are asked until the next command or until it expires."""
+
+    position: Array
+    """Target positions [rad], shape (joints,)."""
+    stiffness: Array
+    """[N m/rad], shape (joints,)."""
+    damping: Array
+    """[N m s/rad], shape (joints,); the target velocity is zero (reading A9)."""
+
+
+class Machine(Protocol):
+    """A robot that answers. Every link implements this and nothing else."""
+
+    robot: str
+    """Name of the robot."""
+    virtual: bool
+    """True for the virtual robot."""
+
+    def connect(self) -> None:
+        """Open the link and check that the machine is fit to move.
+
+        Raises:
+            HardwareError: No answer, or a pre-flight check failed.
+        """
+
+    def latest(self) -> State:
+        """The newest state, without waiting."""
+
+    def wait(self, until: float) -> list[State]:
+        """Let time pass to `until` on the machine's clock; return the states met on the way."""
+
+    def send(self, command: Command) -> None:
+        """Put a command into force."""
+
+    def clamp(self, joints: tuple[str, ...]) -> None:
+        """Fix joints mechanically where they are (a person's job on a real bench); () frees all.
+
+        Raises:
+            HardwareError: The machine cannot.
+        """
+
+    def damp(self) -> None:
+        """Let the joints sink softly: no stiffness, some damping."""
+
+    def close(self) -> None:
+        """Damp and close the link."""

@@ -1,0 +1,175 @@
+"""MatchedGains: the gains that make the simulated joint answer like the real one.
+
+`gains.yaml` is the artefact that people read most, so it is laid out for reading: the simulator
+the gains hold for, a line per joint, a line per joint group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pronk.errors import ArtefactError
+from pronk.files import write_text
+
+SCHEMA = "pronk/gains/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulator:
+    """The simulator that gains hold for. In another one the same numbers mean another joint."""
+
+    engine: str = "mujoco"
+    version: str = ""
+    timestep_s: float = 0.005
+    decimation: int = 4
+    integrator: str = "implicitfast"
+    actuator: str = "dc_motor_pd"
+    """Explicit PD on position and velocity at the start of each physics step, clipped by the
+    torque-speed curve (mjlab's DcMotorActuator)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointGains:
+    """Matched gains of one joint."""
+
+    stiffness: float
+    """[N m/rad]"""
+    damping: float
+    """[N m s/rad]"""
+    grid_stiffness: float
+    """The paper's grid optimum [N m/rad]."""
+    grid_damping: float
+    """The paper's grid optimum [N m s/rad]."""
+    stiffness_ci95: tuple[float, float]
+    damping_ci95: tuple[float, float]
+    covariance: tuple[tuple[float, float], tuple[float, float]]
+    """Of (stiffness, damping), repeats as the unit."""
+    band_hz: tuple[float, float]
+    error_db: float
+    """Root mean square of the gain error in the band at the optimum [dB]."""
+    naive_error_db: float
+    """The same with the gains of the real drive put into the simulator."""
+    coherence_min: float
+    armature: float
+    """Held fixed while matching [kg m^2]."""
+    amplitude_spread: float = float("nan")
+    """Largest relative change of stiffness between amplitudes; NaN with one amplitude."""
+    flags: tuple[str, ...] = ()
+    """Doubts in words, for instance `at the edge of the grid` or `no match`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupGains:
+    """What training uses for one joint group."""
+
+    stiffness: float
+    damping: float
+    stiffness_range: float
+    """Half-width of the uniform randomization about `stiffness` [N m/rad]."""
+    damping_range: float
+    """Half-width of the uniform randomization about `damping` [N m s/rad]."""
+    ellipsoid: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
+    """Shape matrix E of the joint ellipsoid: {x : (x - c)^T E^-1 (x - c) <= 1} covers the data."""
+    ellipsoid_center: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchedGains:
+    """Matched gains of a robot, and what they rest on."""
+
+    robot: str
+    simulator: Simulator
+    joints: Mapping[str, JointGains]
+    groups: Mapping[str, GroupGains]
+    logs: Mapping[str, str] = field(default_factory=dict)
+    """File name to SHA-256 of every log that went in."""
+    virtual: bool = False
+    """True if any log came from pronk's virtual robot."""
+
+
+class _Flow(dict[str, Any]):
+    """A mapping written on one line."""
+
+
+def _represent_flow(dumper: yaml.SafeDumper, data: _Flow) -> yaml.Node:
+    return dumper.represent_mapping("tag:yaml.org,2002:map", data, flow_style=True)
+
+
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that knows `_Flow`."""
+
+
+_Dumper.add_representer(_Flow, _represent_flow)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, (tuple, list)):
+        return [_rounded(v) for v in value]
+    return value
+
+
+def _line(data: object) -> _Flow:
+    return _Flow({k: _rounded(v) for k, v in vars(data).items() if v not in ((), "")})
+
+
+def save(path: Path, gains: MatchedGains) -> None:
+    """Write `gains.yaml`, whole or not at all."""
+    body: dict[str, Any] = {
+        "schema": SCHEMA,
+        "robot": gains.robot,
+        "virtual": gains.virtual,
+        "simulator": _line(gains.simulator),
+        "joints": {name: _line(joint) for name, joint in gains.joints.items()},
+        "groups": {name: _line(group) for name, group in gains.groups.items()},
+        "logs": dict(gains.logs),
+    }
+    write_text(path, yaml.dump(body, Dumper=_Dumper, sort_keys=False, width=10_000))
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+
+
+def _read(kind: type[Any], name: str, entry: Any, path: Path) -> Any:
+    if not isinstance(entry, dict):
+        raise ArtefactError(f"{path}: {name} is {entry!r}; expected a mapping.")
+    try:
+        return kind(**{k: _tuples(v) for k, v in entry.items()})
+    except TypeError as error:
+        fields = ", ".join(kind.__dataclass_fields__)
+        raise ArtefactError(f"{path}: {name}: {error}; the fields are {fields}.") from None
+
+
+def load(path: Path) -> MatchedGains:
+    """Read `gains.yaml`.
+
+    Raises:
+        ArtefactError: Missing, not YAML, of another schema, or with fields missing or misspelled.
+    """
+    try:
+        body = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ArtefactError(f"{path}: no such file; `pronk match` writes one.") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ArtefactError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from error
+    if not isinstance(body, dict) or body.get("schema") != SCHEMA:
+        got = body.get("schema") if isinstance(body, dict) else type(body).__name__
+        raise ArtefactError(f"{path}: schema {got!r}; this pronk reads {SCHEMA!r}.")
+    try:
+        return MatchedGains(
+            robot=body["robot"],
+            virtual=bool(body.get("virtual", False)),
+            simulator=_read(Simulator, "simulator", body["simulator"], path),
+            joints={k: _read(JointGains, k, v, path) for k, v in body["joints"].items()},
+            groups={k: _read(GroupGains, k, v, path) for k, v in body["groups"].items()},
+            logs=dict(body.get("logs") or {}),
+        )
+    except (KeyError, AttributeError) as error:
+        raise ArtefactError(f"{path}: {error} is missing or not a mapping.") from None

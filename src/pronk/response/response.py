@@ -1,0 +1,161 @@
+"""FrequencyResponse: a joint's answer as complex numbers over frequency.
+
+The response is that of the joint, from the position command *as held by the drive* (a staircase)
+to the measured position; the hold itself is not part of it, so it compares directly with
+`stiffness / (I s^2 + (damping + b) s + stiffness)` (paper M2 with theta_dot_des = 0, reading A9).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pronk.errors import ArtefactError
+from pronk.files import written_whole
+
+SCHEMA = "pronk/response/1"
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_ARRAYS = ("omega", "response", "coherence", "averages", "repeats")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrequencyResponse:
+    """Response of one joint at one amplitude, with what is known of its uncertainty."""
+
+    joint: str
+    amplitude: float
+    """Peak of the command [rad]."""
+    omega: Array
+    """Angular frequency [rad/s], increasing, shape (f,)."""
+    response: ComplexArray
+    """Position over held command, averaged over all repeats, shape (f,)."""
+    coherence: Array
+    """Magnitude-squared coherence in 0..1, over all segments of all repeats, shape (f,)."""
+    averages: Array
+    """Effective number of independent averages, shape (f,)."""
+    repeats: ComplexArray
+    """Response of each repeat by itself, shape (repeats, f): the unit of uncertainty."""
+    estimator: str
+    """H1, H2, Hv or periodic."""
+    window: str
+    """Window and overlap in words, for the page."""
+    segment_s: float
+    """Length of a segment [s]."""
+    delay_s: float = 0.0
+    """Command delay from the slope of the phase beyond the fitted joint [s]; NaN if not fitted."""
+    third_harmonic: float = float("nan")
+    """Response at three times the asked frequency over that at it: the friction detector."""
+    virtual: bool = False
+    source: str = ""
+
+    @property
+    def frequency_hz(self) -> Array:
+        """Frequency [Hz], shape (f,)."""
+        return np.asarray(self.omega / (2.0 * np.pi))
+
+    @property
+    def gain(self) -> Array:
+        """Absolute gain, not dB, shape (f,)."""
+        return np.abs(self.response)
+
+    @property
+    def phase(self) -> Array:
+        """Unwrapped phase [rad], shape (f,)."""
+        return np.asarray(np.unwrap(np.angle(self.response)))
+
+    def relative_error(self, level: float = 0.95) -> Array:
+        """Half-width of the interval on the complex response, relative to its gain, shape (f,).
+
+        Where there are three repeats or more it is Student's t over repeats (coloured noise is
+        then counted as it is); with fewer, the coherence formula
+        `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
+        eq. 9.90), which takes noise for white inside a bin.
+        """
+        n = len(self.repeats)
+        if n >= 3:
+            spread = np.abs(self.repeats - self.repeats.mean(axis=0))
+            # Real and imaginary parts share the variance: halve it for one direction.
+            deviation = np.sqrt((spread**2).sum(axis=0) / (2.0 * (n - 1)))
+            quantile = float(stats.t.ppf(0.5 + level / 2.0, 2 * (n - 1)))
+            return np.asarray(quantile * deviation / np.sqrt(n) / self.gain)
+        coherent = np.clip(self.coherence, 1e-9, 1.0)
+        deviation = np.sqrt((1.0 - coherent) / (2.0 * coherent * np.maximum(self.averages, 1.0)))
+        return np.asarray(float(stats.norm.ppf(0.5 + level / 2.0)) * deviation)
+
+    def gain_interval(self, level: float = 0.95) -> tuple[Array, Array]:
+        """Lower and upper bound of the absolute gain."""
+        relative = self.relative_error(level)
+        return self.gain * np.maximum(1.0 - relative, 0.0), self.gain * (1.0 + relative)
+
+    def phase_interval(self, level: float = 0.95) -> tuple[Array, Array]:
+        """Lower and upper bound of the phase [rad]."""
+        half = np.arcsin(np.clip(self.relative_error(level), 0.0, 1.0))
+        return self.phase - half, self.phase + half
+
+    def band(self, low_hz: float, high_hz: float, coherence: float = 0.0) -> NDArray[np.bool_]:
+        """Mask of the frequencies inside a band whose coherence is at least `coherence`."""
+        hz = self.frequency_hz
+        slack = 1e-9
+        inside = (hz >= low_hz - slack) & (hz <= high_hz + slack)
+        return np.asarray(inside & (self.coherence >= coherence))
+
+
+def save(path: Path, responses: Sequence[FrequencyResponse]) -> None:
+    """Write responses to one `*.response.npz` (plain arrays and a JSON header, no pickle)."""
+    header = {
+        "schema": SCHEMA,
+        "responses": [
+            {
+                "joint": r.joint,
+                "amplitude": r.amplitude,
+                "estimator": r.estimator,
+                "window": r.window,
+                "segment_s": r.segment_s,
+                "delay_s": r.delay_s,
+                "third_harmonic": r.third_harmonic,
+                "virtual": r.virtual,
+                "source": r.source,
+            }
+            for r in responses
+        ],
+    }
+    arrays = {f"{i}/{name}": getattr(r, name) for i, r in enumerate(responses) for name in _ARRAYS}
+    with written_whole(path) as aside, aside.open("wb") as file:
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+
+
+def load(path: Path) -> list[FrequencyResponse]:
+    """Read what `save` wrote.
+
+    Raises:
+        ArtefactError: Not such a file, damaged, or of another schema.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            header = json.loads(str(stored["header"]))
+            if header.get("schema") != SCHEMA:
+                raise ArtefactError(
+                    f"{path}: schema {header.get('schema')!r}; this pronk reads {SCHEMA!r}."
+                )
+            return [
+                FrequencyResponse(**entry, **{name: stored[f"{i}/{name}"] for name in _ARRAYS})
+                for i, entry in enumerate(header["responses"])
+            ]
+    except ArtefactError:
+        raise
+    except FileNotFoundError:
+        raise ArtefactError(f"{path}: no such file; `pronk response LOG` writes one.") from None
+    except Exception as error:
+        raise ArtefactError(
+            f"{path}: not a response file of pronk ({type(error).__name__}); "
+            "`pronk response LOG` writes one."
+        ) from error

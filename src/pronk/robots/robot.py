@@ -1,0 +1,172 @@
+"""What a robot is, as far as its joints are concerned.
+
+A `Robot` is data: its joints in the order of every file and table, the drive of each joint, the
+gains on those drives, and how a bench test of each joint is set up. The physics that these
+numbers enter is in `pronk.drive`; the MuJoCo model built from them is in `pronk.robots.spec`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from pronk.errors import RobotError
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """Motor, gearbox and inverter of one joint. Joint side unless the name says motor."""
+
+    gear_ratio: float
+    """Motor revolutions per joint revolution."""
+    rotor_inertia: float
+    """Inertia of the rotor about its own axis, motor side [kg m^2]."""
+    stall_torque: float
+    """Torque at standstill with the full bus voltage across the winding [N m]."""
+    no_load_speed: float
+    """Speed at which back-EMF equals the bus voltage [rad/s]."""
+    effort_limit: float
+    """Largest torque the inverter is allowed to ask for [N m]."""
+    frictionloss: float
+    """Dry (Coulomb) friction [N m]."""
+    viscous_damping: float
+    """Viscous friction [N m s/rad]."""
+    bus_voltage: float
+    """Nominal supply [V]."""
+    resistance: float
+    """Winding resistance, phase, motor side [ohm]."""
+    torque_constant: float
+    """Torque per ampere, motor side [N m/A]."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible drives.
+
+        Raises:
+            RobotError: A value that must be positive is not, or friction is negative.
+        """
+        for name in ("gear_ratio", "stall_torque", "no_load_speed", "effort_limit", "bus_voltage"):
+            if not getattr(self, name) > 0.0:
+                raise RobotError(f"Drive.{name} is {getattr(self, name)}; it must be positive.")
+        for name in ("rotor_inertia", "frictionloss", "viscous_damping"):
+            if not getattr(self, name) >= 0.0:
+                raise RobotError(f"Drive.{name} is {getattr(self, name)}; it must not be negative.")
+
+    @property
+    def armature(self) -> float:
+        """Rotor inertia reflected through the gear, `rotor_inertia * gear_ratio**2` [kg m^2]."""
+        return self.rotor_inertia * self.gear_ratio**2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joint:
+    """One actuated joint and how it is asked on the bench."""
+
+    name: str
+    """`LEG_JOINT`, for instance FR_hip_roll."""
+    group: str
+    """Joints that are built alike and share training gains, for instance hip_roll."""
+    drive: Drive
+    range: tuple[float, float]
+    """Mechanical limits [rad]."""
+    default_position: float
+    """Position in the default pose, also the pose of the sweep [rad]."""
+    stiffness: float
+    """Proportional gain on the real drive [N m/rad]."""
+    damping: float
+    """Derivative gain on the real drive [N m s/rad]."""
+    band_hz: tuple[float, float]
+    """Frequencies at which the match compares magnitudes [Hz]."""
+    clamped: tuple[str, ...] = ()
+    """Joints fixed mechanically while this one is asked; the rest are held by their drives."""
+    chain: tuple[str, ...] = ()
+    """Joints that can move when this one is asked on a fixed base, itself included, root first."""
+    mirror: tuple[str, float] | None = None
+    """The joint whose mechanism this one mirrors and the sign between their coordinates.
+
+    With a fixed base, `position(self | command) == sign * position(mirror | sign * command)`.
+    None for the original of each family.
+    """
+
+    @property
+    def original(self) -> tuple[str, float]:
+        """The joint to simulate in this one's place, and the sign between their coordinates."""
+        return self.mirror or (self.name, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Robot:
+    """A robot: joints in file order, timing, and a recipe for its MuJoCo model."""
+
+    name: str
+    joints: tuple[Joint, ...]
+    build_spec: Callable[[], mujoco.MjSpec] = field(repr=False)
+    """Builds a fresh, free-floating (or, for an arm, fixed) model without actuators."""
+    base_body: str
+    """Body that the bench holds still."""
+    policy_rate_hz: float = 50.0
+    timestep_s: float = 0.005
+    """Physics step of the training simulator."""
+    decimation: int = 4
+    """Physics steps per policy step."""
+    grid_stiffness: tuple[float, float] = (13.0, 27.0)
+    """Stiffness axis of the grid search [N m/rad] (paper F7)."""
+    grid_damping: tuple[float, float] = (0.1, 0.7)
+    """Damping axis of the grid search [N m s/rad] (paper F7)."""
+
+    def __post_init__(self) -> None:
+        """Check that names are unique and every reference resolves.
+
+        Raises:
+            RobotError: A joint is named twice, or refers to one that does not exist.
+        """
+        names = self.joint_names
+        if len(set(names)) != len(names):
+            raise RobotError(f"{self.name}: a joint is named twice in {', '.join(names)}.")
+        for joint in self.joints:
+            others = (*joint.clamped, *joint.chain, joint.original[0])
+            for other in others:
+                if other not in names:
+                    raise RobotError(
+                        f"{self.name}: {joint.name} refers to {other!r}; "
+                        f"the joints are {', '.join(names)}."
+                    )
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joint names in the order of every file and table."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Joint groups in order of first appearance."""
+        return tuple(dict.fromkeys(joint.group for joint in self.joints))
+
+    def joint(self, name: str) -> Joint:
+        """The joint called `name`.
+
+        Raises:
+            RobotError: There is none; the message lists those there are.
+        """
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        raise RobotError(
+            f"{self.name} has no joint {name!r}; its joints are {', '.join(self.joint_names)}."
+        )
+
+    def group(self, name: str) -> tuple[Joint, ...]:
+        """The joints of one group, in file order.
+
+        Raises:
+            RobotError: There is no such group.
+        """
+        members = tuple(joint for joint in self.joints if joint.group == name)
+        if not members:
+            raise RobotError(
+                f"{self.name} has no joint group {name!r}; its groups are {', '.join(self.groups)}."
+            )
+        return members

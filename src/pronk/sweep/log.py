@@ -1,0 +1,200 @@
+"""SweepLog: what was asked of the joints and what they answered, in memory.
+
+Files are read and written next door (`mcap_log.py`, `readers.py`); this module only says what a
+log is and what must be true of one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import LogError
+
+Array = NDArray[np.float64]
+
+SIGNAL_KINDS = ("chirp", "log_chirp", "multisine", "sine_steps", "unknown")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """One question: a signal sent to some joints between two instants of the log."""
+
+    kind: str
+    """One of `SIGNAL_KINDS`; `unknown` for imported logs that do not say."""
+    joints: tuple[str, ...]
+    """Joints that were asked (several only with uncorrelated signals)."""
+    start: float
+    """First instant, on the clock of `SweepLog.time` [s]."""
+    stop: float
+    """Last instant, settling included [s]."""
+    amplitude: float
+    """Peak of the command about the pose [rad]; NaN if unknown."""
+    repeat: int = 0
+    """Number of this repeat of the same question, from 0."""
+    band_hz: tuple[float, float] = (0.0, 0.0)
+    """Lowest and highest frequency asked [Hz]."""
+    period_s: float | None = None
+    """Period of a periodic signal [s]; None for chirps."""
+    clamped: tuple[str, ...] = ()
+    """Joints that were fixed mechanically meanwhile."""
+
+    def __post_init__(self) -> None:
+        """Check the kind and the order of the instants.
+
+        Raises:
+            LogError: The kind is unknown or the segment ends before it starts.
+        """
+        if self.kind not in SIGNAL_KINDS:
+            raise LogError(
+                f"segment kind {self.kind!r}; expected one of {', '.join(SIGNAL_KINDS)}."
+            )
+        if not self.stop > self.start:
+            raise LogError(f"a segment ends at {self.stop} s, before it starts at {self.start} s.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepLog:
+    """A recording of commands and positions, one column per joint.
+
+    Positions are absolute joint angles in the robot's convention; `pose` is what the signals were
+    centred on. Timestamps are those that were measured; nothing is resampled here.
+    """
+
+    robot: str
+    """Name of the robot, for instance mini_cheetah."""
+    joints: tuple[str, ...]
+    """Names of the columns."""
+    time: Array
+    """Measured timestamps, strictly increasing [s], shape (n,)."""
+    command: Array
+    """Position command in force at each sample [rad], shape (n, joints)."""
+    position: Array
+    """Measured position [rad], shape (n, joints)."""
+    velocity: Array | None = None
+    """Measured velocity [rad/s], shape (n, joints), if there is any."""
+    torque: Array | None = None
+    """Measured or current-derived joint torque [N m], shape (n, joints), if there is any."""
+    frequency: Array | None = None
+    """Instantaneous frequency of the question [Hz], shape (n,); NaN between questions."""
+    segments: tuple[Segment, ...] = ()
+    stiffness: Array | None = None
+    """Gains on the drives [N m/rad], shape (joints,); None if unknown."""
+    damping: Array | None = None
+    """Gains on the drives [N m s/rad], shape (joints,); None if unknown."""
+    pose: Array | None = None
+    """Position the signals are centred on [rad], shape (joints,)."""
+    units: tuple[str, ...] = ()
+    """Unit of each column's position: `rad`, or `unknown` where the source gives another scale."""
+    virtual: bool = False
+    """True if the machine was pronk's virtual robot. Shown wherever a number from it is."""
+    source: str = ""
+    """File or link it came from."""
+    sha256: str = ""
+    """Hash of the file it was read from; empty for a log that was never a file."""
+    complete: bool = True
+    """False if the recording was cut short or its file is truncated."""
+    notes: tuple[str, ...] = ()
+    """What the reader found worth saying: jitter, drift, gaps, repaired or dropped rows."""
+    metadata: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes, finiteness and time.
+
+        Raises:
+            LogError: Too short, wrong shape, not finite, or time does not increase.
+        """
+        where = self.source or "log"
+        n, width = len(self.time), len(self.joints)
+        if n < 2:
+            raise LogError(f"{where}: {n} samples; a log needs at least 2.")
+        if width == 0:
+            raise LogError(f"{where}: no joints.")
+        if len(set(self.joints)) != width:
+            raise LogError(f"{where}: a joint is named twice in {', '.join(self.joints)}.")
+        for name in ("command", "position", "velocity", "torque"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if values.shape != (n, width):
+                raise LogError(
+                    f"{where}: {name} has shape {values.shape}; expected {(n, width)} "
+                    f"({n} timestamps, {width} joints)."
+                )
+            if not np.isfinite(values).all():
+                row, column = np.argwhere(~np.isfinite(values))[0]
+                raise LogError(
+                    f"{where}: {name} of {self.joints[column]} is not finite at sample {row} "
+                    f"(t = {self.time[row]:.3f} s); drop or repair such rows before reading."
+                )
+        if not np.isfinite(self.time).all():
+            raise LogError(f"{where}: a timestamp is not finite.")
+        steps = np.diff(self.time)
+        if not (steps > 0.0).all():
+            row = int(np.argmin(steps > 0.0)) + 1
+            what = "repeats" if steps[row - 1] == 0.0 else "goes back"
+            raise LogError(
+                f"{where}: time {what} at sample {row} ({self.time[row - 1]:.6f} s, then "
+                f"{self.time[row]:.6f} s); timestamps must increase."
+            )
+        for name in ("stiffness", "damping", "pose"):
+            values = getattr(self, name)
+            if values is not None and values.shape != (width,):
+                raise LogError(f"{where}: {name} has shape {values.shape}; expected {(width,)}.")
+        if self.units and len(self.units) != width:
+            raise LogError(f"{where}: {len(self.units)} units for {width} joints.")
+        for segment in self.segments:
+            for joint in segment.joints:
+                if joint not in self.joints:
+                    raise LogError(
+                        f"{where}: a segment names joint {joint!r}; "
+                        f"the columns are {', '.join(self.joints)}."
+                    )
+
+    def column(self, joint: str) -> int:
+        """Index of a joint's column.
+
+        Raises:
+            LogError: The log has no such joint; the message lists those it has.
+        """
+        try:
+            return self.joints.index(joint)
+        except ValueError:
+            raise LogError(
+                f"{self.source or 'log'}: no joint {joint!r}; it has {', '.join(self.joints)}."
+            ) from None
+
+    def unit(self, joint: str) -> str:
+        """Unit of a joint's position, `rad` unless the log says otherwise."""
+        return self.units[self.column(joint)] if self.units else "rad"
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean sample rate over the whole log [Hz]."""
+        return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
+
+    def cut(self, segment: Segment) -> SweepLog:
+        """The part of the log inside one segment, as a log of its own (same clock)."""
+        inside = (self.time >= segment.start - 1e-9) & (self.time <= segment.stop + 1e-9)
+        if int(inside.sum()) < 2:
+            raise LogError(
+                f"{self.source or 'log'}: segment {segment.start:.3f} to {segment.stop:.3f} s holds "
+                f"{int(inside.sum())} samples; the log spans {self.time[0]:.3f} to "
+                f"{self.time[-1]:.3f} s."
+            )
+
+        def rows(values: Array | None) -> Array | None:
+            return None if values is None else values[inside]
+
+        return replace(
+            self,
+            time=self.time[inside],
+            command=self.command[inside],
+            position=self.position[inside],
+            velocity=rows(self.velocity),
+            torque=rows(self.torque),
+            frequency=rows(self.frequency),
+            segments=(segment,),
+        )
