@@ -1,1 +1,1 @@
-
+"""Figures and the HTML page, from artefacts alone."""

@@ -1,0 +1,229 @@
+"""Motor and gearbox physics as pure functions.
+
+Everything is at the joint (output of the gear) unless a name says motor, in SI units, and
+broadcasts over arrays. Signs: torque is what the drive puts on the joint, positive along the
+joint axis; power and current are positive when drawn from the bus, negative when the drive
+brakes hard enough to feed the bus (regeneration).
+
+Factors of a three-phase motor with peak currents, as in Cheetah-Software's ActuatorModel.h:
+torque = 1.5 kt i, and the back-EMF that must fit under the bus voltage is 2 kt omega. A brushed
+motor has 1 and 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+THREE_PHASE_TORQUE = 1.5
+"""Torque per peak phase current, over kt."""
+THREE_PHASE_EMF = 2.0
+"""Bus voltage that the back-EMF takes, over kt times motor speed."""
+
+
+def pd_torque(
+    command: ArrayLike,
+    position: ArrayLike,
+    velocity: ArrayLike,
+    *,
+    stiffness: ArrayLike,
+    damping: ArrayLike,
+) -> Array:
+    """Torque the controller asks for, target velocity zero (paper M1 with reading A9) [N m].
+
+    Args:
+        command: Position command [rad].
+        position: Joint position [rad].
+        velocity: Joint velocity [rad/s].
+        stiffness: [N m/rad]
+        damping: [N m s/rad]
+    """
+    error = np.subtract(command, position)
+    return np.asarray(np.multiply(stiffness, error) - np.multiply(damping, velocity))
+
+
+def reflected_inertia(rotor_inertia: ArrayLike, gear_ratio: ArrayLike) -> Array:
+    """Rotor inertia as the joint feels it (armature), `rotor_inertia gear_ratio^2` [kg m^2]."""
+    return np.asarray(np.multiply(rotor_inertia, np.square(gear_ratio)))
+
+
+def stall_torque(
+    *,
+    gear_ratio: float,
+    torque_constant: float,
+    resistance: float,
+    bus_voltage: float,
+    torque_factor: float = THREE_PHASE_TORQUE,
+) -> float:
+    """Torque at standstill with the bus voltage across the winding [N m].
+
+    Args:
+        gear_ratio: Motor revolutions per joint revolution.
+        torque_constant: kt at the motor [N m/A].
+        resistance: Phase resistance [ohm].
+        bus_voltage: [V]
+        torque_factor: 1.5 for three phases, 1 for a brushed motor.
+    """
+    return torque_factor * gear_ratio * torque_constant * bus_voltage / resistance
+
+
+def no_load_speed(
+    *,
+    gear_ratio: float,
+    torque_constant: float,
+    bus_voltage: float,
+    emf_factor: float = THREE_PHASE_EMF,
+) -> float:
+    """Joint speed at which back-EMF takes the whole bus voltage [rad/s].
+
+    Args:
+        gear_ratio: Motor revolutions per joint revolution.
+        torque_constant: kt at the motor [N m/A] = [V s/rad].
+        bus_voltage: [V]
+        emf_factor: 2 for three phases, 1 for a brushed motor.
+    """
+    return bus_voltage / (emf_factor * gear_ratio * torque_constant)
+
+
+def back_emf(speed: ArrayLike, *, no_load_speed: float, bus_voltage: float) -> Array:
+    """Share of the bus voltage that rotation takes [V]: all of it at the no-load speed."""
+    return np.asarray(np.multiply(speed, bus_voltage / no_load_speed))
+
+
+def corner_speed(*, stall_torque: float, no_load_speed: float, effort_limit: float) -> float:
+    """Speed up to which the drive can give its effort limit [rad/s]; 0 if it never can."""
+    return no_load_speed * max(0.0, 1.0 - effort_limit / stall_torque)
+
+
+def torque_limits(
+    speed: ArrayLike,
+    stall_torque: float,
+    no_load_speed: float,
+    effort_limit: float,
+) -> tuple[Array, Array]:
+    """Least and greatest torque the drive can give at a speed [N m].
+
+    Bus voltage less back-EMF drives the current: `stall_torque (1 - speed / no_load_speed)` above
+    and its mirror image below, both held within the effort limit. Beyond the no-load speed the
+    greatest torque is negative: back-EMF brakes whatever is asked.
+
+    Args:
+        speed: Joint speed [rad/s].
+        stall_torque: [N m]
+        no_load_speed: [rad/s]
+        effort_limit: [N m]
+
+    Returns:
+        (low, high), each of the shape of `speed`.
+    """
+    ratio = np.divide(speed, no_load_speed)
+    high = np.clip(stall_torque * (1.0 - ratio), -effort_limit, effort_limit)
+    low = np.clip(stall_torque * (-1.0 - ratio), -effort_limit, effort_limit)
+    return np.asarray(low), np.asarray(high)
+
+
+def clip_torque(
+    torque: ArrayLike,
+    speed: ArrayLike,
+    stall_torque: float,
+    no_load_speed: float,
+    effort_limit: float,
+) -> Array:
+    """The torque that comes out when `torque` is asked at `speed` (see `torque_limits`) [N m]."""
+    low, high = torque_limits(speed, stall_torque, no_load_speed, effort_limit)
+    return np.asarray(np.clip(torque, low, high))
+
+
+def friction_torque(
+    speed: ArrayLike,
+    *,
+    frictionloss: float,
+    viscous_damping: float = 0.0,
+    stribeck_torque: float = 0.0,
+    stribeck_speed: float = 1.0,
+    smoothing: float = 0.0,
+) -> Array:
+    """Friction of a moving joint, against the motion [N m].
+
+    Coulomb friction, more of it at creeping speed (Stribeck), and a viscous part:
+    `-(frictionloss + stribeck_torque exp(-(speed / stribeck_speed)^2)) sign(speed)
+    - viscous_damping speed`. A joint at rest gets 0 here; it stays at rest as long as the other
+    torques on it stay within `frictionloss + stribeck_torque`.
+
+    Args:
+        speed: Joint speed [rad/s].
+        frictionloss: Coulomb friction [N m].
+        viscous_damping: [N m s/rad]
+        stribeck_torque: Break-away friction less Coulomb friction [N m].
+        stribeck_speed: Speed scale on which the surplus dies away [rad/s].
+        smoothing: Half-width of the ramp that stands for the sign, tanh(speed / smoothing)
+            [rad/s]; 0 for the sign itself.
+    """
+    speed = np.asarray(speed, dtype=np.float64)
+    direction = np.tanh(speed / smoothing) if smoothing > 0.0 else np.sign(speed)
+    dry = frictionloss + stribeck_torque * np.exp(-np.square(speed / stribeck_speed))
+    return np.asarray(-dry * direction - viscous_damping * speed)
+
+
+def winding_loss(
+    torque: ArrayLike,
+    *,
+    gear_ratio: float,
+    torque_constant: float,
+    stall_torque: float,
+    bus_voltage: float,
+) -> Array:
+    """Heat in the winding, `factor resistance i^2` with `i = torque / (factor gear kt)` [W].
+
+    Factor and resistance enter through the stall torque, `factor gear kt V / resistance`, so the
+    loss is `torque^2 V / (gear kt stall_torque)` for three-phase and brushed motors alike.
+
+    Args:
+        torque: Joint torque [N m].
+        gear_ratio: Motor revolutions per joint revolution.
+        torque_constant: kt at the motor [N m/A].
+        stall_torque: At the joint and at `bus_voltage` [N m].
+        bus_voltage: [V]
+    """
+    return np.asarray(
+        np.square(torque) * (bus_voltage / (gear_ratio * torque_constant * stall_torque))
+    )
+
+
+def electrical_power(
+    torque: ArrayLike,
+    speed: ArrayLike,
+    *,
+    gear_ratio: float,
+    torque_constant: float,
+    stall_torque: float,
+    bus_voltage: float,
+) -> Array:
+    """Power drawn from the bus: mechanical power and winding loss [W].
+
+    Negative when the drive brakes and the joint gives more than the winding turns to heat.
+    Inverter and iron losses are left out.
+
+    Args:
+        torque: Joint torque of the motor, before friction [N m].
+        speed: Joint speed [rad/s].
+        gear_ratio: Motor revolutions per joint revolution.
+        torque_constant: kt at the motor [N m/A].
+        stall_torque: At the joint and at `bus_voltage` [N m].
+        bus_voltage: [V]
+    """
+    loss = winding_loss(
+        torque,
+        gear_ratio=gear_ratio,
+        torque_constant=torque_constant,
+        stall_torque=stall_torque,
+        bus_voltage=bus_voltage,
+    )
+    return np.asarray(np.multiply(torque, speed) + loss)
+
+
+def bus_current(power: ArrayLike, bus_voltage: float) -> Array:
+    """Current drawn from the bus for a power [A]; negative charges the battery."""
+    return np.asarray(np.divide(power, bus_voltage))

@@ -1,0 +1,201 @@
+"""The paper's search: every gain pair of a 50 x 50 grid, compared by the magnitude (F7 to F11).
+
+Readings, the paper being silent: the error is the mean over the estimator's frequencies inside
+the joint's band of the squared difference of the gains in dB (what a Bode plot shows), every
+frequency counting alike; gains of repeats are averaged (as complex responses) before the
+comparison; phase is disregarded because a command delay turns it (F9); the armature stays as the
+data sheet has it (S6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.match.simulate import Bench
+from pronk.match.target import Target
+from pronk.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+DIVERGED_DB = 100.0
+"""Error written for a simulation that diverged or did not move [dB]: beyond any answer."""
+_COARSE = 4
+"""Every how many nodes the coarse search looks before it looks closely."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridSearch:
+    """Error over the grid, and its best cell."""
+
+    stiffness: Array
+    """Axis [N m/rad], shape (a,)."""
+    damping: Array
+    """Axis [N m s/rad], shape (b,)."""
+    error: Array
+    """Mean squared error of the gain [dB^2], shape (a, b); NaN where it was not looked at."""
+
+    @property
+    def cell(self) -> tuple[int, int]:
+        """Indices of the best node."""
+        i, j = np.unravel_index(int(np.nanargmin(self.error)), self.error.shape)
+        return int(i), int(j)
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Stiffness and damping of the best node."""
+        i, j = self.cell
+        return float(self.stiffness[i]), float(self.damping[j])
+
+    @property
+    def error_db(self) -> float:
+        """Root mean square error at the best node [dB]."""
+        return float(np.sqrt(np.nanmin(self.error)))
+
+    @property
+    def at_edge(self) -> bool:
+        """True if the best node lies on the border: the optimum may lie beyond."""
+        return any(
+            k in (0, n - 1) for k, n in zip(self.cell, self.error.shape, strict=True)
+        )
+
+
+def axes(robot: Robot, points: int = 50) -> tuple[Array, Array]:
+    """Axes of the robot's grid (paper F7: 13 to 27 N m/rad and 0.1 to 0.7 N m s/rad, 50 each)."""
+    return np.linspace(*robot.grid_stiffness, points), np.linspace(*robot.grid_damping, points)
+
+
+def weights(goal: Target, weighting: Literal["none", "coherence"]) -> Array:
+    """Weights of the frequencies inside the band, summing to one, shape (inside,)."""
+    count = int(goal.inside.sum())
+    raw = np.ones(count) if weighting == "none" else goal.deviation_db() ** -2.0
+    return np.asarray(raw / raw.sum())
+
+
+def mean_square(goal: Target, simulated: NDArray[np.complex128], weight: Array) -> Array:
+    """Weighted mean square of the gain error [dB^2], shape (...), for (..., inside)."""
+    error = goal.error_db(simulated)
+    error = np.where(np.isfinite(error), np.clip(error, -DIVERGED_DB, DIVERGED_DB), DIVERGED_DB)
+    return np.asarray(error**2 @ weight)
+
+
+def alike(targets: Sequence[Target], robot: Robot) -> list[list[Target]]:
+    """Targets gathered by simulation: mirror-image joints asked alike share one."""
+    groups: list[list[Target]] = []
+    for goal in targets:
+        for group in groups:
+            if group[0].question.same_as(goal.question, robot):
+                group.append(goal)
+                break
+        else:
+            groups.append([goal])
+    return groups
+
+
+def errors(
+    bench: Bench,
+    group: Sequence[Target],
+    stiffness: Array,
+    damping: Array,
+    weighting: Literal["none", "coherence"] = "none",
+    progress: Callable[[float], None] | None = None,
+) -> Array:
+    """Mean squared errors of several targets that share one simulation.
+
+    Args:
+        bench: The bench of the group's original joint.
+        group: Targets whose questions are the same after mirroring.
+        stiffness: [N m/rad], shape (b,).
+        damping: [N m s/rad], shape (b,).
+        weighting: Weights of the frequencies.
+        progress: Told the share done, 0 to 1.
+
+    Returns:
+        Mean squared error of the gain [dB^2], shape (group, b).
+    """
+    question = group[0].question
+    command = question.mirrored(bench.robot)[2]
+    steps = max(goal.steps for goal in group)
+    # Real and imaginary parts side by side: one real product instead of two of complex numbers.
+    wide = [
+        np.hstack([goal.band_matrix.real, goal.band_matrix.imag]) for goal in group
+    ]
+    weight = [weights(goal, weighting) for goal in group]
+    out = np.empty((len(group), len(stiffness)))
+    for part, position in bench.run(
+        [command[:steps]], [bench.pose(question)], stiffness, damping
+    ):
+        for k, goal in enumerate(group):
+            pair = position[:, : goal.steps] @ wide[k]
+            half = pair.shape[1] // 2
+            out[k, part] = mean_square(goal, pair[:, :half] + 1j * pair[:, half:], weight[k])
+        if progress is not None:
+            progress(part.stop / len(stiffness))
+    return out
+
+
+def search(
+    bench: Bench,
+    group: Sequence[Target],
+    stiffness: Array,
+    damping: Array,
+    weighting: Literal["none", "coherence"] = "none",
+    progress: Callable[[float], None] | None = None,
+) -> list[GridSearch]:
+    """Simulate the whole grid for targets that share one simulation.
+
+    Args:
+        bench: The bench of the group's original joint.
+        group: Targets whose questions are the same after mirroring.
+        stiffness: Axis [N m/rad], shape (a,).
+        damping: Axis [N m s/rad], shape (b,).
+        weighting: Weights of the frequencies.
+        progress: Told the share done, 0 to 1.
+    """
+    kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
+    shape = (len(stiffness), len(damping))
+    found = errors(bench, group, kp, kd, weighting, progress)
+    return [
+        GridSearch(stiffness=stiffness, damping=damping, error=row.reshape(shape)) for row in found
+    ]
+
+
+def coarse_search(
+    bench: Bench,
+    group: Sequence[Target],
+    stiffness: Array,
+    damping: Array,
+    weighting: Literal["none", "coherence"] = "none",
+) -> list[GridSearch]:
+    """Look at every fourth node and the border, then at all nodes around the best.
+
+    Enough to say that no node fits (paper F13) at a tenth of the cost; nodes not looked at are
+    NaN in the error map.
+    """
+    coarse = [_thinned(len(axis)) for axis in (stiffness, damping)]
+    looked = np.zeros((len(stiffness), len(damping)), dtype=bool)
+    looked[np.ix_(*coarse)] = True
+    maps = np.full((len(group), *looked.shape), np.nan)
+
+    def look(nodes: NDArray[np.bool_]) -> None:
+        i, j = np.nonzero(nodes)
+        maps[:, i, j] = errors(bench, group, stiffness[i], damping[j], weighting)
+
+    look(looked)
+    close = np.zeros_like(looked)
+    for row in maps:
+        i, j = np.unravel_index(int(np.nanargmin(row)), row.shape)
+        close[
+            max(i - _COARSE + 1, 0) : i + _COARSE, max(j - _COARSE + 1, 0) : j + _COARSE
+        ] = True
+    look(close & ~looked)
+    return [GridSearch(stiffness=stiffness, damping=damping, error=row) for row in maps]
+
+
+def _thinned(count: int) -> NDArray[np.intp]:
+    """Every fourth index and the last."""
+    return np.unique(np.append(np.arange(0, count, _COARSE), count - 1))

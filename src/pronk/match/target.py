@@ -1,0 +1,202 @@
+"""What a simulation is held against: a measured response and the way to it from positions.
+
+With the command given, the H1 estimate is linear in the position, `response = position @ matrix`,
+so the simulated positions of a whole grid become responses in one product, through the very
+windows and segments that the log went through.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import IdentifiabilityError, LogError
+from pronk.match.question import Question, question
+from pronk.match.settings import MatchSettings
+from pronk.response.estimate import estimate, operators, questions
+from pronk.response.operator import H1Operator
+from pronk.response.response import FrequencyResponse
+from pronk.robots.robot import Robot
+from pronk.sweep.log import SweepLog
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+DB = 20.0 / np.log(10.0)
+"""Decibels per neper: `20 log10(gain) = DB * log(gain)`."""
+FLOOR_DB = 0.1
+"""Smallest believed deviation of a measured gain [dB]. Coherence near 1 would otherwise let a few
+frequencies outvote the band, though the model itself is not better than this."""
+_TAIL = 1e-4
+"""Absolute error of gain that leaving out the end of the log may cause: 0.001 dB at gain 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A joint's measured response at one amplitude, ready to be compared with simulations."""
+
+    question: Question
+    sign: float
+    """Between this joint's coordinate and that of the joint simulated in its place."""
+    measured: FrequencyResponse
+    matrix: ComplexArray
+    """From position about the pose at the start of each step to response, shape (steps, f)."""
+    inside: NDArray[np.bool_]
+    """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
+    steps: int
+    """Steps after which the estimator hears nothing more of the frequencies inside."""
+
+    @property
+    def joint(self) -> str:
+        """The joint asked."""
+        return self.question.joint
+
+    @property
+    def omega(self) -> Array:
+        """Angular frequencies of the fit [rad/s], shape (inside,)."""
+        return self.measured.omega[self.inside]
+
+    @property
+    def band_matrix(self) -> ComplexArray:
+        """Rows and columns of `matrix` that the fit needs, shape (steps, inside)."""
+        return self.matrix[: self.steps, self.inside]
+
+    def deviation_db(self) -> Array:
+        """Standard deviation of the measured gain from its coherence [dB], shape (inside,).
+
+        `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
+        eq. 9.90), in dB, not below `FLOOR_DB`.
+        """
+        coherence = np.clip(self.measured.coherence[self.inside], 1e-9, 1.0)
+        averages = np.maximum(self.measured.averages[self.inside], 1.0)
+        relative = np.sqrt((1.0 - coherence) / (2.0 * averages * coherence))
+        return np.asarray(np.hypot(DB * relative, FLOOR_DB))
+
+    def error_db(self, simulated: ComplexArray) -> Array:
+        """Gain of a simulation over the measured one, inside the band [dB], shape (..., inside).
+
+        Args:
+            simulated: Response, shape (..., inside).
+        """
+        measured = np.abs(self.measured.response[self.inside])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(DB * (np.log(np.abs(simulated)) - np.log(measured)))
+
+
+def targets(
+    log: SweepLog,
+    joint: str,
+    robot: Robot,
+    settings: MatchSettings,
+    *,
+    band_hz: tuple[float, float] | None = None,
+) -> list[Target]:
+    """Estimate a joint's responses and prepare each for comparison, largest amplitude first.
+
+    Sine steps are left out: they are read step by step and have no single matrix.
+
+    Args:
+        log: The log.
+        joint: The joint; the log must hold questions to it.
+        robot: The robot.
+        settings: Estimator and coherence limit.
+        band_hz: Frequencies to compare; the joint's band if not given.
+
+    Raises:
+        LogError: The joint was not asked or did not move, or its unit is unknown.
+        IdentifiabilityError: Too little of the band is coherent.
+    """
+    chosen = tuple(segment for segment in log.segments if segment.kind != "sine_steps")
+    if log.segments:
+        if not any(joint in segment.joints for segment in chosen):
+            raise LogError(
+                f"{log.source or 'log'}: {joint} was asked by sine steps alone; match a chirp or a "
+                "multisine, and keep the steps to check it."
+            )
+        log = replace(log, segments=chosen)
+    measured = estimate(log, joint, settings.estimator)
+    parts = questions(log, joint)
+    maps = operators(log, joint, settings.estimator)
+    return [
+        target(repeats[0], row[0], response, robot, settings, band_hz=band_hz)
+        for repeats, row, response in zip(parts, maps, measured, strict=True)
+    ]
+
+
+def target(
+    part: SweepLog,
+    operator: H1Operator,
+    measured: FrequencyResponse,
+    robot: Robot,
+    settings: MatchSettings,
+    *,
+    band_hz: tuple[float, float] | None = None,
+) -> Target:
+    """Prepare the comparison of one measured response.
+
+    Args:
+        part: The question, one segment; of several repeats any one, their commands being the same.
+        operator: The estimate of that question as a matrix.
+        measured: The response.
+        robot: The robot.
+        settings: Coherence limit.
+        band_hz: Frequencies to compare; the joint's band if not given.
+
+    Raises:
+        LogError: The unit is unknown, or a clamped joint stood elsewhere.
+        IdentifiabilityError: Too little of the band is coherent, or the joint did not move.
+    """
+    joint = measured.joint
+    asked = question(part, part.segments[0], joint, robot)
+    matrix = operator.matrix(asked.time)
+    low, high = band_hz or robot.joint(joint).band_hz
+    inside = _inside(measured, low, high, settings, part.source or "log")
+    return Target(
+        question=asked,
+        sign=robot.joint(joint).original[1],
+        measured=measured,
+        matrix=matrix,
+        inside=inside,
+        steps=_horizon(matrix[:, inside], asked.amplitude),
+    )
+
+
+def _inside(
+    measured: FrequencyResponse, low: float, high: float, settings: MatchSettings, where: str
+) -> NDArray[np.bool_]:
+    """Frequencies of the band that can be believed; refuses a band that mostly cannot be."""
+    band = measured.band(low, high)
+    if int(band.sum()) < 3:
+        raise IdentifiabilityError(
+            f"{where}: {measured.joint} was answered at {int(band.sum())} frequencies between "
+            f"{low:g} and {high:g} Hz; the match needs at least 3, so ask for longer or higher."
+        )
+    coherent = measured.band(low, high, settings.coherence_min)
+    moved = np.abs(measured.response[band]).max()
+    if not moved > 1e-3:
+        raise IdentifiabilityError(
+            f"{where}: {measured.joint} did not move (largest gain {moved:.1e} between {low:g} and "
+            f"{high:g} Hz); check that its drive is on and that the column is the right one."
+        )
+    if 2 * int(coherent.sum()) < int(band.sum()):
+        raise IdentifiabilityError(
+            f"{where}: {measured.joint} is coherent (at least {settings.coherence_min:g}) at only "
+            f"{int(coherent.sum())} of {int(band.sum())} frequencies between {low:g} and {high:g} "
+            "Hz; repeat the sweep with a larger amplitude, a stiffer base or more repeats."
+        )
+    return coherent
+
+
+def _horizon(matrix: ComplexArray, amplitude: float) -> int:
+    """First step after which all remaining positions together move no gain by `_TAIL`.
+
+    A chirp leaves the band long before it ends; the windows of the segments after that hold
+    nothing of the band's frequencies, so those steps need not be simulated.
+    """
+    size = abs(amplitude) if np.isfinite(amplitude) and amplitude != 0.0 else 1.0
+    # Beyond the band a joint moves less than it was asked; twice that is a safe bound.
+    tail = 2.0 * size * np.cumsum(np.abs(matrix)[::-1], axis=0)[::-1].max(axis=1)
+    heard = np.nonzero(tail > _TAIL)[0]
+    return int(min(heard[-1] + 2, len(matrix))) if len(heard) else len(matrix)

@@ -1,0 +1,137 @@
+"""The uniform analysis grid that measured timestamps are brought to.
+
+Measured timestamps are believed. The position is smooth, so it is read between them with a cubic
+spline. The command is a staircase, so it is read as its mean over each grid interval: on a grid
+that falls on the measured timestamps that is the zero-order hold exactly, and off it (jitter,
+drift) no step is moved in time, which sampling a staircase at other instants would do.
+
+Both have the same transform. With u(t) the staircase, its mean over [t, t + D] has the spectrum
+`U(w) exp(+j w D/2) sinc(f D)`, sinc(x) = sin(pi x) / (pi x). Position over command on the grid is
+therefore the response of the joint divided by that factor (`hold` below), up to what lies above
+the Nyquist frequency of the grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.sparse.linalg import splu
+
+from pronk.errors import LogError
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_REACH_S = 0.05
+"""How far the grid may reach beyond the samples, which are then held [s]: two policy ticks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Uniform instants `start + k / rate_hz`, k = 0..count-1."""
+
+    start: float
+    """First instant, on the clock of the log [s]."""
+    rate_hz: float
+    count: int
+
+    @property
+    def times(self) -> Array:
+        """The instants [s], shape (count,)."""
+        return np.asarray(self.start + np.arange(self.count) / self.rate_hz)
+
+
+def analysis_rate(time: Array) -> float:
+    """Mean rate of measured timestamps, to four significant digits [Hz].
+
+    Rounding gives repeats of one question the same grid although their jitter differs; what it
+    shifts (5e-5 of the time at most) the interpolation undoes.
+    """
+    return float(f"{(len(time) - 1) / (time[-1] - time[0]):.4g}")
+
+
+def grid_over(time: Array, rate_hz: float | None = None) -> Grid:
+    """The grid from the first to the last measured timestamp.
+
+    Args:
+        time: Measured timestamps [s], shape (n,).
+        rate_hz: Rate of the grid; `analysis_rate(time)` if not given.
+    """
+    rate = analysis_rate(time) if rate_hz is None else rate_hz
+    # A hundredth of an interval forgives the rounding of the rate and of the timestamps.
+    count = int(np.floor((time[-1] - time[0]) * rate + 0.01)) + 1
+    return Grid(start=float(time[0]), rate_hz=rate, count=count)
+
+
+def held_mean(time: Array, command: Array, grid: Grid) -> Array:
+    """Mean of a held command over each grid interval.
+
+    Args:
+        time: Measured timestamps [s], shape (n,).
+        command: Command in force from each timestamp to the next [rad], shape (n,).
+        grid: Where to read it.
+
+    Returns:
+        Mean over [t, t + 1/rate] at each grid instant t [rad], shape (grid.count,).
+    """
+    step = 1.0 / grid.rate_hz
+    end = grid.times[-1] + 2.0 * step
+    knots = np.append(time, max(end, time[-1] + step))
+    # About its own mean, so that the integral stays small and its differences exact.
+    mean = float(command.mean())
+    area = np.concatenate(([0.0], np.cumsum((command - mean) * np.diff(knots))))
+    edges = grid.start + np.arange(grid.count + 1) * step
+    return np.asarray(np.diff(np.interp(edges, knots, area)) / step + mean)
+
+
+def interpolate(time: Array, values: Array, grid: Grid) -> Array:
+    """Cubic spline through `values` (shape (n, ...) at `time`), read on the grid."""
+    degree = min(3, len(time) - 1)
+    spline = make_interp_spline(time, values, k=degree)
+    return np.asarray(spline(np.clip(grid.times, time[0], time[-1])))
+
+
+def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
+    """Carry weights on grid samples over to samples at other instants, through the spline.
+
+    `values @ pull_back(weights, time, grid) == interpolate(time, values, grid) @ weights`, at the
+    cost of one banded solve, whatever number of `values` follows.
+
+    Args:
+        weights: Shape (grid.count, f).
+        time: Increasing instants of the samples [s], shape (n,).
+        grid: The analysis grid.
+
+    Returns:
+        Shape (n, f).
+
+    Raises:
+        LogError: The samples do not span the grid.
+    """
+    last = grid.start + (grid.count - 1) / grid.rate_hz
+    if time[0] > grid.start + _REACH_S or time[-1] < last - _REACH_S:
+        raise LogError(
+            f"samples from {time[0]:.3f} to {time[-1]:.3f} s do not span the measured question, "
+            f"{grid.start:.3f} to {last:.3f} s; simulate or record all of it."
+        )
+    degree = min(3, len(time) - 1)
+    knots = make_interp_spline(time, np.zeros(len(time)), k=degree).t
+    collocation = BSpline.design_matrix(time, knots, degree)
+    onto_grid = BSpline.design_matrix(np.clip(grid.times, time[0], time[-1]), knots, degree)
+    # Real arithmetic: the spline is real, and the solver takes one kind of number.
+    parts = np.concatenate([weights.real, weights.imag], axis=1)
+    on_knots: Any = onto_grid.T @ parts
+    solved = splu(sparse.csc_matrix(collocation.T)).solve(on_knots)
+    width = weights.shape[1]
+    return np.asarray(solved[:, :width] + 1j * solved[:, width:], dtype=np.complex128)
+
+
+def hold(omega: Array, rate_hz: float) -> ComplexArray:
+    """Grid factor `exp(-j w D/2) sinc(f D)`, D = 1/rate: see the head of this module."""
+    turns = omega / (2.0 * np.pi * rate_hz)
+    return np.asarray(np.exp(-1j * np.pi * turns) * np.sinc(turns))

@@ -1,0 +1,309 @@
+"""The one MuJoCo model that match, train and trial build on.
+
+The training simulator is mjlab's `DcMotorActuator` on MuJoCo: at the start of each 5 ms step
+
+    torque = clip(stiffness (command - q) - damping qdot, low, high),
+    high = min(effort_limit, stall_torque (1 - qdot / no_load_speed)), low its mirror image,
+
+held over the step, integrator implicitfast. The bench gets the very same trajectories from a
+native model with no Python in the loop, so `mujoco.rollout` can run it on every core:
+
+- Integrator Euler. Like implicitfast it treats passive joint damping implicitly; unlike it, it
+  leaves the forces of native actuators explicit, which is what a torque computed outside is.
+- One native `dcmotor` a joint, in joint-side units with voltage as the control variable:
+  K = V / no_load_speed and R = K V / stall_torque put the torque-speed line where it belongs.
+  The controller's voltage K/R-scales to the PD law: kp_V = R stiffness / K gives the stiffness,
+  kd_V = R damping / K - K gives the damping once the back-EMF has taken its own K^2/R, clipping
+  that voltage at V clips the torque at stall_torque (+-1 - qdot / no_load_speed), and
+  saturation at effort_limit does the rest.
+
+A test holds the equivalence, in and out of saturation, against the law written out, and another
+against mjlab itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from pronk.errors import RobotError
+from pronk.robots.robot import Drive, Robot
+
+_POSITION_INPUT = 1  # dcmotor input_mode: control is a position command
+_KP, _KD = 4, 6  # where MuJoCo 3.11 packs controller[0] and controller[2] in actuator_gainprm
+
+Values = Mapping[str, float]
+
+
+def free_spec(
+    robot: Robot, *, armature: Values | None = None, frictionloss: Values | None = None
+) -> mujoco.MjSpec:
+    """The robot as it stands, without floor and without actuators.
+
+    Joints have their armature, dry friction and viscous damping; the timestep is the training
+    simulator's, the integrator implicitfast; keyframe `default` is the default pose.
+
+    Args:
+        robot: Which robot.
+        armature: Reflected rotor inertia by joint name, instead of the drive's [kg m^2].
+        frictionloss: Dry friction by joint name, instead of the drive's [N m].
+
+    Raises:
+        RobotError: A joint is unknown.
+    """
+    spec = robot.build_spec()
+    _set_options(spec, robot, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    _set_passive(spec, robot, robot.joint_names, armature, frictionloss)
+    _add_default_key(spec, robot, with_command=False)
+    return spec
+
+
+def bench_spec(
+    robot: Robot,
+    joint_name: str,
+    *,
+    stiffness: Values | None = None,
+    damping: Values | None = None,
+    armature: Values | None = None,
+    frictionloss: Values | None = None,
+) -> mujoco.MjSpec:
+    """One joint on the bench: what can move when it is asked, and nothing else.
+
+    The base is fixed, so only the joint's own `chain` feels it: other branches are removed,
+    clamped joints are welded at their default position, the other joints of the chain are held
+    by their own drives. Contacts are off, gravity is on. Geoms are left out (the bench is
+    computed, not drawn). Keyframe `default` is the default pose with the commands that ask for it.
+
+    Args:
+        robot: Which robot.
+        joint_name: The joint that is asked.
+        stiffness: Gain by joint name, instead of the one on the robot's drive [N m/rad].
+        damping: Gain by joint name, instead of the one on the robot's drive [N m s/rad].
+        armature: Reflected rotor inertia by joint name, instead of the drive's [kg m^2].
+        frictionloss: Dry friction by joint name, instead of the drive's [N m].
+
+    Raises:
+        RobotError: A joint is unknown, or something outside the chain could move with it.
+    """
+    joint = robot.joint(joint_name)
+    spec = robot.build_spec()
+    _set_options(spec, robot, mujoco.mjtIntegrator.mjINT_EULER)
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    for geom in list(spec.geoms):
+        spec.delete(geom)
+    base = spec.body(robot.base_body)
+    for base_joint in list(base.joints):
+        spec.delete(base_joint)
+    _remove_other_branches(spec, base, {*joint.chain, *joint.clamped}, joint_name)
+    for name in joint.clamped:
+        _weld(spec, name, robot.joint(name).default_position)
+    add_drives(
+        spec,
+        robot,
+        joint.chain,
+        stiffness=stiffness,
+        damping=damping,
+        armature=armature,
+        frictionloss=frictionloss,
+    )
+    _add_default_key(spec, robot, with_command=True)
+    return spec
+
+
+def add_drives(
+    spec: mujoco.MjSpec,
+    robot: Robot,
+    joint_names: Iterable[str],
+    *,
+    stiffness: Values | None = None,
+    damping: Values | None = None,
+    armature: Values | None = None,
+    frictionloss: Values | None = None,
+) -> None:
+    """Give joints of a spec their drives: armature, friction, and a native dcmotor each.
+
+    Actuators have the names of their joints and take position commands [rad].
+
+    Args:
+        spec: Model to change.
+        robot: Where drives and default gains come from.
+        joint_names: Joints to drive, in the order of the actuators.
+        stiffness: Gain by joint name, instead of the one on the robot's drive [N m/rad].
+        damping: Gain by joint name, instead of the one on the robot's drive [N m s/rad].
+        armature: Reflected rotor inertia by joint name, instead of the drive's [kg m^2].
+        frictionloss: Dry friction by joint name, instead of the drive's [N m].
+
+    Raises:
+        RobotError: A joint is unknown.
+    """
+    names = tuple(joint_names)
+    _check_names(robot, stiffness, damping)
+    _set_passive(spec, robot, names, armature, frictionloss)
+    for name in names:
+        joint = robot.joint(name)
+        drive = joint.drive
+        constant, resistance = _electrical(drive)
+        kp, kd = _voltage_gains(
+            drive,
+            (stiffness or {}).get(name, joint.stiffness),
+            (damping or {}).get(name, joint.damping),
+        )
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_dcmotor(
+            motorconst=[constant, 0.0],
+            resistance=resistance,
+            saturation=[drive.effort_limit, 0.0, 0.0],
+            controller=[kp, 0.0, kd, 0.0, 0.0, drive.bus_voltage],
+            input_mode=_POSITION_INPUT,
+        )
+
+
+def set_drive_gains(
+    model: mujoco.MjModel, joint_name: str, drive: Drive, stiffness: float, damping: float
+) -> None:
+    """Change the gains of one drive in a compiled model, exactly as compiling anew would.
+
+    Args:
+        model: Model from a spec with drives.
+        joint_name: Whose drive.
+        drive: The drive the model was built with.
+        stiffness: [N m/rad]
+        damping: [N m s/rad]
+
+    Raises:
+        RobotError: The model has no drive of that name.
+    """
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, joint_name)
+    if index < 0:
+        names = ", ".join(model.actuator(i).name for i in range(model.nu))
+        raise RobotError(f"the model has no drive {joint_name!r}; its drives are {names}.")
+    model.actuator_gainprm[index, [_KP, _KD]] = _voltage_gains(drive, stiffness, damping)
+
+
+def set_passive(
+    model: mujoco.MjModel,
+    joint_name: str,
+    *,
+    armature: float | None = None,
+    frictionloss: float | None = None,
+    viscous_damping: float | None = None,
+) -> None:
+    """Change armature, dry friction or viscous damping of one joint in a compiled model.
+
+    Constants that MuJoCo derives from them are computed anew, so the model is the one that
+    compiling with these values would give.
+
+    Args:
+        model: Model to change.
+        joint_name: Which joint.
+        armature: Reflected rotor inertia [kg m^2]; None leaves it.
+        frictionloss: Dry friction [N m]; None leaves it.
+        viscous_damping: Passive viscous friction [N m s/rad]; None leaves it.
+
+    Raises:
+        RobotError: The model has no joint of that name.
+    """
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint_name)
+    if index < 0:
+        names = ", ".join(model.joint(i).name for i in range(model.njnt))
+        raise RobotError(f"the model has no joint {joint_name!r}; its joints are {names}.")
+    dof = model.jnt_dofadr[index]
+    if frictionloss is not None:
+        model.dof_frictionloss[dof] = frictionloss
+    if viscous_damping is not None:
+        model.dof_damping[dof] = viscous_damping
+    if armature is not None:
+        model.dof_armature[dof] = armature
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _electrical(drive: Drive) -> tuple[float, float]:
+    """Motor constant [N m/A] and resistance [ohm] of the equivalent gearless DC motor."""
+    constant = drive.bus_voltage / drive.no_load_speed
+    return constant, constant * drive.bus_voltage / drive.stall_torque
+
+
+def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[float, float]:
+    """Controller gains in volts that make the torque law `stiffness`, `damping`."""
+    constant, resistance = _electrical(drive)
+    return resistance * stiffness / constant, resistance * damping / constant - constant
+
+
+def _set_options(spec: mujoco.MjSpec, robot: Robot, integrator: Any) -> None:
+    spec.option.timestep = robot.timestep_s
+    spec.option.integrator = integrator
+
+
+def _set_passive(
+    spec: mujoco.MjSpec,
+    robot: Robot,
+    names: Iterable[str],
+    armature: Values | None,
+    frictionloss: Values | None,
+) -> None:
+    _check_names(robot, armature, frictionloss)
+    for name in names:
+        drive = robot.joint(name).drive
+        joint = spec.joint(name)
+        joint.armature = (armature or {}).get(name, drive.armature)
+        joint.frictionloss = (frictionloss or {}).get(name, drive.frictionloss)
+        joint.damping = [drive.viscous_damping, 0.0, 0.0]
+
+
+def _check_names(robot: Robot, *overrides: Values | None) -> None:
+    for values in overrides:
+        for name in values or ():
+            robot.joint(name)
+
+
+def _remove_other_branches(
+    spec: mujoco.MjSpec, body: Any, wanted: set[str], joint_name: str
+) -> None:
+    """Delete, below a body that is still, every branch that moves without the wanted joints."""
+    for child in list(body.bodies):
+        joints = {joint.name for joint in _subtree_joints(child)}
+        if joints and not joints & wanted:
+            spec.delete(child)
+        elif strangers := joints - wanted:
+            raise RobotError(
+                f"{', '.join(sorted(strangers))} can move when {joint_name} is asked; name them in "
+                "its chain (held by their drives) or among its clamped joints."
+            )
+
+
+def _subtree_joints(body: Any) -> list[Any]:
+    return [*body.joints, *(joint for child in body.bodies for joint in _subtree_joints(child))]
+
+
+def _weld(spec: mujoco.MjSpec, joint_name: str, angle: float) -> None:
+    """Fix a hinge at an angle: turn its body about the hinge, then delete the hinge."""
+    joint = spec.joint(joint_name)
+    body = joint.parent
+    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    turn, turned = np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, axis, angle)
+    mujoco.mju_mulQuat(turned, np.array(body.quat), turn)
+    anchor, before, after = np.array(joint.pos), np.zeros(3), np.zeros(3)
+    mujoco.mju_rotVecQuat(before, anchor, np.array(body.quat))
+    mujoco.mju_rotVecQuat(after, anchor, turned)
+    body.pos = np.array(body.pos) + before - after
+    body.quat = turned
+    spec.delete(joint)
+
+
+def _add_default_key(spec: mujoco.MjSpec, robot: Robot, *, with_command: bool) -> None:
+    """Keyframe `default`: the default pose, the base where the model puts it."""
+    model = spec.compile()
+    qpos = model.qpos0.copy()
+    for index in range(model.njnt):
+        name = model.joint(index).name
+        if name in robot.joint_names:
+            qpos[model.jnt_qposadr[index]] = robot.joint(name).default_position
+    command = [robot.joint(model.actuator(i).name).default_position for i in range(model.nu)]
+    if with_command:
+        spec.add_key(name="default", qpos=qpos, ctrl=command)
+    else:
+        spec.add_key(name="default", qpos=qpos)

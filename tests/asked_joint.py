@@ -1,0 +1,154 @@
+"""Logs of joints whose answer is known in closed form, for the tests of the room `response`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import chirp
+
+from pronk.response.analytic import simulate_second_order
+from pronk.sweep.log import Segment, SweepLog
+
+Array = NDArray[np.float64]
+
+KNEE = {"stiffness": 21.9, "damping": 0.54, "inertia": 0.0068}
+HIP = {"stiffness": 20.6, "damping": 0.49, "inertia": 0.02}
+LIVELY = {"stiffness": 17.0, "damping": 0.2, "inertia": 0.012}
+JOINTS = {"knee": KNEE, "hip": HIP, "lively": LIVELY}
+
+AMPLITUDE = 0.25
+TICK_HZ = 50.0
+
+
+def held(time: Array) -> Array:
+    """The policy tick in force at each instant."""
+    return np.floor(time * TICK_HZ + 1e-9) / TICK_HZ
+
+
+def chirp_command(
+    kind: str, rate: float, *, duration: float = 20.0, settle: float = 1.0
+) -> tuple[Array, Array, Array]:
+    """Time, command held at 50 Hz, instantaneous frequency of a chirp of 0.1 to 25 Hz."""
+    time = np.arange(round((duration + settle) * rate)) / rate
+    tick = held(time)
+    method = "linear" if kind == "chirp" else "logarithmic"
+    wave = chirp(tick, 0.1, duration, 25.0, method=method, phi=-90)
+    share = np.minimum(time / duration, 1.0)
+    hz = 0.1 + 24.9 * share if kind == "chirp" else 0.1 * 250.0**share
+    asked = tick < duration - 1e-9
+    return time, np.where(asked, AMPLITUDE * wave, 0.0), np.where(asked, hz, np.nan)
+
+
+def multisine_command(
+    rate: float, *, period: float = 4.0, periods: int = 5, settle: float = 0.5, seed: int = 0
+) -> tuple[Array, Array]:
+    """Random-phase multisine on odd lines, every fourth odd line left silent."""
+    time = np.arange(round((periods * period + settle) * rate)) / rate
+    tick = held(time)
+    lines = np.arange(1, 96, 2)
+    lines = lines[np.arange(len(lines)) % 4 != 2]
+    phases = np.random.default_rng(seed + 1000).uniform(0.0, 2.0 * np.pi, len(lines))
+    wave = np.cos(2.0 * np.pi * np.outer(tick, lines) / period + phases).sum(axis=1)
+    wave *= AMPLITUDE / np.abs(wave).max()
+    return time, np.where(tick < periods * period - 1e-9, wave, 0.0)
+
+
+def steps_command(rate: float, frequencies: tuple[float, ...]) -> tuple[Array, Array, Array]:
+    """Sine steps of six periods or two seconds each, whichever is longer."""
+    pieces, hz = [], []
+    for f in frequencies:
+        length = max(6, int(np.ceil(2.0 * f))) / f
+        tick = held(np.arange(round(length * rate)) / rate)
+        pieces.append(AMPLITUDE * np.sin(2.0 * np.pi * f * tick))
+        hz.append(np.full(len(tick), f))
+    command = np.concatenate([*pieces, np.zeros(round(0.5 * rate))])
+    frequency = np.concatenate([*hz, np.full(round(0.5 * rate), np.nan)])
+    return np.arange(len(command)) / rate, command, frequency
+
+
+def friction_joint(frictionloss: float) -> Callable[[Array, float], Array]:
+    """The knee with dry friction, stepped at 8 times the log rate (velocity projected, as MuJoCo)."""
+
+    def simulate(command: Array, rate: float) -> Array:
+        fine, step = 8, 1.0 / (8.0 * rate)
+        k, d, inertia = KNEE["stiffness"], KNEE["damping"], KNEE["inertia"]
+        q = v = 0.0
+        out = np.empty(len(command))
+        for i, u in enumerate(command.tolist()):
+            out[i] = q
+            for _ in range(fine):
+                v += step * (k * (u - q) - d * v) / inertia
+                slip = abs(v) - step * frictionloss / inertia
+                v = np.sign(v) * slip if slip > 0.0 else 0.0
+                q += step * v
+        return out
+
+    return simulate
+
+
+def linear_joint(**joint: float) -> Callable[[Array, float], Array]:
+    """The exact answer of a second-order joint."""
+    return lambda command, rate: simulate_second_order(command, rate, **joint)
+
+
+def make_log(
+    questions: list[tuple[Array, Array, Array | None]],
+    answer: Callable[[Array, float], Array],
+    *,
+    kind: str,
+    noise: float = 0.0,
+    amplitude: float = AMPLITUDE,
+    period: float | None = None,
+    jitter: float = 0.0,
+    seed: int = 0,
+) -> SweepLog:
+    """One log from several questions (time, command, frequency or None), a repeat each.
+
+    `jitter` moves each timestamp by up to that share of an interval, and the position is that of
+    the joint at the moved instant.
+    """
+    rng = np.random.default_rng(seed)
+    start = 3.0
+    columns: list[tuple[Array, Array, Array, Array]] = []
+    segments = []
+    for repeat, (time, command, frequency) in enumerate(questions):
+        rate = round(1.0 / float(time[1] - time[0]))
+        moved = time.copy()
+        if jitter:
+            # The truth between samples, on a grid forty times as fine.
+            fine = 40
+            moved += jitter / rate * rng.uniform(0.0, 1.0, len(time))
+            index = np.round(moved * rate * fine).astype(int)
+            moved = index / (rate * fine)
+            dense = np.repeat(command, fine)
+            position = answer(np.append(dense, np.repeat(dense[-1], fine)), rate * fine)[index]
+        else:
+            position = answer(command, rate)
+        position = position + noise * rng.standard_normal(len(time))
+        hz = np.full(len(time), np.nan) if frequency is None else frequency
+        columns.append((start + moved, command, position, hz))
+        segments.append(
+            Segment(
+                kind=kind,
+                joints=("knee",),
+                start=float(start + moved[0]),
+                stop=float(start + moved[-1]),
+                amplitude=amplitude,
+                repeat=repeat,
+                period_s=period,
+            )
+        )
+        start += float(time[-1]) + 0.5
+    stacked = [np.concatenate(column) for column in zip(*columns, strict=True)]
+    return SweepLog(
+        robot="bench",
+        joints=("knee",),
+        time=stacked[0],
+        command=stacked[1][:, None],
+        position=stacked[2][:, None],
+        frequency=stacked[3] if np.isfinite(stacked[3]).any() else None,
+        segments=tuple(segments),
+        source="made for a test",
+    )

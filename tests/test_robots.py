@@ -1,0 +1,212 @@
+"""The robots are what their sources say, and their models hold together."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from pronk.errors import RobotError
+from pronk.robots import ROBOT_NAMES, load_robot
+from pronk.robots.inertia import Inertia, joined
+from pronk.robots.mini_cheetah import constants as cheetah
+from pronk.robots.so101 import constants as so101
+from pronk.robots.spec import free_spec
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return free_spec(load_robot("mini_cheetah")).compile()
+
+
+def posed(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_unknown_robot_names_the_known_ones() -> None:
+    with pytest.raises(RobotError, match=r"'go1'.*mini_cheetah, so101"):
+        load_robot("go1")
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_every_joint_of_the_robot_is_a_hinge_of_the_model(name: str) -> None:
+    robot = load_robot(name)
+    model = free_spec(robot).compile()
+    for joint in robot.joints:
+        hinge = model.joint(joint.name)
+        np.testing.assert_allclose(hinge.range, joint.range)
+        assert model.jnt_limited[hinge.id]
+        low, high = joint.range
+        assert low < joint.default_position < high
+        assert model.dof_armature[hinge.dofadr[0]] == joint.drive.armature
+        assert model.dof_frictionloss[hinge.dofadr[0]] == joint.drive.frictionloss
+        assert model.dof_damping[hinge.dofadr[0]] == joint.drive.viscous_damping
+    assert model.opt.timestep == robot.timestep_s
+    assert robot.timestep_s * robot.decimation * robot.policy_rate_hz == pytest.approx(1.0)
+
+
+def test_file_order_is_the_original_leg_order() -> None:
+    names = load_robot("mini_cheetah").joint_names
+    assert names[:3] == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
+    assert [name[:2] for name in names[::3]] == ["FR", "FL", "HR", "HL"]
+
+
+def test_drive_figures_of_the_paper_and_the_open_software() -> None:
+    robot = load_robot("mini_cheetah")
+    hip, knee = robot.joint("FR_hip_pitch").drive, robot.joint("FR_knee").drive
+    assert (hip.armature, knee.armature) == pytest.approx((0.0026, 0.0063), abs=5e-5)  # S6
+    assert (hip.effort_limit, knee.effort_limit) == pytest.approx((17.0, 26.4), abs=0.05)  # A12
+    assert (hip.stall_torque, knee.stall_torque) == pytest.approx((62.4, 97.1), abs=0.05)
+    assert (hip.no_load_speed, knee.no_load_speed) == pytest.approx((40.0, 25.7), abs=0.05)
+
+
+def test_mini_cheetah_weighs_twelve_kilograms(model: mujoco.MjModel) -> None:
+    assert model.body_mass.sum() == pytest.approx(12.0, abs=1e-12)
+    # An original leg is .54 + .634 + .064 kg and two rotors of .055 kg; the third is the trunk's.
+    leg = sum(model.body(f"FR_{link}").mass[0] for link in ("hip", "thigh", "shank"))
+    assert leg == pytest.approx(1.238 + 2 * 0.055)
+
+
+def test_nothing_drawn_or_touching_adds_mass(model: mujoco.MjModel) -> None:
+    bare = load_robot("mini_cheetah").build_spec()
+    for geom in list(bare.geoms):
+        bare.delete(geom)
+    bare = bare.compile()
+    np.testing.assert_array_equal(bare.body_mass, model.body_mass)
+    np.testing.assert_array_equal(bare.body_inertia, model.body_inertia)
+
+
+def test_it_stands_thirty_centimetres_tall_on_feet_below_its_hips(model: mujoco.MjModel) -> None:
+    data = posed(model)
+    assert data.body("trunk").xpos[2] == pytest.approx(cheetah.STANDING_HEIGHT, abs=0.005)  # S1
+    for leg in cheetah.LEGS:
+        hip, knee, foot = (
+            data.body(f"{leg}_hip").xpos,
+            data.body(f"{leg}_shank").xpos,
+            data.site(f"{leg}_foot").xpos,
+        )
+        assert abs(foot[0] - hip[0]) < 0.015
+        assert knee[0] < hip[0] - 0.1, "knees bend backward"
+        assert foot[2] == pytest.approx(cheetah.FOOT_RADIUS, abs=1e-12), "feet touch the floor"
+        side = 1.0 if leg.endswith("L") else -1.0
+        assert side * foot[1] == pytest.approx(0.049 + 0.062 + 0.004)
+
+
+def test_the_whole_robot_is_symmetric_about_its_middle_plane(model: mujoco.MjModel) -> None:
+    data = posed(model)
+    assert data.subtree_com[0][1] == pytest.approx(0.0, abs=1e-15)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, full, data.qM)
+    # Mirroring maps R to L joints, flips y, roll and yaw of the trunk and every hip_roll.
+    order = [model.joint(n).dofadr[0] for n in load_robot("mini_cheetah").joint_names]
+    swap = [0, 1, 2, 3, 4, 5, *(order[i] for i in (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8))]
+    sign = np.array([1, -1, 1, -1, 1, -1, *([-1, 1, 1] * 4)])
+    mirrored = (sign[:, None] * full * sign)[np.ix_(swap, swap)]
+    np.testing.assert_allclose(mirrored, full, atol=1e-15)
+
+
+def test_positive_hip_roll_lifts_left_legs_outwards(model: mujoco.MjModel) -> None:
+    data = posed(model)
+    left, right = data.site("FL_foot").xpos.copy(), data.site("FR_foot").xpos.copy()
+    for leg in ("FL", "FR"):
+        data.qpos[model.joint(f"{leg}_hip_roll").qposadr[0]] = 0.2
+    mujoco.mj_kinematics(model, data)
+    assert data.site("FL_foot").xpos[1] > left[1] + 0.05
+    assert data.site("FR_foot").xpos[1] > right[1] + 0.05
+
+
+def test_only_feet_legs_and_trunk_touch_a_floor_and_never_each_other() -> None:
+    spec = free_spec(load_robot("mini_cheetah"))
+    spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 0.1), pos=(0, 0, 0.5)
+    )
+    model = spec.compile()
+    data = posed(model)
+    touching = {model.geom(g).name for pair in data.contact.geom for g in pair}
+    expected = {"floor", "trunk_collision"}
+    expected |= {f"{leg}_{part}_collision" for leg in cheetah.LEGS for part in ("thigh", "shank")}
+    expected |= {f"{leg}_foot_collision" for leg in cheetah.LEGS}
+    assert touching == expected
+    assert all("floor" in {model.geom(g).name for g in pair} for pair in data.contact.geom)
+    foot = [c for c in data.contact if "FR_foot_collision" in {model.geom(g).name for g in c.geom}]
+    assert {c.dim for c in foot} == {3}
+
+
+def test_thigh_product_is_the_largest_feasible() -> None:
+    assert cheetah.THIGH.triangle_margin() >= 0.0
+    xx, yy, zz, xy, xz, yz = cheetah.THIGH.products
+    with pytest.raises(RobotError, match="triangle inequality"):
+        Inertia(mass=1.0, com=(0.0, 0.0, 0.0), products=(xx, yy, zz, xy + 0.1e-6, xz, yz))
+    cad = (xx, yy, zz, cheetah.THIGH_XY_CAD, xz, yz)
+    with pytest.raises(RobotError, match="triangle inequality"):
+        Inertia(mass=1.0, com=(0.0, 0.0, 0.0), products=cad)
+
+
+def test_trunk_is_not_the_ten_times_error_of_the_public_urdfs() -> None:
+    _, yy, _, *_ = cheetah.TRUNK.products
+    # CAD .0362 for 3.3 kg; about twice the mass and 1.1 times the length: .0362 * 2 * 1.22 ~ .088.
+    assert 0.07 < yy < 0.10
+
+
+def test_joined_spheres_by_hand() -> None:
+    # Two points of 1 kg at y = +-1, each with .1 of its own: Iyy .2, the others 2.2.
+    ball = (0.1, 0.1, 0.1, 0.0, 0.0, 0.0)
+    both = joined([Inertia(mass=1.0, com=(0.0, y, 0.0), products=ball) for y in (-1.0, 1.0)])
+    assert both.mass == 2.0
+    np.testing.assert_allclose(both.com, 0.0)
+    np.testing.assert_allclose(both.products, [2.2, 0.2, 2.2, 0.0, 0.0, 0.0])
+
+
+def test_mirroring_twice_changes_nothing() -> None:
+    assert cheetah.ABAD.mirrored().mirrored() == cheetah.ABAD
+    assert cheetah.ABAD.mirrored() != cheetah.ABAD
+
+
+def test_massless_body_is_refused() -> None:
+    with pytest.raises(RobotError, match="positive"):
+        Inertia(mass=0.0, com=(0.0, 0.0, 0.0), products=(1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+
+
+def test_so101_frames_are_normalized_and_reach_as_far_as_the_arm() -> None:
+    model = free_spec(load_robot("so101")).compile()
+    np.testing.assert_allclose(np.linalg.norm(model.body_quat, axis=1), 1.0, atol=1e-15)
+    assert model.body_mass.sum() == pytest.approx(0.632006)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    # At zero the upper arm stands up and the forearm points forward, gripper in the x-z plane.
+    elbow, wrist, tool = (
+        data.body("lower_arm").xpos,
+        data.body("wrist").xpos,
+        data.site("tool").xpos,
+    )
+    assert elbow[2] > data.body("upper_arm").xpos[2] + 0.1
+    assert wrist[0] > elbow[0] + 0.1
+    assert tool[0] > wrist[0] + 0.1
+    assert abs(tool[1]) < 0.01
+
+
+def test_so101_gravity_sag_agrees_with_the_recorded_offsets() -> None:
+    """The evidence for the signs in SAGE_MAPPING: sag over gravity torque is one stiffness."""
+    robot = load_robot("so101")
+    model = free_spec(robot).compile()
+    data = posed(model)
+    gravity = -data.qfrc_bias
+    sag = {"Pitch": 0.038, "Elbow": 0.037, "Wrist_Pitch": 0.010}  # means of the four recordings
+    stiffness = [
+        so101.SAGE_MAPPING[name][0]
+        * gravity[model.joint(so101.SAGE_JOINTS[name]).dofadr[0]]
+        / offset
+        for name, offset in sag.items()
+    ]
+    assert all(9.0 < k < 14.0 for k in stiffness)
+    assert abs(gravity[model.joint("shoulder_pan").dofadr[0]]) < 1e-3
+    assert abs(gravity[model.joint("wrist_roll").dofadr[0]]) < 1e-3
+
+
+def test_sage_names_map_onto_the_joints_and_the_jaw_is_no_angle() -> None:
+    assert tuple(so101.SAGE_JOINTS.values()) == load_robot("so101").joint_names
+    assert so101.SAGE_UNITS["Jaw"] == "unknown"
+    assert "Jaw" not in so101.SAGE_MAPPING
