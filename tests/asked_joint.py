@@ -69,7 +69,7 @@ def steps_command(rate: float, frequencies: tuple[float, ...]) -> tuple[Array, A
 
 
 def friction_joint(frictionloss: float) -> Callable[[Array, float], Array]:
-    """The knee with dry friction, stepped at 8 times the log rate (velocity projected, as MuJoCo)."""
+    """The knee with dry friction, stepped at 8 times the log rate."""
 
     def simulate(command: Array, rate: float) -> Array:
         fine, step = 8, 1.0 / (8.0 * rate)
@@ -106,8 +106,8 @@ def make_log(
 ) -> SweepLog:
     """One log from several questions (time, command, frequency or None), a repeat each.
 
-    `jitter` moves each timestamp by up to that share of an interval, and the position is that of
-    the joint at the moved instant.
+    `jitter` moves each timestamp by up to that share of an interval. The machine of such a log
+    reads its state and puts the command of that row into force at the moved instant.
     """
     rng = np.random.default_rng(seed)
     start = 3.0
@@ -115,15 +115,15 @@ def make_log(
     segments = []
     for repeat, (time, command, frequency) in enumerate(questions):
         rate = round(1.0 / float(time[1] - time[0]))
-        moved = time.copy()
+        moved, position = time, np.empty(0)
         if jitter:
             # The truth between samples, on a grid forty times as fine.
             fine = 40
-            moved += jitter / rate * rng.uniform(0.0, 1.0, len(time))
-            index = np.round(moved * rate * fine).astype(int)
+            index = np.round((np.arange(len(time)) + jitter * rng.random(len(time))) * fine)
+            index = (index - index[0]).astype(int)
             moved = index / (rate * fine)
-            dense = np.repeat(command, fine)
-            position = answer(np.append(dense, np.repeat(dense[-1], fine)), rate * fine)[index]
+            dense = np.repeat(command, np.diff(np.append(index, index[-1] + 1)))
+            position = answer(dense, rate * fine)[index]
         else:
             position = answer(command, rate)
         position = position + noise * rng.standard_normal(len(time))

@@ -10,11 +10,13 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from pronk import __version__
+from pronk.errors import ArtefactError
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator
 from pronk.match.result import JointMatch, MatchResult
+from pronk.report import figures, page, replay, style
+from pronk.report.paper import published
 from pronk.response.response import FrequencyResponse
 
 LEGS = ("FR", "FL", "HR", "HL")
@@ -72,7 +74,10 @@ def joint_match(name, leg, *, virtual=True, amplitudes=(0.25, 0.125), grid=21, s
     axis_k, axis_d = np.linspace(13, 27, grid), np.linspace(0.1, 0.7, grid)
     surface = np.array(
         [
-            [error_db(first.response, second_order(omega, k, d, inertia), band) ** 2 for d in axis_d]
+            [
+                error_db(first.response, second_order(omega, k, d, inertia), band) ** 2
+                for d in axis_d
+            ]
             for k in axis_k
         ]
     )
@@ -97,14 +102,17 @@ def joint_match(name, leg, *, virtual=True, amplitudes=(0.25, 0.125), grid=21, s
         amplitude_gains=np.array(
             [[0.25, stiffness, damping], [0.125, stiffness * 0.98, damping * 1.03]]
         ),
-        flags=("coherence below 0.8 in part of the band",) if (name, leg) == ("knee", 3) else (),
+        flags=(
+            *(("3 of 60 frequencies left out for low coherence",) if name == "knee" else ()),
+            "zero armature: no match, the best node misses by 2.9 dB RMS, 30 times the match",
+        ),
     )
 
 
-def synthetic(*, virtual: bool = True, robot: str = "mini_cheetah") -> MatchResult:
+def synthetic(*, virtual: bool = True, robot: str = "mini_cheetah", legs: int = 4) -> MatchResult:
     joints = {
         f"{leg}_{name}": joint_match(name, i, virtual=virtual, seed=i)
-        for i, leg in enumerate(LEGS)
+        for i, leg in enumerate(LEGS[:legs])
         for name in GROUPS
     }
     per_joint = {
@@ -122,7 +130,7 @@ def synthetic(*, virtual: bool = True, robot: str = "mini_cheetah") -> MatchResu
             coherence_min=0.91,
             armature=0.0063 if name.endswith("knee") else 0.0026,
             amplitude_spread=0.02,
-            flags=m.flags,
+            flags=tuple(f for f in m.flags if not f.startswith("zero")),
         )
         for name, m in joints.items()
     }
@@ -151,3 +159,344 @@ def synthetic(*, virtual: bool = True, robot: str = "mini_cheetah") -> MatchResu
         seconds={"estimate": 1.2, "grid": 31.0, "refine": 4.0},
         grid_steps_per_second=6.1e5,
     )
+
+
+def a_replay(joint="FR_knee", signal="log_chirp") -> replay.Replay:
+    time = np.arange(0.0, 6.0, 0.002)
+    command = 0.25 * np.sin(2.0 * np.pi * 0.8 * time**2)[(np.arange(time.size) // 10) * 10]
+    # The naive simulation is wrong between 4 and 5 s alone.
+    naive = np.where((time > 4.0) & (time < 5.0), 1.3, 1.0) * command
+    return replay.Replay(
+        joint=joint,
+        time=time,
+        command=command,
+        measured=command,
+        naive=naive,
+        matched=command,
+        rmse_naive=0.03,
+        rmse_matched=0.004,
+        r2_naive=0.9,
+        r2_matched=0.99,
+        signal=signal,
+    )
+
+
+def written(folder: Path, result: MatchResult, *, predictions: bool = True) -> Path:
+    gains_file.save(folder / "gains.yaml", result.gains)
+    result_file.save(folder / "match.npz", result)
+    if predictions:
+        replay.save(
+            folder / "fresh.prediction.npz",
+            [a_replay()],
+            virtual=result.gains.virtual,
+            source="fresh.mcap",
+        )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def match() -> MatchResult:
+    return synthetic()
+
+
+@pytest.fixture(scope="module")
+def html(match, tmp_path_factory) -> str:
+    folder = written(tmp_path_factory.mktemp("match"), match)
+    return page.write_page(folder).read_text(encoding="utf-8")
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    with style.styled():
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
+def colours_in(image: np.ndarray, colour: str) -> int:
+    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+    return int((np.abs(image.astype(int) - wanted).max(axis=-1) < 12).sum())
+
+
+# --- Figures ------------------------------------------------------------------------------------
+
+
+def test_bode_shows_all_three_curves_and_the_band(match):
+    image = pixels(figures.bode(match.joints["FR_knee"]))
+    for colour in (style.MEASURED_WIDE, style.NAIVE, style.MATCHED, style.BAND):
+        assert colours_in(image, colour) > 200, colour
+
+
+def test_the_measured_curve_is_called_virtual_only_if_it_is(match):
+    def words(figure):
+        return " ".join(text.get_text() for text in figure.legends[0].get_texts())
+
+    real = joint_match("knee", 0, virtual=False)
+    assert "virtual robot" in words(figures.bode(match.joints["FR_knee"]))
+    assert "virtual" not in words(figures.bode(real))
+    assert "virtual robot" in figures.hero(match).axes[0].get_title(loc="left")
+    assert "virtual robot" in words(figures.overview(match))
+
+
+def test_gain_is_drawn_in_decibels_and_phase_in_degrees(match):
+    joint = match.joints["FR_knee"]
+    figure = figures.bode(joint)
+    gain = next(line for line in figure.axes[0].lines if line.get_color() == style.MATCHED)
+    phase = next(line for line in figure.axes[1].lines if line.get_color() == style.MATCHED)
+    assert np.allclose(gain.get_ydata(), 20.0 * np.log10(np.abs(joint.matched)))
+    assert np.allclose(phase.get_ydata(), np.degrees(np.unwrap(np.angle(joint.matched))))
+    assert np.allclose(gain.get_xdata(), joint.responses[0].omega / (2.0 * np.pi))
+
+
+def test_every_axis_of_every_figure_is_named_with_its_unit(match):
+    groups = {name: [j for j in match.joints if j.endswith(name)] for name in GROUPS}
+    drawn = [
+        figures.bode(match.joints["FR_knee"]),
+        figures.error_maps(match),
+        figures.ranges(match.gains, groups),
+        figures.zero_armature(match.joints["FR_knee"]),
+        figures.amplitudes(match),
+        figures.replay(a_replay(), virtual=True),
+        figures.answers(match.joints["FR_knee"].responses),
+    ]
+    for figure in drawn:
+        labels = [axes.get_ylabel() for axes in figure.axes] + [
+            axes.get_xlabel() for axes in figure.axes
+        ]
+        named = [label for label in labels if label and label != "coherence"]
+        assert named
+        assert all(re.search(r"\[.+\]$", label) for label in named), named
+
+
+def test_overview_has_a_row_per_group_and_a_column_per_leg(match):
+    assert style.grid_of_joints(list(match.joints)) == [
+        [f"{leg}_{name}" for leg in LEGS] for name in GROUPS
+    ]
+    arm = ["Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll"]
+    assert style.grid_of_joints(arm) == [arm[:3], arm[3:]]
+    titles = [axes.get_title(loc="left") for axes in figures.overview(match).axes]
+    assert titles[:4] == ["FR hip roll", "FL hip roll", "HR hip roll", "HL hip roll"]
+
+
+def test_no_text_of_the_legend_leaves_the_figure(match):
+    groups = {name: [j for j in match.joints if j.endswith(name)] for name in GROUPS}
+    for figure in (
+        figures.bode(match.joints["FR_knee"]),
+        figures.hero(match),
+        figures.overview(match),
+        figures.error_maps(match, dict.fromkeys(match.joints, NAIVE)),
+        figures.ranges(match.gains, groups),
+        figures.zero_armature(match.joints["FR_knee"]),
+        figures.replay(a_replay(), virtual=True),
+    ):
+        pixels(figure)
+        box = figure.legends[0].get_window_extent()
+        assert box.x0 >= 0.0
+        assert box.x1 <= figure.bbox.x1
+
+
+def test_error_map_marks_the_best_node_the_optimum_and_table_one(match):
+    figure = figures.error_maps(match, dict.fromkeys(match.joints, NAIVE))
+    axes = figure.axes[0]
+    joint = match.joints["FR_hip_roll"]
+    i, j = np.unravel_index(joint.grid_error.argmin(), joint.grid_error.shape)
+    marked = {line.get_marker(): line.get_xydata()[0] for line in axes.lines}
+    assert np.allclose(marked["s"], (joint.grid_stiffness[i], joint.grid_damping[j]))
+    assert np.allclose(marked["o"], (joint.stiffness, joint.damping))
+    assert np.allclose(marked["x"], NAIVE)
+    assert np.allclose(marked["+"], (20.6, 0.492))
+    # The map shows RMS dB: the square root of what the artefact holds.
+    shown = np.asarray(axes.collections[0].get_array()).reshape(joint.grid_error.T.shape)
+    assert np.allclose(shown, np.sqrt(joint.grid_error.T))
+    assert pixels(figure).std() > 20.0
+
+
+def test_table_one_is_shown_for_the_robot_of_the_paper_alone():
+    assert published("so101") is None
+    other = synthetic(robot="so101", legs=1)
+    markers = {line.get_marker() for line in figures.error_maps(other).axes[0].lines}
+    assert "+" not in markers
+
+
+def test_ellipse_passes_through_the_points_of_its_equation():
+    covariance = np.array([[0.09, 0.0015], [0.0015, 1e-4]])
+    drawn = figures.ellipse((20.0, 0.5), covariance, squared=5.99)
+    points = drawn.get_patch_transform().transform(drawn.get_path().vertices)[::3]
+    away = points - (20.0, 0.5)
+    assert np.allclose(np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away), 5.99)
+
+
+def test_zero_armature_is_refused_where_it_was_not_tried(match):
+    with pytest.raises(ValueError, match="FR_hip_roll was not matched with zero armature"):
+        figures.zero_armature(match.joints["FR_hip_roll"])
+
+
+def test_no_amplitude_figure_with_one_amplitude():
+    one = joint_match("knee", 0, amplitudes=(0.25,))
+    alone = JointMatch(**{**vars(one), "amplitude_gains": one.amplitude_gains[:1]})
+    gains = synthetic().gains
+    assert figures.amplitudes(MatchResult(gains=gains, joints={"FR_knee": alone})) is None
+
+
+def test_the_same_figure_gives_the_same_bytes(match):
+    joint = match.joints["FL_knee"]
+    assert style.svg(figures.bode(joint)) == style.svg(figures.bode(joint))
+
+
+def test_drawing_leaves_the_settings_of_matplotlib_alone(match):
+    import matplotlib as mpl
+
+    before = dict(mpl.rcParams)
+    style.data_uri(figures.bode(match.joints["FR_knee"]))
+    assert dict(mpl.rcParams) == before
+
+
+# --- Replays ------------------------------------------------------------------------------------
+
+
+def test_replay_shows_where_the_naive_simulation_is_furthest_off():
+    one = a_replay()
+    window = replay.busiest_window(one, 1.0)
+    assert one.time[window][0] == pytest.approx(4.0, abs=0.1)
+    assert one.time[window][-1] == pytest.approx(5.0, abs=0.1)
+    whole = replay.busiest_window(one, 100.0)
+    assert whole == slice(0, len(one.time))
+
+
+def test_replays_survive_a_file(tmp_path):
+    path = tmp_path / "a.prediction.npz"
+    replay.save(path, [a_replay(), a_replay("FL_knee")], virtual=True, source="a.mcap")
+    back = replay.load(path)
+    assert (back.virtual, back.source) == (True, "a.mcap")
+    assert [r.joint for r in back.replays] == ["FR_knee", "FL_knee"]
+    assert np.array_equal(back.replays[0].naive, a_replay().naive)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(ArtefactError, match="not a prediction of pronk"):
+        replay.load(path)
+
+
+# --- Page ---------------------------------------------------------------------------------------
+
+
+def test_page_has_its_sections_verdict_first(html):
+    order = re.findall(r'<section id="([a-z]+)"', html)
+    assert order[0] == "verdict"
+    assert set(order) == {
+        "verdict",
+        "gains",
+        "bode",
+        "maps",
+        "ranges",
+        "armature",
+        "amplitudes",
+        "replay",
+        "identifiability",
+        "use",
+        "asked",
+        "timings",
+    }
+    for target in re.findall(r'href="#([a-z]+)"', html):
+        assert f'id="{target}"' in html
+
+
+def test_page_loads_nothing_from_anywhere(html):
+    for address in re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?([^"\')>\s]+)', html):
+        assert address.startswith(("data:", "#")), address
+    for word in ("<script", "@import", "http://", "https://", "<iframe", "<object"):
+        assert word not in html
+
+
+def test_page_is_small_enough_to_pass_on(html):
+    assert len(html.encode()) < 5e6
+
+
+def test_page_says_the_verdict_in_numbers(html, match):
+    says = page.verdict(match)
+    assert (says["matched"], says["joints"]) == (12, 12)
+    expected = np.sqrt(np.mean([j.error_db**2 for j in match.joints.values()]))
+    assert says["error_db"] == pytest.approx(expected)
+    assert "12 of 12 joints matched" in html
+    assert f"{says['naive_error_db']:.2f} dB" in html
+    assert f"{says['error_db']:.2f} dB" in html
+
+
+def test_a_joint_without_match_is_counted_and_named(tmp_path):
+    result = synthetic()
+    name = "HL_knee"
+    joint = result.joints[name]
+    doubt = "no match: the best gains miss the measured response by 2 dB RMS"
+    bad = JointMatch(**{**vars(joint), "flags": (doubt,)})
+    worse = MatchResult(gains=result.gains, joints={**result.joints, name: bad})
+    assert page.verdict(worse)["matched"] == 11
+    assert page.verdict(worse)["flags"][name] == [doubt]
+
+
+def test_zero_armature_without_a_match_is_no_doubt_about_the_match(match):
+    assert all("zero armature" not in f for fs in page.verdict(match)["flags"].values() for f in fs)
+
+
+def test_virtual_is_said_on_the_page_and_only_if_it_is(html, tmp_path):
+    assert html.count("virtual robot") > 5
+    assert "says nothing about a real robot" in html
+    real = page.write_page(written(tmp_path, synthetic(virtual=False, legs=1))).read_text(
+        encoding="utf-8"
+    )
+    assert "virtual robot" not in real
+
+
+def test_page_holds_every_joint_every_hash_and_the_simulator(html, match):
+    for name in match.joints:
+        assert name.replace("_", " ") in html
+    for digest in match.gains.logs.values():
+        assert digest in html
+    for word in ("3.11.0", "implicitfast", "dc_motor_pd", "0.516"):
+        assert word in html
+
+
+def test_what_comes_from_files_is_escaped(tmp_path):
+    result = synthetic(legs=1)
+    nasty = "<img src=x onerror=alert(1)>"
+    gains = MatchedGains(**{**vars(result.gains), "logs": {nasty: "0" * 64}})
+    text = page.write_page(
+        written(tmp_path, MatchResult(gains=gains, joints=result.joints))
+    ).read_text(encoding="utf-8")
+    assert nasty not in text
+    assert "&lt;img src=x onerror=alert(1)&gt;" in text
+
+
+def test_page_without_predictions_and_zero_armature_leaves_them_out(tmp_path):
+    result = synthetic(legs=1)
+    bare = {
+        name: JointMatch(
+            **{**vars(j), "zero_armature": None, "zero_armature_error_db": float("nan")}
+        )
+        for name, j in result.joints.items()
+    }
+    folder = written(tmp_path, MatchResult(gains=result.gains, joints=bare), predictions=False)
+    text = page.write_page(folder).read_text(encoding="utf-8")
+    assert 'id="replay"' not in text
+    assert 'id="armature"' not in text
+    assert "nan" not in re.sub(r'src="[^"]*"', "", text).lower()
+
+
+def test_missing_and_damaged_artefacts_are_named(tmp_path):
+    with pytest.raises(ArtefactError, match="no such folder"):
+        page.write_page(tmp_path / "nowhere")
+    with pytest.raises(ArtefactError, match=r"no gains\.yaml; `pronk match"):
+        page.write_page(tmp_path)
+    gains_file.save(tmp_path / "gains.yaml", synthetic(legs=1).gains)
+    with pytest.raises(ArtefactError, match=r"match\.npz: no such file"):
+        page.write_page(tmp_path)
+    (tmp_path / "match.npz").write_bytes(b"not a zip")
+    with pytest.raises(ArtefactError, match="not a match file of pronk"):
+        page.write_page(tmp_path)
+    assert not (tmp_path / page.PAGE_NAME).exists()
+
+
+def test_gains_under_another_name_are_found(tmp_path):
+    folder = written(tmp_path, synthetic(legs=1))
+    (folder / "gains.yaml").rename(folder / "tuesday.yaml")
+    (folder / "other.yaml").write_text("just: something\n")
+    assert page.find_gains(folder).name == "tuesday.yaml"
+    gains_file.save(folder / "wednesday.yaml", synthetic(legs=1).gains)
+    with pytest.raises(ArtefactError, match="several gains files"):
+        page.find_gains(folder)

@@ -99,7 +99,7 @@ def test_the_whole_robot_is_symmetric_about_its_middle_plane(model: mujoco.MjMod
     data = posed(model)
     assert data.subtree_com[0][1] == pytest.approx(0.0, abs=1e-15)
     full = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, full, data.qM)
+    mujoco.mj_fullM(model, data, full)
     # Mirroring maps R to L joints, flips y, roll and yaw of the trunk and every hip_roll.
     order = [model.joint(n).dofadr[0] for n in load_robot("mini_cheetah").joint_names]
     swap = [0, 1, 2, 3, 4, 5, *(order[i] for i in (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8))]

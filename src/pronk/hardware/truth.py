@@ -80,6 +80,9 @@ class MachineTruth:
     """Standard deviation of the sampling instant about its tick; the timestamps tell it [s]."""
     timestamp_error_s: float
     """Standard deviation of the timestamp about the sampling instant plus delay [s]."""
+    drive_lag_s: float
+    """Time constant from what a drive asks for to what its motor gives: sampling, averaging of
+    the speed, current loop [s]."""
     bus_voltage: float
     """Open-circuit voltage of the battery [V]."""
     bus_resistance: float
@@ -170,6 +173,7 @@ _MACHINE_BOUNDS: dict[str, tuple[float, float]] = {
     "measurement_delay_s": (0.0, 0.5),
     "sampling_jitter_s": (0.0, 1e-3),
     "timestamp_error_s": (0.0, 1e-3),
+    "drive_lag_s": (1e-6, 0.1),
     "bus_voltage": (1.0, 1e3),
     "bus_resistance": (0.0, 10.0),
     "encoder_bits": (4, 32),

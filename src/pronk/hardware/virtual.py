@@ -114,7 +114,8 @@ class VirtualRobot:
         robot, plant = self._robot, self._plant
         self._rng = np.random.default_rng(self._seed)
         self._data = mujoco.MjData(self._model)
-        self._qpos, self._qvel = self._data.qpos, self._data.qvel  # views, alive with the data
+        # Views, alive with the data.
+        self._qpos, self._qvel, self._act = self._data.qpos, self._data.qvel, self._data.act
         self._data.qpos[plant.rotor] = self._data.qpos[plant.link] = self._default[self._columns]
         plant.set_clamps((), self._qpos, 0.0, 0.0)
         self._voltage = self._truth.bus_voltage
@@ -219,11 +220,12 @@ class VirtualRobot:
     def _apply(self, command: Command) -> None:
         """Let the drives hear a command, through encoders that may be off."""
         columns = self._columns
-        self._target = np.asarray(command.position, dtype=float)[columns] - self._offset
-        self._stiffness = np.asarray(command.stiffness, dtype=float)[columns].copy()
-        self._damping = np.asarray(command.damping, dtype=float)[columns].copy()
-        self._data.ctrl[self._plant.actuator] = self._target
-        self._plant.set_gains(self._stiffness, self._damping)
+        target = np.asarray(command.position, dtype=float)[columns] - self._offset
+        self._data.ctrl[self._plant.actuator] = target
+        self._plant.set_gains(
+            np.asarray(command.stiffness, dtype=float)[columns],
+            np.asarray(command.damping, dtype=float)[columns],
+        )
 
     def _advance(self, to: int) -> None:
         """Step physics up to (not including) step number `to`, commands put in where due."""
@@ -251,6 +253,8 @@ class VirtualRobot:
         total = len(self._robot.joints)
         # One row of normals per tick, so that the cutting of `wait` does not change the noise.
         draws = self._rng.standard_normal((count, 3 * total + 8))
+        if self._sequence == 0:
+            draws[0, -2:] = 0.0  # the clock starts with the first state
         ticks = np.arange(self._sequence, self._sequence + count) / self._rate
         jitter = np.clip(draws[:, -1] * truth.sampling_jitter_s, -0.4 / self._rate, 0.4 / self._rate)
         steps = np.rint((ticks - truth.measurement_delay_s) / self._dt).astype(int)
@@ -262,9 +266,7 @@ class VirtualRobot:
             self._advance(int(steps[row]))
             q[row] = self._qpos[plant.rotor]
             v[row] = self._qvel[plant.rotor]
-            torque[row] = plant.motor_torque(
-                self._target, self._stiffness, self._damping, q[row], v[row], self._voltage
-            )
+            torque[row] = plant.motor_torque(self._act)
             voltage[row] = self._voltage
             self._sag(torque[row], v[row])
             if len(plant.stand):

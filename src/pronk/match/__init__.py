@@ -1,1 +1,7 @@
+"""The same question to the simulator: which gains make it answer like the real joint?
 
+Start at `pipeline.match_logs`. What it uses, in order: `target` (measured responses, ready to be
+compared), `grid` (the paper's search), `quick` (the same optimum by the linearized model),
+`refine` (off the grid), `interval` (how far to believe it), `amplitude` (does friction show?),
+`ranges` (what training randomizes). Results are `result.MatchResult` and `gains.MatchedGains`.
+"""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from pronk.errors import ArtefactError
@@ -59,6 +60,10 @@ class JointGains:
     """Held fixed while matching [kg m^2]."""
     amplitude_spread: float = float("nan")
     """Largest relative change of stiffness between amplitudes; NaN with one amplitude."""
+    frictionloss: float = float("nan")
+    """Dry friction that goes with the gains [N m]; NaN: that of the robot's drive."""
+    delay_s: float = 0.0
+    """Command delay that goes with the gains [s]."""
     flags: tuple[str, ...] = ()
     """Doubts in words, for instance `at the edge of the grid` or `no match`."""
 
@@ -115,8 +120,17 @@ def _rounded(value: Any) -> Any:
     return value
 
 
+def _silent(name: str, value: Any) -> bool:
+    """True for what says nothing: empty text and tuples, and unused optional parameters."""
+    if value in ((), ""):
+        return True
+    if name == "frictionloss":
+        return bool(np.isnan(value))
+    return bool(name == "delay_s" and value == 0.0)
+
+
 def _line(data: object) -> _Flow:
-    return _Flow({k: _rounded(v) for k, v in vars(data).items() if v not in ((), "")})
+    return _Flow({k: _rounded(v) for k, v in vars(data).items() if not _silent(k, v)})
 
 
 def save(path: Path, gains: MatchedGains) -> None:

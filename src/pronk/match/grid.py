@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -24,8 +25,8 @@ Array = NDArray[np.float64]
 
 DIVERGED_DB = 100.0
 """Error written for a simulation that diverged or did not move [dB]: beyond any answer."""
-_COARSE = 4
-"""Every how many nodes the coarse search looks before it looks closely."""
+_STRIDES = (7, 3, 1)
+"""Every how many nodes the coarse search looks, from far to close."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +60,7 @@ class GridSearch:
     @property
     def at_edge(self) -> bool:
         """True if the best node lies on the border: the optimum may lie beyond."""
-        return any(
-            k in (0, n - 1) for k, n in zip(self.cell, self.error.shape, strict=True)
-        )
+        return any(k in (0, n - 1) for k, n in zip(self.cell, self.error.shape, strict=True))
 
 
 def axes(robot: Robot, points: int = 50) -> tuple[Array, Array]:
@@ -120,19 +119,11 @@ def errors(
     question = group[0].question
     command = question.mirrored(bench.robot)[2]
     steps = max(goal.steps for goal in group)
-    # Real and imaginary parts side by side: one real product instead of two of complex numbers.
-    wide = [
-        np.hstack([goal.band_matrix.real, goal.band_matrix.imag]) for goal in group
-    ]
     weight = [weights(goal, weighting) for goal in group]
     out = np.empty((len(group), len(stiffness)))
-    for part, position in bench.run(
-        [command[:steps]], [bench.pose(question)], stiffness, damping
-    ):
+    for part, position in bench.run([command[:steps]], [bench.pose(question)], stiffness, damping):
         for k, goal in enumerate(group):
-            pair = position[:, : goal.steps] @ wide[k]
-            half = pair.shape[1] // 2
-            out[k, part] = mean_square(goal, pair[:, :half] + 1j * pair[:, half:], weight[k])
+            out[k, part] = mean_square(goal, goal.answer(position), weight[k])
         if progress is not None:
             progress(part.stop / len(stiffness))
     return out
@@ -171,31 +162,36 @@ def coarse_search(
     damping: Array,
     weighting: Literal["none", "coherence"] = "none",
 ) -> list[GridSearch]:
-    """Look at every fourth node and the border, then at all nodes around the best.
+    """Look at every seventh node and the border, then ever closer around the best.
 
-    Enough to say that no node fits (paper F13) at a tenth of the cost; nodes not looked at are
-    NaN in the error map.
+    Enough to say that no node fits (paper F13) at a twentieth of the cost; nodes not looked at
+    are NaN in the error map.
     """
-    coarse = [_thinned(len(axis)) for axis in (stiffness, damping)]
-    looked = np.zeros((len(stiffness), len(damping)), dtype=bool)
-    looked[np.ix_(*coarse)] = True
-    maps = np.full((len(group), *looked.shape), np.nan)
+    shape = (len(stiffness), len(damping))
+    looked = np.zeros(shape, dtype=bool)
+    maps = np.full((len(group), *shape), np.nan)
 
     def look(nodes: NDArray[np.bool_]) -> None:
-        i, j = np.nonzero(nodes)
-        maps[:, i, j] = errors(bench, group, stiffness[i], damping[j], weighting)
+        i, j = np.nonzero(nodes & ~looked)
+        if len(i):
+            maps[:, i, j] = errors(bench, group, stiffness[i], damping[j], weighting)
+        looked[i, j] = True
 
-    look(looked)
-    close = np.zeros_like(looked)
-    for row in maps:
-        i, j = np.unravel_index(int(np.nanargmin(row)), row.shape)
-        close[
-            max(i - _COARSE + 1, 0) : i + _COARSE, max(j - _COARSE + 1, 0) : j + _COARSE
-        ] = True
-    look(close & ~looked)
+    first = np.zeros(shape, dtype=bool)
+    first[np.ix_(*(np.unique([*range(0, n, _STRIDES[0]), n - 1]) for n in shape))] = True
+    look(first)
+    for wide, stride in pairwise(_STRIDES):
+        close = np.zeros(shape, dtype=bool)
+        for row in maps:
+            best = np.unravel_index(int(np.nanargmin(row)), shape)
+            near = [
+                np.arange(max(int(k) - wide + 1, 0), min(int(k) + wide, n))
+                for k, n in zip(best, shape, strict=True)
+            ]
+            # The nodes of this stride that lie around the best one so far.
+            chosen = [
+                axis[(axis - int(k)) % stride == 0] for axis, k in zip(near, best, strict=True)
+            ]
+            close[np.ix_(*chosen)] = True
+        look(close)
     return [GridSearch(stiffness=stiffness, damping=damping, error=row) for row in maps]
-
-
-def _thinned(count: int) -> NDArray[np.intp]:
-    """Every fourth index and the last."""
-    return np.unique(np.append(np.arange(0, count, _COARSE), count - 1))

@@ -65,7 +65,7 @@ def interval(fit: Fit, *, level: float = 0.95) -> Interval:
     spread = np.atleast_2d(np.cov(gains.T, ddof=1))
     covariance = spread / count
     quantile = float(stats.t.ppf(0.5 + level / 2.0, count - 1))
-    flags = ()
+    flags: tuple[str, ...] = ()
     if count == 2:
         flags = ("two repeats: the interval is wide, three or more narrow it",)
     return Interval(
@@ -99,6 +99,4 @@ def _from_coherence(fit: Fit, optimum: Array, level: float) -> Interval:
 def measurement_error_db(fit: Fit, *, level: float = 0.95) -> float:
     """Root mean square half-width of the measured gain's own interval in the band [dB]."""
     goal = fit.target
-    return float(
-        DB * np.sqrt(np.mean(goal.measured.relative_error(level)[goal.inside] ** 2))
-    )
+    return float(DB * np.sqrt(np.mean(goal.measured.relative_error(level)[goal.inside] ** 2)))

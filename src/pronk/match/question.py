@@ -85,7 +85,7 @@ def original_pose(question: Question, robot: Robot) -> Array:
     index = {name: i for i, name in enumerate(robot.joint_names)}
     pose = []
     # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
-    for own, first in zip(asked.chain or (asked.name,), original.chain or (original.name,)):
+    for own, first in zip(asked.chain, original.chain, strict=True):
         sign = robot.joint(own).original[1] * robot.joint(first).original[1]
         pose.append(sign * question.pose[index[own]])
     return np.array(pose)
@@ -155,7 +155,9 @@ def question(
     clock, distance = policy_clock(part.time, command, tick)
     on_clock = distance <= _OFF_CLOCK * 0.6
     # Begin with the tick in which the log begins, so that ticks and steps stay aligned.
-    start = clock + np.floor((part.time[0] - clock) / tick + 0.5) * tick if on_clock else part.time[0]
+    start = (
+        clock + np.floor((part.time[0] - clock) / tick + 0.5) * tick if on_clock else part.time[0]
+    )
     end = part.time[-1] if until is None else min(until, float(part.time[-1]))
     if on_clock:
         ticks = int(np.ceil((end - start) / tick))

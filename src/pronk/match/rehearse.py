@@ -76,7 +76,8 @@ def rehearse(
     tick = robot.timestep_s * robot.decimation
     per_tick = round(tick * rate_hz)
     rate = per_tick / tick
-    commands, positions, segments = [], [], []
+    commands, positions = [], []
+    segments: list[Segment] = []
     begin = 0
     for ask in asks:
         rest = np.zeros(round(ask.settle_s / tick))

@@ -107,10 +107,7 @@ class Bench:
         self.chunk = chunk
         self.count = Count()
         self._stiffness = np.array(
-            [
-                (held_stiffness or {}).get(name, robot.joint(name).stiffness)
-                for name in self.chain
-            ]
+            [(held_stiffness or {}).get(name, robot.joint(name).stiffness) for name in self.chain]
         )
         self._sensor = int(self.model.sensor_adr[self.model.sensor("asked").id])
         # One actuator a joint; map joint order to the columns of ctrl.
@@ -212,9 +209,7 @@ class Bench:
             n = part.stop - part.start
             for row in range(n):
                 i = begin + row
-                set_drive_gains(
-                    self._models[row], self.joint.name, drive, stiffness[i], damping[i]
-                )
+                set_drive_gains(self._models[row], self.joint.name, drive, stiffness[i], damping[i])
                 if begin == 0 or not shared:
                     pose = poses[0 if len(poses) == 1 else i]
                     control[row][:, self._ctrl] = pose
@@ -245,7 +240,12 @@ class Bench:
             self.count.seconds += time.perf_counter() - before
             self.count.steps += n * steps
             position = sensor[:n, :, self._sensor]
-            centre = np.array([poses[0 if len(poses) == 1 else i][self.index] for i in range(part.start, part.stop)])
+            centre = np.array(
+                [
+                    poses[0 if len(poses) == 1 else i][self.index]
+                    for i in range(part.start, part.stop)
+                ]
+            )
             yield part, position - centre[:, None]
 
 

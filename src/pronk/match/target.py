@@ -7,6 +7,7 @@ windows and segments that the log went through.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.match.question import Question, question
 from pronk.match.settings import MatchSettings
-from pronk.response.estimate import estimate, operators, questions
+from pronk.response.estimate import estimate, log_rate, questions
+from pronk.response.estimator import Estimator
 from pronk.response.operator import H1Operator
+from pronk.response.periodic import multisine_operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
 from pronk.sweep.log import SweepLog
@@ -45,8 +48,10 @@ class Target:
     """From position about the pose at the start of each step to response, shape (steps, f)."""
     inside: NDArray[np.bool_]
     """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
-    steps: int
-    """Steps after which the estimator hears nothing more of the frequencies inside."""
+    heard: Array
+    """The part of `matrix` that the fit needs, real and imaginary columns side by side (one real
+    product is faster than one of complex numbers), shape (steps heard, 2 inside). The estimator
+    hears nothing of the frequencies inside after these steps, so they need not be simulated."""
 
     @property
     def joint(self) -> str:
@@ -59,9 +64,30 @@ class Target:
         return self.measured.omega[self.inside]
 
     @property
-    def band_matrix(self) -> ComplexArray:
-        """Rows and columns of `matrix` that the fit needs, shape (steps, inside)."""
-        return self.matrix[: self.steps, self.inside]
+    def steps(self) -> int:
+        """Steps that the fit needs."""
+        return len(self.heard)
+
+    def answer(self, position: Array) -> ComplexArray:
+        """Response at the frequencies inside, in this joint's coordinate.
+
+        Args:
+            position: Of the joint simulated, about the pose, shape (..., at least `steps`) [rad].
+
+        Returns:
+            Shape (..., inside).
+        """
+        pair = position[..., : self.steps] @ self.heard
+        half = pair.shape[-1] // 2
+        return np.asarray(self.sign * (pair[..., :half] + 1j * pair[..., half:]))
+
+    def whole_answer(self, position: Array) -> ComplexArray:
+        """Response at all frequencies, shape (..., f), for positions of shape (..., all steps)."""
+        position = position[..., : len(self.matrix)]
+        # Two real products: a mixed one would first turn the positions complex.
+        return np.asarray(
+            self.sign * (position @ self.matrix.real + 1j * (position @ self.matrix.imag))
+        )
 
     def deviation_db(self) -> Array:
         """Standard deviation of the measured gain from its coherence [dB], shape (inside,).
@@ -118,11 +144,26 @@ def targets(
         log = replace(log, segments=chosen)
     measured = estimate(log, joint, settings.estimator)
     parts = questions(log, joint)
-    maps = operators(log, joint, settings.estimator)
+    rate_hz = log_rate([part for repeats in parts for part in repeats])
     return [
-        target(repeats[0], row[0], response, robot, settings, band_hz=band_hz)
-        for repeats, row, response in zip(parts, maps, measured, strict=True)
+        target(
+            repeats[0],
+            _operator(repeats[0], joint, settings.estimator, rate_hz),
+            response,
+            robot,
+            settings,
+            band_hz=band_hz,
+        )
+        for repeats, response in zip(parts, measured, strict=True)
     ]
+
+
+def _operator(part: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
+    """The estimate of one question as a matrix; repeats need one between them."""
+    segment, command = part.segments[0], part.command[:, part.column(joint)]
+    if segment.kind == "multisine" and segment.period_s is not None:
+        return multisine_operator(part.time, command, segment.period_s, estimator, rate_hz=rate_hz)
+    return H1Operator.build(part.time, command, estimator, rate_hz=rate_hz)
 
 
 def target(
@@ -159,8 +200,56 @@ def target(
         measured=measured,
         matrix=matrix,
         inside=inside,
-        steps=_horizon(matrix[:, inside], asked.amplitude),
+        heard=_heard(matrix, inside, asked.mirrored(robot)[2]),
     )
+
+
+def merged(found: Sequence[Sequence[Target]]) -> list[Target]:
+    """Targets of one joint from several logs, repeats of the same question put together.
+
+    Args:
+        found: Targets of each log.
+
+    Returns:
+        One target an amplitude, largest first.
+    """
+    groups: dict[tuple[object, ...], list[Target]] = {}
+    for goal in (goal for row in found for goal in row):
+        measured = goal.measured
+        key = (round(measured.amplitude, 4), measured.estimator, len(measured.omega))
+        groups.setdefault(key, []).append(goal)
+    out = []
+    for goals in groups.values():
+        first = goals[0]
+        alike = [g for g in goals if np.allclose(g.measured.omega, first.measured.omega)]
+        if len(alike) < len(goals):
+            raise LogError(
+                f"{first.joint} was asked at {first.measured.amplitude:.3g} rad in several logs "
+                "whose responses have different frequencies; match them one at a time."
+            )
+        out.append(first if len(goals) == 1 else _together(goals))
+    return sorted(out, key=lambda goal: -goal.measured.amplitude)
+
+
+def _together(goals: Sequence[Target]) -> Target:
+    """One target from repeats in several logs, each log counting by its repeats."""
+    share = np.array([len(goal.measured.repeats) for goal in goals], dtype=np.float64)
+    share /= share.sum()
+    each = [goal.measured for goal in goals]
+    measured = replace(
+        each[0],
+        response=np.asarray(sum(w * r.response for w, r in zip(share, each, strict=True))),
+        coherence=np.asarray(sum(w * r.coherence for w, r in zip(share, each, strict=True))),
+        averages=np.asarray(sum(r.averages for r in each)),
+        repeats=np.concatenate([r.repeats for r in each]),
+        source=", ".join(dict.fromkeys(r.source for r in each)),
+    )
+    # Frequencies that any of the logs cannot be believed at are left out.
+    inside = np.logical_and.reduce([goal.inside for goal in goals])
+    first = goals[0]
+    kept = inside[first.inside]
+    heard = first.heard[:, np.concatenate([kept, kept])]
+    return replace(first, measured=measured, inside=inside, heard=heard)
 
 
 def _inside(
@@ -189,14 +278,20 @@ def _inside(
     return coherent
 
 
-def _horizon(matrix: ComplexArray, amplitude: float) -> int:
-    """First step after which all remaining positions together move no gain by `_TAIL`.
+def _heard(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array) -> Array:
+    """Rows and columns of the matrix that the fit needs (`Target.heard`).
 
-    A chirp leaves the band long before it ends; the windows of the segments after that hold
-    nothing of the band's frequencies, so those steps need not be simulated.
+    A chirp leaves the band long before it ends; the windows of the segments after that hold next
+    to nothing of the band's frequencies. The rows end where all remaining positions together move
+    no gain by `_TAIL`, judged by a joint that follows its command perfectly.
+
+    Args:
+        matrix: Shape (steps, f).
+        inside: Frequencies of the fit, shape (f,).
+        command: Command about the pose [rad], shape (steps,).
     """
-    size = abs(amplitude) if np.isfinite(amplitude) and amplitude != 0.0 else 1.0
-    # Beyond the band a joint moves less than it was asked; twice that is a safe bound.
-    tail = 2.0 * size * np.cumsum(np.abs(matrix)[::-1], axis=0)[::-1].max(axis=1)
-    heard = np.nonzero(tail > _TAIL)[0]
-    return int(min(heard[-1] + 2, len(matrix))) if len(heard) else len(matrix)
+    chosen = matrix[:, inside]
+    tail = np.abs(np.cumsum((chosen * command[:, None])[::-1], axis=0)[::-1]).max(axis=1)
+    loud = np.nonzero(tail > _TAIL)[0]
+    steps = min(int(loud[-1]) + 2, len(matrix)) if len(loud) else len(matrix)
+    return np.hstack([chosen[:steps].real, chosen[:steps].imag])

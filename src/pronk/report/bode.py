@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -45,7 +46,9 @@ def _draw_measured_gain(axes: Axes, response: FrequencyResponse) -> None:
     axes.plot(hz, style.decibel(response.gain), **style.MEASURED_LINE)
 
 
-def _gain_limits(joint: JointMatch, extra: Sequence[NDArray[np.complex128]] = ()) -> list[float]:
+def _gain_limits(
+    joint: JointMatch, extra: Sequence[NDArray[np.complex128]] = ()
+) -> tuple[float, float]:
     """Limits of the gain axis that hold every curve where the measurement is worth reading."""
     response = joint.responses[0]
     low_hz, high_hz = _limits_hz([response])
@@ -55,7 +58,7 @@ def _gain_limits(joint: JointMatch, extra: Sequence[NDArray[np.complex128]] = ()
     curves = [response.gain, np.abs(joint.matched), np.abs(joint.naive), *map(np.abs, extra)]
     values = np.concatenate([style.decibel(curve[inside]) for curve in curves])
     values = values[np.isfinite(values)]
-    return [float(max(values.min(), -60.0)) - 2.0, float(values.max()) + 2.0]
+    return float(max(values.min(), -60.0)) - 2.0, float(values.max()) + 2.0
 
 
 def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True) -> Figure:
@@ -88,7 +91,12 @@ def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True)
 
         low, high = response.phase_interval()
         phase.fill_between(
-            hz, np.degrees(low), np.degrees(high), color=style.MEASURED_WIDE, alpha=0.35, linewidth=0
+            hz,
+            np.degrees(low),
+            np.degrees(high),
+            color=style.MEASURED_WIDE,
+            alpha=0.35,
+            linewidth=0,
         )
         phase.plot(hz, np.degrees(response.phase), **style.MEASURED_LINE)
         for curve, line in ((joint.naive, style.NAIVE_LINE), (joint.matched, style.MATCHED_LINE)):
@@ -128,7 +136,7 @@ def _bode_handles(joint: JointMatch | None, virtual: bool = False) -> list[Line2
         matched += f": {joint.error_db:.2f} dB off"
         naive += f": {joint.naive_error_db:.2f} dB off"
     return [
-        Line2D([], [], label=f"{measured_words(virtual)}, 95 %", **style.MEASURED_LINE),
+        Line2D([], [], label=f"{measured_words(virtual)} (shaded: 95 %)", **style.MEASURED_LINE),
         Line2D([], [], label=matched, **style.MATCHED_LINE),
         Line2D([], [], label=naive, **style.NAIVE_LINE),
         Patch(facecolor=style.BAND, label=band),
@@ -160,8 +168,8 @@ def overview(result: MatchResult) -> Figure:
     """Gain of every joint in small: rows are joint groups, columns are legs."""
     rows = style.grid_of_joints(list(result.joints))
     with style.styled():
-        figure, panels = style.small_multiples(rows, height=2.0)
-        limits = []
+        figure, panels = style.small_multiples(rows, height=2.0, sharey="row")
+        limits = {}
         for name, axes in panels.items():
             joint = result.joints[name]
             hz = joint.responses[0].frequency_hz
@@ -180,11 +188,12 @@ def overview(result: MatchResult) -> Figure:
                 fontsize=8.5,
                 color="#333333",
             )
-            limits.append(_gain_limits(joint))
-        # The words at the lower left need room under the curves.
-        low = max(min(limit[0] for limit in limits), -40.0) - 4.0
-        next(iter(panels.values())).set_ylim(low, max(limit[1] for limit in limits))
+            limits[name] = _gain_limits(joint)
         for row in rows:
+            # The words at the lower left need room under the curves.
+            low = max(min(limits[name][0] for name in row), -45.0)
+            high = max(limits[name][1] for name in row)
+            panels[row[0]].set_ylim(low - 0.12 * (high - low), high)
             panels[row[0]].set_ylabel("gain [dB]")
         for name in style.bottom_row(rows):
             panels[name].set_xlabel("frequency [Hz]")
@@ -231,4 +240,48 @@ def zero_armature(joint: JointMatch) -> Figure:
             ),
         ]
         figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    return figure
+
+
+def answers(responses: Sequence[FrequencyResponse]) -> Figure:
+    """Bode plot of what was measured alone: one joint, one curve per amplitude."""
+    looks = (
+        {"color": style.MEASURED, "linestyle": "-"},
+        {"color": style.MATCHED, "linestyle": (0, (5, 2))},
+        {"color": style.NAIVE, "linestyle": (0, (6, 2, 1, 2))},
+        {"color": style.ZERO_ARMATURE, "linestyle": ":"},
+    )
+    with style.styled():
+        figure = Figure(figsize=(style.PAGE_WIDTH_IN, 6.2), layout="constrained")
+        panels = figure.subplots(3, 1, sharex=True, height_ratios=[3.0, 2.0, 1.0])
+        handles = []
+        lowest, highest = np.inf, -np.inf
+        for i, response in enumerate(responses):
+            look: dict[str, Any] = {**looks[i % len(looks)], "linewidth": 1.4}
+            hz = response.frequency_hz
+            gain, phase = response.gain_interval(), response.phase_interval()
+            shade = {"color": look["color"], "alpha": 0.15, "linewidth": 0}
+            panels[0].fill_between(hz, *map(style.decibel, gain), **shade)
+            panels[0].plot(hz, style.decibel(response.gain), **look)
+            panels[1].fill_between(hz, *map(np.degrees, phase), **shade)
+            panels[1].plot(hz, np.degrees(response.phase), **look)
+            panels[2].plot(hz, response.coherence, **look)
+            handles.append(Line2D([], [], label=f"{response.amplitude:.3g} rad", **look))
+            worth = style.decibel(response.gain[response.coherence >= _MIN_COHERENCE])
+            lowest = min(lowest, *worth, np.inf)
+            highest = max(highest, *worth, -np.inf)
+        for panel in panels:
+            style.frequency_axis(panel, *_limits_hz(responses))
+        if np.isfinite([lowest, highest]).all():
+            panels[0].set_ylim(max(lowest, -60.0) - 2.0, highest + 2.0)
+        panels[0].set_ylabel("gain [dB]")
+        panels[1].set_ylabel("phase [deg]")
+        panels[2].set_ylabel("coherence")
+        panels[2].axhline(0.95, color="#666666", linewidth=0.8, linestyle=":")
+        panels[2].set_ylim(0.0, 1.05)
+        panels[2].set_xlabel("frequency [Hz]")
+        first = responses[0]
+        words = measured_words(first.virtual)
+        panels[0].set_title(f"{style.joint_words(first.joint)}, {words} (shaded: 95 %)")
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure

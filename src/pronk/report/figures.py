@@ -5,12 +5,13 @@ width; `pronk.report.style` turns it into a file or into the page. Gains are abs
 artefacts and in dB only here.
 """
 
-from pronk.report.bode import bode, hero, measured_words, overview, zero_armature
+from pronk.report.bode import answers, bode, hero, measured_words, overview, zero_armature
 from pronk.report.maps import amplitudes, ellipse, error_maps, ranges
 from pronk.report.replay import figure as replay
 
 __all__ = [
     "amplitudes",
+    "answers",
     "bode",
     "ellipse",
     "error_maps",

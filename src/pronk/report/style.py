@@ -13,7 +13,7 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -147,14 +147,14 @@ def grid_of_joints(names: Sequence[str]) -> list[list[str]]:
 
 
 def small_multiples(
-    rows: list[list[str]], *, height: float, sharey: bool = True
+    rows: list[list[str]], *, height: float, sharey: bool | Literal["row"] = True
 ) -> tuple[Figure, dict[str, Axes]]:
     """A figure with one panel per name; call inside `styled`.
 
     Args:
         rows: Names by row; short rows leave their last places empty.
         height: Height of a row [in].
-        sharey: All panels share the vertical axis.
+        sharey: Panels share the vertical axis, all of them or those of a row.
     """
     width = max(len(row) for row in rows)
     figure = Figure(figsize=(PAGE_WIDTH_IN, height * len(rows) + 0.7), layout="constrained")

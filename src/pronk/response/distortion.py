@@ -18,11 +18,14 @@ from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
 
-LOW_BAND_HZ = (0.5, 4.0)
-"""Where it is looked for: three times 4 Hz is still inside the bandwidth of the joints."""
+LOW_BAND_HZ = (1.0, 4.0)
+"""Where it is looked for. A chirp of 0.1 to 25 Hz in 20 s is past its ramp of 0.5 s at 1 Hz (the
+ramp itself reads as 0.008); three times 4 Hz is still inside the bandwidth of the joints."""
 
 _FEWEST_CYCLES = 3.0
 """Fewest turns of the question inside the band that can tell f from 3 f."""
+_SAMPLES_A_TURN = 25
+"""At the top of the band: eight at three times it, and no more than that to be fitted."""
 _SHAPE = {1: 4, 2: 2, 3: 2}
 """Harmonic and degree of the polynomial that its size and phase follow over the band."""
 
@@ -56,6 +59,8 @@ def third_harmonic_chirp(
     first, stop = stretches[int(np.argmax(stretches[:, 1] - stretches[:, 0]))]
     t, y, f = time[first:stop], position[first:stop], frequency[first:stop]
     phase = 2.0 * np.pi * cumulative_trapezoid(f, t, initial=0)
+    thin = max(1, int(len(t) / ((t[-1] - t[0]) * band_hz[1] * _SAMPLES_A_TURN)))
+    t, y, f, phase = t[::thin], y[::thin], f[::thin], phase[::thin]
     if phase[-1] < 2.0 * np.pi * _FEWEST_CYCLES or np.ptp(f) == 0.0:
         return float("nan")
     x = 2.0 * (f - f.min()) / np.ptp(f) - 1.0

@@ -127,7 +127,8 @@ class H1Operator:
         Returns:
             Shape (..., f).
         """
-        return np.asarray(position @ self._own)
+        # Two real products: numpy would first turn the positions into complex numbers.
+        return np.asarray(position @ self._own.real + 1j * (position @ self._own.imag))
 
 
 def combine(responses: Sequence[ComplexArray], operators: Sequence[H1Operator]) -> ComplexArray:

@@ -26,6 +26,9 @@ _SILENT = 1e-4
 """Share of the largest excitation (power) below which a frequency counts as not asked."""
 
 
+_LEAKED = 0.3
+"""Share of a neighbour's power below which a frequency counts as that neighbour's leakage: beside
+a single line a Hann window leaves 0.25. Its response would be that at the line."""
 _SETTLED_S = 0.2
 """A command that is constant for so long at the end leaves the joint at rest [s]: five times the
 slowest time constant of the drives this was written for."""
@@ -64,11 +67,13 @@ class Layout:
     """Their numbers in the transform of a segment, shape (f,)."""
     rate_hz: float
     padded: bool
+    count: int
+    """Samples of the question, without padding."""
 
-    @property
-    def hop(self) -> int:
-        """Samples from one segment to the next."""
-        return int(self.starts[1] - self.starts[0]) if len(self.starts) > 1 else len(self.window)
+    def measured(self, segment: int) -> Array:
+        """The window of a segment, zero where it lies in the padding, shape (samples,)."""
+        sample = self.starts[segment] + np.arange(len(self.window))
+        return np.where((sample >= 0) & (sample < self.count), self.window, 0.0)
 
 
 def _transform(estimator: Estimator, rate_hz: float) -> ShortTimeFFT:
@@ -110,7 +115,8 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
         )
     hz = np.asarray(transform.f)
     slack = 1e-9
-    chosen = (hz >= max(estimator.min_hz, hz[1]) - slack) & (
+    # From the second line on: the main lobe of the window at the first reaches the mean.
+    chosen = (hz >= max(estimator.min_hz, hz[2]) - slack) & (
         hz <= estimator.top_hz(grid.rate_hz) + slack
     )
     if not chosen.any():
@@ -125,6 +131,7 @@ def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
         bins=np.flatnonzero(chosen),
         rate_hz=grid.rate_hz,
         padded=padded,
+        count=grid.count,
     )
 
 
@@ -153,9 +160,10 @@ class Sums:
     uy: ComplexArray
     """conj(U) Y, shape (f,)."""
     yy: Array
-    segments: int
+    segments: float
+    """Number of segments, those that reach into the padding in part."""
     spread: Array
-    """Power that white noise of unit variance per segment leaves in `uy`, shape (f,)."""
+    """Power that white noise of unit power per segment leaves in `uy`, shape (f,)."""
 
     def __add__(self, other: Sums) -> Sums:
         """Sums over the segments of both."""
@@ -190,16 +198,22 @@ class Sums:
         """
         tiny = np.finfo(np.float64).tiny
         raw = np.abs(self.uy) ** 2 / np.maximum(self.uu * self.yy, tiny)
-        return np.where(self.uu >= _SILENT * self.uu.max(), np.clip(raw, 0.0, 1.0), 0.0)
+        return np.where(self.asked(), np.clip(raw, 0.0, 1.0), 0.0)
+
+    def asked(self) -> NDArray[np.bool_]:
+        """Frequencies that the command holds by more than the leakage of others, shape (f,)."""
+        beside = np.pad(self.uu, 1)
+        leaked = self.uu < _LEAKED * np.maximum(beside[:-2], beside[2:])
+        return np.asarray((self.uu >= _SILENT * self.uu.max()) & ~leaked)
 
     def averages(self) -> Array:
         """Effective number of independent averages that the coherence rests on, shape (f,).
 
         `segments sum P / sum_s,t conj(U_s) U_t r_st`, P = |U|^2 and r_st the overlap of windows s
-        and t: the number n for which `(1 - coherence) / (2 n coherence)` is the variance of the
-        estimate under white noise, and 1/n the coherence of a position that is noise alone. It
-        counts overlap exactly. For a stationary random command it is Welch's number; for a chirp
-        it counts the segments in which the chirp is elsewhere, as `coherence` does.
+        and t inside the question: the number n for which `(1 - coherence) / (2 n coherence)` is
+        the variance of the estimate under white noise, and 1/n the coherence of a position that
+        is noise alone. For a stationary random command it is Welch's number; for a chirp it
+        counts the segments in which the chirp is elsewhere, as `coherence` does.
         """
         tiny = np.finfo(np.float64).tiny
         return np.asarray(self.segments * self.uu / np.maximum(self.spread, tiny))
@@ -216,19 +230,23 @@ def sums(command: ComplexArray, position: ComplexArray, where: Layout) -> Sums:
     # Phase from a common instant, in which the noise of two segments correlates by their overlap.
     aligned = command * np.exp(-1j * np.outer(where.starts / where.rate_hz, where.omega))
     power = float(where.window @ where.window)
-    spread = (np.abs(aligned) ** 2).sum(axis=0)
-    for apart in range(1, len(where.starts)):
-        shift = apart * where.hop
-        if shift >= len(where.window):
-            break
-        overlap = float(where.window[shift:] @ where.window[:-shift]) / power
-        pairs = (np.conj(aligned[apart:]) * aligned[:-apart]).real.sum(axis=0)
-        spread = spread + 2.0 * overlap * pairs
+    windows = [where.measured(i) for i in range(len(where.starts))]
+    segments, spread = 0.0, np.zeros(len(where.omega))
+    for i, start in enumerate(where.starts):
+        own = float(windows[i] @ windows[i]) / power
+        segments += own
+        spread += own * np.abs(aligned[i]) ** 2
+        for j in range(i + 1, len(where.starts)):
+            shift = int(where.starts[j] - start)
+            if shift >= len(where.window):
+                break
+            overlap = float(windows[i][shift:] @ windows[j][:-shift]) / power
+            spread += 2.0 * overlap * (np.conj(aligned[i]) * aligned[j]).real
     return Sums(
         uu=np.asarray((np.abs(command) ** 2).sum(axis=0)),
         uy=np.asarray((np.conj(command) * position).sum(axis=0)),
         yy=np.asarray((np.abs(position) ** 2).sum(axis=0)),
-        segments=len(where.starts),
+        segments=segments,
         spread=np.asarray(np.maximum(spread, 0.0)),
     )
 

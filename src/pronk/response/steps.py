@@ -12,6 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import get_window
 
 from pronk.errors import LogError
 from pronk.response.estimator import Estimator
@@ -23,10 +25,15 @@ from pronk.sweep.log import SweepLog
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_SETTLE_S = 0.25
-"""Dropped at the head of each step, and a whole period at the least [s]."""
-_MOST_BLOCKS = 8
-"""Blocks that a step is read in: enough to see the scatter."""
+_SETTLE_S = 0.5
+"""Dropped at the head of each step, a whole period at the least, and beside a ramp [s]."""
+_MOST_BLOCKS = 4
+"""Blocks that a step is read in: enough to see the scatter, few enough to hold several periods."""
+_STEADY = 0.1
+"""Largest deviation of a period of the command from the median one: ramps fall out."""
+_FINE = 4
+"""How much finer than the log the grid of a step is: its period seldom fits the ticks of the
+command, and the images of a held command must not fold back onto the line."""
 _SAME_HZ = 1e-6
 """Relative change of frequency that begins another step."""
 
@@ -56,6 +63,25 @@ def _runs(frequency: Array) -> list[tuple[int, int]]:
     return [(a, b) for a, b in pairwise(edges) if filled[a] > 0.0]
 
 
+def _steady(time: Array, command: Array, span: float, hz: float, rate_hz: float) -> tuple[int, int]:
+    """First and one-past-last period of a step, counted from its start, that is steady."""
+    settle = max(1, int(np.ceil(_SETTLE_S * hz)))
+    periods = int(np.floor(span * hz + 0.01))
+    if periods <= settle:
+        return settle, periods
+    samples = max(4, round(rate_hz / hz))
+    grid = Grid(start=float(time[0]), rate_hz=samples * hz, count=samples * periods)
+    turn = np.exp(-2j * np.pi * np.arange(samples) / samples)
+    found = held_mean(time, command, grid).reshape(periods, samples) @ turn
+    # Smoothed, or the images of a held command would make single periods look unlike.
+    size = np.abs(uniform_filter1d(found, settle, mode="nearest"))
+    even = np.flatnonzero(np.abs(size - np.median(size)) <= _STEADY * np.median(size))
+    if len(even) == 0:
+        return settle, settle
+    end = int(even[-1]) + 1
+    return int(even[0]) + settle, end if end == periods else end - settle
+
+
 def read_steps(log: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -> Steps:
     """Read every step of one question inside the band.
 
@@ -75,16 +101,17 @@ def read_steps(log: SweepLog, joint: str, estimator: Estimator, rate_hz: float) 
             "the segment `unknown` to have it averaged by segments."
         )
     column = log.column(joint)
-    command, position = log.command[:, column], log.position[:, column]
+    time, command, position = log.time, log.command[:, column], log.position[:, column]
     steps = []
     for first, stop in _runs(log.frequency):
         hz = float(log.frequency[first])
         if not estimator.min_hz - 1e-9 <= hz <= estimator.top_hz(rate_hz) + 1e-9:
             continue
         # The last sample's interval belongs to the step as well.
-        span = float(log.time[stop - 1] - log.time[first]) + 1.0 / rate_hz
-        dropped = max(1, int(np.ceil(_SETTLE_S * hz)))
-        steps.append((hz, first, dropped, int(np.floor(span * hz + 0.01)) - dropped))
+        span = float(time[stop - 1] - time[first]) + 1.0 / rate_hz
+        inside = slice(first, min(stop + 3, len(time)))
+        dropped, end = _steady(time[inside], command[inside], span, hz, rate_hz)
+        steps.append((hz, inside, dropped, end - dropped))
     if not steps:
         raise LogError(
             f"{where}: no sine step of {joint} between {estimator.min_hz:g} and "
@@ -96,22 +123,27 @@ def read_steps(log: SweepLog, joint: str, estimator: Estimator, rate_hz: float) 
             f"{where}: the step at {hz:g} Hz lasts {dropped + max(periods, 0)} periods; "
             f"{dropped + 2} are needed ({dropped} to settle, 2 to compare)."
         )
-    blocks = min(periods, _MOST_BLOCKS)
+    # Two periods a block where there are four, for the window below.
+    blocks = max(2, min(periods // 2, _MOST_BLOCKS))
     rows = []
-    for hz, first, dropped, periods in sorted(steps):
+    for hz, inside, dropped, periods in sorted(steps, key=lambda step: step[0]):
         each = periods // blocks
-        samples = max(4, round(each * rate_hz / hz))
+        samples = round(_FINE * each * rate_hz / hz)
         grid = Grid(
-            start=float(log.time[first]) + dropped / hz,
+            # The last whole blocks: the joint has settled longest.
+            start=float(time[inside][0]) + (dropped + periods - blocks * each) / hz,
             rate_hz=samples * hz / each,
             count=samples * blocks,
         )
-        u = held_mean(log.time, command, grid).reshape(blocks, samples)
-        y = interpolate(log.time, position, grid).reshape(blocks, samples)
+        u = held_mean(time[inside], command[inside], grid).reshape(blocks, samples)
+        y = interpolate(time[inside], position[inside], grid).reshape(blocks, samples)
+        # The held command has images that are not whole periods of a block; a window keeps them
+        # out. It needs two periods to keep the mean out as well.
+        window = get_window("hann", samples) if each >= 2 else np.ones(samples)
         turn = 2j * np.pi * each * np.arange(samples) / samples
-        once, thrice = np.exp(-turn) / samples, np.exp(-3.0 * turn) / samples
+        once, thrice = window * np.exp(-turn), window * np.exp(-3.0 * turn)
         omega = 2.0 * np.pi * hz
-        seen = 3.0 * hz < grid.rate_hz / 2.0
+        seen = 3.0 * hz < rate_hz / 2.0
         ratio = abs((y @ thrice).mean()) / abs((y @ once).mean()) if seen else float("nan")
         factor = hold(np.array([omega]), grid.rate_hz)[0]
         rows.append((omega, u @ once, y @ once, factor, ratio))

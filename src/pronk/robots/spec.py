@@ -12,10 +12,10 @@ native model with no Python in the loop, so `mujoco.rollout` can run it on every
   leaves the forces of native actuators explicit, which is what a torque computed outside is.
 - One native `dcmotor` a joint, in joint-side units with voltage as the control variable:
   K = V / no_load_speed and R = K V / stall_torque put the torque-speed line where it belongs.
-  The controller's voltage K/R-scales to the PD law: kp_V = R stiffness / K gives the stiffness,
-  kd_V = R damping / K - K gives the damping once the back-EMF has taken its own K^2/R, clipping
-  that voltage at V clips the torque at stall_torque (+-1 - qdot / no_load_speed), and
-  saturation at effort_limit does the rest.
+  Torque is K/R times voltage less back-EMF, so the controller gain kp_V = R stiffness / K gives
+  the stiffness and kd_V = R damping / K - K the damping, once back-EMF has added its own K^2/R;
+  the voltage clipped at V is the torque clipped at stall_torque (+-1 - qdot / no_load_speed), and
+  the actuator's saturation is the effort limit.
 
 A test holds the equivalence, in and out of saturation, against the law written out, and another
 against mjlab itself.

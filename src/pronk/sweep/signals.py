@@ -306,7 +306,8 @@ class SineSteps(Signal):
     """One sine after another, each held until the joint has settled and then measured.
 
     Each frequency is moved to the nearest one of which `measure_cycles` are whole ticks; the
-    phase runs on from step to step, so the command never jumps.
+    phase runs on from step to step, so the command never jumps. The ramps lie before the first
+    step and after the last and have no frequency of their own (NaN).
     """
 
     kind = "sine_steps"
@@ -362,14 +363,18 @@ class SineSteps(Signal):
     def _frequency(self, rate_hz: float) -> Array:
         windows = self.windows(rate_hz)
         ramp = round(self.ramp_s * rate_hz)
-        frequency = np.full(windows[-1][1] + max(ramp, 1), windows[-1][2])
-        begin = 0
+        frequency = np.full(windows[-1][1] + max(ramp, 1), np.nan)
+        begin = ramp
         for _, end, exact in windows:
             frequency[begin:end] = exact
             begin = end
         return frequency
 
     def _samples(self, rate_hz: float) -> Array:
-        turns = np.concatenate(([0.0], np.cumsum(self.frequency(rate_hz))[:-1] / rate_hz))
+        windows, frequency = self.windows(rate_hz), self.frequency(rate_hz)
+        # The first and the last sine run on into the ramps.
+        frequency[: windows[0][0]] = windows[0][2]
+        frequency[windows[-1][1] :] = windows[-1][2]
+        turns = np.concatenate(([0.0], np.cumsum(frequency)[:-1] / rate_hz))
         window = ramps(len(turns), round(self.ramp_s * rate_hz))
         return np.asarray(self.amplitude * np.sin(2.0 * np.pi * turns) * window)

@@ -33,6 +33,7 @@ def build_spec() -> mujoco.MjSpec:
             axis=(0.0, 0.0, 1.0),
             range=link.range,
             limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            solimp_friction=c.FRICTION_IMPEDANCE,
         )
         _set_inertia(body, link.inertia)
         last = index == len(c.CHAIN) - 1

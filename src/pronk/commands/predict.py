@@ -1,0 +1,1 @@
+"""`pronk predict`: replay a log that the fit never saw."""

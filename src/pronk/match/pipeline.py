@@ -1,0 +1,397 @@
+"""From logs to matched gains: the whole match, joint by joint."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import LogError
+from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
+from pronk.match.ask import Job, Simulator
+from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.gains import Simulator as SimulatorNote
+from pronk.match.grid import GridSearch, alike, axes, coarse_search, search
+from pronk.match.interval import interval, measurement_error_db
+from pronk.match.quick import quick_search
+from pronk.match.ranges import group_gains
+from pronk.match.refine import Fit, refine
+from pronk.match.result import JointMatch, MatchResult
+from pronk.match.settings import MatchSettings
+from pronk.match.target import Target, merged, targets
+from pronk.robots.robot import Robot
+from pronk.sweep.log import SweepLog
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+NO_MATCH_DB = 1.0
+"""Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
+of a good log stays below."""
+NO_MATCH_INTERVALS = 3.0
+"""A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
+NO_ARMATURE_RATIO = 5.0
+"""Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
+
+
+@dataclass
+class _Asked:
+    """One joint and all that was measured of it."""
+
+    targets: list[Target]
+    naive: tuple[float, float]
+    """Gains on the real drive while the log was made."""
+
+    @property
+    def main(self) -> Target:
+        """The response that is matched: that of the largest amplitude."""
+        return self.targets[0]
+
+
+@dataclass
+class _Found:
+    """What the search brought for one joint."""
+
+    grid: GridSearch
+    fit: Fit
+    others: list[Fit] = field(default_factory=list)
+    """Fits of the smaller amplitudes."""
+    zero: GridSearch | None = None
+
+
+def match_logs(
+    logs: Sequence[SweepLog],
+    robot: Robot,
+    *,
+    settings: MatchSettings | None = None,
+    progress: Progress | None = None,
+) -> MatchResult:
+    """Match every joint that was asked in some logs.
+
+    Args:
+        logs: One or more logs of one robot; a joint may be asked in several.
+        robot: The robot.
+        settings: How to match; the paper's search if not given.
+        progress: Told the stage in words and the share of it that is done, 0 to 1.
+
+    Raises:
+        LogError: No joint of the robot was asked, or a log cannot be used.
+        IdentifiabilityError: A joint's band is mostly incoherent or too short.
+    """
+    chosen = settings or MatchSettings()
+    clock = _Clock(progress)
+    with clock.stage("estimate"):
+        asked = _collect(logs, robot, chosen, clock)
+    with Simulator(robot, threads=chosen.threads) as simulator:
+        found, rate = _search(simulator, asked, chosen, clock)
+        with clock.stage("amplitudes"):
+            _fit_amplitudes(simulator, asked, found, chosen)
+        with clock.stage("answers"):
+            matched, naive = _answers(simulator, asked, found)
+    zero: dict[str, NDArray[np.complex128]] = {}
+    if chosen.zero_armature:
+        with clock.stage("zero armature"):
+            zero = _without_armature(robot, asked, found, chosen, clock)
+    joints: dict[str, JointMatch] = {}
+    gains: dict[str, JointGains] = {}
+    for name, item in asked.items():
+        joints[name], gains[name] = _report(
+            robot, item, found[name], matched[name], naive[name], zero.get(name), chosen
+        )
+    return MatchResult(
+        gains=MatchedGains(
+            robot=robot.name,
+            simulator=SimulatorNote(
+                version=mujoco.__version__,
+                timestep_s=robot.timestep_s,
+                decimation=robot.decimation,
+            ),
+            joints=gains,
+            groups=group_gains(robot, gains),
+            logs={Path(log.source or "log").name: log.sha256 for log in logs},
+            virtual=any(log.virtual for log in logs),
+        ),
+        joints=joints,
+        seconds=clock.seconds,
+        grid_steps_per_second=rate,
+    )
+
+
+class _Clock:
+    """Wall time of each stage, and the voice of the progress."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.seconds: dict[str, float] = {}
+        self._progress = progress
+        self._stage = ""
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage, and say when it begins and ends."""
+        self._stage = name
+        self.tell(0.0)
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+        self.tell(1.0)
+
+    def tell(self, share: float) -> None:
+        """Share of the stage that is done."""
+        if self._progress is not None:
+            self._progress(self._stage, share)
+
+
+def _collect(
+    logs: Sequence[SweepLog], robot: Robot, settings: MatchSettings, clock: _Clock
+) -> dict[str, _Asked]:
+    """Responses of every joint asked, in the robot's order."""
+    where: dict[str, list[SweepLog]] = {}
+    for log in logs:
+        names = {name for segment in log.segments for name in segment.joints}
+        # A log that does not say whom it asked asked those whose command moves.
+        for i, name in enumerate(log.joints):
+            if name in names or (not log.segments and np.ptp(log.command[:, i]) > 0.0):
+                where.setdefault(name, []).append(log)
+    for name in where:
+        robot.joint(name)
+    if not where:
+        raise LogError(
+            f"{len(logs)} logs ask no joint; expected questions to some of "
+            f"{', '.join(robot.joint_names)}."
+        )
+    asked: dict[str, _Asked] = {}
+    for i, joint in enumerate(j for j in robot.joints if j.name in where):
+        sources = where[joint.name]
+        found = merged([targets(log, joint.name, robot, settings) for log in sources])
+        first = sources[0]
+        column = first.column(joint.name)
+        asked[joint.name] = _Asked(
+            targets=found,
+            naive=(
+                joint.stiffness if first.stiffness is None else float(first.stiffness[column]),
+                joint.damping if first.damping is None else float(first.damping[column]),
+            ),
+        )
+        clock.tell((i + 1) / len(where))
+    return asked
+
+
+def _search(
+    simulator: Simulator, asked: dict[str, _Asked], settings: MatchSettings, clock: _Clock
+) -> tuple[dict[str, _Found], float]:
+    """Best node and optimum off the grid of every joint; physics steps per second of the grid."""
+    main = [item.main for item in asked.values()]
+    stiffness, damping = axes(simulator.robot, settings.grid_points)
+    if settings.method == "quick":
+        with clock.stage("quick search"):
+            quick = quick_search(
+                simulator,
+                main,
+                stiffness,
+                damping,
+                weighting=settings.grid_weighting,
+                use_phase=settings.use_phase,
+            )
+        return {
+            goal.joint: _Found(grid=one.grid, fit=one.fit)
+            for goal, one in zip(main, quick, strict=True)
+        }, float("nan")
+    grids: dict[str, GridSearch] = {}
+    groups = alike(main, simulator.robot)
+    with clock.stage("grid"):
+        begin = time.perf_counter()
+        for k, group in enumerate(groups):
+            bench = simulator.bench(group[0].joint)
+            searched = search(
+                bench,
+                group,
+                stiffness,
+                damping,
+                settings.grid_weighting,
+                lambda share, k=k: clock.tell((k + share) / len(groups)),  # type: ignore[misc]
+            )
+            grids |= {goal.joint: grid for goal, grid in zip(group, searched, strict=True)}
+        # Everything the search does counts, not the simulator alone.
+        rate = simulator.count.steps / (time.perf_counter() - begin)
+    with clock.stage("refine"):
+        fits = refine(
+            simulator,
+            main,
+            [grids[goal.joint].gains for goal in main],
+            use_phase=settings.use_phase,
+        )
+    return {
+        goal.joint: _Found(grid=grids[goal.joint], fit=fit)
+        for goal, fit in zip(main, fits, strict=True)
+    }, rate
+
+
+def _fit_amplitudes(
+    simulator: Simulator,
+    asked: dict[str, _Asked],
+    found: dict[str, _Found],
+    settings: MatchSettings,
+) -> None:
+    """Fit the smaller amplitudes, each by itself."""
+    others = [goal for item in asked.values() for goal in item.targets[1:]]
+    start = [(found[goal.joint].fit.stiffness, found[goal.joint].fit.damping) for goal in others]
+    for fit in refine(simulator, others, start, use_phase=settings.use_phase):
+        found[fit.target.joint].others.append(fit)
+
+
+def _answers(
+    simulator: Simulator, asked: dict[str, _Asked], found: dict[str, _Found]
+) -> tuple[dict[str, NDArray[np.complex128]], dict[str, NDArray[np.complex128]]]:
+    """Whole responses with the matched and with the naive gains."""
+    main = [item.main for item in asked.values()]
+    jobs = [
+        Job(goal, found[goal.joint].fit.stiffness, found[goal.joint].fit.damping) for goal in main
+    ]
+    jobs += [Job(item.main, *item.naive) for item in asked.values()]
+    answers = simulator.responses(jobs, whole=True)
+    names = list(asked)
+    return (
+        dict(zip(names, answers[: len(names)], strict=True)),
+        dict(zip(names, answers[len(names) :], strict=True)),
+    )
+
+
+def _without_armature(
+    robot: Robot,
+    asked: dict[str, _Asked],
+    found: dict[str, _Found],
+    settings: MatchSettings,
+    clock: _Clock,
+) -> dict[str, NDArray[np.complex128]]:
+    """The search without rotor inertia (F13); whole responses at its best nodes."""
+    stiffness, damping = axes(robot, settings.grid_points)
+    groups = alike([item.main for item in asked.values()], robot)
+    jobs = []
+    with Simulator(robot, armature=0.0, threads=settings.threads) as simulator:
+        for k, group in enumerate(groups):
+            bench = simulator.bench(group[0].joint)
+            for goal, grid in zip(
+                group,
+                coarse_search(bench, group, stiffness, damping, settings.grid_weighting),
+                strict=True,
+            ):
+                found[goal.joint].zero = grid
+                jobs.append(Job(goal, *grid.gains))
+            clock.tell((k + 1) / len(groups))
+        answers = simulator.responses(jobs, whole=True)
+    return {job.target.joint: answer for job, answer in zip(jobs, answers, strict=True)}
+
+
+def _report(
+    robot: Robot,
+    item: _Asked,
+    found: _Found,
+    matched: NDArray[np.complex128],
+    naive: NDArray[np.complex128],
+    zero: NDArray[np.complex128] | None,
+    settings: MatchSettings,
+) -> tuple[JointMatch, JointGains]:
+    """Put one joint's findings into the artefacts."""
+    goal, fit, grid = item.main, found.fit, found.grid
+    joint = robot.joint(goal.joint)
+    bounds = interval(fit, level=settings.level)
+    per_amplitude = amplitude_gains([fit, *found.others])
+    naive_db = float(np.sqrt(np.mean(goal.error_db(naive[goal.inside]) ** 2)))
+    zero_db = float("nan") if found.zero is None else found.zero.error_db
+    band = goal.measured.band(*joint.band_hz)
+    flags = (
+        *_doubts(goal, fit, grid, settings),
+        *bounds.flags,
+        *amplitude_flags(per_amplitude),
+        *_missing(goal, band),
+    )
+    covariance = bounds.covariance
+    gains = JointGains(
+        stiffness=fit.stiffness,
+        damping=fit.damping,
+        grid_stiffness=grid.gains[0],
+        grid_damping=grid.gains[1],
+        stiffness_ci95=bounds.around(fit.stiffness, 0),
+        damping_ci95=bounds.around(fit.damping, 1),
+        covariance=(
+            (float(covariance[0, 0]), float(covariance[0, 1])),
+            (float(covariance[1, 0]), float(covariance[1, 1])),
+        ),
+        band_hz=joint.band_hz,
+        error_db=fit.error_db,
+        naive_error_db=naive_db,
+        coherence_min=float(goal.measured.coherence[band].min()),
+        armature=joint.drive.armature,
+        amplitude_spread=amplitude_spread(per_amplitude),
+        flags=flags,
+    )
+    match = JointMatch(
+        joint=goal.joint,
+        responses=tuple(one.measured for one in item.targets),
+        grid_stiffness=grid.stiffness,
+        grid_damping=grid.damping,
+        grid_error=grid.error,
+        stiffness=fit.stiffness,
+        damping=fit.damping,
+        covariance=covariance,
+        band_hz=joint.band_hz,
+        matched=matched,
+        naive=naive,
+        error_db=fit.error_db,
+        naive_error_db=naive_db,
+        zero_armature_error_db=zero_db,
+        zero_armature=zero,
+        repeat_gains=bounds.repeat_gains,
+        amplitude_gains=per_amplitude,
+        flags=(*flags, *_armature_flags(fit, zero_db, settings)),
+    )
+    return match, gains
+
+
+def _doubts(goal: Target, fit: Fit, grid: GridSearch, settings: MatchSettings) -> Iterator[str]:
+    """What speaks against the optimum."""
+    limit = _no_match_db(fit, settings)
+    if not fit.error_db <= limit:
+        yield (
+            f"no match: the best gains miss the measured response by {fit.error_db:.2g} dB RMS, "
+            f"more than {limit:.2g} dB; the model lacks something that the robot has"
+        )
+    if grid.at_edge:
+        yield (
+            f"at the edge of the grid ({grid.gains[0]:.3g} N m/rad, {grid.gains[1]:.3g} N m s/rad)"
+        )
+    if not fit.settled:
+        yield "the refinement did not settle; take the gains of the grid"
+    if not goal.question.policy_held:
+        yield "the command does not change at the policy's rate; each physics step holds its own"
+
+
+def _no_match_db(fit: Fit, settings: MatchSettings) -> float:
+    """Error in the band above which gains are no match [dB]."""
+    return max(NO_MATCH_DB, NO_MATCH_INTERVALS * measurement_error_db(fit, level=settings.level))
+
+
+def _missing(goal: Target, band: NDArray[np.bool_]) -> Iterator[str]:
+    """Frequencies of the band that the fit did not look at."""
+    left, whole = int(band.sum()) - int(goal.inside.sum()), int(band.sum())
+    if left:
+        yield f"{left} of {whole} frequencies left out for low coherence"
+
+
+def _armature_flags(fit: Fit, zero_db: float, settings: MatchSettings) -> Iterator[str]:
+    """What the search without rotor inertia says (F13)."""
+    if not np.isfinite(zero_db):
+        return
+    ratio = zero_db / max(fit.error_db, 1e-6)
+    if ratio >= NO_ARMATURE_RATIO and zero_db > _no_match_db(fit, settings):
+        verdict = "no match, the best node misses"
+    else:
+        # A light rotor on a heavy link: other gains make up for it.
+        verdict = "not ruled out by this joint, its best node misses"
+    yield f"zero armature: {verdict} by {zero_db:.2g} dB RMS, {ratio:.3g} times the match"

@@ -1,0 +1,209 @@
+"""From the gains of single joints to what training draws from: one pair and one range a group.
+
+The paper trains with one pair of gains per joint group and a uniform range about it (Table I, D3,
+D4) and does not say how it rounded from the matched joints to the group. pronk's rule:
+
+1. Damping is the middle of the joints' intervals, rounded to 0.05 N m s/rad.
+2. Stiffness keeps the joint's impedance. Rounding the damping changes |stiffness + j omega
+   damping|; the stiffness is the value on the 0.5 N m/rad lattice that puts the mean square of
+   it back at the joint's characteristic frequency omega = damping / (2 inertia), the half-width
+   of its resonance (zeta omega_n), with the inertia of the bench model, armature included.
+3. The range is the smallest multiple of the lattice that covers every joint's 95 % interval.
+
+From the paper's own matched gains this gives its training gains in all three groups. The
+undamped, damped and resonance frequencies and those of -3 dB, -45 and -90 degrees in step 2 do
+not, and neither do mean, median or mid-range of the stiffness: the rule was chosen because it
+does, and is no more than a statable reading of three pairs of numbers.
+
+The rule `paper` differs in step 3 only: one range for all groups, the largest needed, rounded to
+the nearest. It gives +-2.0 and +-0.05 and, like the paper, leaves one joint out (reading A13).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import RobotError
+from pronk.match.ellipsoid import enclosing, interval_points
+from pronk.match.gains import GroupGains, JointGains
+from pronk.robots.robot import Robot
+from pronk.robots.spec import bench_spec
+
+Array = NDArray[np.float64]
+Rule = Literal["cover", "paper"]
+
+STIFFNESS_STEP = 0.5
+"""Lattice of the paper's training stiffnesses: 20, 17.5, 21.5 N m/rad (Table I)."""
+DAMPING_STEP = 0.05
+"""Lattice of the paper's training dampings: 0.45, 0.4, 0.55 N m s/rad (Table I)."""
+_SLACK = 1e-6
+"""A range that is too small by rounding of the last binary digit still covers."""
+
+
+def group_gains(
+    robot: Robot, joints: Mapping[str, JointGains], *, rule: Rule = "cover"
+) -> dict[str, GroupGains]:
+    """Training gains, ranges and joint ellipsoids of every group with a matched joint.
+
+    Args:
+        robot: Gives the groups and the inertias.
+        joints: Matched gains by joint name.
+        rule: `cover` gives each group the smallest range that covers all its joints; `paper` one
+            range for all groups, rounded to the nearest (see the module).
+
+    Returns:
+        By group name, in the robot's order.
+
+    Raises:
+        RobotError: A joint is not one of the robot's, or the rule is unknown.
+    """
+    if rule not in ("cover", "paper"):
+        raise RobotError(f"rule {rule!r}; expected cover or paper.")
+    members = _members(robot, joints)
+    centres = {name: _centre(robot, group) for name, group in members.items()}
+    needed = {name: _needed(centres[name], group) for name, group in members.items()}
+    common = np.max(list(needed.values()), axis=0) if needed else np.zeros(2)
+    out = {}
+    for name, group in members.items():
+        stiffness, damping = centres[name]
+        if rule == "cover":
+            ranges = [_up(n, s) for n, s in zip(needed[name], _STEPS, strict=True)]
+        else:
+            ranges = [_nearest(n, s) for n, s in zip(common, _STEPS, strict=True)]
+        centre, shape = enclosing(np.concatenate([interval_points(g) for g in group.values()]))
+        out[name] = GroupGains(
+            stiffness=stiffness,
+            damping=damping,
+            stiffness_range=ranges[0],
+            damping_range=ranges[1],
+            ellipsoid=(
+                (float(shape[0, 0]), float(shape[0, 1])),
+                (float(shape[1, 0]), float(shape[1, 1])),
+            ),
+            ellipsoid_center=(float(centre[0]), float(centre[1])),
+        )
+    return out
+
+
+def coverage(
+    robot: Robot, groups: Mapping[str, GroupGains], joints: Mapping[str, JointGains]
+) -> dict[str, tuple[str, ...]]:
+    """What the ranges of the groups leave out, said aloud (reading A13).
+
+    Args:
+        robot: Gives each joint's group.
+        groups: Training gains and ranges.
+        joints: Matched gains by joint name.
+
+    Returns:
+        By joint name, a sentence for each gain whose value, or else whose 95 % interval, is not
+        inside its group's range; joints that are covered do not appear.
+    """
+    out: dict[str, tuple[str, ...]] = {}
+    for name, group in _members(robot, joints).items():
+        if name not in groups:
+            continue
+        drawn = groups[name]
+        spans = (
+            ("stiffness", drawn.stiffness, drawn.stiffness_range, "N m/rad"),
+            ("damping", drawn.damping, drawn.damping_range, "N m s/rad"),
+        )
+        for joint, gains in group.items():
+            said = []
+            for (what, centre, half, unit), value, bounds in zip(
+                spans, (gains.stiffness, gains.damping), _bounds(gains), strict=True
+            ):
+                if abs(value - centre) > half + _SLACK:
+                    said.append(
+                        f"{what} {value:.4g} {unit} lies outside the {name} range "
+                        f"{centre:.4g} +- {half:.4g}"
+                    )
+                elif max(bounds[1] - centre, centre - bounds[0]) > half + _SLACK:
+                    said.append(
+                        f"{what} {value:.4g} {unit} lies inside the {name} range {centre:.4g} +- "
+                        f"{half:.4g}, its interval {bounds[0]:.4g} to {bounds[1]:.4g} does not"
+                    )
+            if said:
+                out[joint] = tuple(said)
+    return out
+
+
+def characteristic_frequency(robot: Robot, joint_name: str, damping: float) -> float:
+    """Half-width of a joint's resonance, `damping / (2 inertia)` [rad/s].
+
+    The inertia is the joint's own in the bench model at the default pose, armature included.
+
+    Raises:
+        RobotError: The robot has no such joint.
+    """
+    original = robot.joint(joint_name).original[0]
+    model = bench_spec(robot, original).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    dof = int(model.jnt_dofadr[model.joint(original).id])
+    return float(damping / (2.0 * inertia[dof, dof]))
+
+
+_STEPS = (STIFFNESS_STEP, DAMPING_STEP)
+
+
+def _members(robot: Robot, joints: Mapping[str, JointGains]) -> dict[str, dict[str, JointGains]]:
+    for name in joints:
+        robot.joint(name)
+    groups = {
+        group: {j.name: joints[j.name] for j in robot.group(group) if j.name in joints}
+        for group in robot.groups
+    }
+    return {name: group for name, group in groups.items() if group}
+
+
+def _bounds(gains: JointGains) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Interval of each gain, the gain included; the bare gain where there is no interval."""
+    out = []
+    for value, (low, high) in (
+        (gains.stiffness, gains.stiffness_ci95),
+        (gains.damping, gains.damping_ci95),
+    ):
+        finite = np.isfinite(low) and np.isfinite(high)
+        out.append((min(low, value), max(high, value)) if finite else (value, value))
+    return out[0], out[1]
+
+
+def _centre(robot: Robot, group: Mapping[str, JointGains]) -> tuple[float, float]:
+    """Training stiffness and damping of a group (steps 1 and 2)."""
+    bounds = [_bounds(gains) for gains in group.values()]
+    low, high = min(b[1][0] for b in bounds), max(b[1][1] for b in bounds)
+    damping = _nearest(0.5 * (low + high), DAMPING_STEP)
+    stiffnesses = np.array([gains.stiffness for gains in group.values()])
+    dampings = np.array([gains.damping for gains in group.values()])
+    omega = characteristic_frequency(robot, next(iter(group)), float(dampings.mean()))
+    square = np.mean(stiffnesses**2) + omega**2 * (np.mean(dampings**2) - damping**2)
+    # A damping far off the lattice must not carry the stiffness away from the joints.
+    least, most = stiffnesses.min() - STIFFNESS_STEP, stiffnesses.max() + STIFFNESS_STEP
+    kept = float(np.clip(np.sqrt(max(float(square), 0.0)), least, most))
+    return _nearest(kept, STIFFNESS_STEP), damping
+
+
+def _needed(centre: tuple[float, float], group: Mapping[str, JointGains]) -> tuple[float, float]:
+    """Half-widths that cover every joint's interval."""
+    bounds = [_bounds(gains) for gains in group.values()]
+    out = [max(max(b[i][1] - centre[i], centre[i] - b[i][0]) for b in bounds) for i in range(2)]
+    return out[0], out[1]
+
+
+def _nearest(value: float, step: float) -> float:
+    """Nearest multiple of a step, at least one step, free of binary dust."""
+    return round(max(round(value / step), 1) * step, 9)
+
+
+def _up(value: float, step: float) -> float:
+    """Next multiple of a step that is not smaller, at least one step."""
+    return round(max(int(np.ceil(value / step - _SLACK)), 1) * step, 9)

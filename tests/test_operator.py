@@ -1,0 +1,126 @@
+"""The estimate as a matrix is the estimate."""
+
+from __future__ import annotations
+
+import time as clock
+
+import numpy as np
+import pytest
+
+from asked_joint import (
+    HIP,
+    KNEE,
+    LIVELY,
+    chirp_command,
+    linear_joint,
+    make_log,
+    multisine_command,
+    steps_command,
+)
+from pronk.errors import LogError, PronkError
+from pronk.response import Estimator, H1Operator, estimate, operators
+from pronk.response.analytic import simulate_second_order
+from pronk.response.operator import combine
+from pronk.sweep.log import SweepLog
+
+
+def applied(log: SweepLog, settings: Estimator) -> tuple[np.ndarray, np.ndarray]:
+    """Responses of each repeat and of all, by the operators."""
+    (row,) = operators(log, "knee", settings)
+    parts = [log.cut(segment) for segment in log.segments]
+    each = [one.apply(part.position[:, 0]) for one, part in zip(row, parts, strict=True)]
+    return np.array(each), combine(each, row)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.4])
+@pytest.mark.parametrize("kind", ["chirp", "unknown"])
+@pytest.mark.parametrize("segment_s", [4.0, 7.3])
+def test_operator_is_the_estimate(kind: str, jitter: float, segment_s: float) -> None:
+    settings = Estimator(segment_s=segment_s, max_hz=20.0)
+    log = make_log(
+        [chirp_command("chirp", 200.0)] * 2,
+        linear_joint(**KNEE),
+        kind=kind,
+        jitter=jitter,
+        noise=1e-3,
+    )
+    (response,) = estimate(log, "knee", settings)
+    each, whole = applied(log, settings)
+    scale = np.abs(response.response).max()
+    assert np.abs(each - response.repeats).max() < 1e-10 * scale
+    assert np.abs(whole - response.response).max() < 1e-10 * scale
+
+
+def test_operator_is_the_estimate_of_a_question_that_ends_in_motion() -> None:
+    time, command, hz = chirp_command("chirp", 200.0)
+    cut = slice(0, 3500)
+    log = make_log(
+        [(time[cut], command[cut], hz[cut])], linear_joint(**KNEE), kind="unknown", noise=1e-3
+    )
+    (response,) = estimate(log, "knee")
+    assert "inside the question" in response.window
+    assert np.abs(applied(log, Estimator())[1] - response.response).max() < 1e-9
+
+
+def test_operator_is_the_estimate_of_a_multisine() -> None:
+    log = make_log(
+        [(*multisine_command(200.0, seed=s), None) for s in range(3)],
+        linear_joint(**KNEE),
+        kind="multisine",
+        period=4.0,
+        noise=1e-3,
+        jitter=0.3,
+    )
+    (response,) = estimate(log, "knee")
+    each, whole = applied(log, Estimator())
+    assert np.abs(each - response.repeats).max() < 1e-10
+    assert np.abs(whole - response.response).max() < 1e-10
+
+
+def test_matrix_takes_positions_at_physics_steps() -> None:
+    """Positions every 5 ms answer like those every 2 ms, to the error of the interpolation."""
+    time, command, _ = chirp_command("chirp", 500.0)
+    operator = H1Operator.build(time, command, Estimator())
+    steps = np.arange(0.0, time[-1] + 0.005, 0.005)
+    matrix = operator.matrix(steps)
+    assert matrix.shape == (len(steps), len(operator.omega))
+    ticks = command[::10]
+    for joint in (KNEE, HIP, LIVELY):
+        fine = operator.apply(simulate_second_order(command, 500.0, **joint))
+        coarse = simulate_second_order(np.repeat(ticks, 4), 200.0, **joint)[: len(steps)]
+        low = operator.omega < 2.0 * np.pi * 15.0
+        assert np.abs((coarse @ matrix / fine - 1.0)[low]).max() < 1e-3
+        assert np.abs(coarse @ matrix / fine - 1.0).max() < 5e-3
+
+
+def test_matrix_is_linear_over_a_batch_and_blind_to_an_offset() -> None:
+    time, command, _ = chirp_command("chirp", 200.0)
+    operator = H1Operator.build(time, command, Estimator())
+    rng = np.random.default_rng(0)
+    batch = rng.standard_normal((3, 4, len(time)))
+    answer = operator.apply(batch)
+    assert answer.shape == (3, 4, len(operator.omega))
+    assert np.allclose(operator.apply(batch[1, 2]), answer[1, 2])
+    assert np.allclose(operator.apply(batch + 1.7), answer, atol=1e-8)
+
+
+def test_build_is_fast() -> None:
+    time, command, _ = chirp_command("chirp", 500.0)
+    start = clock.perf_counter()
+    operator = H1Operator.build(time, command, Estimator(max_hz=12.5))
+    matrix = operator.matrix(np.arange(0.0, time[-1] + 0.005, 0.005))
+    # Measured 0.15 s; shared machines are slow at times.
+    assert clock.perf_counter() - start < 3.0
+    assert matrix.nbytes + operator.weights.nbytes < 32e6
+
+
+def test_what_is_not_linear_or_does_not_span_is_refused() -> None:
+    time, command, _ = chirp_command("chirp", 200.0)
+    with pytest.raises(PronkError, match="only H1 is linear"):
+        H1Operator.build(time, command, Estimator(method="Hv"))
+    operator = H1Operator.build(time, command, Estimator())
+    with pytest.raises(LogError, match="do not span"):
+        operator.matrix(time[:-100])
+    steps = make_log([steps_command(200.0, (1.0, 2.0))], linear_joint(**KNEE), kind="sine_steps")
+    with pytest.raises(PronkError, match="match a chirp or a multisine"):
+        operators(steps, "knee")

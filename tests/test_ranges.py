@@ -1,0 +1,137 @@
+"""Ranges: the paper's Table I gives its training gains; every interval is covered."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pronk.errors import RobotError
+from pronk.match.ellipsoid import enclosing
+from pronk.match.gains import JointGains
+from pronk.match.ranges import characteristic_frequency, coverage, group_gains
+from pronk.robots import load_robot
+
+ROBOT = load_robot("mini_cheetah")
+LEGS = ("FR", "FL", "HR", "HL")
+TABLE_I = {
+    "hip_roll": ((20.6, 0.492), (18.1, 0.516), (18.5, 0.431), (21.0, 0.490)),
+    "hip_pitch": ((16.5, 0.382), (17.7, 0.406), (16.9, 0.382), (18.9, 0.431)),
+    "knee": ((21.8, 0.541), (22.0, 0.523), (22.2, 0.553), (21.8, 0.553)),
+}
+
+
+def joint(stiffness: float, damping: float, half: tuple[float, float] | None = None) -> JointGains:
+    nan = (math.nan, math.nan)
+    return JointGains(
+        stiffness=stiffness,
+        damping=damping,
+        grid_stiffness=stiffness,
+        grid_damping=damping,
+        stiffness_ci95=nan if half is None else (stiffness - half[0], stiffness + half[0]),
+        damping_ci95=nan if half is None else (damping - half[1], damping + half[1]),
+        covariance=((math.nan, math.nan), (math.nan, math.nan))
+        if half is None
+        else (((half[0] / 2) ** 2, 0.0), (0.0, (half[1] / 2) ** 2)),
+        band_hz=(1.0, 10.0),
+        error_db=0.2,
+        naive_error_db=1.0,
+        coherence_min=0.99,
+        armature=0.0026,
+    )
+
+
+def table_i() -> dict[str, JointGains]:
+    return {
+        f"{leg}_{group}": joint(*gains)
+        for group, row in TABLE_I.items()
+        for leg, gains in zip(LEGS, row, strict=True)
+    }
+
+
+@pytest.mark.parametrize("rule", ["cover", "paper"])
+def test_table_i_gives_the_papers_training_gains(rule: str) -> None:
+    groups = group_gains(ROBOT, table_i(), rule=rule)
+    assert {n: (g.stiffness, g.damping) for n, g in groups.items()} == {
+        "hip_roll": (20.0, 0.45),
+        "hip_pitch": (17.5, 0.4),
+        "knee": (21.5, 0.55),
+    }
+
+
+def test_paper_rule_gives_the_papers_ranges_and_says_a13_aloud() -> None:
+    groups = group_gains(ROBOT, table_i(), rule="paper")
+    assert {(g.stiffness_range, g.damping_range) for g in groups.values()} == {(2.0, 0.05)}
+    said = coverage(ROBOT, groups, table_i())
+    assert list(said) == ["FL_hip_roll"]
+    assert said["FL_hip_roll"] == (
+        "damping 0.516 N m s/rad lies outside the hip_roll range 0.45 +- 0.05",
+    )
+
+
+def test_cover_rule_covers_table_i_with_the_smallest_lattice_ranges() -> None:
+    groups = group_gains(ROBOT, table_i())
+    assert coverage(ROBOT, groups, table_i()) == {}
+    assert {n: (g.stiffness_range, g.damping_range) for n, g in groups.items()} == {
+        "hip_roll": (2.0, 0.1),
+        "hip_pitch": (1.5, 0.05),
+        "knee": (1.0, 0.05),
+    }
+
+
+def test_characteristic_frequency_is_half_the_damping_over_the_inertia() -> None:
+    # A knee alone: shank inertia about the joint plus armature, from the compiled model.
+    omega = characteristic_frequency(ROBOT, "FR_knee", 0.5)
+    assert 0.5 / (2 * omega) > ROBOT.joint("FR_knee").drive.armature
+    assert characteristic_frequency(ROBOT, "HL_knee", 1.0) == pytest.approx(2 * omega)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(10, 30), st.floats(0.15, 0.8), st.floats(0.01, 2.0), st.floats(0.001, 0.1)
+        ),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_every_interval_and_ellipse_is_inside(rows: list[tuple[float, ...]]) -> None:
+    joints = {
+        f"{leg}_knee": joint(r[0], r[1], (r[2], r[3])) for leg, r in zip(LEGS, rows, strict=False)
+    }
+    groups = group_gains(ROBOT, joints)
+    assert coverage(ROBOT, groups, joints) == {}
+    group = groups["knee"]
+    inverse = np.linalg.inv(np.array(group.ellipsoid))
+    for gains in joints.values():
+        about = np.array([gains.stiffness, gains.damping]) - group.ellipsoid_center
+        assert about @ inverse @ about <= 1.0
+    one_less = (group.stiffness_range - 0.5, group.damping_range - 0.05)
+    reach_k = max(
+        max(g.stiffness_ci95[1] - group.stiffness, group.stiffness - g.stiffness_ci95[0])
+        for g in joints.values()
+    )
+    assert reach_k > one_less[0] or group.stiffness_range == 0.5
+
+
+def test_interval_outside_the_range_is_told_from_a_value_outside() -> None:
+    groups = group_gains(ROBOT, {"FR_knee": joint(21.5, 0.55)})
+    said = coverage(ROBOT, groups, {"FR_knee": joint(21.5, 0.55, (0.9, 0.01))})
+    assert "its interval 20.6 to 22.4 does not" in said["FR_knee"][0]
+
+
+def test_enclosing_ellipse_of_a_square_is_its_circumcircle() -> None:
+    centre, shape = enclosing(np.array([[1.0, 1], [1, 3], [3, 1], [3, 3]]))
+    assert centre == pytest.approx([2, 2], abs=1e-6)
+    assert shape == pytest.approx(2.0 * np.eye(2), abs=1e-3)
+
+
+def test_unknown_joint_and_rule_are_refused() -> None:
+    with pytest.raises(RobotError, match="FR_hip_roll"):
+        group_gains(ROBOT, {"FR_ankle": joint(20, 0.5)})
+    with pytest.raises(RobotError, match="cover or paper"):
+        group_gains(ROBOT, table_i(), rule="widest")  # type: ignore[arg-type]

@@ -1,0 +1,349 @@
+"""The bench model: what it holds, and that it is the training simulator."""
+
+from __future__ import annotations
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import chirp
+
+from pronk.drive import clip_torque, pd_torque
+from pronk.errors import RobotError
+from pronk.robots import load_robot
+from pronk.robots.robot import Robot
+from pronk.robots.spec import bench_spec, free_spec, set_drive_gains, set_passive
+
+Array = NDArray[np.float64]
+CHEETAH, ARM = load_robot("mini_cheetah"), load_robot("so101")
+
+
+def held_chirp(robot: Robot, seconds: float, amplitude: float) -> Array:
+    """Linear chirp .1 to 25 Hz held at policy rate, one value a physics step."""
+    ticks = np.arange(round(seconds * robot.policy_rate_hz)) / robot.policy_rate_hz
+    signal = amplitude * chirp(ticks, 0.1, seconds, 25.0, phi=-90)
+    return np.repeat(signal, robot.decimation)
+
+
+def commands(model: mujoco.MjModel, joint: str, offset: Array) -> Array:
+    """Default commands with one joint's offset added, shape (steps, nu)."""
+    out = np.tile(model.key("default").ctrl, (len(offset), 1))
+    out[:, model.actuator(joint).id] += offset
+    return out
+
+
+def start(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
+    return data
+
+
+def simulate(model: mujoco.MjModel, command: Array) -> Array:
+    """Positions at the start of each step by `mujoco.rollout`, shape (steps, nq)."""
+    data = start(model)
+    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    initial = np.empty(size)
+    mujoco.mj_getState(model, data, initial, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    state, _ = mujoco.rollout.rollout(model, [data], initial[None], command[None])
+    positions = state[0, :, 1 : 1 + model.nq]
+    return np.vstack([data.qpos * 0 + model.key("default").qpos, positions[:-1]])
+
+
+def explicit_law(
+    robot: Robot, spec: mujoco.MjSpec, stiffness: float, damping: float, command: Array
+) -> tuple[Array, float]:
+    """The training law written out: PD clipped by drive.py, torque motors, implicitfast.
+
+    Returns positions at the start of each step and the share of steps in which it was clipped.
+    """
+    names = [actuator.name for actuator in spec.actuators]
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    for name in names:
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+    model = spec.compile()
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    data = start(model)
+    data.ctrl[:] = 0.0
+    drives = [robot.joint(name).drive for name in names]
+    positions, clipped = [], 0
+    for target in command:
+        positions.append(data.qpos.copy())
+        asked = pd_torque(target, data.qpos, data.qvel, stiffness=stiffness, damping=damping)
+        for i, drive in enumerate(drives):
+            data.ctrl[i] = clip_torque(
+                asked[i], data.qvel[i], drive.stall_torque, drive.no_load_speed, drive.effort_limit
+            )
+        clipped += bool(np.any(data.ctrl != asked))
+        mujoco.mj_step(model, data)
+    return np.array(positions), clipped / len(command)
+
+
+# --- What a bench model holds -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("robot", [CHEETAH, ARM], ids=lambda robot: robot.name)
+def test_bench_holds_the_chain_and_nothing_else(robot: Robot) -> None:
+    for joint in robot.joints:
+        model = bench_spec(robot, joint.name).compile()
+        assert tuple(model.joint(i).name for i in range(model.njnt)) == joint.chain
+        assert tuple(model.actuator(i).name for i in range(model.nu)) == joint.chain
+        expected = [robot.joint(name).default_position for name in joint.chain]
+        np.testing.assert_array_equal(model.key("default").qpos, expected)
+        np.testing.assert_array_equal(model.key("default").ctrl, expected)
+        assert model.opt.timestep == robot.timestep_s
+        assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+        assert model.opt.gravity[2] == -9.81
+
+
+@pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll", "HL_hip_pitch"])
+def test_bench_is_the_free_robot_with_its_base_held(name: str) -> None:
+    """Gravity torque, inertia and foot position agree with the whole robot's."""
+    bench = bench_spec(CHEETAH, name).compile()
+    whole = free_spec(CHEETAH).compile()
+    small, large = start(bench), start(whole)
+    mujoco.mj_forward(bench, small)
+    mujoco.mj_forward(whole, large)
+    a, b = bench.joint(name).dofadr[0], whole.joint(name).dofadr[0]
+    inertia = []
+    for model, data, dof in ((bench, small, a), (whole, large, b)):
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        inertia.append(full[dof, dof])
+    assert inertia[0] == pytest.approx(inertia[1], rel=1e-12)
+    assert small.qfrc_bias[a] == pytest.approx(large.qfrc_bias[b], rel=1e-9, abs=1e-12)
+    foot = f"{name[:2]}_foot"
+    np.testing.assert_allclose(small.site(foot).xpos, large.site(foot).xpos, atol=1e-12)
+
+
+def test_chain_that_leaves_out_a_moving_joint_is_refused() -> None:
+    from dataclasses import replace
+
+    knee = replace(CHEETAH.joint("FR_knee"), clamped=("FR_hip_roll",))
+    robot = replace(
+        CHEETAH, joints=tuple(knee if j.name == "FR_knee" else j for j in CHEETAH.joints)
+    )
+    with pytest.raises(RobotError, match="FR_hip_pitch can move when FR_knee is asked"):
+        bench_spec(robot, "FR_knee")
+
+
+@pytest.mark.parametrize("keyword", ["stiffness", "damping", "armature", "frictionloss"])
+def test_misspelled_joint_is_refused(keyword: str) -> None:
+    with pytest.raises(RobotError, match="no joint 'FR_kneee'"):
+        bench_spec(CHEETAH, "FR_knee", **{keyword: {"FR_kneee": 1.0}})
+
+
+# --- Editing a compiled model -------------------------------------------------------------------
+
+
+def assert_equal_models(a: mujoco.MjModel, b: mujoco.MjModel) -> None:
+    for field in dir(a):
+        value = getattr(a, field)
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            np.testing.assert_array_equal(value, getattr(b, field), err_msg=field)
+
+
+@pytest.mark.parametrize("name", ["FR_knee", "HL_hip_pitch"])
+def test_set_drive_gains_is_recompilation(name: str) -> None:
+    model = bench_spec(CHEETAH, name).compile()
+    set_drive_gains(model, name, CHEETAH.joint(name).drive, 21.8, 0.541)
+    again = bench_spec(CHEETAH, name, stiffness={name: 21.8}, damping={name: 0.541}).compile()
+    assert_equal_models(model, again)
+
+
+@pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll"])
+@pytest.mark.parametrize("armature", [0.0, 0.005484])
+def test_set_passive_is_recompilation(name: str, armature: float) -> None:
+    model = bench_spec(CHEETAH, name).compile()
+    set_passive(model, name, armature=armature, frictionloss=0.35)
+    again = bench_spec(
+        CHEETAH, name, armature={name: armature}, frictionloss={name: 0.35}
+    ).compile()
+    assert_equal_models(model, again)
+    command = commands(model, name, held_chirp(CHEETAH, 1.0, 0.1))
+    np.testing.assert_array_equal(simulate(model, command), simulate(again, command))
+
+
+def test_friction_can_be_switched_on_in_a_compiled_model() -> None:
+    smooth = bench_spec(CHEETAH, "FR_knee", frictionloss={"FR_knee": 0.0}).compile()
+    command = commands(smooth, "FR_knee", held_chirp(CHEETAH, 1.0, 0.1))
+    before = simulate(smooth, command)
+    set_passive(smooth, "FR_knee", frictionloss=0.2)
+    rough = bench_spec(CHEETAH, "FR_knee").compile()
+    after = simulate(smooth, command)
+    np.testing.assert_array_equal(after, simulate(rough, command))
+    assert np.abs(after - before).max() > 1e-3
+
+
+def test_editing_an_absent_joint_lists_those_there_are() -> None:
+    model = bench_spec(CHEETAH, "FR_knee").compile()
+    with pytest.raises(RobotError, match=r"no drive 'FL_knee'; its drives are FR_knee"):
+        set_drive_gains(model, "FL_knee", CHEETAH.joint("FL_knee").drive, 17.0, 0.4)
+    with pytest.raises(RobotError, match=r"no joint 'FL_knee'; its joints are FR_knee"):
+        set_passive(model, "FL_knee", armature=0.0)
+
+
+# --- Physics ------------------------------------------------------------------------------------
+
+
+def test_knee_alone_is_the_second_order_joint_of_the_paper() -> None:
+    """M2 at a fine step: I s^2 + (Kd + b) s + Kp, with I from the CAD figures by hand."""
+    spec = bench_spec(CHEETAH, "FR_knee", frictionloss={"FR_knee": 0.0})
+    spec.option.timestep = 1e-4
+    spec.option.gravity = (0.0, 0.0, 0.0)
+    model = spec.compile()
+    inertia = 248e-6 + 0.064 * 0.061**2 + 72e-6 * 9.33**2
+    stiffness, damping = 17.0, 0.4 + 0.01
+    steps = np.full(3000, 0.1)
+    position = simulate(model, commands(model, "FR_knee", steps))[:, 0] - 1.6
+    time = np.arange(len(steps)) * 1e-4
+    decay, natural = damping / (2 * inertia), np.sqrt(stiffness / inertia)
+    ringing = np.sqrt(natural**2 - decay**2)
+    truth = 0.1 * (
+        1
+        - np.exp(-decay * time)
+        * (np.cos(ringing * time) + decay / ringing * np.sin(ringing * time))
+    )
+    np.testing.assert_allclose(position, truth, atol=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "amplitude", "stiffness"),
+    [("FR_knee", 0.25, 17.0), ("FR_hip_roll", 0.25, 17.0), ("FR_hip_pitch", 1.0, 90.0)],
+)
+def test_native_model_is_the_explicit_law(name: str, amplitude: float, stiffness: float) -> None:
+    joint = CHEETAH.joint(name)
+    gains = {
+        "stiffness": dict.fromkeys(joint.chain, stiffness),
+        "damping": dict.fromkeys(joint.chain, 0.4),
+    }
+    model = bench_spec(CHEETAH, name, **gains).compile()
+    command = commands(model, name, held_chirp(CHEETAH, 4.0, amplitude))
+    truth, clipped = explicit_law(
+        CHEETAH, bench_spec(CHEETAH, name, **gains), stiffness, 0.4, command
+    )
+    assert (clipped > 0.2) == (stiffness == 90.0), "one case is deep in saturation, two are not"
+    np.testing.assert_allclose(simulate(model, command), truth, atol=1e-9 if clipped else 1e-12)
+
+
+def test_torque_speed_line_binds_as_in_the_explicit_law() -> None:
+    """A weak motor, so that back-EMF rather than the effort limit is what saturates."""
+    from dataclasses import replace
+
+    weak = replace(CHEETAH.joint("FR_knee").drive, stall_torque=12.0, no_load_speed=10.0)
+    knee = replace(CHEETAH.joint("FR_knee"), drive=weak)
+    robot = replace(
+        CHEETAH, joints=tuple(knee if j.name == "FR_knee" else j for j in CHEETAH.joints)
+    )
+    spec = bench_spec(robot, "FR_knee", stiffness={"FR_knee": 40.0})
+    model = spec.compile()
+    command = commands(model, "FR_knee", held_chirp(robot, 4.0, 0.5))
+    truth, clipped = explicit_law(robot, spec, 40.0, 0.4, command)
+    speed = np.abs(np.diff(truth[:, 0])).max() / robot.timestep_s
+    assert clipped > 0.1
+    assert 8.0 < speed < 11.0, "it ran into the no-load speed"
+    np.testing.assert_allclose(simulate(model, command), truth, atol=1e-9)
+
+
+@pytest.mark.parametrize("joint", CHEETAH.joints, ids=lambda joint: joint.name)
+def test_mirror_claim_by_simulation(joint: object) -> None:
+    """position(self | command) == sign position(mirror | sign command), about the pose."""
+    name = joint.name  # type: ignore[attr-defined]
+    original, sign = CHEETAH.joint(name).original
+    offset = held_chirp(CHEETAH, 2.0, 0.25)
+    model, mirrored = (bench_spec(CHEETAH, n).compile() for n in (name, original))
+    here = simulate(model, commands(model, name, offset))
+    there = simulate(mirrored, commands(mirrored, original, sign * offset))
+    column = CHEETAH.joint(name).chain.index(name)
+    assert np.ptp(here[:, column]) > 0.1
+    np.testing.assert_allclose(here[:, column], sign * there[:, column], atol=1e-9)
+
+
+def test_wrong_mirror_sign_would_be_noticed() -> None:
+    offset = held_chirp(CHEETAH, 2.0, 0.25)
+    right, left = (bench_spec(CHEETAH, n).compile() for n in ("FR_hip_roll", "FL_hip_roll"))
+    here = simulate(left, commands(left, "FL_hip_roll", offset))[:, 0]
+    there = simulate(right, commands(right, "FR_hip_roll", offset))[:, 0]
+    assert np.abs(here - there).max() > 1e-3
+
+
+def test_whole_arm_moves_at_once() -> None:
+    model = bench_spec(ARM, "elbow_flex").compile()
+    offset = held_chirp(ARM, 2.0, 0.1)
+    command = np.tile(model.key("default").ctrl, (len(offset), 1)) + offset[:, None]
+    position = simulate(model, command)
+    assert np.all(np.ptp(position, axis=0) > 0.05)
+    truth, _ = explicit_law(ARM, bench_spec(ARM, "elbow_flex"), 17.8, 0.6, command)
+    np.testing.assert_allclose(position, truth, atol=1e-9)
+
+
+# --- mjlab --------------------------------------------------------------------------------------
+
+
+@pytest.mark.train
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll"])
+def test_bench_is_mjlab_with_its_dc_motor_actuator(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The environment's own loop (targets, write, step, update) on the Warp CPU simulator."""
+    pytest.importorskip("mjlab")
+    monkeypatch.setenv("MJLAB_WARP_QUIET", "1")
+    import torch
+    from mjlab.actuator import DcMotorActuatorCfg
+    from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+    from mjlab.scene import Scene, SceneCfg
+    from mjlab.sim.sim import MujocoCfg, Simulation, SimulationCfg
+
+    chain = CHEETAH.joint(name).chain
+    model = bench_spec(CHEETAH, name).compile()
+    command = commands(model, name, held_chirp(CHEETAH, 4.0, 0.25))
+    expected = simulate(model, command)
+
+    def passive() -> mujoco.MjSpec:
+        spec = bench_spec(CHEETAH, name)
+        for element in (*spec.actuators, *spec.keys):
+            spec.delete(element)
+        # The scene has its own options; unequal ones would be warned of.
+        spec.option.timestep, spec.option.disableflags = 0.002, 0
+        return spec
+
+    def motor(joint_name: str) -> DcMotorActuatorCfg:
+        joint = CHEETAH.joint(joint_name)
+        return DcMotorActuatorCfg(
+            target_names_expr=(joint_name,),
+            stiffness=joint.stiffness,
+            damping=joint.damping,
+            armature=joint.drive.armature,
+            frictionloss=joint.drive.frictionloss,
+            viscous_damping=joint.drive.viscous_damping,
+            saturation_effort=joint.drive.stall_torque,
+            velocity_limit=joint.drive.no_load_speed,
+            effort_limit=joint.drive.effort_limit,
+        )
+
+    pose = {joint: CHEETAH.joint(joint).default_position for joint in chain}
+    entity = EntityCfg(
+        spec_fn=passive,
+        init_state=EntityCfg.InitialStateCfg(joint_pos=pose, joint_vel={".*": 0.0}),
+        articulation=EntityArticulationInfoCfg(actuators=tuple(map(motor, chain))),
+    )
+    scene = Scene(SceneCfg(num_envs=1, entities={"robot": entity}), device="cpu")
+    config = SimulationCfg(mujoco=MujocoCfg(timestep=CHEETAH.timestep_s, integrator="implicitfast"))
+    sim = Simulation(num_envs=1, cfg=config, model=scene.compile(), device="cpu")
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    robot = scene["robot"]
+    robot.write_joint_state_to_sim(
+        torch.tensor([list(pose.values())]), torch.zeros((1, len(chain)))
+    )
+    sim.forward()
+    positions = []
+    for target in command:
+        positions.append(robot.data.joint_pos[0].numpy().copy())
+        robot.set_joint_position_target(torch.tensor(target[None], dtype=torch.float32))
+        scene.write_data_to_sim()
+        sim.step()
+        scene.update(CHEETAH.timestep_s)
+    np.testing.assert_allclose(np.array(positions), expected, atol=1e-5)
