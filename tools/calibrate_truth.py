@@ -59,7 +59,7 @@ MACHINE = """\
   encoder_bits: 14                # magnetic absolute encoders of this class
   velocity_window_s: 0.001        # first difference over 40 periods of 25 us
   velocity_noise: 0.02
-  position_noise: 2.0e-4          # 2 quanta of the hips: magnet runout, mount vibration
+  position_noise: 2.0e-4          # 3 quanta of the hips: magnet runout, mount vibration
   position_noise_corner_hz: 40.0  # ... which is a matter of structure, hence slow
   torque_noise: 0.05              # 0.1 A of current noise through the hip's 6 x 0.075 N m/A
   gyro_noise: 0.001               # 0.0035 deg/s per root Hz (a good MEMS unit) over 250 Hz
@@ -67,7 +67,7 @@ MACHINE = """\
   accelerometer_noise: 0.02       # 0.14 mg per root Hz over 250 Hz
   accelerometer_bias: [0.04, -0.06, 0.05]
   clamp_stiffness: 5000.0         # a screw clamp on the thigh, 0.1 m from the hip, 0.5 N/um
-  clamp_damping: 5.0              # tenth of critical for a thigh
+  clamp_damping: 5.0              # a third of critical for a thigh
   stand_stiffness: .inf           # rigid: "fixed to a stable platform" (paper F5)
   stand_damping: 0.0
 """
@@ -84,13 +84,13 @@ HEADER = f"""\
 #   link_inertia_scale     CAD against what a scale says: some per cent, seed {SEED}
 #   rotor_inertia          63e-6 kg m^2 +- 3 %, motor side: Cheetah-Software's figure, where the
 #                          simulator believes the paper's 72e-6 (reading A11)
-#   belt_stiffness         rotor and link ring at about 140 Hz (hips: gears) and 160 Hz (knee: belt
+#   belt_stiffness         rotor and link ring at about 130 Hz (hips: gears) and 160 Hz (knee: belt
 #                          through the thigh), above all that is asked; 4 % of critical damping
 #   coulomb                0.13 to 0.17 N m +- 20 %, below the simulator's 0.2 (Cheetah-Software)
 #   breakaway              1.15 to 1.35 times that
 #   stribeck_speed         about 0.15 rad/s (1 to 1.4 rad/s at the motor)
 #   presliding_stiffness   break-away after about 1 mrad
-#   presliding_damping     half of critical for a hip's rotor on its bristles
+#   presliding_damping     a third of critical for a hip's rotor on its bristles
 #   encoder_offset         zeroed by hand against a stop, +- 2 mrad
 """
 

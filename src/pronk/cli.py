@@ -81,7 +81,7 @@ def run(arguments: Sequence[str]) -> int:
         _complain("interrupted.")
         return 130
     except _UsageError as error:
-        message = getattr(error, "format_message", lambda: str(error))()
+        message = str(getattr(error, "message", error))
         # Without arguments the message is the help itself.
         if not message.strip() or not arguments:
             return 0 if not arguments else 2

@@ -163,8 +163,7 @@ class KnownTruth:
             self._question,
             self.truth.stiffness * factor[:, 0],
             self.truth.damping * factor[:, 1],
-            frictionloss=self.scenario.friction_factor
-            * self.robot.joint(JOINT).drive.frictionloss,
+            frictionloss=self.scenario.friction_factor * self.robot.joint(JOINT).drive.frictionloss,
             threads=self._threads,
         )
         return delayed(position, self.scenario.delay_s, self.robot.timestep_s)
@@ -203,7 +202,7 @@ class KnownTruth:
         return SweepLog(
             robot=robot.name,
             joints=(JOINT,),
-            time=np.arange(len(command)) * robot.timestep_s,
+            time=np.arange(len(command), dtype=np.float64) * robot.timestep_s,
             command=command[:, None],
             position=(clean + noise)[:, None],
             segments=segments,

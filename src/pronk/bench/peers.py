@@ -23,14 +23,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import mujoco
+import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.bench.replay import Replay
 from pronk.errors import PronkError
-from pronk.match.question import asked, question
-from pronk.match.simulate import Bench
 from pronk.robots.robot import Robot
-from pronk.robots.spec import bench_spec, set_drive_gains
 from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
@@ -53,11 +52,11 @@ class Estimate:
     """[N m/rad]"""
     damping: float
     """[N m s/rad]"""
-    half_width: tuple[float, float] | None
-    """Half-widths of the 95 % intervals of stiffness and damping; None if the tool has none."""
+    interval: tuple[tuple[float, float], tuple[float, float]] | None
+    """95 % intervals of stiffness and of damping; None if the tool has none."""
     seconds: float
     """Wall time of the fit [s]."""
-    delay_s: float = 0.0
+    delay_s: float | None = None
     """Delay, where it was fitted [s]."""
 
 
@@ -120,45 +119,28 @@ def fit_sysid(
     """
     sysid = import_sysid()
     before = time.perf_counter()
-    spec = bench_spec(robot, joint)
-    spec.add_sensor(
-        name=joint,
-        type=mujoco.mjtSensor.mjSENS_JOINTPOS,
-        objtype=mujoco.mjtObj.mjOBJ_JOINT,
-        objname=joint,
-    )
-    base = spec.compile()
-    drive = robot.joint(joint).drive
-    chain = [base.joint(i).name for i in range(base.njnt)]
+    replay = Replay.of(log, joint, robot)
+    # Observed as a state: mujoco.rollout's sensors are one step older than their timestamps.
     signal = f"{joint}_qpos"
-    states, controls, answers = [], [], []
-    for segment in asked(log, joint):
-        part = log.cut(segment)
-        asks = question(part, segment, joint, robot)
-        control = np.tile([robot.joint(n).default_position for n in chain], (len(asks.command), 1))
-        control[:, chain.index(joint)] = asks.command
-        # At rest before the chirp: the mean of what was measured until the command moved.
-        first = max(int(np.argmax(asks.command != asks.command[0])), 1)
-        at_rest = control[0].copy()
-        at_rest[chain.index(joint)] = part.position[:first, part.column(joint)].mean()
-        clock = part.time - part.time[0]
-        states.append(sysid.create_initial_state(base, at_rest))
-        controls.append(sysid.TimeSeries(asks.time - asks.time[0], control))
-        # Observed as a state: mujoco.rollout's sensors are one step older than their timestamps.
-        mapping = {signal: (sysid.SignalType.MjStateQPos, np.arange(1))}
-        position = part.position[:, [part.column(joint)]]
-        answers.append(sysid.TimeSeries(clock, position, mapping))
-    names = [f"repeat {k}" for k in range(len(states))]
-    sequences = sysid.ModelSequences(joint, spec, names, states, controls, answers)
+    mapping = {signal: (sysid.SignalType.MjStateQPos, np.arange(1))}
+    control = sysid.TimeSeries(replay.time, replay.control)
+    count = len(replay.position)
+    sequences = sysid.ModelSequences(
+        joint,
+        replay.spec,
+        [f"repeat {k}" for k in range(count)],
+        list(replay.initial),
+        [control] * count,
+        [sysid.TimeSeries(replay.time, one[:, None], mapping) for one in replay.position],
+    )
     parameters = sysid.ParameterDict()
     for name, value, (low, high) in zip(("stiffness", "damping"), start, bounds, strict=True):
         parameters.add(sysid.Parameter(name, value, low, high))
 
     def build(values: Any, _spec: Any) -> Any:
-        model = base.__copy__()
-        kp, kd = float(values["stiffness"].value[0]), float(values["damping"].value[0])
-        set_drive_gains(model, joint, drive, kp, kd)
-        return model
+        return replay.with_gains(
+            float(values["stiffness"].value[0]), float(values["damping"].value[0])
+        )
 
     # The log is at the physics steps already. (Resampled, a float's last digit can add a sample,
     # and the staircase of the command is then interpolated between its steps.)
@@ -167,21 +149,21 @@ def fit_sysid(
         arguments["enabled_observations"] = [(signal, sysid.SignalType.MjStateQPos)]
     else:
         parameters.add(sysid.Parameter("delay", float(np.mean(delay_bounds_s)), *delay_bounds_s))
-        column = 1 + chain.index(joint)  # a state is time, positions, velocities
+        column = 1 + replay.column  # a state is time, positions, velocities
         arguments["modify_residual"] = _delayed_residual(sysid, column, delay_bounds_s)
-    residual = sysid.build_residual_fn(
-        models_sequences=[sequences], build_model=build, **arguments
-    )
+    residual = sysid.build_residual_fn(models_sequences=[sequences], build_model=build, **arguments)
     # Its default optimizer writes its progress to standard output; take it aside.
     found, result = sysid.optimize(parameters, residual, verbose=False, output=io.StringIO())
     at_optimum, _, _ = residual(result.x, found)
     _, half = sysid.calculate_intervals(at_optimum, result.jac)
+    seconds = time.perf_counter() - before
+    kp, kd = float(result.x[0]), float(result.x[1])
     return Estimate(
-        stiffness=float(result.x[0]),
-        damping=float(result.x[1]),
-        half_width=(float(half[0]), float(half[1])),
-        seconds=time.perf_counter() - before,
-        delay_s=float(result.x[2]) if delay_bounds_s is not None else 0.0,
+        stiffness=kp,
+        damping=kd,
+        interval=((kp - half[0], kp + half[0]), (kd - half[1], kd + half[1])),
+        seconds=seconds,
+        delay_s=float(result.x[2]) if delay_bounds_s is not None else None,
     )
 
 
@@ -234,18 +216,12 @@ def fit_cma(
     """
     cma = import_cma()
     before = time.perf_counter()
-    segments = asked(log, joint)
-    parts = [log.cut(segment) for segment in segments]
-    asks = question(parts[0], segments[0], joint, robot)
-    name, sign, command = asks.mirrored(robot)
-    column = parts[0].column(joint)
-    centre = asks.pose[robot.joint_names.index(joint)]
-    steps = min(len(command), *(len(part.time) for part in parts))
+    replay = Replay.of(log, joint, robot)
     # The mean of the repeats has the same best fit as all of them, at a cost less by a constant;
     # the constant is put back for the relative spread.
-    repeats = sign * (np.array([part.position[:steps, column] for part in parts]) - centre)
-    mean = repeats.mean(axis=0)
-    constant = float(repeats.var(axis=0).mean())
+    mean = replay.position.mean(axis=0)
+    constant = float(replay.position.var(axis=0).mean())
+    steps = len(mean)
     lows, highs = (np.array(side) for side in zip(*bounds, strict=True))
     first = np.array(start)
     if delay_steps is not None:
@@ -261,29 +237,30 @@ def fit_cma(
     search = cma.CMAEvolutionStrategy(
         list(2.0 * (first - lows) / (highs - lows) - 1.0), SIGMA, options
     )
-    with Bench(robot, name, threads=threads, chunk=population) as bench:
-        pose = bench.pose(asks)
+    datas = [mujoco.MjData(replay.model) for _ in range(threads)]
+    with mujoco.rollout.Rollout(nthread=threads) as pool:
         while not search.stop():
             unit = search.ask()
             candidates = lows + 0.5 * (np.array(unit) + 1.0) * (highs - lows)
-            costs = np.empty(len(candidates))
-            for rows, position in bench.run(
-                [command[:steps]], [pose], candidates[:, 0], candidates[:, 1]
-            ):
-                lags = _steps_late(candidates[rows], delay_steps)
-                for row, lag in enumerate(lags):
-                    late = mean[lag:] - position[row, : steps - lag]
-                    costs[rows.start + row] = late @ late / (steps - lag) + constant
+            position = replay.positions(candidates, pool, datas)
+            costs = np.full(len(candidates), constant)
+            for row, lag in enumerate(_steps_late(candidates, delay_steps)):
+                error = mean[lag:] - position[row, : steps - lag]
+                costs[row] += error @ error / (steps - lag)
             search.tell(unit, list(costs))
             if np.ptp(costs) < SPREAD * costs.mean():
                 break
     best = lows + 0.5 * (np.clip(search.result.xfavorite, -1.0, 1.0) + 1.0) * (highs - lows)
+    seconds = time.perf_counter() - before
+    late = None
+    if delay_steps is not None:
+        late = float(_steps_late(best[None, :], delay_steps)[0]) * robot.timestep_s
     return Estimate(
         stiffness=float(best[0]),
         damping=float(best[1]),
-        half_width=None,
-        seconds=time.perf_counter() - before,
-        delay_s=float(_steps_late(best[None, :], delay_steps)[0]) * robot.timestep_s,
+        interval=None,
+        seconds=seconds,
+        delay_s=late,
     )
 
 

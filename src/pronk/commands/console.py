@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 JsonOption = Annotated[
     Path | None, typer.Option("--json", help="Also write the figures to this file.")
@@ -58,10 +59,15 @@ def following(*commands: str) -> None:
 
 def table(title: str, *columns: str) -> Table:
     """A table whose first column is a name and whose others are numbers."""
-    made = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
+    made = Table(title=Text(title), title_justify="left", title_style="bold", header_style="bold")
     for i, column in enumerate(columns):
-        made.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
+        made.add_column(Text(column), justify="left" if i == 0 else "right", no_wrap=i == 0)
     return made
+
+
+def row(made: Table, *cells: str) -> None:
+    """Add a row; brackets in a cell are brackets, not markup."""
+    made.add_row(*(Text(cell) for cell in cells))
 
 
 def show(made: Table) -> None:

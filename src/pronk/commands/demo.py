@@ -154,7 +154,8 @@ def summary(result: MatchResult, replays: list[Replay]) -> None:
     for name, gains in result.gains.joints.items():
         joint, one = result.joints[name], by_joint[name]
         cells = cells_apart(result, name, paper.joints[name])
-        made.add_row(
+        console.row(
+            made,
             name,
             f"{gains.stiffness:.2f} / {gains.damping:.3f}",
             f"{paper.joints[name][0]:g} / {paper.joints[name][1]:g}",
@@ -168,9 +169,7 @@ def summary(result: MatchResult, replays: list[Replay]) -> None:
     console.show(made)
 
 
-def cells_apart(
-    result: MatchResult, name: str, pair: tuple[float, float]
-) -> tuple[float, float]:
+def cells_apart(result: MatchResult, name: str, pair: tuple[float, float]) -> tuple[float, float]:
     """Distance from the matched gains to another pair, in cells of the grid."""
     joint = result.joints[name]
     cell = (

@@ -26,3 +26,11 @@ def export(
     json_file: console.JsonOption = None,
 ) -> None:
     """Write matched gains as actuator configuration of mjlab, MuJoCo or Isaac Lab."""
+    from pronk.files import write_text
+    from pronk.match import gains as gains_file
+    from pronk.match.export import export_text
+
+    text = export_text(gains_file.load(gains), to.value)
+    write_text(out, text)
+    console.wrote(out)
+    console.write_json(json_file, {"written": out, "to": to.value})

@@ -1,14 +1,17 @@
-"""Options that say how logs are to be read, the same for every command that reads them."""
+"""Logs on a command line: which files are meant, and how they are to be read."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pronk.errors import LogError
+from pronk.errors import LogError, PronkError
 
 if TYPE_CHECKING:
     from pronk.robots.robot import Robot
@@ -18,3 +21,177 @@ LogsArgument = Annotated[
     list[Path], typer.Argument(help="Logs; a folder means all logs in it.", metavar="LOG...")
 ]
 RobotOption = Annotated[str, typer.Option("--robot", help="Robot, for instance mini_cheetah.")]
+
+_OURS = (".response.npz", ".prediction.npz", "match.npz")
+"""What pronk itself writes beside logs; no logs."""
+_SUFFIXES = (".mcap", ".csv", ".pt", ".npz")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How logs are to be read. A field is an option of every command that reads logs."""
+
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of all angles, rad or deg; must be said for CSV.")
+    ] = None
+    time_unit: Annotated[
+        str | None, typer.Option(help="Unit of the timestamps: s, ms, us or ns.")
+    ] = None
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(help="CSV: OURS=THEIRS, as in position.FR_knee=q3; repeat it."),
+    ] = None
+    joint_names: Annotated[
+        list[str] | None, typer.Option(help="THEIRS=OURS for joints of other names; repeat it.")
+    ] = None
+    scale: Annotated[
+        list[str] | None,
+        typer.Option(help="JOINT=RADIANS per unit, for a joint that is not in radians; repeat it."),
+    ] = None
+    rate_hz: Annotated[
+        float | None, typer.Option(help="Rate the log is said to have; an error if it has not.")
+    ] = None
+    log_format: Annotated[
+        str | None,
+        typer.Option(
+            "--format", help="mcap, csv, sage, pace or npz; told from the name if left out."
+        ),
+    ] = None
+
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `pronk.sweep.readers.read_log`."""
+        scale = {name: _float("--scale", value) for name, value in _pairs(self.scale, "--scale")}
+        return {
+            "unit": self.unit,
+            "time_unit": self.time_unit,
+            "columns": dict(_pairs(self.columns, "--columns")) or None,
+            "joint_names": dict(_pairs(self.joint_names, "--joint-names")) or None,
+            "scale": scale or None,
+            "rate_hz": self.rate_hz,
+            "format": self.log_format,
+        }
+
+
+def _pairs(entries: Sequence[str] | None, option: str) -> list[tuple[str, str]]:
+    found = []
+    for entry in entries or ():
+        name, equals, value = entry.partition("=")
+        if not (name and equals and value):
+            raise PronkError(f"{option} {entry!r}: expected NAME=VALUE.")
+        found.append((name, value))
+    return found
+
+
+def _float(option: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise PronkError(f"{option}: {text!r} is not a number.") from None
+
+
+def reads_logs(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `Reading`; it takes them together as its argument `reading`."""
+    own = inspect.signature(command, eval_str=True)
+    hints = inspect.get_annotations(Reading, eval_str=True)
+    added = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hints[field.name]
+        )
+        for field in fields(Reading)
+    ]
+    kept = [p for p in own.parameters.values() if p.name != "reading"]
+
+    @functools.wraps(command)
+    def wrapped(**given: Any) -> None:
+        reading = Reading(**{field.name: given.pop(field.name) for field in fields(Reading)})
+        command(**given, reading=reading)
+
+    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept] + added
+    wrapped.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    wrapped.__annotations__ = {p.name: p.annotation for p in parameters}
+    return wrapped
+
+
+def files(paths: Sequence[Path]) -> list[Path]:
+    """The logs that some paths stand for; a folder that is no log itself means those in it.
+
+    Raises:
+        LogError: A path does not exist, or a folder holds no log.
+    """
+    from pronk.sweep.sage import is_sage
+
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir() or is_sage(path) or (path / "metadata.yaml").is_file():
+            found.append(path)
+            continue
+        inside = sorted(
+            p
+            for p in path.iterdir()
+            if (p.is_dir() and is_sage(p))
+            or (p.suffix.lower() in _SUFFIXES and not p.name.endswith(_OURS))
+        )
+        if not inside:
+            raise LogError(
+                f"{path}: no logs in this folder; expected {', '.join(_SUFFIXES)} or SAGE folders."
+            )
+        found += inside
+    return found
+
+
+def read(paths: Sequence[Path], reading: Reading, robot: Robot | None) -> list[SweepLog]:
+    """Read every log that some paths stand for.
+
+    Raises:
+        LogError: As `pronk.sweep.readers.read_log`.
+        RobotError: As `pronk.sweep.readers.read_log`.
+    """
+    from pronk.sweep.readers import read_log
+
+    options = {name: value for name, value in reading.options().items() if value is not None}
+    return [read_log(path, robot=robot, **options) for path in files(paths)]
+
+
+def asked_joints(log: SweepLog) -> tuple[str, ...]:
+    """Joints that a log asks: those of its segments, or those whose command moves.
+
+    Raises:
+        LogError: None is.
+    """
+    named = {name for segment in log.segments for name in segment.joints}
+    moving = (log.command.max(axis=0) - log.command.min(axis=0)) > 0.0
+    asked = tuple(
+        name
+        for name, moves in zip(log.joints, moving, strict=True)
+        if (name in named if log.segments else moves)
+    )
+    if not asked:
+        raise LogError(f"{log.source or 'log'}: no command moves, so no joint was asked anything.")
+    return asked
+
+
+def moves_together(log: SweepLog) -> bool:
+    """True if several joints are commanded at the same time, in signals that correlate.
+
+    Several joints may be asked at once with uncorrelated signals; 0.1 is where pronk warns.
+    """
+    from pronk.sweep.correlation import correlation_note
+
+    if all(len(segment.joints) == 1 for segment in log.segments) and log.segments:
+        return False
+    joints = asked_joints(log)
+    if len(joints) < 2:
+        return False
+    columns = [log.column(name) for name in joints]
+    return bool(correlation_note(log.command[:, columns], joints, log.rate_hz))
+
+
+def home(log: SweepLog, out: Path | None) -> tuple[Path, str]:
+    """Folder and stem of what is written about a log: beside it, or in `out`."""
+    source = Path(log.source or "log")
+    return (out if out is not None else source.parent), source.stem
+
+
+def summary(logs: Sequence[SweepLog]) -> Mapping[str, str]:
+    """Name and hash of each log, for `--json`."""
+    return {log.source: log.sha256 for log in logs}

@@ -22,6 +22,7 @@ class Mode(StrEnum):
     DRIVE = "drive"
 
 
+@logs.reads_logs
 def match(
     paths: logs.LogsArgument,
     robot: logs.RobotOption,
@@ -46,18 +47,19 @@ def match(
     phase: Annotated[
         bool, typer.Option("--phase", help="Let the refinement see the phase and a free delay.")
     ] = False,
-    unit: logs.UnitOption = None,
-    columns: logs.ColumnsOption = None,
-    time_unit: logs.TimeUnitOption = None,
     json_file: console.JsonOption = None,
+    *,
+    reading: logs.Reading,
 ) -> None:
     """Find the gains that make the simulator answer like the robot."""
     from pronk.robots import load_robot
 
     machine = load_robot(robot)
     if out.suffix not in (".yaml", ".yml"):
-        raise PronkError(f"--out {out}: expected a name that ends in .yaml, for instance gains.yaml.")
-    read = logs.read(paths, robot=robot, unit=unit, columns=columns, time_unit=time_unit)
+        raise PronkError(
+            f"--out {out}: expected a name that ends in .yaml, for instance gains.yaml."
+        )
+    read = logs.read(paths, reading, machine)
     together = [log for log in read if logs.moves_together(log)]
     if mode is Mode.DRIVE or (mode is None and together):
         from pronk.commands.match_drive import match_drive
@@ -147,7 +149,8 @@ def show(result: MatchResult) -> None:
     )
     for name, gains in result.gains.joints.items():
         known = paper.joints.get(name) if paper else None
-        made.add_row(
+        console.row(
+            made,
             name + (" *" if doubts(result.joints[name]) else ""),
             f"{gains.stiffness:.2f}",
             _interval(gains.stiffness_ci95, 2),
@@ -160,7 +163,8 @@ def show(result: MatchResult) -> None:
     console.show(made)
     groups = console.table("For training", "group", "stiffness [N m/rad]", "damping [N m s/rad]")
     for name, group in result.gains.groups.items():
-        groups.add_row(
+        console.row(
+            groups,
             name,
             f"{group.stiffness:g} +- {group.stiffness_range:g}",
             f"{group.damping:g} +- {group.damping_range:g}",

@@ -27,26 +27,28 @@ COHERENT = 0.95
 """Coherence from which on a frequency counts as answered."""
 
 
+@logs.reads_logs
 def response(
     paths: logs.LogsArgument,
     robot: Annotated[
         str | None, typer.Option("--robot", help="Robot, where the log does not say.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for what is written; beside the log if left out.")
+        Path | None,
+        typer.Option("--out", help="Folder for what is written; beside the log if left out."),
     ] = None,
     method: Annotated[Method, typer.Option(help="H1: noise on the position alone.")] = Method.H1,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw Bode plots.")] = True,
-    unit: logs.UnitOption = None,
-    columns: logs.ColumnsOption = None,
-    time_unit: logs.TimeUnitOption = None,
     json_file: console.JsonOption = None,
+    *,
+    reading: logs.Reading,
 ) -> None:
     """Estimate the frequency response of every joint that was asked."""
     from pronk.report import figures, style
     from pronk.response import Estimator, estimate, save
+    from pronk.robots import load_robot
 
-    read = logs.read(paths, robot=robot, unit=unit, columns=columns, time_unit=time_unit)
+    read = logs.read(paths, reading, load_robot(robot) if robot else None)
     settings = Estimator(method=method.value)
     rows: list[dict[str, Any]] = []
     written: list[Path] = []
@@ -131,12 +133,13 @@ def show(rows: list[dict[str, Any]], *, virtual: bool) -> None:
         "peak [dB]",
         "at [Hz]",
         "-3 dB at [Hz]",
-        "delay [ms]",
+        "command delay [ms]",
         "third harmonic [%]",
     )
     for row in rows:
         band = row["coherent_hz"]
-        made.add_row(
+        console.row(
+            made,
             row["joint"],
             f"{row['amplitude_rad']:.3g}",
             str(row["repeats"]),

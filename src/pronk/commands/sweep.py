@@ -51,7 +51,8 @@ def sweep(
         Path | None, typer.Option(help="Truth of the virtual robot, instead of the shipped one.")
     ] = None,
     joints: Annotated[
-        list[str] | None, typer.Option("--joints", help="Joints to ask; repeat it. All if left out.")
+        list[str] | None,
+        typer.Option("--joints", help="Joints to ask; repeat it. All if left out."),
     ] = None,
     signal: Annotated[SignalName, typer.Option(help="What to ask.")] = SignalName.CHIRP,
     amplitude: Annotated[
@@ -65,7 +66,9 @@ def sweep(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace logs that are already there.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before real hardware moves.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before real hardware moves.")
+    ] = False,
     json_file: console.JsonOption = None,
 ) -> None:
     """Ask every joint: plan, check against the limits, ask, record."""
@@ -139,9 +142,7 @@ def make(
     """The plan of a sweep, one joint after another."""
     from pronk.sweep.plan import make_plan
 
-    return make_plan(
-        robot, joints, make_signal(signal), amplitudes=amplitudes, repeats=repeats
-    )
+    return make_plan(robot, joints, make_signal(signal), amplitudes=amplitudes, repeats=repeats)
 
 
 def show_plan(plan: SweepPlan) -> None:
@@ -162,7 +163,8 @@ def show_plan(plan: SweepPlan) -> None:
     )
     for row in plan.rows():
         low, high = float(row["lowest_rad"]), float(row["highest_rad"])
-        made.add_row(
+        console.row(
+            made,
             str(row["joint"]),
             f"{row['amplitude_rad']:g}",
             f"{low:.2f} to {high:.2f}",

@@ -43,8 +43,10 @@ from pronk.robots.robot import Drive, Robot
 Array = NDArray[np.float64]
 
 # The rotor's inertia lives in the armature of its hinge; MuJoCo still wants a body with mass.
-# 1e-9 kg at the joint axis is a millionth of the lightest link.
+# 1e-9 kg on the joint's axis is nothing beside the lightest link.
 _ROTOR_MASS = 1e-9
+# Largest angular frequency of a spring times the step; the symplectic step is stable below 2.
+_STABLE = 1.0
 _STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (0, 0, 1)}
 
 # Places in MuJoCo's parameter vectors of a dcmotor (MuJoCo 3.11).
@@ -68,9 +70,7 @@ class MotorConstants:
     def of(cls, drive: Drive) -> MotorConstants:
         """The constants of a drive, as the drive itself believes them."""
         constant = drive.bus_voltage / drive.no_load_speed
-        return cls(
-            constant=constant, resistance=constant * drive.bus_voltage / drive.stall_torque
-        )
+        return cls(constant=constant, resistance=constant * drive.bus_voltage / drive.stall_torque)
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,9 @@ class Plant:
         torque = self.constant * act[self.current]
         return np.minimum(np.maximum(torque, -self.effort_limit), self.effort_limit)
 
-    def set_clamps(self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float) -> None:
+    def set_clamps(
+        self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float
+    ) -> None:
         """Hold links where they are with a fixture; release all others.
 
         The fixture is a spring and damper between link and body, not a constraint: its
@@ -257,6 +259,33 @@ def _add_rotor(spec: Any, name: str, drive: Drive, true: JointTruth, lag_s: floa
     )
 
 
+def _check_springs(plant: Plant, truth: Truth) -> None:
+    """Refuse springs that the physics step cannot follow.
+
+    Raises:
+        RobotError: Names the field and the largest value that would do.
+    """
+    model = plant.model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    mobility = np.diag(np.linalg.inv(inertia))
+    for k, name in enumerate(plant.joints):
+        joint = truth.joints[name]
+        rotor, link = mobility[plant.rotor[k]], mobility[plant.link[k]]
+        for field, value, mobile in (
+            ("belt_stiffness", joint.belt_stiffness, rotor + link),
+            ("presliding_stiffness", joint.presliding_stiffness, rotor),
+        ):
+            most = (_STABLE / model.opt.timestep) ** 2 / mobile
+            if value > most:
+                raise RobotError(
+                    f"joints.{name}.{field} is {value:g}; at a physics step of "
+                    f"{model.opt.timestep:g} s at most {most:.3g} N m/rad can be simulated."
+                )
+
+
 def build_plant(robot: Robot, truth: Truth, legs: tuple[str, ...], timestep_s: float) -> Plant:
     """Build the plant on the bench: base on the stand, feet in the air, no contacts.
 
@@ -267,8 +296,14 @@ def build_plant(robot: Robot, truth: Truth, legs: tuple[str, ...], timestep_s: f
         timestep_s: Physics step [s].
 
     Raises:
-        RobotError: A joint of the robot is missing in its model or in the truth.
+        RobotError: The truth is of another robot, a joint is missing in the model or in the truth,
+            or a spring is too stiff for the step.
     """
+    if truth.robot != robot.name:
+        raise RobotError(
+            f"the truth is of {truth.robot!r}, the robot is {robot.name!r}; give a truth file "
+            "written for that robot."
+        )
     truth.check_joints(robot.joint_names)
     joints = tuple(joint for joint in robot.joints if joint.name.split("_")[0] in legs)
     spec = robot.build_spec()
@@ -302,7 +337,7 @@ def build_plant(robot: Robot, truth: Truth, legs: tuple[str, ...], timestep_s: f
     motors = [MotorConstants.of(joint.drive) for joint in joints]
     believed = np.array([motor.constant for motor in motors])
     rigid = not math.isfinite(truth.machine.stand_stiffness)
-    return Plant(
+    plant = Plant(
         model=model,
         joints=tuple(joint.name for joint in joints),
         rotor=addresses("/rotor"),
@@ -328,3 +363,5 @@ def build_plant(robot: Robot, truth: Truth, legs: tuple[str, ...], timestep_s: f
         ),
         viscous=np.array([truth.joints[joint.name].viscous for joint in joints]),
     )
+    _check_springs(plant, truth)
+    return plant

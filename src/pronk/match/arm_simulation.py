@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import mujoco.rollout
@@ -98,8 +98,13 @@ def asked_joints(log: SweepLog, robot: Robot) -> tuple[tuple[str, ...], dict[str
 
 def moves_together(log: SweepLog) -> bool:
     """True if several joints of a log are asked at once, so that only the whole arm can answer."""
-    if log.segments and all(len(segment.joints) == 1 for segment in log.segments):
-        return False
+    if log.segments:
+        return any(
+            set(one.joints) != set(other.joints) or len(one.joints) > 1
+            for one in log.segments
+            for other in log.segments
+            if one.start < other.stop and other.start < one.stop
+        )
     moving = np.ptp(log.command, axis=0) >= MOVED_RAD
     return int(moving.sum()) > 1
 
@@ -276,11 +281,6 @@ def held_mean(time: Array, command: Array, edges: Array) -> Array:
         ]
     )
     return np.asarray(np.diff(np.interp(edges, times, areas)) / np.diff(edges))
-
-
-def shifted(drive: JointDrive, name: str, value: float) -> JointDrive:
-    """A drive with one of its numbers replaced."""
-    return replace(drive, **{name: value})
 
 
 def _sampled(positions: Array, time: Array, timestep: float) -> Array:

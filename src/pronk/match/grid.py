@@ -116,7 +116,8 @@ def errors(
     Returns:
         Mean squared error of the gain [dB^2], shape (group, b).
     """
-    question = group[0].question
+    # One may rest longer than the others at the end.
+    question = max((goal.question for goal in group), key=lambda one: len(one.command))
     command = question.mirrored(bench.robot)[2]
     steps = max(goal.steps for goal in group)
     weight = [weights(goal, weighting) for goal in group]
@@ -164,34 +165,39 @@ def coarse_search(
 ) -> list[GridSearch]:
     """Look at every seventh node and the border, then ever closer around the best.
 
-    Enough to say that no node fits (paper F13) at a twentieth of the cost; nodes not looked at
-    are NaN in the error map.
+    Each stride looks around the best node so far until that no longer moves, so the search
+    follows a narrow valley to its bottom. Enough to say that no node fits (paper F13) at a
+    twentieth of the cost; nodes not looked at are NaN in the error map.
     """
     shape = (len(stiffness), len(damping))
     looked = np.zeros(shape, dtype=bool)
     maps = np.full((len(group), *shape), np.nan)
 
-    def look(nodes: NDArray[np.bool_]) -> None:
+    def look(nodes: NDArray[np.bool_]) -> bool:
         i, j = np.nonzero(nodes & ~looked)
         if len(i):
             maps[:, i, j] = errors(bench, group, stiffness[i], damping[j], weighting)
         looked[i, j] = True
+        return len(i) > 0
 
     first = np.zeros(shape, dtype=bool)
     first[np.ix_(*(np.unique([*range(0, n, _STRIDES[0]), n - 1]) for n in shape))] = True
     look(first)
-    for wide, stride in pairwise(_STRIDES):
-        close = np.zeros(shape, dtype=bool)
-        for row in maps:
-            best = np.unravel_index(int(np.nanargmin(row)), shape)
-            near = [
-                np.arange(max(int(k) - wide + 1, 0), min(int(k) + wide, n))
-                for k, n in zip(best, shape, strict=True)
-            ]
-            # The nodes of this stride that lie around the best one so far.
-            chosen = [
-                axis[(axis - int(k)) % stride == 0] for axis, k in zip(near, best, strict=True)
-            ]
-            close[np.ix_(*chosen)] = True
-        look(close)
+    for reach, stride in pairwise(_STRIDES):
+        while look(_around(maps, reach, stride)):
+            pass
     return [GridSearch(stiffness=stiffness, damping=damping, error=row) for row in maps]
+
+
+def _around(maps: Array, reach: int, stride: int) -> NDArray[np.bool_]:
+    """Nodes every `stride` around the best of each map, closer than `reach`, shape (a, b)."""
+    shape = maps.shape[1:]
+    close = np.zeros(shape, dtype=bool)
+    steps = np.arange(-(reach - 1) // stride * stride, reach, stride)
+    for row in maps:
+        best = np.unravel_index(int(np.nanargmin(row)), shape)
+        near = [
+            np.unique(np.clip(int(k) + steps, 0, n - 1)) for k, n in zip(best, shape, strict=True)
+        ]
+        close[np.ix_(*near)] = True
+    return close

@@ -310,6 +310,7 @@ def _report(
         *bounds.flags,
         *amplitude_flags(per_amplitude),
         *_missing(goal, band),
+        *goal.doubts,
     )
     covariance = bounds.covariance
     gains = JointGains(

@@ -67,13 +67,16 @@ class Question:
     def same_as(self, other: Question, robot: Robot) -> bool:
         """True if both lead to the same simulation of the same original joint.
 
-        The pose of the joints of the chain must agree as well, mirrored.
+        One may rest longer than the other at the end. The pose of the joints of the chain must
+        agree as well, mirrored.
         """
         mine, theirs = self.mirrored(robot), other.mirrored(robot)
+        if mine[0] != theirs[0]:
+            return False
+        short, long = sorted((mine[2], theirs[2]), key=len)
         return (
-            mine[0] == theirs[0]
-            and len(mine[2]) == len(theirs[2])
-            and bool(np.abs(mine[2] - theirs[2]).max() < _SAME)
+            bool(np.abs(long[: len(short)] - short).max() < _SAME)
+            and bool(np.abs(long[len(short) :] - short[-1]).max(initial=0.0) < _SAME)
             and np.allclose(original_pose(self, robot), original_pose(other, robot), atol=1e-3)
         )
 
@@ -162,7 +165,10 @@ def question(
     if on_clock:
         ticks = int(np.ceil((end - start) / tick))
         middle = start + (np.arange(ticks) + 0.5) * tick
-        steps = np.repeat(held(part.time, command, middle), robot.decimation)
+        values = held(part.time, command, middle)
+        early = _early_ticks(values)
+        start -= early * tick
+        steps = np.repeat(np.concatenate([np.full(early, values[0]), values]), robot.decimation)
     else:
         count = int(np.ceil((end - start) / robot.timestep_s))
         middle = start + (np.arange(count) + 0.5) * robot.timestep_s
@@ -178,12 +184,29 @@ def question(
     )
 
 
+def _early_ticks(values: Array) -> int:
+    """Ticks to begin before the log, so that repeats of a question begin alike.
+
+    Whether the log caught the tick it began in is chance; a rest before the first change is
+    therefore lengthened to a multiple of five ticks. A log that begins in motion is left alone.
+    """
+    changes = np.nonzero(np.diff(values) != 0.0)[0]
+    rest = int(changes[0]) + 1 if len(changes) else len(values)
+    # Plans rest for multiples of five ticks (0.1 s) give or take one: keep clear of those.
+    return 0 if rest < 2 else -(-(rest + 2) // 5) * 5 - rest
+
+
 def _pose(log: SweepLog, joint: str, robot: Robot) -> Array:
-    """Pose of every joint of the robot: the log's, or the default where the log has none."""
+    """Pose of every joint of the robot.
+
+    The log's; where it has none, the first command of each of its joints, and the default
+    position of joints that it does not have.
+    """
     pose = np.array([j.default_position for j in robot.joints])
+    logged = log.command[0] if log.pose is None else log.pose
     for i, name in enumerate(robot.joint_names):
-        if log.pose is not None and name in log.joints:
-            pose[i] = log.pose[log.column(name)]
+        if name in log.joints and log.unit(name) == "rad":
+            pose[i] = logged[log.column(name)]
     for name in robot.joint(joint).clamped:
         default = robot.joint(name).default_position
         stood = pose[robot.joint_names.index(name)]

@@ -159,23 +159,20 @@ class Bench:
         model.dof_frictionloss[self.index] = 0.0
         return model
 
-    def _equilibrium(self, pose: Array, stiffness: Array) -> Array:
-        """Positions at rest with the command at the pose: what gravity leaves, shape (b, chain)."""
+    def _equilibrium(self, target: Array, stiffness: float) -> Array:
+        """Positions at rest with the drives at a target: what gravity leaves, shape (chain,)."""
         data = self._data[0]
-        out = np.empty((len(stiffness), len(pose)))
         gains = self._stiffness.copy()
-        for value in np.unique(stiffness):
-            gains[self.index] = value
-            mujoco.mj_resetData(self.model, data)
-            data.qpos[:] = pose
-            for _ in range(_SAG_ROUNDS):
-                mujoco.mj_kinematics(self.model, data)
-                mujoco.mj_comPos(self.model, data)
-                mujoco.mj_comVel(self.model, data)
-                mujoco.mj_rne(self.model, data, 0, data.qfrc_bias)
-                data.qpos[:] = pose - data.qfrc_bias / gains
-            out[stiffness == value] = data.qpos
-        return out
+        gains[self.index] = stiffness
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:] = target
+        for _ in range(_SAG_ROUNDS):
+            mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_comPos(self.model, data)
+            mujoco.mj_comVel(self.model, data)
+            mujoco.mj_rne(self.model, data, 0, data.qfrc_bias)
+            data.qpos[:] = target - data.qfrc_bias / gains
+        return np.array(data.qpos)
 
     def run(
         self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
@@ -192,7 +189,6 @@ class Bench:
         Yields:
             Which simulations, and the position about the pose at the start of each step [rad],
             shape (chunk, steps). The array is reused: take what is needed before going on.
-            A simulation that diverged is NaN from there on.
         """
         total, steps = len(stiffness), len(commands[0])
         size = min(self.chunk, total)
@@ -202,30 +198,25 @@ class Bench:
         sensor = np.empty((size, steps, self.model.nsensordata))
         width = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         initial = np.zeros((size, width))
+        centre = np.empty(size)
         shared = len(commands) == 1 and len(poses) == 1
-        drive = self.joint.drive
+        rest: dict[float, Array] = {}
         for begin in range(0, total, size):
             part = slice(begin, min(begin + size, total))
             n = part.stop - part.start
-            for row in range(n):
-                i = begin + row
-                set_drive_gains(self._models[row], self.joint.name, drive, stiffness[i], damping[i])
-                if begin == 0 or not shared:
-                    pose = poses[0 if len(poses) == 1 else i]
-                    control[row][:, self._ctrl] = pose
-                    control[row][:, self._ctrl[self.index]] += commands[
-                        0 if len(commands) == 1 else i
-                    ]
-            if shared:
-                rest = self._equilibrium(poses[0], stiffness[part])
-            else:
-                rest = np.concatenate(
-                    [
-                        self._equilibrium(poses[0 if len(poses) == 1 else i], stiffness[i : i + 1])
-                        for i in range(part.start, part.stop)
-                    ]
+            for row, i in enumerate(range(part.start, part.stop)):
+                kp = float(stiffness[i])
+                set_drive_gains(
+                    self._models[row], self.joint.name, self.joint.drive, kp, float(damping[i])
                 )
-            initial[:n, 1 : 1 + self.model.nq] = rest
+                if not shared or begin == 0:
+                    pose = poses[0 if len(poses) == 1 else i]
+                    centre[row] = pose[self.index]
+                    control[row][:, self._ctrl] = pose
+                    control[row][:, self.actuator] += commands[0 if len(commands) == 1 else i]
+                if not shared or kp not in rest:
+                    rest[kp] = self._equilibrium(control[row][0, self._ctrl], kp)
+                initial[row, 1 : 1 + self.model.nq] = rest[kp]
             before = time.perf_counter()
             self._pool.rollout(
                 self._models[:n],
@@ -239,14 +230,7 @@ class Bench:
             )
             self.count.seconds += time.perf_counter() - before
             self.count.steps += n * steps
-            position = sensor[:n, :, self._sensor]
-            centre = np.array(
-                [
-                    poses[0 if len(poses) == 1 else i][self.index]
-                    for i in range(part.start, part.stop)
-                ]
-            )
-            yield part, position - centre[:, None]
+            yield part, sensor[:n, :, self._sensor] - centre[:n, None]
 
 
 def simulate(
@@ -263,7 +247,7 @@ def simulate(
 ) -> Array:
     """Position of the asked joint in the training simulator, for many gain pairs.
 
-    The simulation begins at rest where gravity leaves the joint with the command at the pose.
+    The simulation begins at rest where gravity leaves the joint with its first command.
 
     Args:
         robot: The robot.

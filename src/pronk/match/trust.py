@@ -19,10 +19,12 @@ COHERENCE_MIN = 0.95
 _SEGMENT_S = 5.0
 _EXCITED = 1e-3
 """Power of the command, over its largest, from which on a frequency counts as asked."""
-_OCTAVE = 2.0
-"""A recording says where coherence ends only if it was coherent over at least an octave: a sweep
-does, a few lines or a motion that mostly sticks do not."""
+_WIDE = 8.0
+"""A recording says where coherence ends only if it was coherent over three octaves below: a sweep
+does; a few lines or a motion that mostly sticks do not."""
 _WINDOW_S = 2.0
+_AT_LIMIT = 0.25
+"""Share of its power that a sine at the limit keeps, filtered forwards and backwards."""
 
 
 def trusted_frequency(time: Array, command: Array, position: Array) -> float:
@@ -53,7 +55,7 @@ def trusted_frequency(time: Array, command: Array, position: Array) -> float:
     if len(fallen) == 0:
         return float("inf")
     last = hz[first + fallen[0] - 1]
-    return float(hz[first + fallen[0]]) if last >= _OCTAVE * hz[first] else float("inf")
+    return float(hz[first + fallen[0]]) if last >= _WIDE * hz[first] else float("inf")
 
 
 def trusted_samples(log: SweepLog, joint: str) -> tuple[NDArray[np.bool_], float]:
@@ -64,8 +66,8 @@ def trusted_samples(log: SweepLog, joint: str) -> tuple[NDArray[np.bool_], float
         joint: The joint.
 
     Returns:
-        Mask, shape (n,): false where, over two seconds, more than half of the command's power
-        lies above the trusted frequency; and that frequency [Hz].
+        Mask, shape (n,): false where, over two seconds, the command is mostly above the trusted
+        frequency; and that frequency [Hz].
     """
     column = log.column(joint)
     command = log.command[:, column]
@@ -78,4 +80,4 @@ def trusted_samples(log: SweepLog, joint: str) -> tuple[NDArray[np.bool_], float
     window = np.ones(max(round(_WINDOW_S * rate), 1))
     share = signal.fftconvolve(high**2, window, "same")
     whole = signal.fftconvolve(about**2, window, "same")
-    return np.asarray(share <= 0.5 * np.maximum(whole, 0.0)), limit
+    return np.asarray(share <= _AT_LIMIT * np.maximum(whole, 0.0)), limit

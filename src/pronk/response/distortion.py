@@ -1,10 +1,15 @@
-"""Third harmonic: the friction detector.
+"""What the position holds that a linear joint would not: the friction detector.
 
 A linear joint asked at f answers at f. Dry friction is odd in the velocity, so it answers at 3 f as
-well, the more the smaller the motion. Even distortion (gravity, a bent cable) does not show there.
+well, the more the smaller the motion; even distortion (gravity, a bent cable) does not show there.
+For the knee of the Mini Cheetah at 0.25 rad the ratio is 0.0001 without friction and 0.0033 for
+every 0.05 N m of it, inversely to the amplitude. A multisine shows odd and even distortion at the
+odd and even lines that it left silent.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +18,7 @@ from scipy.integrate import cumulative_trapezoid
 from pronk.errors import LogError
 from pronk.response.estimator import Estimator
 from pronk.response.grid import analysis_rate
+from pronk.response.periodic import read_periods
 from pronk.response.steps import read_steps
 from pronk.sweep.log import SweepLog
 
@@ -94,7 +100,7 @@ def third_harmonic(log: SweepLog, joint: str, band_hz: tuple[float, float] = LOW
 
     Returns:
         RMS at 3 f over RMS at f; NaN where the log does not tell the frequency, or for multisines
-        (see `periodic.distortion`).
+        (see `distortion`).
     """
     if log.frequency is None or not log.segments:
         return float("nan")
@@ -111,4 +117,53 @@ def third_harmonic(log: SweepLog, joint: str, band_hz: tuple[float, float] = LOW
         return float("nan")
     return third_harmonic_chirp(
         log.time, log.position[:, log.column(joint)], log.frequency, band_hz
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distortion:
+    """Size of what the position holds beside the linear response, RMS over lines.
+
+    All relative to the RMS of the position over the lines asked.
+    """
+
+    even: float
+    """At even lines that were not asked, noise taken off; NaN if there are none."""
+    odd: float
+    """At odd lines that were not asked, noise taken off; NaN if there are none."""
+    noise: float
+    """Noise of the average over periods at the lines asked."""
+
+
+def distortion(log: SweepLog, joint: str, estimator: Estimator) -> Distortion:
+    """Nonlinear distortion of the answer to one multisine.
+
+    Args:
+        log: One question (`SweepLog.cut`).
+        joint: The joint asked.
+        estimator: Gives the band.
+
+    Raises:
+        LogError: As `read_periods`.
+    """
+    read = read_periods(log, joint, estimator)
+    asked = read.asked
+    mean = read.position.mean(axis=0)
+    count = len(read.position)
+    variance = (np.abs(read.position - mean) ** 2).sum(axis=0) / (count * (count - 1))
+    reference = float(np.mean(np.abs(mean[asked]) ** 2))
+    low, high = np.flatnonzero(asked)[[0, -1]]
+    between = np.arange(len(asked))
+    silent = ~asked & (between >= low) & (between <= high)
+
+    def share(which: NDArray[np.bool_]) -> float:
+        if not which.any():
+            return float("nan")
+        power = float(np.mean(np.abs(mean[which]) ** 2 - variance[which]))
+        return float(np.sqrt(max(power, 0.0) / reference))
+
+    return Distortion(
+        even=share(silent & (read.lines % 2 == 0)),
+        odd=share(silent & (read.lines % 2 == 1)),
+        noise=float(np.sqrt(np.mean(variance[asked]) / reference)),
     )

@@ -41,7 +41,7 @@ class FrequencyResponse:
     coherence: Array
     """Magnitude-squared coherence in 0..1, over all segments of all repeats, shape (f,)."""
     averages: Array
-    """Effective number of independent averages, shape (f,)."""
+    """Effective number of independent averages that the coherence rests on, shape (f,)."""
     repeats: ComplexArray
     """Response of each repeat by itself, shape (repeats, f): the unit of uncertainty."""
     estimator: str
@@ -79,6 +79,10 @@ class FrequencyResponse:
         then counted as it is); with fewer, the coherence formula
         `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
         eq. 9.90), which takes noise for white inside a bin.
+
+        It is the random error alone. Windows bias an estimate as well (0.3 % of gain at most for
+        the default settings and a chirp of 0.1 to 25 Hz in 20 s), alike for a measured and a
+        simulated joint that go through the same estimator.
         """
         n = len(self.repeats)
         if n >= 3:

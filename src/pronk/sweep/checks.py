@@ -1,4 +1,4 @@
-"""Whether a joint's answer can be believed: did it move, freely, in radians, and which one is it."""
+"""Whether a joint's answer can be believed: did it move, freely, in radians, and is it known."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ _UNMOVED = 0.01
 joint's bandwidth, where it follows one to one."""
 _NEAR_END = 0.005
 """Share of the position's travel that counts as being at its end."""
-_COMMAND_MOVES = 0.1
-"""Share of its own travel that the command must make meanwhile."""
+_MOVES_ON = 0.15
+"""Share of its own travel that the command must move outward meanwhile. A joint that friction holds
+at its turning point stands still while the command comes back, not while it moves on."""
 _LONG_RUN_S = 0.1
 """Time at an end from which on it is not the turning point of an oscillation [s]."""
 _MOSTLY = 0.05
@@ -44,7 +45,8 @@ class Motion:
     step: float
     """Smallest change of position that occurs: the encoder's step, or noise [rad]."""
     at_end: float
-    """Share of the time that the joint lies at an end of its travel while the command moves on."""
+    """Share of the time that the joint lies at an end of its travel while the command moves on
+    outward."""
 
 
 def motion(log: SweepLog, joint: str) -> Motion:
@@ -59,11 +61,10 @@ def motion(log: SweepLog, joint: str) -> Motion:
     travel, asked = float(np.ptp(position)), float(np.ptp(command))
     at_end = 0.0
     if travel > 0.0 and asked > 0.0:
-        for near in (
-            position >= position.max() - _NEAR_END * travel,
-            position <= position.min() + _NEAR_END * travel,
-        ):
-            at_end += _stuck(log.time, near, command, _COMMAND_MOVES * asked)
+        for outward in (1.0, -1.0):
+            out = outward * position
+            near = out >= out.max() - _NEAR_END * travel
+            at_end += _stopped(log.time, near, outward * command, _MOVES_ON * asked)
     return Motion(
         travel=travel,
         asked=asked,
@@ -72,13 +73,14 @@ def motion(log: SweepLog, joint: str) -> Motion:
     )
 
 
-def _stuck(time: Array, near: NDArray[np.bool_], command: Array, moves: float) -> float:
-    """Time in runs of `near` that are long and through which the command moves [s]."""
+def _stopped(time: Array, near: NDArray[np.bool_], command: Array, outward: float) -> float:
+    """Time in long runs of `near` during which the command grows by more than `outward` [s]."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], near.astype(np.int8), [0]))))
     total = 0.0
     for first, stop in edges.reshape(-1, 2):
         length = float(time[stop - 1] - time[first])
-        if length >= _LONG_RUN_S and float(np.ptp(command[first:stop])) > moves:
+        grows = float(command[first:stop].max() - command[first])
+        if length >= _LONG_RUN_S and grows > outward:
             total += length
     return total
 
@@ -129,9 +131,8 @@ def check_radians(log: SweepLog, joint: str) -> None:
     farthest = float(max(np.abs(position).max(), np.abs(command).max()))
     if peak <= LARGEST_COMMAND and farthest <= LARGEST_POSITION:
         return
-    what = (
-        f"its command swings by {peak:.3g}" if peak > LARGEST_COMMAND else f"it reaches {farthest:.3g}"
-    )
+    swings = peak > LARGEST_COMMAND
+    what = f"its command swings by {peak:.3g}" if swings else f"it reaches {farthest:.3g}"
     raise LogError(
         f"{log.source or 'log'}: {joint} is said to be in radians and {what}, more than a joint "
         "turns; the file is probably in degrees (unit='deg')."

@@ -125,6 +125,8 @@ class Forecast:
             rest: Position of the joint in its pose [rad].
         """
         low, high = self.range
+        if not low < rest < high:
+            return 0.0
         shares = [
             (high - rest) / (self.highest - rest) if self.highest > high else 1.0,
             (rest - low) / (rest - self.lowest) if self.lowest < low else 1.0,

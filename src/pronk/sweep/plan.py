@@ -161,7 +161,7 @@ class SweepPlan:
         rest = dict(zip(self.robot.joint_names, self.pose, strict=True))
 
         def factor(share: float) -> float:
-            """1 if this share of the amplitude fits, else what it would have to shrink by."""
+            """1 if this share of the amplitude fits, 0 if none can, else by what to shrink it."""
             signals = tuple(s.with_amplitude(s.amplitude * share) for s in ask.signals)
             quieter = Ask(joints=ask.joints, signals=signals, clamped=ask.clamped)
             ends = _forecast_ask(
@@ -175,14 +175,17 @@ class SweepPlan:
             )
             if not any(f.breaches() for f in ends):
                 return 1.0
+            linear = min(f.shrink(rest[f.joint]) for f in ends)
             # A saturated drive is far from linear, so never less than half at a time.
-            return min(max(min(f.shrink(rest[f.joint]) for f in ends), 0.5), 0.98)
+            return float(np.clip(linear, 0.5, 0.98)) if linear > 0.0 else 0.0
 
         share, too_much = 1.0, 1.0
         for _ in range(_FIT_ROUNDS):
             shrink = factor(share)
             if shrink == 1.0:
                 break
+            if shrink == 0.0:
+                return 0.0
             too_much, share = share, share * shrink
         else:
             return 0.0

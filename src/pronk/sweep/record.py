@@ -97,13 +97,19 @@ class _Session:
         self.plan = plan
         self.limits = Limits.of(robot)
         self.tick = 1.0 / plan.rate_hz
-        self.now = machine.latest().time
+        self._start = machine.latest().time
+        self._ticks = 0
         self.target = machine.latest().position.copy()
         self._sent: list[tuple[float, Array, float, int]] = []
         self._waiting: list[State] = []
         self._half = 0.0
         self._writer: McapLogWriter | None = None
         self._columns: NDArray[np.intp] = np.arange(len(robot.joints))
+
+    @property
+    def now(self) -> float:
+        """The present tick on the machine's clock, counted so that rounding never adds up [s]."""
+        return self._start + self._ticks * self.tick
 
     def log_to(self, writer: McapLogWriter, columns: Sequence[int]) -> None:
         """Log what follows."""
@@ -118,8 +124,7 @@ class _Session:
             Command(position=target, stiffness=self.plan.stiffness, damping=self.plan.damping)
         )
         self._sent = [*self._sent[-3:], (self.now, target[self._columns], frequency, segment)]
-        # Ticks are counted from the first, so that rounding never adds up.
-        self.now += self.tick
+        self._ticks += 1
         states = self.machine.wait(self.now)
         if not states:
             raise HardwareError(

@@ -106,7 +106,8 @@ def check_increasing(time: Array, where: str, row: Callable[[int], str]) -> None
     if len(time) < 2:
         raise LogError(f"{where}: {len(time)} samples; a log needs at least 2.")
     if not np.isfinite(time).all():
-        raise LogError(f"{where}: the timestamp in {row(int(np.argmin(np.isfinite(time))))} is missing.")
+        lost = row(int(np.argmin(np.isfinite(time))))
+        raise LogError(f"{where}: the timestamp in {lost} is missing or not a number.")
     steps = np.diff(time)
     if (steps > 0.0).all():
         return
@@ -162,12 +163,14 @@ def check_claim(timing: Timing, where: str, claimed_hz: float) -> None:
         LogError: Gives both.
     """
     if not (np.isfinite(claimed_hz) and claimed_hz > 0.0):
-        raise LogError(f"{where}: a rate of {claimed_hz} Hz was claimed; expected a positive number.")
+        raise LogError(
+            f"{where}: a rate of {claimed_hz} Hz is claimed; expected a positive number."
+        )
     # Lost samples do not make the clock slow.
     measured = (timing.samples + timing.lost - 1) / timing.duration_s
     if abs(measured / claimed_hz - 1.0) > RATE_TOLERANCE:
         late = abs(timing.samples / claimed_hz - timing.samples / measured)
         raise LogError(
             f"{where}: {claimed_hz:g} Hz is claimed and {measured:.2f} Hz measured "
-            f"({late:.2f} s apart by the end); leave the claim out, the measured timestamps are used."
+            f"({late:.2f} s apart by the end); leave the claim out, the measured stamps are used."
         )

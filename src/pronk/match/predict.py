@@ -1,0 +1,257 @@
+"""Replay a log that the fit never saw, with naive and with matched gains.
+
+The commands of the log go to the training simulator, held from each measured timestamp to the
+next, and the simulated position is read at the measured timestamps. The naive column is the very
+same simulation with the gains on the real drive (the log's, or else the robot's published
+figures) put into the simulator, with no delay. Neither column gets a zero offset: an encoder that
+is off costs both the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from pronk.errors import LogError
+from pronk.match.arm_match import drives_of
+from pronk.match.arm_simulation import ArmBench, JointDrive, held_mean, moves_together
+from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.question import Question, question
+from pronk.match.simulate import simulate
+from pronk.robots.robot import Robot
+from pronk.sweep.log import Segment, SweepLog
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPrediction:
+    """One joint's answer to a log, measured and simulated, at the log's timestamps."""
+
+    joint: str
+    time: Array
+    """Instants at which the joint was asked, all questions in a row [s], shape (n,)."""
+    command: Array
+    """Position command in force [rad], shape (n,)."""
+    measured: Array
+    """[rad], shape (n,)."""
+    naive: Array
+    """Simulated with the gains of the real drive [rad], shape (n,)."""
+    matched: Array
+    """Simulated with the matched gains [rad], shape (n,)."""
+    signal: str = "unknown"
+    """Kind of the signal that was replayed."""
+    unit: str = "rad"
+
+    @property
+    def rmse_naive(self) -> float:
+        """Root mean square of simulated less measured [rad]."""
+        return rmse(self.naive, self.measured)
+
+    @property
+    def rmse_matched(self) -> float:
+        """Root mean square of simulated less measured [rad]."""
+        return rmse(self.matched, self.measured)
+
+    @property
+    def r2_naive(self) -> float:
+        """Share of the measured variance that the simulation explains."""
+        return r2(self.naive, self.measured)
+
+    @property
+    def r2_matched(self) -> float:
+        """Share of the measured variance that the simulation explains."""
+        return r2(self.matched, self.measured)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """All joints of one log."""
+
+    joints: tuple[JointPrediction, ...]
+    source: str
+    virtual: bool
+    excluded: Mapping[str, str] = field(default_factory=dict)
+    """Joints that moved and were not predicted, and why."""
+
+
+def predict(log: SweepLog, robot: Robot, gains: MatchedGains, *, threads: int = 2) -> Prediction:
+    """Simulate a log with naive and with matched gains.
+
+    Where several joints move at once the whole arm is simulated; otherwise each question to each
+    joint by itself, the rest held as on the bench.
+
+    Args:
+        log: What to replay; any signal.
+        robot: The robot.
+        gains: Matched gains of the joints to replay.
+        threads: Threads of the simulator.
+
+    Raises:
+        LogError: The log asks no joint that has matched gains, or the robots differ.
+    """
+    if gains.robot != robot.name:
+        raise LogError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    return (_arm if moves_together(log) else _bench)(log, robot, gains, threads)
+
+
+def rmse(simulated: Array, measured: Array) -> float:
+    """Root mean square difference."""
+    return float(np.sqrt(np.mean((simulated - measured) ** 2)))
+
+
+def r2(simulated: Array, measured: Array) -> float:
+    """One less the share of the measured variance that is left over; NaN for a still joint."""
+    spread = float(np.var(measured))
+    if spread == 0.0:
+        return float("nan")
+    return float(1.0 - np.mean((simulated - measured) ** 2) / spread)
+
+
+def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
+    """The whole arm at once."""
+    matched = drives_of(robot, gains)
+    with ArmBench(robot, [log], threads=threads) as bench:
+        naive = {name: _on_drive(log, robot, name) for name in bench.joints}
+        (answer,), (plain,) = bench.run([matched, naive])
+        excluded = dict(bench.excluded)
+        names = bench.joints
+    kinds = {name: s.kind for s in log.segments for name in s.joints}
+    out = []
+    for i, name in enumerate(names):
+        if name not in gains.joints:
+            excluded[name] = _without_gains(name)
+            continue
+        column = log.column(name)
+        out.append(
+            JointPrediction(
+                joint=name,
+                time=log.time,
+                command=log.command[:, column],
+                measured=log.position[:, column],
+                naive=plain[:, i],
+                matched=answer[:, i],
+                signal=kinds.get(name, "unknown"),
+            )
+        )
+    return _prediction(log, out, excluded)
+
+
+def _bench(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
+    """One joint after the other, question by question."""
+    out, excluded = [], {}
+    segments = log.segments or _single(log)
+    asked = {name for segment in segments for name in segment.joints}
+    for name in robot.joint_names:
+        if name not in asked:
+            continue
+        if name not in gains.joints:
+            excluded[name] = _without_gains(name)
+            continue
+        mine = [segment for segment in segments if name in segment.joints]
+        parts = [
+            _replay(log.cut(one), one, name, robot, gains.joints[name], threads)
+            for one in sorted(mine, key=lambda segment: segment.start)
+        ]
+        joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+        out.append(
+            JointPrediction(
+                joint=name,
+                time=joined[0],
+                command=joined[1],
+                measured=joined[2],
+                naive=joined[3],
+                matched=joined[4],
+                signal=mine[0].kind,
+            )
+        )
+    return _prediction(log, out, excluded)
+
+
+def _replay(
+    part: SweepLog,
+    segment: Segment,
+    name: str,
+    robot: Robot,
+    gains: JointGains,
+    threads: int,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Time, command, measured, naive and matched position of one question."""
+    asked = question(part, segment, name, robot)
+    plain = _on_drive(part, robot, name)
+    naive = simulate(robot, asked, plain.stiffness, plain.damping, threads=threads)[0]
+    matched = simulate(
+        robot,
+        _delayed(asked, gains.delay_s),
+        gains.stiffness,
+        gains.damping,
+        armature=gains.armature,
+        frictionloss=None if np.isnan(gains.frictionloss) else gains.frictionloss,
+        threads=threads,
+    )[0]
+    # The last state is that at the start of the last step: no sample may lie beyond it.
+    inside = (part.time >= asked.time[0]) & (part.time <= asked.time[-1])
+    time, column = part.time[inside], part.column(name)
+    return (
+        time,
+        part.command[inside, column],
+        part.position[inside, column],
+        np.asarray(CubicSpline(asked.time, naive)(time)),
+        np.asarray(CubicSpline(asked.time, matched)(time)),
+    )
+
+
+def _delayed(asked: Question, delay: float) -> Question:
+    """The question with its command delayed."""
+    if delay == 0.0:
+        return asked
+    edges = np.append(asked.time, asked.time[-1] + asked.timestep) - delay
+    return Question(**{**vars(asked), "command": held_mean(asked.time, asked.command, edges)})
+
+
+def _on_drive(log: SweepLog, robot: Robot, name: str) -> JointDrive:
+    """Gains on the real drive: the log's if it has them, else the robot's published ones."""
+    published = JointDrive.published(robot, name)
+    column = log.column(name)
+    return JointDrive(
+        stiffness=published.stiffness if log.stiffness is None else float(log.stiffness[column]),
+        damping=published.damping if log.damping is None else float(log.damping[column]),
+        armature=published.armature,
+        frictionloss=published.frictionloss,
+    )
+
+
+def _single(log: SweepLog) -> tuple[Segment, ...]:
+    """The whole log as one question to those whose command moves."""
+    moving = np.ptp(log.command, axis=0) > 0.0
+    names = tuple(name for name, moves in zip(log.joints, moving, strict=True) if moves)
+    if not names:
+        return ()
+    return (
+        Segment(
+            kind="unknown",
+            joints=names,
+            start=float(log.time[0]),
+            stop=float(log.time[-1]),
+            amplitude=float("nan"),
+        ),
+    )
+
+
+def _without_gains(name: str) -> str:
+    return f"{name} is left out: the gains have no entry for it; match a log in which it is asked."
+
+
+def _prediction(
+    log: SweepLog, joints: list[JointPrediction], excluded: dict[str, str]
+) -> Prediction:
+    if not joints:
+        reasons = " ".join(excluded.values()) or "no joint is asked in it."
+        raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
+    return Prediction(
+        joints=tuple(joints), source=log.source, virtual=log.virtual, excluded=excluded
+    )

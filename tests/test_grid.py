@@ -1,0 +1,217 @@
+"""The paper's grid search on logs whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pronk.errors import IdentifiabilityError
+from pronk.match.ask import Job, Simulator
+from pronk.match.grid import (
+    DIVERGED_DB,
+    GridSearch,
+    alike,
+    axes,
+    coarse_search,
+    mean_square,
+    search,
+    weights,
+)
+from pronk.match.quick import quick_search
+from pronk.match.rehearse import Ask, rehearse
+from pronk.match.settings import MatchSettings
+from pronk.match.target import Target, merged, targets
+from pronk.response.estimator import Estimator
+from pronk.robots import load_robot
+from pronk.sweep.signals import Chirp
+
+ROBOT = load_robot("mini_cheetah")
+SETTINGS = MatchSettings()
+
+TABLE_1 = {
+    "hip_roll": ((20.6, 0.492), (18.1, 0.516), (18.5, 0.431), (21.0, 0.490)),
+    "hip_pitch": ((16.5, 0.382), (17.7, 0.406), (16.9, 0.382), (18.9, 0.431)),
+    "knee": ((21.8, 0.541), (22.0, 0.523), (22.2, 0.553), (21.8, 0.553)),
+}
+"""The paper's Table I, legs FR FL HR HL."""
+
+
+def truth(joint: str) -> tuple[float, float]:
+    leg, _, group = joint.partition("_")
+    return TABLE_1[group][("FR", "FL", "HR", "HL").index(leg)]
+
+
+def known(joint: str, *, length_s: float = 20.0, settings: MatchSettings = SETTINGS) -> Target:
+    ask = Ask(offsets=Chirp(length_s=length_s).samples())
+    return targets(rehearse(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, settings)[0]
+
+
+def nearest(grid: GridSearch, gains: tuple[float, float]) -> tuple[int, int]:
+    return (
+        int(np.argmin(np.abs(grid.stiffness - gains[0]))),
+        int(np.argmin(np.abs(grid.damping - gains[1]))),
+    )
+
+
+def test_the_axes_are_those_of_the_paper() -> None:
+    stiffness, damping = axes(ROBOT)
+    assert len(stiffness) == len(damping) == 50
+    assert (stiffness[0], stiffness[-1]) == (13.0, 27.0)
+    assert (damping[0], damping[-1]) == pytest.approx((0.1, 0.7))
+    assert np.allclose(np.diff(stiffness), 14.0 / 49)
+
+
+def test_table_1_is_found_again_by_every_joint() -> None:
+    """12 of 12: the paper's gains as truth, a log without noise (the bars of the match)."""
+    goals = [known(joint.name) for joint in ROBOT.joints]
+    with Simulator(ROBOT) as simulator:
+        found = quick_search(simulator, goals, *axes(ROBOT))
+    for goal, one in zip(goals, found, strict=True):
+        stiffness, damping = truth(goal.joint)
+        assert one.grid.cell == nearest(one.grid, (stiffness, damping)), goal.joint
+        assert one.fit.stiffness == pytest.approx(stiffness, rel=0.005)
+        assert one.fit.damping == pytest.approx(damping, rel=0.01)
+        assert one.fit.settled
+        assert not one.grid.at_edge
+
+
+def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
+    """All 2,500 pairs simulated, two mirror-image knees at once (a short chirp to 18 Hz)."""
+    quick = MatchSettings(estimator=Estimator(segment_s=2.0))
+    ask = Ask(offsets=Chirp(length_s=4.0, stop_hz=18.0).samples(), settle_s=0.2)
+    goals = [
+        targets(rehearse(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, quick)[0]
+        for joint in ("FR_knee", "HL_knee")
+    ]
+    assert len(alike(goals, ROBOT)) == 1
+    with Simulator(ROBOT) as simulator:
+        found = search(simulator.bench("FR_knee"), goals, *axes(ROBOT))
+        assert simulator.count.steps == 2500 * max(goal.steps for goal in goals)
+    for goal, one in zip(goals, found, strict=True):
+        assert one.error.shape == (50, 50)
+        assert one.cell == nearest(one, truth(goal.joint))
+        assert one.error_db < 0.1
+        # Far off the error is large: the map has one valley.
+        assert np.sqrt(one.error[0, 0]) > 1.0
+
+
+def test_mirror_images_share_a_simulation() -> None:
+    goals = [known(joint.name, length_s=8.0) for joint in ROBOT.joints]
+    groups = [{goal.joint for goal in group} for group in alike(goals, ROBOT)]
+    # Left rolls were asked towards the same side as right ones: mirrored, that is the other way.
+    assert groups == [
+        {"FR_hip_roll", "HR_hip_roll"},
+        {"FR_hip_pitch", "FL_hip_pitch", "HR_hip_pitch", "HL_hip_pitch"},
+        {"FR_knee", "FL_knee", "HR_knee", "HL_knee"},
+        {"FL_hip_roll", "HL_hip_roll"},
+    ]
+
+
+def test_the_edge_of_the_grid_is_noticed() -> None:
+    ask = Ask(offsets=Chirp(length_s=8.0).samples())
+    log = rehearse(ROBOT, "FR_knee", [ask], 32.0, 0.6)
+    goal = targets(log, "FR_knee", ROBOT, SETTINGS)[0]
+    with Simulator(ROBOT) as simulator:
+        found = search(simulator.bench("FR_knee"), [goal], *axes(ROBOT, 8))[0]
+    assert found.at_edge
+    assert found.gains[0] == 27.0
+
+
+def test_the_coarse_search_finds_the_best_of_the_whole_grid() -> None:
+    goal = known("FR_knee", length_s=8.0)
+    stiffness, damping = axes(ROBOT, 22)
+    with Simulator(ROBOT) as simulator:
+        bench = simulator.bench("FR_knee")
+        whole = search(bench, [goal], stiffness, damping)[0]
+        coarse = coarse_search(bench, [goal], stiffness, damping)[0]
+    assert coarse.cell == whole.cell
+    looked = np.isfinite(coarse.error)
+    assert looked.mean() < 0.3
+    np.testing.assert_allclose(coarse.error[looked], whole.error[looked], rtol=1e-12)
+
+
+def test_without_rotor_inertia_no_pair_fits_a_knee() -> None:
+    """Paper F13: the best error is at least five times the matched one."""
+    goal = known("FR_knee", length_s=10.0)
+    grid = axes(ROBOT)
+    with Simulator(ROBOT) as simulator:
+        matched = quick_search(simulator, [goal], *grid)[0]
+    with Simulator(ROBOT, armature=0.0) as simulator:
+        bench = simulator.bench("FR_knee")
+        assert bench.model.dof_armature[bench.index] == 0.0
+        zero = coarse_search(bench, [goal], *grid)[0]
+    assert zero.error_db > 5.0 * matched.grid.error_db
+    assert zero.error_db > 5.0
+
+
+def test_the_error_is_the_mean_square_in_decibels() -> None:
+    goal = known("FR_hip_pitch", length_s=8.0)
+    measured = goal.measured.response[goal.inside]
+    flat = weights(goal, "none")
+    assert flat.sum() == pytest.approx(1.0)
+    assert mean_square(goal, measured * 10 ** (0.5 / 20), flat) == pytest.approx(0.25)
+    # Phase is disregarded (F9).
+    turned = measured * np.exp(-1j * goal.omega * 0.01)
+    assert mean_square(goal, turned, flat) == pytest.approx(0.0, abs=1e-20)
+    dead = np.zeros_like(measured)
+    assert mean_square(goal, dead, flat) == pytest.approx(DIVERGED_DB**2)
+    broken = np.full_like(measured, np.nan)
+    assert mean_square(goal, broken, flat) == pytest.approx(DIVERGED_DB**2)
+
+
+def test_coherence_weighs_doubtful_frequencies_down() -> None:
+    goal = known("FR_hip_pitch", length_s=8.0)
+    coherence = goal.measured.coherence.copy()
+    doubtful = np.nonzero(goal.inside)[0][:5]
+    coherence[doubtful] = 0.85
+    worse = replace(goal, measured=replace(goal.measured, coherence=coherence))
+    weight = weights(worse, "coherence")
+    assert weight.sum() == pytest.approx(1.0)
+    assert weight[:5].max() < 0.2 * weight[5:].min()
+
+
+def test_the_band_is_that_of_the_joint() -> None:
+    for joint, low, high in (("FR_hip_roll", 1.0, 10.0), ("FR_knee", 0.1, 15.0)):
+        goal = known(joint, length_s=8.0)
+        hz = goal.omega / (2 * np.pi)
+        spacing = goal.measured.frequency_hz[1] - goal.measured.frequency_hz[0]
+        lowest = max(low, goal.measured.frequency_hz[0])
+        assert low - 1e-9 <= hz.min() < lowest + spacing
+        assert high - spacing < hz.max() <= high + 1e-9
+
+
+def test_an_incoherent_band_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    ask = Ask(offsets=Chirp(length_s=10.0, amplitude=0.02).samples())
+    log = rehearse(ROBOT, "FR_knee", [ask], 20.0, 0.5, noise=[0.1 * rng.standard_normal(20_000)])
+    with pytest.raises(IdentifiabilityError, match=r"FR_knee is coherent .* larger amplitude"):
+        targets(log, "FR_knee", ROBOT, SETTINGS)
+
+
+def test_repeats_in_several_logs_are_put_together() -> None:
+    goal = known("FR_knee", length_s=8.0)
+    turned = replace(
+        goal,
+        measured=replace(
+            goal.measured,
+            response=1.2 * goal.measured.response,
+            repeats=np.repeat(1.2 * goal.measured.repeats, 2, axis=0),
+        ),
+    )
+    both = merged([[goal], [turned]])
+    assert len(both) == 1
+    assert len(both[0].measured.repeats) == 3
+    expected = goal.measured.response * (1.0 + 2 * 1.2) / 3
+    np.testing.assert_allclose(both[0].measured.response, expected)
+
+
+def test_whole_and_banded_answers_agree() -> None:
+    goal = known("FL_hip_roll", length_s=8.0)
+    with Simulator(ROBOT) as simulator:
+        job = Job(goal, *truth("FL_hip_roll"))
+        whole = simulator.responses([job], whole=True)[0]
+        banded = simulator.responses([job])[0]
+    np.testing.assert_allclose(whole, goal.measured.response, rtol=1e-6)
+    np.testing.assert_allclose(banded, whole[goal.inside], rtol=3e-4)

@@ -1,0 +1,213 @@
+"""The whole match: from logs to gains, with what it says of doubtful ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from pronk.errors import IdentifiabilityError, LogError, PronkError, RobotError
+from pronk.match import gains as gains_file
+from pronk.match import result as result_file
+from pronk.match.pipeline import match_logs
+from pronk.match.rehearse import Ask, rehearse
+from pronk.match.result import MatchResult
+from pronk.match.settings import MatchSettings
+from pronk.response.estimator import Estimator
+from pronk.robots import load_robot
+from pronk.sweep.log import SweepLog
+from pronk.sweep.signals import Chirp, Multisine
+
+ROBOT = load_robot("mini_cheetah")
+QUICK = MatchSettings(
+    method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False, grid_points=25
+)
+TRUTH = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": (21.8, 0.541)}
+
+
+def log_of(joint: str, truth: tuple[float, float], *, seed: int = 0, **more: object) -> SweepLog:
+    rng = np.random.default_rng(seed)
+    asks = [
+        Ask(offsets=Chirp(length_s=8.0, amplitude=a).samples(), repeats=3) for a in (0.25, 0.125)
+    ]
+    noise = list(0.001 * rng.standard_normal((6, 6000)))
+    log = rehearse(ROBOT, joint, asks, *truth, noise=noise, **more)  # type: ignore[arg-type]
+    return replace(log, source=f"/somewhere/{joint}.mcap", sha256=f"{seed:064x}")
+
+
+@pytest.fixture(scope="module")
+def matched() -> MatchResult:
+    told: list[tuple[str, float]] = []
+    logs = [log_of(joint, gains, seed=i) for i, (joint, gains) in enumerate(TRUTH.items())]
+    result = match_logs(
+        logs,
+        ROBOT,
+        settings=replace(QUICK, zero_armature=True),
+        progress=lambda stage, share: told.append((stage, share)),
+    )
+    assert {"estimate", "quick search", "amplitudes", "zero armature"} <= {s for s, _ in told}
+    assert all(0.0 <= share <= 1.0 for _, share in told)
+    return result
+
+
+def test_the_truth_is_found_with_honest_intervals(matched: MatchResult) -> None:
+    # The robot's order, not that of the logs.
+    assert list(matched.gains.joints) == ["FR_hip_roll", "FR_knee", "FL_hip_roll"]
+    for joint, truth in TRUTH.items():
+        found = matched.gains.joints[joint]
+        assert (found.stiffness, found.damping) == pytest.approx(truth, rel=5e-3)
+        assert found.stiffness_ci95[0] < found.stiffness < found.stiffness_ci95[1]
+        assert found.damping_ci95[0] < found.damping < found.damping_ci95[1]
+        spacing = 14.0 / 24, 0.6 / 24
+        # Stiffness and damping rise together along a valley; a coarse grid may pick its next node.
+        assert abs(found.grid_stiffness - truth[0]) < 1.5 * spacing[0]
+        assert abs(found.grid_damping - truth[1]) < 1.5 * spacing[1]
+        assert found.error_db < 0.05
+        # The naive gains are those of the real drive, 17 / 0.4.
+        assert found.naive_error_db > 5 * found.error_db
+        assert found.coherence_min > 0.9
+        assert found.amplitude_spread < 0.01
+        assert found.flags == ()
+        assert found.armature == ROBOT.joint(joint).drive.armature
+        assert found.band_hz == ROBOT.joint(joint).band_hz
+
+
+def test_the_result_holds_what_the_page_draws(matched: MatchResult) -> None:
+    for joint in TRUTH:
+        one = matched.joints[joint]
+        assert [round(r.amplitude, 3) for r in one.responses] == [0.25, 0.125]
+        assert one.grid_error.shape == (25, 25)
+        count = len(one.responses[0].omega)
+        for response in (one.matched, one.naive, one.zero_armature):
+            assert response is not None
+            assert response.shape == (count,)
+            assert np.isfinite(response).all()
+        assert one.repeat_gains.shape == (3, 2)
+        assert one.amplitude_gains.shape == (2, 3)
+        inside = one.responses[0].band(*one.band_hz)
+        error = 20 * np.log10(np.abs(one.matched / one.responses[0].response))[inside]
+        assert np.sqrt(np.mean(error**2)) == pytest.approx(one.error_db, rel=0.02)
+    assert set(matched.seconds) >= {"estimate", "quick search", "zero armature"}
+
+
+def test_zero_armature_is_told_apart_where_the_data_can(matched: MatchResult) -> None:
+    knee, roll = matched.joints["FR_knee"], matched.joints["FR_hip_roll"]
+    assert knee.zero_armature_error_db > 5 * knee.error_db
+    assert any(flag.startswith("zero armature: no match") for flag in knee.flags)
+    # The rotor of a hip is light beside the leg: other gains make up for it, and pronk says so.
+    assert any("not ruled out by this joint" in flag for flag in roll.flags)
+    assert matched.gains.joints["FR_knee"].flags == ()
+
+
+def test_the_gains_name_their_simulator_logs_and_groups(matched: MatchResult) -> None:
+    gains = matched.gains
+    assert gains.robot == "mini_cheetah"
+    assert gains.virtual
+    assert gains.simulator.version == mujoco.__version__
+    assert (gains.simulator.timestep_s, gains.simulator.decimation) == (0.005, 4)
+    assert gains.logs["FR_knee.mcap"] == f"{2:064x}"
+    assert set(gains.groups) == {"hip_roll", "knee"}
+    roll = gains.groups["hip_roll"]
+    assert roll.stiffness - roll.stiffness_range <= 18.1
+    assert roll.stiffness + roll.stiffness_range >= 20.6
+
+
+def test_the_artefacts_survive_a_round_trip(matched: MatchResult, tmp_path: Path) -> None:
+    gains_file.save(tmp_path / "gains.yaml", matched.gains)
+    result_file.save(tmp_path / "match.npz", matched)
+    gains = gains_file.load(tmp_path / "gains.yaml")
+    again = result_file.load(tmp_path / "match.npz", gains)
+    assert set(gains.joints) == set(TRUTH)
+    one, other = matched.joints["FR_knee"], again.joints["FR_knee"]
+    np.testing.assert_array_equal(one.grid_error, other.grid_error)
+    np.testing.assert_array_equal(one.matched, other.matched)
+    assert one.flags == other.flags
+
+
+def test_the_grid_way_agrees_with_the_quick_way(matched: MatchResult) -> None:
+    log = log_of("FR_knee", TRUTH["FR_knee"], seed=2)
+    whole = match_logs([log], ROBOT, settings=replace(QUICK, method="grid", grid_points=25))
+    found, quick = whole.gains.joints["FR_knee"], matched.gains.joints["FR_knee"]
+    assert (found.grid_stiffness, found.grid_damping) == (
+        quick.grid_stiffness,
+        quick.grid_damping,
+    )
+    assert found.stiffness == pytest.approx(quick.stiffness, rel=1e-3)
+    assert found.damping == pytest.approx(quick.damping, rel=1e-3)
+    assert whole.grid_steps_per_second > 1e4
+    assert np.isnan(whole.joints["FR_knee"].zero_armature_error_db)
+
+
+def test_a_joint_of_another_kind_is_no_match() -> None:
+    """A knee of three times the armature: no pair on or off the grid answers alike."""
+    log = log_of("FR_knee", (17.0, 0.2), frictionloss=0.6, armature=0.02)
+    found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
+    assert any(flag.startswith(("no match", "at the edge")) for flag in found.flags)
+
+
+def test_a_small_amplitude_that_noise_drowns_is_left_out() -> None:
+    rng = np.random.default_rng(0)
+    asks = [Ask(offsets=Chirp(length_s=8.0, amplitude=a).samples()) for a in (0.25, 0.01)]
+    noise = [np.zeros(6000), 0.1 * rng.standard_normal(6000)]
+    log = rehearse(ROBOT, "FR_knee", asks, 20.0, 0.5, noise=noise)
+    found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
+    assert any(f.startswith("the answer at 0.01 rad is left out") for f in found.flags)
+    assert np.isnan(found.amplitude_spread)
+    assert found.stiffness == pytest.approx(20.0, rel=2e-3)
+
+
+def test_a_multisine_is_matched_through_its_lines() -> None:
+    signal = Multisine(amplitude=0.25)
+    ask = Ask(offsets=signal.samples(), kind="multisine", band_hz=signal.band_hz)
+    log = rehearse(ROBOT, "FR_knee", [ask], 21.0, 0.5)
+    log = replace(log, segments=tuple(replace(s, period_s=signal.period_s) for s in log.segments))
+    found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
+    assert (found.stiffness, found.damping) == pytest.approx((21.0, 0.5), rel=5e-3)
+
+
+def test_naive_gains_are_those_that_the_log_says() -> None:
+    log = replace(
+        log_of("FR_knee", (21.0, 0.5)), stiffness=np.array([21.0]), damping=np.array([0.5])
+    )
+    found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
+    assert found.naive_error_db < 0.1
+
+
+def test_bad_logs_are_refused_in_one_sentence() -> None:
+    good = log_of("FR_knee", (21.0, 0.5))
+    with pytest.raises(LogError, match="0 logs ask no joint; expected questions to some of FR_hip"):
+        match_logs([], ROBOT, settings=QUICK)
+    elbow = tuple(replace(s, joints=("elbow",)) for s in good.segments)
+    renamed = replace(good, joints=("elbow",), segments=elbow)
+    with pytest.raises(RobotError, match="no joint 'elbow'; its joints are FR_hip_roll"):
+        match_logs([renamed], ROBOT, settings=QUICK)
+    with pytest.raises(LogError, match="FR_knee moved"):
+        match_logs([replace(good, position=0 * good.position)], ROBOT, settings=QUICK)
+    with pytest.raises(LogError, match="unit 'unknown'"):
+        match_logs([replace(good, units=("unknown",))], ROBOT, settings=QUICK)
+    rng = np.random.default_rng(0)
+    drowned = replace(good, position=good.position + 2.0 * rng.standard_normal(good.position.shape))
+    with pytest.raises(IdentifiabilityError, match="FR_knee is coherent"):
+        match_logs([drowned], ROBOT, settings=QUICK)
+    steps = replace(good, segments=tuple(replace(s, kind="sine_steps") for s in good.segments))
+    with pytest.raises(LogError, match="sine steps alone"):
+        match_logs([steps], ROBOT, settings=QUICK)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("method", "magic"),
+        ("grid_weighting", "wild"),
+        ("grid_points", 2),
+        ("coherence_min", 1.0),
+        ("level", 0.0),
+        ("threads", 0),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(field: str, value: object) -> None:
+    with pytest.raises(PronkError, match=f"{field} .*expected"):
+        MatchSettings(**{field: value})  # type: ignore[arg-type]

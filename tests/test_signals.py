@@ -1,0 +1,201 @@
+"""The questions: their spectra, their ramps, and what may be asked together."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import cumulative_simpson
+
+from pronk.errors import PlanError
+from pronk.sweep.correlation import correlation, correlation_note, uncorrelated_multisines
+from pronk.sweep.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
+
+ALL: tuple[Signal, ...] = (Chirp(), LogChirp(), Multisine(), SineSteps())
+
+
+@pytest.mark.parametrize("signal", ALL, ids=lambda s: s.kind)
+@pytest.mark.parametrize("rate", [50.0, 100.0])
+def test_begins_and_ends_at_rest_with_the_peak_asked(signal: Signal, rate: float) -> None:
+    offsets = signal.samples(rate)
+    assert offsets[0] == 0.0
+    assert offsets[-1] == 0.0
+    assert np.abs(offsets).max() <= signal.amplitude * (1.0 + 1e-12)
+    assert np.abs(offsets).max() > 0.97 * signal.amplitude
+    assert len(offsets) == len(signal.frequency(rate))
+    assert signal.duration_s(rate) == pytest.approx(len(offsets) / rate)
+    # The ramp is smooth at its outer end: the first moves are small against the peak.
+    assert np.abs(offsets[[1, -2]]).max() < 0.02 * signal.amplitude
+
+
+@pytest.mark.parametrize("signal", ALL, ids=lambda s: s.kind)
+def test_amplitude_scales_the_samples_and_nothing_else(signal: Signal) -> None:
+    softer = signal.with_amplitude(signal.amplitude / 4.0)
+    np.testing.assert_allclose(softer.samples(), signal.samples() / 4.0, atol=1e-15)
+    np.testing.assert_array_equal(softer.frequency(), signal.frequency())
+
+
+def test_the_default_chirp_is_the_papers() -> None:
+    chirp = Chirp()
+    assert chirp.band_hz == (0.1, 25.0)
+    assert chirp.amplitude == 0.25
+    assert len(chirp.samples()) == 1000  # 20 s at 50 Hz
+    assert chirp.period_s is None
+
+
+@pytest.mark.parametrize("chirp", [Chirp(), LogChirp()])
+def test_a_chirp_turns_at_the_frequency_it_names(chirp: Chirp) -> None:
+    rate = 5000.0
+    time = np.arange(len(chirp.frequency(rate))) / rate
+    turns = cumulative_simpson(chirp.frequency(rate), x=time, initial=0.0)
+    inside = slice(round(rate), -round(rate))  # between the ramps
+    expected = chirp.amplitude * np.sin(2.0 * np.pi * turns)
+    np.testing.assert_allclose(chirp.samples(rate)[inside], expected[inside], atol=1e-8)
+
+
+def test_a_log_chirp_takes_the_same_time_for_each_octave() -> None:
+    frequency = LogChirp(start_hz=0.5, stop_hz=8.0, length_s=20.0).frequency()
+    counts = [((frequency >= f) & (frequency < 2 * f)).sum() for f in (0.5, 1.0, 2.0, 4.0)]
+    assert max(counts) - min(counts) <= 1
+
+
+def test_multisine_asks_odd_harmonics_and_nothing_else() -> None:
+    signal = Multisine(length_s=10.0, periods=3)
+    period = signal.one_period()
+    spectrum = np.abs(np.fft.rfft(period))
+    asked = np.zeros(len(spectrum), dtype=bool)
+    asked[list(signal.harmonic_numbers)] = True
+    assert all(number % 2 == 1 for number in signal.harmonic_numbers)
+    assert spectrum[~asked].max() < 1e-12 * spectrum[asked].max()
+    # What is sent repeats that period exactly between the ramps.
+    ramp = round(signal.ramp_s * 50.0)
+    sent = signal.samples()[ramp : ramp + 3 * len(period)].reshape(3, -1)
+    np.testing.assert_allclose(sent, np.tile(period, (3, 1)), atol=1e-15)
+    assert np.abs(period).max() == pytest.approx(signal.amplitude)
+
+
+def test_multisine_tilt_is_the_slope_of_its_lines() -> None:
+    signal = Multisine(tilt=1.0)
+    lines = np.abs(np.fft.rfft(signal.one_period()))[list(signal.harmonic_numbers)]
+    np.testing.assert_allclose(lines * signal.lines_hz, lines[0] * signal.lines_hz[0], rtol=1e-9)
+
+
+def test_more_draws_give_a_smaller_crest_factor() -> None:
+    def crest(draws: int) -> float:
+        period = Multisine(draws=draws).one_period()
+        return float(np.abs(period).max() / period.std())
+
+    assert crest(200) < crest(1)
+    assert crest(200) < 2.2
+    np.testing.assert_array_equal(Multisine(seed=3).samples(), Multisine(seed=3).samples())
+    assert not np.array_equal(Multisine(seed=3).samples(), Multisine(seed=4).samples())
+
+
+def test_sine_steps_measure_whole_cycles_of_one_frequency() -> None:
+    signal = SineSteps(frequencies_hz=(0.5, 3.3, 12.0))
+    offsets, frequency = signal.samples(), signal.frequency()
+    windows = signal.windows()
+    assert len(windows) == 3
+    for (first, stop, exact), wanted in zip(windows, signal.frequencies_hz, strict=True):
+        assert exact == pytest.approx(wanted, rel=0.02)
+        assert set(frequency[first:stop]) == {exact}
+        cycles = (stop - first) * exact / 50.0
+        assert cycles == pytest.approx(round(cycles), abs=1e-9)
+        assert cycles > signal.measure_cycles - 1e-9
+        lines = np.abs(np.fft.rfft(offsets[first:stop])) / (stop - first) * 2.0
+        assert lines[round(cycles)] == pytest.approx(signal.amplitude, rel=1e-6)
+        assert np.delete(lines, round(cycles)).max() < 1e-9
+    for (_, stop, _), (first, _, exact) in pairwise(windows):
+        assert (first - stop) / 50.0 >= max(signal.settle_s, signal.settle_cycles / exact) - 1e-9
+    assert np.isnan(frequency[: round(signal.ramp_s * 50)]).all()
+
+
+def test_sine_steps_never_jump() -> None:
+    signal = SineSteps(frequencies_hz=(1.0, 2.0, 4.0))
+    steepest = 2.0 * np.pi * 4.1 * signal.amplitude / 50.0
+    assert np.abs(np.diff(signal.samples())).max() < steepest
+
+
+@given(ticks=st.integers(2, 500), ramp=st.integers(0, 250))
+def test_ramps_stay_between_zero_and_one(ticks: int, ramp: int) -> None:
+    if 2 * ramp > ticks:
+        with pytest.raises(PlanError, match="do not fit"):
+            ramps(ticks, ramp)
+        return
+    window = ramps(ticks, ramp)
+    assert window[0] == window[-1] == 0.0
+    assert window.min() >= 0.0
+    assert window.max() <= 1.0
+    np.testing.assert_allclose(window, window[::-1], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Chirp(amplitude=0.0), "amplitude"),
+        (lambda: Chirp(amplitude=float("nan")), "amplitude"),
+        (lambda: Chirp(start_hz=5.0, stop_hz=1.0), "lower one first"),
+        (lambda: Chirp(length_s=-1.0), "length_s"),
+        (lambda: Chirp(ramp_s=-0.1), "ramp_s"),
+        (lambda: Chirp(stop_hz=30.0).samples(50.0), "reach 25 Hz"),
+        (lambda: Multisine(low_hz=0.11, high_hz=0.12), "no odd multiple"),
+        (lambda: Multisine(harmonics=(1, 2)), "odd"),
+        (lambda: Multisine(length_s=0.333).samples(50.0), "whole ticks"),
+        (lambda: Multisine(high_hz=30.0).samples(50.0), "reach 25 Hz"),
+        (lambda: SineSteps(frequencies_hz=()), "frequencies_hz"),
+        (lambda: SineSteps(frequencies_hz=(25.0,)).samples(50.0), "below 25 Hz"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(make: object, words: str) -> None:
+    with pytest.raises(PlanError, match=words) as caught:
+        make()  # type: ignore[operator]
+    assert "\n" not in str(caught.value)
+
+
+def test_misspelled_settings_are_refused() -> None:
+    with pytest.raises(TypeError, match="stop_herz"):
+        Chirp(stop_herz=3.0)  # type: ignore[call-arg]
+
+
+@settings(max_examples=15, deadline=None)
+@given(joints=st.integers(2, 8), seed=st.integers(0, 1000))
+def test_multisines_of_several_joints_share_no_line(joints: int, seed: int) -> None:
+    names = [f"j{i}" for i in range(joints)]
+    signals = uncorrelated_multisines(names, Multisine(seed=seed, periods=2))
+    lines = [number for signal in signals.values() for number in signal.harmonic_numbers]
+    assert len(lines) == len(set(lines))
+    # Over whole periods the correlation is zero at every lag.
+    periods = np.stack([signal.one_period() for signal in signals.values()], axis=1)
+    spectra = np.fft.fft(periods, axis=0)
+    cross = np.fft.ifft(spectra[:, 0] * np.conj(spectra[:, 1]))
+    assert np.abs(cross).max() < 1e-12 * (periods[:, 0] ** 2).sum()
+    sent = np.stack([signal.samples() for signal in signals.values()], axis=1)
+    assert correlation_note(sent, names, 50.0) == ""
+
+
+def test_a_shifted_copy_is_found_though_it_does_not_correlate_at_lag_zero() -> None:
+    time = np.arange(2000) / 50.0
+    pair = np.stack([np.sin(2 * np.pi * time), np.cos(2 * np.pi * time)], axis=1)
+    assert abs(np.corrcoef(pair.T)[0, 1]) < 1e-3
+    assert correlation(pair, 50.0)[0, 1] > 0.95
+    note = correlation_note(pair, ["pan", "lift"], 50.0)
+    assert "pan" in note
+    assert "lift" in note
+
+
+def test_a_still_command_correlates_with_nothing() -> None:
+    pair = np.stack([np.full(500, 0.3), np.sin(np.arange(500))], axis=1)
+    np.testing.assert_allclose(correlation(pair, 50.0), np.eye(2))
+
+
+def test_independent_noise_passes() -> None:
+    noise = np.random.default_rng(0).normal(size=(6000, 4))
+    assert correlation_note(noise, list("abcd"), 50.0) == ""
+
+
+def test_too_many_joints_for_the_harmonics() -> None:
+    with pytest.raises(PlanError, match="lengthen the period"):
+        uncorrelated_multisines(list("abcdef"), Multisine(low_hz=1.0, high_hz=1.5, length_s=2.0))

@@ -1,0 +1,130 @@
+"""The truth of the virtual robot: what is refused, and with which words."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from pronk.errors import RobotError
+from pronk.hardware.plant import build_plant
+from pronk.hardware.truth import SHIPPED, load_truth, parse_truth
+from pronk.robots import load_robot
+
+BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
+ROBOT = load_robot("mini_cheetah")
+
+
+def changed(*path: str, value: Any) -> dict[str, Any]:
+    body = copy.deepcopy(BODY)
+    entry = body
+    for key in path[:-1]:
+        entry = entry[key]
+    entry[path[-1]] = value
+    return body
+
+
+def test_shipped_truth_is_of_the_mini_cheetah_and_plausible() -> None:
+    truth = load_truth()
+    truth.check_joints(ROBOT.joint_names)
+    assert truth.robot == ROBOT.name
+    for name, joint in truth.joints.items():
+        assert 0.8 <= joint.link_inertia_scale <= 1.3, name
+        assert 0.8 <= joint.torque_scale <= 1.45, name
+        assert 0.0 <= joint.viscous <= 0.15, name
+        # Between the two published figures (reading A11), less or more some per cent.
+        assert 0.95 * 63e-6 <= joint.rotor_inertia <= 1.05 * 72e-6, name
+        assert 0.0 < joint.coulomb < 0.25, name
+
+
+def test_no_two_joints_are_alike() -> None:
+    joints = list(load_truth().joints.values())
+    for name in ("coulomb", "link_inertia_scale", "belt_stiffness", "encoder_offset"):
+        values = [getattr(joint, name) for joint in joints]
+        assert len(set(values)) > len(joints) // 2, name
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("joints", "FR_knee", "link_inertia_scale"), -1, "FR_knee.link_inertia_scale is -1"),
+        (("joints", "FR_knee", "link_inertia_scale"), 0.0, "expected 0.1 to 10"),
+        (("joints", "FR_knee", "rotor_inertia"), 0, "FR_knee.rotor_inertia is 0"),
+        (("joints", "HL_hip_roll", "viscous"), float("nan"), "HL_hip_roll.viscous is nan"),
+        (("joints", "HL_hip_roll", "coulomb"), "much", "coulomb is 'much'; expected a number"),
+        (("joints", "HL_hip_roll", "coulomb"), True, "coulomb is True; expected a number"),
+        (("joints", "HL_hip_roll", "coulomb"), 9.0, "below coulomb = 9"),
+        (("joints", "HL_hip_roll"), 3, "joints.HL_hip_roll is 3; expected a mapping"),
+        (("joints",), {}, "joints is {}"),
+        (("machine", "encoder_bits"), 14.5, "encoder_bits is 14.5; expected a whole number"),
+        (("machine", "gyro_bias"), [0.0, 1.0], "gyro_bias is [0.0, 1.0]; expected three numbers"),
+        (("machine", "bus_voltage"), -24, "machine.bus_voltage is -24"),
+        (("machine", "command_delay"), 0.002, "machine.command_delay is unknown; the fields are"),
+        (("robot",), 7, "robot is 7; expected a name"),
+        (("colour",), "red", "colour is unknown; the entries are schema, robot"),
+        (("schema",), "pronk/gains/1", "this pronk reads 'pronk/truth/1'"),
+    ],
+)
+def test_impossible_is_refused_in_one_sentence_naming_the_field(
+    path: tuple[str, ...], value: Any, words: str
+) -> None:
+    with pytest.raises(RobotError) as caught:
+        parse_truth(changed(*path, value=value), "my.yaml")
+    message = str(caught.value)
+    assert words in message
+    assert message.startswith("my.yaml: ")
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("path", [("machine", "bus_voltage"), ("joints", "FR_knee", "coulomb")])
+def test_missing_field_is_named(path: tuple[str, ...]) -> None:
+    body = copy.deepcopy(BODY)
+    entry = body
+    for key in path[:-1]:
+        entry = entry[key]
+    del entry[path[-1]]
+    with pytest.raises(RobotError, match=rf"{'.'.join(path)} is missing"):
+        parse_truth(body, "my.yaml")
+
+
+def test_missing_and_foreign_joints_are_named() -> None:
+    truth = load_truth()
+    short = replace(truth, joints={k: v for k, v in truth.joints.items() if k != "HR_knee"})
+    with pytest.raises(RobotError, match=r"joints\.HR_knee is missing"):
+        build_plant(ROBOT, short, ("FR",), 0.25e-3)
+    foreign = replace(truth, joints={**truth.joints, "tail": truth.joints["HR_knee"]})
+    with pytest.raises(RobotError, match=r"joints\.tail is not a joint of mini_cheetah"):
+        build_plant(ROBOT, foreign, ("FR",), 0.25e-3)
+
+
+def test_belt_too_stiff_for_the_step_is_refused_with_the_stiffest_that_fits() -> None:
+    truth = load_truth()
+    stiff = replace(truth.joints["FR_hip_roll"], belt_stiffness=9e4)
+    broken = replace(truth, joints={**truth.joints, "FR_hip_roll": stiff})
+    with pytest.raises(RobotError, match=r"FR_hip_roll\.belt_stiffness is 90000; .* at most"):
+        build_plant(ROBOT, broken, ("FR",), 0.25e-3)
+    build_plant(ROBOT, broken, ("FR",), 0.025e-3)
+
+
+def test_files_that_are_no_truth(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="no such truth file"):
+        load_truth(tmp_path / "none.yaml")
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("joints: [unclosed")
+    with pytest.raises(RobotError, match="cannot be read as YAML"):
+        load_truth(bad)
+    bad.write_text("")
+    with pytest.raises(RobotError, match="schema 'NoneType'"):
+        load_truth(str(bad))
+
+
+def test_a_file_of_ones_own_replaces_the_shipped_one(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(changed("machine", "bus_voltage", value=22.0)))
+    assert load_truth(path) == replace(
+        load_truth(), machine=replace(load_truth().machine, bus_voltage=22.0)
+    )

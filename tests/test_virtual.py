@@ -1,0 +1,409 @@
+"""The virtual robot on the bench: time stepping, drives, delays, sensors, clamps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import signal
+
+from pronk.errors import HardwareError, RobotError
+from pronk.hardware.machine import Command, State
+from pronk.hardware.plant import MotorConstants, build_plant
+from pronk.hardware.truth import Truth, load_truth
+from pronk.hardware.virtual import VirtualRobot
+from pronk.robots import load_robot
+
+Array = NDArray[np.float64]
+
+ROBOT = load_robot("mini_cheetah")
+NAMES = ROBOT.joint_names
+POSE = np.array([joint.default_position for joint in ROBOT.joints])
+TRUTH = load_truth()
+TICK = 0.02
+
+
+def quiet(**machine: Any) -> Truth:
+    """The shipped truth with perfect sensors, no delays and a stiff battery."""
+    perfect = dict.fromkeys(
+        (
+            "command_delay_s",
+            "measurement_delay_s",
+            "sampling_jitter_s",
+            "timestamp_error_s",
+            "bus_resistance",
+            "velocity_noise",
+            "position_noise",
+            "torque_noise",
+            "gyro_noise",
+            "accelerometer_noise",
+        ),
+        0.0,
+    )
+    return replace(
+        TRUTH, machine=replace(TRUTH.machine, **{**perfect, "encoder_bits": 32, **machine})
+    )
+
+
+def with_joint(truth: Truth, name: str, **values: float) -> Truth:
+    return replace(truth, joints={**truth.joints, name: replace(truth.joints[name], **values)})
+
+
+def connected(truth: Truth, **options: Any) -> VirtualRobot:
+    machine = VirtualRobot(ROBOT, truth, **{"legs": ("FR",), **options})
+    machine.connect()
+    return machine
+
+
+def gains(stiffness: float = 17.0, damping: float = 0.4) -> dict[str, Array]:
+    return {"stiffness": np.full(12, stiffness), "damping": np.full(12, damping)}
+
+
+def offset(joint: str, value: float) -> Array:
+    position = POSE.copy()
+    position[NAMES.index(joint)] += value
+    return position
+
+
+def ask(machine: VirtualRobot, joint: str, command: Array) -> list[State]:
+    states = [machine.latest()]
+    start = machine.latest().time
+    for k, value in enumerate(command):
+        machine.send(Command(position=offset(joint, float(value)), **gains()))
+        states += machine.wait(start + (k + 1) * TICK)
+    return states
+
+
+def column(states: list[State], joint: str) -> Array:
+    return np.array([state.position[NAMES.index(joint)] for state in states])
+
+
+def chirp(seconds: float, amplitude: float = 0.25) -> Array:
+    t = np.arange(round(seconds / TICK)) * TICK
+    return amplitude * signal.chirp(t, 0.1, seconds, 25.0, phi=-90.0)
+
+
+def gain_db(command: Array, position: Array, per_tick: int) -> tuple[Array, Array]:
+    """H1 of the held command and the position, and its frequencies up to 15 Hz."""
+    held = np.repeat(command, per_tick)
+    rate = per_tick / TICK
+    options = {"fs": rate, "nperseg": round(2.0 * rate), "noverlap": round(1.5 * rate)}
+    hz, cross = signal.csd(held, position[: len(held)], **options)
+    _, own = signal.welch(held, **options)
+    inside = (hz > 0.0) & (hz <= 15.0)
+    return hz[inside], 20.0 * np.log10(np.abs(cross / own)[inside])
+
+
+# --- Physics ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("joint", ["FR_hip_roll", "FR_hip_pitch", "FR_knee"])
+def test_the_step_has_converged_to_40_khz(joint: str) -> None:
+    command = chirp(6.0)
+    coarse, fine = (
+        gain_db(
+            command, column(ask(connected(quiet(), timestep_s=step), joint, command), joint), 10
+        )[1]
+        for step in (0.25e-3, 0.025e-3)
+    )
+    assert np.abs(coarse - fine).max() < 0.05
+
+
+def test_without_imperfections_a_joint_answers_as_its_equation_says() -> None:
+    joint = "FR_knee"
+    scale, drive = 1.2, ROBOT.joint(joint).drive
+    truth = with_joint(
+        quiet(drive_lag_s=1e-5, clamp_stiffness=9e4),
+        joint,
+        torque_scale=scale,
+        coulomb=1e-6,
+        breakaway=1e-6,
+        presliding_stiffness=1e-3,
+        presliding_damping=0.0,
+        viscous=0.05,
+        belt_stiffness=2500.0,
+        belt_damping=0.0,
+        encoder_offset=0.0,
+    )
+    machine = connected(truth)
+    machine.clamp(ROBOT.joint(joint).clamped)
+    command = chirp(20.0)
+    position = column(ask(machine, joint, command), joint)
+    hz, measured = gain_db(command, position, 10)
+    # I = reflected rotor + shank about the knee (its own inertia and Steiner's term).
+    model = ROBOT.build_spec().compile()
+    body = model.jnt_bodyid[model.joint(joint).id]
+    arm = np.hypot(model.body_ipos[body][0], model.body_ipos[body][2])
+    shank = (model.body_inertia[body].max() + model.body_mass[body] * arm**2) * truth.joints[
+        joint
+    ].link_inertia_scale
+    inertia = truth.joints[joint].rotor_inertia * drive.gear_ratio**2 + shank
+    s = 2j * np.pi * hz
+    stiffness, damping = scale * 17.0, scale * 0.4 + 0.05
+    equation = stiffness / (inertia * s**2 + damping * s + stiffness)
+    middle = (hz > 1.0) & (hz < 15.0)
+    error = measured - 20.0 * np.log10(np.abs(equation))
+    assert np.abs(error[middle]).max() < 0.1
+
+
+def test_nothing_moves_without_a_command() -> None:
+    states = connected(quiet(), legs=None).wait(1.0)
+    positions = np.array([state.position for state in states])
+    assert len(states) == 500
+    assert np.ptp(positions, axis=0).max() < 1e-4
+    assert np.abs([state.velocity for state in states]).max() < 1e-2
+
+
+def test_damped_legs_sink_and_come_to_rest() -> None:
+    machine = connected(quiet())
+    machine.damp()
+    states = machine.wait(6.0)
+    assert np.abs(states[-1].position - states[0].position).max() > 0.2
+    assert np.abs(states[-1].velocity).max() < 0.05
+    assert np.abs(states[-1].velocity).max() < np.abs(states[200].velocity).max()
+
+
+def test_dry_friction_holds_a_joint_that_is_asked_too_softly() -> None:
+    truth = with_joint(quiet(), "FR_knee", coulomb=0.4, breakaway=0.5)
+    machine = connected(truth)
+    before = machine.latest().position[2]
+    ask_torque = 0.2  # N m, asked through 17 N m/rad, well below break-away
+    step = ask_torque / 17.0
+    small = ask(machine, "FR_knee", np.full(25, step))[-1].position[2] - before
+    assert 0.0 < small < 0.3 * step
+    large = ask(machine, "FR_knee", np.full(25, 0.3))[-1].position[2] - before
+    assert large > 0.8 * 0.3
+
+
+# --- Drives -------------------------------------------------------------------------------------
+
+
+def test_torque_stays_below_the_torque_speed_line_and_the_effort_limit() -> None:
+    # A hard step at a low bus voltage: the drive wants far more than the motor can give. A heavy
+    # rotor and a prompt drive, so that torque and speed belong to the same instant.
+    voltage = 12.0
+    truth = quiet(bus_voltage=voltage, drive_lag_s=1e-5)
+    truth = with_joint(truth, "FR_knee", rotor_inertia=1e-3)
+    machine = connected(truth, log_rate_hz=2000.0)
+    machine.send(Command(position=offset("FR_knee", -2.0), **gains(300.0, 0.1)))
+    states = machine.wait(0.2)
+    torque = np.array([state.torque[2] for state in states]) * truth.joints["FR_knee"].torque_scale
+    speed = np.array([state.velocity[2] for state in states])
+    drive, scale = ROBOT.joint("FR_knee").drive, truth.joints["FR_knee"].torque_scale
+    motor = MotorConstants.of(drive)
+    constant = scale * motor.constant
+    line = -constant / motor.resistance * (voltage + constant * speed)
+    slack = 0.02 * np.abs(line).max()  # one physics step of acceleration
+    assert (torque >= line - slack).all()
+    assert (np.abs(torque) <= scale * drive.effort_limit * (1.0 + 1e-9)).all()
+    # Both limits were met, and the line held the joint below its no-load speed.
+    assert np.isclose(np.abs(torque).max(), scale * drive.effort_limit)
+    fast = speed < -0.7 * voltage / constant
+    assert fast.any()
+    assert (torque[fast] > -0.6 * scale * drive.effort_limit).all()
+    assert speed.min() > -voltage / constant
+
+
+def test_reported_torque_is_what_the_drive_believes() -> None:
+    truth = with_joint(quiet(), "FR_hip_pitch", torque_scale=1.25, coulomb=1e-6, breakaway=1e-6)
+    machine = connected(truth)
+    state = machine.wait(0.1)[-1]
+    believed = 17.0 * (POSE[1] - state.position[1])
+    assert abs(state.torque[1]) > 0.02
+    np.testing.assert_allclose(state.torque[1], believed, rtol=1e-3)
+
+
+def test_battery_sags_with_the_power_drawn() -> None:
+    machine = connected(quiet(bus_resistance=0.2))
+    assert machine.latest().bus_voltage == pytest.approx(TRUTH.machine.bus_voltage, abs=0.05)
+    machine.send(Command(position=offset("FR_hip_roll", 1.0), **gains(100.0, 2.0)))
+    states = machine.wait(0.1)
+    assert min(state.bus_voltage for state in states) < TRUTH.machine.bus_voltage - 1.0
+
+
+# --- Time ---------------------------------------------------------------------------------------
+
+
+def test_delays_shift_the_answer() -> None:
+    command = chirp(1.0)
+    prompt, late = (
+        column(ask(connected(quiet(**delays)), "FR_knee", command), "FR_knee")
+        for delays in ({}, {"command_delay_s": 0.004, "measurement_delay_s": 0.002})
+    )
+    np.testing.assert_allclose(late[3:], prompt[:-3], atol=1e-6)
+    assert np.abs(late - prompt).max() > 1e-3
+
+
+def test_timestamps_jitter_increase_and_lose_nothing() -> None:
+    machine = connected(TRUTH)
+    states = [machine.latest(), *machine.wait(4.0)]
+    time = np.array([state.time for state in states])
+    assert time[0] == 0.0
+    assert [state.sequence for state in states] == list(range(2001))
+    assert (np.diff(time) > 0.0).all()
+    jitter = np.std(time - np.arange(2001) / 500.0)
+    assert 0.8 * 51e-6 < jitter < 1.2 * 51e-6  # 50 us and 10 us
+
+
+def test_same_seed_same_numbers_however_time_is_cut() -> None:
+    def run(seed: int, cuts: tuple[float, ...]) -> Array:
+        machine = connected(TRUTH, seed=seed)
+        machine.send(Command(position=offset("FR_knee", 0.2), **gains()))
+        states = [state for until in cuts for state in machine.wait(until)]
+        return np.array([[s.time, *s.position, *s.velocity, *s.torque, *s.gyro] for s in states])
+
+    whole = run(3, (0.3,))
+    assert np.array_equal(whole, run(3, (0.0031, 0.1, 0.1005, 0.3)))
+    assert not np.array_equal(whole, run(4, (0.3,)))
+
+
+def test_connecting_again_starts_anew() -> None:
+    machine = connected(TRUTH)
+    first = ask(machine, "FR_knee", np.full(5, 0.1))
+    machine.clamp(("FR_knee",))
+    machine.close()
+    machine.connect()
+    again = ask(machine, "FR_knee", np.full(5, 0.1))
+    assert np.array_equal(column(first, "FR_knee"), column(again, "FR_knee"))
+
+
+def test_a_time_already_past_brings_no_states() -> None:
+    machine = connected(TRUTH)
+    assert len(machine.wait(0.1)) == 50
+    assert machine.wait(0.1) == []
+    assert machine.wait(0.05) == []
+    assert len(machine.wait(0.102)) == 1
+
+
+# --- Sensors ------------------------------------------------------------------------------------
+
+
+def test_positions_lie_on_the_grid_of_the_encoder() -> None:
+    machine = connected(replace(TRUTH, machine=replace(TRUTH.machine, encoder_bits=10)))
+    states = ask(machine, "FR_knee", chirp(2.0))
+    for joint in machine.joints:
+        grid = 2.0 * np.pi / 2**10 / ROBOT.joint(joint).drive.gear_ratio
+        steps = column(states, joint) / grid
+        np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
+    assert len(set(column(states, "FR_knee"))) > 20
+
+
+def test_position_noise_is_coloured_and_as_large_as_said() -> None:
+    truth = quiet(position_noise=1e-3, position_noise_corner_hz=10.0)
+    noise = column(connected(truth).wait(60.0), "FR_hip_roll")
+    noise = noise - noise.mean()
+    assert np.std(noise) == pytest.approx(1e-3, rel=0.1)
+    neighbours = float(noise[1:] @ noise[:-1] / (noise @ noise))
+    assert neighbours == pytest.approx(np.exp(-2.0 * np.pi * 10.0 / 500.0), abs=0.02)
+
+
+def test_inertial_unit_feels_gravity_and_its_bias() -> None:
+    state = connected(quiet()).latest()
+    np.testing.assert_allclose(state.gyro, TRUTH.machine.gyro_bias)
+    np.testing.assert_allclose(
+        state.accelerometer - np.array(TRUTH.machine.accelerometer_bias), [0.0, 0.0, 9.81]
+    )
+
+
+def test_a_compliant_stand_is_felt_by_the_gyro() -> None:
+    truth = quiet(stand_stiffness=500.0, stand_damping=5.0, gyro_bias=(0.0, 0.0, 0.0))
+    machine = connected(truth, legs=None)
+    states = ask(machine, "FR_hip_pitch", chirp(3.0))
+    rate = np.array([state.gyro for state in states])
+    assert np.abs(rate[:, 1]).max() > 0.05
+    assert np.abs(rate[0]).max() < 1e-2
+
+
+# --- Bench --------------------------------------------------------------------------------------
+
+
+def test_clamp_holds_a_link_but_no_fixture_is_rigid() -> None:
+    joint = "FR_hip_pitch"
+    machine = connected(quiet())
+    machine.clamp((joint,))
+    rest = machine.latest().position[1]
+    held = ask(machine, joint, np.full(25, 0.2))[-1].position[1] - rest
+    # Torque through belt and fixture in series, the drive's own stiffness beside them.
+    torque = 17.0 * TRUTH.joints[joint].torque_scale * 0.2
+    give = torque / TRUTH.machine.clamp_stiffness + torque / TRUTH.joints[joint].belt_stiffness
+    assert 0.5 * give < held < 1.1 * give
+    machine.clamp(())
+    free = ask(machine, joint, np.full(50, 0.2))[-1].position[1] - rest
+    assert free > 0.15
+
+
+def test_legs_on_a_rigid_bench_do_not_feel_each_other() -> None:
+    command = chirp(1.0)
+    alone, together = (
+        ask(connected(quiet(), legs=legs), "FR_knee", command) for legs in (("FR",), None)
+    )
+    np.testing.assert_allclose(
+        column(alone, "FR_knee"), column(together, "FR_knee"), rtol=0.0, atol=1e-9
+    )
+    # Absent legs report their default pose; present ones sag under their weight.
+    assert column(alone, "HL_hip_roll")[-1] == POSE[NAMES.index("HL_hip_roll")]
+    assert column(together, "HL_hip_roll")[-1] != POSE[NAMES.index("HL_hip_roll")]
+    assert all(len(state.position) == 12 for state in alone)
+
+
+def test_mirrored_legs_mirror_each_other_when_their_truths_agree() -> None:
+    same = replace(TRUTH.joints["FR_hip_roll"], encoder_offset=0.0)
+    truth = replace(quiet(), joints=dict.fromkeys(NAMES, same))
+    command = chirp(1.0)
+    right = column(ask(connected(truth, legs=None), "FR_hip_roll", command), "FR_hip_roll")
+    left = column(ask(connected(truth, legs=None), "FL_hip_roll", -command), "FL_hip_roll")
+    np.testing.assert_allclose(left, -right, atol=1e-6)
+
+
+def test_plant_is_another_machine_than_the_model_it_came_from() -> None:
+    plant = build_plant(ROBOT, TRUTH, ("FR",), 0.25e-3)
+    assert plant.joints == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
+    assert plant.model.nv == 6
+    assert not set(plant.rotor) & set(plant.link)
+    data = mujoco.MjData(plant.model)
+    mujoco.mj_forward(plant.model, data)
+    inertia = np.zeros((6, 6))
+    mujoco.mj_fullM(plant.model, data, inertia)
+    expected = [
+        TRUTH.joints[name].rotor_inertia * ROBOT.joint(name).drive.gear_ratio ** 2
+        for name in plant.joints
+    ]
+    np.testing.assert_allclose(inertia[plant.rotor, plant.rotor], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        (lambda m: m.clamp(("tail",)), "no joint 'tail' to clamp; it has FR_hip_roll"),
+        (lambda m: m.wait(float("nan")), "wait until nan"),
+        (
+            lambda m: m.send(Command(position=POSE[:3], **gains())),
+            r"command.position has shape \(3,\)",
+        ),
+        (
+            lambda m: m.send(Command(position=POSE * np.nan, **gains())),
+            "command.position .* not finite",
+        ),
+        (lambda m: m.send(Command(position=POSE, **gains(-1.0))), "command.stiffness is negative"),
+    ],
+)
+def test_refusals(act: Any, words: str) -> None:
+    with pytest.raises(HardwareError, match=words):
+        act(connected(TRUTH))
+
+
+def test_refusals_before_anything_runs() -> None:
+    with pytest.raises(HardwareError, match=r"not connected; call connect\(\) first"):
+        VirtualRobot(ROBOT, TRUTH).latest()
+    with pytest.raises(HardwareError, match="no leg 'XL'; it has FR, FL, HR, HL"):
+        VirtualRobot(ROBOT, TRUTH, legs=("XL",))
+    with pytest.raises(HardwareError, match="no legs"):
+        VirtualRobot(ROBOT, TRUTH, legs=())
+    with pytest.raises(HardwareError, match="log_rate_hz is 50000"):
+        VirtualRobot(ROBOT, TRUTH, log_rate_hz=50000.0)
+    with pytest.raises(RobotError, match="truth is of 'mini_cheetah', the robot is 'so101'"):
+        VirtualRobot(load_robot("so101"), TRUTH)
