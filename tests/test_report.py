@@ -427,7 +427,7 @@ def test_a_joint_without_match_is_counted_and_named(tmp_path):
     bad = JointMatch(**{**vars(joint), "flags": (doubt,)})
     worse = MatchResult(gains=result.gains, joints={**result.joints, name: bad})
     assert page.verdict(worse)["matched"] == 11
-    assert page.verdict(worse)["flags"][name] == [doubt]
+    assert doubt in page.verdict(worse)["flags"][name]
 
 
 def test_zero_armature_without_a_match_is_no_doubt_about_the_match(match):

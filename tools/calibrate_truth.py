@@ -86,7 +86,7 @@ HEADER = f"""\
 #                          simulator believes the paper's 72e-6 (reading A11)
 #   belt_stiffness         rotor and link ring at about 130 Hz (hips: gears) and 160 Hz (knee: belt
 #                          through the thigh), above all that is asked; 4 % of critical damping
-#   coulomb                0.13 to 0.17 N m +- 20 %, below the simulator's 0.2 (Cheetah-Software)
+#   coulomb                0.13 to 0.17 N m +- 20 %; the simulator has 0.2 (Cheetah-Software)
 #   breakaway              1.15 to 1.35 times that
 #   stribeck_speed         about 0.15 rad/s (1 to 1.4 rad/s at the motor)
 #   presliding_stiffness   break-away after about 1 mrad

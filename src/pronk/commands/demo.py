@@ -110,7 +110,7 @@ def run(
     replays: list[Replay] = []
     told = report.bar("predict")
     for i, path in enumerate(fresh):
-        replays += replays_of(read_log(path, robot=robot), robot, result.gains)
+        replays += replays_of(read_log(path, robot=robot), robot, result.gains)[0]
         told((i + 1) / len(fresh))
     replay.save(out / "fresh.prediction.npz", replays, virtual=True, source="fresh")
     lap("predict")

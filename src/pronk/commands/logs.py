@@ -170,22 +170,6 @@ def asked_joints(log: SweepLog) -> tuple[str, ...]:
     return asked
 
 
-def moves_together(log: SweepLog) -> bool:
-    """True if several joints are commanded at the same time, in signals that correlate.
-
-    Several joints may be asked at once with uncorrelated signals; 0.1 is where pronk warns.
-    """
-    from pronk.sweep.correlation import correlation_note
-
-    if all(len(segment.joints) == 1 for segment in log.segments) and log.segments:
-        return False
-    joints = asked_joints(log)
-    if len(joints) < 2:
-        return False
-    columns = [log.column(name) for name in joints]
-    return bool(correlation_note(log.command[:, columns], joints, log.rate_hz))
-
-
 def home(log: SweepLog, out: Path | None) -> tuple[Path, str]:
     """Folder and stem of what is written about a log: beside it, or in `out`."""
     source = Path(log.source or "log")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -12,7 +14,10 @@ from pronk.commands import console, logs
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
+    from pronk.match.arm_match import ArmMatch
     from pronk.match.result import MatchResult
+    from pronk.robots.robot import Robot
+    from pronk.sweep.log import SweepLog
 
 
 class Mode(StrEnum):
@@ -52,6 +57,9 @@ def match(
     reading: logs.Reading,
 ) -> None:
     """Find the gains that make the simulator answer like the robot."""
+    from pronk.match.arm_simulation import moves_together
+    from pronk.match.pipeline import match_logs
+    from pronk.match.settings import MatchSettings
     from pronk.robots import load_robot
 
     machine = load_robot(robot)
@@ -60,35 +68,78 @@ def match(
             f"--out {out}: expected a name that ends in .yaml, for instance gains.yaml."
         )
     read = logs.read(paths, reading, machine)
-    together = [log for log in read if logs.moves_together(log)]
-    if mode is Mode.DRIVE or (mode is None and together):
-        from pronk.commands.match_drive import match_drive
-
-        match_drive(read, machine, out, json_file=json_file, forced=mode is not None)
-        return
-    if together:
-        raise PronkError(
-            f"{together[0].source}: several joints move at once, so their answers cannot be told "
-            "apart joint by joint; use --mode drive, or ask one joint at a time."
-        )
-
-    from pronk.match.pipeline import match_logs
-    from pronk.match.settings import MatchSettings
-
     settings = MatchSettings(
         method="quick" if quick else "grid", zero_armature=zero_armature, use_phase=phase
     )
+    arm: ArmMatch | None = None
     with console.progress() as report:
-        result = match_logs(read, machine, settings=settings, progress=report)
+        if mode is Mode.DRIVE or any(moves_together(log) for log in read):
+            arm, result = together(read, machine, (mode or Mode.GAINS).value, report)
+        else:
+            result = match_logs(read, machine, settings=settings, progress=report)
         page = write(result, out, report)
     show(result)
+    figures = figures_of(result)
+    if arm is not None:
+        show_arm(arm)
+        figures |= {"mode": arm.mode, "held": dict(arm.held), "rmse": rmse_of(arm)}
     console.wrote(out, out.parent / "match.npz", page)
-    console.write_json(json_file, figures_of(result))
+    console.write_json(json_file, figures)
     console.following(
         f"open {page} in a browser",
         f"pronk predict FRESH_LOG --robot {robot} --gains {out}",
         f"pronk export {out} --to mjlab --out actuators.py",
     )
+
+
+def together(
+    read: Sequence[SweepLog],
+    robot: Robot,
+    mode: Literal["gains", "drive"],
+    report: console.Reporter,
+) -> tuple[ArmMatch, MatchResult]:
+    """Match an arm whose joints moved at the same time; there is no grid then."""
+    from pronk.match.arm_match import match_arm
+    from pronk.match.result import MatchResult
+
+    begin = time.perf_counter()
+    arm = match_arm(read, robot, mode=mode, progress=report)
+    seconds = {"fit of the whole arm": time.perf_counter() - begin}
+    return arm, MatchResult(gains=arm.gains, joints=arm.joints, seconds=seconds)
+
+
+def rmse_of(arm: ArmMatch) -> dict[str, dict[str, float]]:
+    """Error in time of each joint over the logs that were fitted [rad]."""
+    return {
+        name: {"published": joint.published_rmse, "matched": joint.rmse}
+        for name, joint in arm.fit.joints.items()
+    }
+
+
+def show_arm(arm: ArmMatch) -> None:
+    """Print what belongs to the gains of an arm, and its error in time."""
+    made = console.table(
+        "Several joints moved at once, so the whole arm was fitted in time",
+        "joint",
+        "armature [kg m^2]",
+        "dry friction [N m]",
+        "command delay [ms]",
+        "RMSE published [rad]",
+        "RMSE matched [rad]",
+    )
+    for name, joint in arm.fit.joints.items():
+        console.row(
+            made,
+            name,
+            console.number(joint.drive.armature, 4),
+            console.number(joint.drive.frictionloss, 3),
+            console.number(1000.0 * joint.drive.delay, 1),
+            console.number(joint.published_rmse, 4),
+            console.number(joint.rmse, 4),
+        )
+    console.show(made)
+    for name, reason in arm.fit.excluded.items():
+        console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
 
 
 def write(result: MatchResult, out: Path, report: console.Reporter) -> Path:
@@ -119,7 +170,7 @@ def figures_of(result: MatchResult) -> dict[str, Any]:
                 "grid": [gains.grid_stiffness, gains.grid_damping],
                 "error_db": gains.error_db,
                 "naive_error_db": gains.naive_error_db,
-                "zero_armature_error_db": result.joints[name].zero_armature_error_db,
+                "zero_armature_error_db": zero_of(result, name),
             }
             for name, gains in result.gains.joints.items()
         },
@@ -127,6 +178,12 @@ def figures_of(result: MatchResult) -> dict[str, Any]:
         "seconds": dict(result.seconds),
         "grid_steps_per_second": result.grid_steps_per_second,
     }
+
+
+def zero_of(result: MatchResult, name: str) -> float:
+    """Best error without rotor inertia [dB]; NaN where it was not looked for."""
+    joint = result.joints.get(name)
+    return float("nan") if joint is None else joint.zero_armature_error_db
 
 
 def show(result: MatchResult) -> None:
@@ -139,19 +196,19 @@ def show(result: MatchResult) -> None:
     made = console.table(
         f"Gains of the simulator that answers like {where} ({result.gains.robot})",
         "joint",
-        "stiffness",
+        "stiffness [N m/rad]",
         "95 %",
-        "damping",
+        "damping [N m s/rad]",
         "95 %",
         *(["paper, Table I"] if paper else []),
-        "naive [dB]",
+        "gain error naive [dB]",
         "matched [dB]",
     )
     for name, gains in result.gains.joints.items():
         known = paper.joints.get(name) if paper else None
         console.row(
             made,
-            name + (" *" if doubts(result.joints[name]) else ""),
+            name + (" *" if doubts(result, name) else ""),
             f"{gains.stiffness:.2f}",
             _interval(gains.stiffness_ci95, 2),
             f"{gains.damping:.3f}",
@@ -170,10 +227,12 @@ def show(result: MatchResult) -> None:
             f"{group.damping:g} +- {group.damping_range:g}",
         )
     console.show(groups)
-    for name, joint in result.joints.items():
-        for flag in doubts(joint):
+    for name in result.gains.joints:
+        for flag in doubts(result, name):
             console.say(f"* {name}: {flag}")
 
 
 def _interval(bounds: tuple[float, float], digits: int) -> str:
+    if bounds[0] == bounds[1]:
+        return "held"
     return f"{console.number(bounds[0], digits)} to {console.number(bounds[1], digits)}"

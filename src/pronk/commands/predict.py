@@ -29,10 +29,101 @@ def predict(
     reading: logs.Reading,
 ) -> None:
     """Replay logs in the simulator with naive and with matched gains; RMSE and R2 per joint."""
+    from pronk.match import gains as gains_file
+    from pronk.report import figures, replay, style
+    from pronk.robots import load_robot
+
+    machine = load_robot(robot)
+    matched = gains_file.load(gains)
+    read = logs.read(paths, reading, machine)
+    seen = [log.source for log in read if log.sha256 and log.sha256 in matched.logs.values()]
+    folder = out if out is not None else gains.parent
+    rows: list[dict[str, Any]] = []
+    written: list[Path] = []
+    excluded: dict[str, str] = {}
+    with console.progress() as report:
+        done = report.bar("predict")
+        for i, log in enumerate(read):
+            replays, left_out = replays_of(log, machine, matched)
+            excluded |= left_out
+            stem = Path(log.source or "log").stem
+            path = folder / f"{stem}.prediction.npz"
+            replay.save(path, replays, virtual=log.virtual, source=Path(log.source).name)
+            written.append(path)
+            for one in replays:
+                name = stem if stem == one.joint else f"{stem}.{one.joint}"
+                figure = figures.replay(one, virtual=log.virtual)
+                written.append(style.save(figure, folder / f"{name}.prediction.svg"))
+            rows += [row_of(one) | {"log": log.source} for one in replays]
+            done((i + 1) / len(read))
+    show(rows, virtual=any(log.virtual for log in read))
+    for source in seen:
+        console.warn(
+            f"{source} went into these gains: this is no prediction but a check of the fit."
+        )
+    for reason in excluded.values():
+        console.say(f"left out: {reason}")
+    console.wrote(*written)
+    console.write_json(json_file, {"predictions": rows, "fitted_on": seen, "excluded": excluded})
+    if (folder / "match.npz").exists():
+        console.following(f"pronk report {folder}   # puts these replays on the page")
 
 
-def replays_of(log: SweepLog, robot: Robot, gains: MatchedGains) -> list[Replay]:
-    raise NotImplementedError
+def replays_of(
+    log: SweepLog, robot: Robot, gains: MatchedGains
+) -> tuple[list[Replay], dict[str, str]]:
+    """Replays of every joint that a log asks, and why some are left out."""
+    from pronk.match.predict import predict as predict_log
+    from pronk.report.replay import Replay
+
+    found = predict_log(log, robot, gains)
+    replays = [
+        Replay(
+            joint=one.joint,
+            time=one.time,
+            command=one.command,
+            measured=one.measured,
+            naive=one.naive,
+            matched=one.matched,
+            rmse_naive=one.rmse_naive,
+            rmse_matched=one.rmse_matched,
+            r2_naive=one.r2_naive,
+            r2_matched=one.r2_matched,
+            signal=one.signal,
+            unit=one.unit,
+        )
+        for one in found.joints
+    ]
+    return replays, dict(found.excluded)
+
+
+def show(rows: list[dict[str, Any]], *, virtual: bool) -> None:
+    """Print the table of predictions."""
+    made = console.table(
+        "Replayed logs of the virtual robot" if virtual else "Replayed logs",
+        "joint",
+        "signal",
+        "RMSE naive",
+        "RMSE matched",
+        "unit",
+        "matched / naive",
+        "R2 naive",
+        "R2 matched",
+    )
+    for row in rows:
+        naive, matched = row["rmse_naive"], row["rmse_matched"]
+        console.row(
+            made,
+            row["joint"],
+            row["signal"].replace("_", " "),
+            console.number(naive, 4),
+            console.number(matched, 4),
+            row["unit"],
+            console.number(matched / naive if naive > 0.0 else float("nan")),
+            console.number(row["r2_naive"], 3),
+            console.number(row["r2_matched"], 3),
+        )
+    console.show(made)
 
 
 def row_of(one: Replay) -> dict[str, Any]:

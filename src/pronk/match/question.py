@@ -9,7 +9,6 @@ read in the middle of each tick of that clock.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -223,11 +222,3 @@ def asked(log: SweepLog, joint: str) -> list[Segment]:
     found = [segment for segment in log.segments if joint in segment.joints]
     # NaN amplitudes (imported logs that do not say) keep the order of the log.
     return sorted(found, key=lambda s: (-np.nan_to_num(s.amplitude), s.repeat, s.start))
-
-
-def amplitudes(segments: Sequence[Segment]) -> list[list[Segment]]:
-    """Segments gathered by amplitude, in the order given."""
-    groups: dict[float, list[Segment]] = {}
-    for segment in segments:
-        groups.setdefault(round(float(np.nan_to_num(segment.amplitude)), 6), []).append(segment)
-    return list(groups.values())

@@ -18,6 +18,7 @@ from pronk.report import style
 from pronk.response.response import FrequencyResponse
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 _LOWEST_HZ = 0.1
 _MIN_COHERENCE = 0.5
@@ -29,10 +30,20 @@ def measured_words(virtual: bool) -> str:
     return "measured on the virtual robot" if virtual else "measured"
 
 
+def _worth(response: FrequencyResponse) -> NDArray[np.bool_]:
+    """Frequencies worth drawing: those that were asked and answered."""
+    asked = (response.coherence >= _MIN_COHERENCE) & (response.frequency_hz > 0.0)
+    return asked if asked.any() else response.frequency_hz > 0.0
+
+
+def _hidden(response: FrequencyResponse, values: Array) -> Array:
+    """Values of a curve, not a number where it is not worth drawing."""
+    return np.where(_worth(response), values, np.nan)
+
+
 def _limits_hz(responses: Sequence[FrequencyResponse]) -> tuple[float, float]:
-    hz = np.concatenate([r.frequency_hz for r in responses])
-    positive = hz[hz > 0.0]
-    return max(_LOWEST_HZ, float(positive.min())), float(positive.max())
+    hz = np.concatenate([r.frequency_hz[_worth(r)] for r in responses])
+    return max(_LOWEST_HZ, float(hz.min())), float(hz.max())
 
 
 def _shade_band(axes: Axes, band_hz: tuple[float, float]) -> None:
@@ -40,21 +51,21 @@ def _shade_band(axes: Axes, band_hz: tuple[float, float]) -> None:
 
 
 def _draw_measured_gain(axes: Axes, response: FrequencyResponse) -> None:
-    hz, low_high = response.frequency_hz, response.gain_interval()
-    low, high = (style.decibel(bound) for bound in low_high)
+    hz = response.frequency_hz
+    low, high = (_hidden(response, style.decibel(bound)) for bound in response.gain_interval())
     axes.fill_between(hz, low, high, color=style.MEASURED_WIDE, alpha=0.35, linewidth=0)
-    axes.plot(hz, style.decibel(response.gain), **style.MEASURED_LINE)
+    axes.plot(hz, _hidden(response, style.decibel(response.gain)), **style.MEASURED_LINE)
 
 
-def _gain_limits(
-    joint: JointMatch, extra: Sequence[NDArray[np.complex128]] = ()
-) -> tuple[float, float]:
+def _gain(axes: Axes, response: FrequencyResponse, curve: ComplexArray, **look: Any) -> None:
+    """Draw the gain of a simulated curve where the measured one is worth comparing with."""
+    axes.plot(response.frequency_hz, _hidden(response, style.decibel(curve)), **look)
+
+
+def _gain_limits(joint: JointMatch, extra: Sequence[ComplexArray] = ()) -> tuple[float, float]:
     """Limits of the gain axis that hold every curve where the measurement is worth reading."""
     response = joint.responses[0]
-    low_hz, high_hz = _limits_hz([response])
-    inside = response.band(low_hz, high_hz, _MIN_COHERENCE)
-    if not inside.any():
-        inside = response.band(low_hz, high_hz)
+    inside = _worth(response)
     curves = [response.gain, np.abs(joint.matched), np.abs(joint.naive), *map(np.abs, extra)]
     values = np.concatenate([style.decibel(curve[inside]) for curve in curves])
     values = values[np.isfinite(values)]
@@ -83,8 +94,8 @@ def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True)
             _shade_band(panel, joint.band_hz)
             style.frequency_axis(panel, low_hz, high_hz)
         _draw_measured_gain(gain, response)
-        gain.plot(hz, style.decibel(joint.naive), **style.NAIVE_LINE)
-        gain.plot(hz, style.decibel(joint.matched), **style.MATCHED_LINE)
+        _gain(gain, response, joint.naive, **style.NAIVE_LINE)
+        _gain(gain, response, joint.matched, **style.MATCHED_LINE)
         gain.set_ylim(*_gain_limits(joint))
         gain.set_ylabel("gain [dB]")
         gain.set_title(title or style.joint_words(joint.joint))
@@ -92,17 +103,27 @@ def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True)
         low, high = response.phase_interval()
         phase.fill_between(
             hz,
-            np.degrees(low),
-            np.degrees(high),
+            _hidden(response, np.degrees(low)),
+            _hidden(response, np.degrees(high)),
             color=style.MEASURED_WIDE,
             alpha=0.35,
             linewidth=0,
         )
-        phase.plot(hz, np.degrees(response.phase), **style.MEASURED_LINE)
+        phase.plot(hz, _hidden(response, np.degrees(response.phase)), **style.MEASURED_LINE)
         for curve, line in ((joint.naive, style.NAIVE_LINE), (joint.matched, style.MATCHED_LINE)):
-            phase.plot(hz, np.degrees(np.unwrap(np.angle(curve))), **line)
+            phase.plot(hz, _hidden(response, np.degrees(np.unwrap(np.angle(curve)))), **line)
         phase.set_ylabel("phase [deg]")
         phase.set_ylim(*_phase_limits(joint))
+        if joint.grid_error.size:
+            # Reading F9: the paper discards the phase, because the links' delay is in it.
+            phase.text(
+                0.01,
+                0.06,
+                "not compared: the delay of command and measurement is in it",
+                transform=phase.transAxes,
+                fontsize=8.5,
+                color="#333333",
+            )
         if coherence:
             panels[2].fill_between(
                 hz, 0.0, response.coherence, color=style.MEASURED, alpha=0.35, linewidth=0
@@ -118,11 +139,9 @@ def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True)
 
 def _phase_limits(joint: JointMatch) -> tuple[float, float]:
     response = joint.responses[0]
-    inside = response.band(*_limits_hz([response]), _MIN_COHERENCE)
+    inside = _worth(response)
     curves = [response.phase, *(np.unwrap(np.angle(c)) for c in (joint.matched, joint.naive))]
-    values = np.degrees(
-        np.concatenate([curve[inside] if inside.any() else curve for curve in curves])
-    )
+    values = np.degrees(np.concatenate([curve[inside] for curve in curves]))
     values = values[np.isfinite(values)]
     return float(max(values.min() - 15.0, -720.0)), float(min(values.max() + 15.0, 90.0))
 
@@ -172,12 +191,13 @@ def overview(result: MatchResult) -> Figure:
         limits = {}
         for name, axes in panels.items():
             joint = result.joints[name]
-            hz = joint.responses[0].frequency_hz
             _shade_band(axes, joint.band_hz)
             style.frequency_axis(axes, *_limits_hz([joint.responses[0]]))
             _draw_measured_gain(axes, joint.responses[0])
-            axes.plot(hz, style.decibel(joint.naive), **{**style.NAIVE_LINE, "linewidth": 1.2})
-            axes.plot(hz, style.decibel(joint.matched), **{**style.MATCHED_LINE, "linewidth": 1.1})
+            _gain(axes, joint.responses[0], joint.naive, **{**style.NAIVE_LINE, "linewidth": 1.2})
+            _gain(
+                axes, joint.responses[0], joint.matched, **{**style.MATCHED_LINE, "linewidth": 1.1}
+            )
             axes.set_title(style.joint_words(name))
             axes.xaxis.set_major_locator(FixedLocator([0.01, 0.1, 1.0, 10.0, 100.0]))
             axes.text(
@@ -215,15 +235,14 @@ def zero_armature(joint: JointMatch) -> Figure:
     if joint.zero_armature is None:
         raise ValueError(f"{joint.joint} was not matched with zero armature")
     response = joint.responses[0]
-    hz = response.frequency_hz
     with style.styled():
         figure = Figure(figsize=(style.PAGE_WIDTH_IN, 3.9), layout="constrained")
         axes = figure.subplots()
         _shade_band(axes, joint.band_hz)
         style.frequency_axis(axes, *_limits_hz([response]))
         _draw_measured_gain(axes, response)
-        axes.plot(hz, style.decibel(joint.zero_armature), **style.ZERO_LINE)
-        axes.plot(hz, style.decibel(joint.matched), **style.MATCHED_LINE)
+        _gain(axes, response, joint.zero_armature, **style.ZERO_LINE)
+        _gain(axes, response, joint.matched, **style.MATCHED_LINE)
         axes.set_ylim(*_gain_limits(joint, [joint.zero_armature]))
         axes.set_ylabel("gain [dB]")
         axes.set_xlabel("frequency [Hz]")
@@ -261,13 +280,14 @@ def answers(responses: Sequence[FrequencyResponse]) -> Figure:
             hz = response.frequency_hz
             gain, phase = response.gain_interval(), response.phase_interval()
             shade = {"color": look["color"], "alpha": 0.15, "linewidth": 0}
-            panels[0].fill_between(hz, *map(style.decibel, gain), **shade)
-            panels[0].plot(hz, style.decibel(response.gain), **look)
-            panels[1].fill_between(hz, *map(np.degrees, phase), **shade)
-            panels[1].plot(hz, np.degrees(response.phase), **look)
+            gains = [_hidden(response, style.decibel(g)) for g in (*gain, response.gain)]
+            phases = [_hidden(response, np.degrees(p)) for p in (*phase, response.phase)]
+            for panel, (low, high, middle) in zip(panels, (gains, phases), strict=False):
+                panel.fill_between(hz, low, high, **shade)
+                panel.plot(hz, middle, **look)
             panels[2].plot(hz, response.coherence, **look)
             handles.append(Line2D([], [], label=f"{response.amplitude:.3g} rad", **look))
-            worth = style.decibel(response.gain[response.coherence >= _MIN_COHERENCE])
+            worth = style.decibel(response.gain[_worth(response)])
             lowest = min(lowest, *worth, np.inf)
             highest = max(highest, *worth, -np.inf)
         for panel in panels:

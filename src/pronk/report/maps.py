@@ -44,10 +44,11 @@ def error_maps(
         naive_gains: Gains of the real drive per joint (stiffness [N m/rad], damping
             [N m s/rad]), drawn as a cross where given.
     """
-    rows = style.grid_of_joints(list(result.joints))
+    mapped = {name: joint for name, joint in result.joints.items() if joint.grid_error.size}
+    rows = style.grid_of_joints(list(mapped))
     paper = published(result.gains.robot)
     known = naive_gains or {}
-    errors = {name: np.sqrt(result.joints[name].grid_error) for name in result.joints}
+    errors = {name: np.sqrt(joint.grid_error) for name, joint in mapped.items()}
     low = max(min(float(np.nanmin(e)) for e in errors.values()), 0.05)
     high = max(float(np.nanmax(e)) for e in errors.values())
     norm = LogNorm(vmin=low, vmax=max(high, low * 1.01))
@@ -216,7 +217,7 @@ def _draw_group(axes: Axes, gains: MatchedGains, name: str, joints: Sequence[str
             markersize=5,
             elinewidth=1.0,
         )
-        if not style.leg_of(joint):
+        if len(joints) > 1 and not style.leg_of(joint):
             axes.annotate(
                 style.joint_words(joint),
                 (one.stiffness, one.damping),

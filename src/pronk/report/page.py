@@ -6,7 +6,7 @@ are any, `*.prediction.npz`), holds its figures in itself and opens without a ne
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import MatchResult
 from pronk.report import figures, replay, style
 from pronk.report.paper import published
 from pronk.robots import load_robot
@@ -90,14 +90,16 @@ def drive_gains(gains: MatchedGains) -> dict[str, tuple[float, float]]:
     return {joint.name: (joint.stiffness, joint.damping) for joint in joints}
 
 
-def doubts(joint: JointMatch) -> list[str]:
-    """The flags that speak against the match; the one about zero armature speaks for it."""
-    return [flag for flag in joint.flags if not flag.startswith("zero armature")]
+def doubts(result: MatchResult, name: str) -> list[str]:
+    """The flags that speak against the match of a joint; that about zero armature speaks for it."""
+    joint = result.joints.get(name)
+    flags = (*result.gains.joints[name].flags, *(joint.flags if joint is not None else ()))
+    return [flag for flag in dict.fromkeys(flags) if not flag.startswith("zero armature")]
 
 
-def is_match(joint: JointMatch) -> bool:
+def is_match(result: MatchResult, name: str) -> bool:
     """True unless a flag of the joint says that there is no match."""
-    return not any(flag.startswith("no match") for flag in joint.flags)
+    return not any(flag.startswith("no match") for flag in doubts(result, name))
 
 
 def rms(values: list[float]) -> float:
@@ -108,16 +110,17 @@ def rms(values: list[float]) -> float:
 
 def verdict(result: MatchResult) -> dict[str, Any]:
     """The figures of the first section, also what `--json` gives."""
-    joints = result.joints
+    joints = result.gains.joints
+    errors = {name: joint.error_db for name, joint in joints.items() if joint.error_db >= 0.0}
     return {
         "robot": result.gains.robot,
         "virtual": result.gains.virtual,
         "joints": len(joints),
-        "matched": sum(is_match(joint) for joint in joints.values()),
+        "matched": sum(is_match(result, name) for name in joints),
         "naive_error_db": rms([joint.naive_error_db for joint in joints.values()]),
         "error_db": rms([joint.error_db for joint in joints.values()]),
-        "worst": max(joints, key=lambda name: joints[name].error_db, default=""),
-        "flags": {name: doubts(joint) for name, joint in joints.items() if doubts(joint)},
+        "worst": max(errors, key=lambda name: errors[name], default=""),
+        "flags": {name: found for name in joints if (found := doubts(result, name))},
     }
 
 
@@ -159,14 +162,19 @@ def _scales(gains: MatchedGains, members: Mapping[str, list[str]]) -> list[dict[
     return rows
 
 
+def knees_first(names: Iterable[str]) -> list[str]:
+    """Joint names, those of knees first: where rotor inertia and mismatch are largest."""
+    return sorted(names, key=lambda name: not name.endswith("knee"))
+
+
 def _predictions(folder: Path) -> list[dict[str, Any]]:
     shown = []
     for path in sorted(folder.glob("*.prediction.npz")):
         prediction = replay.load(path)
         if not prediction.replays:
             continue
-        knees = [r for r in prediction.replays if r.joint.endswith("knee")]
-        first = (knees or list(prediction.replays))[0]
+        by_joint = {one.joint: one for one in prediction.replays}
+        first = by_joint[knees_first(by_joint)[0]]
         where = "the virtual robot" if prediction.virtual else "the robot"
         shown.append(
             {
@@ -188,13 +196,14 @@ def _pictures(result: MatchResult) -> dict[str, Any]:
     where = "on the virtual robot" if gains.virtual else "on the robot"
     amplitudes = figures.amplitudes(result)
     zero = {name: joint for name, joint in joints.items() if joint.zero_armature is not None}
-    knees = [name for name in zero if name.endswith("knee")]
-    worst = max(zero, key=lambda name: zero[name].zero_armature_error_db, default="")
     return {
         "overview": _picture(
             figures.overview(result),
             f"Gain over frequency of every joint, measured {where} and simulated",
-        ),
+        )
+        if joints
+        else None,
+        "example": (knees_first(joints) or [""])[0],
         "bodes": {
             name: _picture(
                 figures.bode(joint),
@@ -206,7 +215,7 @@ def _pictures(result: MatchResult) -> dict[str, Any]:
             figures.error_maps(result, drive_gains(gains)),
             "Gain error over the grid of stiffness and damping for every joint",
         )
-        if joints
+        if any(joint.grid_error.size for joint in joints.values())
         else None,
         "ranges": _picture(
             figures.ranges(gains, dict(group_members(gains))),
@@ -215,7 +224,7 @@ def _pictures(result: MatchResult) -> dict[str, Any]:
         if group_members(gains)
         else None,
         "zero": _picture(
-            figures.zero_armature(zero[(knees or [worst])[0]]),
+            figures.zero_armature(zero[knees_first(zero)[0]]),
             "Gain over frequency with and without rotor inertia in the simulator",
         )
         if zero
@@ -226,12 +235,32 @@ def _pictures(result: MatchResult) -> dict[str, Any]:
     }
 
 
+def _without_armature(result: MatchResult) -> list[dict[str, Any]]:
+    rows = []
+    for name, joint in result.joints.items():
+        if np.isfinite(joint.zero_armature_error_db):
+            said = [flag for flag in joint.flags if flag.startswith("zero armature: no match")]
+            rows.append(
+                {
+                    "joint": name,
+                    "zero_db": joint.zero_armature_error_db,
+                    "error_db": joint.error_db,
+                    "ratio": joint.zero_armature_error_db / max(joint.error_db, 1e-6),
+                    "no_match": bool(said),
+                }
+            )
+    return rows
+
+
 def _number(value: float, digits: int = 3) -> str:
     """A number for a table: fixed digits, a dash where it is unknown."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
 
 
 def _interval(bounds: tuple[float, float], digits: int = 3) -> str:
+    """An interval for a table; `held` for a number that was not fitted."""
+    if bounds[0] == bounds[1]:
+        return "held"
     return f"{_number(bounds[0], digits)} to {_number(bounds[1], digits)}"
 
 
@@ -265,9 +294,11 @@ def render(result: MatchResult, folder: Path, gains_name: str = "gains.yaml") ->
         paper=published(result.gains.robot),
         pictures=_pictures(result),
         predictions=_predictions(folder),
+        in_time=not any(joint.grid_error.size for joint in result.joints.values()),
         seconds=result.seconds,
         steps_per_second=result.grid_steps_per_second,
-        zero={n: j for n, j in result.joints.items() if np.isfinite(j.zero_armature_error_db)},
+        zero=_without_armature(result),
+        drives=any(np.isfinite(j.frictionloss) or j.delay_s for j in result.gains.joints.values()),
         amplitude_rows={n: j for n, j in result.joints.items() if len(j.amplitude_gains) > 1},
     )
 

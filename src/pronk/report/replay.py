@@ -109,11 +109,18 @@ def load(path: Path) -> Prediction:
 
 
 def busiest_window(replay: Replay, seconds: float) -> slice:
-    """The window of this length in which the naive simulation is furthest off."""
+    """The window of this length in which the error of the naive simulation varies most.
+
+    The variance, not the mean square: a joint that rests beside its command is not the picture.
+    """
     rate = (len(replay.time) - 1) / float(replay.time[-1] - replay.time[0])
     width = min(max(2, round(seconds * rate)), len(replay.time))
-    power = np.concatenate(([0.0], np.cumsum((replay.naive - replay.measured) ** 2)))
-    start = int(np.argmax(power[width:] - power[:-width]))
+    error = replay.naive - replay.measured
+    total = np.concatenate(([0.0], np.cumsum(error)))
+    power = np.concatenate(([0.0], np.cumsum(error**2)))
+    mean = (total[width:] - total[:-width]) / width
+    variance = (power[width:] - power[:-width]) / width - mean**2
+    start = int(np.argmax(variance))
     return slice(start, start + width)
 
 
@@ -123,7 +130,7 @@ def figure(replay: Replay, *, virtual: bool, seconds: float = 1.5) -> Figure:
     Args:
         replay: One joint's replay.
         virtual: The measured curve is the virtual robot's.
-        seconds: Length of the window shown, where the naive simulation is furthest off [s].
+        seconds: Length of the window shown, by `busiest_window` [s].
     """
     window = busiest_window(replay, seconds)
     time = replay.time[window]
@@ -137,8 +144,8 @@ def figure(replay: Replay, *, virtual: bool, seconds: float = 1.5) -> Figure:
         top.plot(time, replay.naive[window], **style.NAIVE_LINE)
         top.plot(time, replay.matched[window], **style.MATCHED_LINE)
         top.set_ylabel(f"position [{replay.unit}]")
-        asked = replay.signal.replace("_", " ")
-        top.set_title(f"{style.joint_words(replay.joint)}: a {asked} that the fit never saw")
+        asked = "log" if replay.signal == "unknown" else replay.signal.replace("_", " ")
+        top.set_title(f"{style.joint_words(replay.joint)}: a {asked} replayed")
         bottom.axhline(0.0, color="#666666", linewidth=0.8)
         bottom.plot(time, replay.naive[window] - measured, **style.NAIVE_LINE)
         bottom.plot(time, replay.matched[window] - measured, **style.MATCHED_LINE)

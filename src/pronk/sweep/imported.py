@@ -70,7 +70,8 @@ def import_columns(
         joint_names: Names to give the joints.
         rate_hz: Rate that the file is claimed to have.
         drop_duplicates: Drop rows that repeat the one before in full.
-        scale: Radians per unit of joints whose unit is unknown, by (new) joint name.
+        scale: Radians per unit of joints whose unit is unknown, by (new) joint name; for command
+            and position, the velocity is left as it is.
 
     Raises:
         LogError: Something cannot be believed; the message names it and the way out.
@@ -97,11 +98,15 @@ def import_columns(
     kept = np.flatnonzero(keep)
     time = columns.time[keep]
     check_increasing(time, where, lambda i: columns.row(int(kept[i])))
-    time = time * TIME_UNITS[time_unit]
-    check_unit(time, where, time_unit)
-    if abs(time[0]) > _EPOCH_S:
-        notes.append(f"the clock is made to begin at zero (the first timestamp is {time[0]:.6f} s)")
+    seconds = TIME_UNITS[time_unit]
+    check_unit(time * seconds, where, time_unit)
+    if abs(time[0] * seconds) > _EPOCH_S:
+        notes.append(
+            f"the clock is made to begin at zero (the first timestamp is {time[0] * seconds:.6f} s)"
+        )
+        # Before the unit is changed: nothing is rounded away.
         time = time - time[0]
+    time = time * seconds
     timing = examine(time)
     notes.append(timing.words())
     if rate_hz is not None:
@@ -115,6 +120,10 @@ def import_columns(
     def scaled(values: Array, by: Array | float = 1.0) -> Array:
         return np.asarray(values[keep] * by)
 
+    # A scale says what a unit of position is; the velocity beside it may be an angle already.
+    rates = np.array(
+        [1.0 if joint in (scale or {}) else f for joint, f in zip(joints, factors, strict=True)]
+    )
     command = scaled(columns.command, factors)
     if note := _correlation(time, command, joints, timing.rate_hz):
         notes.append(note)
@@ -124,7 +133,7 @@ def import_columns(
         time=time,
         command=command,
         position=scaled(columns.position, factors),
-        velocity=None if columns.velocity is None else scaled(columns.velocity, factors),
+        velocity=None if columns.velocity is None else scaled(columns.velocity, rates),
         torque=None if columns.torque is None else scaled(columns.torque),
         segments=_questions(time, command, joints),
         pose=np.asarray(0.5 * (command.max(axis=0) + command.min(axis=0))),

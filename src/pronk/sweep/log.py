@@ -180,8 +180,8 @@ class SweepLog:
         inside = (self.time >= segment.start - 1e-9) & (self.time <= segment.stop + 1e-9)
         if int(inside.sum()) < 2:
             raise LogError(
-                f"{self.source or 'log'}: segment {segment.start:.3f} to {segment.stop:.3f} s holds "
-                f"{int(inside.sum())} samples; the log spans {self.time[0]:.3f} to "
+                f"{self.source or 'log'}: segment {segment.start:.3f} to {segment.stop:.3f} s "
+                f"holds {int(inside.sum())} samples; the log spans {self.time[0]:.3f} to "
                 f"{self.time[-1]:.3f} s."
             )
 

@@ -1,0 +1,308 @@
+"""Matched gains as configuration of a simulator, as text to read and to paste.
+
+Every export says which simulator the gains hold for: the same numbers in another engine, at
+another timestep or with another actuator law are another joint. Delays are rounded to physics
+steps where a simulator knows no others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import yaml
+
+from pronk.errors import PronkError
+from pronk.match.gains import MatchedGains
+from pronk.robots import load_robot
+from pronk.robots.robot import Robot
+from pronk.robots.spec import add_drives, free_spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupDrive:
+    """One joint group as every export needs it: gains, ranges and the drive's limits."""
+
+    group: str
+    joints: tuple[str, ...]
+    stiffness: float
+    """[N m/rad]"""
+    damping: float
+    """[N m s/rad]"""
+    stiffness_range: tuple[float, float]
+    """Lowest and highest of the uniform randomization [N m/rad]."""
+    damping_range: tuple[float, float]
+    """Lowest and highest of the uniform randomization, not below 0 [N m s/rad]."""
+    armature: float
+    """[kg m^2]"""
+    frictionloss: float
+    """[N m]"""
+    viscous_damping: float
+    """[N m s/rad]"""
+    effort_limit: float
+    """[N m]"""
+    stall_torque: float
+    """[N m]"""
+    no_load_speed: float
+    """[rad/s]"""
+    delay_steps: int
+    """Command delay in physics steps."""
+
+
+def group_drives(gains: MatchedGains, robot: Robot) -> list[GroupDrive]:
+    """The matched groups, in the robot's order. Fitted friction and delay are averaged.
+
+    Raises:
+        PronkError: The gains are of another robot, or hold no group.
+    """
+    if gains.robot != robot.name:
+        raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    out = []
+    for name in robot.groups:
+        if name not in gains.groups:
+            continue
+        group, members = gains.groups[name], robot.group(name)
+        matched = [gains.joints[j.name] for j in members if j.name in gains.joints]
+        drive = members[0].drive
+        dry = [j.frictionloss for j in matched if not np.isnan(j.frictionloss)]
+        delay = float(np.mean([j.delay_s for j in matched])) if matched else 0.0
+        out.append(
+            GroupDrive(
+                group=name,
+                joints=tuple(j.name for j in members),
+                stiffness=group.stiffness,
+                damping=group.damping,
+                stiffness_range=_about(group.stiffness, group.stiffness_range),
+                damping_range=_about(group.damping, group.damping_range),
+                armature=float(np.mean([j.armature for j in matched]))
+                if matched
+                else drive.armature,
+                frictionloss=float(np.mean(dry)) if dry else drive.frictionloss,
+                viscous_damping=drive.viscous_damping,
+                effort_limit=drive.effort_limit,
+                stall_torque=drive.stall_torque,
+                no_load_speed=drive.no_load_speed,
+                delay_steps=round(delay / gains.simulator.timestep_s),
+            )
+        )
+    if not out:
+        raise PronkError(
+            f"the gains of {gains.robot} hold no joint group; match some joints first."
+        )
+    return out
+
+
+def mjlab_text(gains: MatchedGains) -> str:
+    """Python source for mjlab: `ACTUATORS`, a tuple of configs, and `EVENTS`, a dict of events.
+
+    The events draw absolute gains for every environment (D3, D4); they address the actuators by
+    their place in `ACTUATORS`, so keep the order.
+    """
+    drives = group_drives(gains, load_robot(gains.robot))
+    actuators, events = [], []
+    for index, drive in enumerate(drives):
+        delay = (
+            f"        delay_min_lag={drive.delay_steps},  # physics steps\n"
+            f"        delay_max_lag={drive.delay_steps},\n"
+            if drive.delay_steps
+            else ""
+        )
+        actuators.append(
+            f"    DcMotorActuatorCfg(  # {drive.group}\n"
+            f"        target_names_expr={_names(drive.joints)},\n"
+            f"        stiffness={_number(drive.stiffness)},\n"
+            f"        damping={_number(drive.damping)},\n"
+            f"        armature={_number(drive.armature)},\n"
+            f"        frictionloss={_number(drive.frictionloss)},\n"
+            f"        viscous_damping={_number(drive.viscous_damping)},\n"
+            f"        effort_limit={_number(drive.effort_limit)},\n"
+            f"        saturation_effort={_number(drive.stall_torque)},\n"
+            f"        velocity_limit={_number(drive.no_load_speed)},\n"
+            f"{delay}    ),"
+        )
+        events.append(
+            f'    "{drive.group}_gains": EventTermCfg(\n'
+            f"        func=dr.pd_gains,\n"
+            f'        mode="startup",\n'
+            f"        params={{\n"
+            f'            "asset_cfg": SceneEntityCfg("robot", actuator_ids=[{index}]),\n'
+            f'            "kp_range": {_pair(drive.stiffness_range)},\n'
+            f'            "kd_range": {_pair(drive.damping_range)},\n'
+            f'            "operation": "abs",\n'
+            f"        }},\n"
+            f"    ),"
+        )
+    return "\n".join(
+        [
+            _comment(_face(gains), "# "),
+            "",
+            "from mjlab.actuator import DcMotorActuatorCfg",
+            "from mjlab.envs.mdp import dr",
+            "from mjlab.managers.event_manager import EventTermCfg",
+            "from mjlab.managers.scene_entity_config import SceneEntityCfg",
+            "",
+            "ACTUATORS = (",
+            *actuators,
+            ")",
+            "",
+            "EVENTS = {",
+            *events,
+            "}",
+            "",
+        ]
+    )
+
+
+def events_text(gains: MatchedGains) -> str:
+    """The randomization as YAML: absolute ranges for mjlab's `dr.pd_gains`, one entry a group."""
+    drives = group_drives(gains, load_robot(gains.robot))
+    body = {
+        f"{drive.group}_gains": {
+            "func": "mjlab.envs.mdp.dr.pd_gains",
+            "mode": "startup",
+            "joints": list(drive.joints),
+            "kp_range": list(drive.stiffness_range),
+            "kd_range": list(drive.damping_range),
+            "operation": "abs",
+            "distribution": "uniform",
+        }
+        for drive in drives
+    }
+    return _comment(_face(gains), "# ") + "\n" + yaml.safe_dump(body, sort_keys=False)
+
+
+def mjcf_text(gains: MatchedGains) -> str:
+    """The whole robot as MJCF with a native `dcmotor` for every joint.
+
+    Its torque is the PD law with the groups' gains, clipped by the torque-speed line and the
+    effort limit. MuJoCo treats native drives explicitly under Euler only, so the integrator is
+    Euler: it gives the trajectories of the training simulator (see `pronk.robots.spec`). Joints
+    that were not matched have the robot's published gains. MuJoCo knows no delay of a position
+    command in its drives; a matched delay is named in the comment.
+    """
+    robot = load_robot(gains.robot)
+    drives = group_drives(gains, robot)
+    by_joint = {joint: drive for drive in drives for joint in drive.joints}
+    friction = {name: drive.frictionloss for name, drive in by_joint.items()}
+    armature = {name: drive.armature for name, drive in by_joint.items()}
+    spec = free_spec(robot)
+    spec.option.timestep = gains.simulator.timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    add_drives(
+        spec,
+        robot,
+        robot.joint_names,
+        stiffness={name: drive.stiffness for name, drive in by_joint.items()},
+        damping={name: drive.damping for name, drive in by_joint.items()},
+        armature=armature,
+        frictionloss=friction,
+    )
+    spec.compile()
+    late = [f"{d.group} {d.delay_steps} steps" for d in drives if d.delay_steps]
+    said = _face(gains)
+    if late:
+        said += "\nCommand delays that this file does not have: " + ", ".join(late) + "."
+    return f"<!--\n{said}\n-->\n{spec.to_xml()}"
+
+
+def isaaclab_text(gains: MatchedGains) -> str:
+    """Python source for Isaac Lab: `ACTUATORS`, a dict of `DCMotorCfg` by group.
+
+    Isaac Lab runs PhysX; the text says on its face that the gains must be matched there anew.
+    """
+    drives = group_drives(gains, load_robot(gains.robot))
+    entries = []
+    for drive in drives:
+        entries.append(
+            f'    "{drive.group}": DCMotorCfg(\n'
+            f"        joint_names_expr={list(drive.joints)!r},\n"
+            f"        stiffness={_number(drive.stiffness)},\n"
+            f"        damping={_number(drive.damping)},\n"
+            f"        armature={_number(drive.armature)},\n"
+            f"        friction={_number(drive.frictionloss)},\n"
+            f"        effort_limit={_number(drive.effort_limit)},\n"
+            f"        saturation_effort={_number(drive.stall_torque)},\n"
+            f"        velocity_limit={_number(drive.no_load_speed)},\n"
+            f"    ),  # draw stiffness from {_pair(drive.stiffness_range)}, "
+            f"damping from {_pair(drive.damping_range)}"
+        )
+    warning = (
+        "NOT MATCHED IN THIS SIMULATOR. Isaac Lab runs PhysX, whose integrator and joint friction "
+        "are not MuJoCo's:\nwith the same numbers the joints answer differently. Take them as a "
+        "start, sweep the joints in\nIsaac Lab with the log's own commands, and match again."
+    )
+    return "\n".join(
+        [
+            _comment(warning + "\n\n" + _face(gains), "# "),
+            "",
+            "from isaaclab.actuators import DCMotorCfg",
+            "",
+            "ACTUATORS = {",
+            *entries,
+            "}",
+            "",
+        ]
+    )
+
+
+EXPORTS: Mapping[str, Callable[[MatchedGains], str]] = {
+    "mjlab": mjlab_text,
+    "mjcf": mjcf_text,
+    "isaaclab": isaaclab_text,
+    "events": events_text,
+}
+"""What `export_text` can write."""
+
+
+def export_text(gains: MatchedGains, target: str) -> str:
+    """The gains as text for one simulator.
+
+    Args:
+        gains: Matched gains.
+        target: One of `EXPORTS`.
+
+    Raises:
+        PronkError: The target is unknown, or the gains hold no group.
+        RobotError: The robot is unknown.
+    """
+    if target not in EXPORTS:
+        raise PronkError(f"no export to {target!r}; expected one of {', '.join(EXPORTS)}.")
+    return EXPORTS[target](gains)
+
+
+def _face(gains: MatchedGains) -> str:
+    """What every export says first."""
+    simulator = gains.simulator
+    lines = [
+        f"Gains of {gains.robot}, matched by pronk.",
+        f"They hold for {simulator.engine} {simulator.version}, timestep "
+        f"{simulator.timestep_s:g} s, decimation {simulator.decimation},",
+        f"integrator {simulator.integrator}, actuator law {simulator.actuator}. In any other "
+        "simulator match again.",
+    ]
+    if gains.virtual:
+        lines.append("The logs came from pronk's virtual robot, not from hardware.")
+    lines += [f"Log {name}, SHA-256 {digest}" for name, digest in gains.logs.items()]
+    return "\n".join(lines)
+
+
+def _comment(text: str, mark: str) -> str:
+    return "\n".join((mark + line).rstrip() for line in text.splitlines())
+
+
+def _about(centre: float, half: float) -> tuple[float, float]:
+    return round(max(centre - half, 0.0), 9), round(centre + half, 9)
+
+
+def _number(value: float) -> str:
+    return repr(float(f"{value:.7g}"))
+
+
+def _pair(values: tuple[float, float]) -> str:
+    return f"({_number(values[0])}, {_number(values[1])})"
+
+
+def _names(names: tuple[str, ...]) -> str:
+    return "(" + " ".join(f'"{name}",' for name in names) + ")"

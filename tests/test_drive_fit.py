@@ -1,0 +1,199 @@
+"""A whole arm at once: known drives recovered, refusals, and the recorded SO-101."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pronk.errors import IdentifiabilityError, LogError, PronkError
+from pronk.match import gains as gains_file
+from pronk.match.arm_match import ArmMatch, drives_of, match_arm
+from pronk.match.arm_simulation import ArmBench, JointDrive, held_mean, moves_together
+from pronk.match.drive_fit import fit_drive
+from pronk.match.predict import predict
+from pronk.match.trust import trusted_frequency, trusted_samples
+from pronk.robots import load_robot
+from pronk.sweep.log import Segment, SweepLog
+from pronk.sweep.readers import read_log
+
+SO101 = Path(__file__).resolve().parents[2] / "shared" / "data" / "so101"
+recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the SO-101 recordings are not here")
+
+ARM = load_robot("so101")
+JOINTS = ARM.joint_names[:5]
+COUNT = 2.0 * np.pi / 4096
+"""Encoder of the servo: 12 bits."""
+TRUTH = {
+    name: JointDrive(
+        stiffness=17.8,
+        damping=0.75 + 0.1 * i,
+        armature=0.02 + 0.004 * i,
+        frictionloss=0.1 + 0.05 * i,
+        delay=0.008 + 0.002 * i,
+    )
+    for i, name in enumerate(JOINTS)
+}
+
+
+def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) -> SweepLog:
+    """Every joint on lines of its own; positions are not there yet."""
+    time = np.arange(0.0, seconds, 0.02)
+    random = np.random.default_rng(1)
+    command = np.zeros((len(time), len(JOINTS)))
+    start = np.array([ARM.joint(name).default_position for name in JOINTS])
+    ramp = np.minimum(time / 1.0, 1.0)
+    for i in range(len(JOINTS)):
+        hz = np.geomspace(*lines_hz, 12) * (1.0 + 0.015 * i)
+        phase = random.uniform(0.0, 2.0 * np.pi, len(hz))
+        signal = np.sin(2.0 * np.pi * time[:, None] * hz + phase).sum(axis=1)
+        command[:, i] = start[i] + amplitude * ramp * signal / np.abs(signal).max()
+    return SweepLog(
+        robot="so101",
+        joints=JOINTS,
+        time=time,
+        command=command,
+        position=np.tile(start, (len(time), 1)),
+    )
+
+
+def answered(log: SweepLog, truth: dict[str, JointDrive]) -> SweepLog:
+    """What an arm with these drives and 12-bit encoders would have recorded."""
+    with ArmBench(ARM, [log]) as bench:
+        position = bench.run([truth])[0][0]
+    return replace(log, position=np.round(position / COUNT) * COUNT)
+
+
+def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
+    log = answered(commands(65.0, (0.15, 8.0), 0.35), TRUTH)
+    fit = fit_drive([log], ARM)
+    for name, truth in TRUTH.items():
+        joint = fit.joints[name]
+        assert joint.drive.stiffness == truth.stiffness
+        assert joint.drive.damping == pytest.approx(truth.damping, rel=0.03)
+        assert joint.drive.armature == pytest.approx(truth.armature, rel=0.08)
+        assert joint.drive.frictionloss == pytest.approx(truth.frictionloss, rel=0.05)
+        assert joint.drive.delay == pytest.approx(truth.delay, abs=1e-3)
+        assert joint.rmse < 1e-3 < joint.published_rmse
+
+
+def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
+    log = answered(commands(65.0, (0.05, 0.4), 0.1), TRUTH)
+    with pytest.raises(IdentifiabilityError) as refused:
+        fit_drive([log], ARM)
+    assert "armature" in str(refused.value)
+    assert "a sweep to higher frequencies" in str(refused.value)
+
+
+def test_too_short_and_misspelled_are_refused() -> None:
+    log = commands(30.0, (0.2, 3.0), 0.2)
+    with pytest.raises(LogError, match="intervals need at least 3"):
+        fit_drive([log], ARM)
+    with pytest.raises(PronkError, match="expected some of stiffness, damping"):
+        fit_drive([log], ARM, parameters=("kd",))
+    with pytest.raises(LogError, match="at least one"):
+        fit_drive([], ARM)
+    with pytest.raises(PronkError, match="gains or drive"):
+        match_arm([log], ARM, mode="both")  # type: ignore[arg-type]
+
+
+def test_still_arm_is_refused() -> None:
+    log = commands(30.0, (0.2, 3.0), 0.0)
+    with pytest.raises(LogError, match="asked to move in radians"):
+        ArmBench(ARM, [log])
+
+
+def test_held_mean_is_the_command_on_the_grid_and_its_share_off_it() -> None:
+    time, command = np.arange(4) * 0.02, np.array([0.0, 1.0, 3.0, 3.0])
+    edges = np.arange(17) * 0.005
+    assert held_mean(time, command, edges) == pytest.approx(np.repeat(command, 4))
+    late = held_mean(time, command, edges - 0.0025)
+    assert late[3:6] == pytest.approx([0.0, 0.5, 1.0])
+    assert held_mean(time, command, np.array([-1.0, -0.5])) == pytest.approx([0.0])
+
+
+def test_moving_together_is_told_from_taking_turns() -> None:
+    log = commands(10.0, (0.2, 3.0), 0.2)
+    assert moves_together(log)
+
+    def segment(joint: str, start: float, stop: float) -> Segment:
+        return Segment(kind="unknown", joints=(joint,), start=start, stop=stop, amplitude=0.1)
+
+    turns = (segment(JOINTS[0], 0.0, 4.0), segment(JOINTS[1], 5.0, 9.0))
+    assert not moves_together(replace(log, segments=turns))
+    both = (segment(JOINTS[0], 0.0, 6.0), segment(JOINTS[1], 5.0, 9.0))
+    assert moves_together(replace(log, segments=both))
+
+
+def test_sweep_is_believed_up_to_where_it_breaks() -> None:
+    time = np.arange(0.0, 120.0, 0.02)
+    hz = 0.1 * 50.0 ** (time / time[-1])
+    phase = 2.0 * np.pi * np.cumsum(hz) * 0.02
+    command = 0.15 * np.sin(phase)
+    noise = 0.05 * np.random.default_rng(0).standard_normal(len(time))
+    position = np.where(hz < 2.5, command, noise)
+    assert trusted_frequency(time, command, position) == pytest.approx(2.5, abs=0.3)
+    assert trusted_frequency(time, command, command) == np.inf
+    log = SweepLog(
+        robot="so101",
+        joints=("elbow_flex",),
+        time=time,
+        command=command[:, None],
+        position=position[:, None],
+    )
+    mask, _ = trusted_samples(log, "elbow_flex")
+    assert hz[mask].max() == pytest.approx(2.5, abs=0.3)
+    assert mask[hz < 2.0].all()
+
+
+@pytest.fixture(scope="module")
+def matched() -> ArmMatch:
+    return match_arm([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM)
+
+
+@recorded
+def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
+    matched: ArmMatch, tmp_path: Path
+) -> None:
+    gains_file.save(tmp_path / "gains.yaml", matched.gains)
+    gains = gains_file.load(tmp_path / "gains.yaml")
+    assert drives_of(ARM, gains)["elbow_flex"].frictionloss == pytest.approx(
+        matched.fit.drives["elbow_flex"].frictionloss, rel=1e-5
+    )
+    found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains)
+    assert tuple(one.joint for one in found.joints) == JOINTS
+    for one in found.joints:
+        assert one.rmse_matched < 0.7 * one.rmse_naive
+        assert one.r2_matched > one.r2_naive
+    # The jaw moved too, on a scale that is not radians: left out, with the way out.
+    assert "give the reader its travel in radians" in found.excluded["gripper"]
+
+
+@recorded
+def test_what_the_recording_does_not_tell_is_held_and_said(matched: ArmMatch) -> None:
+    # Gravity turns neither shoulder_pan nor wrist_roll, so nothing fixes the scale of torque.
+    for name in ("shoulder_pan", "wrist_roll"):
+        assert "stiffness" in matched.held[name]
+        assert matched.gains.joints[name].stiffness == ARM.joint(name).stiffness
+        assert any("stiffness held at 17.8" in flag for flag in matched.gains.joints[name].flags)
+    for name in ("shoulder_lift", "elbow_flex"):
+        low, high = matched.gains.joints[name].stiffness_ci95
+        assert high - low < 0.3 * matched.gains.joints[name].stiffness
+
+
+@recorded
+def test_matched_response_is_nearer_in_the_frequency_domain_too(matched: ArmMatch) -> None:
+    assert set(matched.joints) == set(JOINTS)
+    for name, joint in matched.joints.items():
+        assert joint.error_db < 0.5 * joint.naive_error_db, name
+        assert joint.band_hz[1] < 3.0  # the chirp outran the servos above
+
+
+@recorded
+def test_jaw_is_included_once_its_travel_is_given() -> None:
+    log = read_log(SO101 / "step_response", robot=ARM, scale={"gripper": 1.5})
+    with ArmBench(ARM, [log]) as bench:
+        assert bench.joints == ARM.joint_names
+        assert bench.excluded == {}

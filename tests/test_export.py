@@ -1,0 +1,164 @@
+"""Exports: the text runs where it is meant to, and the torque is the PD law."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from pronk.drive import clip_torque
+from pronk.errors import PronkError
+from pronk.match.export import EXPORTS, export_text, group_drives
+from pronk.match.gains import JointGains, MatchedGains, Simulator
+from pronk.match.ranges import group_gains
+from pronk.robots import load_robot
+
+ROBOT = load_robot("mini_cheetah")
+
+
+def matched(robot_name: str = "mini_cheetah", **extra: float) -> MatchedGains:
+    robot = load_robot(robot_name)
+    joints = {}
+    for i, joint in enumerate(robot.joints):
+        kp, kd = joint.stiffness + 0.3 * i, joint.damping + 0.004 * i
+        joints[joint.name] = JointGains(
+            stiffness=kp,
+            damping=kd,
+            grid_stiffness=kp,
+            grid_damping=kd,
+            stiffness_ci95=(kp - 0.3, kp + 0.3),
+            damping_ci95=(kd - 0.02, kd + 0.02),
+            covariance=((0.02, 0.0), (0.0, 1e-4)),
+            band_hz=joint.band_hz,
+            error_db=0.2,
+            naive_error_db=1.0,
+            coherence_min=0.97,
+            armature=joint.drive.armature,
+            **extra,
+        )
+    return MatchedGains(
+        robot=robot.name,
+        simulator=Simulator(version=mujoco.__version__),
+        joints=joints,
+        groups=group_gains(robot, joints),
+        logs={"FR_knee.mcap": "ab" * 32},
+        virtual=True,
+    )
+
+
+@pytest.mark.train
+def test_mjlab_text_builds_the_actuators_and_events() -> None:
+    pytest.importorskip("mjlab")
+    space: dict[str, object] = {}
+    exec(export_text(matched(frictionloss=0.15, delay_s=0.011), "mjlab"), space)
+    actuators, events = space["ACTUATORS"], space["EVENTS"]
+    assert isinstance(actuators, tuple)
+    assert isinstance(events, dict)
+    groups = matched().groups
+    assert len(actuators) == len(events) == len(groups)
+    for i, (cfg, event, (name, group)) in enumerate(
+        zip(actuators, events.values(), groups.items(), strict=True)
+    ):
+        drive = ROBOT.group(name)[0].drive
+        assert cfg.target_names_expr == tuple(j.name for j in ROBOT.group(name))
+        assert (cfg.stiffness, cfg.damping) == (group.stiffness, group.damping)
+        assert cfg.armature == pytest.approx(drive.armature)
+        assert cfg.frictionloss == 0.15
+        assert cfg.effort_limit == pytest.approx(drive.effort_limit)
+        assert cfg.saturation_effort == pytest.approx(drive.stall_torque)
+        assert cfg.velocity_limit == pytest.approx(drive.no_load_speed)
+        assert (cfg.delay_min_lag, cfg.delay_max_lag) == (2, 2)
+        assert event.params["asset_cfg"].actuator_ids == [i]
+        assert event.params["operation"] == "abs"
+        low, high = event.params["kp_range"]
+        assert (low + high) / 2 == pytest.approx(group.stiffness)
+        assert high - low == pytest.approx(2 * group.stiffness_range)
+
+
+@pytest.mark.train
+def test_mjlab_actuators_attach_to_the_robot() -> None:
+    pytest.importorskip("mjlab")
+    from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+    from mjlab.entity.entity import Entity
+
+    from pronk.robots.spec import free_spec
+
+    space: dict[str, object] = {}
+    exec(export_text(matched(), "mjlab"), space)
+    entity = Entity(
+        EntityCfg(
+            spec_fn=lambda: free_spec(ROBOT),
+            articulation=EntityArticulationInfoCfg(actuators=space["ACTUATORS"]),  # type: ignore[arg-type]
+        )
+    )
+    model = entity.spec.compile()
+    assert model.nu == 12
+    assert {model.actuator(i).name.split("/")[-1] for i in range(12)} == set(ROBOT.joint_names)
+
+
+@pytest.mark.parametrize("robot", ["mini_cheetah", "so101"])
+def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law(robot: str) -> None:
+    gains = matched(robot)
+    machine = load_robot(robot)
+    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf"))
+    assert model.opt.timestep == machine.timestep_s
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    data = mujoco.MjData(model)
+    random = np.random.default_rng(0)
+    for scale in (0.1, 3.0):
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = random.normal(0.0, 3.0 * scale, model.nv)
+        data.ctrl[:] = random.normal(0.0, scale, model.nu)
+        mujoco.mj_forward(model, data)
+        for joint in machine.joints:
+            group = gains.groups[joint.group]
+            at = model.joint(joint.name)
+            q, speed = data.qpos[at.qposadr[0]], data.qvel[at.dofadr[0]]
+            asked = group.stiffness * (data.actuator(joint.name).ctrl[0] - q)
+            asked -= group.damping * speed
+            drive = joint.drive
+            expected = clip_torque(
+                asked,
+                speed,
+                stall_torque=drive.stall_torque,
+                no_load_speed=drive.no_load_speed,
+                effort_limit=drive.effort_limit,
+            )
+            assert data.actuator(joint.name).force[0] == pytest.approx(float(expected), abs=1e-4)
+            assert model.dof_armature[at.dofadr[0]] == pytest.approx(drive.armature, rel=1e-4)
+
+
+def test_isaac_lab_snippet_says_on_its_face_that_it_is_not_matched_there() -> None:
+    text = export_text(matched(), "isaaclab")
+    assert text.startswith("# NOT MATCHED IN THIS SIMULATOR.")
+    face = text.split("from isaaclab")[0]
+    for said in ("PhysX", mujoco.__version__, "0.005", "implicitfast", "dc_motor_pd", "virtual"):
+        assert said in face
+    compile(text, "isaaclab", "exec")
+
+
+def test_events_are_the_absolute_ranges_of_the_groups() -> None:
+    gains = matched()
+    body = yaml.safe_load(export_text(gains, "events"))
+    knee = body["knee_gains"]
+    group = gains.groups["knee"]
+    assert knee["joints"] == [j.name for j in ROBOT.group("knee")]
+    assert knee["kp_range"] == pytest.approx(
+        [group.stiffness - group.stiffness_range, group.stiffness + group.stiffness_range]
+    )
+    assert knee["operation"] == "abs"
+
+
+@pytest.mark.parametrize("target", list(EXPORTS))
+def test_every_export_names_its_simulator_and_logs(target: str) -> None:
+    text = export_text(matched(), target)
+    assert f"mujoco {mujoco.__version__}" in text
+    assert "ab" * 32 in text
+
+
+def test_unknown_target_and_foreign_robot_are_refused() -> None:
+    with pytest.raises(PronkError, match="mjlab, mjcf, isaaclab, events"):
+        export_text(matched(), "gazebo")
+    with pytest.raises(PronkError, match="so101"):
+        group_drives(matched(), load_robot("so101"))
