@@ -17,6 +17,7 @@ from pronk.match.grid import (
     coarse_search,
     mean_square,
     search,
+    search_all,
     weights,
 )
 from pronk.match.quick import quick_search
@@ -107,6 +108,24 @@ def test_mirror_images_share_a_simulation() -> None:
         {"FR_knee", "FL_knee", "HR_knee", "HL_knee"},
         {"FL_hip_roll", "HL_hip_roll"},
     ]
+
+
+def test_rolls_asked_to_the_same_side_cost_one_simulation_and_a_look() -> None:
+    """Left rolls are read off the right one's simulation; what could be best is simulated anew."""
+    goals = [known(joint, length_s=8.0) for joint in ("FR_hip_roll", "FL_hip_roll", "FR_knee")]
+    grid = axes(ROBOT, 12)
+    shares: list[float] = []
+    with Simulator(ROBOT) as simulator:
+        found = search_all(simulator, goals, *grid, progress=shares.append)
+        steps = simulator.count.steps
+        whole = [search(simulator.bench(goal.joint), [goal], *grid)[0] for goal in goals]
+    for fast, slow in zip(found, whole, strict=True):
+        assert fast.cell == slow.cell
+        assert fast.error_db == pytest.approx(slow.error_db, rel=1e-9)
+        np.testing.assert_allclose(np.sqrt(fast.error), np.sqrt(slow.error), atol=0.05)
+    assert steps < 1.2 * 144 * (goals[0].steps + goals[2].steps)
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1.0)
 
 
 def test_the_edge_of_the_grid_is_noticed() -> None:

@@ -36,8 +36,8 @@ app.command("report")(report.report)
 app.command("demo")(demo.demo)
 
 _bench = typer.Typer(help="pronk beside its peers, on the same data, in one run.")
-_bench.command("match")(bench.match)
-_bench.callback()(lambda: None)
+for _command in (bench.match, bench.grid, bench.engine, bench.coverage):
+    _bench.command(_command.__name__)(_command)
 app.add_typer(_bench, name="bench")
 
 

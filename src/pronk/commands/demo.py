@@ -64,6 +64,7 @@ def run(
     from pronk.commands.predict import replays_of
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
+    from pronk.match.command_delay import with_delays
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.report import figures, replay, style
@@ -99,9 +100,8 @@ def run(
     )
     lap("sweep")
     logs = [read_log(path, robot=robot) for path in paths]
-    result = match_logs(
-        logs, robot, settings=MatchSettings(method="quick" if quick else "grid"), progress=report
-    )
+    settings = MatchSettings(method="quick" if quick else "grid")
+    result = with_delays(match_logs(logs, robot, settings=settings, progress=report))
     gains_file.save(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():

@@ -58,6 +58,7 @@ def match(
 ) -> None:
     """Find the gains that make the simulator answer like the robot."""
     from pronk.match.arm_simulation import moves_together
+    from pronk.match.command_delay import with_delays
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.robots import load_robot
@@ -76,7 +77,7 @@ def match(
         if mode is Mode.DRIVE or any(moves_together(log) for log in read):
             arm, result = together(read, machine, (mode or Mode.GAINS).value, report)
         else:
-            result = match_logs(read, machine, settings=settings, progress=report)
+            result = with_delays(match_logs(read, machine, settings=settings, progress=report))
         page = write(result, out, report)
     show(result)
     figures = figures_of(result)
@@ -168,6 +169,7 @@ def figures_of(result: MatchResult) -> dict[str, Any]:
                 "stiffness_ci95": gains.stiffness_ci95,
                 "damping_ci95": gains.damping_ci95,
                 "grid": [gains.grid_stiffness, gains.grid_damping],
+                "delay_s": gains.delay_s,
                 "error_db": gains.error_db,
                 "naive_error_db": gains.naive_error_db,
                 "zero_armature_error_db": zero_of(result, name),

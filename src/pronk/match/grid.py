@@ -10,13 +10,14 @@ data sheet has it (S6).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.match.ask import Simulator
 from pronk.match.simulate import Bench
 from pronk.match.target import Target
 from pronk.robots.robot import Robot
@@ -25,6 +26,9 @@ Array = NDArray[np.float64]
 
 DIVERGED_DB = 100.0
 """Error written for a simulation that diverged or did not move [dB]: beyond any answer."""
+_NEAR_DB = 0.2
+"""Nodes this close to the best of a shared map are simulated for themselves [dB]; two sides of a
+hip_roll differ by 0.03 dB around the best."""
 _STRIDES = (7, 3, 1)
 """Every how many nodes the coarse search looks, from far to close."""
 
@@ -117,9 +121,13 @@ def errors(
         Mean squared error of the gain [dB^2], shape (group, b).
     """
     # One may rest longer than the others at the end.
-    question = max((goal.question for goal in group), key=lambda one: len(one.command))
+    question = max(
+        (g.question for g in group if g.question.same_as(group[0].question, bench.robot)),
+        key=lambda one: len(one.command),
+    )
     command = question.mirrored(bench.robot)[2]
     steps = max(goal.steps for goal in group)
+    command = np.pad(command, (0, max(0, steps - len(command))), mode="edge")
     weight = [weights(goal, weighting) for goal in group]
     out = np.empty((len(group), len(stiffness)))
     for part, position in bench.run([command[:steps]], [bench.pose(question)], stiffness, damping):
@@ -154,6 +162,81 @@ def search(
     return [
         GridSearch(stiffness=stiffness, damping=damping, error=row.reshape(shape)) for row in found
     ]
+
+
+def search_all(
+    simulator: Simulator,
+    targets: Sequence[Target],
+    stiffness: Array,
+    damping: Array,
+    weighting: Literal["none", "coherence"] = "none",
+    progress: Callable[[float], None] | None = None,
+) -> list[GridSearch]:
+    """The whole grid for any number of targets, each family of mirrored joints simulated once.
+
+    Joints asked alike share a simulation exactly. So do, nearly, joints asked the other way round
+    (a left hip_roll asked to the same side as the right one): only gravity and the pose tell the
+    sides apart. Their maps are read off the shared simulation, then every node within `_NEAR_DB`
+    of the best is simulated for itself. Should any of those have been wrong by half of that, all
+    nodes are.
+
+    Args:
+        simulator: The training simulator.
+        targets: What to match.
+        stiffness: Axis [N m/rad], shape (a,).
+        damping: Axis [N m s/rad], shape (b,).
+        weighting: Weights of the frequencies.
+        progress: Told the share done, 0 to 1.
+
+    Returns:
+        One search a target, in their order.
+    """
+    robot = simulator.robot
+    families: list[list[list[Target]]] = []
+    for group in alike(targets, robot):
+        for family in families:
+            if family[0][0].question.same_as(group[0].question, robot, sign=-1.0):
+                family.append(group)
+                break
+        else:
+            families.append([group])
+    found: dict[int, GridSearch] = {}
+    for k, family in enumerate(families):
+        bench = simulator.bench(family[0][0].joint)
+
+        def tell(share: float, k: int = k) -> None:
+            if progress is not None:
+                progress((k + share) / len(families))
+
+        members = [goal for group in family for goal in group]
+        maps = search(bench, members, stiffness, damping, weighting, tell)
+        found |= {id(goal): one for goal, one in zip(members, maps, strict=True)}
+        for group in family[1:]:
+            looked = _look_again(bench, group, [found[id(goal)] for goal in group], weighting)
+            found |= {id(goal): one for goal, one in zip(group, looked, strict=True)}
+    return [found[id(goal)] for goal in targets]
+
+
+def _look_again(
+    bench: Bench,
+    group: Sequence[Target],
+    shared: Sequence[GridSearch],
+    weighting: Literal["none", "coherence"],
+) -> list[GridSearch]:
+    """Simulate a group's own question wherever its shared maps could be the best."""
+    maps = np.array([one.error for one in shared])
+    levels = np.sqrt(maps)
+    near = (levels < levels.min(axis=(1, 2), keepdims=True) + _NEAR_DB).any(axis=0)
+    first = shared[0]
+
+    def look(nodes: NDArray[np.bool_]) -> None:
+        i, j = np.nonzero(nodes)
+        maps[:, i, j] = errors(bench, group, first.stiffness[i], first.damping[j], weighting)
+
+    look(near)
+    if np.abs(np.sqrt(maps) - levels).max() > 0.5 * _NEAR_DB:
+        look(~near)
+    return [replace(one, error=row) for one, row in zip(shared, maps, strict=True)]
 
 
 def coarse_search(

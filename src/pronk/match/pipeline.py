@@ -17,7 +17,7 @@ from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_sp
 from pronk.match.ask import Job, Simulator
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.gains import Simulator as SimulatorNote
-from pronk.match.grid import GridSearch, alike, axes, coarse_search, search
+from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
 from pronk.match.interval import interval, measurement_error_db
 from pronk.match.quick import quick_search
 from pronk.match.ranges import group_gains
@@ -202,33 +202,21 @@ def _search(
             goal.joint: _Found(grid=one.grid, fit=one.fit)
             for goal, one in zip(main, quick, strict=True)
         }, float("nan")
-    grids: dict[str, GridSearch] = {}
-    groups = alike(main, simulator.robot)
     with clock.stage("grid"):
         begin = time.perf_counter()
-        for k, group in enumerate(groups):
-            bench = simulator.bench(group[0].joint)
-            searched = search(
-                bench,
-                group,
-                stiffness,
-                damping,
-                settings.grid_weighting,
-                lambda share, k=k: clock.tell((k + share) / len(groups)),  # type: ignore[misc]
-            )
-            grids |= {goal.joint: grid for goal, grid in zip(group, searched, strict=True)}
+        grids = search_all(simulator, main, stiffness, damping, settings.grid_weighting, clock.tell)
         # Everything the search does counts, not the simulator alone.
         rate = simulator.count.steps / (time.perf_counter() - begin)
     with clock.stage("refine"):
         fits = refine(
             simulator,
             main,
-            [grids[goal.joint].gains for goal in main],
+            [grid.gains for grid in grids],
             use_phase=settings.use_phase,
         )
     return {
-        goal.joint: _Found(grid=grids[goal.joint], fit=fit)
-        for goal, fit in zip(main, fits, strict=True)
+        goal.joint: _Found(grid=grid, fit=fit)
+        for goal, grid, fit in zip(main, grids, fits, strict=True)
     }, rate
 
 

@@ -63,16 +63,21 @@ class Question:
         centre = self.pose[robot.joint_names.index(self.joint)]
         return name, sign, np.asarray(sign * (self.command - centre))
 
-    def same_as(self, other: Question, robot: Robot) -> bool:
+    def same_as(self, other: Question, robot: Robot, *, sign: float = 1.0) -> bool:
         """True if both lead to the same simulation of the same original joint.
 
         One may rest longer than the other at the end. The pose of the joints of the chain must
         agree as well, mirrored.
+
+        Args:
+            other: The question to compare with.
+            robot: The robot.
+            sign: With -1, true if the other way round they would.
         """
         mine, theirs = self.mirrored(robot), other.mirrored(robot)
         if mine[0] != theirs[0]:
             return False
-        short, long = sorted((mine[2], theirs[2]), key=len)
+        short, long = sorted((mine[2], sign * theirs[2]), key=len)
         return (
             bool(np.abs(long[: len(short)] - short).max() < _SAME)
             and bool(np.abs(long[len(short) :] - short[-1]).max(initial=0.0) < _SAME)

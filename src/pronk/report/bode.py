@@ -199,7 +199,9 @@ def overview(result: MatchResult) -> Figure:
                 axes, joint.responses[0], joint.matched, **{**style.MATCHED_LINE, "linewidth": 1.1}
             )
             axes.set_title(style.joint_words(name))
-            axes.xaxis.set_major_locator(FixedLocator([0.01, 0.1, 1.0, 10.0, 100.0]))
+            low_hz, high_hz = _limits_hz([joint.responses[0]])
+            if high_hz > 30.0 * low_hz:
+                axes.xaxis.set_major_locator(FixedLocator([0.01, 0.1, 1.0, 10.0, 100.0]))
             axes.text(
                 0.03,
                 0.05,
@@ -217,6 +219,7 @@ def overview(result: MatchResult) -> Figure:
             panels[row[0]].set_ylabel("gain [dB]")
         for name in style.bottom_row(rows):
             panels[name].set_xlabel("frequency [Hz]")
+            panels[name].tick_params(labelbottom=True)
         virtual = any(j.responses[0].virtual for j in result.joints.values())
         figure.legend(
             handles=_bode_handles(None, virtual=virtual), loc="outside lower center", ncols=4

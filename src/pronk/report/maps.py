@@ -78,6 +78,7 @@ def error_maps(
             panels[row[0]].set_ylabel("damping [N m s/rad]")
         for name in style.bottom_row(rows):
             panels[name].set_xlabel("stiffness [N m/rad]")
+            panels[name].tick_params(labelbottom=True)
         bar = figure.colorbar(image, ax=list(panels.values()), aspect=40, pad=0.01)
         bar.set_label("gain error in the band, RMS [dB]")
         bar.ax.yaxis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0)))

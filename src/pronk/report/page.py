@@ -298,7 +298,7 @@ def render(result: MatchResult, folder: Path, gains_name: str = "gains.yaml") ->
         seconds=result.seconds,
         steps_per_second=result.grid_steps_per_second,
         zero=_without_armature(result),
-        drives=any(np.isfinite(j.frictionloss) or j.delay_s for j in result.gains.joints.values()),
+        delays=any(joint.delay_s > 0.0 for joint in result.gains.joints.values()),
         amplitude_rows={n: j for n, j in result.joints.items() if len(j.amplitude_gains) > 1},
     )
 

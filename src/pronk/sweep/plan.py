@@ -39,6 +39,9 @@ class Ask:
     """Number of this repeat of the same question, from 0."""
     clamped: tuple[str, ...] = ()
     """Joints fixed mechanically meanwhile."""
+    signs: tuple[float, ...] = ()
+    """Sign of each joint's command. Mirror-image joints are asked mirrored, so that the match
+    simulates each family once; all positive if empty."""
 
     def offsets(self, rate_hz: float) -> Array:
         """Command offsets about the pose [rad], shape (ticks, joints); shorter ones end early."""
@@ -46,7 +49,7 @@ class Ask:
         offsets = np.zeros((max(len(wave) for wave in waves), len(waves)))
         for i, wave in enumerate(waves):
             offsets[: len(wave), i] = wave
-        return offsets
+        return np.asarray(offsets * np.array(self.signs or (1.0,) * len(waves)))
 
     def frequency(self, rate_hz: float) -> Array:
         """Instantaneous frequency [Hz], shape (ticks,); NaN where there is none."""
@@ -163,7 +166,7 @@ class SweepPlan:
         def factor(share: float) -> float:
             """1 if this share of the amplitude fits, 0 if none can, else by what to shrink it."""
             signals = tuple(s.with_amplitude(s.amplitude * share) for s in ask.signals)
-            quieter = Ask(joints=ask.joints, signals=signals, clamped=ask.clamped)
+            quieter = replace(ask, signals=signals)
             ends = _forecast_ask(
                 self.robot,
                 quieter,
@@ -302,6 +305,7 @@ def _one_by_one(
             signals=(signal.with_amplitude(amplitude),),
             repeat=repeat,
             clamped=robot.joint(name).clamped,
+            signs=(robot.joint(name).original[1],),
         )
         for name in names
         for amplitude in amplitudes

@@ -1,0 +1,40 @@
+"""The delay that the phase shows beyond the matched simulator.
+
+The paper disregards the phase, because the links' delay is in it (F9). The magnitude then gives
+the gains, and what the phase of the measured response lags behind that of the matched simulation
+is the delay: phase = -omega * delay, a straight line through zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pronk.match.result import JointMatch, MatchResult
+
+
+def command_delay(joint: JointMatch, *, coherence_min: float = 0.8) -> float:
+    """Delay of the measured response behind the matched one [s], never negative.
+
+    Least squares through zero over the joint's band: every frequency with enough coherence counts
+    alike. Zero where none has.
+    """
+    measured = joint.responses[0]
+    band = measured.band(*joint.band_hz, coherence_min)
+    if not band.any():
+        return 0.0
+    omega = measured.omega[band]
+    lag = -np.unwrap(np.angle(measured.response[band] / joint.matched[band]))
+    return max(0.0, float(omega @ lag / (omega @ omega)))
+
+
+def with_delays(result: MatchResult) -> MatchResult:
+    """The same match, with the delay of each joint that has a response and no delay yet."""
+    gains = {
+        name: replace(joint, delay_s=command_delay(result.joints[name]))
+        if joint.delay_s == 0.0 and name in result.joints
+        else joint
+        for name, joint in result.gains.joints.items()
+    }
+    return replace(result, gains=replace(result.gains, joints=gains))
