@@ -6,7 +6,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from pronk.commands import console, logs
@@ -86,6 +85,8 @@ def response(
 
 def figures_of(found: FrequencyResponse) -> dict[str, Any]:
     """What the table says of one response."""
+    import numpy as np
+
     hz = found.frequency_hz
     coherent = hz[found.coherence >= COHERENT]
     inside = found.band(float(coherent.min()), float(coherent.max())) if len(coherent) else hz > 0.0
@@ -112,6 +113,8 @@ def bandwidth_hz(found: FrequencyResponse) -> float:
     Only frequencies after the last one above that level count, so a noisy dip is not taken for
     the end of the band; NaN if the gain never falls, interpolated between the two neighbours.
     """
+    import numpy as np
+
     level = found.gain[0] / np.sqrt(2.0)
     reliable = found.coherence >= 0.5
     above = np.flatnonzero((found.gain >= level) & reliable)

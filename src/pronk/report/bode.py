@@ -62,14 +62,19 @@ def _gain(axes: Axes, response: FrequencyResponse, curve: ComplexArray, **look: 
     axes.plot(response.frequency_hz, _hidden(response, style.decibel(curve)), **look)
 
 
-def _gain_limits(joint: JointMatch, extra: Sequence[ComplexArray] = ()) -> tuple[float, float]:
-    """Limits of the gain axis that hold every curve where the measurement is worth reading."""
+def _gain_limits(joint: JointMatch, *, room: float = 0.0) -> tuple[float, float]:
+    """Limits of the gain axis that hold every curve where the measurement is worth reading.
+
+    Args:
+        joint: Its measured, matched and naive gains are to be seen.
+        room: More of it above and below, for a curve that may run out of the picture [dB].
+    """
     response = joint.responses[0]
     inside = _worth(response)
-    curves = [response.gain, np.abs(joint.matched), np.abs(joint.naive), *map(np.abs, extra)]
+    curves = (response.gain, np.abs(joint.matched), np.abs(joint.naive))
     values = np.concatenate([style.decibel(curve[inside]) for curve in curves])
     values = values[np.isfinite(values)]
-    return float(max(values.min(), -60.0)) - 2.0, float(values.max()) + 2.0
+    return float(max(values.min(), -60.0)) - 2.0 - room, float(values.max()) + 2.0 + room
 
 
 def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True) -> Figure:
@@ -246,7 +251,7 @@ def zero_armature(joint: JointMatch) -> Figure:
         _draw_measured_gain(axes, response)
         _gain(axes, response, joint.zero_armature, **style.ZERO_LINE)
         _gain(axes, response, joint.matched, **style.MATCHED_LINE)
-        axes.set_ylim(*_gain_limits(joint, [joint.zero_armature]))
+        axes.set_ylim(*_gain_limits(joint, room=6.0))
         axes.set_ylabel("gain [dB]")
         axes.set_xlabel("frequency [Hz]")
         axes.set_title(f"{style.joint_words(joint.joint)}: with and without rotor inertia")
