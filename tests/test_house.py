@@ -87,7 +87,8 @@ def test_matching_never_loads_the_virtual_robot() -> None:
 def test_the_core_needs_no_pytorch() -> None:
     code = (
         "import sys, pkgutil, importlib, pronk;"
-        "[importlib.import_module(m.name) for m in pkgutil.walk_packages(pronk.__path__, 'pronk.')];"
+        "names = [m.name for m in pkgutil.walk_packages(pronk.__path__, 'pronk.')];"
+        "[importlib.import_module(name) for name in names];"
         "print([m for m in ('torch', 'mjlab', 'cma') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

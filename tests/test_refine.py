@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from pronk.errors import IdentifiabilityError
 from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
 from pronk.match.ask import Simulator
 from pronk.match.engine import engine_gap
@@ -118,7 +119,31 @@ def test_each_repeat_is_fitted_by_itself() -> None:
     expected = np.cov(np.array(others).T) / 3
     np.testing.assert_allclose(bounds.covariance, expected, rtol=0.1)
     # Student's t of two degrees of freedom, 97.5 %.
-    assert bounds.half_width[0] == pytest.approx(4.3027 * np.sqrt(expected[0, 0]), rel=0.05)
+    assert bounds.above[0] == pytest.approx(4.3027 * np.sqrt(expected[0, 0]), rel=0.05)
+
+
+def test_the_bootstrap_agrees_with_student_and_refuses_few_repeats() -> None:
+    """Eighteen repeats of known spread: both intervals are alike; three are too few to resample."""
+    rng = np.random.default_rng(4)
+    base = known()
+    scale = 1.0 + 0.02 * rng.standard_normal(18)
+    answers = base.measured.response * scale[:, None]
+
+    def repeated(count: int) -> Target:
+        some = answers[:count]
+        measured = replace(base.measured, response=some.mean(axis=0), repeats=some)
+        return replace(base, measured=measured)
+
+    with Simulator(ROBOT) as simulator:
+        many, few = refine(simulator, [repeated(18), repeated(3)], [TRUTH, TRUTH])
+    student, bootstrap = interval(many), interval(many, method="bootstrap")
+    for i in range(2):
+        width = bootstrap.below[i] + bootstrap.above[i]
+        assert width == pytest.approx(2.0 * student.above[i], rel=0.25)
+        assert bootstrap.below[i] > 0.0
+        assert bootstrap.above[i] > 0.0
+    with pytest.raises(IdentifiabilityError, match=r"bootstrap over 3 repeats .* record 8 or more"):
+        interval(few, method="bootstrap")
 
 
 def test_few_repeats_say_so() -> None:
@@ -135,7 +160,7 @@ def test_few_repeats_say_so() -> None:
     assert len(bounds.repeat_gains) == 1
     low, high = bounds.around(fits[1].stiffness, 0)
     assert low < TRUTH[0] < high
-    assert 0.0 < bounds.half_width[0] < 0.5
+    assert 0.0 < bounds.above[0] < 0.5
     assert 0.0 < measurement_error_db(fits[1]) < 1.0
 
 

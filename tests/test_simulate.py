@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import mujoco
@@ -121,39 +120,6 @@ def test_armature_and_friction_can_be_given() -> None:
     np.testing.assert_array_equal(plain, same)
     assert np.abs(simulate(ROBOT, asked, 20.0, 0.5, armature=0.02) - plain).max() > 0.02
     assert np.abs(simulate(ROBOT, asked, 20.0, 0.5, frictionloss=1.0) - plain).max() > 0.02
-
-
-def test_threads_cost_little_beside_the_bare_rollout() -> None:
-    """80 % or more of the steps per second of a bare loop over the same model."""
-    asked = ask("FR_knee", short_chirp())
-    command = asked.mirrored(ROBOT)[2]
-    count = 100
-    stiffness, damping = np.full(count, 17.0), np.full(count, 0.4)
-    with Bench(ROBOT, "FR_knee") as bench, mujoco.rollout.Rollout(nthread=2) as pool:
-        model = bench.model
-        width = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        state = np.zeros((count, width))
-        state[:, 1] = bench.pose(asked)[0]
-        control = np.tile((bench.pose(asked)[0] + command)[:, None], (count, 1, 1))
-        data = [mujoco.MjData(model) for _ in range(2)]
-
-        def ours() -> None:
-            for _ in bench.run([command], [bench.pose(asked)], stiffness, damping):
-                pass
-
-        def bare() -> None:
-            pool.rollout([model] * count, data, state, control)
-
-        def fastest(run: object) -> float:
-            best = np.inf
-            for _ in range(5):
-                begin = time.perf_counter()
-                run()  # type: ignore[operator]
-                best = min(best, time.perf_counter() - begin)
-            return best
-
-        ours(), bare()
-        assert fastest(bare) / fastest(ours) > 0.8
 
 
 def log_of(time: np.ndarray, command: np.ndarray, **more: object) -> SweepLog:

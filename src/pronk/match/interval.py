@@ -3,17 +3,20 @@
 Noise on a robot is coloured and neighbouring frequencies share it, so intervals that take
 samples or frequencies for independent are several times too narrow. Repeats of the same question
 are independent whatever the colour. Every repeat is fitted by itself, and the interval is
-Student's t over the fits.
+Student's t over the fits, which holds with as few as three; with many repeats the bootstrap over
+them asks for no normal distribution.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pronk.errors import IdentifiabilityError
 from pronk.match.refine import Fit, residual_db
 from pronk.match.target import DB, FLOOR_DB
 
@@ -23,6 +26,11 @@ _SHARED = 1.5
 """Equivalent noise bandwidth of the Hann window in bins (Harris 1978, table 1): how many
 neighbouring frequencies share their noise."""
 
+BOOTSTRAP_REPEATS = 8
+"""Fewest repeats to resample: with n of them the bootstrap's spread is too small by
+sqrt((n - 1) / n), and its tails hold no more than the repeats do."""
+_RESAMPLES = 2000
+
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
@@ -30,19 +38,22 @@ class Interval:
 
     covariance: Array
     """Of (stiffness, damping), shape (2, 2)."""
-    half_width: Array
-    """Of the interval of each gain by itself, shape (2,)."""
+    below: Array
+    """From the lower end of each gain's own interval to the gain, shape (2,)."""
+    above: Array
+    """From the gain to the upper end, shape (2,)."""
     repeat_gains: Array
     """(stiffness, damping) of each repeat fitted by itself, shape (repeats, 2)."""
     flags: tuple[str, ...] = ()
 
     def around(self, gain: float, index: int) -> tuple[float, float]:
         """Interval of gain 0 (stiffness) or 1 (damping) around its value, not below zero."""
-        half = float(self.half_width[index])
-        return max(gain - half, 0.0), gain + half
+        return max(gain - float(self.below[index]), 0.0), gain + float(self.above[index])
 
 
-def interval(fit: Fit, *, level: float = 0.95) -> Interval:
+def interval(
+    fit: Fit, *, level: float = 0.95, method: Literal["student", "bootstrap"] = "student"
+) -> Interval:
     """Interval of a fit, from the repeats of its measured response.
 
     Each repeat is fitted by one Gauss-Newton step from the common optimum, with the simulator's
@@ -51,10 +62,23 @@ def interval(fit: Fit, *, level: float = 0.95) -> Interval:
     With one repeat there is nothing to compare; the interval is then that of the coherence
     (Fisher information of the weighted fit, widened by the correlation of neighbouring
     frequencies and by the misfit), which takes noise for white, and a flag says so.
+
+    Args:
+        fit: The fit.
+        level: Share of such intervals that shall hold the truth.
+        method: `student`, or `bootstrap` (bias-corrected and accelerated, over repeats).
+
+    Raises:
+        IdentifiabilityError: Too few repeats for the bootstrap.
     """
     goal = fit.target
     optimum = np.array([fit.stiffness, fit.damping])
     count = len(goal.measured.repeats)
+    if method == "bootstrap" and count < BOOTSTRAP_REPEATS:
+        raise IdentifiabilityError(
+            f"{goal.joint}: a bootstrap over {count} repeats covers too little; record "
+            f"{BOOTSTRAP_REPEATS} or more, or take the student interval, which holds with three."
+        )
     if count < 2:
         return _from_coherence(fit, optimum, level)
     use_phase = len(fit.residual) > int(goal.inside.sum())
@@ -64,16 +88,36 @@ def interval(fit: Fit, *, level: float = 0.95) -> Interval:
     gains = optimum * np.exp(change @ fit.influence().T)
     spread = np.atleast_2d(np.cov(gains.T, ddof=1))
     covariance = spread / count
-    quantile = float(stats.t.ppf(0.5 + level / 2.0, count - 1))
+    if method == "bootstrap":
+        below, above = _bootstrapped(gains, level)
+    else:
+        quantile = float(stats.t.ppf(0.5 + level / 2.0, count - 1))
+        below = above = quantile * np.sqrt(np.diag(covariance))
     flags: tuple[str, ...] = ()
     if count == 2:
         flags = ("two repeats: the interval is wide, three or more narrow it",)
     return Interval(
         covariance=covariance,
-        half_width=quantile * np.sqrt(np.diag(covariance)),
+        below=below,
+        above=above,
         repeat_gains=gains,
         flags=flags,
     )
+
+
+def _bootstrapped(gains: Array, level: float) -> tuple[Array, Array]:
+    """How far the interval of the mean reaches below and above it, each shape (2,)."""
+    ends = stats.bootstrap(
+        (gains,),
+        np.mean,
+        axis=0,
+        confidence_level=level,
+        n_resamples=_RESAMPLES,
+        method="BCa",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    mean = gains.mean(axis=0)
+    return mean - ends.low, ends.high - mean
 
 
 def _from_coherence(fit: Fit, optimum: Array, level: float) -> Interval:
@@ -87,10 +131,11 @@ def _from_coherence(fit: Fit, optimum: Array, level: float) -> Interval:
     misfit = max(1.0, float(fit.weight @ fit.residual**2) / free)
     relative = _SHARED * misfit * (influence * variance) @ influence.T
     covariance = relative * np.outer(optimum, optimum)
-    quantile = float(stats.norm.ppf(0.5 + level / 2.0))
+    half = float(stats.norm.ppf(0.5 + level / 2.0)) * np.sqrt(np.diag(covariance))
     return Interval(
         covariance=covariance,
-        half_width=quantile * np.sqrt(np.diag(covariance)),
+        below=half,
+        above=half,
         repeat_gains=optimum[None, :],
         flags=("one repeat: the interval assumes white noise",),
     )

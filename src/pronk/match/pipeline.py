@@ -288,7 +288,7 @@ def _report(
     """Put one joint's findings into the artefacts."""
     goal, fit, grid = item.main, found.fit, found.grid
     joint = robot.joint(goal.joint)
-    bounds = interval(fit, level=settings.level)
+    bounds = interval(fit, level=settings.level, method=settings.interval)
     per_amplitude = amplitude_gains([fit, *found.others])
     naive_db = float(np.sqrt(np.mean(goal.error_db(naive[goal.inside]) ** 2)))
     zero_db = float("nan") if found.zero is None else found.zero.error_db

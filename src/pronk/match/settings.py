@@ -28,6 +28,8 @@ class MatchSettings:
     """Frequencies below are left out of the fit; a joint with most of its band below is refused."""
     level: float = 0.95
     """Level of the intervals."""
+    interval: Literal["student", "bootstrap"] = "student"
+    """Intervals over repeats: Student's t, or a bootstrap where there are eight or more."""
     threads: int = 2
     """Threads of the simulator."""
     estimator: Estimator = field(default_factory=Estimator)
@@ -43,6 +45,8 @@ class MatchSettings:
             raise PronkError(f"method {self.method!r}; expected grid or quick.")
         if self.grid_weighting not in ("none", "coherence"):
             raise PronkError(f"grid_weighting {self.grid_weighting!r}; expected none or coherence.")
+        if self.interval not in ("student", "bootstrap"):
+            raise PronkError(f"interval {self.interval!r}; expected student or bootstrap.")
         if self.grid_points < 3:
             raise PronkError(f"grid_points is {self.grid_points}; expected 3 or more.")
         if not 0.0 <= self.coherence_min < 1.0:
