@@ -10,7 +10,8 @@ from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError
 from pronk.match.gains import JointGains, MatchedGains, Simulator
-from pronk.match.predict import predict, r2, rmse
+from pronk.match.predict import predict
+from pronk.match.prediction import r2, rmse
 from pronk.match.question import question
 from pronk.match.simulate import simulate
 from pronk.robots import load_robot
@@ -110,6 +111,9 @@ def test_matched_delay_is_applied_to_the_command() -> None:
     without = predict(log, ROBOT, gains(tuple(MADE_WITH)))
     for delayed, prompt in zip(late.joints, without.joints, strict=True):
         assert delayed.rmse_matched < 1e-5 < 0.05 * prompt.rmse_matched
+        # The delay alone helps the naive gains too, and the table says by how much.
+        assert delayed.rmse_matched < delayed.rmse_naive_delayed < delayed.rmse_naive
+        assert prompt.rmse_naive_delayed == prompt.rmse_naive
 
 
 def test_friction_of_the_gains_is_used() -> None:

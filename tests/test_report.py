@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from pronk.errors import ArtefactError
 from pronk.match import gains as gains_file
+from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
 from pronk.match.command_delay import command_delay, with_delays
 from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator
@@ -162,22 +163,19 @@ def synthetic(*, virtual: bool = True, robot: str = "mini_cheetah", legs: int = 
     )
 
 
-def a_replay(joint="FR_knee", signal="log_chirp") -> replay.Replay:
+def a_replay(joint="FR_knee", signal="log_chirp") -> prediction_file.JointPrediction:
     time = np.arange(0.0, 6.0, 0.002)
     command = 0.25 * np.sin(2.0 * np.pi * 0.8 * time**2)[(np.arange(time.size) // 10) * 10]
     # The naive simulation is wrong between 4 and 5 s alone.
     naive = np.where((time > 4.0) & (time < 5.0), 1.3, 1.0) * command
-    return replay.Replay(
+    return prediction_file.JointPrediction(
         joint=joint,
         time=time,
         command=command,
         measured=command,
         naive=naive,
-        matched=command,
-        rmse_naive=0.03,
-        rmse_matched=0.004,
-        r2_naive=0.9,
-        r2_matched=0.99,
+        naive_delayed=1.1 * command,
+        matched=1.01 * command,
         signal=signal,
     )
 
@@ -186,11 +184,11 @@ def written(folder: Path, result: MatchResult, *, predictions: bool = True) -> P
     gains_file.save(folder / "gains.yaml", result.gains)
     result_file.save(folder / "match.npz", result)
     if predictions:
-        replay.save(
+        prediction_file.save(
             folder / "fresh.prediction.npz",
-            [a_replay()],
-            virtual=result.gains.virtual,
-            source="fresh.mcap",
+            prediction_file.Prediction(
+                joints=(a_replay(),), virtual=result.gains.virtual, source="fresh.mcap"
+            ),
         )
     return folder
 
@@ -365,14 +363,17 @@ def test_replay_shows_where_the_naive_simulation_is_furthest_off():
 
 def test_replays_survive_a_file(tmp_path):
     path = tmp_path / "a.prediction.npz"
-    replay.save(path, [a_replay(), a_replay("FL_knee")], virtual=True, source="a.mcap")
-    back = replay.load(path)
+    both = (a_replay(), a_replay("FL_knee"))
+    prediction_file.save(
+        path, prediction_file.Prediction(joints=both, virtual=True, source="a.mcap")
+    )
+    back = prediction_file.load(path)
     assert (back.virtual, back.source) == (True, "a.mcap")
-    assert [r.joint for r in back.replays] == ["FR_knee", "FL_knee"]
-    assert np.array_equal(back.replays[0].naive, a_replay().naive)
+    assert [r.joint for r in back.joints] == ["FR_knee", "FL_knee"]
+    assert np.array_equal(back.joints[0].naive, a_replay().naive)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ArtefactError, match="not a prediction of pronk"):
-        replay.load(path)
+        prediction_file.load(path)
 
 
 # --- Page ---------------------------------------------------------------------------------------

@@ -12,8 +12,8 @@ from pronk.commands import console
 from pronk.commands.sweep import AMPLITUDES, SignalName, make, record_twin
 
 if TYPE_CHECKING:
+    from pronk.match.prediction import JointPrediction
     from pronk.match.result import MatchResult
-    from pronk.report.replay import Replay
 
 ROBOT = "mini_cheetah"
 
@@ -61,13 +61,14 @@ def run(
         quick: Search the linearized model.
         report: Told the stage and the share done.
     """
-    from pronk.commands.predict import replays_of
     from pronk.match import gains as gains_file
+    from pronk.match import prediction as prediction_file
     from pronk.match import result as result_file
     from pronk.match.command_delay import with_delays
     from pronk.match.pipeline import match_logs
+    from pronk.match.predict import predict
     from pronk.match.settings import MatchSettings
-    from pronk.report import figures, replay, style
+    from pronk.report import figures, style
     from pronk.report.page import write_page
     from pronk.response import save as save_responses
     from pronk.robots import load_robot
@@ -107,12 +108,15 @@ def run(
     for name, joint in result.joints.items():
         save_responses(out / "logs" / f"{name}.response.npz", joint.responses)
     lap("match")
-    replays: list[Replay] = []
+    replays: list[JointPrediction] = []
     told = report.bar("predict")
     for i, path in enumerate(fresh):
-        replays += replays_of(read_log(path, robot=robot), robot, result.gains)[0]
+        replays += predict(read_log(path, robot=robot), robot, result.gains).joints
         told((i + 1) / len(fresh))
-    replay.save(out / "fresh.prediction.npz", replays, virtual=True, source="fresh")
+    prediction_file.save(
+        out / "fresh.prediction.npz",
+        prediction_file.Prediction(joints=tuple(replays), source="fresh", virtual=True),
+    )
     lap("predict")
     report("page", 0.0)
     page = write_page(out)
@@ -132,7 +136,7 @@ def _timed(seconds: dict[str, float]) -> list[str]:
     return [f"{name} {value:.0f} s" for name, value in seconds.items()]
 
 
-def summary(result: MatchResult, replays: list[Replay]) -> None:
+def summary(result: MatchResult, replays: list[JointPrediction]) -> None:
     """Print matched gains beside the paper's, and what became of the errors."""
     from pronk.report.paper import published
 

@@ -10,10 +10,7 @@ import typer
 from pronk.commands import console, logs
 
 if TYPE_CHECKING:
-    from pronk.match.gains import MatchedGains
-    from pronk.report.replay import Replay
-    from pronk.robots.robot import Robot
-    from pronk.sweep.log import SweepLog
+    from pronk.match.prediction import JointPrediction
 
 
 @logs.reads_logs
@@ -30,7 +27,9 @@ def predict(
 ) -> None:
     """Replay logs in the simulator with naive and with matched gains; RMSE and R2 per joint."""
     from pronk.match import gains as gains_file
-    from pronk.report import figures, replay, style
+    from pronk.match import prediction as prediction_file
+    from pronk.match.predict import predict as predict_log
+    from pronk.report import figures, style
     from pronk.robots import load_robot
 
     machine = load_robot(robot)
@@ -44,17 +43,17 @@ def predict(
     with console.progress() as report:
         done = report.bar("predict")
         for i, log in enumerate(read):
-            replays, left_out = replays_of(log, machine, matched)
-            excluded |= left_out
+            found = predict_log(log, machine, matched)
+            excluded |= found.excluded
             stem = Path(log.source or "log").stem
             path = folder / f"{stem}.prediction.npz"
-            replay.save(path, replays, virtual=log.virtual, source=Path(log.source).name)
+            prediction_file.save(path, found)
             written.append(path)
-            for one in replays:
+            for one in found.joints:
                 name = stem if stem == one.joint else f"{stem}.{one.joint}"
                 figure = figures.replay(one, virtual=log.virtual)
                 written.append(style.save(figure, folder / f"{name}.prediction.svg"))
-            rows += [row_of(one) | {"log": log.source} for one in replays]
+            rows += [row_of(one) | {"log": log.source} for one in found.joints]
             done((i + 1) / len(read))
     show(rows, virtual=any(log.virtual for log in read))
     for source in seen:
@@ -69,34 +68,6 @@ def predict(
         console.following(f"pronk report {folder}   # puts these replays on the page")
 
 
-def replays_of(
-    log: SweepLog, robot: Robot, gains: MatchedGains
-) -> tuple[list[Replay], dict[str, str]]:
-    """Replays of every joint that a log asks, and why some are left out."""
-    from pronk.match.predict import predict as predict_log
-    from pronk.report.replay import Replay
-
-    found = predict_log(log, robot, gains)
-    replays = [
-        Replay(
-            joint=one.joint,
-            time=one.time,
-            command=one.command,
-            measured=one.measured,
-            naive=one.naive,
-            matched=one.matched,
-            rmse_naive=one.rmse_naive,
-            rmse_matched=one.rmse_matched,
-            r2_naive=one.r2_naive,
-            r2_matched=one.r2_matched,
-            signal=one.signal,
-            unit=one.unit,
-        )
-        for one in found.joints
-    ]
-    return replays, dict(found.excluded)
-
-
 def show(rows: list[dict[str, Any]], *, virtual: bool) -> None:
     """Print the table of predictions."""
     made = console.table(
@@ -104,6 +75,7 @@ def show(rows: list[dict[str, Any]], *, virtual: bool) -> None:
         "joint",
         "signal",
         "RMSE naive",
+        "naive with the delay",
         "RMSE matched",
         "unit",
         "matched / naive",
@@ -117,6 +89,7 @@ def show(rows: list[dict[str, Any]], *, virtual: bool) -> None:
             row["joint"],
             row["signal"].replace("_", " "),
             console.number(naive, 4),
+            console.number(row["rmse_naive_delayed"], 4),
             console.number(matched, 4),
             row["unit"],
             console.number(matched / naive if naive > 0.0 else float("nan")),
@@ -126,13 +99,14 @@ def show(rows: list[dict[str, Any]], *, virtual: bool) -> None:
     console.show(made)
 
 
-def row_of(one: Replay) -> dict[str, Any]:
+def row_of(one: JointPrediction) -> dict[str, Any]:
     """What `--json` gives of one replay."""
     return {
         "joint": one.joint,
         "signal": one.signal,
         "unit": one.unit,
         "rmse_naive": one.rmse_naive,
+        "rmse_naive_delayed": one.rmse_naive_delayed,
         "rmse_matched": one.rmse_matched,
         "r2_naive": one.r2_naive,
         "r2_matched": one.r2_matched,

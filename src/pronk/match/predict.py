@@ -3,14 +3,13 @@
 The commands of the log go to the training simulator, held from each measured timestamp to the
 next, and the simulated position is read at the measured timestamps. The naive column is the very
 same simulation with the gains on the real drive (the log's, or else the robot's published
-figures) put into the simulator, with no delay. Neither column gets a zero offset: an encoder that
-is off costs both the same.
+figures) put into the simulator, with no delay; a third column gives it the delay of the matched
+gains. No column gets a zero offset: an encoder that is off costs all the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,63 +19,13 @@ from pronk.errors import LogError
 from pronk.match.arm_match import drives_of
 from pronk.match.arm_simulation import ArmBench, JointDrive, held_mean, moves_together
 from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.prediction import JointPrediction, Prediction
 from pronk.match.question import Question, question
 from pronk.match.simulate import simulate
 from pronk.robots.robot import Robot
 from pronk.sweep.log import Segment, SweepLog
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointPrediction:
-    """One joint's answer to a log, measured and simulated, at the log's timestamps."""
-
-    joint: str
-    time: Array
-    """Instants at which the joint was asked, all questions in a row [s], shape (n,)."""
-    command: Array
-    """Position command in force [rad], shape (n,)."""
-    measured: Array
-    """[rad], shape (n,)."""
-    naive: Array
-    """Simulated with the gains of the real drive [rad], shape (n,)."""
-    matched: Array
-    """Simulated with the matched gains [rad], shape (n,)."""
-    signal: str = "unknown"
-    """Kind of the signal that was replayed."""
-    unit: str = "rad"
-
-    @property
-    def rmse_naive(self) -> float:
-        """Root mean square of simulated less measured [rad]."""
-        return rmse(self.naive, self.measured)
-
-    @property
-    def rmse_matched(self) -> float:
-        """Root mean square of simulated less measured [rad]."""
-        return rmse(self.matched, self.measured)
-
-    @property
-    def r2_naive(self) -> float:
-        """Share of the measured variance that the simulation explains."""
-        return r2(self.naive, self.measured)
-
-    @property
-    def r2_matched(self) -> float:
-        """Share of the measured variance that the simulation explains."""
-        return r2(self.matched, self.measured)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Prediction:
-    """All joints of one log."""
-
-    joints: tuple[JointPrediction, ...]
-    source: str
-    virtual: bool
-    excluded: Mapping[str, str] = field(default_factory=dict)
-    """Joints that moved and were not predicted, and why."""
 
 
 def predict(log: SweepLog, robot: Robot, gains: MatchedGains, *, threads: int = 2) -> Prediction:
@@ -99,25 +48,16 @@ def predict(log: SweepLog, robot: Robot, gains: MatchedGains, *, threads: int = 
     return (_arm if moves_together(log) else _bench)(log, robot, gains, threads)
 
 
-def rmse(simulated: Array, measured: Array) -> float:
-    """Root mean square difference."""
-    return float(np.sqrt(np.mean((simulated - measured) ** 2)))
-
-
-def r2(simulated: Array, measured: Array) -> float:
-    """One less the share of the measured variance that is left over; NaN for a still joint."""
-    spread = float(np.var(measured))
-    if spread == 0.0:
-        return float("nan")
-    return float(1.0 - np.mean((simulated - measured) ** 2) / spread)
-
-
 def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
     """The whole arm at once."""
     matched = drives_of(robot, gains)
     with ArmBench(robot, [log], threads=threads) as bench:
         naive = {name: _on_drive(log, robot, name) for name in bench.joints}
-        (answer,), (plain,) = bench.run([matched, naive])
+        late = {
+            name: replace(drive, delay=matched[name].delay) if name in matched else drive
+            for name, drive in naive.items()
+        }
+        (answer,), (plain,), (delayed,) = bench.run([matched, naive, late])
         excluded = dict(bench.excluded)
         names = bench.joints
     kinds = {name: s.kind for s in log.segments for name in s.joints}
@@ -134,6 +74,7 @@ def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pred
                 command=log.command[:, column],
                 measured=log.position[:, column],
                 naive=plain[:, i],
+                naive_delayed=delayed[:, i],
                 matched=answer[:, i],
                 signal=kinds.get(name, "unknown"),
             )
@@ -165,7 +106,8 @@ def _bench(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pr
                 command=joined[1],
                 measured=joined[2],
                 naive=joined[3],
-                matched=joined[4],
+                naive_delayed=joined[4],
+                matched=joined[5],
                 signal=mine[0].kind,
             )
         )
@@ -179,14 +121,18 @@ def _replay(
     robot: Robot,
     gains: JointGains,
     threads: int,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Time, command, measured, naive and matched position of one question."""
+) -> tuple[Array, ...]:
+    """Time, command, measured, naive, naive with the delay and matched position of a question."""
     asked = question(part, segment, name, robot)
+    late = _delayed(asked, gains.delay_s)
     plain = _on_drive(part, robot, name)
-    naive = simulate(robot, asked, plain.stiffness, plain.damping, threads=threads)[0]
+    naive, naive_delayed = (
+        simulate(robot, one, plain.stiffness, plain.damping, threads=threads)[0]
+        for one in (asked, late)
+    )
     matched = simulate(
         robot,
-        _delayed(asked, gains.delay_s),
+        late,
         gains.stiffness,
         gains.damping,
         armature=gains.armature,
@@ -196,13 +142,10 @@ def _replay(
     # The last state is that at the start of the last step: no sample may lie beyond it.
     inside = (part.time >= asked.time[0]) & (part.time <= asked.time[-1])
     time, column = part.time[inside], part.column(name)
-    return (
-        time,
-        part.command[inside, column],
-        part.position[inside, column],
-        np.asarray(CubicSpline(asked.time, naive)(time)),
-        np.asarray(CubicSpline(asked.time, matched)(time)),
+    answers = (
+        np.asarray(CubicSpline(asked.time, one)(time)) for one in (naive, naive_delayed, matched)
     )
+    return time, part.command[inside, column], part.position[inside, column], *answers
 
 
 def _delayed(asked: Question, delay: float) -> Question:

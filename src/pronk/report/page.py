@@ -19,10 +19,11 @@ from pronk import __version__
 from pronk.errors import ArtefactError, RobotError
 from pronk.files import write_text
 from pronk.match import gains as gains_file
+from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
 from pronk.match.result import MatchResult
-from pronk.report import figures, replay, style
+from pronk.report import figures, style
 from pronk.report.paper import published
 from pronk.robots import load_robot
 
@@ -170,17 +171,17 @@ def knees_first(names: Iterable[str]) -> list[str]:
 def _predictions(folder: Path) -> list[dict[str, Any]]:
     shown = []
     for path in sorted(folder.glob("*.prediction.npz")):
-        prediction = replay.load(path)
-        if not prediction.replays:
+        prediction = prediction_file.load(path)
+        if not prediction.joints:
             continue
-        by_joint = {one.joint: one for one in prediction.replays}
+        by_joint = {one.joint: one for one in prediction.joints}
         first = by_joint[knees_first(by_joint)[0]]
         where = "the virtual robot" if prediction.virtual else "the robot"
         shown.append(
             {
                 "source": prediction.source,
                 "virtual": prediction.virtual,
-                "replays": prediction.replays,
+                "joints": prediction.joints,
                 "picture": _picture(
                     figures.replay(first, virtual=prediction.virtual),
                     f"Position of {first.joint} over time: command, measured on {where}, "
