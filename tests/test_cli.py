@@ -18,6 +18,7 @@ import pytest
 
 from pronk import cli
 from pronk.errors import PronkError
+from pronk.sweep.readers import find_logs
 
 COMMANDS = ("sweep", "response", "match", "predict", "export", "report", "bench", "demo")
 
@@ -307,11 +308,9 @@ def test_match_writes_gains_and_page_and_lands_on_table_one(matched):
 
 
 def test_what_was_written_beside_the_logs_is_no_log(capsys, matched, tmp_path):
-    from pronk.commands import logs
-
     accepted(capsys, "response", matched, "--no-plots")
     assert (matched / "FR_knee.response.npz").exists()
-    assert [p.name for p in logs.files([matched])] == ["FR_knee.mcap"]
+    assert [p.name for p in find_logs([matched])] == ["FR_knee.mcap"]
 
 
 def test_predict_replays_a_fresh_log_and_the_page_shows_it(capsys, matched, tmp_path):

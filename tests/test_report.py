@@ -14,7 +14,7 @@ from pronk.errors import ArtefactError
 from pronk.match import gains as gains_file
 from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
-from pronk.match.command_delay import command_delay, with_delays
+from pronk.match.command_delay import command_delay
 from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator
 from pronk.match.result import JointMatch, MatchResult
 from pronk.report import figures, page, replay, style
@@ -511,12 +511,6 @@ def test_delay_is_what_the_phase_lags_behind_the_matched_simulation(match):
     for name in ("FR_knee", "HL_hip_roll"):
         # The synthetic joint answers 2 ms late (noise of a quarter per cent).
         assert command_delay(match.joints[name]) == pytest.approx(0.002, abs=2e-4)
-    found = with_delays(match).gains.joints
-    assert found["FR_knee"].delay_s == command_delay(match.joints["FR_knee"])
-    known = {"FR_knee": JointGains(**{**vars(found["FR_knee"]), "delay_s": 0.007})}
-    gains = MatchedGains(**{**vars(match.gains), "joints": known})
-    kept = with_delays(MatchResult(gains=gains, joints=match.joints)).gains.joints
-    assert kept["FR_knee"].delay_s == 0.007
 
 
 def test_no_delay_is_made_up_for_an_incoherent_joint(match):

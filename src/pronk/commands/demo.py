@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -64,7 +65,6 @@ def run(
     from pronk.match import gains as gains_file
     from pronk.match import prediction as prediction_file
     from pronk.match import result as result_file
-    from pronk.match.command_delay import with_delays
     from pronk.match.pipeline import match_logs
     from pronk.match.predict import predict
     from pronk.match.settings import MatchSettings
@@ -72,7 +72,7 @@ def run(
     from pronk.report.page import write_page
     from pronk.response import save as save_responses
     from pronk.robots import load_robot
-    from pronk.sweep.readers import read_log
+    from pronk.sweep.readers import read_logs
 
     robot = load_robot(ROBOT)
     seconds: dict[str, float] = {}
@@ -100,9 +100,10 @@ def run(
         progress=report.bar("ask something else"),
     )
     lap("sweep")
-    logs = [read_log(path, robot=robot) for path in paths]
+    logs = read_logs(paths, processes=os.cpu_count() or 1, robot=robot)
+    lap("read")
     settings = MatchSettings(method="quick" if quick else "grid")
-    result = with_delays(match_logs(logs, robot, settings=settings, progress=report))
+    result = match_logs(logs, robot, settings=settings, progress=report)
     gains_file.save(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():
@@ -110,8 +111,8 @@ def run(
     lap("match")
     replays: list[JointPrediction] = []
     told = report.bar("predict")
-    for i, path in enumerate(fresh):
-        replays += predict(read_log(path, robot=robot), robot, result.gains).joints
+    for i, log in enumerate(read_logs(fresh, robot=robot)):
+        replays += predict(log, robot, result.gains).joints
         told((i + 1) / len(fresh))
     prediction_file.save(
         out / "fresh.prediction.npz",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,10 +22,6 @@ LogsArgument = Annotated[
     list[Path], typer.Argument(help="Logs; a folder means all logs in it.", metavar="LOG...")
 ]
 RobotOption = Annotated[str, typer.Option("--robot", help="Robot, for instance mini_cheetah.")]
-
-_OURS = (".response.npz", ".prediction.npz", "match.npz")
-"""What pronk itself writes beside logs; no logs."""
-_SUFFIXES = (".mcap", ".csv", ".pt", ".npz")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,44 +109,17 @@ def reads_logs(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-def files(paths: Sequence[Path]) -> list[Path]:
-    """The logs that some paths stand for; a folder that is no log itself means those in it.
-
-    Raises:
-        LogError: A path does not exist, or a folder holds no log.
-    """
-    from pronk.sweep.sage import is_sage
-
-    found: list[Path] = []
-    for path in paths:
-        if not path.is_dir() or is_sage(path) or (path / "metadata.yaml").is_file():
-            found.append(path)
-            continue
-        inside = sorted(
-            p
-            for p in path.iterdir()
-            if (p.is_dir() and is_sage(p))
-            or (p.suffix.lower() in _SUFFIXES and not p.name.endswith(_OURS))
-        )
-        if not inside:
-            raise LogError(
-                f"{path}: no logs in this folder; expected {', '.join(_SUFFIXES)} or SAGE folders."
-            )
-        found += inside
-    return found
-
-
 def read(paths: Sequence[Path], reading: Reading, robot: Robot | None) -> list[SweepLog]:
-    """Read every log that some paths stand for.
+    """Read every log that some paths stand for, on all cores.
 
     Raises:
-        LogError: As `pronk.sweep.readers.read_log`.
-        RobotError: As `pronk.sweep.readers.read_log`.
+        LogError: As `pronk.sweep.readers.read_logs`.
+        RobotError: As `pronk.sweep.readers.read_logs`.
     """
-    from pronk.sweep.readers import read_log
+    from pronk.sweep.readers import read_logs
 
     options = {name: value for name, value in reading.options().items() if value is not None}
-    return [read_log(path, robot=robot, **options) for path in files(paths)]
+    return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **options)
 
 
 def asked_joints(log: SweepLog) -> tuple[str, ...]:

@@ -58,7 +58,6 @@ def match(
 ) -> None:
     """Find the gains that make the simulator answer like the robot."""
     from pronk.match.arm_simulation import moves_together
-    from pronk.match.command_delay import with_delays
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.robots import load_robot
@@ -77,7 +76,7 @@ def match(
         if mode is Mode.DRIVE or any(moves_together(log) for log in read):
             arm, result = together(read, machine, (mode or Mode.GAINS).value, report)
         else:
-            result = with_delays(match_logs(read, machine, settings=settings, progress=report))
+            result = match_logs(read, machine, settings=settings, progress=report)
         page = write(result, out, report)
     show(result)
     figures = figures_of(result)

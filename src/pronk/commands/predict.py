@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -47,7 +48,7 @@ def predict(
             excluded |= found.excluded
             stem = Path(log.source or "log").stem
             path = folder / f"{stem}.prediction.npz"
-            prediction_file.save(path, found)
+            prediction_file.save(path, replace(found, source=Path(log.source).name))
             written.append(path)
             for one in found.joints:
                 name = stem if stem == one.joint else f"{stem}.{one.joint}"

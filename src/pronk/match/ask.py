@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.match.device import bench_on
 from pronk.match.simulate import Bench, Count
 from pronk.match.target import Target
 from pronk.robots.robot import Robot
@@ -35,6 +36,7 @@ class Simulator:
         armature: float | None = None,
         frictionloss: float | None = None,
         threads: int = 2,
+        device: str = "cpu",
     ) -> None:
         """Take note of the robot.
 
@@ -43,8 +45,13 @@ class Simulator:
             armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
             frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
             threads: Threads of the simulator.
+            device: Where large runs are simulated; see `pronk.match.device.DEVICES`.
+
+        Raises:
+            PronkError: The device is unknown or cannot be used here.
         """
         self.robot = robot
+        self._new_bench = bench_on(device)
         self._armature = armature
         self._frictionloss = frictionloss
         self._threads = threads
@@ -66,7 +73,7 @@ class Simulator:
         """The bench that is simulated for a joint: that of its mirrored original."""
         original = self.robot.joint(joint).original[0]
         if original not in self._benches:
-            self._benches[original] = Bench(
+            self._benches[original] = self._new_bench(
                 self.robot,
                 original,
                 armature=self._armature,

@@ -7,11 +7,9 @@ is the delay: phase = -omega * delay, a straight line through zero.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import JointMatch
 
 
 def command_delay(joint: JointMatch, *, coherence_min: float = 0.8) -> float:
@@ -27,14 +25,3 @@ def command_delay(joint: JointMatch, *, coherence_min: float = 0.8) -> float:
     omega = measured.omega[band]
     lag = -np.unwrap(np.angle(measured.response[band] / joint.matched[band]))
     return max(0.0, float(omega @ lag / (omega @ omega)))
-
-
-def with_delays(result: MatchResult) -> MatchResult:
-    """The same match, with the delay of each joint that has a response and no delay yet."""
-    gains = {
-        name: replace(joint, delay_s=command_delay(result.joints[name]))
-        if joint.delay_s == 0.0 and name in result.joints
-        else joint
-        for name, joint in result.gains.joints.items()
-    }
-    return replace(result, gains=replace(result.gains, joints=gains))

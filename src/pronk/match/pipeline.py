@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
 from pronk.match.ask import Job, Simulator
+from pronk.match.command_delay import command_delay
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.gains import Simulator as SimulatorNote
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
@@ -83,12 +84,14 @@ def match_logs(
     Raises:
         LogError: No joint of the robot was asked, or a log cannot be used.
         IdentifiabilityError: A joint's band is mostly incoherent or too short.
+        PronkError: The device of the settings cannot be used here.
     """
     chosen = settings or MatchSettings()
     clock = _Clock(progress)
-    with clock.stage("estimate"):
-        asked = _collect(logs, robot, chosen, clock)
-    with Simulator(robot, threads=chosen.threads) as simulator:
+    # The simulator first: a device that is missing must not cost the user an estimate.
+    with Simulator(robot, threads=chosen.threads, device=chosen.device) as simulator:
+        with clock.stage("estimate"):
+            asked = _collect(logs, robot, chosen, clock)
         found, rate = _search(simulator, asked, chosen, clock)
         with clock.stage("amplitudes"):
             _fit_amplitudes(simulator, asked, found, chosen)
@@ -104,6 +107,7 @@ def match_logs(
         joints[name], gains[name] = _report(
             robot, item, found[name], matched[name], naive[name], zero.get(name), chosen
         )
+        gains[name] = replace(gains[name], delay_s=command_delay(joints[name]))
     return MatchResult(
         gains=MatchedGains(
             robot=robot.name,
@@ -261,7 +265,9 @@ def _without_armature(
     stiffness, damping = axes(robot, settings.grid_points)
     groups = alike([item.main for item in asked.values()], robot)
     jobs = []
-    with Simulator(robot, armature=0.0, threads=settings.threads) as simulator:
+    with Simulator(
+        robot, armature=0.0, threads=settings.threads, device=settings.device
+    ) as simulator:
         for k, group in enumerate(groups):
             bench = simulator.bench(group[0].joint)
             for goal, grid in zip(

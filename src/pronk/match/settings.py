@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pronk.errors import PronkError
+from pronk.match.device import DEVICES
 from pronk.response.estimator import Estimator
 
 
@@ -32,6 +33,9 @@ class MatchSettings:
     """Intervals over repeats: Student's t, or a bootstrap where there are eight or more."""
     threads: int = 2
     """Threads of the simulator."""
+    device: str = "cpu"
+    """Where the grid is simulated: `cpu` (all of it in double precision), `cuda` (MuJoCo Warp on a
+    GPU; needs `pronk[train]`), or `warp-cpu` (the same arithmetic on the processor, slow)."""
     estimator: Estimator = field(default_factory=Estimator)
     """Estimator, the same for the log and the simulation."""
 
@@ -53,5 +57,7 @@ class MatchSettings:
             raise PronkError(f"coherence_min is {self.coherence_min}; expected 0 to below 1.")
         if not 0.0 < self.level < 1.0:
             raise PronkError(f"level is {self.level}; expected between 0 and 1, for instance 0.95.")
+        if self.device not in DEVICES:
+            raise PronkError(f"device {self.device!r}; expected one of {', '.join(DEVICES)}.")
         if self.threads < 1:
             raise PronkError(f"threads is {self.threads}; expected 1 or more.")

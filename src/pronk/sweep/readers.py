@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
+import multiprocessing
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +34,10 @@ FORMATS = tuple(_READERS)
 """Formats that `read_log` knows."""
 
 _SUFFIXES = {".mcap": "mcap", ".csv": "csv", ".pt": "pace", ".npz": "npz"}
+_NO_LOGS = (".response.npz", ".prediction.npz", "match.npz")
+"""What pronk writes beside logs."""
+_WORTH_PROCESSES = 4
+"""Fewest logs for which starting processes pays."""
 
 
 def read_log(
@@ -132,32 +139,52 @@ def _read(
     return log
 
 
-def read_logs(paths: Iterable[Path | str], **options: Any) -> list[SweepLog]:
+def find_logs(paths: Iterable[Path | str]) -> list[Path]:
+    """The logs that some paths stand for; a folder that is no log itself means those in it.
+
+    Raises:
+        LogError: Nothing was named, or a folder holds no log.
+    """
+    found: list[Path] = []
+    for path in map(Path, paths):
+        if not path.is_dir() or is_sage(path) or (path / "metadata.yaml").is_file():
+            found.append(path)
+            continue
+        inside = sorted(p for p in path.iterdir() if is_sage(p) or _may_be_log(p))
+        if not inside:
+            raise LogError(
+                f"{path}: no logs in this folder; expected {', '.join(_SUFFIXES)} or SAGE folders."
+            )
+        found += inside
+    if not found:
+        raise LogError("no logs were named; give at least one file or folder.")
+    return found
+
+
+def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any) -> list[SweepLog]:
     """Read several logs; a folder that is not itself a log stands for the logs in it.
 
     Args:
         paths: Files and folders.
+        processes: Read so many at a time; worth it from four long logs on.
         options: As for `read_log`.
 
     Raises:
         LogError: As `read_log`, or there is no log.
         RobotError: As `read_log`.
     """
-    files: list[Path] = []
-    for path in map(Path, paths):
-        if path.is_dir() and not is_sage(path) and not (path / "metadata.yaml").is_file():
-            inside = sorted(p for p in path.iterdir() if p.suffix in _SUFFIXES or is_sage(p))
-            if not inside:
-                raise LogError(
-                    f"{path}: no logs in this folder; expected {', '.join(_SUFFIXES)} or SAGE "
-                    "folders."
-                )
-            files += inside
-        else:
-            files.append(path)
-    if not files:
-        raise LogError("no logs were named; give at least one file or folder.")
-    return [read_log(path, **options) for path in files]
+    files = find_logs(paths)
+    read = functools.partial(read_log, **options)
+    if processes < 2 or len(files) < _WORTH_PROCESSES:
+        return [read(path) for path in files]
+    # Threads of the simulator do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context) as pool:
+        return list(pool.map(read, files))
+
+
+def _may_be_log(path: Path) -> bool:
+    return path.suffix.lower() in _SUFFIXES and not path.name.endswith(_NO_LOGS)
 
 
 def _sniff(path: Path) -> str:

@@ -1,0 +1,152 @@
+"""The bench in MuJoCo Warp: the same positions, the same cell, on Warp's CPU device."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pronk.errors import PronkError
+from pronk.match.ask import Simulator
+from pronk.match.device import DEVICES, bench_on
+from pronk.match.grid import search
+from pronk.match.rehearse import Ask, rehearse
+from pronk.match.settings import MatchSettings
+from pronk.match.simulate import Bench
+from pronk.match.target import targets
+from pronk.response.estimator import Estimator
+from pronk.robots import load_robot
+from pronk.sweep.signals import Chirp
+
+Array = NDArray[np.float64]
+
+ROBOT = load_robot("mini_cheetah")
+STIFFNESS = np.array([13.0, 27.0, 20.0, 13.0, 27.0])
+DAMPING = np.array([0.1, 0.7, 0.4, 0.7, 0.1])
+"""The corners of the grid and its middle."""
+ROUNDING = 2e-5
+"""Single precision, measured [rad]: 1.3e-5 at the liveliest corner of the knee, 1e-6 elsewhere."""
+
+
+@contextmanager
+def both(
+    joint: str, *, least: int = 1, frictionloss: float | None = None
+) -> Iterator[tuple[Bench, Bench]]:
+    make = bench_on("warp-cpu")
+    with (
+        Bench(ROBOT, joint, frictionloss=frictionloss) as known,
+        make(ROBOT, joint, frictionloss=frictionloss, least=least) as warped,
+    ):
+        yield known, warped
+
+
+def default_pose(bench: Bench) -> Array:
+    return np.array([ROBOT.joint(name).default_position for name in bench.chain])
+
+
+def command(length_s: float, amplitude: float = 0.25) -> Array:
+    ticks = amplitude / 0.25 * Chirp(length_s=length_s).samples(50.0)
+    return np.repeat(np.concatenate([np.zeros(5), ticks]), 4)
+
+
+def positions(bench: Bench, commands: list[Array], poses: list[Array], rows: int = 5) -> Array:
+    out = np.full((rows, len(commands[0])), np.nan)
+    for part, position in bench.run(commands, poses, STIFFNESS[:rows], DAMPING[:rows]):
+        out[part] = position
+    return out
+
+
+@pytest.mark.train
+@pytest.mark.parametrize(
+    ("joint", "frictionloss"), [("FR_knee", None), ("FR_hip_roll", None), ("FR_knee", 0.3)]
+)
+def test_positions_agree_within_single_precision(joint: str, frictionloss: float | None) -> None:
+    pytest.importorskip("mujoco_warp")
+    with both(joint, frictionloss=frictionloss) as (known, warped):
+        ask = ([command(2.0)], [default_pose(known)])
+        expected, got = positions(known, *ask), positions(warped, *ask)
+        assert warped.count.steps == expected.size
+    assert np.ptp(expected, axis=1).min() > 0.1
+    # Equal would mean that the processor was asked twice.
+    assert 0.0 < np.abs(got - expected).max() < ROUNDING
+
+
+@pytest.mark.train
+def test_simulations_with_their_own_command_and_pose() -> None:
+    pytest.importorskip("mujoco_warp")
+    with both("FR_hip_roll") as (known, warped):
+        shared = ([command(1.0)], [default_pose(known)])
+        first = positions(warped, *shared)
+        asks = [command(1.0, amplitude) for amplitude in (0.25, -0.2, 0.15)]
+        poses = [default_pose(known) + np.array(turn) for turn in np.eye(3) * 0.1]
+        expected = positions(known, asks, poses, rows=3)
+        assert np.abs(positions(warped, asks, poses, rows=3) - expected).max() < ROUNDING
+        # Nothing of one run is left in the next, nor of a larger one in a smaller.
+        assert np.array_equal(positions(warped, *shared), first)
+        assert np.array_equal(positions(warped, *shared, rows=2), first[:2])
+
+
+@pytest.mark.train
+def test_few_simulations_stay_in_double_precision() -> None:
+    pytest.importorskip("mujoco_warp")
+    with both("FR_knee", least=6) as (known, warped):
+        ask = ([command(1.0)], [default_pose(known)])
+        assert np.array_equal(positions(known, *ask), positions(warped, *ask))
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("joint", ["FR_knee", "FR_hip_roll"])
+def test_the_grid_finds_the_same_cell(joint: str) -> None:
+    """A grid of 100 nodes, one step of the paper's grid apart, off the nodes of which the truth is."""
+    pytest.importorskip("mujoco_warp")
+    asked = Ask(offsets=Chirp(length_s=4.0).samples())
+    log = rehearse(ROBOT, joint, [asked], 20.6, 0.492)
+    goal = targets(log, joint, ROBOT, MatchSettings(estimator=Estimator(segment_s=2.0)))[0]
+    stiffness = 20.6 + 14.0 / 49.0 * (np.arange(10) - 4.3)
+    damping = 0.492 + 0.6 / 49.0 * (np.arange(10) - 5.4)
+    grids = []
+    for device in ("cpu", "warp-cpu"):
+        with Simulator(ROBOT, device=device) as simulator:
+            grids.append(search(simulator.bench(joint), [goal], stiffness, damping)[0])
+    known, warped = grids
+    assert known.cell == warped.cell == (4, 5)
+    gap = np.abs(np.sqrt(known.error) - np.sqrt(warped.error))
+    print(gap.max(), known.error_db, warped.error_db)
+    assert 0.0 < gap.max() < 1e-4
+
+
+@pytest.mark.train
+def test_a_missing_gpu_is_refused_in_one_sentence() -> None:
+    wp = pytest.importorskip("warp")
+    if wp.is_cuda_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(PronkError, match="no CUDA device was found"):
+        Simulator(ROBOT, device="cuda")
+
+
+def test_a_missing_extra_is_refused_in_one_sentence() -> None:
+    code = (
+        "import sys; sys.modules['mujoco_warp'] = None\n"
+        "from pronk.errors import PronkError\n"
+        "from pronk.match.device import bench_on\n"
+        "try: bench_on('cuda')\n"
+        "except PronkError as error: print(error)"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    assert "mujoco_warp is not installed" in said
+    assert 'pip install "pronk[train]"' in said
+
+
+def test_an_unknown_device_is_refused() -> None:
+    with pytest.raises(PronkError, match="expected one of cpu, cuda, warp-cpu"):
+        bench_on("tpu")
+    with pytest.raises(PronkError, match="expected one of cpu, cuda, warp-cpu"):
+        MatchSettings(device="tpu")
+    assert MatchSettings().device == DEVICES[0]
