@@ -190,6 +190,25 @@ def test_joints_that_cannot_be_asked_together() -> None:
         make_plan(ROBOT, ["FR_knee", "FR_hip_roll"], Multisine(), simultaneous=True)
 
 
+def test_each_amplitude_may_have_repeats_of_its_own() -> None:
+    plan = make_plan(ROBOT, ["FR_knee"], amplitudes=(0.125, 0.25), repeats=(1, 3))
+    assert [(ask.amplitude, ask.repeat) for ask in plan.asks] == [
+        (0.25, 0),
+        (0.25, 1),
+        (0.25, 2),
+        (0.125, 0),
+    ]
+    with pytest.raises(PlanError, match="one number of repeats for all or one an amplitude"):
+        make_plan(ROBOT, ["FR_knee"], amplitudes=(0.25, 0.125), repeats=(3,))
+
+
+def test_mirror_image_joints_are_asked_mirrored() -> None:
+    plan = make_plan(ROBOT, ["FR_hip_roll", "FL_hip_roll", "HL_knee"], amplitudes=(0.2,), repeats=1)
+    right, left, knee = (ask.offsets(50.0)[:, 0] for ask in plan.asks)
+    assert np.array_equal(left, -right)
+    assert np.array_equal(knee, right)
+
+
 def test_a_plan_of_nothing_and_unknown_joints() -> None:
     with pytest.raises(PlanError, match="asks nothing"):
         make_plan(ROBOT, [])

@@ -102,22 +102,24 @@ def test_few_simulations_stay_in_double_precision() -> None:
 @pytest.mark.train
 @pytest.mark.parametrize("joint", ["FR_knee", "FR_hip_roll"])
 def test_the_grid_finds_the_same_cell(joint: str) -> None:
-    """A grid of 100 nodes, one step of the paper's grid apart, off the nodes of which the truth is."""
+    """100 nodes, a step of the paper's grid apart, the truth between them."""
     pytest.importorskip("mujoco_warp")
     asked = Ask(offsets=Chirp(length_s=4.0).samples())
     log = rehearse(ROBOT, joint, [asked], 20.6, 0.492)
-    goal = targets(log, joint, ROBOT, MatchSettings(estimator=Estimator(segment_s=2.0)))[0]
+    settings = MatchSettings(estimator=Estimator(segment_s=2.0))
+    goal = targets(log, joint, ROBOT, settings)[0]
     stiffness = 20.6 + 14.0 / 49.0 * (np.arange(10) - 4.3)
     damping = 0.492 + 0.6 / 49.0 * (np.arange(10) - 5.4)
     grids = []
     for device in ("cpu", "warp-cpu"):
         with Simulator(ROBOT, device=device) as simulator:
             grids.append(search(simulator.bench(joint), [goal], stiffness, damping)[0])
-    known, warped = grids
-    assert known.cell == warped.cell == (4, 5)
-    gap = np.abs(np.sqrt(known.error) - np.sqrt(warped.error))
-    print(gap.max(), known.error_db, warped.error_db)
-    assert 0.0 < gap.max() < 1e-4
+    known, warped = (np.sqrt(grid.error) for grid in grids)
+    assert grids[0].cell == grids[1].cell
+    assert not grids[0].at_edge
+    # Far less than what sets the best node apart from the next: the cell is no luck.
+    best, second = np.sort(known, axis=None)[:2]
+    assert 0.0 < np.abs(known - warped).max() < 0.1 * (second - best)
 
 
 @pytest.mark.train

@@ -52,6 +52,13 @@ def match(
     phase: Annotated[
         bool, typer.Option("--phase", help="Let the refinement see the phase and a free delay.")
     ] = False,
+    device: Annotated[
+        str,
+        typer.Option(
+            help="Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs "
+            "pronk\\[train])."
+        ),
+    ] = "cpu",
     json_file: console.JsonOption = None,
     *,
     reading: logs.Reading,
@@ -69,7 +76,10 @@ def match(
         )
     read = logs.read(paths, reading, machine)
     settings = MatchSettings(
-        method="quick" if quick else "grid", zero_armature=zero_armature, use_phase=phase
+        method="quick" if quick else "grid",
+        zero_armature=zero_armature,
+        use_phase=phase,
+        device=device,
     )
     arm: ArmMatch | None = None
     with console.progress() as report:

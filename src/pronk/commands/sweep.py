@@ -137,7 +137,7 @@ def make(
     joints: Sequence[str] | None,
     signal: SignalName,
     amplitudes: Sequence[float],
-    repeats: int,
+    repeats: int | Sequence[int],
 ) -> SweepPlan:
     """The plan of a sweep, one joint after another."""
     from pronk.sweep.plan import make_plan

@@ -217,7 +217,7 @@ def make_plan(
     signal: Signal | None = None,
     *,
     amplitudes: Sequence[float] = (0.25, 0.125),
-    repeats: int = 3,
+    repeats: int | Sequence[int] = 3,
     settle_s: float = 0.5,
     simultaneous: bool = False,
     stiffness: Mapping[str, float] | None = None,
@@ -235,7 +235,8 @@ def make_plan(
         joints: Names; all of them if None.
         signal: What to ask; its own amplitude is replaced. The paper's chirp if None.
         amplitudes: Peaks of the command [rad]; two or more show friction.
-        repeats: Times each amplitude is asked; three or more give honest intervals.
+        repeats: Times each amplitude is asked, one number for all or one each; three or more of
+            the largest, which is the one matched, give honest intervals.
         settle_s: Rest after each question [s].
         simultaneous: Ask all joints at once, with multisines on different harmonics.
         stiffness: Gains on the drives by joint, instead of the robot's [N m/rad].
@@ -252,10 +253,11 @@ def make_plan(
     names = robot.joint_names if joints is None else tuple(dict.fromkeys(joints))
     for name in (*names, *(stiffness or {}), *(damping or {})):
         robot.joint(name)
-    if not names or not amplitudes or repeats < 1:
+    counts = [repeats] * len(amplitudes) if isinstance(repeats, int) else list(repeats)
+    if not names or not amplitudes or len(counts) != len(amplitudes) or min(counts) < 1:
         raise PlanError(
             f"a plan of {len(names)} joints, {len(amplitudes)} amplitudes and {repeats} repeats "
-            "asks nothing; expected at least one of each."
+            "asks nothing; expected at least one of each, and one number of repeats for all or one an amplitude."
         )
     if not (np.isfinite(settle_s) and settle_s >= 0.0):
         raise PlanError(f"settle_s is {settle_s}; expected 0 s or more, for instance 0.5.")
@@ -267,11 +269,12 @@ def make_plan(
             raise PlanError(
                 f"a {label} on the drives is negative or not finite; expected 0 or more."
             )
-    loudest = sorted(set(amplitudes), reverse=True)
+    times = dict(zip(amplitudes, counts, strict=True))
+    loudest = dict(sorted(times.items(), reverse=True))
     asks = (
-        _together(robot, names, signal, loudest, repeats)
+        _together(robot, names, signal, loudest)
         if simultaneous and len(names) > 1
-        else _one_by_one(robot, names, signal, loudest, repeats)
+        else _one_by_one(robot, names, signal, loudest)
     )
     rate = robot.policy_rate_hz
     uncertainty = uncertainty or Uncertainty()
@@ -279,7 +282,7 @@ def make_plan(
     forecasts = [
         f
         for ask in asks
-        if ask.repeat == 0 and ask.amplitude == loudest[0]
+        if ask.repeat == 0 and ask.amplitude == max(loudest)
         for f in _forecast_ask(robot, ask, rate, kp, kd, uncertainty, cache)
     ]
     note = correlation_note(asks[0].offsets(rate), asks[0].joints, rate)
@@ -297,7 +300,7 @@ def make_plan(
 
 
 def _one_by_one(
-    robot: Robot, names: Sequence[str], signal: Signal, amplitudes: Sequence[float], repeats: int
+    robot: Robot, names: Sequence[str], signal: Signal, times: Mapping[float, int]
 ) -> tuple[Ask, ...]:
     return tuple(
         Ask(
@@ -308,13 +311,13 @@ def _one_by_one(
             signs=(robot.joint(name).original[1],),
         )
         for name in names
-        for amplitude in amplitudes
-        for repeat in range(repeats)
+        for amplitude, count in times.items()
+        for repeat in range(count)
     )
 
 
 def _together(
-    robot: Robot, names: Sequence[str], signal: Signal, amplitudes: Sequence[float], repeats: int
+    robot: Robot, names: Sequence[str], signal: Signal, times: Mapping[float, int]
 ) -> tuple[Ask, ...]:
     if not isinstance(signal, Multisine):
         raise PlanError(
@@ -335,8 +338,8 @@ def _together(
             repeat=repeat,
             clamped=clamped,
         )
-        for amplitude in amplitudes
-        for repeat in range(repeats)
+        for amplitude, count in times.items()
+        for repeat in range(count)
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import multiprocessing
 from collections.abc import Callable, Iterable, Mapping
@@ -174,13 +173,18 @@ def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any
         RobotError: As `read_log`.
     """
     files = find_logs(paths)
-    read = functools.partial(read_log, **options)
     if processes < 2 or len(files) < _WORTH_PROCESSES:
-        return [read(path) for path in files]
+        return [_read_with(path, options) for path in files]
     # Threads of the simulator do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        return list(pool.map(read, files))
+        return [
+            done.result() for done in [pool.submit(_read_with, path, options) for path in files]
+        ]
+
+
+def _read_with(path: Path, options: Mapping[str, Any]) -> SweepLog:
+    return read_log(path, **options)
 
 
 def _may_be_log(path: Path) -> bool:
