@@ -5,3 +5,12 @@ compared), `grid` (the paper's search), `quick` (the same optimum by the lineari
 `refine` (off the grid), `interval` (how far to believe it), `amplitude` (does friction show?),
 `ranges` (what training randomizes). Results are `result.MatchResult` and `gains.MatchedGains`.
 """
+
+from __future__ import annotations
+
+from pronk.match.pipeline import match_logs
+from pronk.match.predict import predict
+from pronk.match.result import MatchResult
+from pronk.match.settings import MatchSettings
+
+__all__ = ["MatchResult", "MatchSettings", "match_logs", "predict"]

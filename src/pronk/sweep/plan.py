@@ -257,7 +257,8 @@ def make_plan(
     if not names or not amplitudes or len(counts) != len(amplitudes) or min(counts) < 1:
         raise PlanError(
             f"a plan of {len(names)} joints, {len(amplitudes)} amplitudes and {repeats} repeats "
-            "asks nothing; expected at least one of each, and one number of repeats for all or one an amplitude."
+            "asks nothing; expected at least one of each, and one number of repeats for all or "
+            "one an amplitude."
         )
     if not (np.isfinite(settle_s) and settle_s >= 0.0):
         raise PlanError(f"settle_s is {settle_s}; expected 0 s or more, for instance 0.5.")
