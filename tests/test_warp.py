@@ -30,7 +30,7 @@ STIFFNESS = np.array([13.0, 27.0, 20.0, 13.0, 27.0])
 DAMPING = np.array([0.1, 0.7, 0.4, 0.7, 0.1])
 """The corners of the grid and its middle."""
 ROUNDING = 2e-5
-"""Single precision, measured [rad]: 1.3e-5 at the liveliest corner of the knee, 1e-6 elsewhere."""
+"""Single precision over a few seconds [rad]: 1.3e-5 where the knee is liveliest, 1e-6 elsewhere."""
 
 
 @contextmanager
