@@ -24,7 +24,7 @@ $(BIN)/python:
 
 # The core install: no PyTorch.
 $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install -c constraints.txt -e .
+	$(PIP) install --no-compile -c constraints.txt -e .
 	touch $@
 
 # Everything the tests need. PyTorch by itself first, so that its pinned build is taken.
