@@ -102,14 +102,14 @@ def test_few_simulations_stay_in_double_precision() -> None:
 @pytest.mark.train
 @pytest.mark.parametrize("joint", ["FR_knee", "FR_hip_roll"])
 def test_the_grid_finds_the_same_cell(joint: str) -> None:
-    """100 nodes, a step of the paper's grid apart, the truth between them."""
+    """225 nodes, a step of the paper's grid apart, the truth between them."""
     pytest.importorskip("mujoco_warp")
     asked = Ask(offsets=Chirp(length_s=4.0).samples())
     log = rehearse(ROBOT, joint, [asked], 20.6, 0.492)
     settings = MatchSettings(estimator=Estimator(segment_s=2.0))
     goal = targets(log, joint, ROBOT, settings)[0]
-    stiffness = 20.6 + 14.0 / 49.0 * (np.arange(10) - 4.3)
-    damping = 0.492 + 0.6 / 49.0 * (np.arange(10) - 5.4)
+    stiffness = 20.6 + 14.0 / 49.0 * (np.arange(15) - 6.3)
+    damping = 0.492 + 0.6 / 49.0 * (np.arange(15) - 7.4)
     grids = []
     for device in ("cpu", "warp-cpu"):
         with Simulator(ROBOT, device=device) as simulator:
