@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pronk.errors import ArtefactError
 
 
 @contextmanager
@@ -45,3 +51,48 @@ def sha256(path: Path) -> str:
     """Hex SHA-256 of a file's bytes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def save_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Any]) -> None:
+    """Write named arrays and a JSON header to one `.npz`, whole or not at all; no pickle.
+
+    Args:
+        path: Where to.
+        header: What JSON can hold; its `schema` says what the file is.
+        arrays: Name to array.
+    """
+    with written_whole(path) as aside, aside.open("wb") as file:
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+
+
+@contextmanager
+def stored_arrays(
+    path: Path, schema: str, *, what: str, writer: str
+) -> Iterator[tuple[dict[str, Any], Mapping[str, Any]]]:
+    """Open what `save_arrays` wrote: the header and the arrays by name, read inside the block.
+
+    Args:
+        path: The file.
+        schema: The schema that this pronk reads.
+        what: What the file is, for errors, as in `a match file`.
+        writer: The command that writes one, for errors.
+
+    Raises:
+        ArtefactError: Missing, damaged or of another schema, also where the block finds so.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            header = json.loads(str(stored["header"]))
+            if header.get("schema") != schema:
+                raise ArtefactError(
+                    f"{path}: schema {header.get('schema')!r}; this pronk reads {schema!r}."
+                )
+            yield header, stored
+    except ArtefactError:
+        raise
+    except FileNotFoundError:
+        raise ArtefactError(f"{path}: no such file; `{writer}` writes one.") from None
+    except Exception as error:
+        raise ArtefactError(
+            f"{path}: not {what} of pronk ({type(error).__name__}); `{writer}` writes one."
+        ) from error

@@ -14,7 +14,7 @@ from pronk.commands import console, logs
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.match.arm_match import ArmMatch
+    from pronk.match.arm.match import ArmMatch
     from pronk.match.result import MatchResult
     from pronk.robots.robot import Robot
     from pronk.sweep.log import SweepLog
@@ -64,7 +64,7 @@ def match(
     reading: logs.Reading,
 ) -> None:
     """Find the gains that make the simulator answer like the robot."""
-    from pronk.match.arm_simulation import moves_together
+    from pronk.match.arm.simulation import moves_together
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.robots import load_robot
@@ -109,7 +109,7 @@ def together(
     report: console.Reporter,
 ) -> tuple[ArmMatch, MatchResult]:
     """Match an arm whose joints moved at the same time; there is no grid then."""
-    from pronk.match.arm_match import match_arm
+    from pronk.match.arm.match import match_arm
     from pronk.match.result import MatchResult
 
     begin = time.perf_counter()

@@ -3,7 +3,8 @@
 Start at `pipeline.match_logs`. What it uses, in order: `target` (measured responses, ready to be
 compared), `grid` (the paper's search), `quick` (the same optimum by the linearized model),
 `refine` (off the grid), `interval` (how far to believe it), `amplitude` (does friction show?),
-`ranges` (what training randomizes). Results are `result.MatchResult` and `gains.MatchedGains`.
+`ranges` (what training randomizes). Arms whose joints all moved at once have a room of their own,
+`arm`. Results are `result.MatchResult` and `gains.MatchedGains`.
 """
 
 from __future__ import annotations

@@ -16,10 +16,11 @@ from pronk.errors import LogError
 from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
 from pronk.match.ask import Job, Simulator
 from pronk.match.command_delay import command_delay
+from pronk.match.doubts import armature_flags, doubts, missing
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.gains import Simulator as SimulatorNote
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
-from pronk.match.interval import interval, measurement_error_db
+from pronk.match.interval import interval
 from pronk.match.quick import quick_search
 from pronk.match.ranges import group_gains
 from pronk.match.refine import Fit, refine
@@ -31,14 +32,6 @@ from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-
-NO_MATCH_DB = 1.0
-"""Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
-of a good log stays below."""
-NO_MATCH_INTERVALS = 3.0
-"""A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
-NO_ARMATURE_RATIO = 5.0
-"""Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
 
 
 @dataclass
@@ -300,10 +293,10 @@ def _report(
     zero_db = float("nan") if found.zero is None else found.zero.error_db
     band = goal.measured.band(*joint.band_hz)
     flags = (
-        *_doubts(goal, fit, grid, settings),
+        *doubts(goal, fit, grid, settings),
         *bounds.flags,
         *amplitude_flags(per_amplitude),
-        *_missing(goal, band),
+        *missing(goal, band),
         *goal.doubts,
     )
     covariance = bounds.covariance
@@ -344,49 +337,6 @@ def _report(
         zero_armature=zero,
         repeat_gains=bounds.repeat_gains,
         amplitude_gains=per_amplitude,
-        flags=(*flags, *_armature_flags(fit, zero_db, settings)),
+        flags=(*flags, *armature_flags(fit, zero_db, settings)),
     )
     return match, gains
-
-
-def _doubts(goal: Target, fit: Fit, grid: GridSearch, settings: MatchSettings) -> Iterator[str]:
-    """What speaks against the optimum."""
-    limit = _no_match_db(fit, settings)
-    if not fit.error_db <= limit:
-        yield (
-            f"no match: the best gains miss the measured response by {fit.error_db:.2g} dB RMS, "
-            f"more than {limit:.2g} dB; the model lacks something that the robot has"
-        )
-    if grid.at_edge:
-        yield (
-            f"at the edge of the grid ({grid.gains[0]:.3g} N m/rad, {grid.gains[1]:.3g} N m s/rad)"
-        )
-    if not fit.settled:
-        yield "the refinement did not settle; take the gains of the grid"
-    if not goal.question.policy_held:
-        yield "the command does not change at the policy's rate; each physics step holds its own"
-
-
-def _no_match_db(fit: Fit, settings: MatchSettings) -> float:
-    """Error in the band above which gains are no match [dB]."""
-    return max(NO_MATCH_DB, NO_MATCH_INTERVALS * measurement_error_db(fit, level=settings.level))
-
-
-def _missing(goal: Target, band: NDArray[np.bool_]) -> Iterator[str]:
-    """Frequencies of the band that the fit did not look at."""
-    left, whole = int(band.sum()) - int(goal.inside.sum()), int(band.sum())
-    if left:
-        yield f"{left} of {whole} frequencies left out for low coherence"
-
-
-def _armature_flags(fit: Fit, zero_db: float, settings: MatchSettings) -> Iterator[str]:
-    """What the search without rotor inertia says (F13)."""
-    if not np.isfinite(zero_db):
-        return
-    ratio = zero_db / max(fit.error_db, 1e-6)
-    if ratio >= NO_ARMATURE_RATIO and zero_db > _no_match_db(fit, settings):
-        verdict = "no match, the best node misses"
-    else:
-        # A light rotor on a heavy link: other gains make up for it.
-        verdict = "not ruled out by this joint, its best node misses"
-    yield f"zero armature: {verdict} by {zero_db:.2g} dB RMS, {ratio:.3g} times the match"

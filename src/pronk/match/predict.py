@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError
-from pronk.match.arm_match import drives_of
-from pronk.match.arm_simulation import ArmBench, JointDrive, held_mean, moves_together
+from pronk.match.arm.match import drives_of
+from pronk.match.arm.simulation import ArmBench, JointDrive, held_mean, moves_together
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.prediction import JointPrediction, Prediction
 from pronk.match.question import Question, question

@@ -5,7 +5,6 @@ One `*.prediction.npz` a log, plain arrays and a JSON header, no pickle.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import ArtefactError
-from pronk.files import written_whole
+from pronk.files import save_arrays, stored_arrays
 
 SCHEMA = "pronk/prediction/1"
 
@@ -110,8 +108,7 @@ def save(path: Path, prediction: Prediction) -> None:
         for i, one in enumerate(prediction.joints)
         for name in _ARRAYS
     }
-    with written_whole(path) as aside, aside.open("wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+    save_arrays(path, header, arrays)
 
 
 def load(path: Path) -> Prediction:
@@ -120,28 +117,16 @@ def load(path: Path) -> Prediction:
     Raises:
         ArtefactError: Missing, damaged or of another schema.
     """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            header = json.loads(str(stored["header"]))
-            if header.get("schema") != SCHEMA:
-                raise ArtefactError(
-                    f"{path}: schema {header.get('schema')!r}; this pronk reads {SCHEMA!r}."
-                )
-            return Prediction(
-                joints=tuple(
-                    JointPrediction(**entry, **{name: stored[f"{i}/{name}"] for name in _ARRAYS})
-                    for i, entry in enumerate(header["joints"])
-                ),
-                source=str(header["source"]),
-                virtual=bool(header["virtual"]),
-                excluded=header["excluded"],
-            )
-    except ArtefactError:
-        raise
-    except FileNotFoundError:
-        raise ArtefactError(f"{path}: no such file; `pronk predict LOG` writes one.") from None
-    except Exception as error:
-        raise ArtefactError(
-            f"{path}: not a prediction of pronk ({type(error).__name__}); "
-            "`pronk predict LOG` writes one."
-        ) from error
+    with stored_arrays(path, SCHEMA, what="a prediction", writer="pronk predict LOG") as (
+        header,
+        arrays,
+    ):
+        return Prediction(
+            joints=tuple(
+                JointPrediction(**entry, **{name: arrays[f"{i}/{name}"] for name in _ARRAYS})
+                for i, entry in enumerate(header["joints"])
+            ),
+            source=str(header["source"]),
+            virtual=bool(header["virtual"]),
+            excluded=header["excluded"],
+        )

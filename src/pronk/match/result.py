@@ -6,18 +6,17 @@ responses that the page draws. No pickle.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import ArtefactError
-from pronk.files import written_whole
+from pronk.files import save_arrays, stored_arrays
 from pronk.match.gains import MatchedGains
-from pronk.response.response import FrequencyResponse
+from pronk.response.response import FrequencyResponse, packed, unpacked
 
 SCHEMA = "pronk/match/1"
 
@@ -82,18 +81,6 @@ _MATCH_ARRAYS = (
     "repeat_gains",
     "amplitude_gains",
 )
-_RESPONSE_ARRAYS = ("omega", "response", "coherence", "averages", "repeats")
-_RESPONSE_SCALARS = (
-    "joint",
-    "amplitude",
-    "estimator",
-    "window",
-    "segment_s",
-    "delay_s",
-    "third_harmonic",
-    "virtual",
-    "source",
-)
 _MATCH_SCALARS = (
     "joint",
     "stiffness",
@@ -107,24 +94,22 @@ _MATCH_SCALARS = (
 def save(path: Path, result: MatchResult) -> None:
     """Write `match.npz`; the gains themselves are written by `pronk.match.gains.save`."""
     entries = []
-    arrays: dict[str, NDArray[np.generic]] = {}
+    arrays: dict[str, Any] = {}
     for i, joint in enumerate(result.joints.values()):
-        for name in _MATCH_ARRAYS:
-            arrays[f"{i}/{name}"] = np.asarray(getattr(joint, name))
+        arrays |= {f"{i}/{name}": np.asarray(getattr(joint, name)) for name in _MATCH_ARRAYS}
         if joint.zero_armature is not None:
             arrays[f"{i}/zero_armature"] = joint.zero_armature
+        responses = []
         for k, response in enumerate(joint.responses):
-            for name in _RESPONSE_ARRAYS:
-                arrays[f"{i}/{k}/{name}"] = getattr(response, name)
+            scalars, parts = packed(response, f"{i}/{k}")
+            responses.append(scalars)
+            arrays |= parts
         entries.append(
             {
                 **{name: getattr(joint, name) for name in _MATCH_SCALARS},
                 "band_hz": joint.band_hz,
                 "flags": joint.flags,
-                "responses": [
-                    {name: getattr(response, name) for name in _RESPONSE_SCALARS}
-                    for response in joint.responses
-                ],
+                "responses": responses,
             }
         )
     header = {
@@ -133,8 +118,7 @@ def save(path: Path, result: MatchResult) -> None:
         "seconds": dict(result.seconds),
         "grid_steps_per_second": result.grid_steps_per_second,
     }
-    with written_whole(path) as aside, aside.open("wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+    save_arrays(path, header, arrays)
 
 
 def load(path: Path, gains: MatchedGains) -> MatchResult:
@@ -143,40 +127,23 @@ def load(path: Path, gains: MatchedGains) -> MatchResult:
     Raises:
         ArtefactError: Missing, damaged or of another schema.
     """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            header = json.loads(str(stored["header"]))
-            if header.get("schema") != SCHEMA:
-                raise ArtefactError(
-                    f"{path}: schema {header.get('schema')!r}; this pronk reads {SCHEMA!r}."
-                )
-            joints = {}
-            for i, entry in enumerate(header["joints"]):
-                responses = tuple(
-                    FrequencyResponse(
-                        **scalars, **{name: stored[f"{i}/{k}/{name}"] for name in _RESPONSE_ARRAYS}
-                    )
-                    for k, scalars in enumerate(entry["responses"])
-                )
-                joints[entry["joint"]] = JointMatch(
+    with stored_arrays(path, SCHEMA, what="a match file", writer="pronk match") as (header, arrays):
+        return MatchResult(
+            gains=gains,
+            joints={
+                entry["joint"]: JointMatch(
                     **{name: entry[name] for name in _MATCH_SCALARS},
-                    **{name: stored[f"{i}/{name}"] for name in _MATCH_ARRAYS},
+                    **{name: arrays[f"{i}/{name}"] for name in _MATCH_ARRAYS},
                     band_hz=tuple(entry["band_hz"]),
                     flags=tuple(entry["flags"]),
-                    responses=responses,
-                    zero_armature=stored.get(f"{i}/zero_armature"),
+                    responses=tuple(
+                        unpacked(scalars, arrays, f"{i}/{k}")
+                        for k, scalars in enumerate(entry["responses"])
+                    ),
+                    zero_armature=arrays.get(f"{i}/zero_armature"),
                 )
-            return MatchResult(
-                gains=gains,
-                joints=joints,
-                seconds=header["seconds"],
-                grid_steps_per_second=header["grid_steps_per_second"],
-            )
-    except ArtefactError:
-        raise
-    except FileNotFoundError:
-        raise ArtefactError(f"{path}: no such file; `pronk match` writes one.") from None
-    except Exception as error:
-        raise ArtefactError(
-            f"{path}: not a match file of pronk ({type(error).__name__}); `pronk match` writes one."
-        ) from error
+                for i, entry in enumerate(header["joints"])
+            },
+            seconds=header["seconds"],
+            grid_steps_per_second=header["grid_steps_per_second"],
+        )

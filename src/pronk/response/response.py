@@ -7,17 +7,16 @@ to the measured position; the hold itself is not part of it, so it compares dire
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pronk.errors import ArtefactError
-from pronk.files import written_whole
+from pronk.files import save_arrays, stored_arrays
 
 SCHEMA = "pronk/response/1"
 
@@ -25,6 +24,17 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _ARRAYS = ("omega", "response", "coherence", "averages", "repeats")
+_SCALARS = (
+    "joint",
+    "amplitude",
+    "estimator",
+    "window",
+    "segment_s",
+    "delay_s",
+    "third_harmonic",
+    "virtual",
+    "source",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,28 +123,27 @@ class FrequencyResponse:
         return np.asarray(inside & (self.coherence >= coherence))
 
 
+def packed(response: FrequencyResponse, prefix: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A response as what JSON can hold and as arrays named `prefix/...`."""
+    scalars = {name: getattr(response, name) for name in _SCALARS}
+    return scalars, {f"{prefix}/{name}": getattr(response, name) for name in _ARRAYS}
+
+
+def unpacked(
+    scalars: Mapping[str, Any], arrays: Mapping[str, Any], prefix: str
+) -> FrequencyResponse:
+    """The response that `packed` took apart."""
+    return FrequencyResponse(**scalars, **{name: arrays[f"{prefix}/{name}"] for name in _ARRAYS})
+
+
 def save(path: Path, responses: Sequence[FrequencyResponse]) -> None:
     """Write responses to one `*.response.npz` (plain arrays and a JSON header, no pickle)."""
-    header = {
-        "schema": SCHEMA,
-        "responses": [
-            {
-                "joint": r.joint,
-                "amplitude": r.amplitude,
-                "estimator": r.estimator,
-                "window": r.window,
-                "segment_s": r.segment_s,
-                "delay_s": r.delay_s,
-                "third_harmonic": r.third_harmonic,
-                "virtual": r.virtual,
-                "source": r.source,
-            }
-            for r in responses
-        ],
-    }
-    arrays = {f"{i}/{name}": getattr(r, name) for i, r in enumerate(responses) for name in _ARRAYS}
-    with written_whole(path) as aside, aside.open("wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+    parts = [packed(response, str(i)) for i, response in enumerate(responses)]
+    save_arrays(
+        path,
+        {"schema": SCHEMA, "responses": [scalars for scalars, _ in parts]},
+        {name: array for _, arrays in parts for name, array in arrays.items()},
+    )
 
 
 def load(path: Path) -> list[FrequencyResponse]:
@@ -143,23 +152,8 @@ def load(path: Path) -> list[FrequencyResponse]:
     Raises:
         ArtefactError: Not such a file, damaged, or of another schema.
     """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            header = json.loads(str(stored["header"]))
-            if header.get("schema") != SCHEMA:
-                raise ArtefactError(
-                    f"{path}: schema {header.get('schema')!r}; this pronk reads {SCHEMA!r}."
-                )
-            return [
-                FrequencyResponse(**entry, **{name: stored[f"{i}/{name}"] for name in _ARRAYS})
-                for i, entry in enumerate(header["responses"])
-            ]
-    except ArtefactError:
-        raise
-    except FileNotFoundError:
-        raise ArtefactError(f"{path}: no such file; `pronk response LOG` writes one.") from None
-    except Exception as error:
-        raise ArtefactError(
-            f"{path}: not a response file of pronk ({type(error).__name__}); "
-            "`pronk response LOG` writes one."
-        ) from error
+    with stored_arrays(path, SCHEMA, what="a response file", writer="pronk response LOG") as (
+        header,
+        arrays,
+    ):
+        return [unpacked(entry, arrays, str(i)) for i, entry in enumerate(header["responses"])]

@@ -10,11 +10,11 @@ import pytest
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
 from pronk.match import gains as gains_file
-from pronk.match.arm_match import ArmMatch, drives_of, match_arm
-from pronk.match.arm_simulation import ArmBench, JointDrive, held_mean, moves_together
-from pronk.match.drive_fit import fit_drive
+from pronk.match.arm.fit import fit_drive
+from pronk.match.arm.match import ArmMatch, drives_of, match_arm
+from pronk.match.arm.simulation import ArmBench, JointDrive, held_mean, moves_together
+from pronk.match.arm.trust import trusted_frequency, trusted_samples
 from pronk.match.predict import predict
-from pronk.match.trust import trusted_frequency, trusted_samples
 from pronk.robots import load_robot
 from pronk.sweep.log import Segment, SweepLog
 from pronk.sweep.readers import read_log
