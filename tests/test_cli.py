@@ -344,3 +344,20 @@ def test_export(capsys, matched, tmp_path, target):
     out = tmp_path / "exported"
     accepted(capsys, "export", matched / "gains.yaml", "--to", target, "--out", out)
     assert len(out.read_text()) > 200
+
+
+# --- Mode drive ---------------------------------------------------------------------------------
+
+
+def test_drive_mode_finds_what_it_can_and_refuses_the_rest(capsys, matched, tmp_path):
+    log = matched / "FR_knee.mcap"
+    common = ("match", log, "--robot", "mini_cheetah", "--out", tmp_path / "gains.yaml")
+    said = refused(capsys, *common, "--free", "armature")
+    assert "--mode drive" in said
+    said = refused(capsys, *common, "--mode", "drive", "--free", "stiffness", "--free", "armature",
+                   "--free", "damping", "--free", "frictionloss")  # fmt: skip
+    assert "FR_knee: these data" in said
+    assert "payload" in said
+    assert not (tmp_path / "gains.yaml").exists()
+    shown = accepted(capsys, *common, "--mode", "drive", "--free", "damping", "--free", "delay")
+    assert "held" in shown

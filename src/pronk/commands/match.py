@@ -27,19 +27,25 @@ class Mode(StrEnum):
     DRIVE = "drive"
 
 
+class Interval(StrEnum):
+    """How intervals are made from repeats."""
+
+    STUDENT = "student"
+    BOOTSTRAP = "bootstrap"
+
+
 @logs.reads_logs
 def match(
     paths: logs.LogsArgument,
     robot: logs.RobotOption,
     out: Annotated[Path, typer.Option("--out", help="The gains file.")] = Path("gains.yaml"),
     mode: Annotated[
-        Mode | None,
+        Mode,
         typer.Option(
-            help="gains: stiffness and damping (the paper's). drive: stiffness is known; damping, "
-            "armature, friction and delay are looked for. gains if left out, drive where several "
-            "joints move at once."
+            help="gains: stiffness and damping (the paper's), the default. drive: stiffness is "
+            "known; damping, armature, friction and delay are looked for."
         ),
-    ] = None,
+    ] = Mode.GAINS,
     quick: Annotated[
         bool, typer.Option("--quick", help="Search the linearized model, verify by simulation.")
     ] = False,
@@ -49,6 +55,15 @@ def match(
             "--zero-armature/--no-zero-armature", help="Repeat the search without rotor inertia."
         ),
     ] = True,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="drive: look for this instead; repeat it. What the sweeps cannot tell is refused."
+        ),
+    ] = None,
+    interval: Annotated[
+        Interval, typer.Option(help="95 % intervals over repeats; the bootstrap needs eight.")
+    ] = Interval.STUDENT,
     phase: Annotated[
         bool, typer.Option("--phase", help="Let the refinement see the phase and a free delay.")
     ] = False,
@@ -65,6 +80,8 @@ def match(
 ) -> None:
     """Find the gains that make the simulator answer like the robot."""
     from pronk.match.arm.simulation import moves_together
+    from pronk.match.drive import match_drives
+    from pronk.match.drive_parameters import DRIVE_MODE
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.robots import load_robot
@@ -79,12 +96,19 @@ def match(
         method="quick" if quick else "grid",
         zero_armature=zero_armature,
         use_phase=phase,
+        interval=interval.value,
         device=device,
     )
+    if free and mode is not Mode.DRIVE:
+        raise PronkError("--free names what --mode drive looks for; say --mode drive as well.")
     arm: ArmMatch | None = None
     with console.progress() as report:
-        if mode is Mode.DRIVE or any(moves_together(log) for log in read):
-            arm, result = together(read, machine, (mode or Mode.GAINS).value, report)
+        if any(moves_together(log) for log in read):
+            arm, result = together(read, machine, mode.value, report)
+        elif mode is Mode.DRIVE:
+            result = match_drives(
+                read, machine, free=free or DRIVE_MODE, settings=settings, progress=report
+            )
         else:
             result = match_logs(read, machine, settings=settings, progress=report)
         page = write(result, out, report)

@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import LogError
 from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
 from pronk.match.ask import Job, Simulator
 from pronk.match.command_delay import command_delay
@@ -26,7 +25,7 @@ from pronk.match.ranges import group_gains
 from pronk.match.refine import Fit, refine
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
-from pronk.match.target import Target, merged, targets
+from pronk.match.target import Target, gains_on_drive, logs_by_joint, merged, targets
 from pronk.robots.robot import Robot
 from pronk.sweep.log import SweepLog
 
@@ -148,32 +147,12 @@ def _collect(
     logs: Sequence[SweepLog], robot: Robot, settings: MatchSettings, clock: _Clock
 ) -> dict[str, _Asked]:
     """Responses of every joint asked, in the robot's order."""
-    where: dict[str, list[SweepLog]] = {}
-    for log in logs:
-        names = {name for segment in log.segments for name in segment.joints}
-        # A log that does not say whom it asked asked those whose command moves.
-        for i, name in enumerate(log.joints):
-            if name in names or (not log.segments and np.ptp(log.command[:, i]) > 0.0):
-                where.setdefault(name, []).append(log)
-    for name in where:
-        robot.joint(name)
-    if not where:
-        raise LogError(
-            f"{len(logs)} logs ask no joint; expected questions to some of "
-            f"{', '.join(robot.joint_names)}."
-        )
+    where = logs_by_joint(logs, robot)
     asked: dict[str, _Asked] = {}
-    for i, joint in enumerate(j for j in robot.joints if j.name in where):
-        sources = where[joint.name]
-        found = merged([targets(log, joint.name, robot, settings) for log in sources])
-        first = sources[0]
-        column = first.column(joint.name)
-        asked[joint.name] = _Asked(
-            targets=found,
-            naive=(
-                joint.stiffness if first.stiffness is None else float(first.stiffness[column]),
-                joint.damping if first.damping is None else float(first.damping[column]),
-            ),
+    for i, (name, sources) in enumerate(where.items()):
+        asked[name] = _Asked(
+            targets=merged([targets(log, name, robot, settings) for log in sources]),
+            naive=gains_on_drive(sources[0], name, robot),
         )
         clock.tell((i + 1) / len(where))
     return asked

@@ -16,6 +16,7 @@ import copy
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import mujoco
 import mujoco.rollout
@@ -116,7 +117,7 @@ class Bench:
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
 
-    def __enter__(self) -> Bench:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:

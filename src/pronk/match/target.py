@@ -117,6 +117,39 @@ class Target:
             return np.asarray(DB * (np.log(np.abs(simulated)) - np.log(measured)))
 
 
+def logs_by_joint(logs: Sequence[SweepLog], robot: Robot) -> dict[str, list[SweepLog]]:
+    """Which logs ask which joint, joints in the robot's order.
+
+    Raises:
+        LogError: No log asks any joint.
+        RobotError: A log asks a joint that the robot has not.
+    """
+    where: dict[str, list[SweepLog]] = {}
+    for log in logs:
+        names = {name for segment in log.segments for name in segment.joints}
+        # A log that does not say whom it asked asked those whose command moves.
+        for i, name in enumerate(log.joints):
+            if name in names or (not log.segments and np.ptp(log.command[:, i]) > 0.0):
+                where.setdefault(name, []).append(log)
+    for name in where:
+        robot.joint(name)
+    if not where:
+        raise LogError(
+            f"{len(logs)} logs ask no joint; expected questions to some of "
+            f"{', '.join(robot.joint_names)}."
+        )
+    return {name: where[name] for name in robot.joint_names if name in where}
+
+
+def gains_on_drive(log: SweepLog, joint: str, robot: Robot) -> tuple[float, float]:
+    """Stiffness and damping on the real drive: the log's if it has them, else the robot's."""
+    known, column = robot.joint(joint), log.column(joint)
+    return (
+        known.stiffness if log.stiffness is None else float(log.stiffness[column]),
+        known.damping if log.damping is None else float(log.damping[column]),
+    )
+
+
 def targets(
     log: SweepLog,
     joint: str,

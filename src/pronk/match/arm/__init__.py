@@ -2,6 +2,6 @@
 
 Responses of single joints would be mixed up with each other there, so the whole arm is simulated
 with the recorded commands. In order: `simulation` (the arm, many parameter sets at once), `trust`
-(which samples the drives could follow), `parameters` (what is free, what is held), `problem`
+(which samples the drives could follow), `problem`
 (residuals and what they tell apart), `fit` (the drives of the arm), `match` (the same as gains).
 """

@@ -19,9 +19,9 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from pronk.errors import IdentifiabilityError, LogError
-from pronk.match.arm.parameters import DRIVE_MODE, KINDS, PARAMETERS, asked_of
 from pronk.match.arm.problem import DriveProblem, stacked
 from pronk.match.arm.simulation import ArmBench, Drives, JointDrive
+from pronk.match.drive_parameters import DRIVE_MODE, KINDS, PARAMETERS, asked_of
 from pronk.match.identifiability import EXPERIMENTS
 from pronk.robots.robot import Robot
 from pronk.sweep.log import SweepLog

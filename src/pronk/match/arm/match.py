@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError, PronkError
 from pronk.match.arm.fit import DriveFit, DriveJoint, fit_drive
-from pronk.match.arm.parameters import DRIVE_MODE, GAINS_MODE, PARAMETERS
 from pronk.match.arm.simulation import ArmBench, Drives, JointDrive
+from pronk.match.drive_parameters import DRIVE_MODE, GAINS_MODE, PARAMETERS
 from pronk.match.gains import JointGains, MatchedGains, Simulator
 from pronk.match.identifiability import EXPERIMENTS
 from pronk.match.ranges import group_gains

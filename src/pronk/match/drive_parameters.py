@@ -1,4 +1,4 @@
-"""The parameters of a drive that a recording of a moving arm may tell, and how each is searched."""
+"""The parameters of a drive that a log may tell, and how each is searched."""
 
 from __future__ import annotations
 

@@ -1,0 +1,71 @@
+"""Mode `drive` on sweeps: damping, armature, friction and delay with the stiffness known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pronk.errors import IdentifiabilityError, PronkError
+from pronk.match.drive import match_drives
+from pronk.match.rehearse import Ask, rehearse
+from pronk.robots import load_robot
+from pronk.sweep.log import SweepLog
+from pronk.sweep.signals import Chirp
+
+ROBOT = load_robot("mini_cheetah")
+TRUTH = {"damping": 0.33, "armature": 0.0055, "frictionloss": 0.3}
+LATE_S = 0.004
+
+
+def sweep(joint: str, amplitudes: tuple[float, ...] = (0.25, 0.125)) -> SweepLog:
+    """Known drive, two amplitudes of three repeats, 0.2 mrad of noise, answers 4 ms late."""
+    rng = np.random.default_rng(3)
+    asks = [Ask(offsets=Chirp(length_s=12.0, amplitude=a).samples(), repeats=3) for a in amplitudes]
+    noise = [2e-4 * rng.standard_normal(8000) for _ in range(3 * len(asks))]
+    log = rehearse(
+        ROBOT,
+        joint,
+        asks,
+        17.0,
+        TRUTH["damping"],
+        armature=TRUTH["armature"],
+        frictionloss=TRUTH["frictionloss"],
+        noise=noise,
+    )
+    late = round(LATE_S * 500.0)
+    position = np.concatenate([np.repeat(log.position[:1], late, axis=0), log.position[:-late]])
+    return replace(log, position=position)
+
+
+def test_the_drive_is_found_again() -> None:
+    result = match_drives([sweep("FR_knee")], ROBOT)
+    found = result.gains.joints["FR_knee"]
+    assert found.stiffness == 17.0
+    assert found.damping == pytest.approx(TRUTH["damping"], rel=0.02)
+    assert found.armature == pytest.approx(TRUTH["armature"], rel=0.02)
+    assert found.frictionloss == pytest.approx(TRUTH["frictionloss"], rel=0.05)
+    assert found.delay_s == pytest.approx(LATE_S, abs=2e-4)
+    low, high = found.damping_ci95
+    assert low < found.damping < high
+    assert found.error_db < 0.05 < 0.2 * found.naive_error_db
+    assert found.flags == ()
+
+
+def test_what_magnitude_and_phase_cannot_tell_is_refused_with_the_cure() -> None:
+    log = sweep("FR_knee", amplitudes=(0.25,))
+    everything = ("stiffness", "damping", "armature", "frictionloss", "delay")
+    with pytest.raises(IdentifiabilityError) as refused:
+        match_drives([log], ROBOT, free=everything)
+    said = str(refused.value)
+    assert said.startswith("FR_knee: these data cannot tell apart ")
+    for name in ("stiffness", "armature", "payload", "torque"):
+        assert name in said
+
+
+def test_unknown_parameters_are_refused() -> None:
+    with pytest.raises(PronkError, match="free parameters inertia; expected some of stiffness"):
+        match_drives([sweep("FR_knee")], ROBOT, free=("damping", "inertia"))
+    with pytest.raises(PronkError, match="free parameters none"):
+        match_drives([sweep("FR_knee")], ROBOT, free=())
