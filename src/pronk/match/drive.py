@@ -11,20 +11,17 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import least_squares
 
 from pronk.errors import IdentifiabilityError, PronkError
-from pronk.match.drive_parameters import DRIVE_MODE, KINDS
-from pronk.match.gains import JointGains, MatchedGains
-from pronk.match.gains import Simulator as SimulatorNote
+from pronk.match.drive_parameters import DRIVE_MODE, KINDS, gains_covariance
+from pronk.match.gains import JointGains
 from pronk.match.identifiability import EXPERIMENTS, bench_experiment, require_identifiable
-from pronk.match.ranges import group_gains
+from pronk.match.ranges import matched_gains
 from pronk.match.refine import residual_db
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
@@ -129,18 +126,7 @@ def match_drives(
         joints[name], gains[name] = _artefacts(robot, goals[0], goals, fit)
     told("fit", 1.0)
     return MatchResult(
-        gains=MatchedGains(
-            robot=robot.name,
-            simulator=SimulatorNote(
-                version=mujoco.__version__,
-                timestep_s=robot.timestep_s,
-                decimation=robot.decimation,
-            ),
-            joints=gains,
-            groups=group_gains(robot, gains),
-            logs={Path(log.source or "log").name: log.sha256 for log in logs},
-            virtual=any(log.virtual for log in logs),
-        ),
+        gains=matched_gains(robot, gains, logs),
         joints=joints,
     )
 
@@ -312,12 +298,7 @@ def _artefacts(
 ) -> tuple[JointMatch, JointGains]:
     """One joint's fit as the artefacts have it; there is no grid."""
     joint, values = robot.joint(goal.joint), fit.values
-    covariance = np.zeros((2, 2))
-    for i, first in enumerate(("stiffness", "damping")):
-        for j, second in enumerate(("stiffness", "damping")):
-            if first in fit.fitted and second in fit.fitted:
-                at = fit.fitted.index(first), fit.fitted.index(second)
-                covariance[i, j] = fit.covariance[at]
+    covariance = gains_covariance(fit.fitted, fit.covariance)
     errors = [
         float(np.sqrt(np.mean(goal.error_db(answer[goal.inside]) ** 2)))
         for answer in (fit.matched, fit.naive)
@@ -330,10 +311,7 @@ def _artefacts(
         grid_damping=float("nan"),
         stiffness_ci95=fit.ci95.get("stiffness", (values["stiffness"],) * 2),
         damping_ci95=fit.ci95.get("damping", (values["damping"],) * 2),
-        covariance=(
-            (float(covariance[0, 0]), float(covariance[0, 1])),
-            (float(covariance[1, 0]), float(covariance[1, 1])),
-        ),
+        covariance=covariance,
         band_hz=joint.band_hz,
         error_db=errors[0],
         naive_error_db=errors[1],
@@ -351,7 +329,7 @@ def _artefacts(
         grid_error=np.empty((0, 0)),
         stiffness=values["stiffness"],
         damping=values["damping"],
-        covariance=covariance,
+        covariance=np.array(covariance),
         band_hz=joint.band_hz,
         matched=fit.matched,
         naive=fit.naive,

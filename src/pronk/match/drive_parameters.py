@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pronk.errors import PronkError
 from pronk.match.identifiability import SD_MAX
@@ -86,3 +87,22 @@ def asked_of(
         joint: tuple(name for name in PARAMETERS if name in names)
         for joint, names in by_joint.items()
     }
+
+
+def gains_covariance(
+    fitted: Sequence[str], covariance: NDArray[np.float64]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The part of a covariance that is of (stiffness, damping); zero for what was held.
+
+    Args:
+        fitted: Names of the rows and columns.
+        covariance: Shape (fitted, fitted).
+    """
+
+    def of(first: str, second: str) -> float:
+        if first not in fitted or second not in fitted:
+            return 0.0
+        return float(covariance[fitted.index(first), fitted.index(second)])
+
+    kp, kd = "stiffness", "damping"
+    return (of(kp, kp), of(kp, kd)), (of(kd, kp), of(kd, kd))

@@ -6,9 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,12 +14,11 @@ from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_sp
 from pronk.match.ask import Job, Simulator
 from pronk.match.command_delay import command_delay
 from pronk.match.doubts import armature_flags, doubts, missing
-from pronk.match.gains import JointGains, MatchedGains
-from pronk.match.gains import Simulator as SimulatorNote
+from pronk.match.gains import JointGains
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
 from pronk.match.interval import interval
 from pronk.match.quick import quick_search
-from pronk.match.ranges import group_gains
+from pronk.match.ranges import matched_gains
 from pronk.match.refine import Fit, refine
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
@@ -101,18 +98,7 @@ def match_logs(
         )
         gains[name] = replace(gains[name], delay_s=command_delay(joints[name]))
     return MatchResult(
-        gains=MatchedGains(
-            robot=robot.name,
-            simulator=SimulatorNote(
-                version=mujoco.__version__,
-                timestep_s=robot.timestep_s,
-                decimation=robot.decimation,
-            ),
-            joints=gains,
-            groups=group_gains(robot, gains),
-            logs={Path(log.source or "log").name: log.sha256 for log in logs},
-            virtual=any(log.virtual for log in logs),
-        ),
+        gains=matched_gains(robot, gains, logs),
         joints=joints,
         seconds=clock.seconds,
         grid_steps_per_second=rate,

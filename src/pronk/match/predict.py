@@ -22,6 +22,7 @@ from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.prediction import JointPrediction, Prediction
 from pronk.match.question import Question, question
 from pronk.match.simulate import simulate
+from pronk.match.target import gains_on_drive
 from pronk.robots.robot import Robot
 from pronk.sweep.log import Segment, SweepLog
 
@@ -157,15 +158,9 @@ def _delayed(asked: Question, delay: float) -> Question:
 
 
 def _on_drive(log: SweepLog, robot: Robot, name: str) -> JointDrive:
-    """Gains on the real drive: the log's if it has them, else the robot's published ones."""
-    published = JointDrive.published(robot, name)
-    column = log.column(name)
-    return JointDrive(
-        stiffness=published.stiffness if log.stiffness is None else float(log.stiffness[column]),
-        damping=published.damping if log.damping is None else float(log.damping[column]),
-        armature=published.armature,
-        frictionloss=published.frictionloss,
-    )
+    """The published drive, with the gains that were on it."""
+    stiffness, damping = gains_on_drive(log, name, robot)
+    return replace(JointDrive.published(robot, name), stiffness=stiffness, damping=damping)
 
 
 def _single(log: SweepLog) -> tuple[Segment, ...]:

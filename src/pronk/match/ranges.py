@@ -21,7 +21,8 @@ the nearest. It gives +-2.0 and +-0.05 and, like the paper, leaves one joint out
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -30,9 +31,10 @@ from numpy.typing import NDArray
 
 from pronk.errors import RobotError
 from pronk.match.ellipsoid import enclosing, interval_points
-from pronk.match.gains import GroupGains, JointGains
+from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator
 from pronk.robots.robot import Robot
 from pronk.robots.spec import bench_spec
+from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
 Rule = Literal["cover", "paper"]
@@ -88,6 +90,28 @@ def group_gains(
             ellipsoid_center=(float(centre[0]), float(centre[1])),
         )
     return out
+
+
+def matched_gains(
+    robot: Robot, joints: Mapping[str, JointGains], logs: Sequence[SweepLog]
+) -> MatchedGains:
+    """The artefact: gains of the joints, what training draws from, and what they rest on.
+
+    Args:
+        robot: The robot, whose training simulator the gains hold for.
+        joints: Matched gains.
+        logs: The logs that went in.
+    """
+    return MatchedGains(
+        robot=robot.name,
+        simulator=Simulator(
+            version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
+        ),
+        joints=joints,
+        groups=group_gains(robot, joints),
+        logs={Path(log.source or "log").name: log.sha256 for log in logs},
+        virtual=any(log.virtual for log in logs),
+    )
 
 
 def coverage(

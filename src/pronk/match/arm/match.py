@@ -9,20 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Literal
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError, PronkError
 from pronk.match.arm.fit import DriveFit, DriveJoint, fit_drive
 from pronk.match.arm.simulation import ArmBench, Drives, JointDrive
-from pronk.match.drive_parameters import DRIVE_MODE, GAINS_MODE, PARAMETERS
-from pronk.match.gains import JointGains, MatchedGains, Simulator
+from pronk.match.drive_parameters import DRIVE_MODE, GAINS_MODE, PARAMETERS, gains_covariance
+from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.identifiability import EXPERIMENTS
-from pronk.match.ranges import group_gains
+from pronk.match.ranges import matched_gains
 from pronk.match.result import JointMatch
 from pronk.response.estimate import estimate
 from pronk.response.response import FrequencyResponse
@@ -87,17 +85,9 @@ def match_arm(
         name: _gains(robot, joint, joints.get(name), held.get(name, ()))
         for name, joint in fit.joints.items()
     }
-    matched = MatchedGains(
-        robot=robot.name,
-        simulator=Simulator(
-            version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
-        ),
-        joints=gains,
-        groups=group_gains(robot, gains),
-        logs={Path(log.source or "log").name: log.sha256 for log in logs},
-        virtual=any(log.virtual for log in logs),
+    return ArmMatch(
+        gains=matched_gains(robot, gains, logs), fit=fit, mode=mode, held=held, joints=joints
     )
-    return ArmMatch(gains=matched, fit=fit, mode=mode, held=held, joints=joints)
 
 
 def drives_of(robot: Robot, gains: MatchedGains) -> dict[str, JointDrive]:
@@ -160,12 +150,7 @@ def _gains(
     """One joint as the artefact has it."""
     drive = joint.drive
     nan = float("nan")
-    covariance = np.zeros((2, 2))
-    for i, first in enumerate(("stiffness", "damping")):
-        for j, second in enumerate(("stiffness", "damping")):
-            if first in joint.fitted and second in joint.fitted:
-                at = joint.fitted.index(first), joint.fitted.index(second)
-                covariance[i, j] = joint.covariance[at]
+    covariance = gains_covariance(joint.fitted, joint.covariance)
     flags = [
         f"{name} held at {getattr(drive, name):.4g}: these recordings do not tell it; "
         f"{EXPERIMENTS[name]}"
@@ -183,10 +168,7 @@ def _gains(
         grid_damping=nan,
         stiffness_ci95=joint.ci95.get("stiffness", (drive.stiffness, drive.stiffness)),
         damping_ci95=joint.ci95.get("damping", (drive.damping, drive.damping)),
-        covariance=(
-            (float(covariance[0, 0]), float(covariance[0, 1])),
-            (float(covariance[1, 0]), float(covariance[1, 1])),
-        ),
+        covariance=covariance,
         band_hz=match.band_hz if match else (nan, nan),
         error_db=match.error_db if match else nan,
         naive_error_db=match.naive_error_db if match else nan,
