@@ -1,0 +1,122 @@
+"""The measured vector on the robot: what training's observation manager builds, one robot's worth.
+
+At a reset the first sample fills the whole history, and the actions before it count as zero: so
+episodes begin in training, and so a policy must begin everywhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pronk.errors import ArtefactError
+from pronk.policy.layout import ACTIONS, HISTORY, JOINTS, MEASURED
+
+Floats = NDArray[np.float32]
+_SIZES = {"angular_velocity": 3, "projected_gravity": 3, "position": JOINTS, "velocity": JOINTS}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What the robot measures at one moment. Joints in the order of the contract."""
+
+    angular_velocity: ArrayLike
+    """Of the trunk, in its frame (x forward, y left, z up) [rad/s]. (3,)"""
+    projected_gravity: ArrayLike
+    """Unit vector of gravity in the trunk's frame: (0, 0, -1) when level. (3,)"""
+    position: ArrayLike
+    """Joint positions, absolute [rad]. (12,)"""
+    velocity: ArrayLike
+    """Joint velocities [rad/s]. (12,)"""
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a number.
+
+        Raises:
+            ArtefactError: A part has another size or is not finite; the message names it.
+        """
+        for part in fields(self):
+            finite(f"the measured {part.name}", getattr(self, part.name), (_SIZES[part.name],))
+
+
+class History:
+    """The last samples of one robot, oldest first, and the measured vector made of them."""
+
+    def __init__(self, default_position: ArrayLike) -> None:
+        """Begin as after `reset`.
+
+        Args:
+            default_position: What observed positions are relative to [rad]. (12,)
+        """
+        self._default = np.asarray(default_position, np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next sample fills the history."""
+        self._position: Floats | None = None
+        self._velocity: Floats | None = None
+        self._actions = np.zeros((ACTIONS, JOINTS), np.float32)
+
+    def observe(self, measurement: Measurement, command: ArrayLike) -> Floats:
+        """Take a sample and give the measured vector of now, laid out as `layout.MEASURED`.
+
+        Args:
+            measurement: Of now.
+            command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
+
+        Returns:
+            (105,)
+
+        Raises:
+            ArtefactError: The command has another size or is not finite; nothing was taken.
+        """
+        asked = finite("the command", command, (3,))
+        position = np.asarray(measurement.position, np.float32) - self._default
+        self._position = _pushed(self._position, position)
+        self._velocity = _pushed(self._velocity, np.asarray(measurement.velocity, np.float32))
+        parts = {
+            "angular_velocity": measurement.angular_velocity,
+            "projected_gravity": measurement.projected_gravity,
+            "joint_position": self._position,
+            "joint_velocity": self._velocity,
+            "action": self._actions,
+            "command": asked,
+        }
+        return np.concatenate([np.asarray(parts[name], np.float32).ravel() for name in MEASURED])
+
+    def acted(self, action: Floats) -> None:
+        """Remember what the network answered to the last observation. (12,)."""
+        self._actions = np.concatenate([self._actions[1:], action[None]])
+
+
+def _pushed(history: Floats | None, sample: Floats) -> Floats:
+    """The history with a sample behind it, as long as before; the first sample fills it."""
+    if history is None:
+        return np.tile(sample, (HISTORY, 1))
+    return np.concatenate([history[1:], sample[None]])
+
+
+def finite(what: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """`value` as float32.
+
+    Args:
+        what: Its name, for the error.
+        value: Numbers.
+        shape: What it must have.
+
+    Raises:
+        ArtefactError: Of another shape, or with a number that is not finite.
+    """
+    with np.errstate(over="ignore"):  # what overflows becomes infinite, and is refused
+        array = np.asarray(value, np.float32)
+    if array.shape != shape:
+        raise ArtefactError(f"{what} has the shape {array.shape}; expected {shape}.")
+    bad = np.argwhere(~np.isfinite(array))
+    if bad.size:
+        where = ", ".join(str(index) for index in bad[0])
+        raise ArtefactError(
+            f"{what} is {array[tuple(bad[0])]} at [{where}]; a policy reads finite numbers only."
+        )
+    return array

@@ -1,0 +1,190 @@
+"""A policy that runs: `policy.onnx` in ONNX Runtime, on one thread of the processor.
+
+The same code runs a policy in trials, on the virtual robot and on the real one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pronk.errors import ArtefactError, PronkError
+from pronk.policy.contract import Contract, measured_layout
+from pronk.policy.contract_json import METADATA_KEY, from_json
+from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
+from pronk.policy.observation import Floats, History, Measurement, finite
+
+WRITER = "`pronk train` writes one"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inference:
+    """What the network gives for N observations."""
+
+    action: Floats
+    """(N, 12)"""
+    contact: Floats
+    """Probability that each foot (FR, FL, HR, HL) touches the ground. (N, 4)"""
+    linear_velocity: Floats
+    """Estimate for the trunk, in its frame [m/s]. (N, 3)"""
+
+
+class Policy:
+    """A network, its contract, and the history of the one robot that `step` runs."""
+
+    def __init__(self, session: Any, contract: Contract, *, sha256: str = "") -> None:
+        """Wrap what `load_policy` has opened and checked.
+
+        Args:
+            session: ONNX Runtime's.
+            contract: That of the file.
+            sha256: Of the file, hex.
+        """
+        self.contract = contract
+        self.sha256 = sha256
+        self.inference: Inference | None = None
+        """What the network gave in the last `step`; None before the first."""
+        self._session = session
+        self._default = np.asarray(contract.default_position)
+        self._scale = np.asarray(contract.action_scale)
+        self._history = History(contract.default_position)
+
+    def reset(self) -> None:
+        """Begin anew: the next measurement is taken for the whole past, past actions for zero."""
+        self._history.reset()
+        self.inference = None
+
+    def step(
+        self, measurement: Measurement, command: ArrayLike, jump: bool = False
+    ) -> NDArray[np.float64]:
+        """One policy step; call it at `contract.policy_rate_hz`.
+
+        Args:
+            measurement: Of now.
+            command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
+            jump: The jump input.
+
+        Returns:
+            Joint position targets in the order of the contract, absolute [rad]. (12,)
+
+        Raises:
+            ArtefactError: Something is not finite, or a policy without jump is told to jump.
+        """
+        self._refuse_jump(jump)
+        measured = self._history.observe(measurement, command)
+        self.inference = self.infer(measured[None], np.full((1, 1), jump, np.float32))
+        action = self.inference.action[0]
+        self._history.acted(action)
+        target: NDArray[np.float64] = self._default + self._scale * action
+        return target
+
+    def infer(self, measured: ArrayLike, jump: ArrayLike | None = None) -> Inference:
+        """The network alone, for N observations.
+
+        Args:
+            measured: Laid out as `contract.observation`. (N, 105)
+            jump: The jump input, 0 or 1; None is 0 for all. (N, 1)
+
+        Raises:
+            ArtefactError: A shape is wrong, something is not finite, or a policy without jump is
+                told to jump.
+        """
+        count = len(np.atleast_1d(measured))
+        feeds = {"measured": finite('the input "measured"', measured, (count, MEASURED_SIZE))}
+        asked = finite(
+            'the input "jump"', np.zeros((count, 1)) if jump is None else jump, (count, 1)
+        )
+        self._refuse_jump(bool(asked.any()))
+        if self.contract.jump:
+            feeds["jump"] = asked
+        outputs = _outputs()
+        found = self._session.run(list(outputs), feeds)
+        return Inference(
+            **{
+                name: finite(f'the policy\'s output "{name}"', value, (count, size))
+                for (name, size), value in zip(outputs.items(), found, strict=True)
+            }
+        )
+
+    def _refuse_jump(self, jump: bool) -> None:
+        if jump and not self.contract.jump:
+            raise ArtefactError(
+                "this policy was trained to walk only and has no jump input; "
+                "`pronk train jump` teaches it."
+            )
+
+
+def load_policy(path: Path) -> Policy:
+    """Open a policy. Whether it fits a robot, `pronk.policy.contract.check` says.
+
+    Args:
+        path: `policy.onnx`, as `pronk train` writes it.
+
+    Raises:
+        ArtefactError: Missing, damaged, without a contract, or laid out in another way than this
+            pronk builds observations.
+        PronkError: ONNX Runtime is not installed.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ArtefactError(f"{path}: no such file; {WRITER}.") from None
+    except OSError as error:
+        raise ArtefactError(f"{path}: cannot be read ({error.strerror}).") from None
+    session = _session(data, path)
+    text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+    if text is None:
+        raise ArtefactError(f"{path}: a network without a contract of pronk; {WRITER}.")
+    contract = from_json(text, source=path)
+    if contract.observation != measured_layout(contract.policy_rate_hz):
+        raise ArtefactError(
+            f"{path}: the contract's observation is laid out in another way than this pronk "
+            "builds it; use the pronk it was trained with, or train again."
+        )
+    inputs = {"measured": MEASURED_SIZE} | ({"jump": 1} if contract.jump else {})
+    _check_graph(path, "inputs", session.get_inputs(), inputs)
+    _check_graph(path, "outputs", session.get_outputs(), _outputs())
+    return Policy(session, contract, sha256=hashlib.sha256(data).hexdigest())
+
+
+def _outputs() -> dict[str, int]:
+    return {"action": JOINTS, **ESTIMATE}
+
+
+def _session(data: bytes, path: Path) -> Any:
+    try:
+        import onnxruntime
+    except ImportError:
+        raise PronkError(
+            "policies run in ONNX Runtime, which is not installed; "
+            "install it with `pip install 'pronk[policy]'`."
+        ) from None
+    options = onnxruntime.SessionOptions()
+    # A network this small is slower on several threads, and a control loop wants the others.
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # errors come as exceptions
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise ArtefactError(
+            f"{path}: not a network that ONNX Runtime can run ({type(error).__name__}); {WRITER}."
+        ) from error
+
+
+def _check_graph(path: Path, what: str, nodes: Any, sizes: dict[str, int]) -> None:
+    found = {node.name: tuple(node.shape) for node in nodes}
+    # The batch axis has a name in place of a size.
+    fits = {name: shape[1:] for name, shape in found.items()} == {n: (s,) for n, s in sizes.items()}
+    free = all(not isinstance(shape[0], int) for shape in found.values() if shape)
+    floats = all(node.type == "tensor(float)" for node in nodes)
+    if not (fits and free and floats):
+        expected = ", ".join(f"{name} (batch, {size})" for name, size in sizes.items())
+        raise ArtefactError(
+            f"{path}: the network's {what} are {found}; its contract needs {expected}, float32."
+        )

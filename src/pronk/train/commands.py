@@ -1,0 +1,249 @@
+"""What the robot is told: velocities, redrawn now and then, and the jump input.
+
+Checklist C1 to C4. Speed ranges grow from a part of the full range to the whole: with +-3 m/s
+from the first step a policy learns to stand, since the tracking reward has no slope so far away
+(seen in a probe). Everything is computed for all robots with masks: no step waits for the device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+import torch
+from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
+from torch import Tensor
+
+from pronk.robots.robot import Robot
+from pronk.train.gains import TrainingGains
+from pronk.train.jump import JumpSettings, JumpTracker
+from pronk.train.motion import Motion, measure_motion
+from pronk.train.scene import FEET
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+NAME = "motion"
+"""The command term's name in every environment."""
+
+
+@dataclass(kw_only=True)
+class NominalDrive:
+    """Nominal gains and limit of every joint, in joint order."""
+
+    stiffness: tuple[float, ...]
+    """[N m/rad]"""
+    damping: tuple[float, ...]
+    """[N m s/rad]"""
+    effort_limit: tuple[float, ...]
+    """[N m]"""
+
+    @classmethod
+    def of(cls, robot: Robot, gains: TrainingGains) -> Self:
+        """Of a robot with the gains it is trained with."""
+        groups = [gains.groups[joint.group] for joint in robot.joints]
+        return cls(
+            stiffness=tuple(group.stiffness for group in groups),
+            damping=tuple(group.damping for group in groups),
+            effort_limit=tuple(joint.drive.effort_limit for joint in robot.joints),
+        )
+
+
+@dataclass(kw_only=True)
+class MotionCommandCfg(CommandTermCfg):
+    """Velocity ranges and jump intervals."""
+
+    drive: NominalDrive
+    """Of the robot that is commanded."""
+    resampling_time_range: tuple[float, float] = (2.0, 6.0)
+    """Time between draws of the velocity command [s]."""
+    limits: tuple[float, float, float] = (3.0, 1.0, 2.0)
+    """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3)."""
+    growth: tuple[float, int, int] = (0.3, 1000, 6000)
+    """Part of the ranges at first, and the policy steps between which it grows to the whole."""
+    standing: float = 0.1
+    """Part of the draws that are zero."""
+    one_axis: float = 0.4
+    """Part of the draws along one axis alone, as the trials ask."""
+    jump_fraction: float = 0.0
+    """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""
+    jump_on_s: tuple[float, float] = (0.4, 0.7)
+    """Time that the jump input is held [s]: less than preparation and flight together, so that
+    one command means one jump."""
+    jump_off_s: tuple[float, float] = (1.2, 3.0)
+    """Time between jump inputs [s]."""
+    leap: float = 0.35
+    """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
+    1 m/s in proportion: the paper's robot, too, flew further than command times flight time
+    (.60 m at 1 m/s)."""
+    width: float = 1.0
+    """Standard deviation of the lift-off kernel [m/s], see `JumpTracker`."""
+    settings: JumpSettings = field(default_factory=JumpSettings)
+
+    def build(self, env: ManagerBasedRlEnv) -> MotionCommand:
+        """The term of an environment."""
+        return MotionCommand(self, env)
+
+
+class MotionCommand(CommandTerm):
+    """Commands of N robots, and what they do about it."""
+
+    cfg: MotionCommandCfg
+    time_left: Tensor
+
+    def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        count, device = self.num_envs, self.device
+        self.velocity = torch.zeros(count, 3, device=device)
+        """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. Shape (N, 3)."""
+        self.jump = torch.zeros(count, dtype=torch.bool, device=device)
+        """Jump input. Shape (N,)."""
+        data = env.scene["robot"].data
+        self.default_position: Tensor = data.default_joint_pos
+        """[rad]. (N, 12)"""
+        self.position_limits: Tensor = data.joint_pos_limits
+        """[rad]. (N, 12, 2)"""
+        self.stiffness = torch.tensor(cfg.drive.stiffness, device=device)
+        """Nominal [N m/rad]. (12,)"""
+        self.damping = torch.tensor(cfg.drive.damping, device=device)
+        """Nominal [N m s/rad]. (12,)"""
+        self.effort_limit = torch.tensor(cfg.drive.effort_limit, device=device)
+        """[N m]. (12,)"""
+        self.scripted = False
+        """True: nobody but the caller changes `velocity` and `jump`."""
+        self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
+        self._jump_left = torch.zeros(count, device=device)
+        self._limits = torch.tensor(cfg.limits, device=device)
+        # The golden ratio spreads any fraction evenly over the robots.
+        self._rank = (torch.arange(count, device=device) * 0.6180339887) % 1.0
+        self.feet, _ = env.scene["robot"].find_sites(FEET, preserve_order=True)
+        self._motion: Motion | None = None
+        self._motion_step = -1
+
+    @property
+    def command(self) -> Tensor:
+        """Velocity command, shape (N, 3)."""
+        return self.velocity
+
+    @property
+    def target(self) -> Tensor:
+        """Horizontal velocity that is rewarded: the command, in jump mode with `leap`. (N, 2)."""
+        horizontal = self.velocity[:, :2]
+        speed = torch.linalg.vector_norm(horizontal, dim=-1)
+        factor = 1.0 + self.cfg.leap / speed.clamp_min(1.0) * self.tracker.mode
+        return horizontal * factor[:, None]
+
+    @property
+    def standing(self) -> Tensor:
+        """Asked to stand still: no velocity and no jump. Bool, (N,)."""
+        return (self.velocity.square().sum(dim=-1) < 1e-4) & ~self.tracker.mode
+
+    @property
+    def fell(self) -> Tensor:
+        """Episodes that end in this step, and not for time. Bool, (N,)."""
+        terminated: Tensor = self._env.termination_manager.terminated
+        return terminated
+
+    @property
+    def position_target(self) -> Tensor:
+        """What the joints were sent in this step [rad]. (N, 12)."""
+        target: Tensor = self._env.action_manager.get_term("joint_position")._processed_actions
+        return target
+
+    def per_event(self, value: Tensor) -> Tensor:
+        """A reward for an event, as the rate that mjlab will multiply by the step's duration.
+
+        Args:
+            value: What the event is worth. (N,)
+        """
+        return value / self._env.step_dt
+
+    @property
+    def action_change(self) -> Tensor:
+        """Change of the network's actions in the last step. (N, 12)."""
+        actions = self._env.action_manager
+        return actions.action - actions.prev_action
+
+    @property
+    def part(self) -> float:
+        """Part of the velocity ranges in use."""
+        start, first, last = self.cfg.growth
+        done = (self._env.common_step_counter - first) / max(last - first, 1)
+        return start + (1.0 - start) * min(max(done, 0.0), 1.0)
+
+    @property
+    def motion(self) -> Motion:
+        """What the robots did in the step just simulated; measured once a step, on first use."""
+        step = self._env.common_step_counter
+        if self._motion is None or self._motion_step != step:
+            self._motion = measure_motion(self._env, self.feet, self._motion)
+            self._motion_step = step
+            self.tracker.advance(
+                jump=self.jump,
+                contact=self._motion.contact,
+                height=self._motion.height,
+                vertical=self._motion.velocity_world[:, 2],
+                dt=self._env.step_dt,
+            )
+        return self._motion
+
+    def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
+        """Fresh commands for robots that start anew; jumps under way are forgotten."""
+        assert isinstance(env_ids, Tensor)
+        self.tracker.reset(env_ids)
+        if self._motion is not None:
+            self._motion.forget(env_ids)
+        if self.scripted:
+            return {}
+        count = len(env_ids)
+        self.velocity[env_ids] = self._draw(count)
+        self.time_left[env_ids] = self._uniform(count, self.cfg.resampling_time_range)
+        self.jump[env_ids] = False
+        self._jump_left[env_ids] = self._uniform(count, self.cfg.jump_off_s)
+        return {}
+
+    def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
+        """Let time pass; draw anew where it has run out."""
+        if self.scripted or env_ids is not None:
+            return
+        self.time_left -= dt
+        due = self.time_left <= 0.0
+        self.velocity = torch.where(due[:, None], self._draw(self.num_envs), self.velocity)
+        fresh = self._uniform(self.num_envs, self.cfg.resampling_time_range)
+        self.time_left = torch.where(due, fresh, self.time_left)
+        if self.cfg.jump_fraction <= 0.0:
+            self.jump.zero_()
+            return
+        self._jump_left -= dt
+        turn = (self._jump_left <= 0.0) & (self._rank < self.cfg.jump_fraction)
+        self.jump = self.jump ^ turn
+        on = self._uniform(self.num_envs, self.cfg.jump_on_s)
+        off = self._uniform(self.num_envs, self.cfg.jump_off_s)
+        self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
+
+    def _uniform(self, count: int, span: tuple[float, float]) -> Tensor:
+        return torch.rand(count, device=self.device) * (span[1] - span[0]) + span[0]
+
+    def _draw(self, count: int) -> Tensor:
+        velocity = (torch.rand(count, 3, device=self.device) * 2.0 - 1.0) * self._limits * self.part
+        kind = torch.rand(count, 1, device=self.device)
+        axis = torch.randint(3, (count, 1), device=self.device)
+        single = (torch.arange(3, device=self.device) == axis).float()
+        velocity = torch.where(kind < self.cfg.one_axis, velocity * single, velocity)
+        return velocity * (kind < 1.0 - self.cfg.standing)
+
+    def _update_metrics(self) -> None:
+        """Nothing: rewards tell the story."""
+
+    def _resample_command(self, env_ids: Tensor) -> None:
+        """Nothing: `compute` and `reset` draw with masks."""
+
+    def _update_command(self, env_ids: Tensor | None) -> None:
+        """Nothing: `compute` does it all."""
+
+
+def motion_command(env: ManagerBasedRlEnv) -> MotionCommand:
+    """The command term of an environment."""
+    term = env.command_manager.get_term(NAME)
+    assert isinstance(term, MotionCommand)
+    return term

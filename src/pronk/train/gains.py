@@ -1,0 +1,184 @@
+"""TrainingGains: the gains that training draws about, from `gains.yaml` or the naive ones.
+
+Naive is what a user trains with who has not asked the robot: the gains of the real drive, put
+into the simulator as they are (paper S4, reading A20). Everything else stays the same, so that
+two policies differ by their nominal gains and by nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+
+from pronk.errors import ArtefactError, PronkError
+from pronk.files import sha256
+from pronk.match.gains import GroupGains, MatchedGains, Simulator, load
+from pronk.robots.robot import Robot
+
+NAIVE = "naive"
+"""The choice of gains that needs no file."""
+NAIVE_STIFFNESS_RANGE = 2.0
+"""Half-width of the randomization of naive stiffness [N m/rad] (paper D3)."""
+NAIVE_DAMPING_RANGE = 0.05
+"""Half-width of the randomization of naive damping [N m s/rad] (paper D4)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingGains:
+    """Nominal gains and their ranges, per joint group, and what they rest on."""
+
+    name: Literal["naive", "matched"]
+    robot: str
+    """Name of the robot."""
+    groups: Mapping[str, GroupGains]
+    """In the robot's order of groups."""
+    delay_s: float = 0.0
+    """Command delay of the real joint beyond the simulator's, mean of the joints [s]."""
+    sha256: str = ""
+    """Hash of the `gains.yaml` that nominals or ranges come from; empty without one."""
+    virtual: bool = False
+    """True if that file rests on pronk's virtual robot."""
+
+    def __post_init__(self) -> None:
+        """Refuse gains whose ranges reach zero.
+
+        Raises:
+            PronkError: A draw could give a gain that is not positive, or the delay is negative.
+        """
+        for group, gains in self.groups.items():
+            for what in ("stiffness", "damping"):
+                nominal, half = getattr(gains, what), getattr(gains, f"{what}_range")
+                if not 0.0 <= half < nominal:
+                    raise PronkError(
+                        f"{what} of {group} is {nominal:g} +- {half:g}; training needs a range "
+                        "that is not negative and stays above zero."
+                    )
+        if not (math.isfinite(self.delay_s) and self.delay_s >= 0.0):
+            raise PronkError(f"the command delay is {self.delay_s} s; it must be 0 or more.")
+
+
+def training_gains(choice: str | Path, robot: Robot, *, like: Path | None = None) -> TrainingGains:
+    """The gains to train with.
+
+    Args:
+        choice: `naive`, or the path of a `gains.yaml`.
+        robot: The robot that is trained.
+        like: With `naive`, a `gains.yaml` whose ranges and delay are used about the naive
+            nominals, its ellipsoids moved along (reading A20). Without it the ranges are the
+            paper's (D3, D4) and the delay is 0.
+
+    Raises:
+        ArtefactError: The file is missing, damaged, of another robot, or matched in another
+            simulator than the one that trains.
+        PronkError: `like` was given with a file of gains, or a range reaches zero.
+    """
+    if str(choice) != NAIVE:
+        if like is not None:
+            raise PronkError(
+                f"ranges like {like} were asked for with the gains of {choice}; "
+                "they go with the choice 'naive' only, a gains.yaml has its own."
+            )
+        path = Path(choice)
+        matched = _matched(path, robot)
+        return TrainingGains(
+            name="matched",
+            robot=robot.name,
+            groups={group: matched.groups[group] for group in robot.groups},
+            delay_s=_mean_delay(matched, path),
+            sha256=sha256(path),
+            virtual=matched.virtual,
+        )
+    naive = {group: _naive(robot, group) for group in robot.groups}
+    if like is None:
+        return TrainingGains(name="naive", robot=robot.name, groups=naive)
+    matched = _matched(like, robot)
+    return TrainingGains(
+        name="naive",
+        robot=robot.name,
+        groups={group: _about(naive[group], matched.groups[group]) for group in robot.groups},
+        delay_s=_mean_delay(matched, like),
+        sha256=sha256(like),
+        virtual=matched.virtual,
+    )
+
+
+def _naive(robot: Robot, group: str) -> GroupGains:
+    pairs = {(joint.stiffness, joint.damping) for joint in robot.group(group)}
+    if len(pairs) > 1:
+        raise PronkError(
+            f"the joints of {robot.name}'s group {group} have different gains on their drives; "
+            "naive training needs one pair a group."
+        )
+    stiffness, damping = pairs.pop()
+    return GroupGains(
+        stiffness=stiffness,
+        damping=damping,
+        stiffness_range=NAIVE_STIFFNESS_RANGE,
+        damping_range=NAIVE_DAMPING_RANGE,
+        ellipsoid_center=(stiffness, damping),
+    )
+
+
+def _about(nominal: GroupGains, ranges: GroupGains) -> GroupGains:
+    """The ranges of one group about the nominal gains of another."""
+    shift = (nominal.stiffness - ranges.stiffness, nominal.damping - ranges.damping)
+    center = ranges.ellipsoid_center
+    return GroupGains(
+        stiffness=nominal.stiffness,
+        damping=nominal.damping,
+        stiffness_range=ranges.stiffness_range,
+        damping_range=ranges.damping_range,
+        ellipsoid=ranges.ellipsoid,
+        ellipsoid_center=(center[0] + shift[0], center[1] + shift[1]),
+    )
+
+
+def _matched(path: Path, robot: Robot) -> MatchedGains:
+    gains = load(path)
+    if gains.robot != robot.name:
+        raise ArtefactError(
+            f"{path}: gains of {gains.robot}; training {robot.name} needs gains of {robot.name}, "
+            "or the choice 'naive'."
+        )
+    _check_simulator(gains.simulator, robot, path)
+    missing = [group for group in robot.groups if group not in gains.groups]
+    if missing:
+        raise ArtefactError(
+            f"{path}: no training gains for {', '.join(missing)}; match logs of every joint group "
+            f"({', '.join(robot.groups)}) in one run of `pronk match`."
+        )
+    return gains
+
+
+def _check_simulator(simulator: Simulator, robot: Robot, path: Path) -> None:
+    """Gains hold for the simulator that they were matched in, and for no other."""
+    used = Simulator(
+        version=_minor(mujoco.__version__),
+        timestep_s=robot.timestep_s,
+        decimation=robot.decimation,
+    )
+    got = {**vars(simulator), "version": _minor(simulator.version)}
+    differing = [name for name, value in vars(used).items() if got[name] != value]
+    if differing:
+        has = ", ".join(f"{name} {got[name]}" for name in differing)
+        needs = ", ".join(f"{name} {getattr(used, name)}" for name in differing)
+        raise ArtefactError(
+            f"{path}: gains matched in a simulator with {has}; training uses {needs}, where they "
+            "mean another joint: match the logs again with this pronk."
+        )
+
+
+def _minor(version: str) -> str:
+    """`3.11` of `3.11.0`: patches of MuJoCo keep its physics."""
+    return ".".join(str(version).split(".")[:2])
+
+
+def _mean_delay(gains: MatchedGains, path: Path) -> float:
+    if not gains.joints:
+        raise ArtefactError(f"{path}: no joints, so no command delay; `pronk match` writes them.")
+    return math.fsum(joint.delay_s for joint in gains.joints.values()) / len(gains.joints)

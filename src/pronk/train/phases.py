@@ -1,0 +1,111 @@
+"""The phases of training: walk, then jump with a strong hint, then with a weak one (P1, P2).
+
+Phase 1 walks. The networks are then widened by the jump input, and in phase 2 half of the robots
+are told to jump now and then. In 2a equal feet are rewarded strongly, which is what makes a trot
+leave the ground with all feet at once; in 2b a tenth of that is left (Table II).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from pronk.errors import PronkError
+from pronk.train.commands import NAME, MotionCommandCfg, motion_command
+from pronk.train.reward_sum import NAME as TABLE
+from pronk.train.reward_sum import reward_sum
+from pronk.train.reward_table import ROWS, JumpWeights, with_jump_weights
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+
+_NO_JUMP = JumpWeights(dense=0.0, sparse=0.0, width=1.0, rise=0.0, hop=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """One stretch of training with its own commands and rewards."""
+
+    name: str
+    iterations: int
+    """PPO iterations."""
+    jump: bool
+    """Whether the networks read the jump input, and half of the robots get it."""
+    weights: JumpWeights = _NO_JUMP
+
+    @property
+    def jump_fraction(self) -> float:
+        """Part of the robots that get the jump input."""
+        return 0.5 if self.jump else 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a phase of no iterations."""
+        if self.iterations < 1:
+            raise PronkError(f"phase {self.name} has {self.iterations} iterations; 1 or more.")
+
+
+PHASES: tuple[Phase, ...] = (
+    Phase(name="walk", iterations=400, jump=False),
+    Phase(
+        name="jump_a",
+        iterations=300,
+        jump=True,
+        weights=JumpWeights(dense=0.02, sparse=4.0, width=1.0, rise=10.0, hop=0.0),
+    ),
+    Phase(
+        name="jump_b",
+        iterations=300,
+        jump=True,
+        weights=JumpWeights(dense=0.002, sparse=4.0, width=0.4, rise=10.0, hop=0.5),
+    ),
+)
+"""The paper's phases. Its weights are 2.5 and 0.25 for dense and 250 for sparse."""
+
+
+def phase(name: str) -> Phase:
+    """The phase called `name`.
+
+    Raises:
+        PronkError: There is none; the message lists those there are.
+    """
+    for candidate in PHASES:
+        if candidate.name == name:
+            return candidate
+    raise PronkError(f"no phase {name!r}; the phases are {', '.join(p.name for p in PHASES)}.")
+
+
+def with_iterations(iterations: Mapping[str, int]) -> tuple[Phase, ...]:
+    """`PHASES` with other numbers of iterations.
+
+    Args:
+        iterations: By name of the phase; those left out keep theirs.
+
+    Raises:
+        PronkError: A name is unknown or a number is below 1.
+    """
+    for name in iterations:
+        phase(name)
+    return tuple(replace(p, iterations=iterations.get(p.name, p.iterations)) for p in PHASES)
+
+
+def configure_phase(cfg: ManagerBasedRlEnvCfg, phase: Phase) -> None:
+    """Set a phase in the configuration of an environment that is yet to be built."""
+    command = cfg.commands[NAME]
+    assert isinstance(command, MotionCommandCfg)
+    command.width = phase.weights.width
+    command.jump_fraction = phase.jump_fraction
+    cfg.rewards[TABLE].params["rows"] = with_jump_weights(ROWS, phase.weights)
+
+
+def enter_phase(env: ManagerBasedRlEnv, phase: Phase) -> None:
+    """Set a phase in a living environment.
+
+    Args:
+        env: Built from `pronk.train.tasks.env_cfg`.
+        phase: Which.
+    """
+    command, table = motion_command(env), reward_sum(env)
+    command.tracker.width = phase.weights.width
+    command.cfg.jump_fraction = phase.jump_fraction
+    table.set_rows(with_jump_weights(table.rows, phase.weights))

@@ -1,0 +1,118 @@
+"""The weights of the rewards: the paper's table, and what became of it.
+
+The paper's source carries a table of rewards commented out. Its numbers are read as standing
+before the scaling by the step's duration (A23) and divided by `PAPER_UNIT`, which changes no
+optimum and brings returns to the order of ten that PPO's clipped value loss is made for. What was
+changed beyond that, and why, stands beside each weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+from torch import Tensor
+
+from pronk.errors import PronkError
+from pronk.robots.mini_cheetah.model import standing_height
+from pronk.train import rewards
+
+PAPER_UNIT = 20.0
+"""One unit of ours is this many of the paper's."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One reward term and its two weights."""
+
+    term: Callable[..., Tensor]
+    """Of a `MotionCommand` and `arguments`; gives (N,)."""
+    walk: float
+    """Weight outside jump mode (see `pronk.train.jump`)."""
+    jump: float
+    """Weight in jump mode."""
+    arguments: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JumpWeights:
+    """What changes from phase to phase (Table II)."""
+
+    dense: float
+    """On the standard deviation of foot forces, in jump mode [1/N]."""
+    sparse: float
+    """On the lift-off score, per event."""
+    width: float
+    """Standard deviation of the lift-off kernel [m/s]; the paper's expression has 1."""
+    rise: float
+    """Per metre of new height."""
+    hop: float
+    """Per lift-off after the first."""
+
+
+ROWS: Mapping[str, Row] = {
+    # Paper 45 | 45.
+    "tracking_linear": Row(rewards.tracking_linear, 2.25, 2.25, {"variance": 0.25}),
+    # Paper 30 | 30.
+    "tracking_angular": Row(rewards.tracking_angular, 1.5, 1.5, {"variance": 0.25}),
+    # Paper -5 | 0. Standing still, twenty times as much: the pose is all there is to do.
+    "posture": Row(rewards.posture, -0.25, 0.0, {"standing": 8.0}),
+    # Paper -50 | 0.
+    "vertical_velocity": Row(rewards.vertical_velocity, -2.5, 0.0),
+    # Paper -0.2 | -0.2, which is -0.01 here: a trot changes its torques by 5 N m a step and
+    # joint and would pay three times what tracking can earn. A twentieth of it.
+    "smoothness": Row(rewards.smoothness, -0.0002, -0.0001),
+    # Paper -20 | -120.
+    "orientation": Row(rewards.orientation, -1.0, -6.0),
+    # Paper -50 | -50.
+    "collision": Row(rewards.collision, -2.5, -2.5),
+    # Paper -900 | -900, -45 here: the drive clips what exceeds the limit, and a position
+    # command beyond reach is how a policy asks for full torque. A trace is left.
+    "torque_limits": Row(rewards.torque_limits, -0.02, -0.005),
+    # Paper -150 | -150.
+    "position_limits": Row(rewards.position_limits, -7.5, -7.5),
+    # Paper -0.5 | -0.5.
+    "foot_acceleration": Row(rewards.foot_acceleration, -0.025, -0.025),
+    # Paper -250 | -250. In a jump feet are where the jump wants them.
+    "foot_clearance": Row(rewards.foot_clearance, -12.5, 0.0, {"height": 0.09}),
+    # Paper -500, for one step of 20 ms: -0.5. Twice that.
+    "termination": Row(rewards.termination, -1.0, -1.0),
+    # Paper -0.08 | -0.08, -0.004 here: running costs 1,000 N^2 m^2 and would pay 4 of the 3.75
+    # that tracking can earn. A tenth of it.
+    "torque": Row(rewards.torque, -0.0004, -0.0001),
+    # Table II, phase 1.
+    "dense_jump": Row(rewards.dense_jump, 0.0, 0.0),
+    "sparse_jump": Row(rewards.sparse_jump, 0.0, 0.0),
+    # Not in the paper.
+    "rise": Row(rewards.rise, 0.0, 0.0),
+    "hop": Row(rewards.hop, 0.0, 0.0),
+    "action_rate": Row(rewards.action_rate, -0.02, -0.005),
+    "roll_pitch_rate": Row(rewards.roll_pitch_rate, -0.02, -0.02),
+    "slip": Row(rewards.slip, -0.1, 0.0),
+    "trunk_height": Row(rewards.trunk_height, -400.0, 0.0, {"height": standing_height()}),
+}
+"""Every reward, with the weights of phase 1."""
+
+
+def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str, Row]:
+    """The table of a phase.
+
+    Args:
+        rows: The table of phase 1.
+        weights: The phase's.
+
+    Raises:
+        PronkError: The table lacks one of the jump rewards.
+    """
+    changed = {
+        "dense_jump": -weights.dense,
+        "sparse_jump": weights.sparse,
+        "rise": weights.rise,
+        "hop": -weights.hop,
+    }
+    if missing := sorted(set(changed) - set(rows)):
+        raise PronkError(f"the reward table has no {', '.join(missing)}.")
+    return {
+        name: replace(row, jump=changed[name]) if name in changed else row
+        for name, row in rows.items()
+    }

@@ -1,0 +1,169 @@
+"""The tasks: configurations of the environment and of PPO, registered with mjlab.
+
+mjlab finds this module by its entry point, so its own `train`, `play` and `list-envs` know
+`Pronk-Walk-MiniCheetah` and `Pronk-Jump-MiniCheetah`. `pronk train` builds the same
+configurations with the gains that were asked for.
+"""
+
+from __future__ import annotations
+
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.envs import mdp as envs_mdp
+from mjlab.managers import EventTermCfg, RewardTermCfg, TerminationTermCfg
+from mjlab.rl import RslRlOnPolicyRunnerCfg
+from mjlab.tasks.registry import register_mjlab_task
+from mjlab.viewer import ViewerConfig
+
+from pronk.robots import load_robot
+from pronk.train import observations, terminations
+from pronk.train.actions import HeldJointPositionCfg
+from pronk.train.actor import EstimatorActorCfg, JumpCriticCfg
+from pronk.train.commands import NAME, MotionCommandCfg, NominalDrive
+from pronk.train.drives import actuators
+from pronk.train.gains import NAIVE, TrainingGains, training_gains
+from pronk.train.phases import Phase, configure_phase, phase
+from pronk.train.ppo import EstimatorPpoCfg
+from pronk.train.randomization import Randomization, delay_steps, events, noise
+from pronk.train.reward_sum import NAME as TABLE
+from pronk.train.reward_sum import RewardSum
+from pronk.train.reward_table import ROWS
+from pronk.train.runner import PronkRunner
+from pronk.train.scene import robot_entity, scene, simulation
+
+WALK_TASK = "Pronk-Walk-MiniCheetah"
+JUMP_TASK = "Pronk-Jump-MiniCheetah"
+
+ACTION_SCALE = 0.35
+"""Position target per unit of action [rad]."""
+EPISODE_S = 20.0
+STEPS_PER_ITERATION = 24
+"""Policy steps of every robot between two updates."""
+
+
+def env_cfg(
+    *,
+    gains: TrainingGains | None = None,
+    randomization: Randomization | None = None,
+    phase: Phase | None = None,
+    num_envs: int = 4096,
+    seed: int = 0,
+    episode_s: float = EPISODE_S,
+) -> ManagerBasedRlEnvCfg:
+    """The environment of every phase.
+
+    Args:
+        gains: What to draw gains about; naive if None.
+        randomization: What differs from robot to robot; the paper's if None.
+        phase: Commands and rewards to begin with; the first if None.
+        num_envs: Number of robots.
+        seed: Of all draws.
+        episode_s: Longest episode at the nominal policy rate [s].
+    """
+    robot = load_robot("mini_cheetah")
+    gains = gains or training_gains(NAIVE, robot)
+    randomization = randomization or Randomization.paper()
+    cfg = ManagerBasedRlEnvCfg(
+        seed=seed,
+        decimation=robot.decimation,
+        scene=scene(robot_entity(robot, actuators(robot, gains)), num_envs),
+        sim=simulation(robot),
+        observations=observations.groups(noise(randomization)),
+        actions={
+            "joint_position": HeldJointPositionCfg(
+                entity_name="robot",
+                actuator_names=robot.joint_names,
+                scale=ACTION_SCALE,
+                use_default_offset=True,
+                preserve_order=True,
+                delay_steps=delay_steps(robot, gains, randomization),
+            )
+        },
+        commands={NAME: MotionCommandCfg(drive=NominalDrive.of(robot, gains))},
+        events={**_resets(), **events(robot, gains, randomization)},
+        rewards={TABLE: RewardTermCfg(func=RewardSum, weight=1.0, params={"rows": ROWS})},
+        terminations={
+            "time_out": TerminationTermCfg(
+                func=terminations.time_out,
+                time_out=True,
+                params={"steps": round(episode_s * robot.policy_rate_hz)},
+            ),
+            # 70 degrees; the trunk's lower face is 5 cm below its centre.
+            "fell": TerminationTermCfg(
+                func=terminations.fell, params={"tilt_cosine": 0.34, "height": 0.08}
+            ),
+            "non_finite": TerminationTermCfg(func=terminations.non_finite, params={"speed": 200.0}),
+        },
+        episode_length_s=episode_s,
+        viewer=ViewerConfig(
+            origin_type=ViewerConfig.OriginType.ASSET_BODY,
+            entity_name="robot",
+            body_name="trunk",
+            distance=2.0,
+            elevation=-10.0,
+        ),
+    )
+    if phase is not None:
+        configure_phase(cfg, phase)
+    return cfg
+
+
+def _resets() -> dict[str, EventTermCfg]:
+    """Where an episode begins: near the default pose, heading anywhere."""
+    return {
+        "reset_base": EventTermCfg(
+            func=envs_mdp.reset_root_state_uniform,
+            mode="reset",
+            params={
+                "pose_range": {"x": (-0.5, 0.5), "y": (-0.5, 0.5), "yaw": (-3.14, 3.14)},
+                "velocity_range": {"x": (-0.3, 0.3), "y": (-0.3, 0.3)},
+            },
+        ),
+        "reset_joints": EventTermCfg(
+            func=envs_mdp.reset_joints_by_offset,
+            mode="reset",
+            params={"position_range": (-0.1, 0.1), "velocity_range": (0.0, 0.0)},
+        ),
+    }
+
+
+def rl_cfg(*, jump: bool, seed: int = 0) -> RslRlOnPolicyRunnerCfg:
+    """PPO as it is run in a phase with or without the jump input.
+
+    Actor and critic are the paper's (N2). The optimizer's settings are those that mjlab trains
+    its own quadrupeds with.
+
+    Args:
+        jump: Whether the networks read the jump input.
+        seed: Of the networks and of exploration.
+    """
+    return RslRlOnPolicyRunnerCfg(
+        seed=seed,
+        actor=EstimatorActorCfg(),
+        critic=JumpCriticCfg(),
+        algorithm=EstimatorPpoCfg(),
+        obs_groups={
+            "actor": ("measured", "jump") if jump else ("measured",),
+            "critic": ("critic", "critic_jump") if jump else ("critic",),
+        },
+        experiment_name="pronk_jump" if jump else "pronk_walk",
+        logger="tensorboard",
+        num_steps_per_env=STEPS_PER_ITERATION,
+        save_interval=50,
+        max_iterations=1000 if jump else 400,
+    )
+
+
+def _register() -> None:
+    for task, name in ((WALK_TASK, "walk"), (JUMP_TASK, "jump_b")):
+        begun = phase(name)
+        play = env_cfg(phase=begun, randomization=Randomization.none(), num_envs=1, episode_s=1e6)
+        register_mjlab_task(
+            task_id=task,
+            env_cfg=env_cfg(phase=begun),
+            play_env_cfg=play,
+            rl_cfg=rl_cfg(jump=begun.jump),
+            runner_cls=PronkRunner,
+        )
+
+
+_register()
