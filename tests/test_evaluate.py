@@ -442,8 +442,9 @@ def seen() -> Seen:
     from pronk.train.tasks import env_cfg
 
     cfg = env_cfg(randomization=replace(Randomization.none(), decimation=(-2, 2)))
-    cfg.events["reset_base"].params = {"pose_range": {"z": (DROP, DROP)}, "velocity_range": {}}
-    cfg.events["reset_joints"].params = {"position_range": (0, 0), "velocity_range": (0, 0)}
+    cfg.events["start"].params = dict.fromkeys(("place", "speed", "heading", "joints"), 0.0)
+    state = cfg.scene.entities["robot"].init_state
+    state.pos = (0.0, 0.0, state.pos[2] + DROP)
     env = ManagerBasedRlEnv(evaluation_cfg(cfg, SHORT), device="cpu")
     ear = env.metrics_manager.cfg[TERM].func
     states, airborne, looks, shares = [], [], [], []

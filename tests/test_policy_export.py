@@ -33,11 +33,11 @@ ROBOT = load_robot("mini_cheetah")
 PAPER = (1024, 512, 256)
 
 
-def contract(*, jump: bool) -> Contract:
+def contract(*, jump: bool, action_scale: float = 0.35) -> Contract:
     return contract_for(
         ROBOT,
         training_gains("naive", ROBOT),
-        action_scale=0.35,
+        action_scale=action_scale,
         delay_steps=(0, 2),
         command_limits=(3.0, 1.0, 2.0),
         lift_off_velocity=2.5 if jump else None,
@@ -188,7 +188,10 @@ def gravity(quaternion: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 @pytest.mark.slow
 def test_the_contract_is_what_the_environment_does(env: Any) -> None:
-    made = contract(jump=True)
+    from pronk.train.commands import motion_command
+    from pronk.train.tasks import ACTION_SCALE
+
+    made = contract(jump=True, action_scale=ACTION_SCALE)
     robot = env.scene["robot"]
     term = env.action_manager.get_term("joint_position")
     assert tuple(robot.joint_names) == made.joint_names
@@ -197,8 +200,6 @@ def test_the_contract_is_what_the_environment_does(env: Any) -> None:
     assert env.step_dt == pytest.approx(1.0 / made.policy_rate_hz)
     assert env.physics_dt == pytest.approx(made.timestep_s)
     assert env.cfg.decimation == made.decimation
-    from pronk.train.commands import motion_command
-
     command = motion_command(env)
     limits = tuple(high for _, high in made.command_ranges.values())
     assert command.cfg.limits == limits
@@ -208,12 +209,14 @@ def test_the_contract_is_what_the_environment_does(env: Any) -> None:
 @pytest.mark.slow
 def test_the_runtime_runs_as_training_did(env: Any, tmp_path: Path) -> None:
     """Measured vector, action and targets, step by step, through a reset of one robot."""
+    from pronk.train.tasks import ACTION_SCALE
+
     torch.manual_seed(11)
     actor = trained(jump=True).eval()
     with torch.no_grad():
         actor.mlp[-1].weight *= 10.0  # so that the robots move
     path = tmp_path / "policy.onnx"
-    export_policy(actor, contract(jump=True), path)
+    export_policy(actor, contract(jump=True, action_scale=ACTION_SCALE), path)
     policies = [load_policy(path) for _ in range(2)]
     histories = [History(policies[0].contract.default_position) for _ in range(2)]
     observed, _ = env.reset()

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from io import StringIO
+from typing import Any
 
 import pytest
 
 torch = pytest.importorskip("torch")
 
+pytest.importorskip("tensordict")
+
 from rich.console import Console  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
+from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from pronk.train.progress import Episodes, ProgressLine, duration, rate  # noqa: E402
+from pronk.train.rollout import make_finite  # noqa: E402
 
 pytestmark = pytest.mark.train
 
@@ -67,6 +73,42 @@ def test_wrong_physics_is_counted_for_good_and_all_goes_on_from_a_state() -> Non
     assert figures["Train/non_finite"] == 4.0
     assert second.figures() == figures
     assert torch.equal(second.returns, first.returns)
+
+
+class Waits(TorchDispatchMode):
+    """Counts what would make the host wait for a GPU."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        blocking = (torch.ops.aten._local_scalar_dense, torch.ops.aten.nonzero)
+        self.count += func.overloadpacket in blocking
+        return func(*args, **(kwargs or {}))
+
+
+def test_no_step_waits_for_the_device() -> None:
+    episodes = Episodes(4, "cpu")
+    observations = TensorDict({"measured": torch.rand(4, 3)}, batch_size=[4])
+    with Waits() as waits:
+        wrong = make_finite(observations)
+        episodes.step(torch.ones(4), torch.tensor([1, 0, 1, 0]), {"a/b": torch.ones(())}, wrong)
+    assert waits.count == 0
+    with Waits() as waits:
+        episodes.figures()
+    assert waits.count > 0  # the counter counts
+
+
+def test_what_is_not_finite_becomes_zero_in_its_row_alone() -> None:
+    nan, inf = float("nan"), float("inf")
+    groups = {
+        "measured": torch.tensor([[1.0, 2.0], [nan, 3.0], [4.0, 5.0]]),
+        "critic": torch.tensor([[1.0], [2.0], [-inf]]),
+    }
+    observations = TensorDict(groups, batch_size=[3])
+    assert make_finite(observations).tolist() == [False, True, True]
+    assert observations["measured"].tolist() == [[1.0, 2.0], [0.0, 3.0], [4.0, 5.0]]
+    assert observations["critic"].tolist() == [[1.0], [2.0], [0.0]]
+    assert not bool(make_finite(observations).any())
 
 
 def test_away_from_a_terminal_progress_is_a_plain_line_now_and_then() -> None:

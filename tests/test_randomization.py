@@ -30,6 +30,8 @@ pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
 import torch  # noqa: E402
+from mjlab.actuator import DcMotorActuator  # noqa: E402
+from mjlab.actuator.actuator import ActuatorCmd  # noqa: E402
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg  # noqa: E402
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg  # noqa: E402
 from mjlab.envs.mdp import reset_scene_to_default  # noqa: E402
@@ -39,7 +41,7 @@ from mjlab.terrains import TerrainEntityCfg  # noqa: E402
 
 from pronk.train import draws as drawing  # noqa: E402
 from pronk.train.actions import HeldJointPositionCfg  # noqa: E402
-from pronk.train.drives import actuators  # noqa: E402
+from pronk.train.drives import PositionDrive, actuators  # noqa: E402
 from pronk.train.randomization import Randomization, delay_steps, events, noise  # noqa: E402
 from pronk.train.scene import robot_entity, simulation  # noqa: E402
 
@@ -232,6 +234,36 @@ def test_drives_of_every_group() -> None:
     assert (knee.frictionloss, knee.viscous_damping) == (0.2, 0.01)
 
 
+def test_law_of_the_drives_is_that_of_mjlab() -> None:
+    """Over more than twice the no-load speed and torques far beyond the limits."""
+    cfg = actuators(CHEETAH, MATCHED)[2]
+    generator = torch.Generator().manual_seed(5)
+
+    def drawn(low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(5000, 4, generator=generator, dtype=torch.float64)
+
+    params = {
+        "stiffness": drawn(10.0, 30.0),
+        "damping": drawn(0.2, 0.8),
+        "force_limit": torch.full((5000, 4), cfg.effort_limit, dtype=torch.float64),
+        "saturation_effort": torch.full((5000, 4), cfg.saturation_effort, dtype=torch.float64),
+        "velocity_limit_motor": torch.full((5000, 4), cfg.velocity_limit, dtype=torch.float64),
+    }
+    params["back_emf"] = params["saturation_effort"] / params["velocity_limit_motor"]
+    none = torch.zeros(5000, 4, dtype=torch.float64)
+    command = ActuatorCmd(
+        position_target=drawn(-4.0, 4.0),
+        velocity_target=none,
+        effort_target=none,
+        pos=drawn(-4.0, 4.0),
+        vel=drawn(-60.0, 60.0),
+    )
+    expected = DcMotorActuator.control_law(params, command)
+    torch.testing.assert_close(PositionDrive.control_law(params, command), expected)
+    share = (expected.abs() < cfg.effort_limit * 0.999).double().mean()
+    assert 0.1 < share < 0.9, "both within and at the limits"
+
+
 def test_drives_that_are_not_the_robots_are_refused() -> None:
     with pytest.raises(PronkError, match="gains of so101 were given for the drives of mini_ch"):
         actuators(CHEETAH, replace(MATCHED, robot="so101"))
@@ -385,6 +417,33 @@ def test_ellipsoids_that_are_none_are_refused() -> None:
     gains = replace(MATCHED, groups=dict.fromkeys(CHEETAH.groups, wide))
     with pytest.raises(PronkError, match=r"stiffness 19 and damping -0\.5; both must stay above"):
         events(CHEETAH, gains, randomization)
+
+
+def test_episodes_begin_about_the_initial_state(env: Any) -> None:
+    robot, origins = env.scene["robot"], env.scene.env_origins
+    states = []
+    everyone = torch.arange(ROBOTS)
+    for _ in range(10):
+        drawing.draw_start(env, everyone, place=0.5, speed=0.3, heading=math.pi, joints=0.1)
+        qpos = env.sim.data.qpos.clone()
+        qpos[:, :3] -= origins
+        states.append(torch.cat([qpos, env.sim.data.qvel.clone()], dim=1))
+    start = torch.cat(states).numpy().astype(np.float64)
+    quaternion, velocity = start[:, 3:7], start[:, 19:]
+    np.testing.assert_allclose(start[:, 2], robot.data.default_root_state[0, 2], rtol=1e-6)
+    np.testing.assert_allclose(quaternion[:, 1:3], 0.0)
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, rtol=1e-6)
+    assert_uniform(2.0 * np.arctan2(quaternion[:, 3], quaternion[:, 0]), -math.pi, math.pi)
+    default = robot.data.default_joint_pos[0].numpy()
+    for axis in (0, 1):
+        assert_uniform(start[:, axis], -0.5, 0.5)
+        assert_uniform(velocity[:, axis], -0.3, 0.3)
+    assert_uniform(start[:, 7:19] - default, -0.1, 0.1)
+    np.testing.assert_array_equal(velocity[:, 2:], 0.0)
+    before = env.sim.data.qpos.clone()
+    drawing.draw_start(env, everyone[::2], place=0.5, speed=0.3, heading=math.pi, joints=0.1)
+    same = (env.sim.data.qpos == before).all(dim=1)
+    assert same.tolist() == [False, True] * (ROBOTS // 2)
 
 
 # --- Per episode ----------------------------------------------------------------------------------
@@ -549,6 +608,10 @@ def test_noise_has_the_widths_of_the_paper() -> None:
         term = found[name]
         assert term is not None
         assert (term.n_min, term.n_max) == (-width, width)
+        measured = torch.full((1000, 3), 2.0)
+        seen = term.apply(measured).numpy().astype(np.float64)
+        assert_uniform(seen - 2.0, -width, width)
+        torch.testing.assert_close(measured, torch.full((1000, 3), 2.0), msg="left as it was")
 
 
 @pytest.mark.parametrize(

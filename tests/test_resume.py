@@ -19,6 +19,8 @@ pytest.importorskip("mjlab")
 
 import mujoco
 import torch
+from mjlab.utils.os import get_checkpoint_path
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import small_run
 from pronk.errors import ArtefactError, PronkError
@@ -91,6 +93,19 @@ def test_the_resumed_run_is_the_uninterrupted_one(whole: Any, other: Any) -> Non
     assert whole.figures.keys() == other.figures.keys()
     learned = {key for key in whole.figures if not key.startswith("Perf/")}
     assert all(whole.figures[key] == other.figures[key] for key in learned)
+
+
+def test_tensorboard_has_every_iteration(whole: Any) -> None:
+    events = EventAccumulator(str(whole.folder)).Reload()
+    for name in ("Train/mean_reward", "Train/non_finite", "Loss/estimator_contact"):
+        assert [scalar.step for scalar in events.Scalars(name)][:4] == [1, 2, 3, 4]
+    rewards = [scalar.value for scalar in events.Scalars("Train/mean_reward")]
+    assert rewards[3] == pytest.approx(whole.figures["Train/mean_reward"])
+
+
+def test_mjlab_finds_the_checkpoints(whole: Any) -> None:
+    found = get_checkpoint_path(whole.folder.parent, whole.folder.name, "model_.*.pt")
+    assert found == checkpoint.latest(whole.folder)
 
 
 def test_something_was_learned_and_drawn_in_between(whole: Any) -> None:

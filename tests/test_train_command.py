@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.match import gains as gains_file
 from pronk.train import checkpoint, provenance
 from pronk.train.checkpoint import Checkpoint
-from pronk.train.devices import Devices, chosen, kernel_seconds, parse_gpu_ids
+from pronk.train.devices import Devices, check_cuda_graphs, chosen, kernel_seconds, parse_gpu_ids
 from pronk.train.run_folder import RunFolder, plain
 from pronk.train.settings import TrainSettings, WatchSettings
 
@@ -268,6 +270,25 @@ def test_gpus_are_chosen_among_the_visible_ones():
     assert parse_gpu_ids(" 1, 0") == [1, 0]
     assert Devices(device="cuda", visible=("3", "1")).count == 2
     assert Devices(device="cpu").count == 1
+
+
+@pytest.mark.train
+def test_a_device_without_cuda_graphs_is_shouted_about():
+    wp = pytest.importorskip("warp")
+    without = SimpleNamespace(use_cuda_graph=False, wp_device=wp.get_device("cpu"))
+    said = check_cuda_graphs(without)
+    assert said is not None
+    for word in ("WITHOUT CUDA GRAPHS", "12.4", "memory pools are off"):
+        assert word in said
+    assert check_cuda_graphs(SimpleNamespace(use_cuda_graph=True)) is None
+
+
+def test_only_the_chosen_gpus_are_seen(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,1")
+    Devices(device="cpu").claim()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "3,1"
+    Devices(device="cuda", visible=("1", "MIG-a")).claim()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "1,MIG-a"
 
 
 def test_the_time_of_compiling_is_told_from_that_of_loading():

@@ -278,6 +278,14 @@ def test_a_finished_run_is_left_as_it_is(uninterrupted, capsys):
     assert uninterrupted.provenance.read_bytes() == before
 
 
+def test_what_cannot_be_drawn_leaves_no_folder(tmp_path, capsys):
+    # Naive gains on their own have no ellipsoid to draw from.
+    words = ("walk", "--gains", "naive", *SMALL, "--ellipsoid", "--out", tmp_path / "run")
+    assert train(*words) == 2
+    assert "ellips" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 # --- One phase at a time -------------------------------------------------------------------------
 
 

@@ -15,13 +15,25 @@ from typing import Annotated
 import typer
 
 from pronk import __version__
-from pronk.commands import bench, demo, export, match, predict, report, response, sweep
+from pronk.commands import (
+    bench,
+    bench_train,
+    demo,
+    evaluate,
+    export,
+    match,
+    predict,
+    report,
+    response,
+    sweep,
+    train,
+)
 from pronk.errors import PronkError
 
 app = typer.Typer(
     name="pronk",
-    help="From a chirp to matched gains: ask every joint, write down its answer, make the "
-    "simulator answer alike.",
+    help="From a chirp to matched gains to a policy that jumps: ask every joint, write down its "
+    "answer, make the simulator answer alike, train in it.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -31,6 +43,8 @@ app.command("sweep")(sweep.sweep)
 app.command("response")(response.response)
 app.command("match")(match.match)
 app.command("predict")(predict.predict)
+app.command("train")(train.train)
+app.command("evaluate")(evaluate.evaluate)
 app.command("export")(export.export)
 app.command("report")(report.report)
 app.command("demo")(demo.demo)
@@ -38,6 +52,7 @@ app.command("demo")(demo.demo)
 _bench = typer.Typer(help="pronk beside its peers, on the same data, in one run.")
 for _command in (bench.match, bench.grid, bench.engine, bench.coverage):
     _bench.command(_command.__name__)(_command)
+_bench.command("train")(bench_train.train)
 app.add_typer(_bench, name="bench")
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import math
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -143,7 +146,8 @@ def run(
     from pronk.train.tasks import env_cfg
 
     drawn = Randomization.paper() if randomization == "full" else Randomization.none()
-    with console.progress() as report:
+    # mjlab and Warp tell standard output all about themselves.
+    with console.progress() as report, redirect_stdout(io.StringIO()):
         report("building", 0.0)
         cfg = evaluation_cfg(env_cfg(gains=gains, randomization=drawn, seed=plan.seed), plan)
         env = ManagerBasedRlEnv(cfg=cfg, device=device)
@@ -191,7 +195,7 @@ def show(evaluation: Evaluation) -> None:
         console.row(
             made,
             bar.what,
-            console.number(bar.value, 3) + unit,
+            console.number(bar.value, 3) + unit if math.isfinite(bar.value) else "-",
             f"{bar.sense} {bar.bar:g}{unit}",
             "yes" if bar.passed else "NO",
         )
@@ -265,7 +269,9 @@ def show_jumps(evaluation: Evaluation) -> None:
 
 
 def spread(figure: Spread, digits: int = 2) -> str:
-    """Mean and standard deviation."""
+    """Mean and standard deviation; a dash if nobody has the figure."""
+    if not figure.n:
+        return "-"
     return f"{console.number(figure.mean, digits)} +- {console.number(figure.std, digits)}"
 
 

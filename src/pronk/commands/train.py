@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pronk.train.settings import TrainSettings
 
 
-CPU_RATE = 500.0
+CPU_RATE = 300.0
 """Environment steps a second that two cores were seen to train with."""
 
 

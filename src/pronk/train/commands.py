@@ -59,7 +59,7 @@ class MotionCommandCfg(CommandTermCfg):
     """Time between draws of the velocity command [s]."""
     limits: tuple[float, float, float] = (3.0, 1.0, 2.0)
     """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3)."""
-    growth: tuple[float, int, int] = (0.3, 1000, 6000)
+    growth: tuple[float, int, int] = (0.35, 1000, 6500)
     """Part of the ranges at first, and the policy steps between which it grows to the whole."""
     standing: float = 0.1
     """Part of the draws that are zero."""
@@ -72,7 +72,7 @@ class MotionCommandCfg(CommandTermCfg):
     one command means one jump."""
     jump_off_s: tuple[float, float] = (1.2, 3.0)
     """Time between jump inputs [s]."""
-    leap: float = 0.35
+    leap: float = 0.4
     """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s)."""
@@ -114,9 +114,19 @@ class MotionCommand(CommandTerm):
         self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
         self._jump_left = torch.zeros(count, device=device)
         self._limits = torch.tensor(cfg.limits, device=device)
+        moving = 1.0 - cfg.standing
+        kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
+        self._kinds = torch.tensor([*kinds, moving], device=device)
+        """Where, in [0, 1], draws along x, y and yaw alone, of all and of none end."""
+        self._axes = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)]).to(device)
+        """Axes that each kind of draw moves along."""
+        spans = torch.tensor([cfg.resampling_time_range, cfg.jump_on_s, cfg.jump_off_s])
+        self._least, self._most = spans.to(device).T[:, :, None]
         # The golden ratio spreads any fraction evenly over the robots.
         self._rank = (torch.arange(count, device=device) * 0.6180339887) % 1.0
-        self.feet, _ = env.scene["robot"].find_sites(FEET, preserve_order=True)
+        feet, _ = env.scene["robot"].find_sites(FEET, preserve_order=True)
+        self.feet: Tensor = env.scene["robot"].indexing.site_ids[feet].long()
+        """The foot sites' ids in the model. (4,)"""
         self._motion: Motion | None = None
         self._motion_step = -1
 
@@ -183,6 +193,9 @@ class MotionCommand(CommandTerm):
                 contact=self._motion.contact,
                 height=self._motion.height,
                 vertical=self._motion.velocity_world[:, 2],
+                miss=torch.linalg.vector_norm(
+                    self._motion.velocity_trunk[:, :2] - self.target, dim=-1
+                ),
                 dt=self._env.step_dt,
             )
         return self._motion
@@ -195,11 +208,11 @@ class MotionCommand(CommandTerm):
             self._motion.forget(env_ids)
         if self.scripted:
             return {}
-        count = len(env_ids)
-        self.velocity[env_ids] = self._draw(count)
-        self.time_left[env_ids] = self._uniform(count, self.cfg.resampling_time_range)
+        velocity, time, _, off = self._draw(len(env_ids))
+        self.velocity[env_ids] = velocity
+        self.time_left[env_ids] = time
         self.jump[env_ids] = False
-        self._jump_left[env_ids] = self._uniform(count, self.cfg.jump_off_s)
+        self._jump_left[env_ids] = off
         return {}
 
     def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
@@ -208,29 +221,24 @@ class MotionCommand(CommandTerm):
             return
         self.time_left -= dt
         due = self.time_left <= 0.0
-        self.velocity = torch.where(due[:, None], self._draw(self.num_envs), self.velocity)
-        fresh = self._uniform(self.num_envs, self.cfg.resampling_time_range)
-        self.time_left = torch.where(due, fresh, self.time_left)
+        velocity, time, on, off = self._draw(self.num_envs)
+        self.velocity = torch.where(due[:, None], velocity, self.velocity)
+        self.time_left = torch.where(due, time, self.time_left)
         if self.cfg.jump_fraction <= 0.0:
             self.jump.zero_()
             return
         self._jump_left -= dt
         turn = (self._jump_left <= 0.0) & (self._rank < self.cfg.jump_fraction)
         self.jump = self.jump ^ turn
-        on = self._uniform(self.num_envs, self.cfg.jump_on_s)
-        off = self._uniform(self.num_envs, self.cfg.jump_off_s)
         self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
 
-    def _uniform(self, count: int, span: tuple[float, float]) -> Tensor:
-        return torch.rand(count, device=self.device) * (span[1] - span[0]) + span[0]
-
-    def _draw(self, count: int) -> Tensor:
-        velocity = (torch.rand(count, 3, device=self.device) * 2.0 - 1.0) * self._limits * self.part
-        kind = torch.rand(count, 1, device=self.device)
-        axis = torch.randint(3, (count, 1), device=self.device)
-        single = (torch.arange(3, device=self.device) == axis).float()
-        velocity = torch.where(kind < self.cfg.one_axis, velocity * single, velocity)
-        return velocity * (kind < 1.0 - self.cfg.standing)
+    def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
+        drawn = torch.rand(7, count, device=self.device)
+        axes = self._axes[torch.bucketize(drawn[3], self._kinds)]
+        velocity = (drawn[:3].T - 0.5) * (2.0 * self.part * self._limits) * axes
+        time, on, off = torch.lerp(self._least, self._most, drawn[4:])
+        return velocity, time, on, off
 
     def _update_metrics(self) -> None:
         """Nothing: rewards tell the story."""

@@ -48,6 +48,11 @@ class Devices:
         """Number of processes."""
         return max(len(self.visible), 1)
 
+    def claim(self) -> None:
+        """Hide all other GPUs from this process and those it starts, before any uses CUDA."""
+        if self.visible:
+            os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(self.visible)
+
 
 def parse_gpu_ids(text: str) -> list[int] | Literal["all"]:
     """`0,1` or `all`, as it is typed.

@@ -13,12 +13,9 @@ from typing import Any
 from pronk.files import written_whole
 from pronk.train import provenance
 from pronk.train.devices import Devices
-from pronk.train.gains import TrainingGains
-from pronk.train.run_folder import RunFolder, plain
+from pronk.train.run_folder import RunFolder
 from pronk.train.settings import TrainSettings, WatchSettings
 
-_LEARNING = ("num_steps_per_env", "obs_groups", "clip_actions", "actor", "critic", "algorithm")
-"""What of rsl_rl's configuration decides what is learned."""
 _COPIED = ("MUJOCO*", "MJLAB*", "WARP*", "WANDB*")
 """Variables of the environment that the processes shall have, beside torchrunx's own."""
 
@@ -35,14 +32,18 @@ def begin_run(
 
     Returns:
         Its provenance.
-    """
-    from pronk.train.run import run_gains
 
+    Raises:
+        PronkError: What was asked for is impossible; then nothing is written.
+    """
+    from pronk.train.resolve import resolved, run_gains
+
+    gains = run_gains(settings, gains_file)
+    config = resolved(settings, gains)
     folder.checkpoints.mkdir(parents=True, exist_ok=True)
     if gains_file is not None:
         with written_whole(folder.gains) as aside:
             shutil.copyfile(gains_file, aside)
-    gains = run_gains(folder, settings)
     about = {
         "name": gains.name,
         "file": None if gains_file is None else gains_file.name,
@@ -52,49 +53,8 @@ def begin_run(
     begun = provenance.begin(settings, gains=about)
     provenance.write(folder.provenance, begun)
     # The last, since a folder with it is a run that can be resumed.
-    folder.write_config(settings, resolved(settings, gains))
+    folder.write_config(settings, config)
     return begun
-
-
-def resolved(settings: TrainSettings, gains: TrainingGains) -> dict[str, Any]:
-    """What follows from the settings, for people to read: every number that a run is made of.
-
-    Args:
-        settings: What is trained.
-        gains: With which gains.
-    """
-    from pronk.train.run import run_phases, run_randomization
-    from pronk.train.tasks import env_cfg, rl_cfg
-
-    phases = run_phases(settings)
-    randomization = run_randomization(settings)
-    environments = {
-        phase.name: env_cfg(
-            gains=gains,
-            randomization=randomization,
-            phase=phase,
-            num_envs=settings.envs,
-            seed=settings.seed,
-        )
-        for phase in phases
-    }
-    environment = plain(environments[phases[0].name])
-    del environment["rewards"]
-    learning = {p.name: plain(rl_cfg(jump=p.jump, seed=settings.seed)) for p in phases}
-    return {
-        "phases": phases,
-        "rewards": {
-            name: {term: {"weight": cfg.weight, **cfg.params} for term, cfg in one.rewards.items()}
-            for name, one in environments.items()
-        },
-        "gains": gains,
-        "randomization": randomization,
-        "learning": {
-            name: {key: value for key, value in one.items() if key in _LEARNING}
-            for name, one in learning.items()
-        },
-        "environment": environment,
-    }
 
 
 def launch(
@@ -115,8 +75,7 @@ def launch(
         PronkError: Learning has diverged, or a file of the run is missing, damaged or of another
             run.
     """
-    if devices.visible:
-        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(devices.visible)
+    devices.claim()
     os.environ.setdefault("MJLAB_WARP_QUIET", "1")
     begin = time.monotonic()
     with folder.locked():
@@ -168,7 +127,12 @@ class _Handlers:
 
     def __call__(self) -> list[logging.Handler]:
         """Made in the process that gathers them."""
-        return [_Terminal(), logging.FileHandler(self._path, encoding="utf-8")]
+        terminal, file = _Terminal(), logging.FileHandler(self._path, encoding="utf-8")
+        # What a process prints to standard error arrives as errors. Libraries log for themselves
+        # down to the last detail. Levels are not asked where the words are gathered, filters are.
+        terminal.addFilter(lambda record: record.levelno >= logging.ERROR)
+        file.addFilter(lambda record: record.levelno >= logging.INFO)
+        return [terminal, file]
 
 
 class _Terminal(logging.Handler):

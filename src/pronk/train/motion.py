@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
+from mjlab.entity.data import compute_velocity_from_cvel
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from torch import Tensor
 
@@ -64,50 +65,41 @@ class Motion:
         self.torque[env_ids] = 0.0
 
 
-def measure_motion(env: ManagerBasedRlEnv, feet: list[int], before: Motion | None) -> Motion:
+def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) -> Motion:
     """Measure the step just simulated.
 
     Args:
         env: The environment; the robot is the only thing in it that moves.
-        feet: Indices of the robot's foot sites.
+        feet: The foot sites' ids in the model. (4,)
         before: The step before; None at the very first.
     """
-    data = env.scene["robot"].data
+    robot, physics = env.scene["robot"].data, env.sim.data
     ground = env.scene["feet"].data
-    qpos, qvel = env.sim.data.qpos, env.sim.data.qvel
-    orientation = qpos[:, 3:7]
-    velocity = qvel[:, :3].clone()  # of a free joint: of the body's origin, in the world's frame
-    foot_velocity = data.site_lin_vel_w[:, feet]
-    torque = data.actuator_force
+    # Copies: a reset writes to the state before the step's motion is forgotten.
+    qpos, qvel = physics.qpos.clone(), physics.qvel.clone()
+    velocity = qvel[:, :3]  # of a free joint: of the body's origin, in the world's frame
+    velocity_trunk, gravity = quat_apply_inverse(
+        qpos[:, 3:7].repeat(2, 1), torch.cat((velocity, robot.gravity_vec_w))
+    ).chunk(2)
+    foot = physics.site_xpos[:, feet]
+    com = physics.subtree_com[:, robot.indexing.root_body_id].unsqueeze(1)
+    shank_velocity = physics.cvel[:, env.sim.model.site_bodyid[feet]]
+    foot_velocity = compute_velocity_from_cvel(foot, com, shank_velocity)[..., :3]
+    torque = robot.actuator_force
     return Motion(
-        position=qpos[:, 7:].clone(),
-        velocity=qvel[:, 6:].clone(),
-        height=qpos[:, 2].clone(),
+        position=qpos[:, 7:],
+        velocity=qvel[:, 6:],
+        height=qpos[:, 2],
         velocity_world=velocity,
-        velocity_trunk=quat_apply_inverse(orientation, velocity),
-        angular_velocity=qvel[:, 3:6].clone(),
-        gravity=direction_of_gravity(orientation),
+        velocity_trunk=velocity_trunk,
+        angular_velocity=qvel[:, 3:6],
+        gravity=gravity,
         contact=ground.found > 0,
         force=torch.linalg.vector_norm(ground.force, dim=-1),
-        foot_height=data.data.site_xpos[:, data.indexing.site_ids[feet], 2] - constants.FOOT_RADIUS,
+        foot_height=foot[..., 2] - constants.FOOT_RADIUS,
         foot_velocity=foot_velocity,
         foot_velocity_change=foot_velocity - (before.foot_velocity if before else 0.0),
-        touching=(env.scene["limbs"].data.found > 0).sum(dim=-1).float(),
+        touching=(env.scene["limbs"].data.found > 0).sum(dim=-1, dtype=torch.float32),
         torque=torque,
         torque_change=torque - (before.torque if before else 0.0),
-    )
-
-
-def direction_of_gravity(orientation: Tensor) -> Tensor:
-    """Down, in the trunk's frame: minus the last row of the rotation matrix.
-
-    Args:
-        orientation: Unit quaternions (w, x, y, z) of the trunk. (N, 4)
-
-    Returns:
-        Unit vectors. (N, 3)
-    """
-    w, x, y, z = orientation.unbind(dim=-1)
-    return torch.stack(
-        (2.0 * (w * y - x * z), -2.0 * (y * z + w * x), 2.0 * (x * x + y * y) - 1.0), dim=-1
     )

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from pronk.policy.layout import ACTIONS, HISTORY
 from pronk.train.commands import motion_command
-from pronk.train.motion import direction_of_gravity
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -51,7 +50,7 @@ def angular_velocity(env: ManagerBasedRlEnv) -> Tensor:
 
 def projected_gravity(env: ManagerBasedRlEnv) -> Tensor:
     """Direction of gravity in the trunk's frame. (N, 3)."""
-    return direction_of_gravity(env.sim.data.qpos[:, 3:7])
+    return -_trunk_axes(env)[:, 2]
 
 
 def joint_position(env: ManagerBasedRlEnv) -> Tensor:
@@ -124,9 +123,18 @@ def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def _linear_velocity(env: ManagerBasedRlEnv) -> Tensor:
-    from mjlab.utils.lab_api.math import quat_apply_inverse
+    """Of the trunk, in its frame [m/s]. (N, 3)."""
+    # Not a matrix product: those are rounded to ten bits where TF32 is allowed.
+    return (env.sim.data.qvel[:, :3, None] * _trunk_axes(env)).sum(dim=1)
 
-    return quat_apply_inverse(env.sim.data.qpos[:, 3:7], env.sim.data.qvel[:, :3])
+
+def _trunk_axes(env: ManagerBasedRlEnv) -> Tensor:
+    """The trunk's x, y, z axes in the world's frame, as columns. (N, 3, 3).
+
+    Positions are those of the state: mjlab computes them anew before it observes.
+    """
+    axes: Tensor = env.sim.data.xmat[:, env.scene["robot"].indexing.root_body_id]
+    return axes
 
 
 def groups(noise: Noise) -> dict[str, ObservationGroupCfg]:

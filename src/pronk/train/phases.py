@@ -51,13 +51,13 @@ PHASES: tuple[Phase, ...] = (
         name="jump_a",
         iterations=300,
         jump=True,
-        weights=JumpWeights(dense=0.02, sparse=4.0, width=1.0, rise=10.0, hop=0.0),
+        weights=JumpWeights(dense=0.02, sparse=6.0, width=1.0, rise=15.0, hop=0.0),
     ),
     Phase(
         name="jump_b",
         iterations=300,
         jump=True,
-        weights=JumpWeights(dense=0.002, sparse=4.0, width=0.4, rise=10.0, hop=0.5),
+        weights=JumpWeights(dense=0.002, sparse=6.0, width=0.3, rise=15.0, hop=0.5),
     ),
 )
 """The paper's phases. Its weights are 2.5 and 0.25 for dense and 250 for sparse."""

@@ -32,9 +32,9 @@ class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
 
     estimator_learning_rate: float = 1e-3
     """Of the estimator's own Adam."""
-    estimator_epochs: int = 1
+    estimator_epochs: int = 2
     """How often the estimator sees each sample of a rollout."""
-    estimator_mini_batches: int = 8
+    estimator_mini_batches: int = 12
     """Steps of the estimator in an epoch."""
     estimator_contact_coef: float = 1.0
     """Weight of the contacts' cross entropy [nat]."""

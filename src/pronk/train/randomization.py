@@ -16,6 +16,7 @@ from mjlab.envs.mdp import push_by_setting_velocity
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.utils.noise import UniformNoiseCfg
+from torch import Tensor, empty_like
 
 from pronk.errors import PronkError
 from pronk.robots.robot import Robot
@@ -112,6 +113,14 @@ class Randomization:
         )
 
 
+class UniformNoise(UniformNoiseCfg):
+    """mjlab's, drawn in place: two operations where it takes five, twenty times a step."""
+
+    def apply(self, data: Tensor) -> Tensor:
+        """Add noise to a measurement of any shape."""
+        return empty_like(data).uniform_(self.n_min, self.n_max).add_(data)
+
+
 _NOISES = {
     "position": "position_noise",
     "velocity": "velocity_noise",
@@ -124,7 +133,7 @@ def noise(randomization: Randomization) -> dict[str, UniformNoiseCfg | None]:
     """Noise by measurement: position, velocity, angular_velocity, gravity; None where none."""
     half = {name: getattr(randomization, field) for name, field in _NOISES.items()}
     return {
-        name: UniformNoiseCfg(n_min=-width, n_max=width) if width > 0.0 else None
+        name: UniformNoise(n_min=-width, n_max=width) if width > 0.0 else None
         for name, width in half.items()
     }
 

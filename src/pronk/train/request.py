@@ -121,6 +121,8 @@ def new_settings(request: Request) -> tuple[TrainSettings, Devices]:
     asked = request.named()
     require_extra()
     devices = find_devices(request.device or "auto", request.gpu_ids)
+    # What is imported next may look at the GPUs.
+    devices.claim()
     from pronk.train.phases import PHASES
 
     defaults = {phase.name: phase.iterations for phase in PHASES}

@@ -19,13 +19,13 @@ from pronk.train.commands import MotionCommand
 def tracking_linear(command: MotionCommand, variance: float) -> Tensor:
     """exp(-|e|^2 / variance), e the error of the horizontal velocity [m/s] (A3)."""
     error = command.target - command.motion.velocity_trunk[:, :2]
-    return torch.exp(-error.square().sum(dim=-1) / variance)
+    return torch.exp(error.square().sum(dim=-1) / -variance)
 
 
 def tracking_angular(command: MotionCommand, variance: float) -> Tensor:
     """exp(-e^2 / variance), e the error of the yaw rate [rad/s] (A3)."""
     error = command.velocity[:, 2] - command.motion.angular_velocity[:, 2]
-    return torch.exp(-error.square() / variance)
+    return torch.exp(error.square() / -variance)
 
 
 def posture(command: MotionCommand, standing: float) -> Tensor:
@@ -61,15 +61,15 @@ def torque_limits(command: MotionCommand) -> Tensor:
     """
     motion = command.motion
     asked = command.stiffness * (command.position_target - motion.position)
-    asked = asked - command.damping * motion.velocity
+    asked = torch.addcmul(asked, command.damping, motion.velocity, value=-1.0)
     return (asked.abs() - command.effort_limit).clamp_min(0.0).sum(dim=-1)
 
 
 def position_limits(command: MotionCommand) -> Tensor:
-    """Sum of relu(q_low - q) + relu(q - q_high) [rad] (A7)."""
+    """Sum of relu(q_low - q) + relu(q - q_high) [rad] (A7): how far outside its limits q is."""
     low, high = command.position_limits.unbind(dim=-1)
     position = command.motion.position
-    return ((low - position).clamp_min(0.0) + (position - high).clamp_min(0.0)).sum(dim=-1)
+    return (position - position.clamp(low, high)).abs().sum(dim=-1)
 
 
 def foot_acceleration(command: MotionCommand) -> Tensor:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -25,20 +25,17 @@ from rich.console import Console
 
 from pronk.errors import ArtefactError
 from pronk.files import sha256
-from pronk.robots import load_robot
 from pronk.train import checkpoint, provenance
 from pronk.train.commands import motion_command
 from pronk.train.devices import check_cuda_graphs, kernel_seconds
-from pronk.train.export import TOLERANCE, contract_for, export_policy, verify
-from pronk.train.gains import NAIVE, TrainingGains, training_gains
-from pronk.train.phases import Phase, enter_phase, with_iterations
-from pronk.train.randomization import Randomization, delay_steps
-from pronk.train.request import ROBOT
+from pronk.train.export import TOLERANCE, export_policy, verify
+from pronk.train.phases import Phase, enter_phase
+from pronk.train.resolve import run_contract, run_gains, run_phases, run_randomization
 from pronk.train.run_folder import RunFolder
 from pronk.train.runner import PronkRunner
 from pronk.train.settings import TrainSettings, WatchSettings
 from pronk.train.state import random_state, restore_random
-from pronk.train.tasks import ACTION_SCALE, env_cfg, rl_cfg
+from pronk.train.tasks import env_cfg, rl_cfg
 from pronk.train.widen import widen_state
 
 _COMPARED = 4096
@@ -47,11 +44,6 @@ _COMPARED = 4096
 
 class PhaseRunner(PronkRunner):
     """The runner of one phase; in a group of processes, the next one joins the same group."""
-
-    @property
-    def non_finite(self) -> int:
-        """Environments of this process whose physics went wrong in this phase."""
-        return self._episodes.non_finite
 
     def _configure_multi_gpu(self) -> None:
         if not torch.distributed.is_initialized():
@@ -66,35 +58,6 @@ class PhaseRunner(PronkRunner):
             "local_rank": self.gpu_local_rank,
             "world_size": self.gpu_world_size,
         }
-
-
-def run_gains(folder: RunFolder, settings: TrainSettings) -> TrainingGains:
-    """The gains of a run, from the copy in its folder.
-
-    Raises:
-        ArtefactError: The copy is missing or was changed.
-    """
-    robot = load_robot(ROBOT)
-    if not settings.gains_sha256:
-        return training_gains(NAIVE, robot)
-    if not folder.gains.is_file() or sha256(folder.gains) != settings.gains_sha256:
-        raise ArtefactError(
-            f"{folder.gains}: missing or changed since the run began; put the file with SHA-256 "
-            f"{settings.gains_sha256[:12]}... back, or begin a new run."
-        )
-    if settings.gains == NAIVE:
-        return training_gains(NAIVE, robot, like=folder.gains)
-    return training_gains(folder.gains, robot)
-
-
-def run_phases(settings: TrainSettings) -> tuple[Phase, ...]:
-    """The phases of a run, with its numbers of iterations."""
-    return tuple(p for p in with_iterations(settings.iterations) if p.name in settings.phases)
-
-
-def run_randomization(settings: TrainSettings) -> Randomization:
-    """What is drawn in a run."""
-    return Randomization(gains="ellipsoid" if settings.ellipsoid else "box")
 
 
 def train_run(folder: RunFolder, settings: TrainSettings, watch: WatchSettings) -> None:
@@ -133,7 +96,7 @@ class _Run:
         self.rank = rank
         self.log = log
         self.console = Console(stderr=True, highlight=False, soft_wrap=True)
-        self.gains = run_gains(folder, settings)
+        self.gains = run_gains(settings, folder.gains)
         self.phases = run_phases(settings)
         self.device = "cpu"
         if settings.device == "cuda":
@@ -146,15 +109,15 @@ class _Run:
         printed = self.log.stat().st_size
         last = checkpoint.latest(self.folder.checkpoints)
         first = 0 if last is None else self._phase_of(last)
-        self.env = self._build(self.phases[first])
+        self.env = self._build()
         runner: PhaseRunner | None = None
         for phase in self.phases[first:]:
             fresh = runner is None and last is None
+            enter_phase(self.env.unwrapped, phase)
             if runner is None and last is not None:
                 runner = self._runner(phase)
                 runner.load(last)
             else:
-                enter_phase(self.env.unwrapped, phase)
                 runner = self._successor(runner, phase)
             end = self._end_of(phase)
             left = end - runner.current_learning_iteration
@@ -166,9 +129,6 @@ class _Run:
             if runner.stopped or not finished:
                 break
         self.env.close()
-        # rsl_rl makes a folder for differences of source code, which are not kept.
-        with contextlib.suppress(OSError):
-            (self.folder.path / "git").rmdir()
         if self.rank == 0 and runner is not None:
             text = self.log.read_bytes()[printed:].decode("utf-8", "replace")
             with provenance.changed(self.folder.provenance) as found:
@@ -180,7 +140,8 @@ class _Run:
 
     # --- Building --------------------------------------------------------------------------------
 
-    def _build(self, phase: Phase) -> RslRlVecEnvWrapper:
+    def _build(self) -> RslRlVecEnvWrapper:
+        """The environment as the first phase begins, also where a later one is resumed."""
         self._say(
             f"building {self.settings.envs} robots on {self.device} and compiling kernels "
             "(a minute or two on a fresh machine)"
@@ -189,11 +150,14 @@ class _Run:
         cfg = env_cfg(
             gains=self.gains,
             randomization=run_randomization(self.settings),
-            phase=phase,
+            phase=self.phases[0],
             num_envs=self.settings.envs,
             seed=self.settings.seed + self.rank,
         )
-        env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg=cfg, device=self.device))
+        learning = rl_cfg(jump=self.phases[0].jump)
+        env = RslRlVecEnvWrapper(
+            ManagerBasedRlEnv(cfg=cfg, device=self.device), clip_actions=learning.clip_actions
+        )
         built = time.monotonic() - begin
         self._say(f"built in {built:.0f} s")
         if self.device != "cpu":
@@ -316,28 +280,12 @@ class _Run:
         if not (last or phase.name == "walk"):
             return None
         path = self.folder.policy if last else self.folder.walk
-        command = motion_command(self.env.unwrapped).cfg
         actor = runner.alg.get_policy()
-        robot, randomization = load_robot(ROBOT), run_randomization(self.settings)
+        contract = run_contract(
+            self.settings, self.gains, phase, run=self.folder.path.resolve().name
+        )
         # What is drawn here must not shift what the next phase draws.
         before = random_state(self.device)
-        contract = contract_for(
-            robot,
-            # A contract has the hash of gains alone, not of the ranges about naive ones.
-            self.gains if self.gains.name != NAIVE else replace(self.gains, sha256=""),
-            action_scale=ACTION_SCALE,
-            delay_steps=delay_steps(robot, self.gains, randomization),
-            command_limits=command.limits,
-            lift_off_velocity=command.settings.liftoff_velocity if phase.jump else None,
-            provenance={
-                "run": self.folder.path.resolve().name,
-                "phases": {p.name: p.iterations for p in self.phases[: self._index(phase) + 1]},
-                "start_sha256": self.settings.start_sha256,
-                "ranges_sha256": self.gains.sha256,
-                "envs": self.settings.envs * self.settings.gpus,
-                "seed": self.settings.seed,
-            },
-        )
         export_policy(actor, contract, path)
         seen = runner.alg.storage.observations.flatten(0, 1)[:_COMPARED]
         difference = verify(path, actor, {name: seen[name] for name in ("measured", "jump")})

@@ -102,7 +102,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             on_iteration: Called with the runner after every iteration; may `save` or `stop`.
 
         Raises:
-            PronkError: Learning has diverged, or W&B was asked for and is not installed.
+            PronkError: Learning has diverged.
         """
         self.stopped = ""
         if init_at_random_ep_len and not self._under_way:
@@ -221,16 +221,10 @@ class PronkRunner(MjlabOnPolicyRunner):
     def _open_writer(self) -> None:
         if self.logger.writer is not None or self.logger.log_dir is None:
             return
-        try:
-            self.logger.init_logging_writer()
-            # rsl_rl makes a folder for differences of git repositories, of which it finds none.
-            with suppress(OSError):
-                (Path(self.logger.log_dir) / "git").rmdir()
-        except ModuleNotFoundError as error:
-            raise PronkError(
-                f"{self.cfg['logger']} was asked for, but {error.name or 'its package'} is not "
-                "installed; install it, or log to tensorboard."
-            ) from error
+        self.logger.init_logging_writer()
+        # rsl_rl makes a folder for differences of git repositories, of which it was given none.
+        with suppress(OSError):
+            (Path(self.logger.log_dir) / "git").rmdir()
 
     def _write_figures(self) -> None:
         if self.logger.writer is not None:

@@ -7,8 +7,9 @@ configurations with the gains that were asked for.
 
 from __future__ import annotations
 
+import math
+
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.envs import mdp as envs_mdp
 from mjlab.managers import EventTermCfg, RewardTermCfg, TerminationTermCfg
 from mjlab.rl import RslRlOnPolicyRunnerCfg
 from mjlab.tasks.registry import register_mjlab_task
@@ -19,6 +20,7 @@ from pronk.train import observations, terminations
 from pronk.train.actions import HeldJointPositionCfg
 from pronk.train.actor import EstimatorActorCfg, JumpCriticCfg
 from pronk.train.commands import NAME, MotionCommandCfg, NominalDrive
+from pronk.train.draws import draw_start
 from pronk.train.drives import actuators
 from pronk.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.train.phases import Phase, configure_phase, phase
@@ -79,7 +81,14 @@ def env_cfg(
             )
         },
         commands={NAME: MotionCommandCfg(drive=NominalDrive.of(robot, gains))},
-        events={**_resets(), **events(robot, gains, randomization)},
+        events={
+            "start": EventTermCfg(
+                func=draw_start,
+                mode="reset",
+                params={"place": 0.5, "speed": 0.3, "heading": math.pi, "joints": 0.1},
+            ),
+            **events(robot, gains, randomization),
+        },
         rewards={TABLE: RewardTermCfg(func=RewardSum, weight=1.0, params={"rows": ROWS})},
         terminations={
             "time_out": TerminationTermCfg(
@@ -107,25 +116,6 @@ def env_cfg(
     return cfg
 
 
-def _resets() -> dict[str, EventTermCfg]:
-    """Where an episode begins: near the default pose, heading anywhere."""
-    return {
-        "reset_base": EventTermCfg(
-            func=envs_mdp.reset_root_state_uniform,
-            mode="reset",
-            params={
-                "pose_range": {"x": (-0.5, 0.5), "y": (-0.5, 0.5), "yaw": (-3.14, 3.14)},
-                "velocity_range": {"x": (-0.3, 0.3), "y": (-0.3, 0.3)},
-            },
-        ),
-        "reset_joints": EventTermCfg(
-            func=envs_mdp.reset_joints_by_offset,
-            mode="reset",
-            params={"position_range": (-0.1, 0.1), "velocity_range": (0.0, 0.0)},
-        ),
-    }
-
-
 def rl_cfg(*, jump: bool, seed: int = 0) -> RslRlOnPolicyRunnerCfg:
     """PPO as it is run in a phase with or without the jump input.
 
@@ -140,7 +130,13 @@ def rl_cfg(*, jump: bool, seed: int = 0) -> RslRlOnPolicyRunnerCfg:
         seed=seed,
         actor=EstimatorActorCfg(),
         critic=JumpCriticCfg(),
-        algorithm=EstimatorPpoCfg(),
+        algorithm=EstimatorPpoCfg(
+            # Robot and task are alike left and right: every sample teaches two.
+            symmetry_cfg={
+                "data_augmentation_func": "pronk.train.symmetry:with_mirror_image",
+                "use_data_augmentation": True,
+            },
+        ),
         obs_groups={
             "actor": ("measured", "jump") if jump else ("measured",),
             "critic": ("critic", "critic_jump") if jump else ("critic",),

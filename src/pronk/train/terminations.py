@@ -20,8 +20,9 @@ def fell(env: ManagerBasedRlEnv, tilt_cosine: float, height: float) -> Tensor:
         height: Least height of the trunk [m].
     """
     qpos = env.sim.data.qpos
-    cosine = 1.0 - 2.0 * (qpos[:, 4].square() + qpos[:, 5].square())
-    return (cosine < tilt_cosine) | (qpos[:, 2] < height)
+    # The cosine is 1 - 2 (x^2 + y^2) of the quaternion (w, x, y, z).
+    leaning = qpos[:, 4:6].square().sum(dim=-1) > (1.0 - tilt_cosine) / 2.0
+    return leaning | (qpos[:, 2] < height)
 
 
 def non_finite(env: ManagerBasedRlEnv, speed: float) -> Tensor:
@@ -33,9 +34,10 @@ def non_finite(env: ManagerBasedRlEnv, speed: float) -> Tensor:
         env: The environment.
         speed: Largest believable velocity, joint or trunk [rad/s, m/s].
     """
-    qpos, qvel = env.sim.data.qpos, env.sim.data.qvel
-    fastest = torch.nan_to_num(qvel.abs(), nan=torch.inf).amax(dim=-1)
-    return (fastest > speed) | ~torch.isfinite(qpos.sum(dim=-1))
+    # A largest magnitude is NaN if one of them is, and NaN is no less than anything.
+    fastest = torch.linalg.vector_norm(env.sim.data.qvel, ord=torch.inf, dim=-1)
+    farthest = torch.linalg.vector_norm(env.sim.data.qpos, ord=torch.inf, dim=-1)
+    return ~((fastest <= speed) & (farthest < torch.inf))
 
 
 def time_out(env: ManagerBasedRlEnv, steps: int) -> Tensor:

@@ -1,0 +1,421 @@
+"""Every reward against a number worked out by hand, and the table against the paper's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mjlab")
+pytestmark = pytest.mark.train
+
+import torch  # noqa: E402
+from torch import Tensor  # noqa: E402
+
+import small_env  # noqa: E402
+from pronk.errors import PronkError  # noqa: E402
+from pronk.train.commands import MotionCommand, motion_command  # noqa: E402
+from pronk.train.motion import Motion  # noqa: E402
+from pronk.train.phases import enter_phase, phase  # noqa: E402
+from pronk.train.reward_sum import reward_sum  # noqa: E402
+from pronk.train.reward_table import (  # noqa: E402
+    PAPER_UNIT,
+    ROWS,
+    JumpWeights,
+    with_jump_weights,
+)
+
+N = small_env.ROBOTS
+STANDING = 0.298970  # .209 cos(.8) + .195 cos(.8) + .0175
+WALKS, JUMPS = 0, 1
+"""A robot out of jump mode and one in it; all others are as the first."""
+
+
+@pytest.fixture(scope="module")
+def built() -> Any:
+    return small_env.quiet()
+
+
+@pytest.fixture
+def env(built: Any) -> Any:
+    small_env.fresh(built)
+    motion_command(built).scripted = True
+    return built
+
+
+def vector(*values: float) -> Tensor:
+    return torch.tensor(values)
+
+
+def at(size: int, **values: float) -> Tensor:
+    """A vector of zeros but for `_3=0.5`: index and value."""
+    made = torch.zeros(size)
+    for name, value in values.items():
+        made[int(name[1:])] = value
+    return made
+
+
+def feet(*rows: tuple[float, float, float]) -> Tensor:
+    """Vectors of some feet, zeros of the rest."""
+    made = torch.zeros(4, 3)
+    made[: len(rows)] = torch.tensor(rows)
+    return made
+
+
+def pretend(env: Any, **fields: Tensor) -> MotionCommand:
+    """All robots stand still in the default pose, but for `fields`, each of one robot.
+
+    Fields are those of `Motion`; also `velocity_command`, and `joint_position`: that added to the
+    default pose.
+    """
+    command = motion_command(env)
+
+    def every(value: Tensor) -> Tensor:
+        return value.expand(N, *value.shape).clone()
+
+    still = {
+        "position": command.default_position.clone(),
+        "velocity": torch.zeros(N, 12),
+        "height": torch.full((N,), STANDING),
+        "velocity_world": torch.zeros(N, 3),
+        "velocity_trunk": torch.zeros(N, 3),
+        "angular_velocity": torch.zeros(N, 3),
+        "gravity": every(vector(0.0, 0.0, -1.0)),
+        "contact": torch.ones(N, 4, dtype=torch.bool),
+        "force": torch.full((N, 4), 30.0),
+        "foot_height": torch.zeros(N, 4),
+        "foot_velocity": torch.zeros(N, 4, 3),
+        "foot_velocity_change": torch.zeros(N, 4, 3),
+        "touching": torch.zeros(N),
+        "torque": torch.zeros(N, 12),
+        "torque_change": torch.zeros(N, 12),
+    }
+    command.velocity[:] = fields.pop("velocity_command", torch.zeros(3))
+    still["position"] += fields.pop("joint_position", torch.zeros(12))
+    command._motion = Motion(**still | {name: every(value) for name, value in fields.items()})
+    command._motion_step = env.common_step_counter
+    command.tracker.mode[:] = torch.arange(N) == JUMPS
+    return command
+
+
+def paid(env: Any, name: str) -> Tensor:
+    """Weighted rate that a term pays to every robot."""
+    table = reward_sum(env)
+    table(env, None)
+    return table.values[list(table.rows).index(name)]
+
+
+# --- The terms ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """What the robots do, and what a term makes of it, without and within jump mode."""
+
+    name: str
+    walking: float
+    jumping: float
+    motion: dict[str, Tensor]
+
+
+def same(name: str, value: float, **motion: Tensor) -> Case:
+    return Case(name, value, value, motion)
+
+
+CASES = [
+    # |(1 - .7, .5 - .1)|^2 = .25. In jump mode (1, .5) is asked .35 m/s faster: its length is
+    # sqrt(1.25), so times 1 + .35 / 1.118034 = 1.313050: errors .613050 and .556525.
+    Case(
+        "tracking_linear",
+        math.exp(-0.25 / 0.25),
+        math.exp(-(0.613050**2 + 0.556525**2) / 0.25),
+        {"velocity_command": vector(1.0, 0.5, 0.0), "velocity_trunk": vector(0.7, 0.1, 9.0)},
+    ),
+    # Below 1 m/s .35 m/s in proportion: -.4 becomes -.54.
+    Case(
+        "tracking_linear",
+        1.0,
+        math.exp(-(0.14**2) / 0.25),
+        {"velocity_command": vector(0.0, -0.4, 2.0), "velocity_trunk": vector(0.0, -0.4, 0.0)},
+    ),
+    same(
+        "tracking_angular",
+        math.exp(-(0.3**2) / 0.25),
+        velocity_command=vector(1.0, 0.0, -1.0),
+        angular_velocity=vector(5.0, 5.0, -0.7),
+    ),
+    # Walking: .3^2 + .1^2. Standing eight times that; who jumps does not stand.
+    same("posture", 0.1, velocity_command=vector(0.5, 0, 0), joint_position=at(12, _0=0.3, _8=0.1)),
+    Case("posture", 0.8, 0.1, {"joint_position": at(12, _0=0.3, _8=-0.1)}),
+    same("vertical_velocity", 0.36, velocity_world=vector(2.0, 1.0, -0.6)),
+    same("smoothness", 3.0**2 + 4.0**2, torque_change=at(12, _2=3.0, _11=-4.0)),
+    # A roll of .3 rad: g = (0, -sin .3, -cos .3).
+    same("orientation", math.sin(0.3) ** 2, gravity=vector(0.0, -math.sin(0.3), -math.cos(0.3))),
+    same("collision", 3.0, touching=torch.tensor(3.0)),
+    # 17 N m/rad * -1.2 rad = -20.4 N m, 3.4 over the hip's 17. The knee asks -17 * .5 - .4 * 50 =
+    # -28.5 of its 17 * 9.33 / 6 = 26.435, 2.065 over. Hip pitch asks 8.5.
+    same(
+        "torque_limits",
+        3.4 + 2.065,
+        joint_position=at(12, _0=1.2, _4=-0.5, _5=0.5),
+        velocity=at(12, _5=50.0),
+    ),
+    # Hip roll 1.7 of 1.6; hip pitch -.8 - 2.0 of -2.6; knee 1.6 + 1.3 of 2.6.
+    same("position_limits", 0.1 + 0.2 + 0.3, joint_position=at(12, _0=1.7, _4=-2.0, _8=1.3)),
+    same(
+        "foot_acceleration",
+        math.sqrt(0.3**2 + 0.4**2 + 1.2**2),
+        foot_velocity_change=feet((0.3, 0.0, 0.0), (0.0, -0.4, 1.2)),
+    ),
+    # (.09 - .05)^2 sqrt(.25) + (.09 - .10)^2 sqrt(4) = .0008 + .0002; z is no part of the speed.
+    same(
+        "foot_clearance",
+        0.001,
+        foot_height=vector(0.05, 0.10, 0.0, 0.0),
+        foot_velocity=feet((0.15, 0.2, 7.0), (0.0, -4.0, 1.0)),
+    ),
+    same("torque", 5.0**2 + 12.0**2, torque=at(12, _1=5.0, _5=-12.0)),
+    # Mean 25; deviations -25, -15, 5, 35: variance (625 + 225 + 25 + 1225) / 4 = 525.
+    same("dense_jump", math.sqrt(525.0), force=vector(0.0, 10.0, 30.0, 60.0)),
+    same("roll_pitch_rate", 0.25 + 1.44, angular_velocity=vector(0.5, -1.2, 3.0)),
+    # Foot 2 slides as fast but is in the air.
+    same(
+        "slip",
+        0.09 + 0.16 + 0.04,
+        foot_velocity=feet((0.3, 0.4, 2.0), (0.2, 0.0, 0.0), (1.0, 1.0, 0.0)),
+        contact=torch.tensor([True, True, False, True]),
+    ),
+    same("trunk_height", 0.05**2, height=torch.tensor(STANDING + 0.05)),
+    same("trunk_height", 0.0, height=torch.tensor(0.2)),
+]
+
+
+def test_every_term_has_a_case() -> None:
+    own = {"termination", "sparse_jump", "rise", "hop", "action_rate"}
+    assert {case.name for case in CASES} | own == set(ROWS)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_term_by_hand(env: Any, case: Case) -> None:
+    """The value, with weight 1, and with the weights of the mode."""
+    command = pretend(env, **dict(case.motion))
+    env.action_manager.process_action(torch.zeros(N, 12))
+    row = ROWS[case.name]
+    value = row.term(command, **row.arguments)
+    expected = torch.full((N,), case.walking)
+    expected[JUMPS] = case.jumping
+    torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-5)
+    reward_sum(env).set_rows({**ROWS, case.name: replace(row, walk=3.0, jump=-5.0)})
+    weight = torch.full((N,), 3.0)
+    weight[JUMPS] = -5.0
+    torch.testing.assert_close(paid(env, case.name), weight * value)
+
+
+@pytest.mark.parametrize("robot", range(3))
+def test_terms_are_of_one_robot_each(env: Any, robot: int) -> None:
+    """What one robot does is nothing to the others."""
+    command = pretend(env, velocity_command=vector(1.0, 0.0, 0.0))
+    before = {name: row.term(command, **row.arguments) for name, row in ROWS.items()}
+    motion = command.motion
+    for name in vars(motion):
+        value = getattr(motion, name)[robot]
+        value[...] = ~value if value.dtype == torch.bool else value + 2.0
+    others = torch.arange(N) != robot
+    for name, row in ROWS.items():
+        after = row.term(command, **row.arguments)
+        assert after.shape == (N,)
+        assert torch.equal(after[others], before[name][others]), name
+
+
+def test_action_rate_by_hand(env: Any) -> None:
+    command = pretend(env)
+    env.action_manager.process_action(torch.full((N, 12), 0.5))
+    second = torch.full((N, 12), 0.5)
+    second[WALKS, 3], second[JUMPS, :2] = -0.5, torch.tensor([1.0, 0.25])
+    env.action_manager.process_action(second)
+    value = ROWS["action_rate"].term(command)
+    assert value.tolist() == pytest.approx([1.0, 0.25 + 0.0625] + [0.0] * (N - 2))
+
+
+def test_targets_are_what_the_torque_is_asked_for(env: Any) -> None:
+    """An action of 4 asks .35 * 4 = 1.4 rad more: 17 * 1.4 = 23.8 N m, 6.8 over the hip's."""
+    command = pretend(env)
+    env.action_manager.process_action(at(12, _3=4.0).expand(N, 12))
+    assert ROWS["torque_limits"].term(command).tolist() == pytest.approx([6.8] * N, rel=1e-5)
+
+
+# --- Events ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("decimation", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize(
+    ("name", "event", "worth"),
+    [("sparse_jump", "gain", 4.0), ("rise", "rise", 10.0), ("hop", "hop", -0.5)],
+)
+def test_an_event_is_worth_its_weight_once(
+    env: Any, name: str, event: str, worth: float, decimation: int
+) -> None:
+    """However long the policy step was (D1), and in jump mode only."""
+    command = pretend(env)
+    env.cfg.decimation = decimation
+    enter_phase(env, phase("jump_b"))
+    getattr(command.tracker, event)[:] = 0.0
+    env.reward_manager.compute(dt=env.step_dt)
+    without = env.reward_manager._reward_buf.clone()
+    getattr(command.tracker, event)[:] = 0.25
+    env.reward_manager.compute(dt=env.step_dt)
+    change = env.reward_manager._reward_buf - without
+    expected = torch.zeros(N)
+    expected[JUMPS] = 0.25 * worth
+    torch.testing.assert_close(change, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("decimation", [2, 6])
+def test_a_fall_costs_one_once(env: Any, decimation: int) -> None:
+    env.cfg.decimation = decimation
+    qpos = env.sim.data.qpos
+    qpos[2, 3:7] = vector(0.0, 1.0, 0.0, 0.0)  # on its back
+    qpos[2, 2] = 0.3
+    env.episode_length_buf[5] = 10**6  # time is over, which is no fall
+    env.step(torch.zeros(N, 12))
+    table = reward_sum(env)
+    cost = table.values[list(table.rows).index("termination")] * env.step_dt
+    assert cost.tolist() == pytest.approx([-1.0 if i == 2 else 0.0 for i in range(N)])
+
+
+@pytest.mark.parametrize("decimation", [2, 6])
+def test_rates_are_paid_by_the_second(env: Any, decimation: int) -> None:
+    command = pretend(env, velocity_command=vector(1.0, 0, 0), velocity_trunk=vector(1.0, 0, 0))
+    command.tracker.mode[:] = False
+    env.cfg.decimation = decimation
+    # Tracking 2.25 + 1.5 a second; nothing else is amiss.
+    paid = env.reward_manager.compute(dt=env.step_dt)
+    assert paid.tolist() == pytest.approx([3.75 * decimation * 0.005] * N, rel=1e-4)
+
+
+# --- The sum --------------------------------------------------------------------------------------
+
+
+def test_reward_of_a_step_is_the_sum_of_the_rows(env: Any) -> None:
+    enter_phase(env, phase("jump_b"))
+    motion_command(env).jump[::2] = True
+    for _ in range(3):
+        _, reward, *_ = env.step(torch.rand(N, 12) - 0.5)
+    command, table = motion_command(env), reward_sum(env)
+    assert command.tracker.mode.tolist() == [True, False] * (N // 2)
+    expected = torch.zeros(N)
+    for row in table.rows.values():
+        weight = torch.where(command.tracker.mode, row.jump, row.walk)
+        expected += weight * row.term(command, **row.arguments) * env.step_dt
+    torch.testing.assert_close(reward, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_rewards_of_an_episode_are_logged(env: Any) -> None:
+    """Mean over the robots that end of what each term paid, per second of a full episode."""
+    earned = torch.zeros(N)
+    for _ in range(3):
+        env.step(torch.zeros(N, 12))
+        earned += paid_now(env, "tracking_linear") * env.step_dt
+    env.reset(env_ids=torch.tensor([1, 4]))
+    logged = env.extras["log"]["Episode_Reward/tracking_linear"]
+    assert float(logged) == pytest.approx(float(earned[[1, 4]].mean()) / 20.0, rel=1e-5)
+    assert {f"Episode_Reward/{name}" for name in ROWS} <= set(env.extras["log"])
+    env.step(torch.zeros(N, 12))
+    again = paid_now(env, "tracking_linear") * env.step_dt
+    env.reset(env_ids=torch.tensor([4]))
+    logged = env.extras["log"]["Episode_Reward/tracking_linear"]
+    assert float(logged) == pytest.approx(float(again[4]) / 20.0, rel=1e-5)
+
+
+def paid_now(env: Any, name: str) -> Tensor:
+    """What the last step paid."""
+    table = reward_sum(env)
+    return table.values[list(table.rows).index(name)].clone()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_reward_is_a_number_whatever_physics_gives(env: Any, bad: float) -> None:
+    command = pretend(env)
+    usual = reward_sum(env)(env, None).clone()
+    for name in ("velocity", "torque", "torque_change", "velocity_trunk", "force", "foot_height"):
+        getattr(command.motion, name)[3] = bad
+    after = reward_sum(env)(env, None)
+    assert torch.isfinite(after).all()
+    others = torch.arange(N) != 3
+    assert torch.equal(after[others], usual[others])
+
+
+# --- The table ------------------------------------------------------------------------------------
+
+PAPER: dict[str, tuple[float, float]] = {
+    "posture": (-5.0, 0.0),
+    "vertical_velocity": (-50.0, 0.0),
+    "smoothness": (-0.2, -0.2),
+    "orientation": (-20.0, -120.0),
+    "collision": (-50.0, -50.0),
+    "torque_limits": (-900.0, -900.0),
+    "position_limits": (-150.0, -150.0),
+    "foot_acceleration": (-0.5, -0.5),
+    "foot_clearance": (-250.0, -250.0),
+    "torque": (-0.08, -0.08),
+    "tracking_linear": (45.0, 45.0),
+    "tracking_angular": (30.0, 30.0),
+}
+"""The paper's table, walk and jump; its termination is an event."""
+LESS = {"smoothness", "torque_limits", "torque"}
+"""Terms of which only a part is left, in both modes."""
+
+
+@pytest.mark.parametrize("name", sorted(PAPER.keys() - LESS))
+def test_weight_is_the_papers(name: str) -> None:
+    row, (walk, jump) = ROWS[name], PAPER[name]
+    assert row.walk * PAPER_UNIT == pytest.approx(walk)
+    if name == "foot_clearance":
+        jump = 0.0  # in a jump feet are where the jump wants them
+    assert row.jump * PAPER_UNIT == pytest.approx(jump)
+
+
+@pytest.mark.parametrize("name", sorted(LESS))
+def test_weight_is_a_part_of_the_papers(name: str) -> None:
+    row, (walk, jump) = ROWS[name], PAPER[name]
+    assert walk <= 10 * row.walk * PAPER_UNIT < 0.0
+    assert jump < 10 * row.jump * PAPER_UNIT < 0.0
+    assert row.jump >= row.walk, "a jump may cost more torque"
+
+
+def test_weights_of_events_and_of_our_own_terms() -> None:
+    # -500 for a step of 20 ms is -10 of the paper's, -.5 of ours.
+    assert ROWS["termination"].walk == ROWS["termination"].jump == 2 * -500 * 0.02 / PAPER_UNIT
+    for name in ("dense_jump", "sparse_jump", "rise", "hop"):
+        assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
+    for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height"):
+        assert ROWS[name].walk < 0.0
+        assert ROWS[name].walk <= ROWS[name].jump <= 0.0
+
+
+def test_arguments_of_the_terms() -> None:
+    arguments = {name: dict(row.arguments) for name, row in ROWS.items() if row.arguments}
+    assert arguments == {
+        "tracking_linear": {"variance": 0.25},
+        "tracking_angular": {"variance": 0.25},
+        "posture": {"standing": 8.0},
+        "foot_clearance": {"height": 0.09},
+        "trunk_height": {"height": pytest.approx(STANDING, abs=1e-5)},
+    }
+
+
+def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
+    weights = JumpWeights(dense=0.1, sparse=2.0, width=0.5, rise=3.0, hop=0.25)
+    rows = with_jump_weights(ROWS, weights)
+    changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "hop": -0.25}
+    assert {name: rows[name].jump for name in changed} == changed
+    assert all(rows[name].walk == 0.0 for name in changed)
+    assert {name: row for name, row in rows.items() if name not in changed} == {
+        name: row for name, row in ROWS.items() if name not in changed
+    }
+    assert list(rows) == list(ROWS), "order is that of the living table"
+    rest = {name: row for name, row in ROWS.items() if name not in ("hop", "rise")}
+    with pytest.raises(PronkError, match=r"the reward table has no hop, rise\."):
+        with_jump_weights(rest, weights)
