@@ -44,7 +44,10 @@ def fresh(env: Any) -> Any:
     """The environment as it was when built: first phase, first step, nominal rate, seed 0."""
     from pronk.train.commands import motion_command
     from pronk.train.phases import PHASES, enter_phase
+    from pronk.train.reward_sum import reward_sum
+    from pronk.train.reward_table import ROWS
 
+    reward_sum(env).set_rows(ROWS)
     enter_phase(env, PHASES[0])
     motion_command(env).scripted = False
     env.cfg.decimation = 4

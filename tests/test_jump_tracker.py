@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 
@@ -19,7 +20,9 @@ pytestmark = pytest.mark.train
 
 DT = 1 / 64
 """A power of two, so that times add up exactly."""
-SETTINGS = JumpSettings(prompt_s=16 * DT, late_s=16 * DT, settle_s=8 * DT)
+SETTINGS = JumpSettings(
+    liftoff_velocity=2.5, prompt_s=16 * DT, late_s=16 * DT, settle_s=8 * DT, apex=0.75
+)
 EVENTS = ("gain", "rise", "hop")
 TRACES = (*EVENTS, "mode", "since", "best", "highest", "liftoffs", "airborne")
 
@@ -59,6 +62,7 @@ def play(
             contact=foot,
             height=torch.tensor([step.height for step in steps]),
             vertical=torch.tensor([step.speed for step in steps]),
+            miss=torch.zeros(len(steps)),
             dt=DT,
         )
         for name in TRACES:
@@ -298,7 +302,7 @@ def test_any_script_is_paid_as_accounted(steps: list[Step], width: float) -> Non
 def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) -> None:
     seen = alone(steps)
     edges = [i for i, now in enumerate(steps) if now.jump and not (i and steps[i - 1].jump)]
-    for begin, end in zip(edges, [*edges[1:], len(steps)], strict=True):
+    for begin, end in itertools.pairwise([*edges, len(steps)]):
         gain, rise, hop = (seen[name][begin:end] for name in EVENTS)
         assert min(*gain, 0.0) == 0.0
         assert sum(gain) == pytest.approx(max(seen["best"][begin:end]), abs=1e-5)

@@ -228,25 +228,40 @@ def test_all_but_the_measurements_is_exact(noisy: Any) -> None:
 # --- Target and critic ----------------------------------------------------------------------------
 
 
-def test_target_of_the_estimator(env: Any) -> None:
-    """Contacts by MuJoCo's own collision, velocity turned into the trunk's frame."""
-    for _ in range(4):
-        env.step(2.0 * torch.rand(N, 12) - 1.0)
-    seen = observe(env)["target"]
-    qpos, qvel = (np.float64(v.numpy()) for v in (env.sim.data.qpos, env.sim.data.qvel))
-    turned = Rotation.from_quat(qpos[:, [4, 5, 6, 3]])
-    close(seen[:, 4:], turned.inv().apply(qvel[:, :3]))
+def contacts(env: Any) -> Array:
+    """Feet that touch the floor in the present state, by MuJoCo's collision. (N, 4)"""
     model = env.sim.mj_model
     feet = [model.geom(f"robot/{leg}_foot_collision").id for leg in c.LEGS]
-    expected = np.zeros((N, 4))
-    for i in range(N):
+    found = np.zeros((N, 4))
+    for i, q in enumerate(env.sim.data.qpos):
         reference = mujoco.MjData(model)
-        reference.qpos[:] = qpos[i]
+        reference.qpos[:] = q.numpy()
         mujoco.mj_forward(model, reference)
         touching = {int(geom) for contact in reference.contact for geom in contact.geom}
-        expected[i] = [foot in touching for foot in feet]
-    close(seen[:, :4], expected)
-    assert 0.0 < expected.mean() < 1.0
+        found[i] = [foot in touching for foot in feet]
+    return found
+
+
+def test_velocity_that_the_estimator_should_find(env: Any) -> None:
+    """Turned into the trunk's frame."""
+    qpos, qvel = put(env)
+    turned = Rotation.from_quat(qpos[:, [4, 5, 6, 3]])
+    close(observe(env)["target"][:, 4:], turned.inv().apply(qvel[:, :3]))
+
+
+@pytest.mark.parametrize("resets", [False, True], ids=["nobody resets", "another robot resets"])
+def test_contacts_that_the_estimator_should_find(env: Any, resets: bool) -> None:
+    """Of the state that is measured, whatever becomes of other robots."""
+    seen, expected = [], []
+    for _ in range(6):
+        if resets:
+            env.episode_length_buf[0] = 10**6
+        group = env.step(2.0 * torch.rand(N, 12) - 1.0)[0]
+        seen.append(group["target"][1:, :4])
+        assert torch.equal(part(group["critic"], CRITIC, "foot_contact")[1:], seen[-1])
+        expected.append(contacts(env)[1:])
+    close(torch.cat(seen), np.concatenate(expected))
+    assert 0.1 < np.mean(expected) < 0.9
 
 
 def test_parts_of_the_critic(env: Any) -> None:

@@ -10,7 +10,7 @@ the overlap of host and device: the stages of a step add up to more than a step 
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class Stages:
             wait: Waits until the device has done what it was told.
             clock: Gives the time [s].
         """
-        self.seconds: Counter[str] = Counter()
+        self.seconds: defaultdict[str, float] = defaultdict(float)
         self._wait = wait
         self._clock = clock
         self._on = [REST]
@@ -134,7 +134,7 @@ def counted(stages: Stages, device: str = "cpu") -> Iterator[tuple[Counter[str],
     waits: Counter[str] = Counter()
     kind = device.partition(":")[0]
 
-    class Count(TorchDispatchMode):  # type: ignore[misc]
+    class Count(TorchDispatchMode):
         def __torch_dispatch__(
             self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
         ) -> Any:
@@ -143,7 +143,8 @@ def counted(stages: Stages, device: str = "cpu") -> Iterator[tuple[Counter[str],
                 waits[stages.current] += _waits(func, args, kwargs or {}, kind)
             return func(*args, **(kwargs or {}))
 
-    with Count():
+    mode: Any = Count
+    with mode():
         yield operations, waits
 
 

@@ -70,7 +70,7 @@ class MotionCommandCfg(CommandTermCfg):
     jump_on_s: tuple[float, float] = (0.4, 0.7)
     """Time that the jump input is held [s]: less than preparation and flight together, so that
     one command means one jump."""
-    jump_off_s: tuple[float, float] = (1.2, 3.0)
+    jump_off_s: tuple[float, float] = (1.0, 2.5)
     """Time between jump inputs [s]."""
     leap: float = 0.4
     """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below

@@ -33,6 +33,8 @@ class Phase:
     jump: bool
     """Whether the networks read the jump input, and half of the robots get it."""
     weights: JumpWeights = _NO_JUMP
+    entropy: float = 0.005
+    """Coefficient of PPO's entropy bonus: how much exploring is worth."""
 
     @property
     def jump_fraction(self) -> float:
@@ -46,18 +48,22 @@ class Phase:
 
 
 PHASES: tuple[Phase, ...] = (
-    Phase(name="walk", iterations=400, jump=False),
+    Phase(name="walk", iterations=350, jump=False),
+    # Jumping has to be found.
     Phase(
         name="jump_a",
         iterations=300,
         jump=True,
         weights=JumpWeights(dense=0.02, sparse=6.0, width=1.0, rise=15.0, hop=0.0),
+        entropy=0.01,
     ),
+    # And then done alike every time.
     Phase(
         name="jump_b",
-        iterations=300,
+        iterations=600,
         jump=True,
         weights=JumpWeights(dense=0.002, sparse=6.0, width=0.3, rise=15.0, hop=0.5),
+        entropy=0.002,
     ),
 )
 """The paper's phases. Its weights are 2.5 and 0.25 for dense and 250 for sparse."""

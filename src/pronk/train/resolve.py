@@ -111,7 +111,9 @@ def resolved(settings: TrainSettings, gains: TrainingGains) -> dict[str, Any]:
     }
     environment = plain(environments[phases[0].name])
     del environment["rewards"]
-    learning = {p.name: plain(rl_cfg(jump=p.jump, seed=settings.seed)) for p in phases}
+    learning = {
+        p.name: plain(rl_cfg(jump=p.jump, seed=settings.seed, entropy=p.entropy)) for p in phases
+    }
     return {
         "phases": phases,
         "rewards": {

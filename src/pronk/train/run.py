@@ -173,7 +173,7 @@ class _Run:
         return env
 
     def _runner(self, phase: Phase) -> PhaseRunner:
-        cfg = rl_cfg(jump=phase.jump, seed=self.settings.seed + self.rank)
+        cfg = rl_cfg(jump=phase.jump, seed=self.settings.seed + self.rank, entropy=phase.entropy)
         cfg.save_interval = self.watch.save_interval
         cfg.upload_model = False
         if self.watch.logger == "wandb":

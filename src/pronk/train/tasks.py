@@ -116,7 +116,7 @@ def env_cfg(
     return cfg
 
 
-def rl_cfg(*, jump: bool, seed: int = 0) -> RslRlOnPolicyRunnerCfg:
+def rl_cfg(*, jump: bool, seed: int = 0, entropy: float = 0.005) -> RslRlOnPolicyRunnerCfg:
     """PPO as it is run in a phase with or without the jump input.
 
     Actor and critic are the paper's (N2). The optimizer's settings are those that mjlab trains
@@ -125,12 +125,16 @@ def rl_cfg(*, jump: bool, seed: int = 0) -> RslRlOnPolicyRunnerCfg:
     Args:
         jump: Whether the networks read the jump input.
         seed: Of the networks and of exploration.
+        entropy: Coefficient of the entropy bonus.
     """
     return RslRlOnPolicyRunnerCfg(
         seed=seed,
         actor=EstimatorActorCfg(),
         critic=JumpCriticCfg(),
         algorithm=EstimatorPpoCfg(
+            entropy_coef=entropy,
+            # A clipped value may move by 0.2 an update; a jump is worth ten.
+            use_clipped_value_loss=False,
             # Robot and task are alike left and right: every sample teaches two.
             symmetry_cfg={
                 "data_augmentation_func": "pronk.train.symmetry:with_mirror_image",
@@ -157,7 +161,7 @@ def _register() -> None:
             task_id=task,
             env_cfg=env_cfg(phase=begun),
             play_env_cfg=play,
-            rl_cfg=rl_cfg(jump=begun.jump),
+            rl_cfg=rl_cfg(jump=begun.jump, entropy=begun.entropy),
             runner_cls=PronkRunner,
         )
 

@@ -1,0 +1,95 @@
+"""The phases: what the paper says of them, and that a living environment enters them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pronk.errors import PronkError
+
+pytest.importorskip("mjlab")
+pytestmark = pytest.mark.train
+
+import small_env  # noqa: E402
+from pronk.train.commands import NAME, motion_command  # noqa: E402
+from pronk.train.phases import (  # noqa: E402
+    PHASES,
+    Phase,
+    configure_phase,
+    enter_phase,
+    phase,
+    with_iterations,
+)
+from pronk.train.reward_sum import NAME as TABLE  # noqa: E402
+from pronk.train.reward_sum import reward_sum  # noqa: E402
+from pronk.train.reward_table import ROWS  # noqa: E402
+from pronk.train.settings import PHASES_OF  # noqa: E402
+from pronk.train.tasks import env_cfg  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def env() -> Any:
+    return small_env.quiet()
+
+
+def test_phases_are_the_papers() -> None:
+    """P1 and P2: walk; jump with a strong hint; jump with a tenth of it."""
+    walk, strong, weak = PHASES
+    assert [p.jump for p in PHASES] == [False, True, True]
+    assert [p.jump_fraction for p in PHASES] == [0.0, 0.5, 0.5]
+    assert (walk.weights.dense, walk.weights.sparse) == (0.0, 0.0)
+    assert (walk.weights.rise, walk.weights.hop) == (0.0, 0.0)
+    assert weak.weights.dense == pytest.approx(strong.weights.dense / 10)
+    assert weak.weights.sparse == strong.weights.sparse > 0.0
+    assert strong.weights.width == 1.0, "the paper's expression"
+    assert weak.weights.width < strong.weights.width
+
+
+def test_tasks_are_made_of_phases() -> None:
+    assert PHASES_OF["all"] == tuple(p.name for p in PHASES)
+    assert {name for names in PHASES_OF.values() for name in names} == {p.name for p in PHASES}
+
+
+def test_phase_by_name() -> None:
+    assert [phase(p.name) for p in PHASES] == list(PHASES)
+    with pytest.raises(PronkError, match="no phase 'fly'; the phases are walk, jump_a, jump_b"):
+        phase("fly")
+
+
+def test_other_numbers_of_iterations() -> None:
+    changed = with_iterations({"jump_a": 7})
+    assert [p.iterations for p in changed] == [PHASES[0].iterations, 7, PHASES[2].iterations]
+    assert [p.weights for p in changed] == [p.weights for p in PHASES]
+    assert with_iterations({}) == PHASES
+    with pytest.raises(PronkError, match="no phase 'trot'"):
+        with_iterations({"trot": 3})
+    with pytest.raises(PronkError, match="phase walk has 0 iterations; 1 or more"):
+        with_iterations({"walk": 0})
+
+
+def settled(phase: Phase) -> dict[str, tuple[float, float]]:
+    """Weights that a phase should have, from its own numbers."""
+    w = phase.weights
+    jump = {"dense_jump": -w.dense, "sparse_jump": w.sparse, "rise": w.rise, "hop": -w.hop}
+    return {name: (row.walk, jump.get(name, row.jump)) for name, row in ROWS.items()}
+
+
+def test_a_phase_is_the_same_configured_or_entered(env: Any) -> None:
+    for entered in (*PHASES, *reversed(PHASES)):  # onwards and back again
+        enter_phase(env, entered)
+        cfg = env_cfg(num_envs=2)
+        configure_phase(cfg, entered)
+        command = motion_command(env)
+        configured = cfg.commands[NAME]
+        assert command.cfg.jump_fraction == configured.jump_fraction == entered.jump_fraction
+        assert command.tracker.width == configured.width == entered.weights.width
+        for rows in (reward_sum(env).rows, cfg.rewards[TABLE].params["rows"]):
+            found = {name: (row.walk, row.jump) for name, row in rows.items()}
+            assert found == settled(entered)
+
+
+def test_environment_of_a_phase_begins_in_it() -> None:
+    for begun in PHASES:
+        rows = env_cfg(phase=begun, num_envs=2).rewards[TABLE].params["rows"]
+        assert {name: (row.walk, row.jump) for name, row in rows.items()} == settled(begun)

@@ -1,0 +1,185 @@
+"""The tasks: known to mjlab, in the robot's order, and standing on firm ground."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mjlab")
+pytestmark = pytest.mark.train
+
+import torch  # noqa: E402
+from mjlab.scripts.list_envs import list_environments  # noqa: E402
+from mjlab.tasks.registry import (  # noqa: E402
+    list_tasks,
+    load_env_cfg,
+    load_rl_cfg,
+    load_runner_cls,
+)
+
+import small_env  # noqa: E402
+from pronk.robots import load_robot  # noqa: E402
+from pronk.robots.mini_cheetah import constants as c  # noqa: E402
+from pronk.train.commands import NAME, motion_command  # noqa: E402
+from pronk.train.phases import phase  # noqa: E402
+from pronk.train.runner import PronkRunner  # noqa: E402
+from pronk.train.tasks import ACTION_SCALE, JUMP_TASK, WALK_TASK, env_cfg  # noqa: E402
+
+N = small_env.ROBOTS
+ROBOT = load_robot("mini_cheetah")
+TASKS = ["Pronk-Jump-MiniCheetah", "Pronk-Walk-MiniCheetah"]
+
+
+@pytest.fixture(scope="module")
+def built() -> Any:
+    return small_env.quiet()
+
+
+@pytest.fixture
+def env(built: Any) -> Any:
+    small_env.fresh(built)
+    motion_command(built).scripted = True
+    return built
+
+
+# --- Known to mjlab -------------------------------------------------------------------------------
+
+
+def test_entry_point_leads_to_the_tasks() -> None:
+    found = {point.name: point.value for point in entry_points(group="mjlab.tasks")}
+    assert found["pronk"] == "pronk.train.tasks"
+
+
+def test_mjlabs_list_shows_the_tasks(capsys: pytest.CaptureFixture[str]) -> None:
+    assert sorted(TASKS) == sorted([WALK_TASK, JUMP_TASK])
+    assert set(TASKS) <= set(list_tasks())
+    assert list_environments("Pronk") == 2
+    printed = capsys.readouterr().out
+    assert all(task in printed for task in TASKS)
+
+
+def test_tasks_are_known_whatever_is_imported_first() -> None:
+    """mjlab loads the entry point while it is itself imported: here by a module of ours."""
+    code = (
+        "import pronk.train.commands; from mjlab.tasks.registry import list_tasks;"
+        "print(*list_tasks())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"MJLAB_WARP_QUIET": "1"},
+    )
+    assert "Failed to load task package" not in done.stderr
+    assert set(TASKS) <= set(done.stdout.split())
+
+
+@pytest.mark.parametrize(("task", "jump"), [(WALK_TASK, False), (JUMP_TASK, True)])
+def test_tasks_load(task: str, jump: bool) -> None:
+    cfg, learning = load_env_cfg(task), load_rl_cfg(task)
+    assert cfg.scene.num_envs == 4096
+    assert cfg.commands[NAME].jump_fraction == (0.5 if jump else 0.0)
+    assert ("jump" in learning.obs_groups["actor"]) == jump
+    assert ("critic_jump" in learning.obs_groups["critic"]) == jump
+    assert load_runner_cls(task) is PronkRunner
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_playing_is_of_the_nominal_robot_undisturbed(task: str) -> None:
+    cfg = load_env_cfg(task, play=True)
+    assert cfg.scene.num_envs == 1
+    noise = [term.noise for term in cfg.observations["measured"].terms.values()]
+    assert noise == [None] * len(noise)
+    assert set(cfg.events) == {"start"}
+    assert cfg.terminations["time_out"].params["steps"] > 10**6
+
+
+def test_physics_is_that_of_the_match() -> None:
+    cfg = env_cfg(num_envs=2)
+    assert cfg.decimation == ROBOT.decimation == 4
+    assert cfg.sim.mujoco.timestep == ROBOT.timestep_s == 0.005
+    assert cfg.sim.mujoco.integrator == "implicitfast"
+
+
+def test_phases_differ_in_commands_and_rewards_alone() -> None:
+    one, other = env_cfg(num_envs=2), env_cfg(num_envs=2, phase=phase("jump_b"))
+    for part in ("observations", "actions", "events", "terminations", "decimation"):
+        assert str(getattr(one, part)) == str(getattr(other, part))
+
+
+# --- In the robot's order -------------------------------------------------------------------------
+
+
+def test_actuators_are_in_the_robots_order_of_joints(env: Any) -> None:
+    """Torques and targets are read by index: FR, FL, HR, HL; hip_roll, hip_pitch, knee."""
+    model = env.sim.mj_model
+    names = [f"robot/{name}" for name in ROBOT.joint_names]
+    driven = [model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu)]
+    assert driven == names
+    assert [model.joint(1 + i).name for i in range(12)] == names
+    assert list(env.scene["robot"].joint_names) == list(ROBOT.joint_names)
+    assert model.jnt_dofadr[1:].tolist() == list(range(6, 18))
+    np.testing.assert_array_equal(model.actuator_gear[:, 0], 1.0)
+    feet = [f"robot/{leg}_foot" for leg in ("FR", "FL", "HR", "HL")]
+    assert [model.site(int(i)).name for i in motion_command(env).feet] == feet
+
+
+def test_an_action_moves_its_own_joint(env: Any) -> None:
+    """Robot i moves joint i by .35 rad, in the air, and hardly any other."""
+    env.sim.data.qpos[:, 2] = 2.0
+    command = motion_command(env)
+    env.sim.data.qpos[:, 7:] = command.default_position
+    action = torch.eye(12)[:N]
+    for _ in range(4):
+        env.step(action)
+    expected = command.default_position + ACTION_SCALE * action
+    assert torch.equal(command.position_target, expected)
+    moved = env.sim.data.qpos[:, 7:] - command.default_position
+    assert moved.abs().argmax(dim=1).tolist() == list(range(N))
+    assert (moved.diagonal() > 0.2).all()
+
+
+# --- On firm ground -------------------------------------------------------------------------------
+
+
+def test_zero_action_stays_up_and_feet_do_not_sink() -> None:
+    """On feet of friction 3.0, the most that D2 draws.
+
+    With a pyramidal cone the floor was so soft at that friction that feet sank 2 cm.
+    """
+    env = small_env.fresh(small_env.noisy())
+    motion_command(env).scripted = True
+    assert env.sim.model.geom_friction.amax() == pytest.approx(small_env.GRIP)
+    feet = motion_command(env).feet
+    lowest = []
+    for _ in range(60):
+        _, _, terminated, truncated, _ = env.step(torch.zeros(N, 12))
+        assert not (terminated | truncated).any()
+        lowest.append(float(env.sim.data.site_xpos[:, feet, 2].min()) - c.FOOT_RADIUS)
+    # An episode may begin with feet in the floor, or in the air.
+    assert min(lowest[20:]) > -0.006
+    assert min(lowest) > -0.02
+    assert (env.sim.data.qpos[:, 2] > 0.2).all()
+    upright = 1.0 - 2.0 * env.sim.data.qpos[:, 4:6].square().sum(dim=1)
+    assert (upright > 0.9).all()
+
+
+def test_there_is_room_for_all_contacts_that_can_be(env: Any) -> None:
+    """A robot pressed into the floor touches it with everything it has."""
+    env.sim.data.qpos[:, 2] = -0.03
+    env.sim.data.qpos[:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    env.sim.forward()
+    data = env.sim.wp_data
+    # Four feet, two ends of eight capsules, four corners of the trunk.
+    assert int(data.nacon.numpy()[0]) == N * 24
+    assert env.cfg.sim.nconmax >= 24
+    # Three rows a contact; dry friction and a limit for each joint.
+    assert int(data.nefc.numpy().max()) == 24 * 3 + 12
+    assert env.cfg.sim.njmax >= 24 * 3 + 12 + 12
