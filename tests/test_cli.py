@@ -18,7 +18,18 @@ from pronk import cli
 from pronk.errors import PronkError
 from pronk.sweep.readers import find_logs
 
-COMMANDS = ("sweep", "response", "match", "predict", "export", "report", "bench", "demo")
+COMMANDS = (
+    "sweep",
+    "response",
+    "match",
+    "predict",
+    "train",
+    "evaluate",
+    "export",
+    "report",
+    "bench",
+    "demo",
+)
 
 
 def refused(capsys, *arguments: str | Path) -> str:

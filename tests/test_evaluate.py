@@ -73,7 +73,8 @@ def jump(name: str, **changes: Any) -> JumpResult:
         delay=spread(0.2),
         duration=spread(0.5),
         flights=spread(1.0),
-        long_flights=spread(1.0),
+        long_flights=spread(2.4),
+        high_flights=spread(1.0),
         unasked=NO_FLIGHT,
     )
     return replace(good, **changes)
@@ -133,7 +134,7 @@ def test_what_is_only_reported_fails_nothing() -> None:
         ({"height": spread(0.5, math.nan)}, "std of height"),
         ({"distance": spread(0.69)}, "distance"),
         ({"upright": 0.989}, "upright"),
-        ({"single": 0.94}, "one flight"),
+        ({"single": 0.94}, "one high flight"),
         ({"vertical": spread(2.81)}, "lift-off velocity off 2.5"),
         ({"vertical": spread(2.19)}, "lift-off velocity off 2.5"),
         ({"delay": replace(spread(0.2), p95=0.31)}, "lift-off after, 95th percentile"),
@@ -271,7 +272,15 @@ def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
     rng = np.random.default_rng(8)
     count, length = 300, 360
     rules = JumpRules(
-        flight_s=0.015, long_s=0.04, search_s=0.5, tail_s=0.1, upright_s=0.3, grace_s=0.2
+        flight_s=0.015,
+        long_s=0.04,
+        search_s=0.5,
+        tail_s=0.1,
+        upright_s=0.3,
+        grace_s=0.2,
+        # Of heights that walk at random about zero, some are over it and some not.
+        standing_height=0.02,
+        rise=0.03,
     )
     state = np.zeros((length, count, 13), np.float32)
     state[..., 0:3] = rng.normal(size=(length, count, 3)).cumsum(axis=0) * 0.02
@@ -298,7 +307,7 @@ def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
         recorder.add(torch.tensor(state[k]), torch.tensor(airborne[k]), alive)
     got = recorder.figures(command)
 
-    seen = {"jumped": 0, "hopped": 0, "upright": 0, "nothing": 0}
+    seen = {"jumped": 0, "hopped": 0, "both": 0, "ran": 0, "upright": 0, "nothing": 0}
     for i in range(count):
         life = slice(0, end[i])
         whole = Series(
@@ -313,12 +322,14 @@ def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
         unasked = unasked_height(whole, told_at, rules)
         assert got["unasked"][i] == pytest.approx(unasked, abs=1e-6, nan_ok=True)
         if expected is None:
-            expected = Jump(flights=0, long_flights=0, height=math.nan)
+            expected = Jump(flights=0, long_flights=0, high_flights=0, height=math.nan)
             seen["nothing"] += 1
         for name, value in vars(expected).items():
             assert got[name][i] == pytest.approx(float(value), abs=1e-5, nan_ok=True), (i, name)
         seen["jumped"] += expected.found
-        seen["hopped"] += expected.long_flights > 2
+        seen["hopped"] += expected.high_flights > 2
+        seen["both"] += expected.long_flights > expected.high_flights > 0
+        seen["ran"] += expected.long_flights > 0 and not expected.found
         seen["upright"] += expected.upright
     assert min(seen.values()) > 15, seen
 
@@ -488,10 +499,10 @@ def test_contacts_belong_to_the_positions_they_are_paired_with(seen: Seen) -> No
     z = seen.state[:, 0, 2]
     landing = int(np.argmin(seen.airborne[:, 0]))
     samples = np.arange(landing)
-    fall = SHORT.standing_height + DROP - 0.5 * 9.81 * DT**2 * samples * (samples + 1)
+    fall = SHORT.rules.standing_height + DROP - 0.5 * 9.81 * DT**2 * samples * (samples + 1)
     assert z[:landing] == pytest.approx(fall, abs=1e-4)
     assert z[landing - 1] - z[landing] == pytest.approx(0.012, abs=1e-3)
-    assert z[landing] <= SHORT.standing_height < z[landing - 1]
+    assert z[landing] <= SHORT.rules.standing_height < z[landing - 1]
 
 
 @pytest.mark.train
@@ -521,7 +532,7 @@ def test_a_run_says_what_the_definitions_say(seen: Seen) -> None:
             dt=DT,
         )
         assert unasked_height(whole, first.get(i), rules) == pytest.approx(
-            SHORT.standing_height + DROP, abs=2e-3
+            SHORT.rules.standing_height + DROP, abs=2e-3
         )
         if i == 4:
             jump = measure(whole, first[i], SHORT.commands()[i], rules)
@@ -734,6 +745,26 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
     assert found.about["gains"] == {"name": "naive", "sha256": "", "virtual": False}
     assert found.about["device"]["device"] == "cpu"
     assert found.about["versions"]["mjlab"]
+
+
+@pytest.mark.train
+def test_one_robot_is_measured_many_times_with_noise_alone() -> None:
+    pytest.importorskip("mjlab")
+    from pronk.commands.evaluate import Drawn
+    from pronk.robots import load_robot
+    from pronk.train.evaluate_run import RANDOMIZATIONS
+    from pronk.train.gains import training_gains
+    from pronk.train.randomization import delay_steps, events, noise
+
+    assert {drawn.value for drawn in Drawn} == set(RANDOMIZATIONS)
+    full, alone, none = (RANDOMIZATIONS[name] for name in ("full", "noise", "none"))
+    robot = load_robot("mini_cheetah")
+    gains = training_gains("naive", robot)
+    assert noise(alone) == noise(full)
+    assert delay_steps(robot, gains, alone) == delay_steps(robot, gains, full)
+    # Of all that can be drawn, bodies, gains and pushes are not.
+    assert list(events(robot, gains, alone)) == ["decimation"]
+    assert events(robot, gains, none) == {}
 
 
 @pytest.mark.train

@@ -26,7 +26,9 @@ from pronk.train.jump_metrics import (
 DT = 0.005
 G = 9.81
 STAND = 0.3
-RULES = JumpRules()
+RULES = JumpRules(standing_height=STAND)
+ANY = replace(RULES, rise=1e-9)
+"""Rules by which every long flight is a high one."""
 COMMAND = (1.0, 0.0)
 
 
@@ -39,6 +41,11 @@ def hop(samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     time = DT * np.arange(1, samples + 1)
     speed = 0.5 * G * DT * (samples + 1)
     return STAND + speed * time - 0.5 * G * time**2, speed - G * time, np.zeros(samples, bool)
+
+
+def leap_height(samples: int) -> float:
+    """Rise of `hop` at its highest sample; one lies at the apex if `samples` is odd."""
+    return float(hop(samples)[0].max()) - STAND
 
 
 def series(
@@ -79,7 +86,7 @@ def test_a_ballistic_jump_has_the_figures_of_the_parabola() -> None:
     speed = 0.5 * G * flight
     found = jump_of(series(ground(wait), hop(air), ground(500), forward=2.0), on)
     assert found.found
-    assert (found.flights, found.long_flights) == (1, 1)
+    assert (found.flights, found.long_flights, found.high_flights) == (1, 1, 1)
     assert found.height == pytest.approx(speed**2 / (2.0 * G), abs=1e-9)
     assert found.apex == pytest.approx(STAND + speed**2 / (2.0 * G), abs=1e-9)
     assert found.delay == pytest.approx((wait - on) * DT)
@@ -111,7 +118,7 @@ def test_distance_along_the_command_is_signed_and_turns_with_the_trunk() -> None
 def test_two_hops_are_two_and_the_longer_is_the_jump() -> None:
     whole = series(ground(100), hop(40), ground(20), hop(60), ground(500), forward=1.0)
     found = jump_of(whole, 90)
-    assert (found.flights, found.long_flights) == (2, 2)
+    assert (found.flights, found.long_flights, found.high_flights) == (2, 2, 2)
     assert found.delay == pytest.approx((100 + 40 + 20 - 90) * DT)
     assert found.distance == pytest.approx(60 * DT)
     # Of equal ones it is the first.
@@ -121,14 +128,39 @@ def test_two_hops_are_two_and_the_longer_is_the_jump() -> None:
 
 def test_chatter_is_no_flight_and_a_short_flight_no_jump() -> None:
     chatter = series(ground(100), hop(2), ground(3), hop(2), ground(500))
-    assert jump_of(chatter, 90) == Jump(
-        flights=0, long_flights=0, height=pytest.approx(0.5 * G * (1.5 * DT) ** 2, abs=2e-4)
-    )
-    short = jump_of(series(ground(100), hop(3), ground(3), hop(11), ground(500)), 90)
+    height = pytest.approx(0.5 * G * (1.5 * DT) ** 2, abs=2e-4)
+    nothing = Jump(flights=0, long_flights=0, high_flights=0, height=height)
+    assert jump_of(chatter, 90, ANY) == nothing
+    short = jump_of(series(ground(100), hop(3), ground(3), hop(11), ground(500)), 90, ANY)
     assert (short.flights, short.long_flights, short.found) == (2, 0, False)
     assert math.isnan(short.distance)
     assert not short.upright
-    assert jump_of(series(ground(100), hop(12), ground(500)), 90).found
+    assert jump_of(series(ground(100), hop(12), ground(500)), 90, ANY).found
+
+
+def test_a_flight_of_the_gait_is_no_jump() -> None:
+    """A run rises (g / 2) (13 DT / 2)^2 = 5 mm over standing height in 60 ms; a jump far more."""
+    run, leap = hop(12), hop(60)
+    stride = (run, ground(12))
+    running = jump_of(series(ground(100), *stride, *stride, *stride, ground(500)), 90)
+    assert (running.long_flights, running.high_flights, running.found) == (3, 0, False)
+    assert running.height == pytest.approx(leap_height(12), abs=1e-9)
+    assert math.isnan(running.apex)
+    found = jump_of(series(ground(100), *stride, leap, ground(20), *stride, ground(500)), 90)
+    assert (found.flights, found.long_flights, found.high_flights) == (3, 3, 1)
+    assert found.delay == pytest.approx((100 + 24 - 90) * DT)
+    # A long flight with bent legs, under standing height, is not the main one.
+    low = (hop(40)[0] - 0.1, *hop(40)[1:])
+    found = jump_of(series(ground(100), low, ground(12), hop(36), ground(500)), 90)
+    assert (found.long_flights, found.high_flights) == (2, 1)
+    assert found.duration == pytest.approx(36 * DT)
+
+
+def test_a_high_flight_is_more_than_3_cm_over_standing_height() -> None:
+    for excess, count in ((1e-4, 1), (-1e-4, 0)):
+        z, vz, touching = hop(12)
+        lifted = z + (STAND + 0.03 + excess - z.max()), vz, touching
+        assert jump_of(series(ground(100), lifted, ground(500)), 90).high_flights == count
 
 
 def test_height_takes_in_the_crouch_before_and_what_comes_soon_after() -> None:
@@ -156,7 +188,7 @@ def test_a_jump_must_answer_its_command() -> None:
     whole = series(ground(150), hop(80), ground(700))
     assert jump_of(whole, 150).found
     assert not jump_of(whole, 151).found
-    search = JumpRules(search_s=0.25)
+    search = replace(RULES, search_s=0.25)
     assert jump_of(whole, 100, search).found
     assert not jump_of(whole, 99, search).found
 

@@ -35,6 +35,7 @@ class Step:
     air: bool = False
     height: float = 0.3
     speed: float = 0.0
+    miss: float = 0.0
 
 
 def script(jump: str, air: str, speed: dict[int, float] | None = None) -> list[Step]:
@@ -62,7 +63,7 @@ def play(
             contact=foot,
             height=torch.tensor([step.height for step in steps]),
             vertical=torch.tensor([step.speed for step in steps]),
-            miss=torch.zeros(len(steps)),
+            miss=torch.tensor([step.miss for step in steps]),
             dt=DT,
         )
         for name in TRACES:
@@ -99,6 +100,19 @@ def test_kernel_of_the_lift_off_velocity(speed: float, width: float, worth: floa
     """exp(-(v - 2.5)^2 / (2 width^2)): one width off is worth exp(-1/2)."""
     seen = alone(script("0111", "0001", {3: speed}), width=width)
     assert seen["gain"] == pytest.approx([0, 0, 0, worth], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("miss", "width", "worth"), [(0.0, 0.3, 1.0), (0.3, 0.3, 0.803265), (1.0, 0.1, 0.5)]
+)
+def test_half_the_worth_is_for_going_where_the_command_says(
+    miss: float, width: float, worth: float
+) -> None:
+    """1/2 + exp(-miss^2 / (2 width^2)) / 2: one width off costs half of 1 - exp(-1/2)."""
+    before = script("011", "000")
+    liftoff = Step(jump=True, air=True, speed=2.5, miss=miss)
+    seen = alone([*before, liftoff], width=width)
+    assert seen["gain"][-1] == pytest.approx(worth, rel=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,8 @@ def test_mjlabs_list_shows_the_tasks(capsys: pytest.CaptureFixture[str]) -> None
 def test_tasks_are_known_whatever_is_imported_first() -> None:
     """mjlab loads the entry point while it is itself imported: here by a module of ours."""
     code = (
-        "import pronk.train.commands; from mjlab.tasks.registry import list_tasks;"
+        "import pronk.train.commands, pronk.train.tasks\n"
+        "from mjlab.tasks.registry import list_tasks\n"
         "print(*list_tasks())"
     )
     done = subprocess.run(

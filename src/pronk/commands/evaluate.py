@@ -34,6 +34,7 @@ class Drawn(StrEnum):
     """What differs from robot to robot."""
 
     FULL = "full"
+    NOISE = "noise"
     NONE = "none"
 
 
@@ -69,7 +70,11 @@ def evaluate(
     ] = What.ALL,
     robots: Annotated[int, typer.Option(help="Robots for each command.")] = 1000,
     randomization: Annotated[
-        Drawn, typer.Option(help="full: as in training. none: the nominal robot, undisturbed.")
+        Drawn,
+        typer.Option(
+            help="full: as in training. noise: one nominal robot many times, with noise, timing "
+            "and delay as in training. none: the nominal robot, undisturbed."
+        ),
     ] = Drawn.FULL,
     before: Annotated[
         Path | None,
@@ -135,17 +140,17 @@ def run(
         gains: Of the simulated drives.
         plan: What is asked.
         device: `cpu` or `cuda:0`.
-        randomization: `full` or `none`.
+        randomization: One of `evaluate_run.RANDOMIZATIONS`.
         before: Speed errors to compare with; empty for none.
     """
     from mjlab.envs import ManagerBasedRlEnv
 
     from pronk.train.evaluate import evaluate_policy, evaluation_cfg
+    from pronk.train.evaluate_run import RANDOMIZATIONS
     from pronk.train.provenance import device_facts, versions
-    from pronk.train.randomization import Randomization
     from pronk.train.tasks import env_cfg
 
-    drawn = Randomization.paper() if randomization == "full" else Randomization.none()
+    drawn = RANDOMIZATIONS[randomization]
     # mjlab and Warp tell standard output all about themselves.
     with console.progress() as report, redirect_stdout(io.StringIO()):
         report("building", 0.0)
@@ -246,6 +251,7 @@ def show_jumps(evaluation: Evaluation) -> None:
         "after [s]",
         "flights",
         "of 60 ms or more",
+        "high ones",
         "one [%]",
         "jumped [%]",
         "upright [%]",
@@ -261,6 +267,7 @@ def show_jumps(evaluation: Evaluation) -> None:
             spread(jump.delay),
             console.number(jump.flights.mean),
             console.number(jump.long_flights.mean),
+            console.number(jump.high_flights.mean),
             percent(jump.single),
             percent(jump.found),
             percent(jump.upright),

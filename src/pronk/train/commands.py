@@ -217,6 +217,9 @@ class MotionCommand(CommandTerm):
 
     def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
         """Let time pass; draw anew where it has run out."""
+        # Rewards have read the feet before `forward`, and mjlab keeps what was read until a robot
+        # resets; what is observed after this shall be of now.
+        self._env.scene["feet"].update(0.0)
         if self.scripted or env_ids is not None:
             return
         self.time_left -= dt

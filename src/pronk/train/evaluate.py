@@ -50,6 +50,7 @@ _SPREADS = (
     "duration",
     "flights",
     "long_flights",
+    "high_flights",
 )
 """Figures of a jump that are given as they are."""
 
@@ -139,8 +140,8 @@ def _walk(
 def _jump(
     name: str, command: tuple[float, float, float], figures: Figures, plan: Plan
 ) -> JumpResult:
-    told, found = figures["told"], figures["long_flights"] > 0
-    single = figures["long_flights"][told] == 1
+    told, found = figures["told"], figures["high_flights"] > 0
+    single = figures["high_flights"][told] == 1
     kept = {key: np.where(told, figures[key], math.nan) for key in _SPREADS}
     return JumpResult(
         name=name,
@@ -151,14 +152,14 @@ def _jump(
         upright=float((found & (figures["upright"] > 0.0)).mean()),
         non_finite=float(figures["non_finite"].mean()),
         single=float(single.mean()) if told.any() else 0.0,
-        apex=Spread.of(figures["apex"] - plan.standing_height),
+        apex=Spread.of(figures["apex"] - plan.rules.standing_height),
         unasked=_unasked(figures["unasked"], plan),
         **{key: Spread.of(values) for key, values in kept.items()},
     )
 
 
 def _unasked(highest: NDArray[Any], plan: Plan) -> Unasked:
-    over = highest[np.isfinite(highest)] - plan.standing_height
+    over = highest[np.isfinite(highest)] - plan.rules.standing_height
     return Unasked(
         share=len(over) / len(highest),
         highest=float(over.max()) if len(over) else math.nan,

@@ -33,7 +33,7 @@ class FlightRecorder:
         Args:
             count: Robots.
             device: Where they are.
-            rules: Times of the definitions.
+            rules: Of the definitions.
             dt: Time between samples [s].
         """
         self.rules, self.dt = rules, dt
@@ -70,6 +70,7 @@ class FlightRecorder:
         # All of the jump.
         self._flights = whole()
         self._long_flights = whole()
+        self._high_flights = whole()
         self._top = number(-torch.inf)
         self._low = number(torch.inf)
         self._deadline = whole(NEVER)
@@ -127,7 +128,9 @@ class FlightRecorder:
         long = own & (self._run >= self._long)
         self._flights += own
         self._long_flights += long
-        main = long & (self._run > self._main)
+        high = long & (self._peak > self.rules.high)
+        self._high_flights += high
+        main = high & (self._run > self._main)
         self._main = torch.where(main, self._run, self._main)
         self._main_up = torch.where(main[:, None], self._up, self._main_up)
         self._main_up_at = torch.where(main, self._up_at, self._main_up_at)
@@ -170,6 +173,7 @@ class FlightRecorder:
         return {name: np.where(found, value, np.nan) for name, value in jump.items()} | {
             "flights": plain(self._flights),
             "long_flights": plain(self._long_flights),
+            "high_flights": plain(self._high_flights),
             "height": plain(self._height),
             "upright": (plain(self._cosine) >= self.rules.upright_cosine).astype(float),
             "unasked": np.where(np.isfinite(unasked), unasked, np.nan),

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.robots.mini_cheetah.model import standing_height
 from pronk.train.jump_metrics import JumpRules, steps
 
 NEVER = 2**30
@@ -79,8 +78,6 @@ class Plan:
     """Length of the jump input [s]."""
     keep_s: float = 0.5
     """From its end to the command to stop [s]."""
-    standing_height: float = field(default_factory=standing_height)
-    """Of the trunk, in the default pose [m]."""
     rules: JumpRules = field(default_factory=JumpRules)
 
     def __post_init__(self) -> None:
@@ -93,7 +90,7 @@ class Plan:
             raise PronkError(f"{self.robots} robots for each command; expected 1 or more.")
         if not self.walks and not self.jumps:
             raise PronkError("the evaluation has neither walks nor jumps; it needs one of them.")
-        for name in ("walk_s", "average_s", "run_s", "jump_s", "standing_height"):
+        for name in ("walk_s", "average_s", "run_s", "jump_s"):
             if not getattr(self, name) > 0.0:
                 raise PronkError(f"Plan.{name} is {getattr(self, name)}; it must be positive.")
         for name in ("settle_s", "stand_s", "spread_s", "keep_s"):

@@ -103,7 +103,7 @@ class JumpResult:
     non_finite: float
     """Share of the robots whose physics went wrong."""
     single: float
-    """Share of those told that made exactly one long flight."""
+    """Share of those told that made exactly one high flight."""
     height: Spread
     apex: Spread
     """Over standing height [m]."""
@@ -114,8 +114,10 @@ class JumpResult:
     delay: Spread
     duration: Spread
     flights: Spread
-    """Flight phases for each jump input."""
+    """Flight phases for each jump input, those of the gait among them."""
     long_flights: Spread
+    high_flights: Spread
+    """What is counted as jumps."""
     unasked: Unasked
 
 

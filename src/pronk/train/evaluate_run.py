@@ -7,7 +7,8 @@ until its contacts are known.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Self
 
 import torch
@@ -22,6 +23,7 @@ from pronk.train.evaluate_flight import FlightRecorder
 from pronk.train.evaluate_plan import NEVER, Plan
 from pronk.train.evaluate_walk import EstimatorRecorder, SpeedRecorder
 from pronk.train.jump_metrics import steps
+from pronk.train.randomization import Randomization
 
 Policy = Callable[[TensorDict], Tensor]
 """Observation groups to actions (N, 12)."""
@@ -30,6 +32,25 @@ Estimate = Callable[[TensorDict], tuple[Tensor, Tensor]]
 
 TERM = "evaluation"
 """The metrics term's name."""
+
+_PAPER = Randomization.paper()
+RANDOMIZATIONS: Mapping[str, Randomization] = {
+    "full": _PAPER,
+    "noise": replace(
+        _PAPER,
+        friction=None,
+        gains="off",
+        shank_length=None,
+        base_mass=(0.0, 0.0),
+        push_velocity=0.0,
+        push_yaw_rate=0.0,
+    ),
+    "none": Randomization.none(),
+}
+"""What may differ in an evaluation. `full`: as in training, a thousand robots. `noise`: one robot a
+thousand times: the nominal body and gains, undisturbed, with noise, timing (D1) and command delay
+drawn as in training. It is the closest to the paper's figures, those of one robot measured several
+times. `none`: the nominal robot with nothing drawn but where it starts and when it is told."""
 
 
 class Ear:

@@ -132,7 +132,9 @@ class JumpTracker:
         deviation = (speed - s.liftoff_velocity).square()
         kernel = torch.exp(deviation * (-0.5 / self.width**2))
         prompt = torch.rsub(self.since, (s.prompt_s + s.late_s) / s.late_s, alpha=1.0 / s.late_s)
-        score = kernel * prompt.clamp(0.0, 1.0) * liftoff
+        # Half the worth is for going up, half for going where the command says as well.
+        aim = torch.exp(miss.square() * (-0.5 / self.width**2))
+        score = kernel * (0.5 + 0.5 * aim) * prompt.clamp(0.0, 1.0) * liftoff
         best = self.best * keep
         self.best = torch.maximum(best, score)
         self.gain = self.best - best

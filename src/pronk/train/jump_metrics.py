@@ -10,8 +10,10 @@ lift-off, d (the first sample with a foot on the ground) its touchdown, (d - l) 
 Shorter gaps are contact chatter. Sampling cuts up to one step off each end.
 
 A jump belongs to a jump input that rises at sample c. Its flights are those with
-c <= l <= c + search_s / dt. The main flight is the longest of those that last `long_s` or more, at
-equal length the first; without one there was no jump. Then
+c <= l <= c + search_s / dt. A running robot has flights too, `long_s` or longer in a fast gait, but
+they do not lift the trunk. So a flight is a high one if it lasts `long_s` or more and max z over
+its samples is more than `rise` over standing height. The main flight is the longest of the high
+ones, at equal length the first; without one there was no jump. Then
 
     height       max z - min z over samples c .. d + tail_s / dt          (paper E5)
                  (without a jump: over c .. c + search_s / dt)
@@ -30,25 +32,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
+from pronk.robots.mini_cheetah.model import standing_height
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+RISE = 0.03
+"""Over standing height; a flight whose trunk goes higher is a jump, asked for or not [m]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class JumpRules:
-    """Times that the definitions rest on [s]."""
+    """Times [s] and heights that the definitions rest on."""
 
     flight_s: float = 0.015
     """Shortest flight phase: three physics steps."""
     long_s: float = 0.06
-    """Shortest flight that can be a jump; a ballistic hop of this length rises 4 mm."""
+    """Shortest flight that is counted as a long one; a ballistic hop of this length rises 4 mm."""
     search_s: float = 1.5
     """A jump lifts off within this time after its command."""
     tail_s: float = 0.5
@@ -59,12 +65,16 @@ class JumpRules:
     """Largest tilt of an upright robot [deg]."""
     grace_s: float = 0.5
     """Time after the start in which flights are not counted: the robot is set down."""
+    standing_height: float = field(default_factory=standing_height)
+    """Of the trunk, in the default pose [m]."""
+    rise: float = RISE
+    """Over standing height, what a high flight exceeds [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse times that contradict each other.
+        """Refuse rules that contradict each other.
 
         Raises:
-            PronkError: A time is not positive, or a long flight is shorter than a flight.
+            PronkError: A number is not positive, or a long flight is shorter than a flight.
         """
         for name, value in vars(self).items():
             if not value > 0.0:
@@ -74,6 +84,11 @@ class JumpRules:
                 f"JumpRules.long_s is {self.long_s}; it must not be shorter than flight_s, "
                 f"{self.flight_s}."
             )
+
+    @property
+    def high(self) -> float:
+        """Trunk height that a high flight exceeds [m]."""
+        return self.standing_height + self.rise
 
     @property
     def upright_cosine(self) -> float:
@@ -134,6 +149,8 @@ class Jump:
     """Flight phases that belong to the jump input."""
     long_flights: int
     """Those of `long_s` or more."""
+    high_flights: int
+    """Those of them that are high."""
     height: float
     """[m]"""
     apex: float = math.nan
@@ -155,7 +172,7 @@ class Jump:
     @property
     def found(self) -> bool:
         """True if there was a jump."""
-        return self.long_flights > 0
+        return self.high_flights > 0
 
 
 def steps(seconds: float, dt: float) -> int:
@@ -226,7 +243,7 @@ def measure(series: Series, on: int, command: Sequence[float], rules: JumpRules)
         series: The robot.
         on: First sample with the jump input.
         command: Forward and left velocity command [m/s].
-        rules: Times of the definitions.
+        rules: Of the definitions.
 
     Returns:
         The jump; None if the robot fell before the command.
@@ -237,16 +254,19 @@ def measure(series: Series, on: int, command: Sequence[float], rules: JumpRules)
     phases = flights(series.contact, least=series.steps(rules.flight_s))
     own = commanded(phases, on, rules, dt)
     long = [phase for phase in own if phase.samples >= series.steps(rules.long_s)]
-    if not long:
+    high = [phase for phase in long if z[phase.liftoff : phase.touchdown].max() > rules.high]
+    if not high:
         window = z[on : on + series.steps(rules.search_s) + 1]
-        return Jump(flights=len(own), long_flights=0, height=float(np.ptp(window)))
-    main = max(long, key=lambda phase: phase.samples)
+        height = float(np.ptp(window))
+        return Jump(flights=len(own), long_flights=len(long), high_flights=0, height=height)
+    main = max(high, key=lambda phase: phase.samples)
     up, down = main.liftoff, main.touchdown
     displacement = series.position[down, :2] - series.position[up, :2]
     end = down + series.steps(rules.upright_s)
     return Jump(
         flights=len(own),
         long_flights=len(long),
+        high_flights=len(high),
         height=float(np.ptp(z[on : down + series.steps(rules.tail_s) + 1])),
         apex=float(z[up:down].max()),
         delay=(up - on) * dt,
@@ -275,7 +295,7 @@ def unasked_height(series: Series, on: int | None, rules: JumpRules) -> float:
     Args:
         series: The robot.
         on: First sample with the jump input; None for a robot that is never told to jump.
-        rules: Times of the definitions; flights that lift off within `grace_s` do not count.
+        rules: Of the definitions; flights that lift off within `grace_s` do not count.
     """
     phases = flights(series.contact, least=series.steps(rules.flight_s))
     own = commanded(phases, on, rules, series.dt)

@@ -2,7 +2,7 @@
 
 The paper's source carries a table of rewards commented out. Its numbers are read as standing
 before the scaling by the step's duration (A23) and divided by `PAPER_UNIT`, which changes no
-optimum and brings returns to the order of ten that PPO's clipped value loss is made for. What was
+optimum and brings returns to the order of ten that PPO's usual settings are made for. What was
 changed beyond that, and why, stands beside each weight.
 """
 
@@ -59,12 +59,12 @@ ROWS: Mapping[str, Row] = {
     # nothing to a robot that stands, and some runs never found out.
     "approach_linear": Row(rewards.tracking_linear, 0.75, 0.75, {"variance": 4.0}),
     "approach_angular": Row(rewards.tracking_angular, 0.5, 0.5, {"variance": 4.0}),
-    # Paper -5 | 0. Standing still, twenty times as much: the pose is all there is to do.
+    # Paper -5 | 0. Standing still, eight times as much: the pose is all there is to do.
     "posture": Row(rewards.posture, -0.25, 0.0, {"standing": 8.0}),
     # Paper -50 | 0.
     "vertical_velocity": Row(rewards.vertical_velocity, -2.5, 0.0),
     # Paper -0.2 | -0.2, which is -0.01 here: a trot changes its torques by 5 N m a step and
-    # joint and would pay three times what tracking can earn. A twentieth of it.
+    # joint and would pay 3 of the 5.5 that tracking can earn. A fiftieth, jumping a hundredth.
     "smoothness": Row(rewards.smoothness, -0.0002, -0.0001),
     # Paper -20 | -120.
     "orientation": Row(rewards.orientation, -1.0, -6.0),
@@ -82,8 +82,8 @@ ROWS: Mapping[str, Row] = {
     # Paper -500 | -500, for one step of 20 ms: -0.5. More of it, and most where there is most to
     # win by a leap that ends on the side.
     "termination": Row(rewards.termination, -2.0, -5.0),
-    # Paper -0.08 | -0.08, -0.004 here: running costs 1,000 N^2 m^2 and would pay 4 of the 3.75
-    # that tracking can earn. A tenth of it.
+    # Paper -0.08 | -0.08, -0.004 here: running costs 1,000 N^2 m^2 and would pay 4 of the 5.5
+    # that tracking can earn. A tenth of it, jumping a fortieth.
     "torque": Row(rewards.torque, -0.0004, -0.0001),
     # Table II, phase 1.
     "dense_jump": Row(rewards.dense_jump, 0.0, 0.0),
