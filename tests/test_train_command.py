@@ -260,6 +260,20 @@ def test_what_a_task_trains():
 # --- Devices -------------------------------------------------------------------------------------
 
 
+@pytest.mark.train
+def test_together_takes_as_many_steps_as_in_sequence() -> None:
+    pytest.importorskip("mjlab")
+    from pronk.train.request import Request, new_settings
+
+    asked = {
+        task: new_settings(Request(task=task, gains="naive", device="cpu"))[0]
+        for task in ("all", "together")
+    }
+    assert asked["together"].phases == ("jump_a", "jump_b")
+    assert asked["together"].total_iterations == asked["all"].total_iterations
+    assert asked["together"].iterations["jump_b"] == asked["all"].iterations["jump_b"]
+
+
 def test_gpus_are_chosen_among_the_visible_ones():
     # As CUDA_VISIBLE_DEVICES may have it: numbers out of order, or names.
     assert chosen(("3", "1"), None) == ("3",)

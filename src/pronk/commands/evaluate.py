@@ -58,7 +58,7 @@ def evaluate(
         str,
         typer.Option(help="Gains of the simulated drives: gains.yaml, or naive."),
     ],
-    out: Annotated[Path, typer.Option("--out", help="The evaluation, as JSON.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "--json", help="The evaluation, as JSON.")] = Path(
         "evaluation.json"
     ),
     like: Annotated[

@@ -28,6 +28,7 @@ class Task(StrEnum):
     WALK = "walk"
     JUMP = "jump"
     ALL = "all"
+    TOGETHER = "together"
 
 
 class Device(StrEnum):
@@ -50,7 +51,8 @@ def train(
     task: Annotated[
         Task,
         typer.Argument(
-            help="walk: phase 1. jump: widen a walking policy, then phases 2a and 2b. all: both."
+            help="walk: phase 1. jump: widen a walking policy, then phases 2a and 2b. all: both. "
+            "together: walk and jump at once from random weights, the paper's ablation."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder of the run, new or empty.")],

@@ -35,6 +35,8 @@ class Phase:
     weights: JumpWeights = _NO_JUMP
     entropy: float = 0.005
     """Coefficient of PPO's entropy bonus: how much exploring is worth."""
+    estimator_rate: float = 1e-3
+    """Learning rate of the estimator."""
 
     @property
     def jump_fraction(self) -> float:
@@ -64,6 +66,7 @@ PHASES: tuple[Phase, ...] = (
         jump=True,
         weights=JumpWeights(dense=0.002, sparse=6.0, width=0.3, rise=15.0, hop=0.5),
         entropy=0.002,
+        estimator_rate=3e-4,
     ),
 )
 """The paper's phases. Its weights are 2.5 and 0.25 for dense and 250 for sparse."""

@@ -150,6 +150,15 @@ class EstimatorPPO(PPO):
         mean_contact, mean_velocity = (total / steps).tolist()
         return {"estimator_contact": mean_contact, "estimator_velocity": mean_velocity}
 
+    def set_estimator_rate(self, rate: float) -> None:
+        """Let the estimator learn at another rate from now on.
+
+        Args:
+            rate: Learning rate of its Adam.
+        """
+        for group in self.estimator_optimizer.param_groups:
+            group["lr"] = rate
+
     def get_critic(self) -> JumpCritic:
         """The critic, uncompiled, as `get_policy` gives the actor."""
         return self._raw_critic

@@ -126,6 +126,9 @@ def new_settings(request: Request) -> tuple[TrainSettings, Devices]:
     from pronk.train.phases import PHASES
 
     defaults = {phase.name: phase.iterations for phase in PHASES}
+    if request.task == "together":
+        # As many steps in all as in sequence.
+        defaults["jump_a"] += defaults.pop("walk")
     iterations = {
         name: request.iterations.get(name, defaults[name]) for name in PHASES_OF[request.task]
     }

@@ -208,9 +208,11 @@ class _Run:
             self.env.unwrapped.common_step_counter = walked["counter/common_step_counter"]
             narrow = True
         else:
+            runner.alg.set_estimator_rate(phase.estimator_rate)
             return runner
         runner.alg.load(widen_state(state, runner.alg) if narrow else state)
         runner.alg.learning_rate = rate
+        runner.alg.set_estimator_rate(phase.estimator_rate)
         return runner
 
     def _start(self) -> Path:

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 from pronk.errors import PronkError
 
-Task = Literal["walk", "jump", "all"]
+Task = Literal["walk", "jump", "all", "together"]
 Gains = Literal["naive", "matched"]
 Device = Literal["cpu", "cuda"]
 Logger = Literal["tensorboard", "wandb", "none"]
@@ -21,6 +21,7 @@ PHASES_OF: Mapping[str, tuple[str, ...]] = {
     "walk": ("walk",),
     "jump": ("jump_a", "jump_b"),
     "all": ("walk", "jump_a", "jump_b"),
+    "together": ("jump_a", "jump_b"),
 }
 """The phases of each task, in order."""
 
@@ -30,7 +31,8 @@ class TrainSettings:
     """What is trained. Two runs with equal settings and equal machines are the same run."""
 
     task: Task
-    """`walk` is phase 1; `jump` widens a walking policy and is phases 2a and 2b; `all` is both."""
+    """`walk` is phase 1; `jump` widens a walking policy and is phases 2a and 2b; `all` is both;
+    `together` learns to walk and to jump at once, from random weights (the paper's ablation)."""
     gains: Gains
     """Nominal gains: those of the real drives as they are, or those of a `gains.yaml`."""
     gains_sha256: str = ""
