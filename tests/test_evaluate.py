@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pronk.errors import ArtefactError, PronkError
+from pronk.jumps import Jump, JumpRules, Series, measure, unasked_height
 from pronk.train import evaluate_bars, evaluate_result
 from pronk.train.evaluate_bars import Check, checks, cost_of_jumping
 from pronk.train.evaluate_plan import JUMPS, NEVER, WALKS, Case, Plan
@@ -24,7 +25,6 @@ from pronk.train.evaluate_result import (
     Unasked,
     WalkResult,
 )
-from pronk.train.jump_metrics import Jump, JumpRules, Series, measure, unasked_height
 
 DT = 0.005
 

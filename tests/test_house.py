@@ -15,6 +15,7 @@ ROOT = Path(pronk.__file__).parent
 ROOMS = (
     "robots",
     "drive",
+    "jumps",
     "hardware",
     "sweep",
     "response",

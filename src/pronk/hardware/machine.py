@@ -6,13 +6,15 @@ Times are the machine's own monotonic clock in seconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+import math
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+TorqueKind = Literal["measured", "computed", "absent"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +37,13 @@ class State:
     """Specific force of the trunk in its own frame [m/s^2], shape (3,)."""
     bus_voltage: float
     """[V]"""
+    orientation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    """Trunk to world, as the machine's own attitude filter has it, unit quaternion w, x, y, z,
+    shape (4,). Its yaw starts anywhere."""
+    robot_time: float | None = None
+    """The robot's own stamp [s], where the wire carries one."""
+    temperature: Array | None = None
+    """Of the motors [deg C], shape (joints,), where the wire carries it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +56,14 @@ class Command:
     """[N m/rad], shape (joints,)."""
     damping: Array
     """[N m s/rad], shape (joints,); the target velocity is zero (reading A9)."""
+    sequence: int = 0
+    """Counts commands; a link that puts a number on the wire uses this one."""
+    state_sequence: int = -1
+    """`State.sequence` that the command answers; -1 where it answers none."""
+    made: float = 0.0
+    """When it was decided, on the machine's clock [s]."""
+    valid_for: float = math.inf
+    """Time after `made` at which whoever writes the wire damps instead of repeating it [s]."""
 
 
 class Machine(Protocol):
@@ -56,6 +73,12 @@ class Machine(Protocol):
     """Name of the robot."""
     virtual: bool
     """True for the virtual robot."""
+
+    torque_kind: TorqueKind
+    """Whether `State.torque` was measured, computed from the command, or is absent (zeros)."""
+
+    def now(self) -> float:
+        """The machine's clock [s]."""
 
     def connect(self) -> None:
         """Open the link and check that the machine is fit to move.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.hardware.machine import Command, State
+from pronk.hardware.machine import Command, State, TorqueKind
 from pronk.hardware.plant import build_plant, legs_of
 from pronk.hardware.sensors import Raw, Sensors
 from pronk.hardware.truth import Truth
@@ -44,6 +44,7 @@ class VirtualRobot:
     """
 
     virtual = True
+    torque_kind: TorqueKind = "measured"
 
     def __init__(
         self,
@@ -133,6 +134,11 @@ class VirtualRobot:
         self._step = -round(_SETTLE_S / self._dt)
         self._open = True
         self._latest = self._run(1)[0]
+
+    def now(self) -> float:
+        """The machine's clock [s]."""
+        self._check_open()
+        return self._now
 
     def latest(self) -> State:
         """The newest state, without waiting."""

@@ -11,7 +11,7 @@ it at the end (paper N3).
 Histories run from old to new: t-0.04, t-0.02, t (positions and velocities); t-0.04, t-0.02
 (actions). The estimator reads all but the command (102, with the jump input 103: paper N1, reading
 A19); the actor reads what is current (45), behind the estimate (7): 52, with the jump input 53
-(paper N2, reading A20 of one previous action).
+(paper N2, reading A19 of one previous action).
 
 Frames and units: angular velocity [rad/s] and gravity (unit vector) in the trunk's frame (x
 forward, y left, z up), position [rad] relative to the default pose, velocity [rad/s], actions as

@@ -5,7 +5,7 @@
     evaluation = evaluate_policy(policy, env, plan, estimate=actor.estimate)
     write(Path("evaluation.json"), evaluation)
 
-What is asked is in `evaluate_plan`, what is measured in `jump_metrics` and `evaluate_walk`, what
+What is asked is in `evaluate_plan`, what is measured in `pronk.jumps` and `evaluate_walk`, what
 is good enough in `evaluate_bars`, how it runs in `evaluate_run`.
 """
 
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.jumps import steps
 from pronk.train import evaluate_result
 from pronk.train.evaluate_bars import UNASKED_HEIGHT, checks
 from pronk.train.evaluate_plan import Plan
@@ -34,7 +35,6 @@ from pronk.train.evaluate_result import (
 )
 from pronk.train.evaluate_run import Estimate, Policy, Run, evaluation_cfg
 from pronk.train.evaluate_walk import FIGURES
-from pronk.train.jump_metrics import steps
 
 __all__ = ["evaluate_policy", "evaluation_cfg", "write"]
 

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+from pronk.jumps import RISE
 from pronk.train.evaluate_result import Evaluation, JumpResult, WalkResult
-from pronk.train.jump_metrics import RISE
 
 SPEED_ERROR = 0.15
 """[m/s]"""
@@ -39,7 +39,7 @@ DISTANCE = {
 """[m]"""
 UPRIGHT = 0.99
 SINGLE = 0.95
-"""Share of the jump inputs that one high flight answers (see `jump_metrics`); the flights of the
+"""Share of the jump inputs that one high flight answers (see `pronk.jumps`); the flights of the
 gait before and after do not count."""
 LIFTOFF_VELOCITY = 2.5
 """Desired [m/s]."""

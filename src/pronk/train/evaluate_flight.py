@@ -1,7 +1,7 @@
-"""Jumps of many robots, measured while they run: `jump_metrics`, with a few numbers a robot.
+"""Jumps of many robots, measured while they run: `pronk.jumps`, with a few numbers a robot.
 
 Called at every physics step, on the device, without waiting for it: everything is a masked update
-of tensors of shape (N,) or (N, 13). The definitions are those of `pronk.train.jump_metrics`.
+of tensors of shape (N,) or (N, 13). The definitions are those of `pronk.jumps`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pronk.jumps import JumpRules, along, steps
 from pronk.train.evaluate_plan import NEVER
-from pronk.train.jump_metrics import JumpRules, along, steps
 
 STATE = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 3}
 """The trunk: position [m], quaternion w x y z and velocity [m/s] in the world's frame, angular
@@ -144,7 +144,7 @@ class FlightRecorder:
         self._unasked = torch.where(unasked, highest, self._unasked)
 
     def figures(self, command: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """The fields of `jump_metrics.Jump`, and `unasked`, its `unasked_height`; each (N,).
+        """The fields of `jumps.Jump`, and `unasked`, its `unasked_height`; each (N,).
 
         Args:
             command: Forward and left velocity command [m/s]. (N, 2)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.train.jump_metrics import JumpRules, steps
+from pronk.jumps import JumpRules, steps
 
 NEVER = 2**30
 """A sample that does not come."""

@@ -51,7 +51,7 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class Unasked:
-    """Flight phases without a jump input (see `jump_metrics.unasked_height`)."""
+    """Flight phases without a jump input (see `jumps.unasked_height`)."""
 
     share: float
     """Of the robots, with one or more."""
@@ -89,7 +89,7 @@ class WalkResult:
 
 @dataclass(frozen=True, kw_only=True)
 class JumpResult:
-    """One jump command; figures as in `jump_metrics`, one value a robot."""
+    """One jump command; figures as in `pronk.jumps`, one value a robot."""
 
     name: str
     command: tuple[float, float, float]

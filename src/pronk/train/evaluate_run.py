@@ -18,11 +18,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from pronk.errors import PronkError
+from pronk.jumps import steps
 from pronk.train.commands import motion_command
 from pronk.train.evaluate_flight import FlightRecorder
 from pronk.train.evaluate_plan import NEVER, Plan
 from pronk.train.evaluate_walk import EstimatorRecorder, SpeedRecorder
-from pronk.train.jump_metrics import steps
 from pronk.train.randomization import Randomization
 
 Policy = Callable[[TensorDict], Tensor]
