@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -72,7 +73,7 @@ def play(
     return traces
 
 
-def alone(steps: list[Step], **how: float) -> dict[str, list[float]]:
+def alone(steps: list[Step], **how: Any) -> dict[str, list[float]]:
     """The traces of a single robot."""
     return {name: trace[0] for name, trace in play([steps], **how).items()}
 
@@ -111,7 +112,8 @@ def test_half_the_worth_is_for_going_where_the_command_says(
     """1/2 + exp(-miss^2 / (2 width^2)) / 2: one width off costs half of 1 - exp(-1/2)."""
     before = script("011", "000")
     liftoff = Step(jump=True, air=True, speed=2.5, miss=miss)
-    seen = alone([*before, liftoff], width=width)
+    tracker = JumpTracker(1, "cpu", replace(SETTINGS, aim_width=width), 0.7)
+    seen = alone([*before, liftoff], tracker=tracker)
     assert seen["gain"][-1] == pytest.approx(worth, rel=1e-5)
 
 

@@ -27,7 +27,7 @@ def posed(model: mujoco.MjModel) -> mujoco.MjData:
 
 
 def test_unknown_robot_names_the_known_ones() -> None:
-    with pytest.raises(RobotError, match=r"'go1'.*mini_cheetah, so101"):
+    with pytest.raises(RobotError, match=r"'go1'.*mini_cheetah, go2, so101"):
         load_robot("go1")
 
 

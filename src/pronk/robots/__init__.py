@@ -8,7 +8,7 @@ from __future__ import annotations
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, Joint, Robot
 
-ROBOT_NAMES: tuple[str, ...] = ("mini_cheetah", "so101")
+ROBOT_NAMES: tuple[str, ...] = ("mini_cheetah", "go2", "so101")
 """The robots that `load_robot` knows."""
 
 
@@ -22,6 +22,10 @@ def load_robot(name: str) -> Robot:
         from pronk.robots.mini_cheetah import MINI_CHEETAH
 
         return MINI_CHEETAH
+    if name == "go2":
+        from pronk.robots.go2 import GO2
+
+        return GO2
     if name == "so101":
         from pronk.robots.so101 import SO101
 

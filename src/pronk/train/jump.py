@@ -33,13 +33,16 @@ class JumpSettings:
     """Beyond that its worth falls linearly to zero over this time [s]."""
     settle_s: float = 0.3
     """Time on the ground after which jump mode ends [s]."""
+    aim_width: float = 0.5
+    """Standard deviation of the kernel that asks where the jump goes [m/s]: a running robot has a
+    tenth of a second to speed up, so a kernel as narrow as that of the lift-off says nothing."""
     apex: float = 0.68
     """Trunk height up to which rising is rewarded [m]: a lift-off with straight legs (.33 m) at
     the desired velocity reaches .65 m."""
 
     def __post_init__(self) -> None:
         """Refuse widths and times that are not positive."""
-        for name in ("liftoff_velocity", "prompt_s", "late_s", "settle_s", "apex"):
+        for name in ("liftoff_velocity", "prompt_s", "late_s", "settle_s", "aim_width", "apex"):
             if not getattr(self, name) > 0.0:
                 raise PronkError(f"JumpSettings.{name} is {getattr(self, name)}, not positive.")
 
@@ -133,7 +136,7 @@ class JumpTracker:
         kernel = torch.exp(deviation * (-0.5 / self.width**2))
         prompt = torch.rsub(self.since, (s.prompt_s + s.late_s) / s.late_s, alpha=1.0 / s.late_s)
         # Half the worth is for going up, half for going where the command says as well.
-        aim = torch.exp(miss.square() * (-0.5 / self.width**2))
+        aim = torch.exp(miss.square() * (-0.5 / s.aim_width**2))
         score = kernel * (0.5 + 0.5 * aim) * prompt.clamp(0.0, 1.0) * liftoff
         best = self.best * keep
         self.best = torch.maximum(best, score)

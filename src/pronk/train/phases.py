@@ -54,17 +54,17 @@ PHASES: tuple[Phase, ...] = (
     # Jumping has to be found.
     Phase(
         name="jump_a",
-        iterations=300,
+        iterations=310,
         jump=True,
-        weights=JumpWeights(dense=0.02, sparse=6.0, width=1.0, rise=15.0, hop=0.0),
+        weights=JumpWeights(dense=0.02, sparse=8.0, width=1.0, rise=20.0, hop=0.0),
         entropy=0.01,
     ),
     # And then done alike every time.
     Phase(
         name="jump_b",
-        iterations=600,
+        iterations=640,
         jump=True,
-        weights=JumpWeights(dense=0.002, sparse=6.0, width=0.3, rise=15.0, hop=0.5),
+        weights=JumpWeights(dense=0.002, sparse=8.0, width=0.3, rise=25.0, hop=0.5),
         entropy=0.002,
         estimator_rate=3e-4,
     ),

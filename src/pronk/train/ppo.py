@@ -14,10 +14,12 @@ from typing import Any
 import torch
 from mjlab.rl import RslRlPpoAlgorithmCfg
 from rsl_rl.algorithms import PPO
+from rsl_rl.extensions import Symmetry
 from rsl_rl.storage import RolloutStorage
-from torch import nn
+from torch import Tensor, nn
 
 from pronk.errors import PronkError
+from pronk.train import adam
 from pronk.train.actor import EstimatorActor, JumpCritic
 from pronk.train.estimator import estimator_losses
 from pronk.train.normalization import average
@@ -56,11 +58,22 @@ class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
             )
 
 
+class _Augmentation(Symmetry):
+    """rsl_rl's symmetry without the mirror loss.
+
+    It computes it even where it is only logged: one more pass of the actor over every mini-batch.
+    """
+
+    def compute_loss(self, actor: Any, batch: RolloutStorage.Batch, rows: int) -> Tensor:
+        return batch.advantages.new_zeros(())
+
+
 class EstimatorPPO(PPO):
     """rsl_rl's PPO; the estimator inside the actor has an optimizer of its own."""
 
     _raw_actor: EstimatorActor
     _raw_critic: JumpCritic
+    optimizer: torch.optim.Optimizer
 
     def __init__(
         self,
@@ -97,16 +110,22 @@ class EstimatorPPO(PPO):
                 f" the estimator needs {TARGET_GROUP!r} to learn from."
             )
         super().__init__(actor, critic, storage, **cfg)
+        symmetry: Mapping[str, Any] = cfg.get("symmetry_cfg") or {}
+        self._augments = bool(symmetry) and not symmetry.get("use_mirror_loss")
+        if self._augments:
+            self.symmetry = _Augmentation(**symmetry)
         self.estimator_epochs = estimator_epochs
         self.estimator_mini_batches = estimator_mini_batches
         self.estimator_contact_coef = estimator_contact_coef
         self.estimator_velocity_coef = estimator_velocity_coef
-        estimator = list(actor.estimator.parameters())
-        self.estimator_optimizer = torch.optim.Adam(estimator, lr=estimator_learning_rate)
         # PPO has put the whole actor under its optimizer; the estimator is part of the actor.
-        others = {id(parameter) for parameter in estimator}
-        for group in self.optimizer.param_groups:
-            group["params"] = [p for p in group["params"] if id(p) not in others]
+        estimator = list(actor.estimator.parameters())
+        mine = {id(parameter) for parameter in estimator}
+        others = [p for p in (*actor.parameters(), *critic.parameters()) if id(p) not in mine]
+        self.optimizer = adam.on_device(type(self.optimizer), others, lr=self.learning_rate)
+        self.estimator_optimizer = adam.on_device(
+            torch.optim.Adam, estimator, lr=estimator_learning_rate
+        )
 
     def update(self) -> dict[str, float]:
         """One iteration of learning on the stored rollout.
@@ -115,6 +134,8 @@ class EstimatorPPO(PPO):
             Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2].
         """
         losses: dict[str, float] = super().update()
+        if self._augments:
+            del losses["symmetry"]
         # The storage is cleared by now, but only its cursor: the rollout is still there.
         losses.update(self._update_estimator())
         observations = self.storage.observations
@@ -124,31 +145,40 @@ class EstimatorPPO(PPO):
 
     def _update_estimator(self) -> dict[str, float]:
         actor, optimizer = self._raw_actor, self.estimator_optimizer
+        parameters = list(actor.estimator.parameters())
         observations = self.storage.observations
         with torch.no_grad():
             inputs = actor.estimator_input(observations).flatten(0, 1)
         targets = observations[TARGET_GROUP].flatten(0, 1)
-        total = torch.zeros(2, device=inputs.device)
+        weights = inputs.new_tensor(
+            [self.estimator_contact_coef, self.estimator_velocity_coef]
+        ).unbind()
+        seen: list[Tensor] = []
         for _ in range(self.estimator_epochs):
             order = torch.randperm(len(inputs), device=inputs.device)
-            for rows in order.tensor_split(self.estimator_mini_batches):
-                contact, velocity = estimator_losses(actor.estimator(inputs[rows]), targets[rows])
-                loss = (
-                    self.estimator_contact_coef * contact + self.estimator_velocity_coef * velocity
-                )
+            batches = (
+                whole[order].tensor_split(self.estimator_mini_batches)
+                for whole in (inputs, targets)
+            )
+            for batch, target in zip(*batches, strict=True):
+                losses = estimator_losses(actor.estimator(batch), target)
                 optimizer.zero_grad()
-                loss.backward()
-                for parameter in actor.estimator.parameters():
-                    if parameter.grad is not None:
-                        average(parameter.grad, self.gpu_world_size)
-                nn.utils.clip_grad_norm_(actor.estimator.parameters(), self.max_grad_norm)
+                torch.autograd.backward(losses, weights)
+                if self.gpu_world_size > 1:
+                    self._average_gradients(parameters)
+                nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
                 optimizer.step()
-                total += torch.stack([contact.detach(), velocity.detach()])
+                seen += [loss.detach() for loss in losses]
         # PPO clips and reduces what gradients it finds in the actor: leave it none.
         optimizer.zero_grad()
-        steps = self.estimator_epochs * self.estimator_mini_batches
-        mean_contact, mean_velocity = (total / steps).tolist()
-        return {"estimator_contact": mean_contact, "estimator_velocity": mean_velocity}
+        contact, velocity = torch.stack(seen).view(-1, 2).mean(dim=0).tolist()
+        return {"estimator_contact": contact, "estimator_velocity": velocity}
+
+    def _average_gradients(self, parameters: list[nn.Parameter]) -> None:
+        """Over the processes, in one piece."""
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        together = average(nn.utils.parameters_to_vector(gradients), self.gpu_world_size)
+        nn.utils.vector_to_parameters(together, gradients)
 
     def set_estimator_rate(self, rate: float) -> None:
         """Let the estimator learn at another rate from now on.

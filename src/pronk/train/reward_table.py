@@ -81,7 +81,7 @@ ROWS: Mapping[str, Row] = {
     "foot_clearance": Row(rewards.foot_clearance, -12.5, 0.0, {"height": 0.09}),
     # Paper -500 | -500, for one step of 20 ms: -0.5. More of it, and most where there is most to
     # win by a leap that ends on the side.
-    "termination": Row(rewards.termination, -2.0, -5.0),
+    "termination": Row(rewards.termination, -2.0, -10.0),
     # Paper -0.08 | -0.08, -0.004 here: running costs 1,000 N^2 m^2 and would pay 4 of the 5.5
     # that tracking can earn. A tenth of it, jumping a fortieth.
     "torque": Row(rewards.torque, -0.0004, -0.0001),
@@ -94,7 +94,7 @@ ROWS: Mapping[str, Row] = {
     "action_rate": Row(rewards.action_rate, -0.02, -0.005),
     "roll_pitch_rate": Row(rewards.roll_pitch_rate, -0.02, -0.02),
     "slip": Row(rewards.slip, -0.1, 0.0),
-    "trunk_height": Row(rewards.trunk_height, -400.0, 0.0, {"height": standing_height()}),
+    "trunk_height": Row(rewards.trunk_height, -500.0, 0.0, {"height": standing_height()}),
 }
 """Every reward, with the weights of phase 1."""
 

@@ -133,6 +133,8 @@ def rl_cfg(*, jump: bool, seed: int = 0, entropy: float = 0.005) -> RslRlOnPolic
         critic=JumpCriticCfg(),
         algorithm=EstimatorPpoCfg(
             entropy_coef=entropy,
+            # Mirrored, an epoch holds every sample twice: three of them are six.
+            num_learning_epochs=3,
             # A clipped value may move by 0.2 an update; a jump is worth ten.
             use_clipped_value_loss=False,
             # Squared errors of 0.02 m^2/s^2 stand beside 0.1 nat of the contacts.
