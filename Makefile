@@ -22,9 +22,9 @@ lint: $(VENV)/.dev
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-# The core install: no PyTorch.
+# The core install, and what jumps and films need: no PyTorch.
 $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install --no-compile -c constraints.txt -e .
+	$(PIP) install --no-compile -c constraints.txt -e .[policy,video]
 	touch $@
 
 # Everything the tests need. PyTorch by itself first, so that its pinned build is taken.

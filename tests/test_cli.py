@@ -26,6 +26,10 @@ COMMANDS = (
     "train",
     "evaluate",
     "export",
+    "trial",
+    "play",
+    "deploy",
+    "twin",
     "report",
     "bench",
     "demo",
@@ -325,7 +329,7 @@ def test_predict_replays_a_fresh_log_and_the_page_shows_it(capsys, matched, tmp_
     row = json.loads((tmp_path / "predict.json").read_text())["predictions"][0]
     assert row["rmse_matched"] < 0.5 * row["rmse_naive"]
     accepted(capsys, "report", matched)
-    assert 'id="replay"' in (matched / "match.html").read_text(encoding="utf-8")
+    assert 'id="match-replay"' in (matched / "report.html").read_text(encoding="utf-8")
 
 
 def test_predict_on_the_fitted_log_says_so(capsys, matched):

@@ -294,6 +294,8 @@ def test_draws_are_uniform_over_their_ranges(env: Any) -> None:
     assert_uniform(found["friction"], 0.05, 3.0)
     assert_uniform(found["base_mass"], trunk - 0.4, trunk + 1.6)
     assert_uniform(found["shank_length"], 0.18, 0.20)
+    assert_uniform(found["no_load"], 22.2 / 24.0, 25.2 / 24.0)
+    assert_uniform(found["drop"], 0.0, 4 * 0.1 / 24.0**2)
     assert found["shank_length"].shape == (10 * ROBOTS, 4)
     names = env.scene["robot"].joint_names
     for group, g in MATCHED.groups.items():
@@ -592,6 +594,8 @@ def test_none_is_the_nominal_robot() -> None:
         "stiffness": 17.0,
         "damping": 0.4,
         "delay": 0.0,
+        "no_load": 1.0,
+        "drop": 0.0,
     }
     shapes = {"shank_length": (2, 4), "stiffness": (2, 12), "damping": (2, 12)}
     assert found.keys() == nominal.keys()
@@ -621,6 +625,8 @@ def test_noise_has_the_widths_of_the_paper() -> None:
         ({"friction": (0.0, 1.0)}, r"friction begins at 0.0; it must be positive"),
         ({"shank_length": (-0.1, 0.2)}, "shank_length begins at -0.1"),
         ({"delay": -1}, "delay is -1; it must not be negative"),
+        ({"bus_voltage": (0.0, 25.0)}, "bus_voltage begins at 0.0; it must be positive"),
+        ({"bus_resistance": (-0.1, 0.1)}, "bus_resistance begins at -0.1; it must not be negative"),
         ({"gravity_noise": float("nan")}, "gravity_noise is nan"),
         ({"gains": "sphere"}, "'sphere'; choose box, ellipsoid or off"),
     ],

@@ -13,7 +13,8 @@ from scipy import signal
 
 from pronk.errors import HardwareError, RobotError
 from pronk.hardware.machine import Command, State
-from pronk.hardware.plant import MotorConstants, build_plant
+from pronk.hardware.plant import build_plant
+from pronk.hardware.rotor import MotorConstants
 from pronk.hardware.truth import Truth, load_truth
 from pronk.hardware.virtual import VirtualRobot
 from pronk.robots import load_robot

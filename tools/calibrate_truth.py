@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from pronk.files import write_text
-from pronk.hardware.truth import SCHEMA, SHIPPED, JointTruth, Truth, load_truth, parse_truth
+from pronk.hardware.truth import SCHEMA, SHIPPED, Truth, load_truth, parse_truth
+from pronk.hardware.truth_parts import JointTruth
 from pronk.hardware.virtual import VirtualRobot
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
@@ -70,6 +71,22 @@ MACHINE = """\
   clamp_damping: 5.0              # a third of critical for a thigh
   stand_stiffness: .inf           # rigid: "fixed to a stable platform" (paper F5)
   stand_damping: 0.0
+"""
+
+BODY = """\
+trunk:                            # no two robots weigh the same, and none what its CAD says
+  mass_offset: 0.25               # kg over the nominal 12: cables, markers, guards
+  com_offset: [0.006, -0.003, 0.004]  # m; the battery is not where the drawing has it
+  inertia_scale: [1.06, 0.96, 0.98]   # a shell that was scaled, not weighed (constants.py)
+attitude:                         # of a MEMS unit with its own filter, data sheet class VN-100:
+  bias: [0.006, -0.004, 0.0]      # 0.5 deg static (mounting and accelerometer)
+  noise: 0.009                    # 0.5 deg RMS more in motion ...
+  noise_corner_hz: 0.3            # ... wandering over half a second
+  yaw_drift: 0.001                # 3.4 deg/min: indoors no magnetometer holds the heading
+ground:
+  friction: 0.8                   # rubber on a laboratory floor: .7 to 1; training draws its own
+  stiffness: 30.0e+3              # N/m: a rubber foot of 17.5 mm (2 MPa) under 30 N, after Hertz
+  damping: 60.0                   # N s/m: a loss factor of about .3, as soft rubber has
 """
 
 HEADER = f"""\
@@ -124,6 +141,7 @@ def designed() -> Truth:
             "schema": SCHEMA,
             "robot": "mini_cheetah",
             "machine": yaml.safe_load("machine:\n" + MACHINE)["machine"],
+            **yaml.safe_load(BODY),
             "joints": joints,
         },
         "designed truth",
@@ -183,7 +201,8 @@ def calibrated(truth: Truth, name: str) -> JointTruth:
 
 def text(truth: Truth) -> str:
     """The truth file, laid out for reading."""
-    lines = [HEADER, f"schema: {SCHEMA}", f"robot: {truth.robot}", "machine:", MACHINE + "joints:"]
+    lines = [HEADER, f"schema: {SCHEMA}", f"robot: {truth.robot}", "machine:"]
+    lines.append(MACHINE + BODY + "joints:")
     for name, joint in truth.joints.items():
         entries = [f"{key}: {_decimal(value)}" for key, value in vars(joint).items()]
         lines.append(f"  {name}:")

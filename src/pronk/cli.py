@@ -17,16 +17,22 @@ import typer
 from pronk import __version__
 from pronk.commands import (
     bench,
+    bench_tick,
     bench_train,
+    bench_trial,
     demo,
+    deploy,
     evaluate,
     export,
     match,
+    play,
     predict,
     report,
     response,
     sweep,
     train,
+    trial,
+    twin,
 )
 from pronk.errors import PronkError
 
@@ -46,6 +52,10 @@ app.command("predict")(predict.predict)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.command("export")(export.export)
+app.command("trial")(trial.trial)
+app.command("play")(play.play)
+app.command("deploy")(deploy.deploy)
+app.command("twin")(twin.twin)
 app.command("report")(report.report)
 app.command("demo")(demo.demo)
 
@@ -53,6 +63,8 @@ _bench = typer.Typer(help="pronk beside its peers, on the same data, in one run.
 for _command in (bench.match, bench.grid, bench.engine, bench.coverage):
     _bench.command(_command.__name__)(_command)
 _bench.command("train")(bench_train.train)
+_bench.command("trial")(bench_trial.trial)
+_bench.command("tick")(bench_tick.tick)
 app.add_typer(_bench, name="bench")
 
 

@@ -236,6 +236,38 @@ def commanded(
     return tuple(phase for phase in phases if on <= phase.liftoff <= last)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """The flight phases that belong to a jump input, in their order."""
+
+    all: tuple[Flight, ...]
+    long: tuple[Flight, ...]
+    """Those of `long_s` or more."""
+    high: tuple[Flight, ...]
+    """Those of them that are high."""
+
+    @property
+    def main(self) -> Flight | None:
+        """The longest of the high ones; None if there was no jump."""
+        return max(self.high, key=lambda phase: phase.samples, default=None)
+
+
+def answer(series: Series, on: int, rules: JumpRules) -> Answer:
+    """The flight phases that belong to the jump input which rises at sample `on`.
+
+    Args:
+        series: The robot.
+        on: First sample with the jump input.
+        rules: Of the definitions.
+    """
+    z = series.position[:, 2]
+    phases = flights(series.contact, least=series.steps(rules.flight_s))
+    own = commanded(phases, on, rules, series.dt)
+    long = tuple(phase for phase in own if phase.samples >= series.steps(rules.long_s))
+    high = (phase for phase in long if z[phase.liftoff : phase.touchdown].max() > rules.high)
+    return Answer(all=own, long=long, high=tuple(high))
+
+
 def measure(series: Series, on: int, command: Sequence[float], rules: JumpRules) -> Jump | None:
     """The jump that belongs to the input which rises at sample `on`.
 
@@ -251,22 +283,18 @@ def measure(series: Series, on: int, command: Sequence[float], rules: JumpRules)
     if on >= len(series.position):
         return None
     dt, z = series.dt, series.position[:, 2]
-    phases = flights(series.contact, least=series.steps(rules.flight_s))
-    own = commanded(phases, on, rules, dt)
-    long = [phase for phase in own if phase.samples >= series.steps(rules.long_s)]
-    high = [phase for phase in long if z[phase.liftoff : phase.touchdown].max() > rules.high]
-    if not high:
+    found = answer(series, on, rules)
+    own, long, main = len(found.all), len(found.long), found.main
+    if main is None:
         window = z[on : on + series.steps(rules.search_s) + 1]
-        height = float(np.ptp(window))
-        return Jump(flights=len(own), long_flights=len(long), high_flights=0, height=height)
-    main = max(high, key=lambda phase: phase.samples)
+        return Jump(flights=own, long_flights=long, high_flights=0, height=float(np.ptp(window)))
     up, down = main.liftoff, main.touchdown
     displacement = series.position[down, :2] - series.position[up, :2]
     end = down + series.steps(rules.upright_s)
     return Jump(
-        flights=len(own),
-        long_flights=len(long),
-        high_flights=len(high),
+        flights=own,
+        long_flights=long,
+        high_flights=len(found.high),
         height=float(np.ptp(z[on : down + series.steps(rules.tail_s) + 1])),
         apex=float(z[up:down].max()),
         delay=(up - on) * dt,

@@ -9,18 +9,49 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pronk.commands import console
+from pronk.commands import console, demo_trial
 from pronk.commands.sweep import AMPLITUDES, SignalName, make, record_twin
+from pronk.errors import PronkError
 
 if TYPE_CHECKING:
     from pronk.match.prediction import JointPrediction
     from pronk.match.result import MatchResult
+    from pronk.robots.robot import Robot
 
 ROBOT = "mini_cheetah"
 
 
+class Clock:
+    """How long each part of the demo takes."""
+
+    def __init__(self) -> None:
+        """Start."""
+        self.seconds: dict[str, float] = {}
+        self._begun = self._lap = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """A part is done."""
+        now = time.perf_counter()
+        self.seconds[name], self._lap = now - self._lap, now
+
+    @property
+    def total(self) -> float:
+        """Since the start [s]."""
+        return time.perf_counter() - self._begun
+
+    def words(self) -> str:
+        """All of it, as one line."""
+        parts = ", ".join(f"{name} {value:.0f} s" for name, value in self.seconds.items())
+        return f"{self.total:.0f} s in all: {parts}"
+
+
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for everything.")] = Path("out/demo"),
+    policies: Annotated[
+        Path | None,
+        typer.Option(help="Folder of policies to try; those that come with pronk if left out."),
+    ] = None,
+    jumps: Annotated[int, typer.Option(help="Jumps with each of the paper's commands.")] = 3,
     repeats: Annotated[int, typer.Option(help="Times the matched amplitude is asked.")] = 3,
     seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,
     quick: Annotated[
@@ -28,67 +59,124 @@ def demo(
     ] = False,
     json_file: console.JsonOption = None,
 ) -> None:
-    """Ask, match, predict and report all twelve joints of the virtual robot."""
-    begin = time.perf_counter()
+    """Ask and match all joints of the virtual robot, let trained policies jump on it, report."""
+    if jumps < 1:
+        raise PronkError(f"--jumps {jumps}; expected 1 or more.")
     console.say(
         "Everything below is about pronk's virtual robot, a simulated stand-in for the Mini "
         "Cheetah whose true parameters the match cannot see."
     )
+    clock = Clock()
     with console.progress() as report:
-        found = run(out, repeats=repeats, seed=seed, quick=quick, report=report)
+        found = run(
+            out,
+            policies,
+            jumps=jumps,
+            repeats=repeats,
+            seed=seed,
+            quick=quick,
+            report=report,
+            clock=clock,
+        )
     summary(found["result"], found["replays"])
-    seconds = time.perf_counter() - begin
-    console.say(f"{seconds:.0f} s in all: " + ", ".join(_timed(found["seconds"])))
-    console.wrote(out / "logs", out / "gains.yaml", out / "match.npz", found["page"], found["hero"])
+    if found["trial"] is not None:
+        demo_trial.summary(found["trial"])
+    console.say(
+        "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`; the policies "
+        "were trained before."
+    )
+    console.say(clock.words())
+    wrote = [out / "logs", out / "gains.yaml", out / "match.npz", found["hero"], *found["videos"]]
+    console.wrote(*wrote, found["page"])
     console.write_json(
-        json_file, figures_of(found) | {"seconds_total": seconds, "seconds": found["seconds"]}
+        json_file, figures_of(found) | {"seconds_total": clock.total, "seconds": clock.seconds}
     )
     console.following(
         f"open {found['page']} in a browser",
-        f"pronk export {out / 'gains.yaml'} --to mjlab --out actuators.py",
+        f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
+        *(f"pronk trial {path} --out out/trial" for path in found["policies"][:1]),
         f"pronk sweep {ROBOT} --link twin --truth YOUR_TRUTH.yaml --out YOUR_LOGS",
     )
 
 
 def run(
-    out: Path, *, repeats: int, seed: int, quick: bool, report: console.Reporter
+    out: Path,
+    policies: Path | None = None,
+    *,
+    jumps: int,
+    repeats: int,
+    seed: int,
+    quick: bool,
+    report: console.Reporter,
+    clock: Clock,
 ) -> dict[str, Any]:
-    """The whole way; returns the match, the replays, the paths and the time of each part.
+    """The whole way; returns the match, the replays, the trial and the paths.
 
     Args:
-        out: Folder; `logs` and `fresh` are made in it.
+        out: Folder; `logs`, `fresh` and `trial` are made in it.
+        policies: Folder of policies; those that come with pronk if None.
+        jumps: With each command.
         repeats: Times the matched amplitude is asked; the smaller one, which only checks whether
             the gains hold there too, is asked once.
         seed: Of the virtual robot's noise.
         quick: Search the linearized model.
         report: Told the stage and the share done.
+        clock: Told when a part is done.
     """
+    from pronk.report import figures, style
+    from pronk.report.whole import write_report
+    from pronk.robots import load_robot
+
+    robot = load_robot(ROBOT)
+    tried, lack = demo_trial.find(policies, robot)
+    if lack:
+        console.warn(lack)
+    found = ask_and_match(
+        robot, out, repeats=repeats, seed=seed, quick=quick, report=report, clock=clock
+    )
+    found |= {"policies": tried, "trial": None, "videos": ()}
+    if tried:
+        place = out / demo_trial.FOLDER
+        found["trial"] = demo_trial.jump(
+            tried, place, robot=robot, jumps=jumps, seed=seed, report=report
+        )
+        clock.lap("jump")
+        found["videos"] = demo_trial.film(found["trial"], place, report=report)
+        clock.lap("video")
+    found["hero"] = style.save(figures.hero(found["result"]), out / "hero.svg")
+    found["page"], _ = write_report(out, report)
+    clock.lap("page")
+    return found
+
+
+def ask_and_match(
+    robot: Robot,
+    out: Path,
+    *,
+    repeats: int,
+    seed: int,
+    quick: bool,
+    report: console.Reporter,
+    clock: Clock,
+) -> dict[str, Any]:
+    """Sweep all joints, match them, and predict a sweep that was not matched; as `run`."""
     from pronk.match import gains as gains_file
     from pronk.match import prediction as prediction_file
     from pronk.match import result as result_file
     from pronk.match.pipeline import match_logs
     from pronk.match.predict import predict
     from pronk.match.settings import MatchSettings
-    from pronk.report import figures, style
-    from pronk.report.page import write_page
     from pronk.response import save as save_responses
-    from pronk.robots import load_robot
     from pronk.sweep.readers import read_logs
 
-    robot = load_robot(ROBOT)
-    seconds: dict[str, float] = {}
-    begin = time.perf_counter()
-
-    def lap(name: str) -> None:
-        nonlocal begin
-        now = time.perf_counter()
-        seconds[name], begin = now - begin, now
-
+    report("plan", 0.0)
     plan = make(robot, None, SignalName.CHIRP, AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])))
     plan.check()
+    report("plan", 0.5)
     fresh_plan = make(robot, None, SignalName.LOG_CHIRP, AMPLITUDES[:1], 1)
     fresh_plan.check()
-    lap("plan")
+    report("plan", 1.0)
+    clock.lap("plan")
     paths = record_twin(
         robot, plan, out / "logs", seed=seed, overwrite=True, progress=report.bar("ask")
     )
@@ -100,16 +188,16 @@ def run(
         overwrite=True,
         progress=report.bar("ask something else"),
     )
-    lap("sweep")
+    clock.lap("sweep")
     logs = read_logs(paths, processes=os.cpu_count() or 1, robot=robot)
-    lap("read")
+    clock.lap("read")
     settings = MatchSettings(method="quick" if quick else "grid")
     result = match_logs(logs, robot, settings=settings, progress=report)
     gains_file.save(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():
         save_responses(out / "logs" / f"{name}.response.npz", joint.responses)
-    lap("match")
+    clock.lap("match")
     replays: list[JointPrediction] = []
     told = report.bar("predict")
     for i, log in enumerate(read_logs(fresh, robot=robot)):
@@ -119,23 +207,8 @@ def run(
         out / "fresh.prediction.npz",
         prediction_file.Prediction(joints=tuple(replays), source="fresh", virtual=True),
     )
-    lap("predict")
-    report("page", 0.0)
-    page = write_page(out)
-    hero = style.save(figures.hero(result), out / "hero.svg")
-    report("page", 1.0)
-    lap("page")
-    return {
-        "result": result,
-        "replays": replays,
-        "page": page,
-        "hero": hero,
-        "seconds": seconds,
-    }
-
-
-def _timed(seconds: dict[str, float]) -> list[str]:
-    return [f"{name} {value:.0f} s" for name, value in seconds.items()]
+    clock.lap("predict")
+    return {"result": result, "replays": replays}
 
 
 def summary(result: MatchResult, replays: list[JointPrediction]) -> None:
@@ -192,6 +265,7 @@ def figures_of(found: dict[str, Any]) -> dict[str, Any]:
     """What `--json` gives of the demo."""
     from pronk.commands.match import figures_of as match_figures
     from pronk.commands.predict import row_of
+    from pronk.commands.trial import figures as trial_figures
     from pronk.report.paper import published
 
     result: MatchResult = found["result"]
@@ -202,5 +276,7 @@ def figures_of(found: dict[str, Any]) -> dict[str, Any]:
             name: cells_apart(result, name, paper.joints[name]) for name in result.joints
         },
         "predictions": [row_of(one) for one in found["replays"]],
+        "trial": trial_figures(found["trial"]) if found["trial"] is not None else None,
+        "videos": found["videos"],
         "page": found["page"],
     }

@@ -1,4 +1,4 @@
-"""`pronk report`: one HTML page of what a folder holds."""
+"""`pronk report`: one HTML page of everything that a folder holds."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from pronk.commands import console
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Folder with gains.yaml and match.npz.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder that matches and trials were written to, or one above.")
+    ],
     json_file: console.JsonOption = None,
 ) -> None:
-    """Write one HTML page of a match; it opens without a network."""
-    from pronk.match import gains as gains_file
-    from pronk.match import result as result_file
-    from pronk.report.page import find_gains, verdict, write_page
+    """Write one HTML page of every match and trial in a folder; it opens without a network."""
+    from pronk.report import whole
 
     with console.progress() as shown:
-        bar = shown.bar("page")
-        page = write_page(folder)
-        bar(1.0)
-    found = result_file.load(folder / "match.npz", gains_file.load(find_gains(folder)))
+        page, found = whole.write_report(folder, shown)
     console.wrote(page)
-    console.write_json(json_file, {"page": page} | verdict(found))
+    console.write_json(
+        json_file,
+        {"page": page, "parts": [{"source": one.source, **one.figures} for one in found]},
+    )
     console.following(f"open {page} in a browser")

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import queue
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from collections.abc import Sequence
 from enum import StrEnum
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pronk.commands import console
-from pronk.errors import HardwareError, PlanError
+from pronk.commands import confirm, console, sweep_wire
+from pronk.commands.sweep_twin import record_twin as record_twin
+from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.robots.robot import Robot
@@ -28,6 +25,13 @@ class Link(StrEnum):
     TWIN = "twin"
     LCM = "lcm"
     DDS = "dds"
+
+
+class Layout(StrEnum):
+    """The messages on LCM."""
+
+    CHEETAH = "cheetah"
+    WTW = "wtw"
 
 
 class SignalName(StrEnum):
@@ -46,7 +50,26 @@ AMPLITUDES = (0.25, 0.125)
 def sweep(
     robot: Annotated[str, typer.Argument(help="Robot, for instance mini_cheetah.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the logs, one MCAP per joint.")],
-    link: Annotated[Link, typer.Option(help="twin is the virtual robot.")] = Link.TWIN,
+    link: Annotated[
+        Link, typer.Option(help="twin: the virtual robot in this program; lcm, dds: by wire.")
+    ] = Link.TWIN,
+    interface: Annotated[
+        str | None,
+        typer.Option(help="Network interface to a real robot; without it nothing leaves here."),
+    ] = None,
+    layout: Annotated[
+        Layout | None, typer.Option(help="Messages on LCM; cheetah if left out.")
+    ] = None,
+    port: Annotated[int | None, typer.Option(help="UDP port of LCM.")] = None,
+    domain: Annotated[int | None, typer.Option(help="Domain of DDS.")] = None,
+    release: Annotated[
+        bool,
+        typer.Option("--release", help="Make the robot's own controller let go of the joints."),
+    ] = False,
+    real_time: Annotated[
+        bool,
+        typer.Option("--real-time/--no-real-time", help="Ask for real-time scheduling (by wire)."),
+    ] = True,
     truth: Annotated[
         Path | None, typer.Option(help="Truth of the virtual robot, instead of the shipped one.")
     ] = None,
@@ -75,12 +98,23 @@ def sweep(
     from pronk.robots import load_robot
 
     machine = load_robot(robot)
-    if link is not Link.TWIN:
-        raise HardwareError(
-            f"--link {link.value} is not built yet: links to a real robot come with the issue "
-            '"put it on the robot"; use --link twin, the virtual robot, until then.'
+    address = None
+    if link is Link.TWIN:
+        sweep_wire.refuse_without_wire(
+            interface=interface, layout=layout, port=port, domain=domain, release=release
         )
-    del yes  # only hardware is asked about
+    else:
+        from pronk.hardware.links import Address
+
+        if truth is not None:
+            raise HardwareError("--truth is of --link twin; give it to `pronk twin` instead.")
+        address = Address(
+            kind=link.value,
+            interface=interface,
+            layout=layout and layout.value,
+            port=port,
+            domain=domain,
+        )
     names = [part for entry in joints or () for part in entry.split(",") if part]
     with console.progress() as report:
         report("forecast", 0.0)
@@ -90,27 +124,49 @@ def sweep(
     plan.check()
     figures: dict[str, Any] = {
         "robot": machine.name,
-        "virtual": True,
+        "link": str(address or "twin"),
         "duration_s": plan.duration_s,
         "plan": plan.rows(),
         "logs": [],
-    }
+    } | ({"virtual": True} if address is None else {})
     if plan_only:
         console.write_json(json_file, figures)
         console.following(f"pronk sweep {robot} --link {link.value} --out {out}")
         return
-    with console.progress() as report:
-        paths = record_twin(
-            machine,
-            plan,
-            out,
-            truth=truth,
-            seed=seed,
-            overwrite=overwrite,
-            progress=report.bar("ask the virtual robot"),
-        )
-    figures["logs"] = paths
-    console.say(f"wrote {len(paths)} logs of the virtual robot to {out}")
+    if address is None:
+        with console.progress() as report:
+            paths = record_twin(
+                machine,
+                plan,
+                out,
+                truth=truth,
+                seed=seed,
+                overwrite=overwrite,
+                progress=report.bar("ask the virtual robot"),
+            )
+        figures["logs"] = paths
+        console.say(f"wrote {len(paths)} logs of the virtual robot to {out}")
+    else:
+        if not address.local and not yes:
+            confirm.before_it_moves(machine.name, str(address))
+        if real_time:
+            sweep_wire.enter_real_time()
+        with console.progress() as report:
+            recorded = sweep_wire.record_wire(
+                machine,
+                plan,
+                out,
+                address,
+                release=release,
+                overwrite=overwrite,
+                progress=report.bar(f"ask over {link.value}"),
+            )
+        figures |= {
+            "virtual": recorded.virtual,
+            "logs": recorded.logs,
+            "servo": recorded.servo,
+        }
+        sweep_wire.tell(recorded, out)
     console.write_json(json_file, figures)
     console.following(
         f"pronk response {out}",
@@ -179,96 +235,3 @@ def show_plan(plan: SweepPlan) -> None:
     console.show(made)
     for warning in plan.warnings:
         console.warn(warning)
-
-
-def record_twin(
-    robot: Robot,
-    plan: SweepPlan,
-    out_dir: Path,
-    *,
-    truth: Path | None = None,
-    seed: int = 0,
-    overwrite: bool = False,
-    progress: Callable[[float], None] | None = None,
-) -> list[Path]:
-    """Ask the virtual robot, legs side by side in processes of their own.
-
-    On a rigid bench legs do not feel each other, so each process simulates one leg.
-
-    Args:
-        robot: The robot.
-        plan: What to ask; checked by the caller.
-        out_dir: Folder for the logs.
-        truth: Truth file; the shipped one if None.
-        seed: Of all noise; each leg takes its own from it.
-        overwrite: Replace logs that are already there.
-        progress: Told the share done, 0 to 1.
-
-    Returns:
-        The logs, in the order of the robot's joints.
-    """
-    from pronk.hardware.plant import legs_of
-    from pronk.hardware.truth import load_truth
-
-    # Read it here once, so that a bad file is one message and not one per process.
-    load_truth(truth).check_joints(robot.joint_names, str(truth or "truth"))
-    if len(plan.sets) != len(plan.joints):
-        raise PlanError("several joints asked at once: the virtual robot is asked one at a time.")
-    jobs = []
-    for index, leg in enumerate(legs_of(robot)):
-        asked = tuple(name for name in plan.joints if name.split("_")[0] == leg)
-        if asked:
-            jobs.append((leg, asked, seed * 1000 + index))
-    context = get_context("spawn")
-    with (
-        context.Manager() as manager,
-        ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), mp_context=context) as pool,
-    ):
-        told: queue.Queue[tuple[str, float]] = manager.Queue()
-        running = {
-            pool.submit(_record_leg, plan, leg, asked, out_dir, truth, s, overwrite, told)
-            for leg, asked, s in jobs
-        }
-        shares = {leg: 0.0 for leg, _, _ in jobs}
-        weight = {leg: len(asked) / len(plan.joints) for leg, asked, _ in jobs}
-        done: list[Path] = []
-        while running:
-            finished, running = wait(running, timeout=0.2, return_when=FIRST_EXCEPTION)
-            while not told.empty():
-                leg, share = told.get()
-                shares[leg] = share
-            if progress is not None:
-                progress(sum(weight[leg] * share for leg, share in shares.items()))
-            for future in finished:
-                done += future.result()
-    if progress is not None:
-        progress(1.0)
-    order = {name: i for i, name in enumerate(robot.joint_names)}
-    return sorted(done, key=lambda path: order.get(path.stem, len(order)))
-
-
-def _record_leg(
-    plan: SweepPlan,
-    leg: str,
-    joints: Sequence[str],
-    out_dir: Path,
-    truth: Path | None,
-    seed: int,
-    overwrite: bool,
-    told: queue.Queue[tuple[str, float]],
-) -> list[Path]:
-    """Ask one leg; runs in a process of its own."""
-    from pronk.hardware.truth import load_truth
-    from pronk.hardware.virtual import VirtualRobot
-    from pronk.sweep.record import record
-
-    machine = VirtualRobot(plan.robot, load_truth(truth), seed=seed, legs=(leg,))
-    return record(
-        machine,
-        plan.robot,
-        plan,
-        out_dir,
-        progress=lambda share, _: told.put((leg, share)),
-        joints=joints,
-        overwrite=overwrite,
-    )

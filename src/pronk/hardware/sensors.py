@@ -2,10 +2,11 @@
 
 Encoders sit on the rotors and have the grid of their bits seen through the gear; their mounts
 shake slowly (coloured noise). Speed is the drive's own first difference of that grid. Torque is
-current times the constant that the drive believes. Timestamps jitter.
+current times the constant that the drive believes. The accelerometer gives the mean over the time
+since the last state, as a unit that integrates inside does. The attitude filter is off by a
+constant, by something that wanders, and by a heading that starts anywhere. Timestamps jitter.
 
-A block of ticks is read at once. Noise is drawn one row per tick, so that reading the same ticks
-in other blocks gives the same numbers.
+A block of ticks is read at once; reading the same ticks in other blocks gives the same numbers.
 """
 
 from __future__ import annotations
@@ -16,16 +17,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.hardware.inertial import Motion
 from pronk.hardware.machine import State
-from pronk.hardware.truth import JointTruth, MachineTruth
+from pronk.hardware.noise import NoiseSource
+from pronk.hardware.quaternion import product
+from pronk.hardware.truth import Truth
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
-_GRAVITY = 9.81
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Raw:
     """True values at the physics steps nearest to a block of ticks. Joints: those present."""
 
@@ -41,20 +43,18 @@ class Raw:
     """Of the motors, without friction [N m], shape (n, present)."""
     voltage: Array
     """Of the bus [V], shape (n,)."""
-    tilt: Array
-    """Roll, pitch and yaw of the body on its stand [rad], shape (n, 3)."""
-    tilt_rate: Array
-    """[rad/s], shape (n, 3)"""
+    motion: Motion
+    """Of the trunk."""
 
 
 class Sensors:
-    """Turns true values into states. Keeps the state of the noise between blocks."""
+    """Turns true values into states."""
 
     def __init__(
         self,
         robot: Robot,
-        machine: MachineTruth,
-        joints: dict[str, JointTruth],
+        truth: Truth,
+        joints: tuple[str, ...],
         *,
         rate_hz: float,
         seed: int,
@@ -63,22 +63,20 @@ class Sensors:
 
         Args:
             robot: Names, gears and default pose.
-            machine: Noise, delays, encoders.
+            truth: Noise, delays, encoders, attitude filter.
             joints: The joints that are present, in file order.
             rate_hz: States per second.
             seed: Of all noise.
         """
-        self._machine = machine
-        self._period = 1.0 / rate_hz
-        self._rng = np.random.default_rng(seed)
+        self._machine = machine = truth.machine
         names = robot.joint_names
         self._columns = np.array([names.index(name) for name in joints], dtype=np.intp)
         self._default = np.array([joint.default_position for joint in robot.joints])
-        self._offset = np.array([joint.encoder_offset for joint in joints.values()])
-        self._scale = np.array([joint.torque_scale for joint in joints.values()])
+        self._offset = np.array([truth.joints[name].encoder_offset for name in joints])
+        self._scale = np.array([truth.joints[name].torque_scale for name in joints])
         gears = np.array([robot.joint(name).drive.gear_ratio for name in joints])
         self._count = 2.0 * math.pi / 2.0**machine.encoder_bits / gears
-        self._mount = np.zeros(len(names))
+        self._noise = NoiseSource(truth, len(names), rate_hz=rate_hz, seed=seed)
         self._sequence = 0
 
     @property
@@ -88,60 +86,51 @@ class Sensors:
 
     def read(self, raw: Raw) -> list[State]:
         """The states of a block of ticks, joints that are absent at rest in the default pose."""
-        machine, n, total = self._machine, len(raw.tick), len(self._default)
-        draws = self._rng.standard_normal((n, 3 * total + 8))
-        mount, fast, current = (draws[:, k * total : (k + 1) * total] for k in range(3))
-        if self._sequence == 0:
-            draws[0, -2:] = 0.0  # the clock starts with the first state
-        # Clipped so that neither may ever put two states out of order.
-        most = 0.4 * self._period
-        jitter = np.clip(machine.sampling_jitter_s * draws[:, -1], -most, most)
-        stamp = raw.tick + jitter
-        stamp += np.clip(machine.timestamp_error_s * draws[:, -2], -most / 8, most / 8)
+        noise, total = self._noise.take(len(raw.tick)), len(self._default)
+        stamp = raw.tick + noise.jitter + noise.stamp
         # To first order from the physics step to the instant of sampling, at most half a step plus
         # the jitter away: 1e-5 rad of error at 500 rad/s^2.
-        late = raw.tick - machine.measurement_delay_s + jitter - raw.instant
+        late = raw.tick - self._machine.measurement_delay_s + noise.jitter - raw.instant
         angle = raw.angle + raw.speed * late[:, None] + self._offset
-        shaken = angle + self._shake(mount)[:, self._columns]
-        position = np.tile(self._default, (n, 1))
-        position[:, self._columns] = np.rint(shaken / self._count) * self._count
-        velocity, torque = np.zeros((n, total)), np.zeros((n, total))
-        velocity[:, self._columns] = (
-            self._difference(angle, raw.speed) + machine.velocity_noise * fast[:, self._columns]
-        )
-        torque[:, self._columns] = (
-            raw.torque / self._scale + machine.torque_noise * current[:, self._columns]
-        )
-        gyro = raw.tilt_rate + np.array(machine.gyro_bias)
-        gyro += machine.gyro_noise * draws[:, -8:-5]
-        force = specific_force(raw.tilt) + np.array(machine.accelerometer_bias)
-        force += machine.accelerometer_noise * draws[:, -5:-2]
+        shaken = angle + self._present(noise.position)
+        position = np.rint(shaken / self._count) * self._count
+        velocity = self._difference(angle, raw.speed)
+        velocity += self._present(noise.velocity)
+        torque = raw.torque / self._scale + self._present(noise.torque)
+        if len(self._columns) < total:
+            position = self._spread(position, self._default)
+            velocity, torque = (self._spread(v, np.zeros(total)) for v in (velocity, torque))
+        gyro, force = raw.motion.rate + noise.gyro, raw.motion.force + noise.force
+        orientation = product(noise.heading, product(raw.motion.orientation, noise.tilt))
+        rows = (position, velocity, torque, gyro, force, orientation)
         states = [
             State(
-                time=float(stamp[row]),
-                sequence=self._sequence + row,
-                position=position[row],
-                velocity=velocity[row],
-                torque=torque[row],
-                gyro=gyro[row],
-                accelerometer=force[row],
-                bus_voltage=float(raw.voltage[row]),
+                time=time,
+                sequence=sequence,
+                position=q,
+                velocity=v,
+                torque=t,
+                gyro=rate,
+                accelerometer=acceleration,
+                bus_voltage=voltage,
+                orientation=quaternion,
             )
-            for row in range(n)
+            for sequence, (time, voltage, q, v, t, rate, acceleration, quaternion) in enumerate(
+                zip(stamp.tolist(), raw.voltage.tolist(), *rows, strict=True), self._sequence
+            )
         ]
-        self._sequence += n
+        self._sequence += len(states)
         return states
 
-    def _shake(self, normals: Array) -> Array:
-        """First-order low-passed noise of the encoders' mounts [rad], shape (n, joints)."""
-        corner = self._machine.position_noise_corner_hz
-        keep = math.exp(-2.0 * math.pi * corner * self._period)
-        fresh = self._machine.position_noise * math.sqrt(1.0 - keep**2) * normals
-        shaken = np.empty_like(fresh)
-        for row in range(len(fresh)):
-            self._mount = keep * self._mount + fresh[row]
-            shaken[row] = self._mount
-        return shaken
+    def _present(self, values: Array) -> Array:
+        """Columns of the joints that are present."""
+        return values if len(self._columns) == values.shape[1] else values[:, self._columns]
+
+    def _spread(self, values: Array, absent: Array) -> Array:
+        """Columns of all joints, those that are absent with a value of their own."""
+        whole = np.tile(absent, (len(values), 1))
+        whole[:, self._columns] = values
+        return whole
 
     def _difference(self, angle: Array, speed: Array) -> Array:
         """First difference of the encoder's grid over the drive's window [rad/s]."""
@@ -149,13 +138,3 @@ class Sensors:
         now = np.rint(angle / self._count)
         before = np.rint((angle - speed * window) / self._count)
         return np.asarray((now - before) * self._count / window)
-
-
-def specific_force(tilt: Array) -> Array:
-    """What an accelerometer at rest reads in the frame of a body with a small tilt [m/s^2].
-
-    Args:
-        tilt: Roll, pitch and yaw of the body [rad], shape (n, 3).
-    """
-    roll, pitch = tilt[:, 0], tilt[:, 1]
-    return _GRAVITY * np.stack([-pitch, roll, np.ones_like(roll)], axis=1)

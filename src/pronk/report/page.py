@@ -7,15 +7,11 @@ are any, `*.prediction.npz`), holds its figures in itself and opens without a ne
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
-from matplotlib.figure import Figure
 
-from pronk import __version__
 from pronk.errors import ArtefactError, RobotError
 from pronk.files import write_text
 from pronk.match import gains as gains_file
@@ -23,24 +19,12 @@ from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
 from pronk.match.result import MatchResult
-from pronk.report import figures, style
+from pronk.report import figures
 from pronk.report.paper import published
+from pronk.report.shell import Part, fill, page, picture
 from pronk.robots import load_robot
 
 PAGE_NAME = "match.html"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Picture:
-    """A figure of the page with its words."""
-
-    src: str
-    alt: str
-    caption: str = ""
-
-
-def _picture(figure: Figure, alt: str, caption: str = "") -> Picture:
-    return Picture(src=style.data_uri(figure), alt=alt, caption=caption)
 
 
 def find_gains(folder: Path) -> Path:
@@ -182,7 +166,7 @@ def _predictions(folder: Path) -> list[dict[str, Any]]:
                 "source": prediction.source,
                 "virtual": prediction.virtual,
                 "joints": prediction.joints,
-                "picture": _picture(
+                "picture": picture(
                     figures.replay(first, virtual=prediction.virtual),
                     f"Position of {first.joint} over time: command, measured on {where}, "
                     "simulated with naive and with matched gains",
@@ -198,7 +182,7 @@ def _pictures(result: MatchResult) -> dict[str, Any]:
     amplitudes = figures.amplitudes(result)
     zero = {name: joint for name, joint in joints.items() if joint.zero_armature is not None}
     return {
-        "overview": _picture(
+        "overview": picture(
             figures.overview(result),
             f"Gain over frequency of every joint, measured {where} and simulated",
         )
@@ -206,31 +190,31 @@ def _pictures(result: MatchResult) -> dict[str, Any]:
         else None,
         "example": (knees_first(joints) or [""])[0],
         "bodes": {
-            name: _picture(
+            name: picture(
                 figures.bode(joint),
                 f"Bode plot of {name}: gain, phase and coherence, measured {where} and simulated",
             )
             for name, joint in joints.items()
         },
-        "maps": _picture(
+        "maps": picture(
             figures.error_maps(result, drive_gains(gains)),
             "Gain error over the grid of stiffness and damping for every joint",
         )
         if any(joint.grid_error.size for joint in joints.values())
         else None,
-        "ranges": _picture(
+        "ranges": picture(
             figures.ranges(gains, dict(group_members(gains))),
             "Matched gains of the joints of each group and the ranges that training draws from",
         )
         if group_members(gains)
         else None,
-        "zero": _picture(
+        "zero": picture(
             figures.zero_armature(zero[knees_first(zero)[0]]),
             "Gain over frequency with and without rotor inertia in the simulator",
         )
         if zero
         else None,
-        "amplitudes": _picture(amplitudes, "Change of the matched gains with the amplitude")
+        "amplitudes": picture(amplitudes, "Change of the matched gains with the amplitude")
         if amplitudes is not None
         else None,
     }
@@ -253,37 +237,27 @@ def _without_armature(result: MatchResult) -> list[dict[str, Any]]:
     return rows
 
 
-def _number(value: float, digits: int = 3) -> str:
-    """A number for a table: fixed digits, a dash where it is unknown."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
-
-
-def _interval(bounds: tuple[float, float], digits: int = 3) -> str:
-    """An interval for a table; `held` for a number that was not fitted."""
-    if bounds[0] == bounds[1]:
-        return "held"
-    return f"{_number(bounds[0], digits)} to {_number(bounds[1], digits)}"
-
-
-def render(result: MatchResult, folder: Path, gains_name: str = "gains.yaml") -> str:
-    """The page as text.
+def part(
+    result: MatchResult,
+    folder: Path,
+    gains_name: str = "gains.yaml",
+    *,
+    anchor: str = "",
+    title: str | None = None,
+) -> Part:
+    """The match as a part of a page.
 
     Args:
         result: The match.
         folder: Where `*.prediction.npz` are looked for.
         gains_name: Name of the gains file, for the commands that the page shows.
+        anchor: What the anchors of the part begin with; one for each part of a page.
+        title: Of the part; names the robot if None.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pronk.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(number=_number, interval=_interval, words=style.joint_words)
     members = group_members(result.gains)
-    return environment.get_template("page.html.j2").render(
-        version=__version__,
+    html = fill(
+        "match.html.j2",
+        at=f"{anchor}-" if anchor else "",
         gains=result.gains,
         gains_name=gains_name,
         joints=result.joints,
@@ -302,6 +276,18 @@ def render(result: MatchResult, folder: Path, gains_name: str = "gains.yaml") ->
         delays=any(joint.delay_s > 0.0 for joint in result.gains.joints.values()),
         amplitude_rows={n: j for n, j in result.joints.items() if len(j.amplitude_gains) > 1},
     )
+    return Part(anchor=anchor, title=title or f"Match of {result.gains.robot}", html=html)
+
+
+def render(result: MatchResult, folder: Path, gains_name: str = "gains.yaml") -> str:
+    """The page of one match as text; the arguments are those of `part`."""
+    return page(
+        f"match of {result.gains.robot}",
+        [part(result, folder, gains_name)],
+        virtual=result.gains.virtual,
+        sub="Each joint's answer to a sweep, and the simulator gains that give the same answer.",
+        made_from=f"{gains_name} and match.npz",
+    )
 
 
 def write_page(out_dir: Path, *, gains: str | None = None) -> Path:
@@ -316,6 +302,6 @@ def write_page(out_dir: Path, *, gains: str | None = None) -> Path:
     """
     path = out_dir / gains if gains else find_gains(out_dir)
     result = result_file.load(out_dir / "match.npz", gains_file.load(path))
-    page = out_dir / PAGE_NAME
-    write_text(page, render(result, out_dir, path.name))
-    return page
+    written = out_dir / PAGE_NAME
+    write_text(written, render(result, out_dir, path.name))
+    return written

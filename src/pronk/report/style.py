@@ -124,6 +124,19 @@ def data_uri(figure: Figure) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg(figure)).decode("ascii")
 
 
+def png(figure: Figure, dpi: float = 130.0) -> bytes:
+    """The figure as PNG bytes, for figures whose SVG would be large."""
+    buffer = io.BytesIO()
+    with styled():
+        figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def png_uri(figure: Figure) -> str:
+    """The figure as a `data:` address of a PNG image."""
+    return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as SVG or PNG, by the suffix of `path`, whole or not at all."""
     with styled(), written_whole(path) as aside:

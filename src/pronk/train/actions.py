@@ -20,6 +20,7 @@ from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
 from torch import Tensor
 
 from pronk.errors import PronkError
+from pronk.train.supply import Supply
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -60,6 +61,8 @@ class HeldJointPosition(JointPositionAction):
         low, high = cfg.delay_steps
         self.lag = torch.full((self.num_envs, 1), low, device=self.device)
         """Delay in this episode [physics steps]. Shape (N, 1)."""
+        self.supply = Supply(self._entity)
+        """What the drives are fed from."""
         everything = self._target_ids.tolist() == list(range(self._entity.num_joints))
         # A slice costs a view where a list of indices costs a kernel.
         self._joints: slice | Tensor = slice(None) if everything else self._target_ids
@@ -93,6 +96,7 @@ class HeldJointPosition(JointPositionAction):
         if self._ages[0] == 0 or any(low <= age <= high for age in self._ages):
             self._entity.set_joint_position_target(self._in_force(), joint_ids=self._joints)
         self._ages = [age + 1 for age in self._ages]
+        self.supply.advance()
 
     def _in_force(self) -> Tensor:
         """Of each robot the newest target that is at least as old as its delay."""

@@ -128,6 +128,27 @@ def draw_base_mass(env: Any, env_ids: None, span: Range, base: SceneEntityCfg) -
     env.sim.model.body_inertia[:, ids] = inertia * (drawn / mass)[..., None]
 
 
+def draw_supply(env: Any, env_ids: None, voltage: Range, resistance: Range, rated: float) -> None:
+    """A robot's battery: voltage at no load [V], resistance with the wires [ohm].
+
+    Args:
+        env: The environment.
+        env_ids: Not used; all robots draw.
+        voltage: Range of the one.
+        resistance: Range of the other.
+        rated: Voltage that the drives' law is for [V].
+    """
+    volts, ohms = (_uniform(env, span, env.num_envs, 1) for span in (voltage, resistance))
+    _held(env).supply.set(volts, ohms, rated=rated)
+
+
+def _held(env: Any) -> HeldJointPosition:
+    """The action term that feeds the drives."""
+    terms = [env.action_manager.get_term(name) for name in env.action_manager.active_terms]
+    (found,) = (term for term in terms if isinstance(term, HeldJointPosition))
+    return found
+
+
 # --- Per episode and per step -------------------------------------------------------------------
 
 
@@ -180,13 +201,13 @@ def draws(env: Any) -> dict[str, NDArray[np.float64]]:
     Returns:
         `friction` (n,), `base_mass` [kg] (n,), `shank_length` [m] (n, legs), `stiffness`
         [N m/rad] and `damping` [N m s/rad] (n, joints), `delay` of the command in this episode
-        [physics steps] (n,); joints and legs in the order of the entity.
+        [physics steps] (n,), `no_load` voltage over the rated one and `drop`, four times the
+        battery's resistance over its square [1/W] (n,); joints and legs in the order of the entity.
     """
     robot, model, n = env.scene[ENTITY], env.sim.model, env.num_envs
     feet = robot.indexing.geom_ids[robot.find_geoms(FEET)[0]]
     gains = {name: torch.zeros(n, robot.num_joints) for name in ("stiffness", "damping")}
-    terms = [env.action_manager.get_term(name) for name in env.action_manager.active_terms]
-    delay = [term.lag[:, 0] for term in terms if isinstance(term, HeldJointPosition)]
+    held = _held(env)
     for drive in robot.actuators:
         for name, table in gains.items():
             table[:, drive.target_ids.cpu()] = getattr(drive, name).cpu()
@@ -195,6 +216,8 @@ def draws(env: Any) -> dict[str, NDArray[np.float64]]:
         "base_mass": model.body_mass[:, robot.indexing.body_ids[0]],
         "shank_length": -model.geom_pos[:, feet, 2],
         **gains,
-        "delay": delay[0] if delay else torch.zeros(n),
+        "delay": held.lag[:, 0],
+        "no_load": held.supply.no_load[:, 0],
+        "drop": held.supply.drop[:, 0],
     }
     return {name: value.cpu().double().numpy() for name, value in found.items()}

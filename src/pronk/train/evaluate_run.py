@@ -42,6 +42,7 @@ RANDOMIZATIONS: Mapping[str, Randomization] = {
         gains="off",
         shank_length=None,
         base_mass=(0.0, 0.0),
+        bus_voltage=None,
         push_velocity=0.0,
         push_yaw_rate=0.0,
     ),

@@ -32,6 +32,7 @@ from pronk.train.draws import (
     draw_friction,
     draw_gains,
     draw_shank_length,
+    draw_supply,
 )
 from pronk.train.gains import TrainingGains
 
@@ -51,6 +52,12 @@ class Randomization:
     """Knee axis to foot centre, every leg its own [m] (D5); None leaves the model's."""
     base_mass: Range = (-0.4, 1.6)
     """Mass added to the trunk [kg], its inertia scaled alike (D6)."""
+    bus_voltage: Range | None = (22.2, 25.2)
+    """Voltage of a robot's battery at no load [V]: six lithium cells, 3.7 V (their nominal, and all
+    but empty) to 4.2 V (full). Not in the paper; None holds the rated voltage whatever is drawn."""
+    bus_resistance: Range = (0.0, 0.1)
+    """Of battery and wires [ohm]: six cells of 5 to 12 milliohm, the rest plugs and wires. A jump
+    draws a kilowatt and more, which costs 7 V at most. Not in the paper."""
     delay: int = 1
     """Half-width of the command delay about the matched one [physics steps], drawn per episode
     and never below 0. Not in the paper."""
@@ -75,14 +82,26 @@ class Randomization:
         Raises:
             PronkError: A range falls, or reaches where physics does not.
         """
-        for name in ("decimation", "friction", "shank_length", "base_mass", "push_interval_s"):
+        for name in (
+            "decimation",
+            "friction",
+            "shank_length",
+            "base_mass",
+            "bus_voltage",
+            "bus_resistance",
+            "push_interval_s",
+        ):
             span = getattr(self, name)
             if span is not None and not span[0] <= span[1]:
                 raise PronkError(f"{name} {span[0]} to {span[1]}; a range must not fall.")
-        for name in ("friction", "shank_length", "push_interval_s"):
+        for name in ("friction", "shank_length", "bus_voltage", "push_interval_s"):
             span = getattr(self, name)
             if span is not None and not span[0] > 0.0:
                 raise PronkError(f"{name} begins at {span[0]}; it must be positive.")
+        if not self.bus_resistance[0] >= 0.0:
+            raise PronkError(
+                f"bus_resistance begins at {self.bus_resistance[0]}; it must not be negative."
+            )
         for name in ("delay", *_NOISES.values(), "push_velocity", "push_yaw_rate"):
             if not getattr(self, name) >= 0.0:
                 raise PronkError(f"{name} is {getattr(self, name)}; it must not be negative.")
@@ -103,6 +122,8 @@ class Randomization:
             gains="off",
             shank_length=None,
             base_mass=(0.0, 0.0),
+            bus_voltage=None,
+            bus_resistance=(0.0, 0.0),
             delay=0,
             position_noise=0.0,
             velocity_noise=0.0,
@@ -181,6 +202,13 @@ def events(
     if r.base_mass != (0.0, 0.0):
         base = SceneEntityCfg(ENTITY, body_names=robot.base_body)
         terms["base_mass"] = _startup(draw_base_mass, span=r.base_mass, base=base)
+    if r.bus_voltage is not None:
+        terms["supply"] = _startup(
+            draw_supply,
+            voltage=r.bus_voltage,
+            resistance=r.bus_resistance,
+            rated=robot.joints[0].drive.bus_voltage,
+        )
     if r.decimation != (0, 0):
         if robot.decimation + r.decimation[0] < 1:
             raise PronkError(

@@ -1,0 +1,229 @@
+"""`pronk deploy`: a policy on a machine, virtual or real."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pronk.commands import console
+from pronk.errors import HardwareError
+
+if TYPE_CHECKING:
+    from pronk.deploy.operators import Operator
+    from pronk.deploy.run import Notice, Outcome
+    from pronk.policy.contract import Contract
+
+
+class Link(StrEnum):
+    """How the machine is reached."""
+
+    TWIN = "twin"
+    LCM = "lcm"
+    DDS = "dds"
+
+
+class Base(StrEnum):
+    """What the virtual robot's trunk stands on."""
+
+    BENCH = "bench"
+    GROUND = "ground"
+
+
+_FAILED = 1
+"""Exit status of a run that a fault ended."""
+
+
+def deploy(
+    policy: Annotated[Path, typer.Argument(help="policy.onnx, as `pronk train` writes it.")],
+    link: Annotated[
+        Link, typer.Option(help="twin: the virtual robot in this program; lcm, dds: by wire.")
+    ] = Link.TWIN,
+    interface: Annotated[
+        str | None,
+        typer.Option(help="Network interface to a real robot; without it nothing leaves here."),
+    ] = None,
+    script: Annotated[
+        str | None,
+        typer.Option(help="Fly this unattended: paper, or a command such as 1,0,0."),
+    ] = None,
+    walk_only: Annotated[bool, typer.Option("--walk-only", help="A script without jumps.")] = False,
+    gamepad: Annotated[
+        Path | None, typer.Option(help="Gamepad, such as /dev/input/js0; a keyboard if left out.")
+    ] = None,
+    log: Annotated[Path | None, typer.Option(help="Log of everything, MCAP.")] = None,
+    capture: Annotated[
+        Path | None, typer.Option(help="What cameras around the twin saw, .npz (--link twin).")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Sit down after this time with the policy in charge.")
+    ] = None,
+    blend: Annotated[
+        float, typer.Option(help="Time in which the policy takes over [s]; 0 as in training.")
+    ] = 0.4,
+    tilt: Annotated[float, typer.Option(help="Largest tilt of the trunk [rad].")] = 0.8,
+    base: Annotated[Base, typer.Option(help="Of the twin.")] = Base.GROUND,
+    truth: Annotated[
+        Path | None, typer.Option(help="Truth of the twin, instead of the shipped one.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the twin's noise.")] = 0,
+    layout: Annotated[str, typer.Option(help="Messages on LCM: cheetah or wtw.")] = "cheetah",
+    port: Annotated[int | None, typer.Option(help="UDP port of LCM.")] = None,
+    domain: Annotated[int | None, typer.Option(help="Domain of DDS.")] = None,
+    release: Annotated[
+        bool,
+        typer.Option("--release", help="Make the robot's own controller let go of the joints."),
+    ] = False,
+    any_delay: Annotated[
+        bool, typer.Option("--any-delay", help="Walk whatever delay is measured.")
+    ] = False,
+    real_time: Annotated[
+        bool, typer.Option("--real-time/--no-real-time", help="Ask for real-time scheduling.")
+    ] = True,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before real hardware moves.")
+    ] = False,
+    json_file: console.JsonOption = None,
+) -> None:
+    """Stand up, let the policy walk and jump, sit down; every command through the safety filter."""
+    from pronk.deploy.links import Link as Opener
+    from pronk.deploy.plan import Plan
+    from pronk.deploy.run import fly
+    from pronk.deploy.stance import Timing
+    from pronk.policy.runtime import load_policy
+
+    contract = load_policy(policy).contract
+    if capture is not None and (link is not Link.TWIN or base is not Base.GROUND):
+        raise HardwareError("--capture needs --link twin --base ground: no camera sees elsewhere.")
+    plan = Plan(
+        link=Opener(
+            kind=link.value,
+            robot=contract.robot,
+            interface=interface,
+            layout=layout,
+            port=port,
+            domain=domain,
+            release=release,
+            truth=truth,
+            seed=seed,
+            base=base.value,
+        ),
+        policy=policy,
+        log=log,
+        capture=capture,
+        limits={"tilt": tilt},
+        timing=Timing(blend_s=blend),
+        any_delay=any_delay,
+        real_time=real_time,
+    )
+    if interface is not None and link is not Link.TWIN and not yes:
+        _confirm(contract, f"{link.value} on {interface}")
+    with _operator(contract, script, walk_only, gamepad, seconds) as (operator, words):
+        console.say(words)
+        outcome = fly(plan, operator, _tell)
+    _report(outcome)
+    console.wrote(*(path for path in (log, capture) if path is not None))
+    console.write_json(json_file, outcome.figures())
+    console.following(
+        f"pronk report {log}"
+        if log is not None
+        else f"pronk deploy {policy} --link {link.value} --log run.mcap   # keeps everything"
+    )
+    if outcome.faults or outcome.refusals:
+        raise typer.Exit(_FAILED)
+
+
+def _confirm(contract: Contract, where: str) -> None:
+    """A typed word, so that no key pressed by chance moves a robot.
+
+    Raises:
+        HardwareError: Another word, or nobody there.
+    """
+    console.say(
+        f"A real {contract.robot} at {where} is about to move. Everybody out of its reach; the "
+        "first time, hang it up."
+    )
+    if typer.prompt(f"Type the robot's name ({contract.robot}) to go on").strip() != contract.robot:
+        raise HardwareError(f"that was not {contract.robot!r}; nothing was moved.")
+
+
+@contextmanager
+def _operator(
+    contract: Contract,
+    script: str | None,
+    walk_only: bool,
+    gamepad: Path | None,
+    seconds: float | None,
+) -> Iterator[tuple[Operator, str]]:
+    """Who holds the stick, and what to tell them."""
+    from pronk.deploy.hands import HELP, PAD_HELP, Gamepad, Keyboard
+    from pronk.deploy.operators import Scripted, Timed
+
+    if script is not None:
+        unattended = Scripted(_scripts(script, contract, walk_only))
+        what = f"unattended: {len(unattended.scripts)} scripts, {unattended.seconds:.0f} s."
+        yield (unattended if seconds is None else Timed(unattended, seconds)), what
+        return
+    held = (
+        Keyboard(contract.command_ranges)
+        if gamepad is None
+        else Gamepad(gamepad, contract.command_ranges)
+    )
+    try:
+        yield (
+            (held if seconds is None else Timed(held, seconds)),
+            (HELP if gamepad is None else PAD_HELP),
+        )
+    finally:
+        held.close()
+
+
+def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Any]:
+    from pronk.trial.protocol import PAPER_COMMANDS, Script, parse_case
+
+    cases = PAPER_COMMANDS if text == "paper" else (parse_case(text),)
+    jump_s = 0.5 if contract.jump and not walk_only else 0.0
+    return [Script(command=case.command, jump_s=jump_s) for case in cases]
+
+
+def _tell(notice: Notice) -> None:
+    """One line for each thing that happened."""
+    line = f"{notice.kind}: {notice.text}"
+    if notice.kind in ("fault", "refused", "notice"):
+        console.warn(line)
+    else:
+        console.err().print(line, markup=False)
+
+
+def _report(outcome: Outcome) -> None:
+    """The figures of the run."""
+    servo, policy = outcome.servo, outcome.policy
+    robot = "the virtual robot" if servo.get("virtual") else "a real robot"
+    made = console.table(
+        f"Deployment on {robot}", "what [ms]", "n", "median", "95 %", "99 %", "99.9 %", "largest"
+    )
+    rows = (
+        ("servo tick late", servo.get("lateness")),
+        ("age of the state at a tick", servo.get("state_age")),
+        ("state to command", servo.get("state_to_command")),
+        ("policy step late", policy.get("lateness")),
+        ("policy's decision", policy.get("decision")),
+    )
+    keys = ("p50_ms", "p95_ms", "p99_ms", "p99_9_ms", "max_ms")
+    for name, figures in rows:
+        if figures and figures["n"]:
+            cells = [console.number(figures[key], 3) for key in keys]
+            console.row(made, name, str(figures["n"]), *cells)
+    console.show(made)
+    met = ", ".join(f"{name} {count}" for name, count in servo.get("interventions", {}).items())
+    console.say(
+        f"safety filter: {met or 'nothing to object to'} (ticks of {servo.get('ticks', 0)})"
+    )
+    dropped = sum(servo.get("dropped", {}).values())
+    if dropped:
+        console.warn(f"{dropped} records found no room on their way to the log")
+    console.say(outcome.delay_words())

@@ -1,0 +1,1 @@
+"""A policy on a machine: control loop, safety filter, start and stop."""

@@ -1,0 +1,201 @@
+"""The policy's process: at 50 Hz from the newest state to an order for the servo.
+
+It decides from the moment the robot is damped, heard or not: so the network is warm, and the
+latency is known, before the policy's turn comes. Every change of mode begins a new past for it,
+except that it comes to a halt as it was.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import orjson
+
+from pronk.deploy.plan import POLICY_PRIORITY, Names, Plan, Shared
+from pronk.deploy.realtime import Histogram, Pace, enter, sleep_until
+from pronk.deploy.records import ORDERS, STEP, Mode, event, get_state
+from pronk.errors import PronkError
+from pronk.hardware.machine import State
+from pronk.policy.contract import Contract
+from pronk.policy.layout import MEASURED_SIZE
+from pronk.policy.observation import History
+from pronk.policy.runtime import Policy, load_policy
+from pronk.trial.pilot import Pilot, measurement
+from pronk.trial.protocol import STILL, Asked
+
+WARM_UP = 20
+"""Steps before the first one that counts."""
+PRIME_S = 1.5e-3
+"""Before each step the network runs once for nothing: in 20 ms its weights have left the cache,
+and a step that has to fetch them takes three times as long [s]."""
+_PHASE_S = 0.4e-3
+"""After the servo's tick, when its news are there: nothing waits for the next tick [s]."""
+_LIVE = (Mode.POLICY, Mode.HALT)
+
+
+def think(plan: Plan, names: Names, end: Connection) -> None:
+    """Body of the policy process.
+
+    Args:
+        plan: What to do.
+        names: Of the shared memory.
+        end: Where the figures of the run go when it is over, as JSON.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    shared = Shared(names)
+    thinker = Thinker(plan, shared, load_policy(plan.policy))
+    signal.signal(signal.SIGTERM, lambda *_: thinker.stop())
+    for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
+        shared.troubles.put(event(time.monotonic(), "system", f"policy: {line}"))
+    try:
+        thinker.run()
+    finally:
+        end.send_bytes(orjson.dumps(thinker.figures()))
+        end.close()
+        shared.close()
+
+
+def warm_up(policy: Policy, contract: Contract, steps: int = WARM_UP) -> None:
+    """Run the network on a robot that stands, and forget it."""
+    state = State(
+        time=0.0,
+        sequence=0,
+        position=np.array(contract.default_position),
+        velocity=np.zeros(len(contract.joint_names)),
+        torque=np.zeros(len(contract.joint_names)),
+        gyro=np.zeros(3),
+        accelerometer=np.array([0.0, 0.0, 9.81]),
+        bus_voltage=0.0,
+    )
+    for _ in range(steps):
+        policy.step(measurement(state), STILL)
+    policy.reset()
+
+
+class Thinker:
+    """The loop and what it counts."""
+
+    def __init__(self, plan: Plan, shared: Shared, policy: Policy) -> None:
+        """Warm the network up."""
+        self.plan = plan
+        self.shared = shared
+        self.pilot = Pilot(policy, plan.robot)
+        self.rate_hz = policy.contract.policy_rate_hz
+        self.lateness = Histogram()
+        self.decision = Histogram()
+        """Observation built and network run."""
+        self._history = History(policy.contract.default_position)
+        self._jumps = policy.contract.jump
+        self._pace: Pace | None = None
+        self._entry = -1
+        self._mode = Mode.IDLE
+        self._stopping = False
+        self._parent = os.getppid()
+        self._complaint = ""
+        self._order = np.zeros((), dtype=ORDERS)
+        self._step = np.zeros((), dtype=STEP)
+        self._count = 0
+        self._nothing = np.zeros((1, MEASURED_SIZE), np.float32)
+        warm_up(policy, policy.contract)
+
+    def stop(self) -> None:
+        """End at the next step."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Step until the servo has ended."""
+        while not self._stopping and os.getppid() == self._parent:
+            news = self.shared.news.read()
+            if news is None:
+                time.sleep(1.0 / self.rate_hz)
+                continue
+            mode = Mode(int(news["mode"]))
+            if mode is Mode.ENDED:
+                return
+            if self._pace is None:
+                # On the servo's own grid, so that news are always as young.
+                self._pace = Pace(self.rate_hz, float(news["start"]) + _PHASE_S)
+                self._pace.advance(time.monotonic())
+            sleep_until(self._pace.deadline - PRIME_S)
+            self.pilot.policy.infer(self._nothing)
+            sleep_until(self._pace.deadline)
+            self._one(self._pace)
+
+    def figures(self) -> dict[str, Any]:
+        """Of the run so far."""
+        pace = self._pace
+        return {
+            "steps": self.decision.count,
+            "missed_steps": 0 if pace is None else pace.missed,
+            "lateness": self.lateness.figures(),
+            "decision": self.decision.figures(),
+        }
+
+    def _one(self, pace: Pace) -> None:
+        begun = time.monotonic()
+        self.lateness.add(begun - pace.deadline)
+        deadline = pace.deadline
+        news = self.shared.news.read()
+        if news is not None and Mode(int(news["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
+            mode, entry = Mode(int(news["mode"])), int(news["entry"])
+            if entry != self._entry and not (mode is Mode.HALT and self._mode is Mode.POLICY):
+                self.pilot.reset()
+                self._history.reset()
+                self._entry = entry
+            self._mode = mode
+            try:
+                self._answer(news, deadline, begun)
+            except PronkError as error:
+                # No order: the servo's filter says what is wrong and lets the last one expire.
+                self._complain(str(error))
+        pace.advance(time.monotonic())
+
+    def _answer(self, news: np.void, deadline: float, begun: float) -> None:
+        state = get_state(news)
+        velocity, jump = self._asked()
+        now = time.monotonic()
+        command, tick = self.pilot.decide(state, (velocity, jump), now)
+        inferred = time.monotonic()
+        self.decision.add(inferred - now)
+        order = self._order
+        order["sequence"] = self._count
+        order["state_sequence"], order["state_time"] = state.sequence, state.time
+        order["made"], order["valid_for"] = begun, self.plan.order_valid_s
+        order["entry"] = self._entry
+        order["position"] = command.position
+        self.shared.orders.write(order)
+        done = time.monotonic()
+        self._count += 1
+        # What the network read, built once more beside it: after the order, where it costs nothing.
+        observation = self._history.observe(measurement(state), velocity)
+        self._history.acted(tick.action.astype(np.float32))
+        step = self._step
+        step["observation"] = observation
+        step["sequence"], step["deadline"], step["begun"] = order["sequence"], deadline, begun
+        step["observed"], step["inferred"], step["done"] = now, inferred, done
+        step["state_sequence"], step["state_time"] = state.sequence, state.time
+        step["live"] = self._mode in _LIVE
+        step["command"], step["jump"] = velocity, jump
+        step["action"], step["target"] = tick.action, tick.target
+        step["contact"], step["linear_velocity"] = tick.contact, tick.linear_velocity
+        self.shared.steps.put(step)
+        self._complaint = ""
+
+    def _asked(self) -> Asked:
+        """What the operator wants now: to stand still unless the policy is in charge."""
+        stick = self.shared.stick.read()
+        if stick is None or self._mode is not Mode.POLICY:
+            return STILL, False
+        forward, left, yaw = (float(value) for value in stick["command"])
+        return (forward, left, yaw), bool(stick["jump"]) and self._jumps
+
+    def _complain(self, text: str) -> None:
+        """Once for each new complaint."""
+        if text != self._complaint:
+            self._complaint = text
+            self.shared.troubles.put(event(time.monotonic(), "policy", text))

@@ -1,0 +1,209 @@
+"""What goes wrong on a link, on purpose and repeatably.
+
+A `Lane` is one direction of a link: what is put in comes out late, twice, in another order, or
+never. Draws are seeded, one of each kind per message whether it is used or not, so that asking for
+one fault more does not change when the others strike.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from dataclasses import dataclass, field, fields
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from pronk.errors import HardwareError
+
+T = TypeVar("T")
+
+# Times in a specification may carry a unit; how many make a second.
+_UNITS = {"us": 1e6, "ms": 1e3, "s": 1.0}
+_JITTER_SHAPE = 2.0
+"""Of the gamma distribution of the jitter: few messages are on time, and some are very late."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaneFaults:
+    """One direction. Probabilities are per message."""
+
+    delay: float = 0.0
+    """[s]"""
+    jitter: float = 0.0
+    """Mean of what comes on top of the delay, gamma distributed of shape 2 [s]."""
+    loss: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    """That a message waits for the next one and comes after it."""
+    nan: float = 0.0
+    """That one number of a state is not a number. Has no meaning for commands."""
+    flip: float = 0.0
+    """That one bit of a message is another."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible faults.
+
+        Raises:
+            HardwareError: A time is negative or not finite, or a probability not in 0 to 1.
+        """
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name in ("delay", "jitter"):
+                if not 0.0 <= value < math.inf:
+                    raise HardwareError(f"{entry.name} is {value} s; expected 0 or more.")
+            elif not 0.0 <= value <= 1.0:
+                raise HardwareError(f"{entry.name} is {value}; expected a probability, 0 to 1.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """Everything that goes wrong with a machine behind a link. Times on the machine's clock."""
+
+    command: LaneFaults = field(default_factory=LaneFaults)
+    """From whoever commands to the machine."""
+    state: LaneFaults = field(default_factory=LaneFaults)
+    """From the machine to whoever listens."""
+    after: float = 0.0
+    """When the faults of both directions begin [s]."""
+    freeze: tuple[float, float] | None = None
+    """When the values of the states stop changing, and for how long; their numbers and stamps go
+    on [s]."""
+    clock: tuple[float, float] | None = None
+    """When the robot's own clock jumps, and by how much [s]."""
+    rival: float | None = None
+    """When another program begins to command the joints [s]."""
+
+
+def parse_faults(text: str) -> Faults:
+    """Faults from words such as `loss=0.3,state.delay=5ms,freeze=3s:0.5s`.
+
+    `delay`, `jitter`, `loss`, `duplicate`, `reorder`, `nan`, `flip` are of both directions unless
+    `command.` or `state.` stands before them; `after=T`, `rival=T`, `freeze=T:LENGTH` and
+    `clock=T:STEP` are of the machine. Numbers without a unit are in seconds.
+
+    Raises:
+        HardwareError: A word is unknown, or a value cannot be read or is impossible.
+    """
+    lanes: dict[str, dict[str, float]] = {"command": {}, "state": {}}
+    whole: dict[str, float | tuple[float, float]] = {}
+    known = [entry.name for entry in fields(LaneFaults)]
+    for word in filter(None, (part.strip() for part in text.split(","))):
+        name, _, value = word.partition("=")
+        lane, dot, bare = name.rpartition(".")
+        if bare in known and (not dot or lane in lanes):
+            for each in (lane,) if dot else tuple(lanes):
+                lanes[each][bare] = _number(word, value)
+        elif name in ("after", "rival"):
+            whole[name] = _number(word, value)
+        elif name in ("freeze", "clock") and value.count(":") == 1:
+            first, second = value.split(":")
+            whole[name] = (_number(word, first), _number(word, second))
+        else:
+            raise HardwareError(
+                f"fault {word!r} is unknown; expected {', '.join(known)} (both directions, or with "
+                "command. or state. before it), after=T, rival=T, freeze=T:LENGTH, clock=T:STEP."
+            )
+    return Faults(
+        command=LaneFaults(**lanes["command"]),
+        state=LaneFaults(**lanes["state"]),
+        **whole,  # type: ignore[arg-type]
+    )
+
+
+def _number(word: str, text: str) -> float:
+    scale = 1.0
+    for unit, factor in _UNITS.items():
+        if text.endswith(unit):
+            text, scale = text[: -len(unit)], factor
+            break
+    try:
+        value = float(text) / scale
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise HardwareError(f"fault {word!r}: expected a number, if a time also with s, ms or us.")
+    return value
+
+
+class Lane(Generic[T]):
+    """One direction of a link and what happens to messages in it."""
+
+    def __init__(self, faults: LaneFaults, *, after: float, seed: int) -> None:
+        """An empty lane.
+
+        Args:
+            faults: What happens.
+            after: Messages put in before this time pass untouched [s].
+            seed: Of all draws.
+        """
+        self.counts: Counter[str] = Counter()
+        """How many messages met each fault."""
+        self._faults = faults
+        self._after = after
+        self._rng, self._spoiling = (np.random.default_rng([seed, k]) for k in range(2))
+        self._idle = faults == LaneFaults()
+        self._queue: list[tuple[float, int, T]] = []
+        self._put = 0
+        self._held: T | None = None
+
+    def put(self, item: T, now: float) -> None:
+        """A message enters the lane.
+
+        Args:
+            item: The message.
+            now: [s]
+        """
+        if self._idle or now < self._after:
+            self._push(item, now)
+            return
+        faults = self._faults
+        lost, twice, swapped = self._rng.random(3) < (faults.loss, faults.duplicate, faults.reorder)
+        late = self._rng.standard_gamma(_JITTER_SHAPE) / _JITTER_SHAPE * faults.jitter
+        if lost:
+            self.counts["lost"] += 1
+            return
+        due = now + faults.delay + late
+        if swapped and self._held is None:
+            self.counts["reordered"] += 1
+            self._held = item
+            return
+        self._push(item, due)
+        if twice:
+            self.counts["duplicated"] += 1
+            self._push(item, due)
+        if self._held is not None:
+            self._push(self._held, due)
+            self._held = None
+
+    def due(self, now: float) -> list[T]:
+        """The messages that leave the lane until `now` [s], in the order they leave."""
+        out: list[T] = []
+        while self._queue and self._queue[0][0] <= now:
+            out.append(heapq.heappop(self._queue)[2])
+        return out
+
+    def strikes(self, kind: str, now: float) -> bool:
+        """Whether a fault of this kind (`nan` or `flip`) strikes the message at hand."""
+        chance: float = getattr(self._faults, kind)
+        if chance == 0.0 or now < self._after:
+            return False
+        struck = bool(self._spoiling.random() < chance)
+        self.counts[kind] += struck
+        return struck
+
+    def pick(self, below: int) -> int:
+        """A random number from 0 to `below` - 1: which bit, which joint."""
+        return int(self._spoiling.integers(below))
+
+    def _push(self, item: T, due: float) -> None:
+        heapq.heappush(self._queue, (due, self._put, item))
+        self._put += 1
+
+
+def flip_bit(data: bytes, bit: int) -> bytes:
+    """The same bytes with one bit turned over."""
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)

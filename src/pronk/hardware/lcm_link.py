@@ -1,0 +1,303 @@
+"""A robot behind LCM: the Mini Cheetah, a Go1 behind the bridge of walk-these-ways, or the twin.
+
+One handle receives, in a thread of its own, because polling one message per tick from LCM's queue
+yields data hundreds of milliseconds old; the other publishes. Times are the local monotonic
+clock's: a state's is when its last message arrived.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+
+from pronk.errors import HardwareError
+from pronk.hardware.lcm_layout import (
+    layout_of,
+)
+from pronk.hardware.lcm_reader import ANSWER_S, StateReader, waited_for
+from pronk.hardware.lcm_service import (
+    BEACON_CHANNEL,
+    BENCH_CHANNEL,
+    REQUEST_CHANNEL,
+    RESPONSE_CHANNEL,
+    clamp_message,
+    mode_request,
+)
+from pronk.hardware.lcm_url import open_lcm, url_of
+from pronk.hardware.lcm_writer import DAMP_PERIOD_S, CommandWriter
+from pronk.hardware.machine import Command, State, TorqueKind
+from pronk.hardware.preflight import WINDOW_S, Freshness, check_rate, check_rest
+from pronk.robots.robot import Robot
+
+Hand = Callable[[tuple[str, ...]], None]
+"""A person at the bench: told which joints to fix, returns when they are."""
+
+_DAMP_AT_LEAST_S, _DAMP_AT_MOST_S = 1.0, 3.0
+_AT_REST = 0.5
+"""Joint speed below which a robot that is being left counts as at rest [rad/s]."""
+_QUEUE = 100
+
+
+class LcmMachine:
+    """A robot with twelve joints behind LCM. Implements `Machine`.
+
+    `virtual` is known once connected: the virtual robot says on a channel of its own what it is.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        layout: str = "cheetah",
+        port: int | None = None,
+        interface: str | None = None,
+        hand: Hand | None = None,
+        release: bool = False,
+        alone_s: float = 1.0,
+        fresh: Freshness | None = None,
+    ) -> None:
+        """Describe the link; nothing is opened yet.
+
+        Args:
+            robot: Names, order and limits of the joints.
+            layout: `cheetah` or `wtw`.
+            port: UDP port; None for the twin's on loopback, the robots' on an interface.
+            interface: Network interface of a real robot, `lo` on the robot itself; None never
+                leaves this computer and meets no real robot.
+            hand: Who fixes joints on a real bench; None if nobody.
+            release: Ask the robot's own controller to let go of the joints first.
+            alone_s: How long the command channel must be silent before pronk writes to it [s].
+            fresh: How fresh states must be; None for what moving a robot takes.
+
+        Raises:
+            HardwareError: The layout is unknown, the robot has not twelve joints, or the address
+                is impossible.
+        """
+        self._layout = layout_of(layout)
+        if len(robot.joints) != 12:
+            raise HardwareError(
+                f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
+                "for twelve."
+            )
+        self.robot = robot.name
+        self.virtual = False
+        self.torque_kind: TorqueKind = self._layout.torque_kind
+        self._robot = robot
+        self._interface = interface
+        self._url = url_of(port=port, interface=interface)
+        self._hand = hand
+        self._release = release
+        self._alone_s = alone_s
+        self._fresh = fresh
+        self._foreign = 0
+        self._reader = StateReader(self._layout, robot.joint_names)
+        self._writer: CommandWriter | None = None
+        self._written: Counter[str] = Counter()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was met: states, and why some were not made; commands, `expired`, `foreign`."""
+        met = Counter(self._reader.counts)
+        met["foreign"] = self._foreign
+        return met + self._written
+
+    def connect(self) -> None:
+        """Open the link and check that the robot is fit to move. About a second.
+
+        In this order: states arrive at the layout's rate without gaps for 200 ms; gravity points
+        where the attitude says; every joint is within its limits; nobody else commands.
+
+        Raises:
+            HardwareError: A check failed; nothing was written to the robot's joints.
+        """
+        self.close()
+        layout = self._layout
+        reader = self._reader = StateReader(layout, self._robot.joint_names)
+        self.virtual, self._foreign = False, 0
+        self._responses: list[bytes] = []
+        self._in, self._out = open_lcm(self._url), open_lcm(self._url)
+        self._publishing = threading.Lock()
+        self._writer = writer = CommandWriter(
+            layout, lambda data: self._publish(layout.command_channel, data)
+        )
+
+        self._written = writer.counts
+
+        def command(_: str, data: bytes) -> None:
+            self._foreign += not writer.is_own(data)
+
+        for channel, handler in (
+            (layout.attitude_channel, lambda _, data: reader.attitude(data, time.monotonic())),
+            (layout.joints_channel, lambda _, data: reader.joints(data, time.monotonic())),
+            (layout.command_channel, command),
+            (BEACON_CHANNEL, lambda _, data: reader.beacon(data)),
+            (RESPONSE_CHANNEL, lambda _, data: self._responses.append(data)),
+        ):
+            self._in.subscribe(channel, handler).set_queue_capacity(_QUEUE)
+        self._reading = True
+        self._thread = threading.Thread(target=self._read, name="pronk lcm reader", daemon=True)
+        self._thread.start()
+        try:
+            self._preflight()
+        except BaseException:
+            self.close()
+            raise
+
+    def now(self) -> float:
+        """The local monotonic clock [s]."""
+        return time.monotonic()
+
+    def latest(self) -> State:
+        """The newest state, without waiting.
+
+        Raises:
+            HardwareError: Not connected.
+        """
+        state = self._reader.latest if self._writer else None
+        if state is None:
+            raise HardwareError(f"the LCM link to {self.robot} is not open; call connect() first.")
+        return state
+
+    def wait(self, until: float) -> list[State]:
+        """Sleep to `until` [s]; return the states that arrived since the last call."""
+        delay = until - time.monotonic()
+        if delay > 0.0:
+            time.sleep(delay)
+        return self._reader.drain()
+
+    def send(self, command: Command) -> None:
+        """Put a command on the wire, once. One that has expired already becomes damping.
+
+        Raises:
+            HardwareError: Not connected, not finite, or someone else has commanded since.
+        """
+        if self._writer is None:
+            raise HardwareError(f"the LCM link to {self.robot} is not open; call connect() first.")
+        if self._foreign:
+            raise HardwareError(
+                f"another program commands the joints on {self._layout.command_channel} "
+                f"({self._foreign} commands met); stop it, and connect again."
+            )
+        values = (command.position, command.stiffness, command.damping)
+        if not all(np.isfinite(value).all() for value in values):
+            raise HardwareError("a command holds a number that is not finite; it was not sent.")
+        self._writer.send(command)
+
+    def clamp(self, joints: tuple[str, ...]) -> None:
+        """Have joints fixed: by the virtual robot itself, or by a person's hand.
+
+        Raises:
+            HardwareError: A joint is unknown, nobody is there to fix it, or no answer came.
+        """
+        for name in joints:
+            self._robot.joint(name)
+        if self.virtual:
+            self._bench(joints)
+        elif self._hand is not None:
+            self._hand(joints)
+        elif joints:
+            raise HardwareError(
+                f"{', '.join(joints)} must be fixed mechanically and nobody is at the bench; "
+                "ask joints that need no clamp, or have someone there who confirms it."
+            )
+
+    def damp(self) -> None:
+        """Write damping now and go on until a command or the end. Never raises."""
+        if self._writer is not None:
+            self._writer.damp()
+
+    def close(self) -> None:
+        """Leave the robot damped and at rest, and close; closing twice does no harm.
+
+        Takes 1 s of damping at least, 3 s at most; no time at all if nothing was ever sent.
+        """
+        writer = self._writer
+        if writer is None:
+            return
+        if writer.wrote:
+            writer.damp()
+            begun = time.monotonic()
+            while (spent := time.monotonic() - begun) < _DAMP_AT_MOST_S:
+                state = self._reader.latest
+                speed = np.abs(state.velocity).max() if state is not None else 0.0
+                if spent >= _DAMP_AT_LEAST_S and speed < _AT_REST:
+                    break
+                time.sleep(DAMP_PERIOD_S)
+        writer.stop()
+        self._reading = False
+        self._thread.join()
+        self._writer = None
+        del self._in, self._out
+
+    def _read(self) -> None:
+        while self._reading:
+            self._in.handle_timeout(50)
+
+    def _publish(self, channel: str, data: bytes) -> None:
+        # The handle belongs to one thread at a time.
+        with self._publishing:
+            self._out.publish(channel, data)
+
+    def _preflight(self) -> None:
+        reader, layout = self._reader, self._layout
+        begun = time.monotonic()
+        if not waited_for(lambda: reader.latest is not None):
+            raise HardwareError(
+                f"{self.robot} sent no state on {layout.joints_channel} and "
+                f"{layout.attitude_channel} within {ANSWER_S:g} s at {self._url}"
+                + (f"; what came was refused: {reader.complaint}" if reader.complaint else "")
+                + "; check that its program runs, the layout, the port and the network."
+            )
+        if self._release:
+            self._let_go()
+        self._foreign, silent_from = 0, time.monotonic()
+        while True:
+            reader.drain()
+            states = self.wait(time.monotonic() + WINDOW_S)
+            try:
+                check_rate(self.robot, states, layout.state_rate_hz, self._fresh)
+                break
+            except HardwareError:
+                # A busy computer may lose its breath; a robot that is too slow never has it.
+                if time.monotonic() > begun + 2.0 * ANSWER_S:
+                    raise
+        check_rest(self._robot, states)
+        time.sleep(max(0.0, silent_from + self._alone_s - time.monotonic()))
+        if self._foreign:
+            raise HardwareError(
+                f"someone else commands the joints: {self._foreign} commands on "
+                f"{layout.command_channel} within {self._alone_s:g} s; stop that program, or "
+                "release the robot's own controller."
+            )
+        if self._interface is None:
+            # It says so ten times a second; someone else's simulator never does.
+            waited_for(lambda: reader.virtual)
+        self.virtual = reader.virtual
+        reader.drain()
+
+    def _let_go(self) -> None:
+        data = mode_request(0, time.monotonic_ns())
+        self._publish(REQUEST_CHANNEL, data)
+        if not waited_for(lambda: data in self._responses):
+            raise HardwareError(
+                f"{self.robot} did not confirm control_mode 0 on {RESPONSE_CHANNEL} within "
+                f"{ANSWER_S:g} s; release it by its own remote."
+            )
+
+    def _bench(self, joints: tuple[str, ...]) -> None:
+        names, request = self._robot.joint_names, time.monotonic_ns()
+        data = clamp_message(names, joints, request)
+        held = (request, tuple(name for name in names if name in joints))
+        # Asked again, for the way there may lose messages.
+        for _ in range(4):
+            self._publish(BENCH_CHANNEL, data)
+            if waited_for(lambda: self._reader.held == held, ANSWER_S / 4):
+                return
+        raise HardwareError(
+            f"the virtual robot did not confirm its clamps within {ANSWER_S:g} s; check that "
+            "`pronk twin` still runs."
+        )

@@ -1,0 +1,174 @@
+"""What an LCM message is: its fields, and all that follows from them.
+
+A message on the wire is its fingerprint (8 bytes) and then its fields, big-endian and without
+padding. The fingerprint is a hash of the fields' names, types and dimensions by the rule of
+lcm-gen (`lcmgen.c`). The name of the type is not hashed, nor is the channel.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pronk.errors import HardwareError
+
+_WORD = (1 << 64) - 1
+# LCM's primitive types as numpy sees them, big-endian.
+_KINDS = {
+    "int8_t": ">i1",
+    "int16_t": ">i2",
+    "int32_t": ">i4",
+    "int64_t": ">i8",
+    "float": ">f4",
+    "double": ">f8",
+}
+_FIELD = re.compile(r"\s*(\w+)\s+(\w+)(?:\[(\d+)\])?\s*")
+
+
+class RefusedError(HardwareError):
+    """A message that is not what it must be; `reason` is a label to count it under."""
+
+    def __init__(self, reason: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.reason = reason
+
+
+@dataclass(frozen=True, kw_only=True)
+class Field:
+    """One field of a message."""
+
+    name: str
+    kind: str
+    """LCM's name of its type, for instance float."""
+    count: int | None
+    """Length of a one-dimensional array; None for a scalar."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A type of message: its fields in wire order, and all that follows from them."""
+
+    name: str
+    """Its stack and its name there, for instance cheetah.spi_data_t."""
+    fingerprint: int
+    """As lcm-gen 1.5.3 gives it."""
+    layout: str
+    """Fields in LCM's own language, separated by semicolons: `float q[12]; int64_t id`."""
+
+    def __post_init__(self) -> None:
+        """Check the table against the rule.
+
+        Raises:
+            HardwareError: A field cannot be read, or the fingerprint is not that of the fields.
+        """
+        if self.computed_fingerprint != self.fingerprint:
+            raise HardwareError(
+                f"{self.name}: the fields hash to {self.computed_fingerprint:#018x}, expected "
+                f"{self.fingerprint:#018x}; a name, type or length in the table is wrong."
+            )
+
+    @cached_property
+    def fields(self) -> tuple[Field, ...]:
+        """The fields in wire order."""
+        made = []
+        for text in self.layout.split(";"):
+            found = _FIELD.fullmatch(text)
+            if found is None or found[1] not in _KINDS:
+                raise HardwareError(
+                    f"{self.name}: field {text.strip()!r} is not `type name` or `type name[count]` "
+                    f"of {', '.join(_KINDS)}."
+                )
+            count = int(found[3]) if found[3] else None
+            made.append(Field(name=found[2], kind=found[1], count=count))
+        return tuple(made)
+
+    @cached_property
+    def computed_fingerprint(self) -> int:
+        """The hash of the fields by lcm-gen's rule, as an unsigned number of 64 bits."""
+        value = 0x12345678
+        for field in self.fields:
+            value = _hash_text(_hash_text(value, field.name), field.kind)
+            value = _hash(value, 0 if field.count is None else 1)
+            if field.count is not None:
+                # 0: the dimension is a constant.
+                value = _hash_text(_hash(value, 0), str(field.count))
+        return (value << 1 | value >> 63) & _WORD
+
+    @cached_property
+    def dtype(self) -> np.dtype[np.void]:
+        """The whole message, fingerprint included, as a numpy record."""
+        columns: list[Any] = [("_fingerprint", ">u8")]
+        for field in self.fields:
+            shape = () if field.count is None else (field.count,)
+            columns.append((field.name, _KINDS[field.kind], shape))
+        return np.dtype(columns)
+
+    @property
+    def size(self) -> int:
+        """Length on the wire, fingerprint included [bytes]."""
+        return self.dtype.itemsize
+
+    def encode(self, **values: ArrayLike) -> bytes:
+        """The bytes of a message; fields that are not named are 0.
+
+        Args:
+            **values: By name of the field; scalars fill arrays.
+
+        Raises:
+            HardwareError: A name is not that of a field.
+        """
+        record = np.zeros((), self.dtype)
+        record["_fingerprint"] = self.fingerprint
+        for name, value in values.items():
+            if name not in self.dtype.fields or name == "_fingerprint":  # type: ignore[operator]
+                raise HardwareError(
+                    f"{self.name} has no field {name!r}; it has "
+                    f"{', '.join(field.name for field in self.fields)}."
+                )
+            record[name] = value
+        return record.tobytes()
+
+    def decode(self, data: bytes) -> NDArray[np.void]:
+        """The fields of a message, by name; numbers keep their wire types.
+
+        Raises:
+            RefusedError: Another fingerprint or another length. Counted as `fingerprint`, `length`.
+        """
+        met = int.from_bytes(data[:8], "big")
+        if len(data) < 8 or met != self.fingerprint:
+            # Here, because the table is made of messages.
+            from pronk.hardware.lcm_types import MESSAGES
+
+            known = MESSAGES.get(met)
+            got = f"{met:#018x}" + (f" ({known.name})" if known else "")
+            raise RefusedError(
+                "fingerprint",
+                f"a message has fingerprint {got}, expected {self.fingerprint:#018x} "
+                f"({self.name}); whoever sends it speaks another layout.",
+            )
+        if len(data) != self.size:
+            raise RefusedError(
+                "length",
+                f"{self.name} is {len(data)} bytes long, expected {self.size}; it was cut or "
+                "padded on the way.",
+            )
+        return np.frombuffer(data, self.dtype)[0]  # type: ignore[no-any-return]
+
+
+def _hash(value: int, byte: int) -> int:
+    """One byte into lcm-gen's hash: v' = ((v << 8) ^ (v >> 55)) + byte, v signed, 64 bits."""
+    signed = value - (1 << 64) if value >> 63 else value
+    return ((value << 8) ^ (signed >> 55)) + byte & _WORD
+
+
+def _hash_text(value: int, text: str) -> int:
+    """A length and then its characters into the hash."""
+    value = _hash(value, len(text))
+    for byte in text.encode():
+        value = _hash(value, byte)
+    return value

@@ -1,0 +1,427 @@
+"""Tables of a trial, as plain data: the paper's Table III beside ours, ratios, bars, definitions.
+
+A `Sheet` is what the terminal and the page print. No cell is left out: one that could not be
+measured holds a dash and its count says why.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from pronk.trial.metrics import FIGURES
+from pronk.trial.result import COMPARED, Trial
+from pronk.trial.summary import FEWEST, Cell, Ratio, Spread
+
+Pair = tuple[float, float]
+"""Mean and standard deviation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperCell:
+    """One row of the paper's Table III: mean and standard deviation of five jumps [m]."""
+
+    height: Mapping[str, Pair]
+    """By gains: `naive`, `matched`."""
+    distance: Mapping[str, Pair]
+
+
+TABLE_III: Mapping[str, PaperCell] = {
+    "forward 1": PaperCell(
+        height={"naive": (0.332, 0.008), "matched": (0.318, 0.014)},
+        distance={"naive": (0.690, 0.076), "matched": (0.597, 0.042)},
+    ),
+    "forward 2": PaperCell(
+        height={"naive": (0.246, 0.022), "matched": (0.244, 0.013)},
+        distance={"naive": (0.944, 0.030), "matched": (0.969, 0.026)},
+    ),
+    "side -1": PaperCell(
+        height={"naive": (0.304, 0.061), "matched": (0.374, 0.016)},
+        distance={"naive": (0.636, 0.092), "matched": (0.587, 0.054)},
+    ),
+    "side +1": PaperCell(
+        height={"naive": (0.249, 0.041), "matched": (0.366, 0.052)},
+        distance={"naive": (0.701, 0.183), "matched": (0.542, 0.051)},
+    ),
+    "back 2": PaperCell(
+        height={"naive": (0.346, 0.031), "matched": (0.381, 0.015)},
+        distance={"naive": (0.944, 0.030), "matched": (0.932, 0.025)},
+    ),
+}
+"""arXiv 2404.15096. Its naive distance with `back 2` is that with `forward 2`, digit by digit: most
+likely a slip of the pen (reading A4)."""
+
+PAPER_RATIOS = {"height": 1.48, "distance": 2.08}
+"""Ratio of the mean standard deviations, naive over matched, as Table III gives it; the text says
+2.30 for the distance (reading A4)."""
+
+GAPS = {"forward 2": 0.60, "back 2": 0.55, "side -1": 0.40, "side +1": 0.40}
+"""Bars [m]; the paper's are .55, .50, .40 (R3)."""
+HEIGHT = 0.45
+"""Bar of the best command [m]: what the paper calls the physical limit (R5)."""
+SUCCESS = 0.95
+"""Bar of the landing success."""
+DEFINITIONS = "Definitions"
+"""Title of the table of equations."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheet:
+    """A table of text."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One figure of the first policy and its bar."""
+
+    what: str
+    value: float
+    sense: Literal["<=", ">="]
+    bar: float
+    unit: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the figure clears the bar; NaN does not."""
+        return self.value <= self.bar if self.sense == "<=" else self.value >= self.bar
+
+    def row(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {**asdict(self), "passed": self.passed}
+
+
+def sheets(trial: Trial) -> tuple[Sheet, ...]:
+    """All tables, in the order in which they are read."""
+    found = [table_iii(trial, figure) for figure in ("height", "distance")]
+    found.append(landings(trial))
+    found += [more(trial, subject.name) for subject in trial.subjects]
+    found.append(drives(trial))
+    found += [scatter(trial, other.name) for other in trial.subjects[1:]]
+    return (*found, bars(trial), definitions())
+
+
+def table_iii(trial: Trial, figure: str) -> Sheet:
+    """The paper's Table III beside ours, for `height` or `distance`."""
+    # In the paper's order, naive before matched.
+    subjects = sorted(
+        (subject.name for subject in trial.subjects), key=lambda name: name != "naive"
+    )
+    rows = []
+    for case in trial.cases:
+        paper = TABLE_III.get(case.name)
+        published: Mapping[str, Pair] = getattr(paper, figure) if paper else {}
+        own = (trial.cell(name, case.name) for name in subjects)
+        rows.append(
+            (
+                case.name,
+                *(pair(published.get(gains)) for gains in ("naive", "matched")),
+                *(f"{spread(cell.figures[figure])} {counted(cell)}" for cell in own),
+            )
+        )
+    means: list[str] = []
+    for gains in ("naive", "matched"):
+        stds = [getattr(paper, figure)[gains][1] for paper in TABLE_III.values()]
+        means.append(f"+- {sum(stds) / len(stds):.3f}")
+    for name in subjects:
+        stds = [trial.cell(name, case).figures[figure].std for case in trial.pooled]
+        means.append(f"+- {number(sum(stds) / len(stds))}")
+    rows.append(("mean scatter", *means))
+    return Sheet(
+        title=f"{figure.capitalize()} [m]: mean +- standard deviation (jumps found of those asked)",
+        columns=(
+            "command",
+            "paper, naive",
+            "paper, matched",
+            *(f"{name}, {place(trial)}" for name in subjects),
+        ),
+        rows=tuple(rows),
+        notes=(
+            f"{figure}: {FIGURES[figure].says}.",
+            f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
+            "paper: five jumps a cell on the real robot, of one policy each (E2, A21).",
+            virtual_note(trial),
+        ),
+    )
+
+
+def landings(trial: Trial) -> Sheet:
+    """What became of every jump that was asked for."""
+    rows = []
+    for cell in trial.cells:
+        low, high = (100.0 * share for share in cell.success_ci95)
+        rows.append(
+            (
+                f"{cell.policy}: {cell.case}",
+                str(cell.n),
+                str(cell.told),
+                str(cell.found),
+                str(cell.succeeded),
+                f"{100.0 * cell.success:.0f} ({low:.0f} to {high:.0f})",
+                str(cell.fell),
+                spread(cell.figures["high_flights"], 2),
+            )
+        )
+    return Sheet(
+        title="Landings",
+        columns=(
+            "policy: command",
+            "asked",
+            "standing",
+            "jumped",
+            "landed",
+            "success [%] (95 %)",
+            "fell",
+            "high flights",
+        ),
+        rows=tuple(rows),
+        notes=(
+            "landed: upright 2 s after touchdown, and nothing but feet touched the ground; of all "
+            "asked. fell: at any time of the run.",
+        ),
+    )
+
+
+_MORE = (
+    "apex_gain",
+    "rise",
+    "ballistic",
+    "clearance",
+    "clearance_half",
+    "along",
+    "distance_minima",
+    "gap",
+    "lift_off_velocity",
+    "horizontal_velocity",
+    "delay",
+    "duration",
+    "speed",
+    "roll_rate_rms",
+    "roll_rate_peak",
+    "pitch_rate_rms",
+    "pitch_rate_peak",
+    "energy",
+    "cost_of_transport",
+)
+
+
+def more(trial: Trial, policy: str | None = None) -> Sheet:
+    """Every other figure of one policy, or of all, with every command."""
+    cells = [cell for cell in trial.cells if policy in (None, cell.policy)]
+    whose = f" of {policy}" if policy else ""
+    return Sheet(
+        title=f"Every other figure{whose}: mean +- standard deviation",
+        columns=("figure", *(c.case if policy else f"{c.policy}: {c.case}" for c in cells)),
+        rows=tuple(
+            (
+                f"{name} [{FIGURES[name].unit}]",
+                *(spread(cell.figures[name]) for cell in cells),
+            )
+            for name in _MORE
+        ),
+        notes=(virtual_note(trial),),
+    )
+
+
+def drives(trial: Trial) -> Sheet:
+    """How hard the drives work: the greatest of all jumps, by joint."""
+    rows = []
+    for subject in trial.subjects:
+        cells = [cell for cell in trial.cells if cell.policy == subject.name]
+        for joint in trial.joint_names:
+            torque = _extreme(cells, "peak_torque", joint, max, "most")
+            speed = _extreme(cells, "peak_speed", joint, max, "most")
+            margin = _extreme(cells, "torque_margin", joint, min, "least")
+            rows.append(
+                (
+                    f"{subject.name}: {joint}",
+                    number(torque, 1),
+                    number(speed, 1),
+                    number(margin, 3),
+                )
+            )
+    return Sheet(
+        title="Drives: the greatest of all jumps",
+        columns=("policy: joint", "torque [N m]", "speed [rad/s]", "margin [1]"),
+        rows=tuple(rows),
+        notes=(f"margin: {FIGURES['torque_margin'].says}.",),
+    )
+
+
+def _extreme(cells: list[Cell], name: str, joint: str, choose: Any, which: str) -> float:
+    values = [getattr(cell.joints[name][joint], which) for cell in cells]
+    known = [value for value in values if math.isfinite(value)]
+    return float(choose(known)) if known else math.nan
+
+
+def scatter(trial: Trial, other: str | None = None) -> Sheet:
+    """Standard deviations of another policy, the second if None, over those of the first."""
+    first = trial.subjects[0].name
+    other = other or trial.subjects[1].name
+    cases = (None, *(case.name for case in trial.cases))
+    found = {(r.figure, r.case): r for r in trial.ratios if r.other == other}
+    return Sheet(
+        title=f"Standard deviations, {other} over {first}, with 95 % bootstrap intervals",
+        columns=("figure", *(case or "all" for case in cases), "paper, all"),
+        rows=tuple(
+            (
+                figure,
+                *(interval(found[figure, case]).replace(" to ", "-") for case in cases),
+                number(PAPER_RATIOS.get(figure, math.nan), 2),
+            )
+            for figure in COMPARED
+        ),
+        notes=(
+            f"all: ratio of the means over {', '.join(trial.pooled)}.",
+            "paper: naive over matched; its Table III gives 2.08 in distance, its text says 2.30 "
+            "(reading A4).",
+            verdict(trial, other),
+        ),
+    )
+
+
+def verdict(trial: Trial, other: str) -> str:
+    """One sentence on whether the paper's claim holds between the first policy and another."""
+    parts = []
+    for figure in ("distance", "height"):
+        ratio = next(
+            r for r in trial.ratios if (r.figure, r.case, r.other) == (figure, None, other)
+        )
+        claim = PAPER_RATIOS[figure]
+        if not math.isfinite(ratio.value):
+            parts.append(f"in {figure} could not be measured")
+            continue
+        if not math.isfinite(ratio.low):
+            parts.append(
+                f"in {figure} is {ratio.value:.2f} times as large, with fewer than {FEWEST} jumps "
+                "in a command, too few for an interval and for an answer"
+            )
+            continue
+        if ratio.low > 1.0:
+            says = "is larger"
+        elif ratio.high < 1.0:
+            says = "is smaller"
+        else:
+            says = "cannot be told apart"
+        where = "above" if claim > ratio.high else "below" if claim < ratio.low else "within"
+        parts.append(
+            f"in {figure} {says}, {interval(ratio)} times, and the paper's {claim:g} is {where} "
+            "that interval"
+        )
+    return (
+        f"scatter of {other} against {trial.subjects[0].name} on the {place(trial)}: "
+        f"{'; '.join(parts)}."
+    )
+
+
+def checks(trial: Trial) -> list[Check]:
+    """Every bar that the first policy must clear on the commands that were tried."""
+    first = trial.subjects[0].name
+    cells = [trial.cell(first, case.name) for case in trial.cases]
+    found = [check for cell in cells for check in _checks(cell)]
+    if any(cell.case in TABLE_III for cell in cells):
+        best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
+        found.append(Check(what="best: height", value=best, sense=">=", bar=HEIGHT, unit="m"))
+    return found
+
+
+def _checks(cell: Cell) -> Iterator[Check]:
+    paper = TABLE_III.get(cell.case)
+    for figure in ("height", "distance") if paper else ():
+        mean, std = getattr(paper, figure)["matched"]
+        ours = cell.figures[figure]
+        what = f"{cell.case}: {figure}"
+        yield Check(what=what, value=ours.mean, sense=">=", bar=mean, unit="m")
+        yield Check(what=f"{what}, std", value=ours.std, sense="<=", bar=std, unit="m")
+    if cell.case in GAPS:
+        yield Check(
+            what=f"{cell.case}: gap",
+            value=cell.figures["gap"].mean,
+            sense=">=",
+            bar=GAPS[cell.case],
+            unit="m",
+        )
+    yield Check(what=f"{cell.case}: success", value=cell.success, sense=">=", bar=SUCCESS)
+
+
+def bars(trial: Trial) -> Sheet:
+    """What the first policy must show."""
+    found = checks(trial)
+    rows = []
+    for check in found:
+        unit = f" {check.unit}" if check.unit else ""
+        value = number(check.value, 4) + unit if math.isfinite(check.value) else "-"
+        bar = f"{check.sense} {check.bar:g}{unit}"
+        rows.append((check.what, value, bar, "yes" if check.passed else "NO"))
+    passed = sum(check.passed for check in found)
+    return Sheet(
+        title=f"Bars of {trial.subjects[0].name}: the paper's matched column, and more",
+        columns=("what", "measured", "bar", "passed"),
+        rows=tuple(rows),
+        notes=(f"{passed} of {len(found)} bars passed.",),
+    )
+
+
+def definitions() -> Sheet:
+    """What every figure is."""
+    return Sheet(
+        title=DEFINITIONS,
+        columns=("figure", "unit", "equation"),
+        rows=tuple((name, figure.unit, figure.says) for name, figure in FIGURES.items()),
+        notes=(
+            "c: the jump input rises. l, d: lift-off and touchdown of the main flight, the longest "
+            "in which the trunk rises more than 3 cm over standing. e: d + 0.5 s. p, z, v: "
+            "position, height and velocity of the trunk's origin. f_i, r: centre and radius of a "
+            "foot. u: direction of p_d - p_l in the plane.",
+        ),
+    )
+
+
+def place(trial: Trial) -> str:
+    """Where it was measured, in words."""
+    return "virtual robot" if trial.virtual else "robot"
+
+
+def virtual_note(trial: Trial) -> str:
+    """Where the numbers come from."""
+    where = (
+        "ours: pronk's virtual robot, not a real one" if trial.virtual else "ours: the real robot"
+    )
+    return f"{where}; seed {trial.seed}, truth {str(trial.truth.get('sha256', '-'))[:12]}."
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number; a dash where it is unknown."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+
+def pair(values: Pair | None) -> str:
+    """Mean and standard deviation of the paper; a dash where it has none."""
+    return f"{values[0]:.3f} +- {values[1]:.3f}" if values else "-"
+
+
+def spread(figure: Spread, digits: int = 3) -> str:
+    """Mean and standard deviation; a dash if no jump has the figure."""
+    if not figure.n:
+        return "-"
+    return f"{number(figure.mean, digits)} +- {number(figure.std, digits)}"
+
+
+def counted(cell: Cell) -> str:
+    """Jumps found of those asked."""
+    return f"({cell.found}/{cell.n})"
+
+
+def interval(ratio: Ratio) -> str:
+    """A ratio and its interval; too few jumps have none."""
+    if not math.isfinite(ratio.value):
+        return "-"
+    if not math.isfinite(ratio.low):
+        return f"{ratio.value:.2f} (too few)"
+    return f"{ratio.value:.2f} ({ratio.low:.2f} to {ratio.high:.2f})"

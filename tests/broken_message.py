@@ -1,0 +1,28 @@
+"""Messages that are broken in the ways in which messages break."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def mutated(data: bytes, rng: np.random.Generator) -> bytes:
+    """A broken copy of a message: one flipped bit, a burst, cut, longer, shifted, or noise."""
+    kind = rng.integers(6)
+    changed = bytearray(data)
+    if kind == 0:  # a bit
+        at = int(rng.integers(8 * len(data)))
+        changed[at // 8] ^= 1 << at % 8
+    elif kind == 1:  # a burst
+        at, size = int(rng.integers(len(data))), int(rng.integers(1, 64))
+        changed[at : at + size] = rng.bytes(len(changed[at : at + size]))
+    elif kind == 2:  # cut off
+        del changed[int(rng.integers(len(data))) :]
+    elif kind == 3:  # too long
+        changed += rng.bytes(int(rng.integers(1, 64)))
+    elif kind == 4:  # shifted
+        at = int(rng.integers(len(data)))
+        del changed[at : at + 1]
+        changed += b"\0"
+    else:  # nothing of it is left
+        changed = bytearray(rng.bytes(len(data)))
+    return bytes(changed)

@@ -1,0 +1,219 @@
+"""What is seen of the virtual robot from outside: geometry, contacts, power, files."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pronk.errors import ArtefactError, HardwareError
+from pronk.files import save_arrays
+from pronk.hardware.capture import SCHEMA, Capture, load, save
+from pronk.hardware.ground import Start
+from pronk.hardware.machine import Command
+from pronk.hardware.rotor import MotorConstants
+from pronk.hardware.truth import load_truth
+from pronk.hardware.virtual import VirtualRobot
+from pronk.robots import load_robot
+
+Array = NDArray[np.float64]
+
+ROBOT = load_robot("mini_cheetah")
+POSE = np.array([joint.default_position for joint in ROBOT.joints])
+TRUTH = load_truth()
+FEET = [f"{leg}_foot" for leg in ("FR", "FL", "HR", "HL")]
+KNEES = [k for k, name in enumerate(ROBOT.joint_names) if name.endswith("knee")]
+
+
+def _hold(position: Array, stiffness: float, damping: float) -> Command:
+    gains = {"stiffness": np.full(12, stiffness), "damping": np.full(12, damping)}
+    return Command(position=position, **gains)
+
+
+def hopped(**options: Any) -> VirtualRobot:
+    """A robot that has stretched its legs at once, left the ground and come back."""
+    start = Start(position=(0.3, -0.2), yaw=0.4, settle_s=1.5)
+    machine = VirtualRobot(ROBOT, TRUTH, base="ground", start=start, **options)
+    machine.connect()
+    stretched = POSE.copy()
+    stretched[KNEES] = 1.1
+    stretched[[k - 1 for k in KNEES]] = -0.55
+    machine.send(_hold(stretched, 20.0, 0.5))
+    machine.wait(0.1)
+    machine.send(_hold(POSE, 30.0, 1.5))
+    machine.wait(0.7)
+    return machine
+
+
+@pytest.fixture(scope="module")
+def machine() -> VirtualRobot:
+    return hopped()
+
+
+@pytest.fixture(scope="module")
+def seen(machine: VirtualRobot) -> Capture:
+    return machine.capture()
+
+
+def test_samples_are_a_millisecond_apart_from_the_clocks_zero(seen: Capture) -> None:
+    # The physics has been taken to the instant that the last state was measured at.
+    assert len(seen.time) == 700
+    np.testing.assert_allclose(seen.time, np.arange(700) / 1000.0, atol=1e-12)
+    assert seen.dt == pytest.approx(1e-3)
+    assert np.linalg.norm(seen.orientation, axis=1) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_feet_are_where_the_trunk_and_the_joints_put_them(seen: Capture) -> None:
+    model = ROBOT.build_spec().compile()
+    data = mujoco.MjData(model)
+    joints = [model.joint(name).qposadr[0] for name in ROBOT.joint_names]
+    sites = [model.site(name).id for name in FEET]
+    for k in (0, 120, 250, 699):
+        data.qpos[:3], data.qpos[3:7] = seen.position[k], seen.orientation[k]
+        data.qpos[joints] = seen.joint_position[k]
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(seen.foot_position[k], data.site_xpos[sites], atol=1e-12)
+
+
+def test_positions_are_what_velocities_add_up_to(seen: Capture) -> None:
+    for place, speed in (
+        (seen.position, seen.velocity),
+        (seen.joint_position, seen.joint_velocity),
+    ):
+        moved = np.cumsum(0.5 * (speed[1:] + speed[:-1]), axis=0) * seen.dt
+        np.testing.assert_allclose(place[1:] - place[0], moved, atol=0.01 * np.ptp(place))
+
+
+def test_a_foot_touches_where_its_sphere_is_below_the_floor(seen: Capture) -> None:
+    np.testing.assert_array_equal(seen.contact, seen.foot_position[..., 2] < 0.0175)
+    airborne = ~seen.contact.any(axis=1)
+    assert 0.05 < airborne.mean() < 0.9
+    assert seen.contact[0].all()
+    assert not seen.other_contact.any()
+
+
+def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
+    # Momentum of the whole robot, from the capture alone, changes by gravity.
+    model = ROBOT.build_spec().compile()
+    plant = VirtualRobot(ROBOT, TRUTH, base="ground")._plant.model
+    for body in range(1, model.nbody):
+        name = model.body(body).name
+        model.body_mass[body] = plant.body(name).mass[0]
+        model.body_ipos[body] = plant.body(name).ipos
+    data = mujoco.MjData(model)
+    joints = [model.joint(name).qposadr[0] for name in ROBOT.joint_names]
+    airborne = np.flatnonzero(~seen.contact.any(axis=1))
+    flight = airborne[airborne < airborne[0] + 40]
+    centre = []
+    for k in flight:
+        data.qpos[:3], data.qpos[3:7] = seen.position[k], seen.orientation[k]
+        data.qpos[joints] = seen.joint_position[k]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        centre.append(data.subtree_com[1].copy())
+    fit = np.polyfit(seen.time[flight], np.array(centre), 2)
+    np.testing.assert_allclose(2.0 * fit[0], [0.0, 0.0, -9.81], atol=0.05)
+
+
+def test_power_is_what_the_battery_gives(seen: Capture) -> None:
+    # Before anything is asked, current squared times resistance.
+    constants = [MotorConstants.of(joint.drive) for joint in ROBOT.joints]
+    scale = np.array([TRUTH.joints[name].torque_scale for name in ROBOT.joint_names])
+    current = seen.torque[0] / (scale * np.array([c.constant for c in constants]))
+    heat = float(current**2 @ np.array([c.resistance for c in constants]))
+    assert seen.electrical_power[0] == pytest.approx(heat, rel=0.02)
+    assert heat > 1.0
+    # The open-circuit voltage less what its resistance takes, a state later.
+    machine = TRUTH.machine
+    drop = machine.bus_resistance * seen.electrical_power / seen.bus_voltage
+    assert np.corrcoef(drop[1:-3], machine.bus_voltage - seen.bus_voltage[4:])[0, 1] > 0.9
+    assert seen.electrical_power.max() > 200.0
+
+
+def test_a_part_and_a_single_look(machine: VirtualRobot, seen: Capture) -> None:
+    late = machine.capture(since=0.5)
+    assert late.time[0] == pytest.approx(0.5)
+    np.testing.assert_array_equal(late.position, seen.position[500:])
+    now = machine.snapshot()
+    assert now.time == pytest.approx([0.699])
+    for part in fields(Capture):
+        here, there = getattr(now, part.name)[0], getattr(seen, part.name)[-1]
+        # The battery has sagged a little further since: it does so after each state.
+        close = 1e-3 if part.name == "bus_voltage" else 1e-12
+        np.testing.assert_allclose(here, there, rtol=close)
+
+
+def test_looking_changes_nothing() -> None:
+    looked, not_looked, faster = (hopped(capture_rate_hz=rate) for rate in (1000.0, None, 4000.0))
+    looked.capture()
+    looked.snapshot()
+    for machine in (looked, not_looked, faster):
+        machine.wait(0.75)
+    position = looked.snapshot().position
+    np.testing.assert_array_equal(position, not_looked.snapshot().position)
+    np.testing.assert_array_equal(position, faster.snapshot().position)
+    assert len(faster.capture().time) == 4 * 749 + 1
+    np.testing.assert_array_equal(faster.capture().position[::4], looked.capture().position)
+
+
+def test_it_outlives_the_connection_and_begins_anew_with_the_next(machine: VirtualRobot) -> None:
+    other = hopped()
+    other.close()
+    assert len(other.capture().time) == len(machine.capture().time)
+    other.connect()
+    assert len(other.capture().time) == 0
+    assert np.isnan(other.capture().dt)
+
+
+def test_round_trip(seen: Capture, tmp_path: Path) -> None:
+    path = tmp_path / "hop.capture.npz"
+    save(path, seen)
+    back = load(path)
+    for part in fields(Capture):
+        got, wanted = getattr(back, part.name), getattr(seen, part.name)
+        assert got.dtype == wanted.dtype
+        np.testing.assert_array_equal(got, wanted)
+
+
+def test_files_that_are_no_capture(seen: Capture, tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    with pytest.raises(ArtefactError, match="no such file"):
+        load(path)
+    path.write_bytes(b"PK not a zip")
+    with pytest.raises(ArtefactError, match="not a capture"):
+        load(path)
+    arrays = {part.name: getattr(seen, part.name) for part in fields(Capture)}
+    save_arrays(path, {"schema": "pronk/capture/9"}, arrays)
+    with pytest.raises(ArtefactError, match="'pronk/capture/9'; this pronk reads"):
+        load(path)
+    save_arrays(path, {"schema": SCHEMA}, {**arrays, "torque": seen.torque[:, :3]})
+    with pytest.raises(ArtefactError, match=r"Capture.torque has shape \(700, 3\)"):
+        load(path)
+    del arrays["contact"]
+    save_arrays(path, {"schema": SCHEMA}, arrays)
+    with pytest.raises(ArtefactError, match="not a capture"):
+        load(path)
+
+
+def test_shapes_that_do_not_belong_together(seen: Capture) -> None:
+    with pytest.raises(ArtefactError, match=r"Capture.contact has shape \(5, 4\); expected \(700"):
+        replace(seen, contact=seen.contact[:5])
+
+
+def test_nothing_is_captured_on_the_bench_or_unconnected() -> None:
+    bench = VirtualRobot(ROBOT, TRUTH, legs=("FR",))
+    bench.connect()
+    with pytest.raises(HardwareError, match="nothing was captured"):
+        bench.capture()
+    with pytest.raises(HardwareError, match="on the bench"):
+        bench.snapshot()
+    ground = VirtualRobot(ROBOT, TRUTH, base="ground")
+    with pytest.raises(HardwareError, match="nothing was captured"):
+        ground.capture()
+    with pytest.raises(HardwareError, match=r"call connect\(\) first"):
+        ground.snapshot()

@@ -1,0 +1,315 @@
+"""The DDS link on loopback: two processes, real bytes, on a domain of the tests' own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds")
+
+from broken_message import mutated
+from pronk.errors import HardwareError, RobotError
+from pronk.hardware import dds_idl as idl
+from pronk.hardware.dds_codec import encode_command, joint_map
+from pronk.hardware.dds_link import DdsMachine
+from pronk.hardware.dds_net import DdsNetwork, Message, Participant, take
+from pronk.hardware.dds_service import SWITCHER, Client
+from pronk.hardware.machine import Command
+from pronk.hardware.truth import load_truth
+from pronk.hardware.twin import Twin
+from pronk.hardware.twin_dds import COMMANDS, STATES, DdsWire
+from pronk.hardware.virtual import VirtualRobot
+from pronk.robots import load_robot
+
+ROBOT = load_robot("mini_cheetah")
+JOINTS = joint_map(ROBOT)
+DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
+STIFF, DAMPED = np.full(12, 17.0), np.full(12, 0.4)
+HOLD = Command(position=DEFAULT, stiffness=STIFF, damping=DAMPED)
+PITCH = ROBOT.joint_names.index("FR_hip_pitch")
+
+
+def own_network(shift: int = 0) -> DdsNetwork:
+    """Two test processes on one computer must not hear each other."""
+    return DdsNetwork(domain=2 + (2 * os.getpid() + shift) % 70)
+
+
+def live(network: DdsNetwork, end: Connection) -> None:
+    """Body of the twin's process, until it is told to stop; it tells what it met."""
+    robot = VirtualRobot(ROBOT, load_truth(), legs=("FR",))
+    robot.connect()
+    wire = DdsWire(ROBOT, network, mode="normal")
+    twin = Twin(robot, wire, hold=HOLD)
+    end.send("ready")
+    twin.run(end.poll)
+    end.send(twin.figures())
+
+
+class Double:
+    """A twin in another process, whose own controller holds the joints at first."""
+
+    def __init__(self) -> None:
+        self.network = own_network()
+        context = multiprocessing.get_context("spawn")
+        self._end, other = context.Pipe()
+        self.process = context.Process(target=live, args=(self.network, other), daemon=True)
+        self.process.start()
+        assert self._end.recv() == "ready"
+
+    def stop(self) -> Any:
+        self._end.send("stop")
+        figures = self._end.recv()
+        self.process.join()
+        return figures
+
+
+@pytest.fixture
+def double() -> Iterator[Double]:
+    made = Double()
+    yield made
+    made.process.kill()
+
+
+def eventually(done: Callable[[], bool], seconds: float = 2.0) -> bool:
+    end = time.monotonic() + seconds
+    while not (is_done := done()) and time.monotonic() < end:
+        time.sleep(0.005)
+    return is_done
+
+
+def turned(angle: float) -> Command:
+    """The default pose with the front right thigh turned."""
+    position = DEFAULT.copy()
+    position[PITCH] += angle
+    return Command(position=position, stiffness=STIFF, damping=DAMPED)
+
+
+def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
+    network = double.network
+    # Its own controller holds the joints: refused, unless it may be released.
+    with pytest.raises(HardwareError, match="own controller 'normal' holds the joints"):
+        DdsMachine(ROBOT, network=network).connect()
+    machine = DdsMachine(ROBOT, network=network, release=True, alone_s=0.3)
+    machine.connect()
+    assert machine.virtual
+    begun = machine.latest()
+    np.testing.assert_allclose(begun.position, DEFAULT, atol=0.1)
+    assert begun.bus_voltage == pytest.approx(24.5, abs=0.5)
+    assert machine.counts["commands"] == machine.counts["repeats"] == 0
+
+    # What has a wrong checksum, or asks for the impossible, moves nothing.
+    stranger = Participant(network).writer(COMMANDS, idl.LowCmd, raw=True)
+    assert eventually(lambda: len(stranger.get_matched_subscriptions()) >= 2)
+    far = bytearray(encode_command(JOINTS, turned(0.5)))
+    far[-1] ^= 1
+    for _ in range(20):
+        stranger.write(Message(bytes(far)))
+        time.sleep(0.002)
+    states = machine.wait(machine.now() + 0.2)
+    assert max(abs(state.position[PITCH] - begun.position[PITCH]) for state in states) < 0.01
+    # But whoever wrote that is another writer: no commands beside him, and none after.
+    with pytest.raises(HardwareError, match="another program commands the joints on rt/lowcmd"):
+        machine.send(HOLD)
+    machine.close()
+
+    # While he is silent, a joint moves as asked, for as long as the command is valid.
+    machine.connect()
+    machine.send(turned(-0.2))
+    states = machine.wait(machine.now() + 0.5)
+    assert states[-1].position[PITCH] == pytest.approx(DEFAULT[PITCH] - 0.2, abs=0.05)
+    assert all(np.diff([state.time for state in states]) > 0.0)
+    machine.clamp(("FR_knee",))
+    with pytest.raises(RobotError, match="no joint 'XX_knee'"):
+        machine.clamp(("XX_knee",))
+    machine.clamp(())
+
+    # A second pronk finds the first one writing.
+    second = DdsMachine(ROBOT, network=network, alone_s=0.3)
+    with pytest.raises(HardwareError, match="someone else commands the joints"):
+        second.connect()
+    assert second.counts["commands"] == second.counts["repeats"] == 0
+
+    # Expiry: damping on the wire, without anybody's doing.
+    heard = Participant(network).reader(COMMANDS, idl.LowCmd)
+    machine.send(
+        Command(
+            position=DEFAULT, stiffness=STIFF, damping=DAMPED, made=machine.now(), valid_for=0.1
+        )
+    )
+    assert eventually(lambda: machine.counts["expired"] == 1)
+    time.sleep(0.05)
+    last = take(heard, Counter())[-1].motor_cmd[PITCH]
+    assert (last.kp, last.kd, last.q) == (0.0, 1.0, 2.146e9)
+
+    # And another writer in the middle of it all is answered with damping.
+    machine.send(HOLD)
+    stranger.write(Message(encode_command(JOINTS, HOLD)))
+    assert eventually(lambda: machine.counts["foreign"] > 0)
+    with pytest.raises(HardwareError, match="another program commands"):
+        machine.send(HOLD)
+    take(heard, Counter())
+    assert eventually(lambda: any(m.motor_cmd[PITCH].kp == 0.0 for m in take(heard, Counter())))
+
+    begun_closing = time.monotonic()
+    machine.close()
+    machine.close()
+    assert time.monotonic() - begun_closing >= 1.0
+    with pytest.raises(HardwareError, match="not open; call connect"):
+        machine.latest()
+    figures = double.stop()
+    assert 0 < figures["wire"]["refused: checksum"] <= 20
+    assert figures["wire"]["mode switches"] == 1
+    assert figures["twin"]["commands of others"] > 0
+
+
+def test_nobody_there() -> None:
+    with pytest.raises(HardwareError, match=r"sent no state on rt/lowstate .*on loopback; check"):
+        DdsMachine(ROBOT, network=own_network(1)).connect()
+
+
+def test_the_mode_switcher_and_the_bench_answer_like_unitrees_services() -> None:
+    network = own_network(1)
+    wire = DdsWire(ROBOT, network, mode="mcf")
+    client = Client(Participant(network), SWITCHER)
+    assert asked(wire, client, 1001, {}) == {"form": "0", "name": "mcf"}
+    assert asked(wire, client, 1003, {}) == {}
+    assert wire.mode == ""
+    assert asked(wire, client, 1002, {"name": "ai"}) == {}
+    assert wire.mode == "ai"
+    for parameter in ({"name": "dance"}, None, [1], "x"):
+        with pytest.raises(HardwareError, match="answered 3204 to function 1002"):
+            asked(wire, client, 1002, parameter)
+    with pytest.raises(HardwareError, match="answered 3203 to function 9"):
+        asked(wire, client, 9, {})
+    assert wire.mode == "ai"
+    bench = Client(Participant(network), "pronk_bench")
+    assert asked(wire, bench, 1, {"joints": ["FL_knee", "FR_knee"]}) == {
+        "joints": ["FR_knee", "FL_knee"]
+    }
+    assert wire.clamps == ("FR_knee", "FL_knee")
+    with pytest.raises(HardwareError, match="answered 3204"):
+        asked(wire, bench, 1, {"joints": ["tail"]})
+    assert wire.clamps == ("FR_knee", "FL_knee")
+
+
+def asked(wire: DdsWire, client: Client, api_id: int, parameter: Any) -> Any:
+    """Ask while the wire is polled, as the twin does, from this very thread."""
+    polling = True
+
+    def poll() -> None:
+        while polling:
+            wire.poll()
+            time.sleep(0.0005)
+
+    thread = Thread(target=poll)
+    thread.start()
+    try:
+        return client.ask(api_id, parameter)
+    finally:
+        polling = False
+        thread.join()
+
+
+def test_a_wire_hears_its_rival_and_refuses_what_is_spoiled() -> None:
+    wire = DdsWire(ROBOT, own_network(1))
+    wire.contend(turned(0.1))
+    met: list[Command] = []
+    assert eventually(lambda: bool(met.extend(wire.poll()) or met))
+    np.testing.assert_allclose(met[0].position, turned(0.1).position, atol=1e-6)
+    wire.spoil_in = lambda data: data[:-1] + bytes([data[-1] ^ 1])
+    wire.contend(turned(0.1))
+    assert eventually(lambda: not wire.poll() and wire.counts["refused: checksum"] == 1)
+
+
+def test_a_hundred_thousand_mutated_commands_move_nothing() -> None:
+    """Refused and counted, or the same command: the bytes between the numbers carry nothing."""
+    wire = DdsWire(ROBOT, own_network(1))
+    data = encode_command(JOINTS, turned(0.3))
+    honest = wire.receive(data)
+    assert honest is not None
+    rng = np.random.default_rng(0)
+    same = 0
+    for _ in range(100_000):
+        met = wire.receive(mutated(data, rng))
+        if met is not None:
+            same += 1
+            for name in ("position", "stiffness", "damping"):
+                np.testing.assert_array_equal(getattr(met, name), getattr(honest, name))
+    refused = sum(count for name, count in wire.counts.items() if name.startswith("refused"))
+    assert wire.counts["commands"] == same + 1 < 2000
+    assert refused + same == 100_000
+
+
+def test_two_robots_on_one_domain_are_refused() -> None:
+    """Both wires speak; no physics is needed to say the same twice over."""
+    network = own_network(1)
+    wires = [DdsWire(ROBOT, network) for _ in range(2)]
+    robots = [VirtualRobot(ROBOT, load_truth(), legs=("FR",), seed=k) for k in range(2)]
+    said = []
+    for robot in robots:
+        robot.connect()
+        said.append(robot.wait(4.0))
+    polling = True
+
+    def speak() -> None:
+        start = time.monotonic()
+        for k, pair in enumerate(zip(*said, strict=True)):
+            for wire, state in zip(wires, pair, strict=True):
+                wire.poll()
+                wire.publish(state)
+            if not polling:
+                return
+            time.sleep(max(0.0, start + 0.002 * k - time.monotonic()))
+
+    thread = Thread(target=speak)
+    thread.start()
+    try:
+        with pytest.raises(HardwareError, match="2 robots speak on rt/lowstate"):
+            DdsMachine(ROBOT, network=network, alone_s=0.0).connect()
+    finally:
+        polling = False
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        ({"domain": 0}, "domain 0 is where real robots listen; name the network interface"),
+        ({"domain": 233}, "DDS domain 233; expected 0 to 232"),
+        ({"domain": -1}, "DDS domain -1; expected 0 to 232"),
+    ],
+)
+def test_networks_that_are_refused(where: dict[str, int], words: str) -> None:
+    with pytest.raises(HardwareError, match=words):
+        DdsNetwork(**where)
+
+
+def test_networks_that_are_taken() -> None:
+    assert (DdsNetwork().domain, DdsNetwork().loopback) == (77, True)
+    named = DdsNetwork(interface="eth7")
+    assert (named.domain, named.loopback) == (0, False)
+    assert 'name="eth7"' in named.configuration
+    assert 'address="127.0.0.1"' in DdsNetwork().configuration
+
+
+def test_an_interface_that_is_not_there_is_one_sentence() -> None:
+    network = DdsNetwork(interface="no_such_interface", domain=150)
+    with pytest.raises(HardwareError, match=r"cannot join DDS domain 150 on no_such_interface"):
+        Participant(network)
+
+
+def test_a_virtual_robot_stays_on_loopback() -> None:
+    with pytest.raises(HardwareError, match="a virtual robot does not go to DDS domain 0 on eth0"):
+        DdsWire(ROBOT, DdsNetwork(interface="eth0"))
+    with pytest.raises(HardwareError, match="mode 'dance'; expected one of normal, ai"):
+        DdsWire(ROBOT, own_network(1), mode="dance")
+    assert STATES == "rt/lowstate"

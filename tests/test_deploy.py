@@ -1,0 +1,669 @@
+"""Deployment's parts: memory, pacing, paths, state machine, pre-flight, operators, log."""
+
+from __future__ import annotations
+
+import math
+import os
+import pty
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pronk.deploy.hands import Gamepad, Keyboard
+from pronk.deploy.limits import Limits
+from pronk.deploy.links import Link
+from pronk.deploy.log import DeployLogWriter, is_deploy_log, read_deploy_log
+from pronk.deploy.operators import Scripted, Timed
+from pronk.deploy.preflight import delay_objection, refusals
+from pronk.deploy.realtime import Histogram, Pace
+from pronk.deploy.records import EVENT, STEP, TICK, Mode, Wish, event, get_state, put_state
+from pronk.deploy.rules import Level, Reason
+from pronk.deploy.safety import Memory, fault
+from pronk.deploy.shared import Mailbox, Ring
+from pronk.deploy.stance import Timing, folded_pose, minimum_jerk, sit_down, stand_up
+from pronk.deploy.states import FIRST_ORDER_S, Director, Order
+from pronk.errors import HardwareError, LogError, RobotError
+from pronk.hardware.machine import State
+from pronk.robots import load_robot
+from pronk.trial.protocol import Script
+
+ROBOT = load_robot("mini_cheetah")
+LIMITS = Limits.of(ROBOT)
+POSE = np.array([joint.default_position for joint in ROBOT.joints])
+LYING = folded_pose(ROBOT)
+RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
+
+
+def state(**changes: Any) -> State:
+    whole: dict[str, Any] = {
+        "time": 0.0,
+        "sequence": 0,
+        "position": LYING,
+        "velocity": np.zeros(12),
+        "torque": np.zeros(12),
+        "gyro": np.zeros(3),
+        "accelerometer": np.array([0.0, 0.0, 9.81]),
+        "bus_voltage": 24.0,
+    }
+    return State(**(whole | changes))
+
+
+# --- Shared memory ------------------------------------------------------------------------------
+
+PAIR = np.dtype([("a", "<i8"), ("b", "<f8", 100)])
+
+
+def pair(number: int) -> np.ndarray:
+    record = np.zeros((), dtype=PAIR)
+    record["a"], record["b"] = number, number
+    return record
+
+
+def _scribble(name: str, count: int) -> None:
+    mailbox = Mailbox(PAIR, name)
+    for number in range(count):
+        mailbox.write(pair(number))
+    mailbox.close()
+
+
+def test_a_mailbox_never_shows_half_a_record() -> None:
+    mailbox = Mailbox(PAIR)
+    try:
+        assert mailbox.read() is None
+        writer = get_context("fork").Process(target=_scribble, args=(mailbox.name, 40_000))
+        writer.start()
+        seen, reads = -1, 0
+        while seen < 39_999:
+            record = mailbox.read()
+            if record is None:
+                continue
+            assert (record["b"] == record["a"]).all()
+            assert record["a"] >= seen
+            seen = int(record["a"])
+            reads += 1
+        writer.join()
+        assert reads > 10
+    finally:
+        mailbox.close()
+
+
+def test_a_half_written_slot_is_not_read() -> None:
+    ring = Ring(PAIR, 4)
+    try:
+        ring.put(pair(1))
+        ring._buffer[-100] ^= 1  # in the last slot: another record's
+        assert [int(r["a"]) for r in ring.take()] == [1]
+        ring.put(pair(2))
+        ring._buffer[24 + ring._stride + 40] ^= 1  # in the middle of record 2
+        assert ring.take() == []
+    finally:
+        ring.close()
+
+
+def test_a_full_ring_drops_the_new_and_counts_them() -> None:
+    ring = Ring(PAIR, 3)
+    other = Ring(PAIR, 3, ring.name)
+    try:
+        assert [ring.put(pair(i)) for i in range(5)] == [True] * 3 + [False] * 2
+        assert other.dropped == 2
+        assert [int(r["a"]) for r in other.take(2)] == [0, 1]
+        assert ring.put(pair(9))
+        assert [int(r["a"]) for r in other.take()] == [2, 9]
+        assert other.take() == []
+    finally:
+        other.close()
+        ring.close()
+        ring.close()
+
+
+def test_a_state_survives_the_way_through_memory() -> None:
+    rng = np.random.default_rng(0)
+    one = state(
+        time=3.0,
+        sequence=7,
+        position=rng.standard_normal(12),
+        temperature=rng.standard_normal(12),
+        robot_time=5.0,
+    )
+    record = np.zeros((), dtype=TICK)
+    put_state(record, one, 10.0)
+    back = get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
+    assert (back.time, back.sequence, back.robot_time) == (13.0, 7, 5.0)
+    for name in ("position", "temperature", "orientation", "accelerometer"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(one, name))
+    put_state(record, state(), 0.0)
+    back = get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
+    assert back.temperature is None
+    assert back.robot_time is None
+
+
+# --- Pacing -------------------------------------------------------------------------------------
+
+
+def test_a_pace_leaves_out_what_has_passed() -> None:
+    pace = Pace(50.0, 100.0)
+    assert pace.deadline == 100.0
+    pace.advance(100.001)
+    assert (pace.tick, pace.missed) == (1, 0)
+    pace.advance(100.065)  # 20, 40 and 60 ms have passed
+    assert (pace.tick, pace.missed) == (4, 2)
+    assert pace.deadline == pytest.approx(100.08)
+
+
+@given(st.lists(st.floats(1e-6, 1.0), min_size=1, max_size=300), st.floats(0.01, 1.0))
+def test_quantiles_are_those_of_the_numbers_to_a_bin(values: list[float], share: float) -> None:
+    histogram = Histogram()
+    for value in values:
+        histogram.add(value)
+    exact = sorted(values)[max(1, math.ceil(share * len(values) - 1e-9)) - 1]
+    assert exact * (1 - 1e-9) <= histogram.quantile(share) <= exact * 1.048
+    assert histogram.figures()["n"] == len(values)
+    assert histogram.quantile(1.0) == max(values)
+
+
+def test_an_empty_histogram_knows_nothing() -> None:
+    assert math.isnan(Histogram().quantile(0.5))
+
+
+# --- Paths --------------------------------------------------------------------------------------
+
+
+def test_minimum_jerk_by_hand() -> None:
+    assert [minimum_jerk(s) for s in (-1.0, 0.0, 0.5, 1.0, 2.0)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert minimum_jerk(0.25) == pytest.approx(10 / 64 - 15 / 256 + 6 / 1024)
+
+
+def test_the_way_up_begins_where_the_robot_is_and_ends_standing() -> None:
+    rng = np.random.default_rng(1)
+    measured = LYING + 0.2 * rng.standard_normal(12)
+    path = stand_up(ROBOT, measured, 5.0, Timing(fold_s=1.0, rise_s=2.0, ramp_s=0.5))
+    np.testing.assert_array_equal(path.target(5.0), measured)
+    np.testing.assert_allclose(path.target(6.0), LYING)
+    np.testing.assert_allclose(path.target(8.0), POSE)
+    assert (path.stiffness(5.0), path.stiffness(5.25), path.stiffness(5.5)) == (0.0, 0.5, 1.0)
+    assert [path.done(t) for t in (7.99, 8.0)] == [False, True]
+    # No jump anywhere: 1.875 times the mean speed at most.
+    targets = np.array([path.target(5.0 + k / 500) for k in range(1501)])
+    fastest = 1.875 * max(np.abs(LYING - measured).max() / 1.0, np.abs(POSE - LYING).max() / 2.0)
+    assert np.abs(np.diff(targets, axis=0)).max() * 500 <= fastest * 1.001
+
+
+def test_the_way_down_ends_folded() -> None:
+    path = sit_down(ROBOT, POSE, 0.0, Timing(sit_s=1.0))
+    np.testing.assert_allclose(path.target(2.0), LYING)
+    assert path.stiffness(0.0) == 1.0
+
+
+def test_the_folded_pose_has_the_feet_under_the_hips() -> None:
+    thigh, shank = 0.209, 0.195
+    pitch, knee = LYING[1], LYING[2]
+    forward = -thigh * math.sin(pitch) - shank * math.sin(pitch + knee)
+    down = thigh * math.cos(pitch) + shank * math.cos(pitch + knee)
+    assert abs(forward) < 0.03
+    assert 0.1 < down < 0.16
+    low, high = LIMITS.low + LIMITS.margin, LIMITS.high - LIMITS.margin
+    assert (low < LYING).all()
+    assert (high > LYING).all()
+
+
+def test_an_arm_has_no_pose_to_lie_in() -> None:
+    with pytest.raises(RobotError, match="so101"):
+        folded_pose(load_robot("so101"))
+
+
+def test_a_time_that_is_none_is_refused() -> None:
+    with pytest.raises(RobotError, match="rise_s"):
+        Timing(rise_s=-1.0)
+
+
+# --- The state machine --------------------------------------------------------------------------
+
+
+class Run:
+    """A director on a clock of its own."""
+
+    def __init__(self, **times: float) -> None:
+        self.director = Director(ROBOT, Timing(**times))
+        self.memory = Memory()
+        self.t = 0.0
+        self.order: Order | None = None
+        self.objection = ""
+
+    def tick(self, seconds: float = 0.0, wish: Wish = Wish.NONE, q: np.ndarray = LYING) -> Any:
+        self.t += seconds
+        if wish is not Wish.NONE:
+            self.director.wish(wish)
+        intent, self.memory = self.director.step(
+            self.t, state(position=q), self.memory, self.order, objection=self.objection
+        )
+        if self.memory.faulted:
+            self.director.faulted(self.t)
+        return intent
+
+    def give(self, target: np.ndarray, entry: int | None = None) -> None:
+        self.order = Order(
+            sequence=0 if self.order is None else self.order.sequence + 1,
+            state_sequence=3,
+            state_time=self.t,
+            made=self.t,
+            valid_for=0.05,
+            entry=self.director.entry if entry is None else entry,
+            position=target,
+        )
+
+    def standing(self) -> Run:
+        self.director.preflighted((), self.t)
+        self.tick(0.0, Wish.STAND)
+        self.tick(1.0)
+        self.tick(2.5)
+        assert self.director.mode is Mode.STAND
+        return self
+
+
+def test_nothing_is_sent_before_and_without_the_checks() -> None:
+    run = Run()
+    assert run.tick().silent
+    run.director.enter(Mode.PREFLIGHT, run.t)
+    assert run.tick(wish=Wish.STAND).silent
+    run.director.preflighted(("the battery is empty.",), run.t)
+    assert run.director.mode is Mode.IDLE
+    assert run.tick(5.0, Wish.STAND).silent
+    assert run.director.refusals == ("the battery is empty.",)
+
+
+def test_the_whole_way() -> None:
+    run = Run(blend_s=0.4, halt_s=1.0, sit_s=1.5)
+    run.director.preflighted((), 0.0)
+    intent = run.tick()
+    assert not intent.silent
+    assert intent.command is None
+    run.tick(0.5, Wish.STAND)
+    assert run.director.mode is Mode.DAMP, "it has not sunk yet"
+    intent = run.tick(0.5)
+    assert run.director.mode is Mode.STAND
+    np.testing.assert_array_equal(intent.command.position, LYING)
+    assert (intent.command.stiffness == 0.0).all()
+    run.tick(2.0, Wish.WALK)
+    assert run.director.mode is Mode.STAND, "it is not up yet"
+    intent = run.tick(0.5)
+    assert run.director.mode is Mode.POLICY
+    np.testing.assert_allclose(intent.command.position, POSE)
+    # An order for another mode is not followed; the first for this one is blended in.
+    run.give(POSE + 0.4, entry=run.director.entry - 1)
+    np.testing.assert_allclose(run.tick(0.02).command.position, POSE)
+    run.give(POSE + 0.4)
+    assert run.tick(0.02).blend == 0.0
+    run.give(POSE + 0.4)
+    intent = run.tick(0.2)
+    assert intent.blend == pytest.approx(0.5)
+    np.testing.assert_allclose(intent.command.position, POSE + 0.2)
+    assert (intent.command.made, intent.command.state_sequence) == (run.order.made, 3)
+    np.testing.assert_allclose(run.tick(0.2).command.position, POSE + 0.4)
+    # Down: the policy first comes to a halt.
+    intent = run.tick(0.0, Wish.SIT)
+    assert run.director.mode is Mode.HALT
+    assert intent.blend == 1.0
+    run.tick(1.0, q=POSE)
+    intent = run.tick(0.0, q=POSE)
+    assert run.director.mode is Mode.SIT
+    np.testing.assert_array_equal(intent.command.position, POSE)
+    intent = run.tick(1.5, q=POSE)
+    assert run.director.mode is Mode.DAMP
+    assert intent.command is None
+
+
+@pytest.mark.parametrize("wish", [Wish.DAMP, Wish.QUIT])
+def test_damping_comes_at_once(wish: Wish) -> None:
+    run = Run().standing()
+    assert run.tick(0.0, wish).command is None
+    assert run.director.mode is Mode.DAMP
+    assert run.director.quitting() is (wish is Wish.QUIT)
+
+
+def test_a_policy_that_never_answers_is_a_fault() -> None:
+    run = Run().standing()
+    run.tick(0.0, Wish.WALK)
+    assert run.tick(FIRST_ORDER_S - 0.01).command is not None
+    assert run.tick(0.02).command is None
+    assert (run.memory.reason, run.director.mode) == (Reason.EXPIRED, Mode.FAULT)
+
+
+def test_an_objection_keeps_the_policy_out_and_is_told() -> None:
+    run = Run().standing()
+    run.objection = "too slow."
+    run.tick(0.0, Wish.WALK)
+    assert run.director.mode is Mode.STAND
+    assert run.director.notice == "too slow."
+    run.objection = ""
+    run.tick(0.1, Wish.WALK)
+    assert run.director.mode is Mode.POLICY
+
+
+def test_the_way_back_from_a_fault() -> None:
+    run = Run().standing()
+    run.memory = fault(Memory(), Level.LATCH, Reason.TILT, run.t)
+    run.tick()
+    run.director.faulted(run.t)
+    assert run.director.mode is Mode.FAULT
+    run.tick(2.0, Wish.STAND)
+    assert run.director.mode is Mode.FAULT
+    assert "reset" in run.director.notice
+    run.tick(0.0, Wish.RESET)
+    assert run.director.mode is Mode.DAMP
+    assert not run.memory.faulted
+    # One that is not latched needs no reset, but its second.
+    run = Run(damp_s=0.0).standing()
+    run.memory = fault(Memory(), Level.DAMP, Reason.DEAD_MAN, run.t)
+    run.director.faulted(run.t)
+    run.tick(0.5, Wish.STAND)
+    assert run.director.mode is Mode.FAULT
+    run.tick(0.6)
+    run.tick(0.01)
+    assert run.director.mode is Mode.STAND
+
+
+# --- Pre-flight ---------------------------------------------------------------------------------
+
+
+def stream(**changes: Any) -> list[State]:
+    rng = np.random.default_rng(0)
+    return [
+        state(**({"time": k / 500, "sequence": k, "gyro": 0.01 * rng.standard_normal(3)} | changes))
+        for k in range(250)
+    ]
+
+
+def found(states: list[State], now: float = 0.5) -> tuple[str, ...]:
+    return refusals(states, ROBOT, LIMITS, now=now, seconds=0.5)
+
+
+def test_a_robot_that_lies_there_may_move() -> None:
+    assert found(stream()) == ()
+    warm = stream(temperature=np.full(12, 40.0), bus_voltage=0.0)
+    assert found(warm) == (), "a voltage of 0 is one that the link does not carry"
+
+
+def turned(angle: float) -> np.ndarray:
+    return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
+
+
+def at(index: int, value: float, values: np.ndarray = LYING) -> np.ndarray:
+    array = values.copy()
+    array[index] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("states", "now", "word"),
+    [
+        ([], 0.5, "0 states"),
+        (stream()[::2], 0.5, "250 states per second"),
+        (stream()[:1], 0.5, "1 states"),
+        (stream(), 0.6, "ms old"),
+        (stream(), 0.4, "ahead of now"),
+        (stream(gyro=np.zeros(3)), 0.5, "no number changed"),
+        (stream(velocity=at(0, math.nan)), 0.5, "velocity holds"),
+        (stream(orientation=np.zeros(4)), 0.5, "quaternion"),
+        (stream(accelerometer=np.array([0.0, 0.0, 1.0])), 0.5, "accelerometer"),
+        (stream(accelerometer=np.array([0.0, 0.0, -9.81])), 0.5, "disagree"),
+        (stream(orientation=turned(0.5)), 0.5, "disagree by 0.50"),
+        (
+            stream(orientation=turned(1.0), accelerometer=9.81 * np.array([0, 0.84147, 0.54030])),
+            0.5,
+            "tilted by 1.00",
+        ),
+        (stream(position=at(2, 2.8)), 0.5, "FR_knee is at 2.80"),
+        (stream(velocity=at(3, 2.0, np.zeros(12))), 0.5, "FL_hip_roll turns"),
+        (stream(bus_voltage=18.0), 0.5, "battery gives 18.0"),
+        (stream(temperature=np.full(12, 90.0)), 0.5, "FR_hip_roll has 90"),
+    ],
+)
+def test_refusals_are_one_sentence_each(states: list[State], now: float, word: str) -> None:
+    sentences = found(states, now)
+    assert any(word in sentence for sentence in sentences), sentences
+    for sentence in sentences:
+        assert sentence.endswith(".")
+        assert "\n" not in sentence
+
+
+def test_the_delay_must_be_one_that_was_trained_for() -> None:
+    assert delay_objection(0.004, 50, (0.0, 0.01)) == ""
+    assert "12.0 ms" in delay_objection(0.012, 50, (0.0, 0.01))
+    assert "not answered" in delay_objection(math.nan, 0, (0.0, 0.01))
+
+
+# --- Operators ----------------------------------------------------------------------------------
+
+
+def test_a_script_stands_walks_sits_and_leaves() -> None:
+    script = Script(
+        command=(1.0, 0.0, 0.0), stand_s=1.0, run_s=1.0, jump_s=0.5, keep_s=0.5, stop_s=1.0
+    )
+    operator = Scripted([script, replace(script, command=(0.0, -1.0, 0.0))], pause_s=1.0)
+    assert operator.seconds == 10.0
+    assert operator.stick(0.0, Mode.PREFLIGHT).wish is Wish.NONE
+    assert [operator.stick(0.1 * k, Mode.DAMP).wish for k in range(2)] == [Wish.STAND, Wish.NONE]
+    assert operator.stick(1.0, Mode.STAND).wish is Wish.WALK
+    told = {t: operator.stick(10.0 + t, Mode.POLICY) for t in (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)}
+    assert all(stick.held for stick in told.values())
+    assert [stick.jump for stick in told.values()] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+        False,
+        True,
+    ]
+    forward = (1.0, 0.0, 0.0)
+    assert [told[t].command == forward for t in (0, 1.5, 2.2, 2.7, 4.5)] == [
+        False,
+        *[True] * 3,
+        False,
+    ]
+    assert told[6.5].command == (0.0, -1.0, 0.0)
+    assert not operator.finished
+    assert operator.stick(20.1, Mode.POLICY).wish is Wish.SIT
+    assert operator.finished
+    assert operator.stick(22.0, Mode.SIT).wish is Wish.NONE
+    assert operator.stick(23.0, Mode.DAMP).wish is Wish.QUIT
+
+
+@pytest.mark.parametrize("kind", ["fault", "refused", "notice"])
+def test_a_script_ends_at_the_first_trouble(kind: str) -> None:
+    operator = Scripted([Script(command=(1.0, 0.0, 0.0))])
+    operator.told("mode", "STAND")
+    assert operator.stick(0.0, Mode.STAND).wish is Wish.WALK
+    operator.told(kind, "no.")
+    assert operator.stick(0.1, Mode.STAND).wish is Wish.QUIT
+
+
+def test_time_runs_out() -> None:
+    operator = Timed(Scripted([Script(command=(1.0, 0.0, 0.0), stand_s=0.0)]), 0.5)
+    assert operator.stick(0.0, Mode.STAND).wish is Wish.WALK
+    assert operator.stick(5.0, Mode.POLICY).command == (1.0, 0.0, 0.0)
+    late = operator.stick(5.6, Mode.POLICY)
+    assert (late.wish, late.held) == (Wish.SIT, True)
+    assert operator.stick(5.7, Mode.HALT).wish is Wish.NONE
+    assert operator.stick(6.7, Mode.DAMP).wish is Wish.QUIT
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, Keyboard]]:
+    master, slave = pty.openpty()
+    keyboard = Keyboard(RANGES, slave)
+    yield master, keyboard
+    keyboard.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_keys_of_a_terminal(terminal: tuple[int, Keyboard]) -> None:
+    master, keyboard = terminal
+    assert not keyboard.stick(0.0, Mode.DAMP).held
+    os.write(master, b" wwwad")
+    stick = keyboard.stick(1.0, Mode.POLICY)
+    assert stick.held
+    assert stick.command == (0.75, 0.0, 0.0)
+    os.write(master, b"\n2jj")
+    stick = keyboard.stick(1.1, Mode.POLICY)
+    assert (stick.jump, stick.wish) == (True, Wish.WALK)
+    assert stick.command[2] == pytest.approx(0.4)
+    # The jump's press lasts half a second, the dead-man key four fifths.
+    assert keyboard.stick(1.61, Mode.POLICY).jump is False
+    assert keyboard.stick(1.79, Mode.POLICY).held
+    assert not keyboard.stick(1.81, Mode.POLICY).held
+    os.write(master, b"s" * 40)
+    assert keyboard.stick(2.0, Mode.POLICY).command[0] == RANGES["vx"][0], "as far as was trained"
+    keyboard.told("mode", "DAMP")
+    assert keyboard.stick(2.1, Mode.DAMP).command == (0.0, 0.0, 0.0)
+
+
+def test_without_a_terminal_there_is_no_keyboard() -> None:
+    read, write = os.pipe()
+    with pytest.raises(HardwareError, match="--script"):
+        Keyboard(RANGES, read)
+    os.close(read)
+    os.close(write)
+
+
+def test_a_gamepad(tmp_path: Path) -> None:
+    path = tmp_path / "js0"
+    os.mkfifo(path)
+    pad = Gamepad(path, RANGES)
+    wire = os.open(path, os.O_WRONLY)
+
+    def say(value: int, kind: int, number: int) -> None:
+        os.write(wire, struct.pack("<IhBB", 0, value, kind, number))
+
+    say(0, 0x81, 4)  # what was held when it was opened is told first, and is no press
+    say(1, 0x81, 3)
+    stick = pad.stick(0.0, Mode.STAND)
+    assert (stick.held, stick.wish) == (False, Wish.NONE)
+    say(1, 1, 4)
+    say(1, 1, 3)
+    say(-32767, 2, 1)
+    say(16384, 2, 0)
+    say(2000, 2, 3)  # within the dead zone
+    stick = pad.stick(0.1, Mode.STAND)
+    assert (stick.held, stick.wish) == (True, Wish.WALK)
+    assert stick.command == pytest.approx((3.0, -0.5, 0.0), abs=1e-3)
+    say(1, 1, 5)
+    assert pad.stick(0.2, Mode.POLICY).jump
+    os.close(wire)
+    stick = pad.stick(0.3, Mode.POLICY)
+    assert not stick.held, "unplugged is let go"
+    assert stick.command == (0.0, 0.0, 0.0)
+    pad.close()
+    with pytest.raises(HardwareError, match="js9"):
+        Gamepad(tmp_path / "js9", RANGES)
+
+
+def test_a_link_that_there_is_not_is_refused() -> None:
+    with pytest.raises(HardwareError, match="twin, lcm, dds"):
+        Link(kind="usb", robot="mini_cheetah")
+    assert Link(kind="lcm", robot="mini_cheetah").local
+    assert not Link(kind="dds", robot="mini_cheetah", interface="eth0").local
+
+
+# --- The log ------------------------------------------------------------------------------------
+
+HEADER = {"robot": "mini_cheetah", "joints": list(ROBOT.joint_names)}
+
+
+def record(number: int, **changes: Any) -> np.void:
+    one = np.zeros((), dtype=TICK)
+    put_state(one, state(time=number / 500, sequence=number), 0.0)
+    one["tick"], one["begun"], one["deadline"] = number, number / 500 + 1e-4, number / 500
+    one["done"], one["latency"] = number / 500 + 4e-4, np.nan
+    one["asked"] = one["sent"] = POSE
+    for name, value in changes.items():
+        one[name] = value
+    return np.frombuffer(one.tobytes(), dtype=TICK)[0]
+
+
+def written(path: Path) -> DeployLogWriter:
+    writer = DeployLogWriter(path, HEADER)
+    text = event(0.5, "fault", "tilted", reason=Reason.TILT, level=Level.LATCH)
+    writer.event(np.frombuffer(text.tobytes(), dtype=EVENT)[0])
+    for k in range(100):
+        damped = {"sent": np.nan, "damped": 1} if k >= 90 else {}
+        writer.tick(record(k, mode=Mode.POLICY, **damped))
+    step = np.zeros((), dtype=STEP)
+    step["sequence"], step["begun"], step["action"], step["jump"] = 4, 0.1, 0.25, 1
+    writer.step(np.frombuffer(step.tobytes(), dtype=STEP)[0])
+    return writer
+
+
+def test_a_log_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    written(path).end(complete=True, figures={"servo": {"ticks": 100}})
+    log = read_deploy_log(path)
+    assert log.complete
+    assert log.figures == {"servo": {"ticks": 100}}
+    assert log.joints == ROBOT.joint_names
+    np.testing.assert_array_equal(log.tick, np.arange(100))
+    np.testing.assert_allclose(log.lateness, 1e-4, atol=1e-12)
+    np.testing.assert_allclose(log.work, 3e-4, atol=1e-12)
+    np.testing.assert_array_equal(log.position, np.tile(LYING, (100, 1)))
+    assert np.isnan(log.sent[90:]).all()
+    np.testing.assert_array_equal(log.sent[:90], np.tile(POSE, (90, 1)))
+    np.testing.assert_array_equal(log.damped, np.arange(100) >= 90)
+    assert (log.mode == Mode.POLICY).all()
+    assert log.jump.tolist() == [True]
+    np.testing.assert_array_equal(log.action, np.full((1, 12), 0.25))
+    assert (log.events[0].kind, log.events[0].reason, log.events[0].level) == (
+        "fault",
+        "TILT",
+        "LATCH",
+    )
+    assert not log.virtual
+
+
+@given(share=st.floats(0.0, 1.0))
+def test_a_log_cut_anywhere_is_read_up_to_there_or_refused(
+    share: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.getbasetemp() / "cut"
+    folder.mkdir(exist_ok=True)
+    whole = folder / "whole.mcap"
+    if not whole.exists():
+        writer = DeployLogWriter(whole, HEADER)
+        for k in range(60):
+            writer.tick(record(k))
+            if k % 10 == 9:
+                writer.flush()
+        writer.end(complete=True, figures={})
+    data = whole.read_bytes()
+    cut = folder / "cut.mcap"
+    cut.write_bytes(data[: int(share * len(data))])
+    try:
+        log = read_deploy_log(cut)
+    except LogError:
+        assert share < 0.9
+        return
+    assert len(log.tick) in (10, 20, 30, 40, 50, 60)
+    np.testing.assert_array_equal(log.tick, np.arange(len(log.tick)))
+    assert log.complete or share < 1.0
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    other = tmp_path / "other.mcap"
+    other.write_bytes(b"nothing")
+    assert not is_deploy_log(other)
+    assert not is_deploy_log(tmp_path / "none")
+    for path in (other, tmp_path / "none"):
+        with pytest.raises(LogError):
+            read_deploy_log(path)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(LogError, match="cannot be written"):
+        DeployLogWriter(folder, HEADER)

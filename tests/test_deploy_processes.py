@@ -1,0 +1,255 @@
+"""The real processes on the virtual robot in real time: what goes wrong, and what happens then."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from deploy_faults import FaultyLink, writes
+from hopper import write_hopper
+from pronk.commands.deploy import deploy
+from pronk.deploy.log import is_deploy_log, read_deploy_log
+from pronk.deploy.operators import Stick
+from pronk.deploy.plan import Plan
+from pronk.deploy.records import Mode, Wish
+from pronk.deploy.run import Deployment
+from pronk.deploy.stance import Timing
+from pronk.errors import ArtefactError, HardwareError
+from pronk.hardware.capture import load as load_capture
+
+pytest.importorskip("onnxruntime")
+
+QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
+DAMPED_S = 0.060
+"""The bar: from the fault to damping at the writer."""
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_hopper(tmp_path_factory.mktemp("policy") / "policy.onnx", strength=0.2)
+
+
+@pytest.fixture
+def events() -> dict[str, Any]:
+    context = get_context("spawn")
+    return {name: context.Event() for name in ("nan", "freeze", "stuck")}
+
+
+def hold(
+    deployment: Deployment, seconds: float, mode: Mode | None = None, *wishes: Wish, **more: Any
+) -> float:
+    """Hold the dead-man button until a mode comes, or for a time; when that was."""
+    said = list(wishes)
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        stick = {"held": True, "command": (0.5, 0.0, 0.0)} | more
+        deployment.write(Stick(wish=said.pop(0) if said else Wish.NONE, **stick))
+        if mode is not None and deployment.mode is mode:
+            return time.monotonic()
+        time.sleep(0.01)
+    assert mode is None, f"{mode.name} did not come: {deployment.mode.name}, {deployment.notices()}"
+    return time.monotonic()
+
+
+def walk(deployment: Deployment) -> None:
+    """From damping to where the policy decides."""
+    hold(deployment, 10.0, Mode.STAND, Wish.STAND)
+    hold(deployment, 10.0, Mode.POLICY, Wish.WALK)
+    hold(deployment, 0.3)
+
+
+def first_damping(wire: Path, after: float) -> float:
+    """Time from a fault until the first damping that lasts [s]."""
+    when, damped = writes(wire)
+    later = when > after
+    start = when[later & damped][0]
+    assert damped[when > start].all() or (when[(when > start) & ~damped][0] - start) > 0.9
+    return float(start - after)
+
+
+@pytest.fixture
+def running(
+    policy: Path, events: dict[str, Any], tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[tuple[Deployment, Path, Path]]:
+    wire, log = tmp_path / "wire.txt", tmp_path / "run.mcap"
+    plan = Plan(
+        link=FaultyLink(wire=wire, loss=request.param, **events),
+        policy=policy,
+        log=log,
+        timing=QUICK,
+        any_delay=True,
+        stick_valid_s=1.0,
+    )
+    with Deployment(plan) as deployment:
+        yield deployment, wire, log
+
+
+@pytest.mark.parametrize("running", [0.3], indirect=True)
+def test_loss_and_killed_processes(running: tuple[Deployment, Path, Path]) -> None:
+    deployment, wire, log = running
+    walk(deployment)
+    # A third of the states lost: it walks on.
+    hold(deployment, 0.5, jump=True)
+    assert deployment.mode is Mode.POLICY
+    # The logger dies: it walks on, and the file holds all but the last moment.
+    assert deployment.logger is not None
+    os.kill(deployment.logger.pid or 0, signal.SIGKILL)
+    killed = time.monotonic()
+    hold(deployment, 0.3)
+    assert deployment.mode is Mode.POLICY
+    assert is_deploy_log(log)
+    found = read_deploy_log(log)
+    assert not found.complete
+    assert found.virtual
+    assert killed - found.time[-1] < 1.0
+    assert (np.diff(found.tick) >= 1).all()
+    assert Mode.POLICY in found.mode
+    # Every tick that the servo did is there: ticks it missed are the only gaps.
+    assert found.tick[0] <= 1
+    # The policy's process dies: damping.
+    os.kill(deployment.policy.pid or 0, signal.SIGKILL)
+    killed = time.monotonic()
+    hold(deployment, 2.0, Mode.FAULT)
+    hold(deployment, 0.2)
+    assert first_damping(wire, killed) <= DAMPED_S
+    # It does not come back by itself, nor by asking to stand: the fault is latched.
+    hold(deployment, 1.2, None, Wish.STAND)
+    assert deployment.mode is Mode.FAULT
+    deployment.close()
+    assert any("expired" in fault for fault in deployment.outcome.faults)
+    assert deployment.outcome.servo["states_lost"] > 100
+    assert deployment.outcome.policy == {}
+
+
+@pytest.mark.parametrize("running", [0.0], indirect=True)
+def test_states_that_cannot_be_believed(
+    running: tuple[Deployment, Path, Path], events: dict[str, Any]
+) -> None:
+    deployment, wire, log = running
+    for name, reset in (("nan", Wish.RESET), ("stuck", Wish.RESET), ("freeze", Wish.NONE)):
+        walk(deployment)
+        struck = time.monotonic()
+        events[name].set()
+        hold(deployment, 2.0, Mode.FAULT)
+        hold(deployment, 0.2)
+        assert first_damping(wire, struck) <= DAMPED_S, name
+        events[name].clear()
+        hold(deployment, 1.1)
+        assert deployment.mode is Mode.FAULT, "a fault damps for a second at least"
+        if reset is not Wish.NONE:
+            hold(deployment, 5.0, Mode.DAMP, reset)
+    deployment.close()
+    # The log of a run that ended badly is whole.
+    found = read_deploy_log(log)
+    assert found.complete, (found.damage, found.figures["servo"]["dropped"], len(found.time))
+    faults = [event for event in found.events if event.kind == "fault"]
+    assert [event.text for event in faults] == deployment.outcome.faults
+    assert faults[0].reason == "STATE_NOT_FINITE"
+    assert {event.reason for event in faults[1:]} <= {"NO_STATE", "STATE_LOST"}
+    # What the log says was sent is what was written: damping wherever no target was.
+    driven = found.mode != Mode.PREFLIGHT
+    assert (found.damped == np.isnan(found.sent[:, 0]))[driven].all()
+    when, damped = writes(wire)
+    assert abs(int(damped.sum()) - int(found.damped.sum())) <= 1
+    assert abs(len(when) - int(driven.sum())) <= 1
+    # The policy's orders were followed, once blended in.
+    followed = (found.mode == Mode.POLICY) & (found.blend == 1.0) & (found.level == 0)
+    assert followed.any()
+    target = {
+        int(k): row for k, row in zip(np.arange(len(found.target)), found.target, strict=True)
+    }
+    k = int(np.flatnonzero(followed)[0])
+    np.testing.assert_allclose(found.sent[k], target[int(found.order[k])])
+    # What the network read is what pronk's observation of the logged state is.
+    assert found.observation.shape[1] == 105
+    assert np.isfinite(found.latency[found.mode == Mode.POLICY]).sum() > 10
+    assert found.figures["servo"]["ticks"] >= len(found.tick)
+
+
+def test_a_policy_for_another_robot_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    other = write_hopper(
+        tmp_path / "other.onnx", joint_names=tuple(f"joint_{i}" for i in range(12))
+    )
+    plan = Plan(
+        link=FaultyLink(wire=tmp_path / "w", nan=None, freeze=None, stuck=None), policy=other
+    )
+    with pytest.raises(ArtefactError, match="joint_names"):
+        Deployment(plan)
+
+
+def test_a_plan_without_time_is_refused(policy: Path, tmp_path: Path) -> None:
+    link = FaultyLink(wire=tmp_path / "w", nan=None, freeze=None, stuck=None)
+    with pytest.raises(HardwareError, match="order_valid_s"):
+        Plan(link=link, policy=policy, order_valid_s=0.0)
+
+
+# --- From the command line ----------------------------------------------------------------------
+
+
+def run_command(*words: str) -> tuple[int, str, Exception | None]:
+    app = typer.Typer()
+    app.command()(deploy)
+    done = CliRunner().invoke(app, list(words), catch_exceptions=True)
+    error = done.exception if isinstance(done.exception, Exception) else None
+    return done.exit_code, done.output, error
+
+
+@pytest.mark.slow
+def test_the_command_on_the_virtual_robot_on_the_ground(tmp_path: Path, policy: Path) -> None:
+    log, capture, figures = (tmp_path / name for name in ("run.mcap", "run.npz", "run.json"))
+    status, output, error = run_command(
+        *(str(policy), "--script", "0,0", "--seconds", "0.6", "--any-delay", "--log", str(log)),
+        *("--capture", str(capture), "--json", str(figures)),
+    )
+    assert error is None, error
+    assert status == 0, output
+    assert "the virtual robot" in output
+    assert f"wrote {log}" in output
+    found = read_deploy_log(log)
+    assert found.complete
+    assert found.virtual
+    # It lay down damped, stood up, ran the policy, sat down and was damped, in this order.
+    order = [Mode(mode) for mode, _ in itertools.groupby(found.mode.tolist())]
+    assert order == [
+        *(Mode.PREFLIGHT, Mode.DAMP, Mode.STAND, Mode.POLICY, Mode.HALT, Mode.SIT, Mode.DAMP)
+    ]
+    seen = load_capture(capture)
+    height = seen.position[:, 2]
+    began = found.time[0]
+    standing = found.time[found.mode == Mode.POLICY] - began
+    upright = height[np.searchsorted(seen.time, standing[-1])]
+    assert height[-1] < 0.15 < 0.25 < upright < 0.33
+    assert json.loads(figures.read_text())["faults"] == []
+
+
+def test_nobody_at_the_keyboard_and_nobody_who_confirms(policy: Path) -> None:
+    status, _, error = run_command(str(policy), "--gamepad", "/dev/input/js77")
+    assert isinstance(error, HardwareError)
+    assert "js77" in str(error)
+    _, output, error = run_command(
+        str(policy), "--link", "dds", "--interface", "nowhere0", "--script", "1,0"
+    )
+    assert status != 0
+    assert "is about to move" in output
+    assert isinstance(error, (HardwareError, SystemExit)) or error is None
+
+
+def test_another_word_moves_nothing(policy: Path) -> None:
+    app = typer.Typer()
+    app.command()(deploy)
+    words = [str(policy), "--link", "lcm", "--interface", "nowhere0", "--script", "1,0"]
+    done = CliRunner().invoke(app, words, input="yes\n")
+    assert isinstance(done.exception, HardwareError)
+    assert "nothing was moved" in str(done.exception)

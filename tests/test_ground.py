@@ -1,0 +1,583 @@
+"""The virtual robot off the bench: contact, free flight, inertial unit, commands that expire."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from pronk.errors import HardwareError, RobotError
+from pronk.hardware import quaternion
+from pronk.hardware.ground import Box, Ground, Start
+from pronk.hardware.inertial import moving_force
+from pronk.hardware.machine import Command, State
+from pronk.hardware.plant import build_plant, legs_of
+from pronk.hardware.transport import Transport, sinking
+from pronk.hardware.truth import SHIPPED, Truth, load_truth, parse_truth, with_changes
+from pronk.hardware.truth_parts import AttitudeTruth, TrunkTruth
+from pronk.hardware.virtual import VirtualRobot
+from pronk.robots import load_robot
+
+Array = NDArray[np.float64]
+
+ROBOT = load_robot("mini_cheetah")
+POSE = np.array([joint.default_position for joint in ROBOT.joints])
+TRUTH = load_truth()
+GRAVITY = 9.81
+STEP = 0.25e-3
+NOISES = (
+    "sampling_jitter_s",
+    "timestamp_error_s",
+    "velocity_noise",
+    "position_noise",
+    "torque_noise",
+    "gyro_noise",
+    "accelerometer_noise",
+)
+
+
+def quiet(**changes: Any) -> Truth:
+    """The shipped truth with perfect sensors and no delays."""
+    machine = replace(
+        TRUTH.machine,
+        **dict.fromkeys((*NOISES, "command_delay_s", "measurement_delay_s"), 0.0),
+        gyro_bias=(0.0, 0.0, 0.0),
+        accelerometer_bias=(0.0, 0.0, 0.0),
+    )
+    return replace(TRUTH, machine=machine, attitude=AttitudeTruth(), **changes)
+
+
+def frictionless() -> Truth:
+    """Nothing that takes energy away."""
+    nothing = dict.fromkeys(("presliding_damping", "viscous", "belt_damping"), 0.0)
+    nothing |= dict.fromkeys(("coulomb", "breakaway"), 1e-9) | {"presliding_stiffness": 1e-3}
+    joints = {name: replace(joint, **nothing) for name, joint in TRUTH.joints.items()}
+    return quiet(joints=joints)
+
+
+def aligned(truth: Truth) -> Truth:
+    """Encoders without offset: in free fall the drives have nothing to correct."""
+    joints = {name: replace(joint, encoder_offset=0.0) for name, joint in truth.joints.items()}
+    return replace(truth, joints=joints)
+
+
+def standing(truth: Truth = TRUTH, **options: Any) -> VirtualRobot:
+    machine = VirtualRobot(ROBOT, truth, base="ground", **options)
+    machine.connect()
+    return machine
+
+
+def hold(position: Array = POSE, **options: Any) -> Command:
+    return Command(
+        position=position, stiffness=np.full(12, 17.0), damping=np.full(12, 0.4), **options
+    )
+
+
+def falling(truth: Truth, **options: Any) -> VirtualRobot:
+    return standing(truth, start=Start(drop=2.0, settle_s=0.0), **options)
+
+
+def down(state: State) -> Array:
+    """Direction of gravity in the trunk's frame, as the machine believes."""
+    w = Rotation.from_quat(state.orientation, scalar_first=True)
+    return np.asarray(w.inv().apply([0.0, 0.0, -1.0]))
+
+
+# --- Contact of one foot, by itself -------------------------------------------------------------
+
+
+def ball(ground: Ground, mass: float = 2.0) -> tuple[Any, Any]:
+    """A point mass with a foot that can only shift, let down on the ground."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = STEP
+    ground.add_to(spec)
+    body = spec.worldbody.add_body(name="ball", mass=mass, inertia=(1, 1, 1), explicitinertial=True)
+    for axis in np.eye(3):
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    size = (0.02, 0.0, 0.0)
+    body.add_geom(name="foot", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, priority=1, mass=0.0)
+    model = spec.compile()
+    ground.set_contact(model, np.array([model.geom("foot").id]))
+    data = mujoco.MjData(model)
+    data.qpos[2] = 0.02 - mass * GRAVITY / ground.stiffness
+    return model, data
+
+
+def test_a_foot_sinks_in_by_its_load_over_the_stiffness() -> None:
+    ground = Ground(stiffness=20e3)
+    model, data = ball(ground)
+    data.qpos[2] = 0.02
+    mujoco.mj_step(model, data, 8000)
+    assert 0.02 - data.qpos[2] == pytest.approx(2.0 * GRAVITY / 20e3, rel=1e-6)
+
+
+def test_a_pressed_foot_swings_with_its_own_mass_added() -> None:
+    ground = Ground(stiffness=20e3, damping=1.0)
+    model, data = ball(ground)
+    data.qpos[2] += 1e-4
+    height = []
+    for _ in range(2000):
+        mujoco.mj_step(model, data)
+        height.append(data.qpos[2])
+    swing = np.array(height) - np.mean(height)
+    ups = np.flatnonzero((swing[1:] > 0.0) & (swing[:-1] <= 0.0))
+    period = STEP * np.diff(ups).mean()
+    # The added mass at an impedance of one half is 1 / A, the mass of the body.
+    assert 2.0 * math.pi / period == pytest.approx(math.sqrt(20e3 / 4.0), rel=0.02)
+
+
+def test_a_sliding_foot_slows_down_by_friction_and_a_sticking_one_stays() -> None:
+    ground = Ground(friction=0.6)
+    model, data = ball(ground)
+    data.qvel[0] = 2.0
+    mujoco.mj_step(model, data, 400)
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_constraint[0] == pytest.approx(-0.6 * data.qfrc_constraint[2], rel=1e-4)
+    assert data.qvel[0] == pytest.approx(2.0 - 0.6 * GRAVITY * 0.1, rel=0.03)
+    mujoco.mj_step(model, data, 2000)
+    rest = data.qpos[0]
+    data.qfrc_applied[0] = 0.9 * 0.6 * 2.0 * GRAVITY
+    mujoco.mj_step(model, data, 4000)
+    assert abs(data.qpos[0] - rest) < 1e-3
+    data.qfrc_applied[0] = 1.2 * 0.6 * 2.0 * GRAVITY
+    mujoco.mj_step(model, data, 4000)
+    assert data.qpos[0] - rest == pytest.approx(0.5 * 0.2 * 0.6 * GRAVITY, rel=0.03)
+
+
+# --- Standing -----------------------------------------------------------------------------------
+
+
+def test_feet_carry_the_weight_and_sink_in_as_hertz_would_have_it() -> None:
+    machine = standing(quiet())
+    machine.wait(1.0)
+    model, data = machine._plant.model, machine._physics.data
+    mujoco.mj_forward(model, data)
+    force, total = np.zeros(6), 0.0
+    for index in range(data.ncon):
+        mujoco.mj_contactForce(model, data, index, force)
+        total += force[0]
+    weight = model.body_mass.sum() * GRAVITY
+    links = sum(
+        model.body_mass[model.body(f"{leg}_{part}").id]
+        for leg in legs_of(ROBOT)
+        for part in ("hip", "thigh", "shank")
+    )
+    nominal = ROBOT.build_spec().compile()
+    trunk = nominal.body("trunk").mass[0] + TRUTH.trunk.mass_offset
+    assert weight == pytest.approx((trunk + links) * GRAVITY, rel=1e-6)
+    assert total == pytest.approx(weight, rel=0.01)
+    sunk = 0.0175 - machine.snapshot().foot_position[0, :, 2]
+    assert sunk.sum() * TRUTH.ground.stiffness == pytest.approx(weight, rel=0.06)
+
+
+def test_it_stands_still_on_four_feet_until_it_is_asked() -> None:
+    machine = standing()
+    machine.wait(2.0)
+    seen = machine.capture()
+    assert seen.contact.all()
+    assert not seen.other_contact.any()
+    assert np.ptp(seen.position, axis=0).max() < 0.01
+    assert 0.22 < seen.position[:, 2].min() < 0.31
+    # Feet creep a little where they are loaded sideways, and no more.
+    assert np.ptp(seen.foot_position, axis=0).max() < 0.004
+
+
+def test_it_is_set_down_where_and_how_one_says() -> None:
+    offset = tuple(np.linspace(-0.1, 0.1, 12))
+    start = Start(position=(1.0, -2.0), yaw=2.0, joint_offset=offset, settle_s=0.0)
+    seen = standing(quiet(), start=start).snapshot()
+    np.testing.assert_allclose(seen.position[0, :2], [1.0, -2.0], atol=1e-12)
+    turned = Rotation.from_quat(seen.orientation[0], scalar_first=True)
+    np.testing.assert_allclose(turned.as_rotvec(), [0.0, 0.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(seen.joint_position[0], POSE + offset, atol=1e-12)
+    assert seen.foot_position[0, :, 2].min() == pytest.approx(0.0175, abs=1e-12)
+
+
+def test_it_stands_on_blocks_over_a_gap() -> None:
+    near = Box(center=(-1.0, 0.0, -0.1), half_size=(1.0, 1.0, 0.1))
+    far = Box(center=(1.6, 0.0, -0.05), half_size=(1.0, 1.0, 0.1))
+    ground = replace(TRUTH.ground, floor=-0.5, terrain=(near, far))
+    assert ground.height(-0.5, 0.0) == 0.0
+    assert ground.height(0.3, 0.0) == -0.5
+    assert ground.height(1.0, 0.5) == pytest.approx(0.05)
+    machine = standing(quiet(), ground=ground, start=Start(position=(1.5, 0.0)))
+    seen = machine.snapshot()
+    assert seen.contact.all()
+    assert seen.foot_position[0, :, 2].mean() == pytest.approx(0.05 + 0.0175, abs=0.002)
+    # Half over the edge it tips into the gap.
+    machine = standing(quiet(), ground=ground, start=Start(position=(0.6, 0.0), settle_s=0.0))
+    machine.wait(1.5)
+    seen = machine.capture()
+    assert seen.other_contact.any()
+    assert seen.foot_position[-1, 2:, 2].max() < 0.0
+
+
+def test_without_torque_it_sinks_to_its_belly_and_goes_on() -> None:
+    machine = standing()
+    machine.damp()
+    machine.wait(3.0)
+    seen = machine.capture()
+    assert seen.other_contact[-1]
+    assert seen.position[-1, 2] < 0.12
+    assert np.abs(seen.velocity[-1]).max() < 0.05
+
+
+def test_the_battery_never_gives_more_than_it_can() -> None:
+    machine = standing(with_changes(quiet(), bus_resistance=0.5))
+    gains = {"stiffness": np.full(12, 100.0), "damping": np.full(12, 0.4)}
+    machine.send(Command(position=0.3 * POSE, **gains))
+    voltage = [state.bus_voltage for state in machine.wait(0.2)]
+    assert min(voltage) == 0.5 * TRUTH.machine.bus_voltage
+
+
+# --- Free flight --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [STEP, STEP / 2])
+def test_energy_is_conserved_without_drives_and_contacts(step: float) -> None:
+    machine = falling(frictionless(), timestep_s=step)
+    model, data = machine._plant.model, machine._physics.data
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    zeros = np.zeros(12)
+    machine.send(Command(position=POSE, stiffness=zeros, damping=zeros))
+    machine.wait(0.002)
+    rng = np.random.default_rng(5)
+    data.qvel[:6] += rng.uniform(-3.0, 3.0, 6)
+    data.qvel[machine._plant.link] += rng.uniform(-4.0, 4.0, 12)
+
+    def energy() -> float:
+        mujoco.mj_forward(model, data)
+        return float(data.energy.sum())
+
+    before, swing = energy(), []
+    for k in range(40):
+        machine.wait(0.002 + 0.004 * (k + 1))
+        swing.append(energy() - before)
+    kinetic = float(data.energy[1])
+    # First order in the step, as MuJoCo's Euler is.
+    assert np.abs(swing).max() < 0.02 * kinetic * step / STEP
+    assert kinetic > 20.0
+
+
+def test_it_falls_freely_and_its_accelerometer_feels_nothing() -> None:
+    machine = falling(aligned(quiet()))
+    height = machine.snapshot().position[0, 2]
+    states = machine.wait(0.4)
+    seen = machine.capture()
+    t = seen.time
+    # MuJoCo's Euler is symplectic: a step ahead of the parabola, g h t / 2.
+    fallen = height - seen.position[:, 2]
+    np.testing.assert_allclose(fallen, 0.5 * GRAVITY * t * (t + STEP), atol=1e-9)
+    np.testing.assert_allclose(seen.velocity[:, 2], -GRAVITY * t, atol=1e-9)
+    assert not seen.contact.any()
+    assert max(np.abs(state.accelerometer).max() for state in states) < 1e-6
+    assert max(np.abs(state.gyro).max() for state in states) < 1e-9
+
+
+# --- Inertial unit ------------------------------------------------------------------------------
+
+
+def test_at_rest_it_feels_gravity_along_its_own_vertical() -> None:
+    machine = standing(quiet())
+    state = machine.wait(2.0)[-1]
+    np.testing.assert_allclose(state.accelerometer, -GRAVITY * down(state), atol=0.05)
+    # The truth's trunk leans, so this is no test of (0, 0, g).
+    assert abs(down(state)[0]) > 1e-4
+
+
+def test_bias_and_noise_are_as_large_as_said() -> None:
+    truth = replace(TRUTH, machine=replace(TRUTH.machine, gyro_bias=(0.1, 0.2, 0.3)))
+    states = falling(aligned(truth)).wait(0.6)
+    gyro = np.array([state.gyro for state in states])
+    force = np.array([state.accelerometer for state in states[1:]])  # before, it was at rest
+    np.testing.assert_allclose(gyro.mean(axis=0), [0.1, 0.2, 0.3], atol=3e-4)
+    np.testing.assert_allclose(force.mean(axis=0), TRUTH.machine.accelerometer_bias, atol=4e-3)
+    assert gyro.std() == pytest.approx(math.hypot(0.001, np.std([0.1, 0.2, 0.3])), rel=0.1)
+    assert force.std(axis=0).mean() == pytest.approx(0.02, rel=0.1)
+
+
+def test_attitude_is_off_by_bias_and_wander_and_its_heading_starts_anywhere() -> None:
+    attitude = AttitudeTruth(bias=(0.05, -0.03, 0.0), noise=0.01, noise_corner_hz=20.0)
+    truth = quiet(trunk=TrunkTruth())
+    headings = []
+    for seed in range(3):
+        machine = standing(replace(truth, attitude=attitude), seed=seed)
+        states = machine.wait(1.5)
+        true = standing(truth, seed=seed).wait(1.5)
+        # To first order, a small rotation e turns gravity (0, 0, -1) by e x (0, 0, 1).
+        off = np.array([down(a) - down(b) for a, b in zip(states, true, strict=True)])
+        np.testing.assert_allclose(off.mean(axis=0), [-0.03, -0.05, 0.0], atol=0.006)
+        assert off[:, :2].std(axis=0).mean() == pytest.approx(0.01, rel=0.3)
+        turned = Rotation.from_quat(states[0].orientation, scalar_first=True)
+        headings.append(turned.as_euler("ZYX")[0])
+    assert np.ptp(headings) > 0.3
+
+
+def test_heading_drifts() -> None:
+    states = falling(replace(aligned(quiet()), attitude=AttitudeTruth(yaw_drift=0.2))).wait(0.5)
+    turn = Rotation.from_quat([s.orientation for s in (states[0], states[-1])], scalar_first=True)
+    drift = (turn[1] * turn[0].inv()).as_rotvec()
+    np.testing.assert_allclose(drift, [0.0, 0.0, 0.2 * 0.498], atol=1e-6)
+
+
+@given(
+    st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
+    st.lists(st.floats(-20.0, 20.0), min_size=3, max_size=3),
+)
+def test_accelerometer_of_a_constant_acceleration(turn: list[float], pull: list[float]) -> None:
+    orientation = np.tile(quaternion.of_vector(np.array([turn])), (4, 1))
+    velocity = np.arange(4)[:, None] * 0.01 * np.array(pull)
+    force = moving_force(velocity, orientation, 0.01)
+    expected = Rotation.from_rotvec(turn).inv().apply(np.add(pull, [0.0, 0.0, GRAVITY]))
+    np.testing.assert_allclose(force, np.tile(expected, (3, 1)), atol=1e-9)
+
+
+@given(
+    st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
+    st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
+)
+def test_quaternions_agree_with_scipy(first: list[float], second: list[float]) -> None:
+    a, b = Rotation.from_rotvec(first), Rotation.from_rotvec(second)
+    qa, qb = (quaternion.of_vector(np.array([v])) for v in (first, second))
+    both = Rotation.from_quat(quaternion.product(qa, qb), scalar_first=True)
+    np.testing.assert_allclose(both.as_matrix()[0], (a * b).as_matrix(), atol=1e-12)
+    back = quaternion.turned_back(qa, np.array([second]))[0]
+    np.testing.assert_allclose(back, a.inv().apply(second), atol=1e-9)
+    heading = Rotation.from_quat(quaternion.about_z(np.array(first)), scalar_first=True)
+    np.testing.assert_allclose(
+        heading.as_matrix(),
+        Rotation.from_euler("z", np.array(first)[:, None]).as_matrix(),
+        atol=1e-12,
+    )
+
+
+# --- Repeatability ------------------------------------------------------------------------------
+
+
+def shaken(seed: int, cuts: int) -> tuple[Array, Array]:
+    """States and capture of a robot that is asked to bob, time cut into pieces."""
+    machine = standing(seed=seed, start=Start(settle_s=0.2))
+    states = []
+    for k in range(10):
+        machine.send(hold(POSE + 0.15 * (-1.0) ** k))
+        for cut in range(cuts):
+            states += machine.wait(0.02 * k + 0.02 * (cut + 1) / cuts)
+    seen = machine.capture()
+    rows = [[s.time, *s.position, *s.gyro, *s.accelerometer, *s.orientation] for s in states]
+    return np.array(rows), np.hstack([seen.position, seen.torque, seen.bus_voltage[:, None]])
+
+
+def test_same_seed_same_numbers_to_the_last_digit_however_time_is_cut() -> None:
+    states, seen = shaken(3, 1)
+    again = shaken(3, 7)
+    assert np.array_equal(states, again[0])
+    assert np.array_equal(seen, again[1])
+    other = shaken(4, 1)
+    assert not np.array_equal(states, other[0])
+    # Noise is in what the robot says, not in the robot.
+    assert np.array_equal(seen, other[1])
+
+
+# --- Commands that expire -----------------------------------------------------------------------
+
+
+def test_transport_delivers_late_and_damps_when_nothing_new_comes() -> None:
+    way = Transport(12, 0.002, 0.001)
+    first, second = hold(made=0.0, valid_for=0.010), hold(POSE + 1.0, made=0.005, valid_for=0.010)
+    way.put(first, 0.0)
+    way.put(second, 0.005)
+    assert way.take(2) is None
+    assert way.take(3) == (2, first)
+    assert way.take(100) == (7, second)
+    step, damping = way.take(100) or (0, first)
+    assert step == 17  # made + valid_for + delay
+    assert not damping.stiffness.any()
+    assert (damping.damping > 0.0).all()
+    assert way.take(10**9) is None
+
+
+def test_a_command_that_comes_when_the_last_expires_is_obeyed() -> None:
+    way = Transport(12, 0.0, 0.001)
+    second = hold(made=0.010)
+    way.put(hold(made=0.0, valid_for=0.010), 0.0)
+    way.put(second, 0.010)
+    assert [(way.take(50) or (0, second))[0] for _ in range(3)] == [0, 10, 10]
+    assert way.take(50) is None  # the last one never expires
+
+
+def test_a_command_that_is_stale_on_arrival_is_followed_by_damping_at_once() -> None:
+    way = Transport(12, 0.0, 0.001)
+    way.put(hold(made=0.0, valid_for=0.005), 0.020)
+    heard = [way.take(50) or (0, sinking(12)) for _ in range(2)]
+    assert heard[0][0] == 20
+    assert not heard[1][1].stiffness.any()
+
+
+def test_an_expired_command_lets_the_robot_sink_and_a_lasting_one_does_not() -> None:
+    heights = []
+    for valid_for in (0.1, math.inf):
+        machine = standing(quiet())
+        machine.send(hold(made=machine.now(), valid_for=valid_for))
+        machine.wait(0.09)
+        before = machine.snapshot().position[0, 2]
+        machine.wait(1.5)
+        heights.append(before - machine.snapshot().position[0, 2])
+    assert heights[0] > 0.1
+    assert abs(heights[1]) < 0.005
+
+
+# --- Other bodies -------------------------------------------------------------------------------
+
+
+def test_a_trunk_with_other_mass_centre_and_inertia() -> None:
+    trunk = TrunkTruth(
+        mass_offset=1.5, com_offset=(0.01, 0.02, -0.03), inertia_scale=(1.1, 0.9, 1.0)
+    )
+    truth = replace(TRUTH, trunk=trunk)
+    model = build_plant(ROBOT, truth, legs_of(ROBOT), STEP, Ground()).model
+    nominal = ROBOT.build_spec().compile()
+    was, now = nominal.body("trunk"), model.body("trunk")
+    mass = float(was.mass[0])
+    assert now.mass[0] == pytest.approx(mass + 1.5)
+    np.testing.assert_allclose(now.ipos - was.ipos, trunk.com_offset, atol=1e-12)
+
+    def tensor(body: Any) -> Array:
+        axes = Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
+        return np.asarray(axes @ np.diag(body.inertia) @ axes.T)
+
+    expected = np.diag(tensor(was)) * trunk.inertia_scale * (1.0 + 1.5 / mass)
+    np.testing.assert_allclose(tensor(now), np.diag(expected), atol=1e-9)
+
+
+def test_changes_one_by_one() -> None:
+    changed = with_changes(
+        TRUTH, trunk_mass_offset=1.0, friction=0.5, command_delay_s=0.01, bus_voltage=20.0
+    )
+    assert changed.trunk == replace(TRUTH.trunk, mass_offset=1.0)
+    assert changed.ground == replace(TRUTH.ground, friction=0.5)
+    assert changed.machine == replace(TRUTH.machine, command_delay_s=0.01, bus_voltage=20.0)
+    assert changed.joints is TRUTH.joints
+    assert with_changes(TRUTH) == TRUTH
+    with pytest.raises(RobotError, match="no 'mass' to change; it has trunk_mass_offset, friction"):
+        with_changes(TRUTH, mass=1.0)
+    with pytest.raises(RobotError, match="friction is -1"):
+        with_changes(TRUTH, friction=-1.0)
+
+
+def body_of_file(**entries: Any) -> dict[str, Any]:
+    return yaml.safe_load(SHIPPED.read_text(encoding="utf-8")) | entries
+
+
+def test_parts_for_the_ground_may_be_left_out_of_a_truth() -> None:
+    body = body_of_file(trunk={"mass_offset": 1}, ground={"friction": 0.5})
+    del body["attitude"]
+    truth = parse_truth(body, "my.yaml")
+    assert truth.trunk == TrunkTruth(mass_offset=1.0)
+    assert truth.ground == Ground(friction=0.5)
+    assert truth.attitude == AttitudeTruth()
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        ({"ground": {"friction": 0}}, "my.yaml: ground.friction is 0; expected"),
+        ({"ground": {"friction": "ice"}}, "ground.friction is 'ice'; expected a number"),
+        ({"ground": {"stiffness": -1}}, "ground.stiffness is -1"),
+        ({"ground": {"terrain": []}}, "ground.terrain is unknown; the fields are friction"),
+        ({"ground": None}, "ground is None; expected a mapping"),
+        ({"trunk": {"mass": 3}}, "trunk.mass is unknown; the fields are mass_offset"),
+        ({"trunk": {"com_offset": [0, 0]}}, "trunk.com_offset is [0, 0]; expected three numbers"),
+        ({"trunk": {"inertia_scale": [1, -1, 1]}}, "trunk.inertia_scale is -1"),
+        ({"attitude": {"noise": math.nan}}, "attitude.noise is nan"),
+    ],
+)
+def test_impossible_parts_are_refused_by_name(entries: dict[str, Any], words: str) -> None:
+    with pytest.raises(RobotError) as caught:
+        parse_truth(body_of_file(**entries), "my.yaml")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# --- Refusals -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("truth", "words"),
+    [
+        (replace(TRUTH, trunk=TrunkTruth(mass_offset=-20.0)), r"trunk\.mass_offset is -20 kg"),
+        (
+            replace(TRUTH, trunk=TrunkTruth(inertia_scale=(1.0, 1.0, 3.0))),
+            r"trunk\.inertia_scale is \[1\.0, 1\.0, 3\.0\]; .* sum of the others",
+        ),
+        (
+            replace(TRUTH, ground=Ground(stiffness=5e6)),
+            r"ground\.stiffness is 5e\+06 .* take less of both",
+        ),
+    ],
+)
+def test_impossible_bodies_are_refused_before_the_first_step(truth: Truth, words: str) -> None:
+    with pytest.raises(RobotError, match=words) as caught:
+        VirtualRobot(ROBOT, truth, base="ground")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"base": "sky"}, "base 'sky'; the virtual robot knows 'bench' and 'ground'"),
+        ({"base": "bench", "ground": Ground()}, "ground or start given on the bench"),
+        ({"base": "bench", "start": Start()}, "ground or start given on the bench"),
+        ({"base": "ground", "legs": ("FR",)}, "legs .* on the ground, where all are needed"),
+        ({"base": "ground", "capture_rate_hz": 1e5}, "capture_rate_hz is 100000"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(HardwareError, match=words):
+        VirtualRobot(ROBOT, TRUTH, **options)
+
+
+def test_more_refusals() -> None:
+    machine = standing(start=Start(settle_s=0.0))
+    with pytest.raises(HardwareError, match="cannot be clamped on the ground"):
+        machine.clamp(("FR_knee",))
+    with pytest.raises(HardwareError, match=r"command\.made is nan"):
+        machine.send(hold(made=math.nan))
+    with pytest.raises(HardwareError, match=r"command\.valid_for 0"):
+        machine.send(hold(valid_for=0.0))
+    with pytest.raises(RobotError, match="joint_offset has 3 numbers; expected 12"):
+        standing(start=Start(joint_offset=(0.0, 0.0, 0.0)))
+    with pytest.raises(RobotError, match="neither may be negative"):
+        Start(drop=-1.0)
+    with pytest.raises(RobotError, match="all are finite"):
+        Start(yaw=math.inf)
+    with pytest.raises(RobotError, match=r"Box\.half_size is .* positive"):
+        Box(center=(0.0, 0.0, 0.0), half_size=(1.0, 0.0, 1.0))
+    with pytest.raises(RobotError, match=r"Box\.center is .* three finite numbers"):
+        Box(center=(0.0, math.nan, 0.0), half_size=(1.0, 1.0, 1.0))
+    with pytest.raises(RobotError, match="friction is 0; expected"):
+        Ground(friction=0.0)
+
+
+def test_an_arm_does_not_stand() -> None:
+    arm = load_robot("so101")
+    joint = next(iter(TRUTH.joints.values()))
+    truth = replace(TRUTH, robot="so101", joints=dict.fromkeys(arm.joint_names, joint))
+    with pytest.raises(RobotError, match="so101 has no legs to stand on"):
+        VirtualRobot(arm, truth, base="ground")
+
+
+def test_physics_that_runs_away_is_told() -> None:
+    machine = standing(start=Start(settle_s=0.0))
+    machine.wait(0.02)
+    machine._physics.data.qvel[0] = math.nan
+    with pytest.raises(HardwareError, match=r"physics ran away by 0\.\d+ s at a step of 0\.00025"):
+        machine.wait(0.1)

@@ -1,0 +1,299 @@
+"""The link against a real `pronk twin` process, on loopback, in real time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pronk.errors import HardwareError
+from pronk.hardware.lcm_codec import (
+    decode_command,
+    encode_command,
+)
+from pronk.hardware.lcm_layout import (
+    CHEETAH,
+)
+from pronk.hardware.lcm_link import LcmMachine
+from pronk.hardware.lcm_service import REQUEST_CHANNEL, mode_request
+from pronk.hardware.lcm_url import url_of
+from pronk.hardware.lcm_writer import DAMPING, CommandWriter
+from pronk.hardware.machine import Command, State
+from pronk.hardware.preflight import Freshness
+from pronk.hardware.twin import hold_of
+from pronk.robots import load_robot
+
+lcm = pytest.importorskip("lcm")
+
+ROBOT = load_robot("mini_cheetah")
+HOLD = hold_of(ROBOT)
+KNEE = ROBOT.joint_names.index("FL_knee")
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass
+class Process:
+    """A twin of its own."""
+
+    layout: str
+    folder: Path
+    port: int = field(default_factory=free_port)
+
+    def __post_init__(self) -> None:
+        code = "import typer; from pronk.commands.twin import twin; typer.run(twin)"
+        words = ["--layout", self.layout, "--port", str(self.port), "--json", self.json]
+        self.running = subprocess.Popen(
+            [sys.executable, "-c", code, *map(str, words)],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+
+    @property
+    def json(self) -> Path:
+        return self.folder / f"{self.layout}.json"
+
+    def ready(self) -> str:
+        assert self.running.stdout is not None
+        return self.running.stdout.readline()
+
+    def machine(self, **options: object) -> LcmMachine:
+        made = LcmMachine(
+            ROBOT,
+            layout=self.layout,
+            port=self.port,
+            alone_s=0.3,
+            # A computer that runs tests side by side is busy; what is tested here is not that.
+            fresh=Freshness(share=0.02, longest_gap_s=10.0),
+            **options,  # type: ignore[arg-type]
+        )
+        return made
+
+
+@pytest.fixture(scope="module")
+def twins(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Process]]:
+    folder = tmp_path_factory.mktemp("twins")
+    made = {layout: Process(layout, folder) for layout in ("cheetah", "wtw")}
+    try:
+        for process in made.values():
+            assert process.ready().startswith("ready: the virtual mini_cheetah on the bench")
+        yield made
+    finally:
+        for process in made.values():
+            if process.running.poll() is None:
+                process.running.kill()
+            process.running.wait()
+
+
+def moved_knee(angle: float) -> np.ndarray:
+    target = HOLD.position.copy()
+    target[KNEE] += angle
+    return target
+
+
+def follow(
+    machine: LcmMachine, command: Command | None, there: Callable[[np.ndarray], bool]
+) -> list[State]:
+    """Command at 50 Hz until the joints are there, for 20 s at most; the states met."""
+    states: list[State] = []
+    for k in range(1000):
+        if command is not None:
+            machine.send(replace(command, made=machine.now(), valid_for=10.0, sequence=k))
+        states += machine.wait(machine.now() + 0.02)
+        if there(machine.latest().position):
+            break
+    return states
+
+
+@pytest.mark.parametrize("layout", ["cheetah", "wtw"])
+def test_a_joint_moves_as_commanded_and_is_left_damped(
+    twins: dict[str, Process], layout: str
+) -> None:
+    machine = twins[layout].machine()
+    machine.connect()
+    try:
+        assert machine.virtual
+        assert machine.torque_kind == ("absent" if layout == "cheetah" else "measured")
+        before = machine.latest()
+        np.testing.assert_allclose(before.position, HOLD.position, atol=0.1)
+        assert (before.robot_time is None) == (layout == "cheetah")
+        command = replace(HOLD, position=moved_knee(0.3))
+        states = follow(machine, command, lambda q: abs(q[KNEE] - command.position[KNEE]) < 0.03)
+        times = [state.time for state in states]
+        assert times == sorted(times)
+        moved = machine.latest().position - before.position
+        assert moved[KNEE] == pytest.approx(0.3, abs=0.05)
+        assert np.abs(np.delete(moved, KNEE)).max() < 0.1
+        machine.clamp(("FR_hip_roll", "FR_knee"))
+        machine.clamp(())
+    finally:
+        machine.close()
+    # Damped: the hip rolls, which gravity pulls at, have left their place.
+    machine.connect()
+    follow(machine, None, lambda q: np.abs(q - HOLD.position).max() > 0.3)
+    assert np.abs(machine.latest().position - HOLD.position).max() > 0.3
+    machine.close()
+    with pytest.raises(HardwareError, match="call connect"):
+        machine.latest()
+
+
+def test_a_command_that_expires_is_followed_by_damping(twins: dict[str, Process]) -> None:
+    process = twins["cheetah"]
+    machine = process.machine()
+    listener = lcm.LCM(url_of(port=process.port))
+    heard: list[Command] = []
+    listener.subscribe(
+        CHEETAH.command_channel, lambda _, data: heard.append(decode_command(CHEETAH, data))
+    )
+    machine.connect()
+    machine.send(replace(HOLD, made=machine.now(), valid_for=0.5))
+    until = time.monotonic() + 20.0
+    while len(heard) < 6 and time.monotonic() < until:
+        listener.handle_timeout(100)
+    assert heard[0].stiffness.min() > 1.0
+    assert len(heard) == 6
+    for command in heard[1:]:
+        np.testing.assert_array_equal(command.stiffness, 0.0)
+        np.testing.assert_allclose(command.damping, DAMPING, rtol=1e-6)
+    # One that is late already is not sent at all.
+    machine.send(replace(HOLD, made=machine.now() - 1.0, valid_for=0.5))
+    while listener.handle_timeout(0) > 0:
+        pass
+    assert all(command.stiffness.max() == 0.0 for command in heard[1:])
+    assert machine.counts["expired"] == 2
+    machine.close()
+
+
+def test_who_else_commands_is_met_before_and_while_pronk_does(twins: dict[str, Process]) -> None:
+    process = twins["cheetah"]
+    machine = process.machine()
+    other = lcm.LCM(url_of(port=process.port))
+    done = threading.Event()
+
+    def command() -> None:
+        while not done.wait(0.02):
+            other.publish(CHEETAH.command_channel, encode_command(CHEETAH, HOLD))
+
+    rival = threading.Thread(target=command)
+    rival.start()
+    try:
+        with pytest.raises(HardwareError, match="someone else commands the joints"):
+            machine.connect()
+    finally:
+        done.set()
+        rival.join()
+    assert machine.counts["commands"] == 0
+    machine.connect()
+    machine.send(HOLD)
+    foreign = replace(HOLD, position=HOLD.position + 0.01)
+    other.publish(CHEETAH.command_channel, encode_command(CHEETAH, foreign))
+    until = time.monotonic() + 20.0
+    while not machine.counts["foreign"] and time.monotonic() < until:
+        machine.wait(machine.now() + 0.01)
+    with pytest.raises(HardwareError, match="another program commands the joints"):
+        machine.send(HOLD)
+    machine.close()
+
+
+def test_the_robots_own_controller_is_asked_to_let_go(twins: dict[str, Process]) -> None:
+    process = twins["cheetah"]
+    lcm.LCM(url_of(port=process.port)).publish(REQUEST_CHANNEL, mode_request(4, 1))
+    with pytest.raises(HardwareError, match="someone else commands the joints"):
+        process.machine().connect()
+    machine = process.machine(release=True)
+    machine.connect()
+    machine.close()
+
+
+def test_the_wrong_layout_is_said(twins: dict[str, Process]) -> None:
+    # Both stacks have a channel leg_control_data: what comes there is refused by its fingerprint.
+    machine = LcmMachine(ROBOT, layout="wtw", port=twins["cheetah"].port)
+    with pytest.raises(HardwareError, match="sent no state on leg_control_data"):
+        machine.connect()
+
+
+def test_a_real_bench_needs_a_hand() -> None:
+    asked: list[tuple[str, ...]] = []
+    machine = LcmMachine(ROBOT, port=free_port())
+    with pytest.raises(HardwareError, match="FR_knee must be fixed mechanically"):
+        machine.clamp(("FR_knee",))
+    machine.clamp(())
+    LcmMachine(ROBOT, port=free_port(), hand=asked.append).clamp(("FR_knee",))
+    assert asked == [("FR_knee",)]
+    # Never opened: nothing to damp, nothing to close.
+    machine.damp()
+    machine.close()
+    with pytest.raises(HardwareError, match="so101 has 6 joints"):
+        LcmMachine(load_robot("so101"))
+
+
+def test_the_writer_repeats_damping_and_nothing_else() -> None:
+    written: list[bytes] = []
+    writer = CommandWriter(CHEETAH, written.append)
+    writer.send(HOLD)
+    time.sleep(0.05)
+    assert written == [encode_command(CHEETAH, HOLD)]
+    assert writer.is_own(written[0])
+    assert not writer.is_own(b"else")
+    writer.damp()
+    while len(written) < 5:
+        time.sleep(0.01)
+    assert len(set(written[1:])) == 1
+    writer.send(HOLD)
+    count = len(written)
+    time.sleep(0.05)
+    assert len(written) == count
+    writer.stop()
+    writer.damp()
+    assert len(written) == count
+
+
+def test_a_twin_that_dies_leaves_a_link_that_still_closes(twins: dict[str, Process]) -> None:
+    process = twins["wtw"]
+    machine = process.machine()
+    machine.connect()
+    machine.send(HOLD)
+    process.running.kill()
+    process.running.wait()
+    machine.wait(machine.now() + 0.1)
+    assert machine.wait(machine.now() + 0.1) == []
+    with pytest.raises(HardwareError, match="did not confirm its clamps"):
+        machine.clamp(("FR_knee",))
+    machine.damp()
+    machine.close()
+    with pytest.raises(HardwareError, match="sent no state"):
+        machine.connect()
+
+
+def test_a_twin_ends_cleanly_when_told_to(twins: dict[str, Process]) -> None:
+    process = twins["cheetah"]
+    machine = process.machine()
+    machine.connect()
+    machine.send(HOLD)
+    machine.close()
+    process.running.send_signal(signal.SIGTERM)
+    out, _ = process.running.communicate(timeout=30)
+    assert process.running.returncode == 0
+    assert "the virtual robot lived" in out
+    figures = json.loads(process.json.read_text(encoding="utf-8"))
+    assert figures["virtual"] is True
+    # The command, and a second of damping after it.
+    assert figures["wire"]["commands"] > 10
+    assert figures["wire"]["states"] > 100
+    assert figures["twin"]["commands applied"] == figures["wire"]["commands"]

@@ -1,0 +1,164 @@
+"""Bodies never seen: draws within their tolerances, files, and how wrong gains are on a sweep."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hopper import ROBOT, write_hopper
+from pronk.errors import PronkError
+from pronk.hardware.truth import load_truth
+from pronk.hardware.virtual import VirtualRobot
+from pronk.match.pipeline import match_logs
+from pronk.match.rehearse import Ask, rehearse
+from pronk.match.settings import MatchSettings
+from pronk.response.estimator import Estimator
+from pronk.sweep.signals import Chirp
+from pronk.trial import bode, variation
+from pronk.trial.bode import bode_errors, gains_of
+from pronk.trial.other_truths import GROUP_TORQUE, TOLERANCES, draw, save_truth
+from pronk.trial.protocol import Case, Script
+from pronk.trial.run import Plan
+from pronk.trial.subjects import load_subjects
+from pronk.trial.variation import AS_IT_IS, Parameter, add_variation
+
+TRUTH = load_truth()
+QUICK = MatchSettings(method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False)
+
+
+# --- Draws --------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000))
+def test_draws_stay_within_their_tolerances(seed: int) -> None:
+    drawn = draw(TRUTH, ROBOT, seed=seed)
+    parts = {
+        "machine": [(TRUTH.machine, drawn.machine)],
+        "trunk": [(TRUTH.trunk, drawn.trunk)],
+        "attitude": [(TRUTH.attitude, drawn.attitude)],
+        "ground": [(TRUTH.ground, drawn.ground)],
+        "joints": [(TRUTH.joints[name], drawn.joints[name]) for name in ROBOT.joint_names],
+    }
+    for part, tolerances in TOLERANCES.items():
+        for field, tolerance in tolerances.items():
+            batch = GROUP_TORQUE * (1.0 + tolerance.half) if field == "torque_scale" else 0.0
+            for own, new in parts[part]:
+                if field == "breakaway":
+                    assert new.breakaway >= new.coulomb  # type: ignore[attr-defined]
+                    continue
+                value, found = (np.atleast_1d(getattr(each, field)) for each in (own, new))
+                centre = tolerance.centre if tolerance.kind == "about" else value
+                half = tolerance.half + batch
+                half = half * np.abs(value) if tolerance.kind == "relative" else half
+                # Rounded to five digits.
+                assert (np.abs(found - centre) <= half + 1e-4 * np.abs(found)).all(), field
+
+
+def test_a_body_is_its_seed_and_its_file(tmp_path: Path) -> None:
+    one, again, other = (draw(TRUTH, ROBOT, seed=seed) for seed in (1, 1, 2))
+    assert one == again != other
+    assert one.joints["FR_knee"] != TRUTH.joints["FR_knee"]
+    path = tmp_path / "body" / "truth.yaml"
+    save_truth(path, one, says="A body.\nFrom a test.")
+    assert load_truth(path) == one
+    assert path.read_text().startswith("# A body.\n# From a test.\n")
+    # What is not drawn stays.
+    assert one.machine.encoder_bits == TRUTH.machine.encoder_bits
+    scene = replace(one, ground=replace(one.ground, floor=-1.0))
+    with pytest.raises(PronkError, match="no terrain"):
+        save_truth(path, scene, says="")
+    assert load_truth(path) == one
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_drawn_bodies_can_exist(seed: int) -> None:
+    VirtualRobot(ROBOT, draw(TRUTH, ROBOT, seed=seed), base="ground")
+
+
+# --- The Bode error of gains --------------------------------------------------------------------
+
+
+def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
+    truth = (20.6, 0.492)
+    logs = [rehearse(ROBOT, "FR_hip_roll", [Ask(offsets=Chirp(length_s=8.0).samples())], *truth)]
+    naive = {"FR_hip_roll": (17.0, 0.4)}
+    found = bode_errors(
+        logs, ROBOT, {"naive": naive, "truth": {"FR_hip_roll": truth}}, settings=QUICK
+    )
+    (off,), (right,) = found["naive"], found["truth"]
+    assert right.rms_db < 0.01
+    matched = match_logs(logs, ROBOT, settings=QUICK).gains.joints["FR_hip_roll"]
+    assert off.rms_db == pytest.approx(matched.naive_error_db, rel=1e-4)
+    assert off.largest_db > off.rms_db
+    low, high = ROBOT.joint("FR_hip_roll").band_hz
+    hz = off.omega / (2.0 * math.pi)
+    assert low <= hz.min() < hz.max() <= high
+    # Too soft and too little damped: more gain near the resonance.
+    assert off.error_db.max() > 0.0
+    assert bode.overall_rms_db([off, right]) == pytest.approx(
+        math.hypot(off.rms_db, right.rms_db) / math.sqrt(2.0)
+    )
+    with pytest.raises(PronkError, match="none for FR_hip_roll"):
+        bode_errors(logs, ROBOT, {"empty": {}}, settings=QUICK)
+
+
+def test_a_policys_training_gains_are_in_its_contract(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    (subject,) = load_subjects([write_hopper(tmp_path / "policy.onnx")], ROBOT)
+    gains = gains_of(subject)
+    assert gains["FR_hip_roll"] == gains["HL_hip_roll"] == (20.0, 0.45)
+    assert gains["FL_knee"] == (21.5, 0.55)
+
+
+# --- One number at a time -----------------------------------------------------------------------
+
+
+def test_only_the_varied_number_differs(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    policy = write_hopper(tmp_path / "policy.onnx")
+    on_the_spot = Script(
+        command=(0.0, 0.0, 0.0), stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=1.0
+    )
+    plan = Plan(
+        cases=(Case(name="spot", command=(0.0, 0.0, 0.0)),),
+        jumps=1,
+        script=on_the_spot,
+        spread_s=0.0,
+    )
+    own = TRUTH.machine.bus_voltage
+    volts = Parameter(
+        name="bus_voltage", says="battery", unit="V", values=(18.0, own), trained="24 V"
+    )
+    found = add_variation(
+        [policy], plan, robot=ROBOT, truth=TRUTH, out=tmp_path, parameters=(volts,)
+    )
+    as_it_is, low, same = found.rows
+    assert as_it_is.parameter == AS_IT_IS
+    # The same number again is the same jump, to the last digit; another is another.
+    assert same.height == as_it_is.height
+    assert low.height < as_it_is.height
+    line = found.line("bus_voltage", "matched", "spot")
+    assert [point.value for point in line] == [18.0, own, own]
+    assert [point.n for point in line] == [1, 1, 1]
+    read = variation.load(tmp_path)
+    assert repr(read.rows) == repr(found.rows)
+    assert repr(read.points) == repr(found.points)
+
+
+def test_parameters_know_their_own_value() -> None:
+    values = {each.name: each.of(TRUTH) for each in variation.PARAMETERS}
+    assert values == {
+        "trunk_mass_offset": TRUTH.trunk.mass_offset,
+        "friction": TRUTH.ground.friction,
+        "command_delay_s": TRUTH.machine.command_delay_s,
+        "bus_voltage": TRUTH.machine.bus_voltage,
+    }
+    with pytest.raises(PronkError, match="all different"):
+        replace(variation.PARAMETERS[0], values=(1.0, 1.0))

@@ -1,0 +1,413 @@
+"""The safety filter: no output breaks a limit, ever; damping is always allowed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pronk.deploy.limits import Limits
+from pronk.deploy.rules import TEXTS, Asked, Level, Reason, judge
+from pronk.deploy.safety import LEAST_DAMPING_S, Memory, fault, filtered, released, tilt
+from pronk.errors import RobotError
+from pronk.hardware.machine import Command, State
+from pronk.robots import load_robot
+
+ROBOT = load_robot("mini_cheetah")
+LIMITS = Limits.of(ROBOT)
+N = len(ROBOT.joints)
+POSE = np.array([joint.default_position for joint in ROBOT.joints])
+KP = np.array([joint.stiffness for joint in ROBOT.joints])
+KD = np.array([joint.damping for joint in ROBOT.joints])
+
+
+def state(**changes: Any) -> State:
+    whole: dict[str, Any] = {
+        "time": 0.0,
+        "sequence": 100,
+        "position": POSE,
+        "velocity": np.zeros(N),
+        "torque": np.zeros(N),
+        "gyro": np.zeros(3),
+        "accelerometer": np.array([0.0, 0.0, 9.81]),
+        "bus_voltage": 24.0,
+    }
+    return State(**(whole | changes))
+
+
+def command(**changes: Any) -> Command:
+    whole: dict[str, Any] = {
+        "position": POSE,
+        "stiffness": KP,
+        "damping": KD,
+        "state_sequence": 100,
+        "made": 0.0,
+        "valid_for": 0.05,
+    }
+    return Command(**(whole | changes))
+
+
+def verdict(
+    s: State, c: Command, t: float = 0.0, memory: Memory | None = None, **more: Any
+) -> tuple[Level, Reason]:
+    found = filtered(s, c, memory or Memory(), LIMITS, t, **more)[1]
+    return found.level, found.reason
+
+
+def test_what_is_fine_goes_through_untouched() -> None:
+    target = POSE + 0.1
+    sent, found, memory = filtered(state(), command(position=target), Memory(), LIMITS, 0.001)
+    assert sent is not None
+    assert (found.level, found.reason) == (Level.PASS, Reason.NONE)
+    np.testing.assert_array_equal(sent.position, target)
+    assert sent.stiffness is KP
+    assert sent.damping is KD
+    assert memory.last is not None
+    np.testing.assert_array_equal(memory.last, target)
+
+
+@pytest.mark.parametrize(
+    ("age_s", "level", "reason"),
+    [
+        (0.019, Level.PASS, Reason.NONE),
+        (0.021, Level.HOLD, Reason.OLD_STATE),
+        (0.049, Level.HOLD, Reason.OLD_STATE),
+        (0.051, Level.DAMP, Reason.NO_STATE),
+        (0.099, Level.DAMP, Reason.NO_STATE),
+        (0.101, Level.LATCH, Reason.STATE_LOST),
+    ],
+)
+def test_an_old_state_holds_then_damps_then_latches(
+    age_s: float, level: Level, reason: Reason
+) -> None:
+    assert verdict(state(), command(made=age_s), age_s) == (level, reason)
+
+
+def test_hold_sends_the_last_target() -> None:
+    last = POSE + 0.2
+    asked = command(position=POSE + 0.4, made=0.03)
+    sent, _, memory = filtered(state(), asked, Memory(last=last), LIMITS, 0.03)
+    assert sent is not None
+    np.testing.assert_array_equal(sent.position, last)
+    assert memory.last is not None
+    np.testing.assert_array_equal(memory.last, last)
+
+
+def spoilt(values: Any, wrong: float) -> np.ndarray:
+    array = np.array(values, dtype=float)
+    array[-1] = wrong
+    return array
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("part", ["position", "velocity", "gyro", "orientation"])
+def test_a_state_that_is_no_number_latches(part: str, wrong: float) -> None:
+    s = state(**{part: spoilt(getattr(state(), part), wrong)})
+    assert verdict(s, command()) == (Level.LATCH, Reason.STATE_NOT_FINITE)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+@pytest.mark.parametrize("part", ["position", "stiffness", "damping"])
+def test_a_command_that_is_no_number_latches(part: str, wrong: float) -> None:
+    c = command(**{part: spoilt(getattr(command(), part), wrong)})
+    assert verdict(state(), c) == (Level.LATCH, Reason.COMMAND_NOT_FINITE)
+
+
+@pytest.mark.parametrize("shape", [np.zeros(N + 1), np.zeros((2, N)), None, "legs"])
+def test_a_command_of_another_shape_latches(shape: Any) -> None:
+    c = command(position=shape)
+    assert verdict(state(), c) == (Level.LATCH, Reason.COMMAND_NOT_FINITE)
+
+
+def turned(angle: float) -> np.ndarray:
+    return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("s", "c", "reason"),
+    [
+        (state(), command(made=-0.06), Reason.EXPIRED),
+        (state(), command(made=-0.06, valid_for=math.inf), Reason.EXPIRED),
+        (state(), command(made=-0.03, valid_for=0.02), Reason.EXPIRED),
+        (state(), command(made=0.02), Reason.CLOCK),
+        (state(time=0.02), command(), Reason.CLOCK),
+        (state(sequence=131), command(), Reason.LAG),
+        (state(), command(stiffness=KP - 20.0), Reason.GAINS),
+        (state(), command(stiffness=KP + 100.0), Reason.GAINS),
+        (state(), command(damping=KD + 5.0), Reason.GAINS),
+        (state(position=spoilt(POSE, 2.71)), command(), Reason.OVERRUN),
+        (state(orientation=turned(0.81)), command(), Reason.TILT),
+        (state(orientation=turned(-3.0)), command(), Reason.TILT),
+        (state(orientation=np.zeros(4)), command(), Reason.STATE_NOT_FINITE),
+        (state(velocity=spoilt(np.zeros(N), -31.0)), command(), Reason.SPEED),
+        (state(temperature=spoilt(np.full(N, 40.0), 81.0)), command(), Reason.TEMPERATURE),
+    ],
+)
+def test_faults_latch_and_say_why(s: State, c: Command, reason: Reason) -> None:
+    sent, found, memory = filtered(s, c, Memory(), LIMITS, 0.0)
+    assert sent is None
+    assert (found.level, found.reason) == (Level.LATCH, reason)
+    assert memory.faulted
+    assert memory.last is None
+    assert TEXTS[reason] in found.text
+    assert "\n" not in found.text
+
+
+def test_what_is_just_within_does_not_fault() -> None:
+    s = state(
+        position=spoilt(POSE, 2.69),
+        orientation=turned(0.79),
+        velocity=spoilt(np.zeros(N), -5.0),
+        temperature=spoilt(np.full(N, np.nan), 79.0),
+        sequence=130,
+    )
+    last = np.minimum(s.position, 2.5)
+    assert verdict(s, command(position=last), 0.0, Memory(last=last))[0] <= Level.LIMIT
+
+
+def test_letting_go_of_the_dead_man_damps() -> None:
+    assert verdict(state(), command(), held=False) == (Level.DAMP, Reason.DEAD_MAN)
+
+
+def test_a_fault_lasts_a_second_and_a_latched_one_until_somebody_says_so() -> None:
+    soft, hard = (fault(Memory(), level, Reason.TILT, 10.0) for level in (Level.DAMP, Level.LATCH))
+    for memory in (soft, hard):
+        sent, found, after = filtered(state(time=10.0), command(made=10.0), memory, LIMITS, 10.0)
+        assert sent is None
+        assert found.level == memory.level
+        assert after.faulted
+        assert released(memory, 10.0 + LEAST_DAMPING_S - 1e-6, mended=True).faulted
+    assert not released(soft, 10.0 + LEAST_DAMPING_S).faulted
+    assert released(hard, 1e6).faulted
+    assert not released(hard, 10.0 + LEAST_DAMPING_S, mended=True).faulted
+
+
+def test_a_fault_can_only_become_worse() -> None:
+    _, _, memory = filtered(state(), command(made=0.06), Memory(), LIMITS, 0.06)
+    assert (memory.level, memory.reason) == (Level.DAMP, Reason.NO_STATE)
+    _, found, memory = filtered(state(), command(made=0.11), memory, LIMITS, 0.11)
+    assert (memory.level, memory.reason) == (Level.LATCH, Reason.STATE_LOST)
+    assert memory.since == 0.06
+    assert found.level is Level.LATCH
+    same = fault(memory, Level.DAMP, Reason.DEAD_MAN, 0.2)
+    assert same is memory
+
+
+def test_torque_is_limited_by_moving_the_target() -> None:
+    # By hand: 17 N m at 17 N m/rad is 1 rad, and 0.4 N m s/rad at 2.5 rad/s is 1 N m more room.
+    v = np.zeros(N)
+    v[0] = 2.5
+    target = POSE.copy()
+    target[0] = 1.4
+    s = state(velocity=v)
+    memory = Memory(last=np.concatenate([[0.9], POSE[1:]]))
+    sent, found, _ = filtered(s, command(position=target), memory, LIMITS, 0.0)
+    assert sent is not None
+    assert (found.level, found.reason) == (Level.LIMIT, Reason.TORQUE)
+    assert sent.position[0] == pytest.approx(1.0 + 1.0 / 17.0)
+    np.testing.assert_array_equal(sent.position[1:], POSE[1:])
+
+
+def test_a_target_changes_by_so_much_in_a_tick() -> None:
+    sent, found, _ = filtered(
+        state(), command(position=POSE - 0.9), Memory(last=POSE + 0.5), LIMITS, 0.0
+    )
+    assert sent is not None
+    assert found.reason is Reason.CHANGE
+    np.testing.assert_allclose(sent.position, POSE + 0.5 - LIMITS.change)
+
+
+def test_a_joint_on_its_way_out_is_not_driven_further() -> None:
+    # In 20 ms at 10 rad/s the knee would pass its margin, 2.55 rad.
+    q, v = POSE.copy(), np.zeros(N)
+    q[2], v[2] = 2.4, 10.0
+    sent, found, _ = filtered(
+        state(position=q, velocity=v), command(position=spoilt_at(q, 2, 2.5)), Memory(), LIMITS, 0.0
+    )
+    assert sent is not None
+    assert found.reason is Reason.POSITION
+    assert sent.position[2] == 2.4
+
+
+def spoilt_at(values: np.ndarray, index: int, value: float) -> np.ndarray:
+    array = values.copy()
+    array[index] = value
+    return array
+
+
+def test_power_is_limited_by_scaling_all_torques() -> None:
+    limits = Limits.of(ROBOT, power_w=1000.0)
+    target = POSE + 0.8
+    sent, found, _ = filtered(state(), command(position=target), Memory(), limits, 0.0)
+    assert sent is not None
+    assert found.reason is Reason.POWER
+    torque = KP * (sent.position - POSE)
+    # At rest all power is winding loss: the torques are equal still, and give the limit exactly.
+    np.testing.assert_allclose(torque, torque[0])
+    assert float(torque**2 @ LIMITS.loss) == pytest.approx(1000.0)
+
+
+def test_loss_is_that_of_the_drive() -> None:
+    # V / (gear kt stall torque), by hand for the hips: 24 / (6 0.05 62.43).
+    stall = 1.5 * 6 * 0.05 * 24 / 0.173
+    assert LIMITS.loss[0] == pytest.approx(24 / (6 * 0.05 * stall))
+
+
+def test_limits_that_limit_nothing_are_refused() -> None:
+    for name, value in (("power_w", 0.0), ("change", math.inf), ("margin", 3.0), ("hold_s", 9.0)):
+        with pytest.raises(RobotError):
+            Limits.of(ROBOT, **{name: value})
+    assert Limits.of(ROBOT, tilt=math.inf).tilt == math.inf
+
+
+def test_tilt_is_the_angle_of_the_z_axis() -> None:
+    assert tilt(turned(0.3)) == pytest.approx(0.3)
+    assert tilt(np.array([math.cos(1.0), 0.0, 0.0, math.sin(1.0)])) == pytest.approx(0.0)
+
+
+def wild(rng: np.random.Generator, count: int) -> Asked:
+    """States and commands from harmless to impossible, every limit met on both sides."""
+
+    def spread(shape: tuple[int, ...], centre: Any, scale: Any) -> np.ndarray:
+        # Each row has its own size: from far within all limits to far beyond.
+        size = 10.0 ** rng.uniform(-2.0, 0.7, (count, 1))
+        return np.asarray(centre + scale * size * rng.standard_normal(shape))
+
+    many = (count, N)
+    orientation = np.array([1.0, 0.0, 0.0, 0.0]) + rng.uniform(0, 0.6, (count, 1)) * (
+        rng.standard_normal((count, 4))
+    )
+    orientation /= np.linalg.norm(orientation, axis=-1, keepdims=True)
+    position = spread(many, POSE, 0.5)
+    asked = Asked(
+        position=position,
+        velocity=spread(many, 0.0, 5.0),
+        orientation=orientation,
+        gyro=spread((count, 3), 0.0, 1.0),
+        temperature=np.where(rng.random(many) < 0.5, np.nan, rng.uniform(20.0, 82.0, many)),
+        state_age=rng.exponential(0.01, count),
+        target=position + spread(many, 0.0, 1.0),
+        stiffness=np.abs(spread(many, KP, 5.0)) * (rng.random((count, 1)) > 0.05),
+        damping=np.abs(spread(many, KD, 0.2)),
+        command_age=rng.exponential(0.01, count),
+        valid_for=rng.choice([0.01, 0.05, math.inf], count),
+        lag=rng.integers(0, 35, count).astype(float),
+        last=position + spread(many, 0.0, 0.3),
+        held=rng.random(count) < 0.95,
+    )
+    for values in (asked.position, asked.velocity, asked.gyro, asked.target, asked.last):
+        struck = rng.random(values.shape) < 0.001
+        values[struck] = rng.choice([math.nan, math.inf, -math.inf, 1e300], struck.sum())
+    return asked
+
+
+def broken(asked: Asked, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
+    """Which rows that were sent break which limit; written anew, not the filter's own code."""
+    slack = 1e-6
+    q, v, kp, kd = asked.position, asked.velocity, asked.stiffness, asked.damping
+    torque = kp * (target - q) - kd * v
+    top = limits.stall * (1.0 - v / limits.no_load)
+    bottom = -limits.stall * (1.0 + v / limits.no_load)
+    given = np.clip(torque, bottom, top)
+    power = (np.maximum(given * v, 0.0) + limits.loss * given**2).sum(axis=-1)
+    w, x, y, z = asked.orientation.T
+    upright = w * w - x * x - y * y + z * z
+    ahead = q + limits.horizon_s * v
+    out = (ahead > limits.high - limits.margin) & (target > q + slack)
+    out |= (ahead < limits.low + limits.margin) & (target < q - slack)
+    # Where the joint itself is beyond the margin its target may lead it back, no less.
+    inside = (q <= limits.high - limits.margin) & (q >= limits.low + limits.margin)
+    return {
+        "finite": ~np.isfinite(target).all(axis=-1),
+        "position": (
+            (target < limits.low + limits.margin - slack)
+            | (target > limits.high - limits.margin + slack)
+            | (out & inside)
+        ).any(axis=-1),
+        "change": (np.abs(target - asked.last) > limits.change + slack).any(axis=-1),
+        "torque": (np.abs(torque) > limits.torque + slack).any(axis=-1),
+        "power": power > limits.power_w * (1.0 + slack),
+        "tilt": upright < math.cos(limits.tilt) - slack,
+        "speed": (np.abs(v) > limits.speed).any(axis=-1),
+        "temperature": (asked.temperature > limits.temperature).any(axis=-1),
+        "age": asked.state_age > limits.damp_s,
+        "expiry": asked.command_age > np.minimum(asked.valid_for, limits.expiry_s),
+        "lag": asked.lag > limits.lag,
+        "dead man": ~asked.held,
+        "gains": ((kp < 0) | (kp > limits.stiffness) | (kd < 0) | (kd > limits.damping)).any(-1),
+    }
+
+
+def test_a_million_states_and_commands_break_no_limit() -> None:
+    rng = np.random.default_rng(240415096)
+    chunk, met, passed = 5_000, np.zeros(len(Reason), dtype=int), np.zeros(5, dtype=int)
+    limits = Limits.of(ROBOT, power_w=2000.0)
+    for _ in range(200):
+        asked = wild(rng, chunk)
+        found = judge(asked, limits)
+        met += np.bincount(found.reason, minlength=len(Reason))
+        passed += np.bincount(found.level, minlength=5)
+        sent = found.level < Level.DAMP
+        with np.errstate(invalid="ignore", over="ignore"):
+            for name, wrong in broken(asked, found.target, limits).items():
+                assert not (wrong & sent).any(), name
+        # A command that is passed is the one that was asked for, to the last bit.
+        same = found.level == Level.PASS
+        np.testing.assert_array_equal(found.target[same], asked.target[same])
+        held = found.level == Level.HOLD
+        assert (asked.state_age[held] > limits.hold_s).all()
+    # Every rule had its say, and enough went through for the test to mean something.
+    silent = {Reason(i) for i in np.flatnonzero(met == 0)}
+    assert silent <= {Reason.CLOCK, Reason.STATE_LOST, Reason.ENDED, Reason.LINK}
+    assert passed.min() > 1000
+    assert passed.sum() == 1_000_000
+
+
+numbers = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@given(
+    values=st.lists(numbers, min_size=3 * N + 12, max_size=3 * N + 12),
+    ages=st.tuples(numbers, numbers, numbers),
+    sequences=st.tuples(st.integers(-5, 200), st.integers(-5, 200)),
+    held=st.booleans(),
+)
+def test_whatever_comes_the_filter_answers_and_damping_is_allowed(
+    values: list[float],
+    ages: tuple[float, float, float],
+    sequences: tuple[int, int],
+    held: bool,
+) -> None:
+    array = np.array(values)
+    s = state(
+        time=-ages[0],
+        sequence=sequences[0],
+        position=array[:N],
+        velocity=array[N : 2 * N],
+        orientation=array[-4:],
+        gyro=array[-7:-4],
+    )
+    c = command(
+        position=array[2 * N : 3 * N],
+        made=-ages[1],
+        valid_for=ages[2],
+        state_sequence=sequences[1],
+    )
+    sent, found, memory = filtered(s, c, Memory(), LIMITS, 0.0, held=held)
+    assert (sent is None) == (found.level >= Level.DAMP) == memory.faulted
+    if sent is not None:
+        assert np.isfinite(sent.position).all()
+        assert (sent.position >= LIMITS.low).all()
+        assert (sent.position <= LIMITS.high).all()
+        assert held
+
+
+def test_every_reason_has_a_line() -> None:
+    assert set(TEXTS) == set(Reason)
+    assert len(set(TEXTS.values())) == len(Reason)
+    assert replace(Memory(), last=POSE).faulted is False

@@ -1,0 +1,116 @@
+"""What is asked over time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pronk.errors import PronkError
+from pronk.trial.protocol import PAPER_COMMANDS, RATES, STILL, Case, Script, parse_case, parse_cases
+
+COMMAND = (2.0, 0.0, 0.5)
+
+
+def script(**changes: Any) -> Script:
+    kept: dict[str, Any] = {"command": COMMAND}
+    return Script(**(kept | changes))
+
+
+def test_the_paper_s_commands() -> None:
+    assert [case.command for case in PAPER_COMMANDS] == [
+        (1.0, 0.0, 0.0),
+        (2.0, 0.0, 0.0),
+        (0.0, -1.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (-2.0, 0.0, 0.0),
+    ]
+
+
+def test_the_whole_script_by_hand() -> None:
+    made = script()
+    assert (made.start, made.on, made.off, made.stop, made.seconds) == (1.0, 3.5, 4.0, 4.5, 7.5)
+    expected = [
+        (0.0, STILL, False),
+        (0.98, STILL, False),
+        (1.0, COMMAND, False),
+        (3.48, COMMAND, False),
+        (3.5, COMMAND, True),
+        (3.98, COMMAND, True),
+        (4.0, COMMAND, False),
+        (4.48, COMMAND, False),
+        (4.5, STILL, False),
+        (7.4, STILL, False),
+    ]
+    assert [(t, *made.asked(t)) for t, _, _ in expected] == expected
+
+
+def test_times_are_met_whatever_binary_fractions_they_have() -> None:
+    for ticks in range(26):
+        made = script(run_s=2.5 + ticks / 50)
+        asked = [made.asked(k / 50) for k in range(round(made.seconds * 50))]
+        jumps = [k for k, (_, jump) in enumerate(asked) if jump]
+        assert jumps == list(range(175 + ticks, 200 + ticks))
+        assert [k for k, (command, _) in enumerate(asked) if command != STILL] == list(
+            range(50, 225 + ticks)
+        )
+
+
+def test_a_ramp_by_hand() -> None:
+    made = script(acceleration=4.0)
+    shares = {1.0: 0.0, 1.25: 0.5, 1.5: 1.0, 3.0: 1.0, 4.5: 1.0, 4.75: 0.5, 5.0: 0.0, 6.0: 0.0}
+    for t, share in shares.items():
+        assert made.asked(t)[0] == pytest.approx([share * axis for axis in COMMAND], abs=1e-6)
+    # A command that does not move the robot has nothing to ramp.
+    assert script(command=(0.0, 0.0, 1.0), acceleration=1.0).asked(1.1)[0] == (0.0, 0.0, 1.0)
+
+
+@given(st.floats(0.1, 10.0), st.floats(-1.0, 10.0), st.floats(0.0, 0.1))
+def test_a_ramp_is_never_steeper_than_said(acceleration: float, t: float, later: float) -> None:
+    made = script(acceleration=acceleration)
+    speeds = [math.hypot(*made.asked(s)[0][:2]) for s in (t, t + later)]
+    inside = t + later < made.seconds  # where the script ends, so does its command
+    assert not inside or abs(speeds[1] - speeds[0]) <= acceleration * later + 1e-6
+    assert max(speeds) <= 2.0
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "command"),
+    [
+        ("1,0,0", "forward 1", (1.0, 0.0, 0.0)),
+        ("0, -1", "side -1", (0.0, -1.0, 0.0)),
+        ("2.25,0", RATES.name, (2.25, 0.0, 0.0)),
+        ("1.5,0.5,-1", "1.5,0.5,-1", (1.5, 0.5, -1.0)),
+    ],
+)
+def test_commands_are_read(text: str, name: str, command: tuple[float, ...]) -> None:
+    assert parse_case(text) == Case(name=name, command=command)  # type: ignore[arg-type]
+
+
+def test_paper_stands_for_five_commands() -> None:
+    assert parse_cases(["paper", "2.25,0"]) == (*PAPER_COMMANDS, RATES)
+    assert parse_cases([]) == ()
+
+
+@pytest.mark.parametrize("text", ["", "1", "1,2,3,4", "fast", "1,nan", "inf,0"])
+def test_what_is_no_command_is_refused(text: str) -> None:
+    with pytest.raises(PronkError, match=r"^command .* as in \"1,0,0\"\.$"):
+        parse_case(text)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"stand_s": -1.0}, "Script.stand_s"),
+        ({"stop_s": math.inf}, "Script.stop_s"),
+        ({"run_s": math.nan}, "Script.run_s"),
+        ({"acceleration": 0.0}, "Script.acceleration"),
+        ({"command": (1.0, math.nan, 0.0)}, "command"),
+    ],
+)
+def test_impossible_scripts_are_refused(changes: dict[str, Any], what: str) -> None:
+    with pytest.raises(PronkError, match=what):
+        script(**changes)
