@@ -13,7 +13,8 @@ test: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "not live"
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m live
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check --fix .

@@ -205,11 +205,12 @@ def test_wrong_robot_joint_and_file_names_list_what_there_is(capsys, tmp_path):
     assert "mjlab" in said
 
 
-def test_links_to_real_robots_are_refused_with_the_way_out(capsys, tmp_path):
-    for link in ("lcm", "dds"):
-        said = refused(capsys, "sweep", "mini_cheetah", "--link", link, "--out", tmp_path / "x")
-        assert "put it on the robot" in said
-        assert "--link twin" in said
+def test_a_sweep_by_wire_is_refused_with_the_way_out(capsys, tmp_path):
+    asked = ("sweep", "mini_cheetah", "--out", tmp_path / "x")
+    assert "--port: of --link lcm" in refused(capsys, *asked, "--port", "7801")
+    assert "give a domain" in refused(capsys, *asked, "--link", "dds", "--port", "7801")
+    assert "give a port" in refused(capsys, *asked, "--link", "lcm", "--domain", "3")
+    assert "pronk twin" in refused(capsys, *asked, "--link", "lcm", "--truth", "t.yaml")
     assert not (tmp_path / "x").exists()
 
 

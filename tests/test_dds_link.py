@@ -24,16 +24,21 @@ from pronk.hardware.dds_link import DdsMachine
 from pronk.hardware.dds_net import DdsNetwork, Message, Participant, take
 from pronk.hardware.dds_service import SWITCHER, Client
 from pronk.hardware.machine import Command
+from pronk.hardware.preflight import Freshness
 from pronk.hardware.truth import load_truth
 from pronk.hardware.twin import Twin
 from pronk.hardware.twin_dds import COMMANDS, STATES, DdsWire
 from pronk.hardware.virtual import VirtualRobot
 from pronk.robots import load_robot
 
+pytestmark = pytest.mark.live
+
 ROBOT = load_robot("mini_cheetah")
 JOINTS = joint_map(ROBOT)
 DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
 STIFF, DAMPED = np.full(12, 17.0), np.full(12, 0.4)
+# A computer that runs tests side by side is busy; what is tested here is not that.
+FRESH = Freshness(share=0.02, longest_gap_s=10.0)
 HOLD = Command(position=DEFAULT, stiffness=STIFF, damping=DAMPED)
 PITCH = ROBOT.joint_names.index("FR_hip_pitch")
 
@@ -98,7 +103,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     # Its own controller holds the joints: refused, unless it may be released.
     with pytest.raises(HardwareError, match="own controller 'normal' holds the joints"):
         DdsMachine(ROBOT, network=network).connect()
-    machine = DdsMachine(ROBOT, network=network, release=True, alone_s=0.3)
+    machine = DdsMachine(ROBOT, network=network, release=True, alone_s=0.3, fresh=FRESH)
     machine.connect()
     assert machine.virtual
     begun = machine.latest()
@@ -133,7 +138,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     machine.clamp(())
 
     # A second pronk finds the first one writing.
-    second = DdsMachine(ROBOT, network=network, alone_s=0.3)
+    second = DdsMachine(ROBOT, network=network, alone_s=0.3, fresh=FRESH)
     with pytest.raises(HardwareError, match="someone else commands the joints"):
         second.connect()
     assert second.counts["commands"] == second.counts["repeats"] == 0

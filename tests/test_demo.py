@@ -23,7 +23,9 @@ def test_the_repository_has_a_policy_that_fits() -> None:
 def test_matched_comes_first_and_a_policy_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     for name in ("naive", "matched", "a"):
         (tmp_path / name).mkdir()
-    write_hopper(tmp_path / "naive" / "policy.onnx", 0.5, gains="naive", gains_sha256="")
+    naive = {"gains": "naive", "gains_sha256": ""}
+    own = {"stiffness": (17.0,) * 12, "damping": (0.4,) * 12}
+    write_hopper(tmp_path / "naive" / "policy.onnx", 0.5, **naive, **own)
     write_hopper(tmp_path / "matched" / "policy.onnx")
     found, lack = demo_trial.find(tmp_path, ROBOT)
     assert [path.parent.name for path in found] == ["matched", "naive"]

@@ -23,15 +23,15 @@ from pronk.deploy.links import Link
 from pronk.deploy.log import DeployLogWriter, is_deploy_log, read_deploy_log
 from pronk.deploy.operators import Scripted, Timed
 from pronk.deploy.preflight import delay_objection, refusals
-from pronk.deploy.realtime import Histogram, Pace
+from pronk.deploy.reasons import Level, Reason
 from pronk.deploy.records import EVENT, STEP, TICK, Mode, Wish, event, get_state, put_state
-from pronk.deploy.rules import Level, Reason
 from pronk.deploy.safety import Memory, fault
 from pronk.deploy.shared import Mailbox, Ring
 from pronk.deploy.stance import Timing, folded_pose, minimum_jerk, sit_down, stand_up
 from pronk.deploy.states import FIRST_ORDER_S, Director, Order
 from pronk.errors import HardwareError, LogError, RobotError
 from pronk.hardware.machine import State
+from pronk.hardware.realtime import Histogram, Pace
 from pronk.robots import load_robot
 from pronk.trial.protocol import Script
 

@@ -29,6 +29,8 @@ from pronk.deploy.stance import Timing
 from pronk.errors import ArtefactError, HardwareError
 from pronk.hardware.capture import load as load_capture
 
+pytestmark = pytest.mark.live
+
 pytest.importorskip("onnxruntime")
 
 QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)

@@ -34,6 +34,8 @@ from pronk.hardware.preflight import Freshness
 from pronk.hardware.twin import hold_of
 from pronk.robots import load_robot
 
+pytestmark = pytest.mark.live
+
 lcm = pytest.importorskip("lcm")
 
 ROBOT = load_robot("mini_cheetah")

@@ -38,12 +38,13 @@ from pronk.report.trial_cells import cells, scatter
 from pronk.report.trial_sweeps import Line, Panel, argument, lines
 from pronk.report.trial_traces import Trace, heights, rates, rms, torque_speed
 from pronk.robots import load_robot
-from pronk.trial import bodies, crossing, result, sheet, tables, variation, walk
+from pronk.trial import bodies, crossing, published, result, sheet, tables, variation, walk
 from pronk.trial.bodies import Bodies, Body, GainsError
 from pronk.trial.crossing import Crossing, Crossings
 from pronk.trial.metrics import JumpFigures, measure
 from pronk.trial.protocol import PAPER_COMMANDS, RATES, Case
-from pronk.trial.result import Row, Subject, Trial
+from pronk.trial.result import Subject, Trial
+from pronk.trial.rows import Row
 from pronk.trial.variation import Variation, Varied
 from pronk.trial.walk import Walk, Walks
 from pronk.trial.walk_metrics import WalkFigures
@@ -90,13 +91,14 @@ def made(
     cases: tuple[Case, ...] = CASES,
     *,
     keep: bool = True,
+    times: int = 1,
 ) -> Trial:
     """A trial in a folder, measured by `pronk.trial.metrics` on jumps made by hand."""
     rows = []
     for name in policies:
         for case in cases:
             script = replace(SCRIPT, command=case.command)
-            for number, flight in enumerate(FLIGHTS[name]):
+            for number, flight in enumerate(times * FLIGHTS[name]):
                 taken = seen(flight, 2.0 if name == "naive" else 1.0)
                 where = f"captures/{name}_{case.name}_{number:03d}.npz".replace(" ", "_")
                 if keep:
@@ -587,8 +589,10 @@ def test_scatter_has_a_panel_a_command(trial: Trial) -> None:
 
 
 def test_ratios_are_naive_over_matched_whichever_came_first(tmp_path: Path) -> None:
-    forth = made(tmp_path / "a", ("matched", "naive"), CASES[:2], keep=False)
-    back = made(tmp_path / "b", ("naive", "matched"), CASES[:2], keep=False)
+    few = made(tmp_path / "few", cases=CASES[:2], keep=False)
+    assert not trial_data.naive_over_matched(few, "distance")
+    forth = made(tmp_path / "a", ("matched", "naive"), CASES[:2], keep=False, times=2)
+    back = made(tmp_path / "b", ("naive", "matched"), CASES[:2], keep=False, times=2)
     one, other = (trial_data.naive_over_matched(each, "distance") for each in (forth, back))
     assert [ratio.words for ratio in one] == [ratio.words for ratio in other]
     assert one[0].overall
@@ -596,7 +600,7 @@ def test_ratios_are_naive_over_matched_whichever_came_first(tmp_path: Path) -> N
         assert ratio.value == pytest.approx(2.0)
         assert same.value == pytest.approx(2.0)
         assert same.interval[0] <= same.value <= same.interval[1]
-    assert one[0].paper == tables.PAPER_RATIOS["distance"]
+    assert one[0].paper == published.PAPER_RATIOS["distance"]
     forward = next(ratio for ratio in one if ratio.words == "forward 1")
     assert forward.paper == pytest.approx(0.076 / 0.042)
 

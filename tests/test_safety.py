@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pronk.deploy.limits import Limits
-from pronk.deploy.rules import TEXTS, Asked, Level, Reason, judge
+from pronk.deploy.reasons import TEXTS, Level, Reason
+from pronk.deploy.rules import Asked, judge
 from pronk.deploy.safety import LEAST_DAMPING_S, Memory, fault, filtered, released, tilt
 from pronk.errors import RobotError
 from pronk.hardware.machine import Command, State

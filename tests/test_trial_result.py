@@ -18,10 +18,12 @@ from hypothesis import strategies as st
 from pronk.errors import ArtefactError
 from pronk.jumps import JumpRules
 from pronk.robots import load_robot
-from pronk.trial import result, tables
+from pronk.trial import bars, published, result, tables
+from pronk.trial import rows as rows_file
 from pronk.trial.metrics import FIGURES, JumpFigures
 from pronk.trial.protocol import PAPER_COMMANDS, Case, Script
-from pronk.trial.result import Row, Subject, Trial
+from pronk.trial.result import Subject, Trial
+from pronk.trial.rows import Row
 from pronk.trial.summary import Spread, ratio_of_scatter, share_interval
 
 ROBOT = load_robot("mini_cheetah")
@@ -175,9 +177,9 @@ def test_one_figure_for_all_is_that_of_the_paper_s_commands() -> None:
 
 
 def test_the_paper_s_ratios_follow_from_its_table() -> None:
-    for figure, ratio in tables.PAPER_RATIOS.items():
+    for figure, ratio in published.PAPER_RATIOS.items():
         sums = {
-            gains: sum(getattr(cell, figure)[gains][1] for cell in tables.TABLE_III.values())
+            gains: sum(getattr(cell, figure)[gains][1] for cell in published.TABLE_III.values())
             for gains in ("naive", "matched")
         }
         assert sums["naive"] / sums["matched"] == pytest.approx(ratio, abs=5e-3)
@@ -238,7 +240,7 @@ def test_numbers_are_kept_to_the_last_digit(tmp_path: Path) -> None:
 
 def test_the_table_names_its_units() -> None:
     made = trial()
-    table = list(csv.DictReader(io.StringIO(result.to_csv(made))))
+    table = list(csv.DictReader(io.StringIO(rows_file.to_csv(made.rows, made.joint_names))))
     assert len(table) == len(made.rows) == 40
     first, missed = table[0], table[3]
     assert (first["policy"], first["command"], first["number"]) == ("matched", "forward 1", "0")
@@ -321,6 +323,12 @@ def test_table_iii_stands_beside_ours() -> None:
     assert any("virtual" in note for note in sheet.notes)
 
 
+def test_one_jump_alone_has_a_value_and_no_deviation() -> None:
+    sheet = tables.table_iii(trial({"matched": (0.4,)}), "height")
+    assert sheet.rows[0][-1] == "0.400 (1/2)"
+    assert sheet.rows[-1][-1] == "-"
+
+
 def test_a_command_of_its_own_has_no_paper_and_no_cell_is_left_out() -> None:
     own = Case(name="1.5,0", command=(1.5, 0.0, 0.0))
     made = trial({"matched": ()}, cases=(own, PAPER_COMMANDS[0]))
@@ -333,15 +341,20 @@ def test_a_command_of_its_own_has_no_paper_and_no_cell_is_left_out() -> None:
 
 
 def test_bars_by_hand() -> None:
-    found = {check.what: check for check in tables.checks(trial())}
+    found = {check.what: check for check in bars.checks(trial())}
     assert found["forward 2: height"].passed  # .44 against .244
     assert not found["forward 2: height, std"].passed  # .04 against .013
     assert not found["forward 2: distance"].passed  # .88 against .969
     assert not found["forward 2: gap"].passed  # not measured
     assert not found["forward 2: success"].passed  # .75 against .95
     assert not found["best: height"].passed  # .44 against .45
-    best = tables.checks(trial({"matched": (0.45, 0.46)}))[-1]
+    best = bars.checks(trial({"matched": (0.45, 0.46)}))[-1]
     assert (best.what, best.passed) == ("best: height", True)
+    assert any(
+        "20 jumps with each command; these are of 4" in n for n in tables.bars(trial()).notes
+    )
+    many = trial({"matched": HEIGHTS * 7})
+    assert not any("20 jumps" in note for note in tables.bars(many).notes)
     # Five commands of height, its scatter, distance, its scatter and success; four gaps; the best.
     assert len(found) == 5 * 5 + 4 + 1
 

@@ -20,9 +20,9 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from pronk.deploy.realtime import Histogram, Pace, Wanted, enter, sleep_until
 from pronk.deploy.thinker import PRIME_S, WARM_UP
 from pronk.errors import PronkError
+from pronk.hardware.realtime import Histogram, Pace, Wanted, enter, sleep_until
 from pronk.policy.layout import MEASURED_SIZE
 from pronk.policy.runtime import load_policy
 

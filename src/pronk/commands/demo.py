@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pronk.commands import console, demo_trial
-from pronk.commands.sweep import AMPLITUDES, SignalName, make, record_twin
+from pronk.commands.sweep import AMPLITUDES, SignalName, make
+from pronk.commands.sweep_twin import record_twin
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""`pronk report`: one HTML page of everything that a folder holds."""
+"""`pronk report`: one HTML page of everything that a folder holds, or of one deployment's log."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from pronk.commands import console
 
 def report(
     folder: Annotated[
-        Path, typer.Argument(help="Folder that matches and trials were written to, or one above.")
+        Path,
+        typer.Argument(
+            help="Folder that matches and trials were written to, or one above; or the log of a "
+            "deployment, .mcap."
+        ),
     ],
     json_file: console.JsonOption = None,
 ) -> None:
-    """Write one HTML page of every match and trial in a folder; it opens without a network."""
+    """Write one HTML page of all matches, trials and deployments in a folder, or of one log."""
     from pronk.report import whole
 
     with console.progress() as shown:

@@ -131,7 +131,7 @@ def sweep(
     } | ({"virtual": True} if address is None else {})
     if plan_only:
         console.write_json(json_file, figures)
-        console.following(f"pronk sweep {robot} --link {link.value} --out {out}")
+        console.say("next: the same command without --plan-only")
         return
     if address is None:
         with console.progress() as report:

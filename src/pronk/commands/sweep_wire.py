@@ -99,9 +99,7 @@ def record_wire(
                 metadata={"link": str(address), "servo_rate_hz": f"{servo.timing.rate_hz:g}"},
             )
     except BaseException:
-        for path in sorted(out_dir.glob("*.mcap")):
-            if path.stat().st_mtime >= begun:
-                console.warn(f"ended early; what was recorded until then is kept in {path}")
+        _say_what_is_kept(out_dir, begun)
         raise
     return Recorded(logs=logs, virtual=machine.virtual, servo=servo.figures())
 
@@ -114,6 +112,18 @@ def tell(recorded: Recorded, out_dir: Path) -> None:
         f"servo: {late['n']} ticks, late by {late['p50_ms']:.2f} ms (median), "
         f"{late['p99_ms']:.2f} ms (99 %), {late['max_ms']:.1f} ms at most; {late['missed']} missed"
     )
+
+
+def _say_what_is_kept(out_dir: Path, since: float) -> None:
+    """One line on the logs written since then; the last one is that which was cut short."""
+    kept = sorted((path.stat().st_mtime, path) for path in out_dir.glob("*.mcap"))
+    paths = [path for written, path in kept if written >= since]
+    if paths:
+        whole = f"{', '.join(path.stem for path in paths[:-1])} whole, and " if paths[1:] else ""
+        console.warn(
+            f"ended early; in {out_dir} are kept {whole}what was recorded until then of "
+            f"{paths[-1].stem}; ask the others with --joints"
+        )
 
 
 @contextmanager

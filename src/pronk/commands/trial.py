@@ -31,7 +31,7 @@ def trial(
     commands: Annotated[
         list[str] | None,
         typer.Option(
-            help='Forward and left velocity [m/s], as "2.25,0"; a yaw rate [rad/s] may follow. '
+            help='Forward and left velocity in m/s, as "2.25,0"; a yaw rate in rad/s may follow. '
             'Give it repeatedly; "paper" is the paper\'s five. If left out, those, and a few jumps '
             "at 2.25 m/s for the figure of roll and pitch rates."
         ),
@@ -79,7 +79,7 @@ def trial(
         bool,
         typer.Option(
             "--keep-captures",
-            help="Keep what was seen of every jump (2 MB each), not of the first of each command.",
+            help="Keep what was seen of every jump (4 MB each), not of the first of each command.",
         ),
     ] = False,
     overwrite: Annotated[
@@ -138,7 +138,8 @@ def trial(
     console.say(spent(found))
     console.wrote(out / TABLE, out / SUMMARY, out / CAPTURES)
     with console.progress() as report:
-        films = painted(found, out, report=report, at_once=count) if video else ()
+        shown = [case.name for case in plan.cases]
+        films = painted(found, out, report=report, at_once=count, cases=shown) if video else ()
         sheets, files = more(
             policies,
             out,
@@ -226,12 +227,12 @@ def figures(found: Trial, more: Sequence[Sheet] = ()) -> dict[str, Any]:
     """
     from dataclasses import asdict
 
-    from pronk.trial import tables
+    from pronk.trial import bars, tables
 
     return {
         "virtual": found.virtual,
         "sheets": [asdict(sheet) for sheet in (*tables.sheets(found), *more)],
-        "checks": [check.row() for check in tables.checks(found)],
+        "checks": [check.row() for check in bars.checks(found)],
         "cells": [asdict(cell) for cell in found.cells],
         "ratios": [asdict(ratio) for ratio in found.ratios],
         "timing": dict(found.timing),

@@ -6,6 +6,7 @@ Each writes a sheet into the trial's folder, where `pronk report` finds it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,13 +78,13 @@ def more(
     wrote: list[Path] = []
     if walk:
         walks = walk_file.add_walks(policies, seed=seed, progress=report.bar("walking"), **kept)
-        sheets += trial_walk.tables(walks)
+        sheets += [on_virtual("walking", one) for one in trial_walk.tables(walks)]
         wrote.append(out / walk_file.FILE)
     if crossing:
         crossed = add_crossings(
             policies, Climbs(seed=seed), progress=report.bar("crossing"), **kept
         )
-        sheets.append(trial_crossing.table(crossed))
+        sheets.append(on_virtual("crossing", trial_crossing.table(crossed)))
         wrote.append(out / crossing_file.FILE)
     if variation:
         plan = Plan(jumps=5, seed=seed)
@@ -98,6 +99,11 @@ def more(
         sheets.append(bodies_sheet(found))
         wrote += [out / bodies_file.FILE, out / bodies_file.FOLDER]
     return sheets, wrote
+
+
+def on_virtual(what: str, sheet: Sheet) -> Sheet:
+    """A table of the page with a title that says what it is where no heading does."""
+    return replace(sheet, title=f"Virtual robot, {what}: {sheet.title}")
 
 
 def variation_sheet(varied: Variation) -> Sheet:

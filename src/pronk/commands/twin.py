@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _PRIORITY = 30
 """Of SCHED_FIFO; below that of whoever commands."""
+_LATE_MS = 5.0
+"""Lateness of one tick in a hundred above which a virtual robot no longer moves like one [ms]."""
 
 
 class TwinLink(StrEnum):
@@ -217,6 +219,11 @@ def _tell(figures: dict[str, Any]) -> None:
         f"{late['p50']:.2f} ms (median), {late['p99']:.2f} ms (p99); "
         f"{100 * figures['cpu_share']:.0f} % of one core"
     )
+    if late["p99"] > _LATE_MS:
+        console.warn(
+            f"1 in 100 ticks was late by {late['p99']:.0f} ms or more: this computer is too busy, "
+            "and what was measured on the wire is not what an idle one would give"
+        )
     if figures["slipped_s"]:
         console.warn(
             f"this computer was too busy for real time: the robot stood still for "

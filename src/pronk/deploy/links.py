@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from pronk.deploy.realtime import sleep_until
 from pronk.errors import HardwareError
 from pronk.hardware.machine import Command, Machine, State, TorqueKind
+from pronk.hardware.realtime import sleep_until
 
 if TYPE_CHECKING:
     from pronk.hardware.virtual import VirtualRobot

@@ -28,8 +28,8 @@ import orjson
 from mcap.writer import CompressionType, IndexType, Writer
 from numpy.typing import NDArray
 
+from pronk.deploy.reasons import Level, Reason
 from pronk.deploy.records import VIRTUAL, Mode
-from pronk.deploy.rules import Level, Reason
 from pronk.errors import LogError
 from pronk.files import sha256
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from pronk.deploy.limits import Limits
 from pronk.deploy.links import Opener
-from pronk.deploy.realtime import Wanted
 from pronk.deploy.records import EVENT, NEWS, ORDERS, STEP, STICK, TICK
 from pronk.deploy.shared import Mailbox, Ring
 from pronk.deploy.stance import Timing
 from pronk.errors import HardwareError
+from pronk.hardware.realtime import Wanted
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.deploy.limits import Limits
-from pronk.deploy.rules import Asked, Level, Reason, judge
+from pronk.deploy.reasons import Level, Reason
+from pronk.deploy.rules import Asked, judge
 from pronk.hardware.machine import Command, State
 
 Array = NDArray[np.float64]

@@ -20,13 +20,13 @@ import orjson
 
 from pronk.deploy.plan import SERVO_PRIORITY, Names, Plan, Shared
 from pronk.deploy.preflight import delay_objection, refusals
-from pronk.deploy.realtime import Histogram, Pace, enter
+from pronk.deploy.reasons import Level, Reason
 from pronk.deploy.records import NEWS, REAL, TICK, VIRTUAL, Mode, Wish, event, put_state
-from pronk.deploy.rules import Level, Reason
 from pronk.deploy.safety import LEAST_DAMPING_S, Memory, Verdict, fault, filtered
 from pronk.deploy.states import PREFLIGHT_S, Director, Intent, Order
 from pronk.errors import PronkError
 from pronk.hardware.machine import Command, Machine, State
+from pronk.hardware.realtime import Histogram, Pace, enter
 
 _SWITCH_S = 0.5e-3
 """Longest that a thread of the link keeps the loop waiting [s]."""

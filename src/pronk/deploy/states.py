@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.deploy.reasons import Level, Reason
 from pronk.deploy.records import Mode, Wish
-from pronk.deploy.rules import Level, Reason
 from pronk.deploy.safety import Memory, released
 from pronk.deploy.stance import Path, Timing, minimum_jerk, sit_down, stand_up
 from pronk.hardware.machine import Command, State

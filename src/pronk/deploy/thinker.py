@@ -17,10 +17,10 @@ import numpy as np
 import orjson
 
 from pronk.deploy.plan import POLICY_PRIORITY, Names, Plan, Shared
-from pronk.deploy.realtime import Histogram, Pace, enter, sleep_until
 from pronk.deploy.records import ORDERS, STEP, Mode, event, get_state
 from pronk.errors import PronkError
 from pronk.hardware.machine import State
+from pronk.hardware.realtime import Histogram, Pace, enter, sleep_until
 from pronk.policy.contract import Contract
 from pronk.policy.layout import MEASURED_SIZE
 from pronk.policy.observation import History

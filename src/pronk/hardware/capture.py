@@ -8,6 +8,7 @@ feet and legs are in the order FR, FL, HR, HL.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -110,38 +111,46 @@ def load(path: Path) -> Capture:
 
 
 class Recorder:
-    """Keeps raw states of a plant while it runs, in arrays that grow by doubling."""
+    """Keeps raw states of a plant while it runs, block after block as they come."""
 
-    def __init__(self, plant: Plant, period_s: float, *, first_step: int = 0) -> None:
-        """Begin empty.
+    def __init__(self, plant: Plant, period_s: float) -> None:
+        """Begin empty, the first sample due at the clock's zero.
 
         Args:
             plant: On the ground.
             period_s: Between samples [s].
-            first_step: Physics step of the first sample, counted from the clock's zero.
         """
         self._plant = plant
         self._step_s = float(plant.model.opt.timestep)
         self._period = period_s
-        self._first = first_step
-        self._rows = np.empty((1024, plant.state_size + 1))
-        self._count = 0
+        self._rows: list[Array] = []
+        self._voltage: list[Array] = []
+        self._begins = [0]
+        """Number of the first sample of each block, and of the next one."""
 
-        self.next_step = first_step
-        """Physics step of the next sample."""
+    def due(self, last: int) -> list[int]:
+        """Physics steps of the samples that are still to be taken, up to and with one step."""
+        first = self._begins[-1]
+        # One more than there can be, for the rounding of steps.
+        most = math.floor((last + 0.5) * self._step_s / self._period) + 2
+        steps = self._steps(first, max(first, most)).tolist()
+        return [step for step in steps if step <= last]
 
-    def record(self, data: Any, voltage: float) -> None:
-        """Keep the present state of a mujoco.MjData as the next sample."""
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
-        row = self._rows[self._count]
-        self._plant.read(data, row[:-1])
-        row[-1] = voltage
-        self._count += 1
-        self.next_step = self._step_of(self._count)
+    def keep(self, rows: Array, voltage: Array) -> None:
+        """Keep the next samples.
 
-    def _step_of(self, sample: int) -> int:
-        return self._first + round(sample * self._period / self._step_s)
+        Args:
+            rows: Raw states of the plant, at the steps that were due. (n, state_size)
+            voltage: Of the bus [V]. (n,)
+        """
+        if len(rows):
+            self._rows.append(rows)
+            self._voltage.append(voltage)
+            self._begins.append(self._begins[-1] + len(rows))
+
+    def _steps(self, first: int, end: int) -> NDArray[np.intp]:
+        """Physics steps of samples `first` to `end` - 1."""
+        return np.rint(np.arange(first, end) * self._period / self._step_s).astype(np.intp)
 
     def capture(self, since: float = -math.inf) -> Capture:
         """What was seen at and after a time.
@@ -149,41 +158,29 @@ class Recorder:
         Args:
             since: [s]
         """
-        steps = [self._step_of(sample) for sample in range(self._count)]
-        times = np.array(steps, dtype=float) * self._step_s
+        times = self._steps(0, self._begins[-1]) * self._step_s
         first = int(np.searchsorted(times, since - 0.5 * self._step_s))
-        return seen(self._plant, times[first:], self._rows[first : self._count])
+        # From the block that holds the first sample.
+        block = max(bisect_right(self._begins, first) - 1, 0)
+        skipped = first - self._begins[block]
+        empty = np.empty((0, self._plant.state_size)), np.empty(0)
+        rows = np.concatenate([empty[0], *self._rows[block:]])[skipped:]
+        voltage = np.concatenate([empty[1], *self._voltage[block:]])[skipped:]
+        return seen(self._plant, times[first:], rows, voltage)
 
 
-def seen(plant: Plant, time: Array, rows: Array) -> Capture:
+def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:
     """Turn raw states into a capture.
 
     Args:
         plant: On the ground.
         time: [s]. (T,)
-        rows: Raw states of the plant and bus voltages. (T, state_size + 1)
+        rows: Raw states of the plant. (T, state_size)
+        voltage: Of the bus [V]. (T,)
     """
-    model = plant.model
-    place, speed, act = plant.parts(rows[:, :-1])
+    place, speed, act = plant.parts(rows)
     torque = plant.motor_torque(act)
-    data = mujoco.MjData(model)
-    feet = np.empty((len(time), len(plant.feet), 3))
-    contact = np.zeros((len(time), len(plant.feet)), dtype=bool)
-    other = np.zeros(len(time), dtype=bool)
-    leg = {int(geom): index for index, geom in enumerate(plant.feet)}
-    where, touching = data.geom_xpos, data.contact
-    for k in range(len(rows)):
-        data.qpos = place[k]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        feet[k] = where[plant.feet]
-        for pair in touching.geom[: data.ncon].tolist() if data.ncon else ():
-            # The ground is one of the two; what touches it, the other.
-            index = leg.get(pair[0], leg.get(pair[1]))
-            if index is None:
-                other[k] = True
-            else:
-                contact[k, index] = True
+    feet, contact, other = _touch(plant, place)
     return Capture(
         time=time,
         position=place[:, :3].copy(),
@@ -197,5 +194,33 @@ def seen(plant: Plant, time: Array, rows: Array) -> Capture:
         joint_velocity=speed[:, plant.link],
         torque=torque,
         electrical_power=plant.electrical_power(torque, speed[:, plant.rotor]),
-        bus_voltage=rows[:, -1].copy(),
+        bus_voltage=voltage.copy(),
     )
+
+
+def _touch(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
+    """Where the feet are (T, 4, 3), whether they touch (T, 4), and whether anything else does (T,).
+
+    Args:
+        plant: On the ground.
+        place: Positions of the plant. (T, nq)
+    """
+    model = plant.model
+    data = mujoco.MjData(model)
+    qpos, where, none = data.qpos, data.geom_xpos, len(plant.feet)
+    feet = np.empty((len(place), none, 3))
+    samples, pairs = [], [np.empty((0, 2), dtype=np.intp)]
+    for k, (row, there) in enumerate(zip(place, feet, strict=True)):
+        qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        where.take(plant.feet, axis=0, out=there, mode="clip")
+        if data.ncon:
+            pairs.append(data.contact.geom.copy())
+            samples += [k] * data.ncon
+    # The ground is one of two; what touches it is the other, a foot or none.
+    foot = np.full(model.ngeom, none)
+    foot[plant.feet] = np.arange(none)
+    touched = np.zeros((len(place), none + 1), dtype=bool)
+    touched[samples, foot[np.concatenate(pairs)].min(axis=1)] = True
+    return feet, touched[:, :none], touched[:, none]

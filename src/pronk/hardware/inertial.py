@@ -91,7 +91,7 @@ def moving_force(velocity: Array, orientation: Array, period_s: float) -> Array:
     Returns:
         Shape (n, 3).
     """
-    force = np.diff(velocity, axis=0) / period_s
+    force = (velocity[1:] - velocity[:-1]) / period_s
     force[:, 2] += _GRAVITY
     # Not normalized: the mean of two orientations 0.02 rad apart is short of 1 by 1e-5.
     return turned_back(0.5 * (orientation[1:] + orientation[:-1]), force)

@@ -64,7 +64,17 @@ class NoiseSource:
         # A stream of its own: what the joints say does not depend on the attitude.
         self._attitude_rng = np.random.default_rng([seed, 1])
         self._yaw = self._attitude_rng.uniform(-math.pi, math.pi)
-        self._shake, self._wander = np.zeros(joints), np.zeros(3)
+        # What is left of the slow noise after a tick, and how large what is added is.
+        corner, size = (
+            np.repeat([of_mounts, of_attitude], [joints, 3])
+            for of_mounts, of_attitude in (
+                (self._machine.position_noise_corner_hz, self._filter.noise_corner_hz),
+                (self._machine.position_noise, self._filter.noise),
+            )
+        )
+        self._keep = np.exp(-2.0 * math.pi * corner * self._period)
+        self._fresh = size * np.sqrt(1.0 - self._keep**2)
+        self._last = np.zeros(joints + 3)
         self._drawn = 0
         # Columns side by side, so that a slice of rows is a slice of everything.
         widths = (1, 1, joints, joints, joints, 3, 3, 4, 4)
@@ -107,12 +117,9 @@ class NoiseSource:
         most = 0.4 * self._period
         jitter = np.clip(machine.sampling_jitter_s * draws[:, -1], -most, most)
         stamp = np.clip(machine.timestamp_error_s * draws[:, -2], -most / 8, most / 8)
-        shake = self._low_passed(
-            self._shake, machine.position_noise_corner_hz, machine.position_noise, mount
-        )
         normals = self._attitude_rng.standard_normal((n, 3))
-        wander = self._low_passed(self._wander, off.noise_corner_hz, off.noise, normals)
-        self._shake, self._wander = shake[-1], wander[-1]
+        slow = self._low_passed(np.concatenate([mount, normals], axis=1))
+        shake, wander = slow[:, :joints], slow[:, joints:]
         ticks = np.arange(self._drawn, self._drawn + n) * self._period
         self._drawn += n
         return np.concatenate(
@@ -131,12 +138,12 @@ class NoiseSource:
             axis=1,
         )
 
-    def _low_passed(self, last: Array, corner_hz: float, size: float, normals: Array) -> Array:
-        """First-order low-passed noise of standard deviation `size` that goes on from `last`."""
-        keep = math.exp(-2.0 * math.pi * corner_hz * self._period)
-        fresh = size * math.sqrt(1.0 - keep**2) * normals
-        passed = np.empty_like(fresh)
-        for row in range(len(fresh)):
-            last = keep * last + fresh[row]
-            passed[row] = last
-        return passed
+    def _low_passed(self, normals: Array) -> Array:
+        """First-order low-passed noise, of the mounts and of the attitude, that goes on."""
+        slow: Array = self._fresh * normals
+        last = self._last
+        for row in slow:
+            row += self._keep * last
+            last = row
+        self._last = last.copy()
+        return slow

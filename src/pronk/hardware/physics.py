@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.hardware.capture import Capture, Recorder
+from pronk.hardware.capture import Capture, Recorder, seen
 from pronk.hardware.machine import Command
 from pronk.hardware.plant import Plant
 from pronk.hardware.transport import Transport
@@ -67,6 +67,8 @@ class Physics:
         self._columns, self._offset = columns, offset
         self._dt = float(plant.model.opt.timestep)
         self._voltage = machine.bus_voltage
+        self._gains = b""
+        self._qvel, self._act = self.data.qvel, self.data.act  # views
         plant.set_bus_voltage(self._voltage)
 
     def place(self, pose: Array) -> None:
@@ -80,10 +82,11 @@ class Physics:
         columns = self._columns
         target = np.asarray(command.position, dtype=float)[columns] - self._offset
         self.data.ctrl[self.plant.actuator] = target
-        self.plant.set_gains(
-            np.asarray(command.stiffness, dtype=float)[columns],
-            np.asarray(command.damping, dtype=float)[columns],
-        )
+        gains = np.asarray([command.stiffness, command.damping], dtype=float)
+        # A policy says the same gains again with every command.
+        if (told := gains.tobytes()) != self._gains:
+            self._gains = told
+            self.plant.set_gains(*gains[:, columns])
 
     def run(self, steps: list[int], transport: Transport) -> Block:
         """Go on to each of some physics steps, and look.
@@ -95,44 +98,57 @@ class Physics:
         Raises:
             HardwareError: The numbers ran away.
         """
-        plant, data = self.plant, self.data
-        rows, voltage = np.empty((len(steps), plant.state_size)), np.empty(len(steps))
-        qpos, qvel, act = plant.parts(rows)
-        torque = np.empty((len(steps), len(plant.joints)))
-        for row, step in enumerate(steps):
-            if self.recorder is not None:
-                while (due := self.recorder.next_step) <= step:
-                    self._advance(due, transport)
-                    self.recorder.record(data, self._voltage)
-            self._advance(step, transport)
-            plant.read(data, rows[row])
-            torque[row] = plant.motor_torque(act[row])
-            voltage[row] = self._voltage
-            self._sag(torque[row], qvel[row].take(plant.rotor))
+        plant, data, told = self.plant, self.data, set(steps)
+        due = [] if self.recorder is None else self.recorder.due(steps[-1])
+        # Where a sample and a state are of the same step, one look does for both.
+        stops = sorted(steps + [step for step in due if step not in told])
+        rows, voltages = np.empty((len(stops), plant.state_size)), []
+        heard = transport.soonest
+        for stop, row in zip(stops, rows, strict=True):
+            if heard < stop:
+                heard = self._obey(stop, transport)
+            self._step_to(stop)
+            plant.read(data, row)
+            voltages.append(self._voltage)
+            if stop in told:
+                self._sag()
+        voltage = np.array(voltages)
         self._check()
-        return Block(qpos=qpos, qvel=qvel, torque=torque, voltage=voltage)
+        if self.recorder is not None:
+            sampled = np.searchsorted(stops, due)
+            self.recorder.keep(rows[sampled], voltage[sampled])
+        if len(stops) > len(steps):
+            chosen = [stop in told for stop in stops]
+            rows, voltage = rows[chosen], voltage[chosen]
+        qpos, qvel, act = plant.parts(rows)
+        return Block(qpos=qpos, qvel=qvel, torque=plant.motor_torque(act), voltage=voltage)
 
     def look(self) -> Capture:
         """One sample of a capture, of now."""
-        recorder = Recorder(self.plant, self._dt, first_step=self.step)
-        recorder.record(self.data, self._voltage)
-        return recorder.capture()
+        row = np.empty((1, self.plant.state_size))
+        self.plant.read(self.data, row[0])
+        return seen(self.plant, np.array([self.step * self._dt]), row, np.array([self._voltage]))
 
-    def _advance(self, to: int, transport: Transport) -> None:
-        """Step up to (not including) a physics step, commands put in where they are heard."""
-        while (heard := transport.take(to)) is not None:
+    def _obey(self, before: int, transport: Transport) -> float:
+        """Step to where commands are heard before a physics step, and put them in.
+
+        Returns:
+            The step at which the next one is heard.
+        """
+        while (heard := transport.take(before)) is not None:
             self._step_to(heard[0])
             self.hear(heard[1])
-        self._step_to(to)
+        return transport.soonest
 
     def _step_to(self, step: int) -> None:
         if step > self.step:
             mujoco.mj_step(self.plant.model, self.data, step - self.step)
             self.step = step
 
-    def _sag(self, torque: Array, speed: Array) -> None:
+    def _sag(self) -> None:
         """Let the bus voltage follow the power that the motors draw (or give back)."""
         plant, machine = self.plant, self._machine
+        torque, speed = plant.motor_torque(self._act), self._qvel.take(plant.rotor)
         current = torque / plant.constant
         power = float(torque.dot(speed) + (current * current).dot(plant.resistance))
         sagged = machine.bus_voltage - machine.bus_resistance * power / self._voltage

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -84,7 +85,7 @@ class Plant:
     viscous: Array
     """[N m s/rad]"""
 
-    @property
+    @cached_property
     def state_size(self) -> int:
         """Numbers in a raw state: positions, velocities, activations."""
         return int(self.model.nq + self.model.nv + self.model.na)
@@ -119,7 +120,13 @@ class Plant:
     def set_bus_voltage(self, voltage: float) -> None:
         """Set the voltage at which the inverters clip [V]."""
         # Every actuator of the plant is a motor.
-        self.model.actuator_gainprm[:, _VMAX] = voltage
+        self._inverters[:] = voltage
+
+    @cached_property
+    def _inverters(self) -> Array:
+        """View of the voltages at which they clip."""
+        view: Array = self.model.actuator_gainprm[:, _VMAX]
+        return view
 
     def motor_torque(self, act: Array) -> Array:
         """Torque of the motors without friction [N m], shape (..., joints).
@@ -128,7 +135,11 @@ class Plant:
             act: Activation of the plant; the currents are in it. Shape (..., na).
         """
         torque = self.constant * act.take(self.current, axis=-1)
-        return np.minimum(np.maximum(torque, -self.effort_limit), self.effort_limit)
+        return np.minimum(np.maximum(torque, self._least_torque), self.effort_limit)
+
+    @cached_property
+    def _least_torque(self) -> Array:
+        return -self.effort_limit
 
     def electrical_power(self, torque: Array, speed: Array) -> Array:
         """What the motors draw from the bus: mechanical power and heat, sum over joints [W].

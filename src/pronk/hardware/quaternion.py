@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# Row k: what Hamilton's product makes of part k of its left factor.
+_FACTORS = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_SIGNS = np.array([[1.0, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]])
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+
 
 def product(a: Array, b: Array) -> Array:
     """The rotations `b`, then `a`: Hamilton's product. (n, 4) each."""
-    aw, ax, ay, az = a.T
-    bw, bx, by, bz = b.T
-    both = np.empty_like(b)
-    both[:, 0] = aw * bw - ax * bx - ay * by - az * bz
-    both[:, 1] = aw * bx + ax * bw + ay * bz - az * by
-    both[:, 2] = aw * by - ax * bz + ay * bw + az * bx
-    both[:, 3] = aw * bz + ax * by - ay * bx + az * bw
+    both: Array = np.add.reduce(a[:, :, None] * (b.take(_FACTORS, axis=1) * _SIGNS), axis=1)
     return both
 
 
@@ -55,10 +54,6 @@ def normalized(q: Array) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    ax, ay, az = a.T
-    bx, by, bz = b.T
-    across = np.empty_like(b)
-    across[:, 0] = ay * bz - az * by
-    across[:, 1] = az * bx - ax * bz
-    across[:, 2] = ax * by - ay * bx
+    ahead = a.take(_NEXT, axis=1) * b.take(_LAST, axis=1)
+    across: Array = ahead - a.take(_LAST, axis=1) * b.take(_NEXT, axis=1)
     return across

@@ -29,6 +29,9 @@ ROTOR_MASS = 1e-9
 """The rotor's inertia lives in the armature of its hinge; MuJoCo still wants a body with mass, and
 1e-9 kg on the joint's axis is nothing beside the lightest link."""
 
+_STOP_S = 2e-3
+"""Time in which a joint that has run into its stop is pushed back, 8 physics steps [s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MotorConstants:
@@ -97,6 +100,8 @@ def add_rotor(spec: Any, name: str, drive: Drive, true: JointTruth, lag_s: float
     link.frictionloss = 0.0
     link.damping = [0.0, 0.0, 0.0]
     link.stiffness = [0.0, 0.0, 0.0]
+    # A mechanical stop is hard: the model's gives way by 0.4 rad under the weight of the trunk.
+    link.solref_limit = [_STOP_S, 1.0]
     belt = spec.add_tendon(
         name=f"{name}/belt",
         stiffness=[true.belt_stiffness, 0, 0],

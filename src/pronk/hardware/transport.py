@@ -32,13 +32,13 @@ def check_command(command: Command, joints: int) -> None:
         HardwareError: Wrong shape, not finite, a negative gain, or a time that is none.
     """
     for name in ("position", "stiffness", "damping"):
-        values = getattr(command, name)
-        if np.shape(values) != (joints,) or not np.isfinite(values).all():
+        values = np.asarray(getattr(command, name))
+        if values.shape != (joints,) or not np.isfinite(values).all():
             raise HardwareError(
-                f"command.{name} has shape {np.shape(values)} or is not finite; "
+                f"command.{name} has shape {values.shape} or is not finite; "
                 f"expected {(joints,)} finite numbers, one per joint."
             )
-        if name != "position" and (np.asarray(values) < 0.0).any():
+        if name != "position" and values.min() < 0.0:
             raise HardwareError(f"command.{name} is negative; the drives accept 0 or more.")
     if not math.isfinite(command.made) or not command.valid_for > 0.0:
         raise HardwareError(
@@ -66,6 +66,11 @@ class Transport:
     def put(self, command: Command, now: float) -> None:
         """Send a command at a time on the machine's clock [s]."""
         self._under_way.append((round((now + self._delay) / self._step), command))
+
+    @property
+    def soonest(self) -> float:
+        """Physics step at which the next command is heard, of those on the way; may be infinite."""
+        return min(self._under_way[0][0], self._expiry) if self._under_way else self._expiry
 
     def take(self, before: int) -> tuple[int, Command] | None:
         """The next command that is heard before a physics step, and the step; None without one."""

@@ -282,8 +282,8 @@ class VirtualRobot:
             Raw(
                 tick=ticks,
                 instant=steps * self._dt,
-                angle=block.qpos[:, plant.rotor_qpos],
-                speed=block.qvel[:, plant.rotor],
+                angle=block.qpos.take(plant.rotor_qpos, axis=1),
+                speed=block.qvel.take(plant.rotor, axis=1),
                 torque=block.torque,
                 voltage=block.voltage,
                 motion=self._body.motion(block.qpos, block.qvel),

@@ -20,6 +20,8 @@ from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
 from pronk.policy.observation import Floats, History, Measurement, finite
 
 WRITER = "`pronk train` writes one"
+_OUTPUTS = {"action": JOINTS, **ESTIMATE}
+"""Names and sizes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +52,7 @@ class Policy:
         self.inference: Inference | None = None
         """What the network gave in the last `step`; None before the first."""
         self._session = session
+        self._jumps = contract.jump
         self._default = np.asarray(contract.default_position)
         self._scale = np.asarray(contract.action_scale)
         self._history = History(contract.default_position)
@@ -77,7 +80,7 @@ class Policy:
         """
         self._refuse_jump(jump)
         measured = self._history.observe(measurement, command)
-        self.inference = self.infer(measured[None], np.full((1, 1), jump, np.float32))
+        self.inference = self._run(measured[None], np.full((1, 1), jump, np.float32))
         action = self.inference.action[0]
         self._history.acted(action)
         target: NDArray[np.float64] = self._default + self._scale * action
@@ -95,24 +98,26 @@ class Policy:
                 told to jump.
         """
         count = len(np.atleast_1d(measured))
-        feeds = {"measured": finite('the input "measured"', measured, (count, MEASURED_SIZE))}
+        read = finite('the input "measured"', measured, (count, MEASURED_SIZE))
         asked = finite(
             'the input "jump"', np.zeros((count, 1)) if jump is None else jump, (count, 1)
         )
         self._refuse_jump(bool(asked.any()))
-        if self.contract.jump:
-            feeds["jump"] = asked
-        outputs = _outputs()
-        found = self._session.run(list(outputs), feeds)
+        return self._run(read, asked)
+
+    def _run(self, measured: Floats, jump: Floats) -> Inference:
+        """The network, for inputs that have been checked."""
+        feeds = {"measured": measured, "jump": jump} if self._jumps else {"measured": measured}
+        found = self._session.run(list(_OUTPUTS), feeds)
         return Inference(
             **{
-                name: finite(f'the policy\'s output "{name}"', value, (count, size))
-                for (name, size), value in zip(outputs.items(), found, strict=True)
+                name: finite(f'the policy\'s output "{name}"', value, (len(measured), size))
+                for (name, size), value in zip(_OUTPUTS.items(), found, strict=True)
             }
         )
 
     def _refuse_jump(self, jump: bool) -> None:
-        if jump and not self.contract.jump:
+        if jump and not self._jumps:
             raise ArtefactError(
                 "this policy was trained to walk only and has no jump input; "
                 "`pronk train jump` teaches it."
@@ -148,12 +153,8 @@ def load_policy(path: Path) -> Policy:
         )
     inputs = {"measured": MEASURED_SIZE} | ({"jump": 1} if contract.jump else {})
     _check_graph(path, "inputs", session.get_inputs(), inputs)
-    _check_graph(path, "outputs", session.get_outputs(), _outputs())
+    _check_graph(path, "outputs", session.get_outputs(), _OUTPUTS)
     return Policy(session, contract, sha256=hashlib.sha256(data).hexdigest())
-
-
-def _outputs() -> dict[str, int]:
-    return {"action": JOINTS, **ESTIMATE}
 
 
 def _session(data: bytes, path: Path) -> Any:

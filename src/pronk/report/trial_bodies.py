@@ -11,8 +11,9 @@ from pronk.report.trial_cells import Array, Values, cells
 from pronk.report.trial_data import policies, published, values
 from pronk.report.trial_extra import Block, part, place
 from pronk.report.trial_sweeps import argument
+from pronk.trial.bars import checks
 from pronk.trial.bodies import Bodies, Body
-from pronk.trial.tables import Sheet, checks, number, table_iii, verdict
+from pronk.trial.tables import Sheet, number, table_iii, verdict
 
 _OF_POLICY = "training gains of "
 

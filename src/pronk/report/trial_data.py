@@ -16,8 +16,9 @@ from pronk.report.trial_cells import Published, Values
 from pronk.report.trial_ratios import Ratio
 from pronk.report.trial_traces import Trace
 from pronk.trial.protocol import RATES
-from pronk.trial.result import Row, Trial
-from pronk.trial.tables import PAPER_RATIOS, TABLE_III
+from pronk.trial.published import PAPER_RATIOS, TABLE_III
+from pronk.trial.result import Trial
+from pronk.trial.rows import Row
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,8 @@ def published(figure: str) -> Published:
 def naive_over_matched(trial: Trial, figure: str) -> list[Ratio]:
     """Ratios of the standard deviations with the naive policy above the line, whichever came first.
 
-    Empty unless the trial has the paper's two policies. The first is over all commands.
+    Empty unless the trial has the paper's two policies, and without those of too few jumps for an
+    interval. The first is over all commands.
     """
     found = []
     paper = published(figure)
@@ -60,7 +62,7 @@ def naive_over_matched(trial: Trial, figure: str) -> list[Ratio]:
         if ratio.figure != figure or {ratio.policy, ratio.other} != {"naive", "matched"}:
             continue
         value, low, high = ratio.value, ratio.low, ratio.high
-        if not (math.isfinite(value) and value > 0.0):
+        if not (math.isfinite(value) and value > 0.0 and math.isfinite(low)):
             continue
         if ratio.other == "matched":
             value, low, high = 1.0 / value, 1.0 / high, 1.0 / low if low > 0.0 else math.inf

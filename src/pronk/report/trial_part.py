@@ -28,7 +28,7 @@ from pronk.report.trial_sweeps import argument
 from pronk.report.trial_traces import heights, rates, torque_speed
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.trial import tables
+from pronk.trial import bars, tables
 from pronk.trial.protocol import RATES
 from pronk.trial.result import Subject, Trial, load
 from pronk.trial.summary import share_interval
@@ -93,7 +93,7 @@ def part(material: Material, *, anchor: str, title: str = "Trial") -> Part:
         trial=trial,
         first=trial.subjects[0].name,
         totals=totals(trial),
-        checks=tables.checks(trial),
+        checks=bars.checks(trial),
         verdicts=[tables.verdict(trial, other.name) for other in trial.subjects[1:]],
         table_iii=[
             _naive_first(tables.table_iii(trial, figure)) for figure in ("height", "distance")

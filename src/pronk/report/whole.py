@@ -1,9 +1,9 @@
 """One page of everything that a folder and the folders in it hold.
 
 What is looked for, and by which file: trials (`summary.json`), what was tried beside the jumps
-(`walk.json`, `crossing.json`, `variation.json`, `bodies.json`) and matches (`match.npz`). Parts
-that are not there are left out; one that is damaged is an error, since a page that silently lacks
-it would be read as whole.
+(`walk.json`, `crossing.json`, `variation.json`, `bodies.json`), logs of deployments (`*.mcap`) and
+matches (`match.npz`). Parts that are not there are left out; one that is damaged is an error, since
+a page that silently lacks it would be read as whole.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pronk.deploy.log import is_deploy_log
 from pronk.errors import ArtefactError
 from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
+from pronk.report import deploy_part, trial_part
 from pronk.report import page as match_page
-from pronk.report import trial_part
 from pronk.report.shell import Part, page
 from pronk.report.trial_bodies import bodies_part
 from pronk.report.trial_crossing import crossing_part
 from pronk.report.trial_variation import variation_part
 from pronk.report.trial_walk import walk_part
 from pronk.trial import bodies, crossing, variation, walk
+from pronk.trial.bars import checks
 from pronk.trial.bodies import Bodies
 from pronk.trial.crossing import Crossings
 from pronk.trial.result import SUMMARY
-from pronk.trial.tables import checks
 from pronk.trial.variation import Variation
 from pronk.trial.walk import Walks
 
@@ -143,28 +144,48 @@ def _matches(root: Path) -> Iterator[Found]:
         )
 
 
+def _deployments(root: Path) -> Iterator[Found]:
+    """Of the logs in a folder, or of one log."""
+    logs = [root] if root.is_file() else sorted(filter(is_deploy_log, root.rglob("*.mcap")))
+    for i, path in enumerate(logs):
+        source = path.name if root.is_file() else str(path.relative_to(root))
+        material = deploy_part.read(path)
+        title = f"Deployment: {source}" if len(logs) > 1 else "Deployment"
+        yield Found(
+            source=source,
+            virtual=material.log.virtual,
+            draw=partial(deploy_part.part, material, anchor=f"deploy{i or ''}", title=title),
+            figures=deploy_part.figures(material),
+        )
+
+
 def find(root: Path, told: Callable[[float], None] = lambda share: None) -> list[Found]:
     """Everything in the folder tree that can be drawn, read and in the order of the page.
 
     Args:
-        root: The folder.
+        root: The folder, or the log of one deployment.
         told: Told the share of a trial's captures that is read, 0 to 1.
 
     Raises:
         ArtefactError: No such folder, nothing in it, or something damaged.
+        LogError: A damaged log, or a file that is none of a deployment.
     """
+    if root.is_file():
+        return list(_deployments(root))
     if not root.is_dir():
         raise ArtefactError(
             f"{root}: no such folder; give one that `pronk match --out` or `pronk trial --out` "
-            "wrote to."
+            "wrote to, or the log of a deployment."
         )
     # Captures are the slowest to read: what is small and damaged is told of first.
     matches, extras = list(_matches(root)), list(_extras(root))
-    found = [*_trials(root, told), *extras, *matches]
+    deployments = list(_deployments(root))
+    found = [*_trials(root, told), *extras, *deployments, *matches]
     if not found:
         raise ArtefactError(
             f"{root}: nothing to report; neither {SUMMARY} (`pronk trial POLICY --out DIR`) nor "
-            "match.npz (`pronk match LOG... --out`) is in it or in a folder in it."
+            "match.npz (`pronk match LOG... --out`) nor the log of a deployment (`pronk deploy "
+            "--log`) is in it or in a folder in it."
         )
     return found
 
@@ -175,11 +196,13 @@ def write_report(
     """Write the page of everything in `root`; returns its path and what is on it.
 
     Args:
-        root: The folder.
+        root: The folder, which gets `report.html`, or the log of one deployment, which gets a page
+            of its name beside it.
         progress: Told the stage, `read` or `draw`, and the share of it that is done, 0 to 1.
 
     Raises:
         ArtefactError: As `find`.
+        LogError: The same.
     """
     progress("read", 0.0)
     found = find(root, partial(progress, "read"))
@@ -188,7 +211,7 @@ def write_report(
     for i, one in enumerate(found):
         progress("draw", i / len(found))
         parts.append(one.draw())
-    written = root / NAME
+    written = root.with_suffix(".html") if root.is_file() else root / NAME
     write_text(
         written,
         page(

@@ -78,7 +78,7 @@ class Session:
             damping=self.plan.damping,
         )
         begun = self.now
-        sent = (self.machine.now(), target[self._columns], frequency, segment)
+        sent = (self.machine.now(), target, frequency, segment)
         self._sent = [*self._sent[-3:], sent]
         self._ticks += 1
         known = len(self._waiting)
@@ -126,7 +126,7 @@ class Session:
             )
             self._writer.sample(
                 state.time,
-                command,
+                command[self._columns],
                 state.position[self._columns],
                 state.velocity[self._columns],
                 None if self._torque_absent else state.torque[self._columns],

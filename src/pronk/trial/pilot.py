@@ -47,7 +47,7 @@ def projected_gravity(orientation: Array) -> Array:
     Args:
         orientation: Trunk to world, unit quaternion w, x, y, z. (4,)
     """
-    w, x, y, z = orientation
+    w, x, y, z = orientation.tolist()
     return np.array([-2.0 * (x * z - w * y), -2.0 * (y * z + w * x), -1.0 + 2.0 * (x * x + y * y)])
 
 

@@ -7,11 +7,9 @@ that were found; how many those are of how many, and the success rate, stand bes
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,8 +20,9 @@ from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError
 from pronk.files import write_text
-from pronk.trial.metrics import FIGURES, FLAGS, JumpFigures
+from pronk.trial.metrics import FIGURES
 from pronk.trial.protocol import PAPER_COMMANDS, Case, Script
+from pronk.trial.rows import Row, of_csv, to_csv
 from pronk.trial.summary import Cell, Ratio, Spread, ratio_of_scatter, share_interval
 
 SCHEMA = "pronk/trial/1"
@@ -41,9 +40,6 @@ COMPARED = (
 """Figures whose scatter is compared between policies."""
 Array = NDArray[np.float64]
 
-_OWN = ("policy", "command", "number", "seed", "capture", "success")
-"""Columns before the figures."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
@@ -54,27 +50,6 @@ class Subject:
     sha256: str
     contract: Mapping[str, Any]
     """What of the contract tells it apart: robot, gains, hash of the gains, rates, delays."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """One jump."""
-
-    policy: str
-    """Name of the subject."""
-    case: str
-    """Name of the command."""
-    number: int
-    """0 for the first jump with this command."""
-    seed: int
-    """Of its virtual robot's noise."""
-    figures: JumpFigures
-    script: Script
-    """What was asked, with the time of its own of the jump input."""
-    capture: str = ""
-    """What was seen, a file beside this table; empty if it was not kept."""
-    began: float = 0.0
-    """When the policy took over, on the capture's clock [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,44 +174,9 @@ def save(folder: Path, trial: Trial) -> tuple[Path, Path]:
         The two files.
     """
     table, summary = folder / TABLE, folder / SUMMARY
-    write_text(table, to_csv(trial))
+    write_text(table, to_csv(trial.rows, trial.joint_names))
     write_text(summary, json.dumps(_plain(_body(trial)), indent=2, allow_nan=False) + "\n")
     return table, summary
-
-
-def _columns(joint_names: tuple[str, ...]) -> list[tuple[str, str, int | None]]:
-    """Column, figure, and which joint, of every figure."""
-    found: list[tuple[str, str, int | None]] = []
-    for name, figure in FIGURES.items():
-        if figure.joints:
-            unit = figure.column.removeprefix(name)
-            found += [(f"{name}_{joint}{unit}", name, i) for i, joint in enumerate(joint_names)]
-        else:
-            found.append((figure.column, name, None))
-    return found
-
-
-def to_csv(trial: Trial) -> str:
-    """One row a jump; unknown figures are empty, truths 1 and 0, numbers exact."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    columns = _columns(trial.joint_names)
-    times = ("run_s", "began_s")
-    writer.writerow([*_OWN, *times, *FLAGS, *(column for column, _, _ in columns)])
-    for row in trial.rows:
-        figures = row.figures
-        own = (row.policy, row.case, row.number, row.seed, row.capture, int(figures.success))
-        flags = (int(getattr(figures, name)) for name in FLAGS)
-        numbers = (_text(figures, name, joint) for _, name, joint in columns)
-        writer.writerow([*own, repr(row.script.run_s), repr(row.began), *flags, *numbers])
-    return text.getvalue()
-
-
-def _text(figures: JumpFigures, name: str, joint: int | None) -> str:
-    value = getattr(figures, name)
-    if joint is not None:
-        value = value[joint] if value else math.nan
-    return repr(value) if math.isfinite(value) else ""
 
 
 def _body(trial: Trial) -> dict[str, Any]:
@@ -315,7 +255,7 @@ def _trial(body: Mapping[str, Any], table: str, folder: Path) -> Trial:
     times = {name: float(value) for name, value in protocol["script"].items()}
     joints = tuple(body["joint_names"])
     subjects = tuple(Subject(**entry) for entry in body["policies"])
-    rows = tuple(_rows(table, cases, times, joints, folder / TABLE))
+    rows = tuple(of_csv(table, cases=cases, times=times, joint_names=joints, path=folder / TABLE))
     expected = {(cell["policy"], cell["case"]): cell["n"] for cell in body["cells"]}
     counted = {
         (subject.name, case.name): sum(
@@ -350,40 +290,3 @@ def _trial(body: Mapping[str, Any], table: str, folder: Path) -> Trial:
 def _velocity(values: list[float]) -> tuple[float, float, float]:
     forward, left, yaw = map(float, values)
     return forward, left, yaw
-
-
-def _rows(
-    table: str,
-    cases: tuple[Case, ...],
-    times: Mapping[str, float],
-    joints: tuple[str, ...],
-    path: Path,
-) -> Iterator[Row]:
-    commands = {case.name: case.command for case in cases}
-    columns = _columns(joints)
-    for line, entry in enumerate(csv.DictReader(io.StringIO(table)), start=2):
-        try:
-            figures: dict[str, Any] = {name: bool(int(entry[name])) for name in FLAGS}
-            for column, name, joint in columns:
-                if joint is None:
-                    figures[name] = float(entry[column] or "nan")
-                elif entry[column]:
-                    figures[name] = (*figures.get(name, ()), float(entry[column]))
-            yield Row(
-                policy=entry["policy"],
-                case=entry["command"],
-                number=int(entry["number"]),
-                seed=int(entry["seed"]),
-                figures=JumpFigures(**figures),
-                script=Script(
-                    command=commands[entry["command"]],
-                    **{**times, "run_s": float(entry["run_s"])},
-                ),
-                capture=entry["capture"],
-                began=float(entry["began_s"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ArtefactError(
-                f"{path}: line {line} cannot be read ({type(error).__name__}: {error}); "
-                "run the trial again."
-            ) from None

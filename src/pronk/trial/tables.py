@@ -7,62 +7,16 @@ measured holds a dash and its count says why.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
+from pronk.trial.bars import JUMPS, checks
 from pronk.trial.metrics import FIGURES
+from pronk.trial.published import PAPER_RATIOS, TABLE_III, Pair
 from pronk.trial.result import COMPARED, Trial
 from pronk.trial.summary import FEWEST, Cell, Ratio, Spread
 
-Pair = tuple[float, float]
-"""Mean and standard deviation."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperCell:
-    """One row of the paper's Table III: mean and standard deviation of five jumps [m]."""
-
-    height: Mapping[str, Pair]
-    """By gains: `naive`, `matched`."""
-    distance: Mapping[str, Pair]
-
-
-TABLE_III: Mapping[str, PaperCell] = {
-    "forward 1": PaperCell(
-        height={"naive": (0.332, 0.008), "matched": (0.318, 0.014)},
-        distance={"naive": (0.690, 0.076), "matched": (0.597, 0.042)},
-    ),
-    "forward 2": PaperCell(
-        height={"naive": (0.246, 0.022), "matched": (0.244, 0.013)},
-        distance={"naive": (0.944, 0.030), "matched": (0.969, 0.026)},
-    ),
-    "side -1": PaperCell(
-        height={"naive": (0.304, 0.061), "matched": (0.374, 0.016)},
-        distance={"naive": (0.636, 0.092), "matched": (0.587, 0.054)},
-    ),
-    "side +1": PaperCell(
-        height={"naive": (0.249, 0.041), "matched": (0.366, 0.052)},
-        distance={"naive": (0.701, 0.183), "matched": (0.542, 0.051)},
-    ),
-    "back 2": PaperCell(
-        height={"naive": (0.346, 0.031), "matched": (0.381, 0.015)},
-        distance={"naive": (0.944, 0.030), "matched": (0.932, 0.025)},
-    ),
-}
-"""arXiv 2404.15096. Its naive distance with `back 2` is that with `forward 2`, digit by digit: most
-likely a slip of the pen (reading A4)."""
-
-PAPER_RATIOS = {"height": 1.48, "distance": 2.08}
-"""Ratio of the mean standard deviations, naive over matched, as Table III gives it; the text says
-2.30 for the distance (reading A4)."""
-
-GAPS = {"forward 2": 0.60, "back 2": 0.55, "side -1": 0.40, "side +1": 0.40}
-"""Bars [m]; the paper's are .55, .50, .40 (R3)."""
-HEIGHT = 0.45
-"""Bar of the best command [m]: what the paper calls the physical limit (R5)."""
-SUCCESS = 0.95
-"""Bar of the landing success."""
 DEFINITIONS = "Definitions"
 """Title of the table of equations."""
 
@@ -75,26 +29,6 @@ class Sheet:
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """One figure of the first policy and its bar."""
-
-    what: str
-    value: float
-    sense: Literal["<=", ">="]
-    bar: float
-    unit: str = ""
-
-    @property
-    def passed(self) -> bool:
-        """Whether the figure clears the bar; NaN does not."""
-        return self.value <= self.bar if self.sense == "<=" else self.value >= self.bar
-
-    def row(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return {**asdict(self), "passed": self.passed}
 
 
 def sheets(trial: Trial) -> tuple[Sheet, ...]:
@@ -131,7 +65,8 @@ def table_iii(trial: Trial, figure: str) -> Sheet:
         means.append(f"+- {sum(stds) / len(stds):.3f}")
     for name in subjects:
         stds = [trial.cell(name, case).figures[figure].std for case in trial.pooled]
-        means.append(f"+- {number(sum(stds) / len(stds))}")
+        mean = sum(stds) / len(stds)
+        means.append(f"+- {number(mean)}" if math.isfinite(mean) else "-")
     rows.append(("mean scatter", *means))
     return Sheet(
         title=f"{figure.capitalize()} [m]: mean +- standard deviation (jumps found of those asked)",
@@ -320,36 +255,6 @@ def verdict(trial: Trial, other: str) -> str:
     )
 
 
-def checks(trial: Trial) -> list[Check]:
-    """Every bar that the first policy must clear on the commands that were tried."""
-    first = trial.subjects[0].name
-    cells = [trial.cell(first, case.name) for case in trial.cases]
-    found = [check for cell in cells for check in _checks(cell)]
-    if any(cell.case in TABLE_III for cell in cells):
-        best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
-        found.append(Check(what="best: height", value=best, sense=">=", bar=HEIGHT, unit="m"))
-    return found
-
-
-def _checks(cell: Cell) -> Iterator[Check]:
-    paper = TABLE_III.get(cell.case)
-    for figure in ("height", "distance") if paper else ():
-        mean, std = getattr(paper, figure)["matched"]
-        ours = cell.figures[figure]
-        what = f"{cell.case}: {figure}"
-        yield Check(what=what, value=ours.mean, sense=">=", bar=mean, unit="m")
-        yield Check(what=f"{what}, std", value=ours.std, sense="<=", bar=std, unit="m")
-    if cell.case in GAPS:
-        yield Check(
-            what=f"{cell.case}: gap",
-            value=cell.figures["gap"].mean,
-            sense=">=",
-            bar=GAPS[cell.case],
-            unit="m",
-        )
-    yield Check(what=f"{cell.case}: success", value=cell.success, sense=">=", bar=SUCCESS)
-
-
 def bars(trial: Trial) -> Sheet:
     """What the first policy must show."""
     found = checks(trial)
@@ -360,11 +265,13 @@ def bars(trial: Trial) -> Sheet:
         bar = f"{check.sense} {check.bar:g}{unit}"
         rows.append((check.what, value, bar, "yes" if check.passed else "NO"))
     passed = sum(check.passed for check in found)
+    least = min(trial.cell(trial.subjects[0].name, case).n for case in trial.pooled)
+    few = (f"The bars are meant for {JUMPS} jumps with each command; these are of {least}.",)
     return Sheet(
         title=f"Bars of {trial.subjects[0].name}: the paper's matched column, and more",
         columns=("what", "measured", "bar", "passed"),
         rows=tuple(rows),
-        notes=(f"{passed} of {len(found)} bars passed.",),
+        notes=(f"{passed} of {len(found)} bars passed.", *(few if least < JUMPS else ())),
     )
 
 
@@ -407,10 +314,11 @@ def pair(values: Pair | None) -> str:
 
 
 def spread(figure: Spread, digits: int = 3) -> str:
-    """Mean and standard deviation; a dash if no jump has the figure."""
+    """Mean and standard deviation; the value of one jump alone; a dash if none has the figure."""
     if not figure.n:
         return "-"
-    return f"{number(figure.mean, digits)} +- {number(figure.std, digits)}"
+    mean = number(figure.mean, digits)
+    return f"{mean} +- {number(figure.std, digits)}" if figure.n > 1 else mean
 
 
 def counted(cell: Cell) -> str:

@@ -15,7 +15,8 @@ from pronk.hardware import capture as captures
 from pronk.trial import video
 from pronk.trial.film import Film, plan
 from pronk.trial.marks import marks_of
-from pronk.trial.result import Row, Trial
+from pronk.trial.result import Trial
+from pronk.trial.rows import Row
 
 SLOW = 4.0
 """How many times slower than real time a flight is shown."""

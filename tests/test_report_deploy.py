@@ -1,0 +1,252 @@
+"""The page of a deployment's log: numbers known beforehand, and pages of runs that went wrong."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pronk.cli import app
+from pronk.deploy.log import DeployLog, DeployLogWriter, read_deploy_log
+from pronk.deploy.reasons import Level, Reason
+from pronk.deploy.records import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
+from pronk.errors import LogError
+from pronk.hardware.machine import State
+from pronk.report import deploy_data, deploy_part, deploy_words, whole
+from pronk.report.deploy_delay import delay, shift
+from pronk.robots import load_robot
+
+ROBOT = load_robot("mini_cheetah")
+POSE = np.array([joint.default_position for joint in ROBOT.joints])
+KP = np.array([joint.stiffness for joint in ROBOT.joints])
+HEADER = {
+    "robot": "mini_cheetah",
+    "joints": list(ROBOT.joint_names),
+    "link": "twin",
+    "policy": {"file": "policy.onnx", "sha256": "ab" * 32, "delay_range_s": [0.0, 0.01]},
+    "limits": {"tilt": 0.8, "hold_s": 0.02, "damp_s": 0.05, "latch_s": 0.1},
+    "versions": {"pronk": "0"},
+}
+TICK_S = 0.002
+
+
+def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
+    """A tick in which all goes well; the joints do not move."""
+    one = np.zeros((), dtype=TICK)
+    state = State(
+        time=number * TICK_S,
+        sequence=number,
+        position=POSE,
+        velocity=np.zeros(12),
+        torque=changes.pop("torque", np.zeros(12)),
+        gyro=np.zeros(3),
+        accelerometer=np.array([0.0, 0.0, 9.81]),
+        bus_voltage=24.0,
+        orientation=changes.pop("orientation", np.array([1.0, 0.0, 0.0, 0.0])),
+        temperature=changes.pop("temperature", None),
+    )
+    put_state(one, state, 0.0)
+    one["tick"], one["deadline"] = number, number * TICK_S
+    one["begun"], one["done"] = number * TICK_S + 1e-4, number * TICK_S + 4e-4
+    one["mode"], one["latency"] = Mode.POLICY, np.nan
+    one["asked"] = one["sent"] = target
+    for name, value in changes.items():
+        one[name] = value
+    return np.frombuffer(one.tobytes(), dtype=TICK)[0]
+
+
+def say(writer: DeployLogWriter, at: float, kind: str, text: str, **more: int) -> None:
+    writer.event(np.frombuffer(event(at, kind, text, **more).tobytes(), dtype=EVENT)[0])
+
+
+def targets(count: int) -> np.ndarray:
+    """Small steps every 20 ms, as a policy gives them. (count, joints)."""
+    steps = np.random.default_rng(1).uniform(-0.2, 0.2, (count // 10 + 1, 12))
+    return POSE + np.repeat(steps, 10, axis=0)[:count]
+
+
+def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
+    """A run whose torques obey the drives' law with targets sent `lag` ticks earlier."""
+    asked = targets(count)
+    writer = DeployLogWriter(path, HEADER)
+    say(writer, 0.0, "robot", VIRTUAL)
+    for k in range(count):
+        torque = KP * (asked[max(k - lag, 0)] - POSE)
+        answered = {"latency": 0.003} if k % 10 == 0 else {}
+        writer.tick(record(k, asked[k], torque=torque, **answered, **changes))
+        if k % 10 == 0:
+            step = np.zeros((), dtype=STEP)
+            step["sequence"], step["begun"], step["live"] = k // 10, k * TICK_S, 1
+            step["deadline"], step["inferred"] = k * TICK_S, 1e-4
+            step["jump"] = 100 <= k < 200
+            writer.step(np.frombuffer(step.tobytes(), dtype=STEP)[0])
+    writer.end(complete=True, figures={})
+    return path
+
+
+def faulted(path: Path, *, end: bool = True) -> Path:
+    """0.2 s standing, 0.2 s policy with moved targets, then a fault of the tilt."""
+    writer = DeployLogWriter(path, HEADER)
+    say(writer, 0.0, "robot", REAL)
+    moved = POSE + np.eye(12)[5] * 0.25
+    limited = {"level": Level.LIMIT, "reason": Reason.POSITION, "sent": POSE}
+    damped = {
+        "sent": np.nan,
+        "asked": np.nan,
+        "damped": 1,
+        "level": Level.LATCH,
+        "reason": Reason.TILT,
+        "mode": Mode.FAULT,
+        "orientation": np.array([math.cos(0.5), math.sin(0.5), 0.0, 0.0]),
+    }
+    for k in range(100):
+        writer.tick(record(k, POSE + 0.01, mode=Mode.STAND))
+    for k in range(100, 200):
+        writer.tick(record(k, moved, **limited))
+    say(writer, 0.4, "fault", "tilted", reason=Reason.TILT, level=Level.LATCH)
+    for k in range(200, 300):
+        writer.tick(record(k, POSE, **damped))
+    if end:
+        writer.end(complete=True, figures={})
+    else:
+        writer.flush()
+    return path
+
+
+def test_quantiles_are_those_of_the_sorted_values() -> None:
+    found = deploy_data.spread(np.r_[np.arange(1000, 0, -1), np.nan])
+    assert (found.n, found.p50, found.p95, found.p99) == (1000, 500.0, 950.0, 990.0)
+    assert (found.p99_9, found.largest) == (999.0, 1000.0)
+    few = deploy_data.spread(np.arange(50.0))
+    assert math.isnan(few.p99)
+    assert few.p95 == 47.0
+    assert deploy_data.spread(np.array([])).n == 0
+
+
+@pytest.mark.parametrize("lag", [1, 2, 4])
+def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
+    log = read_deploy_log(flown(tmp_path / "run.mcap", lag=lag))
+    # A state at tick k sees the target sent at tick k - lag, on the wire 0.4 ms after the tick:
+    # right for every shift between (lag - 1) ticks and lag ticks, less 0.4 ms.
+    latest = lag * TICK_S - 4e-4
+    found = shift(log, ROBOT)
+    np.testing.assert_allclose(found, (max(latest - TICK_S, 0.0), latest), atol=2.6e-4)
+    whole_delay = delay(log, ROBOT)
+    assert whole_delay.within
+    assert whole_delay.longest == pytest.approx(0.003 + found[1])
+
+
+def test_a_delay_beyond_training_is_a_doubt(tmp_path: Path) -> None:
+    log = read_deploy_log(flown(tmp_path / "run.mcap", lag=5))
+    found = delay(log, ROBOT)
+    assert found.within is False
+    assert "BEYOND the 0 to 10 ms" in deploy_words.delaying(found)
+    assert deploy_words.doubtful(log, found)
+
+
+def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = DeployLogWriter(path, HEADER)
+    for k, target in enumerate(targets(400)):
+        answered = {"latency": 0.003} if k % 10 == 0 else {}
+        writer.tick(record(k, target, torque=np.full(12, np.nan), **answered))
+    writer.end(complete=True, figures={})
+    found = delay(read_deploy_log(path), ROBOT)
+    assert np.isnan(found.drives).all()
+    assert found.longest == pytest.approx(0.003)
+    assert "without the drives: within" in deploy_words.delaying(found)
+
+
+def test_what_a_fault_leaves(tmp_path: Path) -> None:
+    log = read_deploy_log(faulted(tmp_path / "run.mcap"))
+    found = deploy_data.stretches(log)
+    assert [one.mode for one in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
+    np.testing.assert_allclose([one.seconds for one in found], 0.2, atol=1e-9)
+    moved, latched = deploy_data.interventions(log)
+    assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, Level.LIMIT, 100)
+    assert (moved.largest, moved.joint) == (pytest.approx(0.25), ROBOT.joint_names[5])
+    assert (latched.reason, latched.ticks, latched.joint) == (Reason.TILT, 100, "")
+    np.testing.assert_allclose(deploy_data.tilt(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
+    joints = deploy_data.tracking(log)
+    assert joints[0].standing == pytest.approx(0.01)
+    assert deploy_words.says(log) == (
+        "Real mini_cheetah: a fault at 0.40 s, after 0.2 s of the policy: tilted."
+    )
+    assert "100 of 100 commands on the wire were damping" in deploy_words.damping(log)
+    assert deploy_words.filtering(log).endswith("in 100 of 200 commands (50.0 %).")
+
+
+def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
+    writer = DeployLogWriter(tmp_path / "run.mcap", HEADER)
+    for k in (0, 1, 2, 5, 6, 10):
+        writer.tick(record(k, POSE))
+    writer.end(complete=True, figures={})
+    assert deploy_data.missed(read_deploy_log(tmp_path / "run.mcap")) == 5
+
+
+def test_temperatures_where_there_are_any(tmp_path: Path) -> None:
+    assert deploy_data.temperatures(flown(tmp_path / "cold.mcap", count=5)) is None
+    path = flown(tmp_path / "hot.mcap", count=5, temperature=np.arange(12.0) + 30.0)
+    found = deploy_data.temperatures(path)
+    assert found is not None
+    np.testing.assert_allclose(found[0], np.arange(5) * TICK_S)
+    np.testing.assert_array_equal(found[1], np.tile(np.arange(12.0) + 30.0, (5, 1)))
+
+
+def page(path: Path) -> tuple[str, DeployLog]:
+    material = deploy_part.read(path)
+    return str(deploy_part.part(material, anchor="deploy").html), material.log
+
+
+def test_the_page_of_a_cut_log_says_so(tmp_path: Path) -> None:
+    path = faulted(tmp_path / "run.mcap", end=False)
+    path.write_bytes(path.read_bytes()[:-20])
+    html, log = page(path)
+    assert not log.complete
+    assert "The log was cut" in html
+    assert 'class="verdict doubt"' in html
+    assert html.count("data:image/") == 5
+
+
+def test_the_page_of_a_refusal(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = DeployLogWriter(path, HEADER | {"robot": "unheard_of"})
+    nothing = {"asked": np.nan, "sent": np.nan, "bus_voltage": np.nan, "orientation": np.zeros(4)}
+    for k in range(3):
+        writer.tick(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
+    say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")
+    writer.end(complete=True, figures={})
+    html, _ = page(path)
+    assert "was not moved: the battery gives 12.0 V; charge it." in html
+    assert "No delay was measured" in html
+    assert "battery [V]" not in html
+
+
+def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
+    faulted(tmp_path / "a.mcap")
+    runner = CliRunner()
+    one = runner.invoke(
+        app, ["report", str(tmp_path / "a.mcap"), "--json", str(tmp_path / "a.json")]
+    )
+    assert one.exit_code == 0, one.output
+    written = (tmp_path / "a.html").read_text()
+    assert "virtual robot</span>" not in written
+    assert "at 0.40 s" in written
+    assert '"within":true' not in (tmp_path / "a.json").read_text().replace(" ", "")
+    (tmp_path / "deep").mkdir()
+    flown(tmp_path / "deep" / "b.mcap")
+    (tmp_path / "other.mcap").write_bytes(b"no log of anything")
+    found = whole.find(tmp_path)
+    assert [one.source for one in found] == ["a.mcap", "deep/b.mcap"]
+    assert [one.virtual for one in found] == [False, True]
+    assert found[1].figures["delay"]["within"] is True
+
+
+def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "other.mcap").write_bytes(b"no log of anything")
+    with pytest.raises(LogError, match="not a log of a deployment"):
+        whole.find(tmp_path / "other.mcap")
