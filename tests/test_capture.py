@@ -161,6 +161,24 @@ def test_looking_changes_nothing() -> None:
     np.testing.assert_array_equal(faster.capture().position[::4], looked.capture().position)
 
 
+@pytest.mark.parametrize("rate", [300.0, 1500.0])
+def test_samples_between_states_are_taken_at_the_steps_nearest_to_them(rate: float) -> None:
+    whole, some = hopped(capture_rate_hz=4000.0).capture(), hopped(capture_rate_hz=rate).capture()
+    steps = np.rint(np.arange(len(some.time)) * 4000.0 / rate).astype(int)
+    assert steps[-1] < len(whole.time) <= steps[-1] + 4000.0 / rate + 1.0
+    for part in fields(Capture):
+        np.testing.assert_array_equal(getattr(some, part.name), getattr(whole, part.name)[steps])
+
+
+def test_any_part_is_the_end_of_the_whole(machine: VirtualRobot, seen: Capture) -> None:
+    for first in (0, 1, 98, 99, 100, 101, 699):
+        part = machine.capture(since=float(seen.time[first]))
+        np.testing.assert_array_equal(part.time, seen.time[first:])
+        np.testing.assert_array_equal(part.contact, seen.contact[first:])
+        np.testing.assert_array_equal(part.bus_voltage, seen.bus_voltage[first:])
+    assert len(machine.capture(since=1.0).time) == 0
+
+
 def test_it_outlives_the_connection_and_begins_anew_with_the_next(machine: VirtualRobot) -> None:
     other = hopped()
     other.close()

@@ -387,6 +387,21 @@ def test_same_seed_same_numbers_to_the_last_digit_however_time_is_cut() -> None:
     assert np.array_equal(seen, other[1])
 
 
+def test_gains_that_come_back_are_obeyed_again() -> None:
+    heights = []
+    for soft in (False, True):
+        machine = standing(quiet(), start=Start(settle_s=0.2))
+        for k in range(4):
+            weak = soft and k == 1
+            command = hold()
+            machine.send(replace(command, stiffness=command.stiffness * (0.2 if weak else 1.0)))
+            machine.wait(0.05 * (k + 1))
+        machine.wait(2.0)
+        heights.append(machine.snapshot().position[0, 2])
+    # It stands again as it would have; with the weak gains still in force it would lie.
+    assert heights[1] == pytest.approx(heights[0], abs=0.01)
+
+
 # --- Commands that expire -----------------------------------------------------------------------
 
 
@@ -395,14 +410,17 @@ def test_transport_delivers_late_and_damps_when_nothing_new_comes() -> None:
     first, second = hold(made=0.0, valid_for=0.010), hold(POSE + 1.0, made=0.005, valid_for=0.010)
     way.put(first, 0.0)
     way.put(second, 0.005)
+    assert way.soonest == 2
     assert way.take(2) is None
     assert way.take(3) == (2, first)
+    assert way.soonest == 7
     assert way.take(100) == (7, second)
     step, damping = way.take(100) or (0, first)
     assert step == 17  # made + valid_for + delay
     assert not damping.stiffness.any()
     assert (damping.damping > 0.0).all()
     assert way.take(10**9) is None
+    assert way.soonest == math.inf
 
 
 def test_a_command_that_comes_when_the_last_expires_is_obeyed() -> None:

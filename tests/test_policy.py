@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.policy.contract import Contract, check, measured_layout
 from pronk.policy.contract_json import METADATA_KEY, SCHEMA, from_json, to_json
 from pronk.policy.layout import MEASURED, MEASURED_SIZE
-from pronk.policy.observation import History, Measurement
+from pronk.policy.observation import History, Measurement, finite
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
 
@@ -369,6 +370,19 @@ def test_what_is_no_number_is_refused(jumper: Policy) -> None:
         jumper.infer(np.zeros((3, 104)))
     with pytest.raises(ArtefactError, match=r'output "action" is'):
         jumper.infer(np.full((1, 105), 3e38, np.float32))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
+def test_finite_numbers_of_any_size_and_kind_are_read(kind: type) -> None:
+    # Squares of the largest have no room in a float32.
+    most = 2**62 if kind is np.int64 else kind(3.4e38)
+    for value in ([0, 1, -2], [most, 1, -most]):
+        read = finite("it", np.array(value, kind), (3,))
+        assert read.dtype == np.float32
+        np.testing.assert_array_equal(read, np.array(value, np.float32))
+    for bad in (math.nan, math.inf, -math.inf, 1e39):
+        with pytest.raises(ArtefactError, match=r"it is (nan|-?inf) at \[1\]; a policy reads"):
+            finite("it", [0.0, bad, 1e300], (3,))
 
 
 def test_files_that_are_no_policy_are_refused(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_entry_point_leads_to_the_tasks() -> None:
 def test_mjlabs_list_shows_the_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert sorted(TASKS) == sorted([WALK_TASK, JUMP_TASK])
     assert set(TASKS) <= set(list_tasks())
-    assert list_environments("Pronk") == 2
+    assert list_environments("MiniCheetah") == 2
     printed = capsys.readouterr().out
     assert all(task in printed for task in TASKS)
 

@@ -63,9 +63,9 @@ def deploy(
         float | None, typer.Option(help="Sit down after this time with the policy in charge.")
     ] = None,
     blend: Annotated[
-        float, typer.Option(help="Time in which the policy takes over [s]; 0 as in training.")
+        float, typer.Option(help="Time in which the policy takes over, in s; 0 as in training.")
     ] = 0.4,
-    tilt: Annotated[float, typer.Option(help="Largest tilt of the trunk [rad].")] = 0.8,
+    tilt: Annotated[float, typer.Option(help="Largest tilt of the trunk, in rad.")] = 0.8,
     base: Annotated[Base, typer.Option(help="Of the twin.")] = Base.GROUND,
     truth: Annotated[
         Path | None, typer.Option(help="Truth of the twin, instead of the shipped one.")

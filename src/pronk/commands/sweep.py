@@ -79,7 +79,7 @@ def sweep(
     ] = None,
     signal: Annotated[SignalName, typer.Option(help="What to ask.")] = SignalName.CHIRP,
     amplitude: Annotated[
-        list[float] | None, typer.Option(help="Peak of the command [rad]; repeat it for several.")
+        list[float] | None, typer.Option(help="Peak of the command in rad; repeat it for several.")
     ] = None,
     repeats: Annotated[int, typer.Option(help="Times each amplitude is asked.")] = 3,
     seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,

@@ -86,7 +86,7 @@ def twin(
         Silence, typer.Option(help="What the drives do when commands stop.")
     ] = Silence.HOLD,
     silence_after: Annotated[
-        float, typer.Option(help="Time without a command after which they do it [s].")
+        float, typer.Option(help="Time without a command after which they do it, in s.")
     ] = 0.1,
     mode: Annotated[
         str,
@@ -97,7 +97,7 @@ def twin(
         ),
     ] = "",
     duration: Annotated[
-        float | None, typer.Option(help="End after this time [s]; Ctrl-C ends it too.")
+        float | None, typer.Option(help="End after this time, in s; Ctrl-C ends it too.")
     ] = None,
     capture: Annotated[
         Path | None,

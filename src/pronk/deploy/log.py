@@ -43,7 +43,8 @@ _I: dict[str, Any] = {"type": "integer"}
 _S: dict[str, Any] = {"type": "string"}
 _B: dict[str, Any] = {"type": "boolean"}
 _NS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
-_O: dict[str, Any] = {"type": "object"}
+# Foxglove reads the properties of every object; without them it refuses the channel.
+_O: dict[str, Any] = {"type": "object", "properties": {}}
 
 TOPICS: dict[str, dict[str, dict[str, Any]]] = {
     "header": {"schema": _S, "robot": _S, "joints": {"type": "array", "items": _S}}
@@ -92,6 +93,10 @@ class DeployLogWriter:
             )
             self._channels[topic] = self._writer.register_channel(_ROOT + topic, "json", number)
         self._wall = time.time() - time.monotonic()
+        policy = header.get("policy") or {}
+        facts = {"schema": SCHEMA, "robot": header.get("robot"), "link": header.get("link")}
+        facts["policy_sha256"] = policy.get("sha256")
+        self._writer.add_metadata("pronk", {key: str(value) for key, value in facts.items()})
         self._put("header", time.monotonic(), {"schema": SCHEMA, **header})
         self.flush()
 

@@ -11,7 +11,6 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -150,7 +149,10 @@ class Recorder:
 
     def _steps(self, first: int, end: int) -> NDArray[np.intp]:
         """Physics steps of samples `first` to `end` - 1."""
-        return np.rint(np.arange(first, end) * self._period / self._step_s).astype(np.intp)
+        steps: NDArray[np.intp] = np.rint(
+            np.arange(first, end) * self._period / self._step_s
+        ).astype(np.intp)
+        return steps
 
     def capture(self, since: float = -math.inf) -> Capture:
         """What was seen at and after a time.
@@ -158,15 +160,15 @@ class Recorder:
         Args:
             since: [s]
         """
-        times = self._steps(0, self._begins[-1]) * self._step_s
+        times = self._step_s * self._steps(0, self._begins[-1]).astype(np.float64)
         first = int(np.searchsorted(times, since - 0.5 * self._step_s))
         # From the block that holds the first sample.
         block = max(bisect_right(self._begins, first) - 1, 0)
         skipped = first - self._begins[block]
-        empty = np.empty((0, self._plant.state_size)), np.empty(0)
-        rows = np.concatenate([empty[0], *self._rows[block:]])[skipped:]
-        voltage = np.concatenate([empty[1], *self._voltage[block:]])[skipped:]
-        return seen(self._plant, times[first:], rows, voltage)
+        none = np.empty((0, self._plant.state_size))
+        rows: Array = np.concatenate([none, *self._rows[block:]])
+        voltage: Array = np.concatenate([none[:, 0], *self._voltage[block:]])
+        return seen(self._plant, times[first:], rows[skipped:], voltage[skipped:])
 
 
 def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:

@@ -65,14 +65,10 @@ class NoiseSource:
         self._attitude_rng = np.random.default_rng([seed, 1])
         self._yaw = self._attitude_rng.uniform(-math.pi, math.pi)
         # What is left of the slow noise after a tick, and how large what is added is.
-        corner, size = (
-            np.repeat([of_mounts, of_attitude], [joints, 3])
-            for of_mounts, of_attitude in (
-                (self._machine.position_noise_corner_hz, self._filter.noise_corner_hz),
-                (self._machine.position_noise, self._filter.noise),
-            )
-        )
+        machine, off, each = truth.machine, truth.attitude, [joints, 3]
+        corner = np.repeat([machine.position_noise_corner_hz, off.noise_corner_hz], each)
         self._keep = np.exp(-2.0 * math.pi * corner * self._period)
+        size = np.repeat([machine.position_noise, off.noise], each)
         self._fresh = size * np.sqrt(1.0 - self._keep**2)
         self._last = np.zeros(joints + 3)
         self._drawn = 0

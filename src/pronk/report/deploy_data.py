@@ -75,7 +75,7 @@ class Tracking:
     standing: float
     """RMS on the way up and standing [rad]."""
     torque: float
-    """RMS as the robot tells it [N m]."""
+    """RMS as the robot tells it [N m]; NaN where it tells none."""
     torque_largest: float
     """[N m]"""
     speed_largest: float
@@ -96,6 +96,12 @@ def period(log: DeployLog) -> float:
 def flying(log: DeployLog) -> Mask:
     """Ticks in which the policy decided. (T,)."""
     return np.asarray(np.isin(log.mode, FLYING))
+
+
+def until_fault(log: DeployLog) -> int:
+    """Number of ticks up to the first that damped for a fault, that one included."""
+    bad = log.level >= Level.DAMP
+    return int(bad.argmax()) + 1 if bad.any() else len(bad)
 
 
 def stretches(log: DeployLog) -> tuple[Stretch, ...]:
@@ -185,14 +191,15 @@ def tracking(log: DeployLog) -> tuple[Tracking, ...]:
     """How each joint followed its targets."""
     error = in_force(log) - log.position
     up, live = log.mode == Mode.STAND, flying(log)
+    torque = log.torque if log.torque.any() else np.full_like(log.torque, np.nan)
     return tuple(
         Tracking(
             joint=joint,
             error=_rms(error[live, i]),
             largest=_largest(error[live, i]),
             standing=_rms(error[up, i]),
-            torque=_rms(log.torque[live, i]),
-            torque_largest=_largest(log.torque[live, i]),
+            torque=_rms(torque[live, i]),
+            torque_largest=_largest(torque[live, i]),
             speed_largest=_largest(log.velocity[live, i]),
         )
         for i, joint in enumerate(log.joints)

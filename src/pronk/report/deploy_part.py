@@ -11,24 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.deploy.log import DeployLog, read_deploy_log
-from pronk.deploy.reasons import Level
 from pronk.errors import PronkError
-from pronk.report import deploy_data, deploy_times, deploy_traces, deploy_words, shell
+from pronk.report import (
+    deploy_data,
+    deploy_tables,
+    deploy_times,
+    deploy_traces,
+    deploy_words,
+    shell,
+)
 from pronk.report.deploy_delay import Delay, delay
-from pronk.report.shell import Part, number
+from pronk.report.shell import Part
 from pronk.report.trial_extra import Block
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.trial.tables import Sheet
 
 Array = NDArray[np.float64]
-
-_LEVEL_WORDS = {
-    Level.LIMIT: "target moved",
-    Level.HOLD: "last one held",
-    Level.DAMP: "damped",
-    Level.LATCH: "damped, latched",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +148,7 @@ def _blocks(material: Material) -> Iterator[Block]:
             "Modes, speeds asked and estimated, tilt and battery over the run",
             dense=True,
         ),
-        folded=(said(log),),
+        folded=(deploy_tables.said(log),),
     )
     yield _joints(material)
     yield _delay(material)
@@ -162,7 +160,7 @@ def _blocks(material: Material) -> Iterator[Block]:
             deploy_times.histograms(log, material.delay.trained),
             "Histograms of lateness, ages of states and times from state to command",
         ),
-        sheets=(times(log),),
+        sheets=(deploy_tables.times(log),),
     )
     yield Block(
         anchor="when",
@@ -191,7 +189,7 @@ def _joints(material: Material) -> Block:
         picture=None
         if drawn is None
         else shell.picture(drawn, f"Targets and positions of all joints, {words}"),
-        sheets=(tracking(material),),
+        sheets=(deploy_tables.tracking(log, material.robot),),
     )
 
 
@@ -207,33 +205,14 @@ def _delay(material: Material) -> Block:
         )
     elif found.answer.n:
         lines.append(
-            "What the drives add could not be told: too short, torques not measured, or not "
-            "explained by the targets and the gains of the drives."
+            "What the drives add could not be told: the run is too short, the robot tells no "
+            "torques, or targets and the gains of the drives do not explain them."
         )
     return Block(
         anchor="delay",
         title="Delay, beside training",
         lines=tuple(lines),
-        sheets=(delays(found),) if found.answer.n else (),
-    )
-
-
-def delays(found: Delay) -> Sheet:
-    """The parts of the delay, their sum, and what was trained for."""
-    trained = found.trained or (np.nan, np.nan)
-    rows = (
-        ("state to command", found.answer.p50, found.answer.p95, "median to 95 %, measured"),
-        ("command to torque", *found.drives, "fitted: bus, drives, stamping of states"),
-        ("whole", *found.whole, "their sum: what training calls the command delay"),
-        ("trained for", *trained, "by the contract in the policy's file"),
-    )
-    return Sheet(
-        title="Delay",
-        columns=("[ms]", "from", "to", "what it is"),
-        rows=tuple(
-            (name, number(1e3 * low, 1), number(1e3 * high, 1), what)
-            for name, low, high, what in rows
-        ),
+        sheets=(deploy_tables.delays(found),) if found.answer.n else (),
     )
 
 
@@ -252,96 +231,5 @@ def _filter(log: DeployLog) -> Block:
         picture=shell.picture(
             deploy_traces.marked(log, names, rows), "When the filter did something, by reason"
         ),
-        sheets=(
-            Sheet(
-                title="Safety filter",
-                columns=("what was done", "ticks", "farthest [rad]", "joint", "why"),
-                rows=tuple(
-                    (
-                        _LEVEL_WORDS[one.level],
-                        str(one.ticks),
-                        number(one.largest),
-                        one.joint.replace("_", " ") or "-",
-                        one.reason.text,
-                    )
-                    for one in done
-                ),
-                notes=("joint: the one whose target was moved most often for this reason.",),
-            ),
-        ),
-    )
-
-
-def tracking(material: Material) -> Sheet:
-    """How each joint followed, and what it gave."""
-    robot, limits = material.robot, material.log.header.get("limits", {})
-    effort = {} if robot is None else {j.name: j.drive.effort_limit for j in robot.joints}
-    speed = dict(zip(material.log.joints, limits.get("speed", ()), strict=False))
-    rows = []
-    for one in deploy_data.tracking(material.log):
-        rows.append(
-            (
-                one.joint.replace("_", " "),
-                number(one.standing),
-                number(one.error),
-                number(one.largest),
-                number(one.torque, 1),
-                _of(one.torque_largest, effort.get(one.joint)),
-                _of(one.speed_largest, speed.get(one.joint)),
-            )
-        )
-    return Sheet(
-        title="Joints",
-        columns=(
-            "joint",
-            "error standing, RMS [rad]",
-            "error, RMS [rad]",
-            "largest [rad]",
-            "torque, RMS [N\u00a0m]",
-            "largest [N\u00a0m]",
-            "fastest [rad/s]",
-        ),
-        rows=tuple(rows),
-        notes=(
-            "error: the target in force less the measured position. All but the first column: "
-            "while the policy decided. Torques as the robot tells them, of the drives' effort "
-            "limits; speeds of those at which the filter sees a fault.",
-        ),
-    )
-
-
-def _of(value: float, limit: float | None) -> str:
-    return number(value, 1) + (f" of {limit:.0f}" if limit is not None else "")
-
-
-def times(log: DeployLog) -> Sheet:
-    """Quantiles of everything that was timed."""
-    found = deploy_times.times(log)
-    rows = []
-    for one in found:
-        at = deploy_data.spread(one.values)
-        cells = (at.p50, at.p95, at.p99, at.p99_9, at.largest)
-        rows.append((one.name, str(at.n), *(number(1e3 * value) for value in cells)))
-    return Sheet(
-        title="Times [ms]",
-        columns=("[ms]", "n", "50 %", "95 %", "99 %", "99.9 %", "largest"),
-        rows=tuple(rows),
-        notes=(
-            *(f"{one.name}: {one.says}." for one in found),
-            "A quantile is left out where fewer than one value lies beyond it.",
-        ),
-    )
-
-
-def said(log: DeployLog) -> Sheet:
-    """All events, in their order."""
-    rows = []
-    for event in sorted(log.events, key=lambda event: event.time):
-        at = float(deploy_data.seconds(log, event.time))
-        rows.append((f"{at:.3f}", event.kind, event.text))
-    return Sheet(
-        title=f"Everything that was said ({len(rows)} lines)",
-        columns=("time [s]", "kind", "text"),
-        rows=tuple(rows),
-        notes=("Before the first tick times are negative.",),
+        sheets=(deploy_tables.interventions(done),),
     )

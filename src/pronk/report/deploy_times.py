@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pronk.deploy.log import DeployLog
 from pronk.report import style
-from pronk.report.deploy_data import flying, seconds, spread
+from pronk.report.deploy_data import flying, seconds, spread, until_fault
 
 Array = NDArray[np.float64]
 
@@ -46,8 +46,8 @@ def times(log: DeployLog) -> tuple[Timed, ...]:
         ),
         Timed(
             name="age of the state at a tick",
-            values=log.state_age,
-            says="from the newest state to the tick's begin, every tick",
+            values=log.state_age[: until_fault(log)],
+            says="from the newest state to the tick's begin, every tick until a fault",
         ),
         Timed(
             name="state to command",
@@ -114,7 +114,7 @@ def _histogram(axes: Axes, one: Timed) -> None:
     values = np.maximum(1e3 * one.values[np.isfinite(one.values)], _LEAST_MS)
     decades = int(np.ceil(np.log10(max(values.max() / _LEAST_MS, 10.0)))) + 1
     edges = _LEAST_MS * 10.0 ** (np.arange(decades * _PER_DECADE + 1) / _PER_DECADE)
-    axes.hist(values, bins=list(edges), color=style.MEASURED_WIDE)
+    axes.hist(values, bins=list(edges), color=style.MEASURED_WIDE, histtype="stepfilled")
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.7)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -128,7 +128,7 @@ def _histogram(axes: Axes, one: Timed) -> None:
                 color=style.MATCHED,
                 linewidth=1.3,
                 linestyle=dash,
-                label=f"{words}: {value:.3g} ms",
+                label=f"{words}: {value:{'.0f' if value >= 100.0 else '.3g'}} ms",
             )
     axes.set_title(f"{one.name}, n = {at.n}")
     axes.legend(loc="upper right", fontsize=8, frameon=True, edgecolor="none", framealpha=0.85)

@@ -13,7 +13,6 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from pronk.deploy.log import DeployLog
-from pronk.deploy.reasons import Level
 from pronk.deploy.records import Mode
 from pronk.report import style
 from pronk.report.deploy_data import flying, in_force, seconds, stretches, tilt
@@ -41,6 +40,8 @@ _MODE_COLOURS = {
 _QUIET = "#ececec"
 _JUMP = "#fbe3a3"
 _FAULT = style.NAIVE
+_MOVED = 1e-6
+"""Smaller differences of what was asked and sent are not drawn [rad]."""
 _LETTER = 0.0075
 """Width of a letter in a mode's bar, as a share of the axis."""
 WINDOW_S = 1.2
@@ -202,7 +203,9 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure | None:
     if not there.any():
         return None
     rows = style.grid_of_joints(log.joints)
-    moved = (log.level == Level.LIMIT) | (log.level == Level.HOLD)
+    with np.errstate(invalid="ignore"):
+        moved = bool((np.abs(log.asked - log.sent)[there] > _MOVED).any())
+    shown = [(max(a, begin), min(b, end)) for a, b in jumps(log) if a < end and b > begin]
     with style.styled():
         drawn, panels = style.small_multiples(rows, height=1.55, sharey="row")
         lowest = style.bottom_row(rows)
@@ -212,9 +215,8 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure | None:
             for at in faults(log):
                 if begin <= at <= end:
                     axes.axvline(at, color=_FAULT, linewidth=1.4)
-            for a, b in jumps(log):
-                if a < end and b > begin:
-                    axes.axvspan(max(a, begin), min(b, end), color=_JUMP, zorder=0, linewidth=0.0)
+            for a, b in shown:
+                axes.axvspan(a, b, color=_JUMP, zorder=0, linewidth=0.0)
             axes.set_title(style.joint_words(name), fontsize=9)
             axes.set_xlim(begin, end)
             if name in lowest:
@@ -225,9 +227,9 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure | None:
             Line2D([], [], **style.MEASURED_LINE, label="measured"),
             Line2D([], [], color=style.MATCHED, linewidth=1.2, label="target sent"),
         ]
-        if (moved & there).any():
+        if moved:
             keys.append(Line2D([], [], **_ASKED, label="target asked, where the filter moved it"))
-        if jumps(log):
+        if shown:
             keys.append(Patch(color=_JUMP, label="jump input"))
         if any(begin <= at <= end for at in faults(log)):
             keys.append(Line2D([], [], color=_FAULT, linewidth=1.4, label="fault"))
@@ -249,7 +251,7 @@ def _joint(axes: Axes, log: DeployLog, i: int, there: NDArray[np.bool_]) -> None
     asked, sent = log.asked[there, i], in_force(log)[there, i]
     now = log.sent[there, i]
     with np.errstate(invalid="ignore"):
-        axes.step(t, np.where(np.abs(asked - now) > 1e-6, asked, np.nan), where="post", **_ASKED)
+        axes.step(t, np.where(np.abs(asked - now) > _MOVED, asked, np.nan), where="post", **_ASKED)
     axes.step(t, sent, where="pre", color=style.MATCHED, linewidth=1.0)
 
 

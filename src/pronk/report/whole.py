@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pronk.deploy.log import is_deploy_log
-from pronk.errors import ArtefactError
+from pronk.errors import ArtefactError, LogError
 from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
@@ -149,7 +149,13 @@ def _deployments(root: Path) -> Iterator[Found]:
     logs = [root] if root.is_file() else sorted(filter(is_deploy_log, root.rglob("*.mcap")))
     for i, path in enumerate(logs):
         source = path.name if root.is_file() else str(path.relative_to(root))
-        material = deploy_part.read(path)
+        try:
+            material = deploy_part.read(path)
+        except LogError:
+            # A link that never opened leaves a log without a tick beside others that have some.
+            if len(logs) == 1:
+                raise
+            continue
         title = f"Deployment: {source}" if len(logs) > 1 else "Deployment"
         yield Found(
             source=source,
