@@ -52,7 +52,7 @@ def demo(
         Path | None,
         typer.Option(help="Folder of policies to try; those that come with pronk if left out."),
     ] = None,
-    jumps: Annotated[int, typer.Option(help="Jumps with each of the paper's commands.")] = 3,
+    jumps: Annotated[int, typer.Option(help="Jumps with each of the paper's commands.")] = 2,
     repeats: Annotated[int, typer.Option(help="Times the matched amplitude is asked.")] = 3,
     seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,
     quick: Annotated[

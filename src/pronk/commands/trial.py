@@ -168,6 +168,7 @@ def painted(
     report: console.Reporter,
     at_once: int,
     cases: Sequence[str] | None = None,
+    slow: float | None = None,
 ) -> tuple[Path, ...]:
     """Paint the films of a trial, where this machine can; one line says what it lacks.
 
@@ -177,12 +178,13 @@ def painted(
         report: Told the share that is painted.
         at_once: How many films at once.
         cases: Names of the commands to show; all if None.
+        slow: How many times slower than real time the flight is shown; as usual if None.
 
     Returns:
         The files.
     """
     from pronk.trial.folder import VIDEOS
-    from pronk.trial.videos import record_all
+    from pronk.trial.videos import SLOW, record_all
 
     return record_all(
         found,
@@ -190,6 +192,7 @@ def painted(
         out / VIDEOS,
         tell=console.warn,
         cases=cases,
+        slow=slow or SLOW,
         at_once=at_once,
         progress=report.bar("painting videos"),
     )
