@@ -4,34 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pronk.commands import console
+from pronk.commands import confirm, console
+from pronk.commands.choices import Base, Link
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.deploy.operators import Operator
     from pronk.deploy.run import Notice, Outcome
     from pronk.policy.contract import Contract
-
-
-class Link(StrEnum):
-    """How the machine is reached."""
-
-    TWIN = "twin"
-    LCM = "lcm"
-    DDS = "dds"
-
-
-class Base(StrEnum):
-    """What the virtual robot's trunk stands on."""
-
-    BENCH = "bench"
-    GROUND = "ground"
 
 
 _FAILED = 1
@@ -121,7 +106,7 @@ def deploy(
         real_time=real_time,
     )
     if interface is not None and link is not Link.TWIN and not yes:
-        _confirm(contract, f"{link.value} on {interface}")
+        confirm.before_it_moves(contract.robot, f"{link.value} on {interface}")
     with _operator(contract, script, walk_only, gamepad, seconds) as (operator, words):
         console.say(words)
         outcome = fly(plan, operator, _tell)
@@ -135,20 +120,6 @@ def deploy(
     )
     if outcome.faults or outcome.refusals:
         raise typer.Exit(_FAILED)
-
-
-def _confirm(contract: Contract, where: str) -> None:
-    """A typed word, so that no key pressed by chance moves a robot.
-
-    Raises:
-        HardwareError: Another word, or nobody there.
-    """
-    console.say(
-        f"A real {contract.robot} at {where} is about to move. Everybody out of its reach; the "
-        "first time, hang it up."
-    )
-    if typer.prompt(f"Type the robot's name ({contract.robot}) to go on").strip() != contract.robot:
-        raise HardwareError(f"that was not {contract.robot!r}; nothing was moved.")
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pronk.commands import confirm, console, sweep_wire
+from pronk.commands.choices import Layout, Link
 from pronk.commands.sweep_twin import record_twin as record_twin
 from pronk.errors import HardwareError
 
@@ -17,21 +18,6 @@ if TYPE_CHECKING:
     from pronk.robots.robot import Robot
     from pronk.sweep.plan import SweepPlan
     from pronk.sweep.signals import Signal
-
-
-class Link(StrEnum):
-    """How the machine is reached."""
-
-    TWIN = "twin"
-    LCM = "lcm"
-    DDS = "dds"
-
-
-class Layout(StrEnum):
-    """The messages on LCM."""
-
-    CHEETAH = "cheetah"
-    WTW = "wtw"
 
 
 class SignalName(StrEnum):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pronk.commands import console
+from pronk.commands.choices import Base, Layout
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
@@ -29,20 +30,6 @@ class TwinLink(StrEnum):
 
     LCM = "lcm"
     DDS = "dds"
-
-
-class Layout(StrEnum):
-    """The messages on LCM."""
-
-    CHEETAH = "cheetah"
-    WTW = "wtw"
-
-
-class Base(StrEnum):
-    """What the trunk stands on."""
-
-    BENCH = "bench"
-    GROUND = "ground"
 
 
 class Silence(StrEnum):

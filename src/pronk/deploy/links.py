@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from pronk.errors import HardwareError
+from pronk.hardware.links import WIRES, Address
 from pronk.hardware.machine import Command, Machine, State, TorqueKind
 from pronk.hardware.realtime import sleep_until
 
 if TYPE_CHECKING:
     from pronk.hardware.virtual import VirtualRobot
 
-LINKS = ("twin", "lcm", "dds")
+LINKS = ("twin", *WIRES)
 
 
 class Opener(Protocol):
@@ -71,22 +72,15 @@ class Link:
             return Paced(self._virtual())
         from pronk.robots import load_robot
 
-        robot = load_robot(self.robot)
-        if self.kind == "lcm":
-            from pronk.hardware.lcm_link import LcmMachine
-
-            return LcmMachine(
-                robot,
-                layout=self.layout,
-                port=self.port,
-                interface=self.interface,
-                release=self.release,
-            )
-        from pronk.hardware.dds_link import DdsMachine
-        from pronk.hardware.dds_net import DdsNetwork
-
-        network = DdsNetwork(interface=self.interface, domain=self.domain)
-        return DdsMachine(robot, network=network, release=self.release)
+        lcm = self.kind == "lcm"
+        address = Address(
+            kind=self.kind,
+            interface=self.interface,
+            layout=self.layout if lcm else None,
+            port=self.port if lcm else None,
+            domain=None if lcm else self.domain,
+        )
+        return address.machine(load_robot(self.robot), release=self.release)
 
     @property
     def local(self) -> bool:
