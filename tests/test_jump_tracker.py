@@ -22,10 +22,10 @@ pytestmark = pytest.mark.train
 DT = 1 / 64
 """A power of two, so that times add up exactly."""
 SETTINGS = JumpSettings(
-    liftoff_velocity=2.5, prompt_s=16 * DT, late_s=16 * DT, settle_s=8 * DT, apex=0.75
+    liftoff_velocity=2.5, prompt_s=16 * DT, late_s=16 * DT, settle_s=8 * DT, stroke=0.5
 )
-EVENTS = ("gain", "rise", "hop")
-TRACES = (*EVENTS, "mode", "since", "best", "highest", "liftoffs", "airborne")
+EVENTS = ("gain", "rise", "reach", "hop")
+TRACES = (*EVENTS, "mode", "since", "best", "stroke", "farthest", "liftoffs", "airborne")
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class Step:
     height: float = 0.3
     speed: float = 0.0
     miss: float = 0.0
+    along: float = 0.0
 
 
 def script(jump: str, air: str, speed: dict[int, float] | None = None) -> list[Step]:
@@ -65,6 +66,7 @@ def play(
             height=torch.tensor([step.height for step in steps]),
             vertical=torch.tensor([step.speed for step in steps]),
             miss=torch.tensor([step.miss for step in steps]),
+            along=torch.tensor([step.along for step in steps]),
             dt=DT,
         )
         for name in TRACES:
@@ -199,15 +201,44 @@ def test_a_lift_off_before_the_mode_ends_is_paid() -> None:
     assert seen["gain"][-1] == pytest.approx(1.0)
 
 
-def test_rise_is_new_height_up_to_the_apex() -> None:
+def test_rise_is_the_way_from_the_lowest_to_the_highest_trunk() -> None:
     heights = [0.3, 0.25, 0.2, 0.28, 0.5, 0.4, 0.6, 0.9, 1.0, 0.3]
     jump = [False, *[True] * 9]
     seen = alone([Step(jump=j, height=h) for j, h in zip(jump, heights, strict=True)])
-    # From .25, where the command came; .75 is as high as it pays.
-    assert seen["rise"] == pytest.approx([0, 0, 0, 0.03, 0.22, 0, 0.1, 0.15, 0, 0], abs=1e-6)
-    assert seen["highest"] == pytest.approx(
-        [0.3, 0.25, 0.25, 0.28, 0.5, 0.5, 0.6, 0.75, 0.75, 0.75], abs=1e-6
+    # The command comes at .25, the crouch adds .05; .5 is as much as is paid.
+    assert seen["rise"] == pytest.approx([0, 0, 0.05, 0.03, 0.22, 0, 0.1, 0.1, 0, 0], abs=1e-6)
+    assert seen["stroke"] == pytest.approx(
+        [0, 0, 0.05, 0.08, 0.3, 0.3, 0.4, 0.5, 0.5, 0.5], abs=1e-6
     )
+
+
+def test_a_deep_landing_is_no_crouch() -> None:
+    """Lift-off in step 2: what is lower after it was not pushed from."""
+    heights = [0.3, 0.25, 0.4, 0.5, 0.1, 0.3]
+    air = [False, False, True, True, False, False]
+    steps = [Step(jump=True, air=a, height=h) for a, h in zip(air, heights, strict=True)]
+    assert alone(steps)["rise"] == pytest.approx([0, 0.05, 0.1, 0.1, 0, 0], abs=1e-6)
+
+
+def test_reach_is_the_ground_covered_in_the_longest_flight() -> None:
+    """Steps 2 to 4 and 6 to 9 in the air; the first of each is its lift-off."""
+    steps = [
+        Step(jump=True, air=a == "1", along=v)
+        for a, v in zip("00111011110", [4, 4, 4, 2, 1, 4, 4, 2, 2, 1, 4], strict=True)
+    ]
+    seen = alone(steps)
+    expected = [0, 0, 0, 2, 1, 0, 0, 0, 1, 1, 0]
+    assert seen["reach"] == pytest.approx([DT * value for value in expected])
+    assert seen["farthest"][-1] == pytest.approx(5 * DT)
+
+
+def test_flying_backwards_reaches_nothing() -> None:
+    steps = [Step(jump=True, air=i > 1, along=-1.0) for i in range(6)]
+    assert alone(steps)["reach"] == [0] * 6
+
+
+def test_flights_without_a_command_reach_nothing() -> None:
+    assert alone([Step(air=True, along=3.0)] * 6)["reach"] == [0] * 6
 
 
 def test_the_next_command_begins_at_its_own_height() -> None:
@@ -230,7 +261,7 @@ def test_reset_forgets_one_robot_and_no_other() -> None:
         assert after[name][1] == anew[name]
 
 
-@pytest.mark.parametrize("name", ["liftoff_velocity", "prompt_s", "late_s", "settle_s", "apex"])
+@pytest.mark.parametrize("name", ["liftoff_velocity", "prompt_s", "late_s", "settle_s", "stroke"])
 def test_settings_that_are_none_are_refused(name: str) -> None:
     with pytest.raises(PronkError, match=rf"JumpSettings\.{name} is 0\.0, not positive"):
         JumpSettings(**{name: 0.0})
@@ -253,12 +284,16 @@ class Account:
     speed: float = 0.0
     scores: list[float] = field(default_factory=list)
     highest: float = 0.0
+    lowest: float = 0.0
+    stroke: float = 0.0
+    flown: float = 0.0
+    farthest: float = 0.0
 
     def step(self, now: Step) -> dict[str, float]:
         s = self.settings
         new = now.jump and not self.told
         if new:
-            self.age, self.scores = 0, []
+            self.age, self.scores, self.farthest = 0, [], 0.0
         if now.jump:
             self.settled = 0
         elif self.settled is not None and not now.air:
@@ -267,7 +302,7 @@ class Account:
                 self.settled = None
         mode = self.settled is not None
         self.age = self.age + 1 if mode else 0
-        paid = {"gain": 0.0, "hop": 0.0, "rise": 0.0, "mode": float(mode)}
+        paid = {"gain": 0.0, "hop": 0.0, "rise": 0.0, "reach": 0.0, "mode": float(mode)}
         if mode and now.air and not self.was_up:
             off = (max(self.speed, now.speed) - s.liftoff_velocity) / self.width
             late = min(max((self.age * DT - s.prompt_s) / s.late_s, 0.0), 1.0)
@@ -275,12 +310,17 @@ class Account:
             paid["gain"] = max(score - max(self.scores, default=0.0), 0.0)
             paid["hop"] = float(len(self.scores) > 0)
             self.scores.append(score)
-        height = min(now.height, s.apex)
-        if mode and not new:
-            paid["rise"] = max(height - self.highest, 0.0)
-            self.highest = max(self.highest, height)
-        else:
-            self.highest = height
+        if not mode or new:
+            self.highest = self.lowest = now.height
+            self.stroke = 0.0
+        self.highest = max(self.highest, now.height)
+        if not self.scores:
+            self.lowest = min(self.lowest, now.height)
+        stroke = min(self.highest - self.lowest, s.stroke)
+        paid["rise"], self.stroke = stroke - self.stroke, stroke
+        self.flown = self.flown + now.along * DT if mode and now.air and self.was_up else 0.0
+        if self.flown > self.farthest:
+            paid["reach"], self.farthest = self.flown - self.farthest, self.flown
         self.told, self.was_up, self.speed = now.jump, now.air, now.speed
         return paid
 
@@ -300,7 +340,11 @@ def scripts(draw: st.DrawFn) -> list[Step]:
         st.lists(st.integers(0, 56).map(lambda i: i / 64 + 0.125), min_size=60, max_size=60)
     )
     speed = draw(st.lists(st.integers(-96, 128).map(lambda i: i / 32), min_size=60, max_size=60))
-    return [Step(*now) for now in zip(jump, air, height, speed, strict=False)]
+    along = draw(st.lists(st.integers(-32, 128).map(lambda i: i / 32), min_size=60, max_size=60))
+    return [
+        Step(jump=j, air=a, height=h, speed=v, along=u)
+        for j, a, h, v, u in zip(jump, air, height, speed, along, strict=False)
+    ]
 
 
 @settings(max_examples=50)
@@ -319,12 +363,14 @@ def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) 
     seen = alone(steps)
     edges = [i for i, now in enumerate(steps) if now.jump and not (i and steps[i - 1].jump)]
     for begin, end in itertools.pairwise([*edges, len(steps)]):
-        gain, rise, hop = (seen[name][begin:end] for name in EVENTS)
+        gain, rise, reach, hop = (seen[name][begin:end] for name in EVENTS)
         assert min(*gain, 0.0) == 0.0
         assert sum(gain) == pytest.approx(max(seen["best"][begin:end]), abs=1e-5)
         assert sum(gain) <= 1.0 + 1e-5
         assert min(*rise, 0.0) == 0.0
-        assert sum(rise) <= SETTINGS.apex - min(steps[begin].height, SETTINGS.apex) + 1e-5
+        assert sum(rise) <= SETTINGS.stroke + 1e-5
+        assert min(*reach, 0.0) == 0.0
+        assert sum(reach) == pytest.approx(max(seen["farthest"][begin:end]), abs=1e-5)
         assert sum(hop) == max(max(seen["liftoffs"][begin:end]) - 1, 0)
 
 

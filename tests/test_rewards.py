@@ -208,7 +208,7 @@ CASES = [
 
 
 def test_every_term_has_a_case() -> None:
-    own = {"termination", "sparse_jump", "rise", "hop", "action_rate"}
+    own = {"termination", "sparse_jump", "rise", "reach", "hop", "action_rate"}
     assert {case.name for case in CASES} | own == set(ROWS)
 
 
@@ -267,7 +267,12 @@ def test_targets_are_what_the_torque_is_asked_for(env: Any) -> None:
 @pytest.mark.parametrize("decimation", [2, 3, 4, 5, 6])
 @pytest.mark.parametrize(
     ("name", "event", "worth"),
-    [("sparse_jump", "gain", 4.0), ("rise", "rise", 10.0), ("hop", "hop", -0.5)],
+    [
+        ("sparse_jump", "gain", 4.0),
+        ("rise", "rise", 10.0),
+        ("reach", "reach", 6.0),
+        ("hop", "hop", -0.5),
+    ],
 )
 def test_an_event_is_worth_its_weight_once(
     env: Any, name: str, event: str, worth: float, decimation: int
@@ -275,7 +280,7 @@ def test_an_event_is_worth_its_weight_once(
     """However long the policy step was (D1), and in jump mode only."""
     command = pretend(env)
     env.cfg.decimation = decimation
-    weights = JumpWeights(dense=0.0, sparse=4.0, width=1.0, rise=10.0, hop=0.5)
+    weights = JumpWeights(dense=0.0, sparse=4.0, width=1.0, rise=10.0, reach=6.0, hop=0.5)
     enter_phase(env, Phase(name="made up", iterations=1, jump=True, weights=weights))
     getattr(command.tracker, event)[:] = 0.0
     env.reward_manager.compute(dt=env.step_dt)
@@ -410,7 +415,7 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
     paper = -500 * 0.02 / PAPER_UNIT
     assert ROWS["termination"].jump <= ROWS["termination"].walk <= paper
     assert ROWS["tracking_angular"].walk * PAPER_UNIT >= PAPER["tracking_angular"][0]
-    for name in ("dense_jump", "sparse_jump", "rise", "hop"):
+    for name in ("dense_jump", "sparse_jump", "rise", "reach", "hop"):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
     for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height"):
         assert ROWS[name].walk < 0.0
@@ -426,9 +431,9 @@ def test_arguments_of_the_papers_terms() -> None:
 
 
 def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
-    weights = JumpWeights(dense=0.1, sparse=2.0, width=0.5, rise=3.0, hop=0.25)
+    weights = JumpWeights(dense=0.1, sparse=2.0, width=0.5, rise=3.0, reach=1.5, hop=0.25)
     rows = with_jump_weights(ROWS, weights)
-    changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "hop": -0.25}
+    changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5, "hop": -0.25}
     assert {name: rows[name].jump for name in changed} == changed
     assert all(rows[name].walk == 0.0 for name in changed)
     assert {name: row for name, row in rows.items() if name not in changed} == {

@@ -119,7 +119,7 @@ def test_batteries_are_drawn_with_everything_else() -> None:
     cfg = env_cfg(num_envs=1, randomization=Randomization.paper())
     assert cfg.events["supply"].params == {
         "voltage": (22.2, 25.2),
-        "resistance": (0.0, 0.1),
+        "resistance": (0.03, 0.1),
         "rated": RATED,
     }
     none = replace(Randomization.paper(), bus_voltage=None)

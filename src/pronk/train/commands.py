@@ -196,9 +196,17 @@ class MotionCommand(CommandTerm):
                 miss=torch.linalg.vector_norm(
                     self._motion.velocity_trunk[:, :2] - self.target, dim=-1
                 ),
+                along=self._along(self._motion.velocity_trunk[:, :2]),
                 dt=self._env.step_dt,
             )
         return self._motion
+
+    def _along(self, velocity: Tensor) -> Tensor:
+        """Part of a horizontal velocity (N, 2) towards `target`, no more than asked for. (N,)."""
+        target = self.target
+        speed = torch.linalg.vector_norm(target, dim=-1)
+        part = (velocity * target).sum(dim=-1) / speed.clamp_min(1e-6)
+        return torch.minimum(part, speed)
 
     def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
         """Fresh commands for robots that start anew; jumps under way are forgotten."""

@@ -20,7 +20,7 @@ from pronk.train.reward_table import ROWS, JumpWeights, with_jump_weights
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
-_NO_JUMP = JumpWeights(dense=0.0, sparse=0.0, width=1.0, rise=0.0, hop=0.0)
+_NO_JUMP = JumpWeights(dense=0.0, sparse=0.0, width=1.0, rise=0.0, reach=0.0, hop=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,22 +50,22 @@ class Phase:
 
 
 PHASES: tuple[Phase, ...] = (
-    Phase(name="walk", iterations=350, jump=False),
+    Phase(name="walk", iterations=310, jump=False),
     # Jumping has to be found.
     Phase(
         name="jump_a",
-        iterations=310,
+        iterations=290,
         jump=True,
-        weights=JumpWeights(dense=0.02, sparse=8.0, width=1.0, rise=20.0, hop=0.0),
+        weights=JumpWeights(dense=0.02, sparse=8.0, width=1.0, rise=20.0, reach=10.0, hop=0.0),
         entropy=0.01,
     ),
     # And then done alike every time.
     Phase(
         name="jump_b",
-        iterations=640,
+        iterations=560,
         jump=True,
-        weights=JumpWeights(dense=0.002, sparse=8.0, width=0.3, rise=25.0, hop=0.5),
-        entropy=0.002,
+        weights=JumpWeights(dense=0.002, sparse=8.0, width=0.3, rise=25.0, reach=10.0, hop=0.5),
+        entropy=0.003,
         estimator_rate=3e-4,
     ),
 )

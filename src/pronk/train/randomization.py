@@ -55,7 +55,7 @@ class Randomization:
     bus_voltage: Range | None = (22.2, 25.2)
     """Voltage of a robot's battery at no load [V]: six lithium cells, 3.7 V (their nominal, and all
     but empty) to 4.2 V (full). Not in the paper; None holds the rated voltage whatever is drawn."""
-    bus_resistance: Range = (0.0, 0.1)
+    bus_resistance: Range = (0.03, 0.1)
     """Of battery and wires [ohm]: six cells of 5 to 12 milliohm, the rest plugs and wires. A jump
     draws a kilowatt and more, which costs 7 V at most. Not in the paper."""
     delay: int = 1

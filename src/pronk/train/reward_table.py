@@ -45,7 +45,9 @@ class JumpWeights:
     width: float
     """Standard deviation of the lift-off kernel [m/s]; the paper's expression has 1."""
     rise: float
-    """Per metre of new height."""
+    """Per metre of the jump's height."""
+    reach: float
+    """Per metre of ground newly covered in flight."""
     hop: float
     """Per lift-off after the first."""
 
@@ -90,6 +92,7 @@ ROWS: Mapping[str, Row] = {
     "sparse_jump": Row(rewards.sparse_jump, 0.0, 0.0),
     # Not in the paper.
     "rise": Row(rewards.rise, 0.0, 0.0),
+    "reach": Row(rewards.reach, 0.0, 0.0),
     "hop": Row(rewards.hop, 0.0, 0.0),
     "action_rate": Row(rewards.action_rate, -0.02, -0.005),
     "roll_pitch_rate": Row(rewards.roll_pitch_rate, -0.02, -0.02),
@@ -113,6 +116,7 @@ def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str
         "dense_jump": -weights.dense,
         "sparse_jump": weights.sparse,
         "rise": weights.rise,
+        "reach": weights.reach,
         "hop": -weights.hop,
     }
     if missing := sorted(set(changed) - set(rows)):

@@ -111,8 +111,13 @@ def sparse_jump(command: MotionCommand) -> Tensor:
 
 
 def rise(command: MotionCommand) -> Tensor:
-    """New height of the trunk within this command [m]: lift-off made dense; an event."""
+    """New height of the jump, lowest to highest trunk [m]: lift-off made dense; an event."""
     return command.per_event(command.tracker.rise)
+
+
+def reach(command: MotionCommand) -> Tensor:
+    """New ground covered in flight within this command [m], where it was told to go; an event."""
+    return command.per_event(command.tracker.reach)
 
 
 def hop(command: MotionCommand) -> Tensor:
