@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pronk.deploy.links import Link, Paced
+from pronk.errors import HardwareError
 from pronk.hardware.machine import Command, State
 
 
@@ -26,6 +27,8 @@ class FaultyLink:
     """Event: states stop coming."""
     stuck: Any
     """Event: states come with fresh stamps and old numbers."""
+    broken: Any = None
+    """Event: the link complains at every look; None for never."""
     loss: float = 0.0
     """Share of the states that is lost."""
     robot: str = "mini_cheetah"
@@ -55,6 +58,8 @@ class Faulty:
         return self._last or self.inner.latest()
 
     def wait(self, until: float) -> list[State]:
+        if self.link.broken is not None and self.link.broken.is_set():
+            raise HardwareError("the cable was pulled out.")
         met = [state for state in self.inner.wait(until) if self._rng.random() >= self.link.loss]
         if self.link.freeze.is_set():
             met = []

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hopper import ROBOT, write_hopper
-from pronk.commands import demo_trial
+from pronk.commands import console, demo_trial
 from pronk.errors import ArtefactError, PronkError
 
 pytest.importorskip("onnxruntime")
@@ -58,3 +58,53 @@ def test_without_onnxruntime_the_demo_goes_on_and_names_the_extra(
     found, lack = demo_trial.find(None, ROBOT)
     assert not found
     assert "pip install 'pronk[policy]'" in lack
+
+
+class Told(console.Reporter):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+
+    def __call__(self, stage: str, share: float) -> None:
+        self.stages.append(stage)
+
+
+def test_a_policy_that_changes_is_told_of_by_whoever_waits_for_the_jumps(tmp_path: Path) -> None:
+    policy = tmp_path / "policy.onnx"
+    policy.write_bytes(b"none")
+    with (
+        demo_trial.beside(
+            [policy], tmp_path / "out", robot=ROBOT, jumps=1, seed=0, report=Told()
+        ) as done,
+        pytest.raises(ArtefactError, match="not a network"),
+    ):
+        done()
+
+
+def test_without_policies_nothing_is_done_beside(tmp_path: Path) -> None:
+    with demo_trial.beside([], tmp_path, robot=ROBOT, jumps=1, seed=0, report=Told()) as done:
+        assert done() == demo_trial.Jumped()
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_goes_wrong_elsewhere_stops_the_jumps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares: list[float] = []
+
+    def forever(*_: object, report: console.Reporter, **__: object) -> None:
+        while True:
+            shares.append(0.0)
+            report("jump", 0.0)
+
+    monkeypatch.setattr(demo_trial, "jump", forever)
+
+    def fail() -> None:
+        with demo_trial.beside([tmp_path], tmp_path, robot=ROBOT, jumps=1, seed=0, report=Told()):
+            while not shares:
+                pass
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()

@@ -17,11 +17,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import pronk.deploy.log
 from pronk.deploy.hands import Gamepad, Keyboard
 from pronk.deploy.limits import Limits
 from pronk.deploy.links import Link
-from pronk.deploy.log import DeployLogWriter, is_deploy_log, read_deploy_log
-from pronk.deploy.operators import Scripted, Timed
+from pronk.deploy.log import is_deploy_log, read_deploy_log
+from pronk.deploy.log_writer import DeployLogWriter
+from pronk.deploy.operators import Scripted, Stick, Timed
 from pronk.deploy.preflight import delay_objection, refusals
 from pronk.deploy.reasons import Level, Reason
 from pronk.deploy.records import EVENT, STEP, TICK, Mode, Wish, event, get_state, put_state
@@ -33,6 +35,7 @@ from pronk.errors import HardwareError, LogError, RobotError
 from pronk.hardware.machine import State
 from pronk.hardware.realtime import Histogram, Pace
 from pronk.robots import load_robot
+from pronk.sweep.mcap_stream import MOST_BYTES, DamagedError, records
 from pronk.trial.protocol import Script
 
 ROBOT = load_robot("mini_cheetah")
@@ -336,6 +339,27 @@ def test_a_policy_that_never_answers_is_a_fault() -> None:
     assert (run.memory.reason, run.director.mode) == (Reason.EXPIRED, Mode.FAULT)
 
 
+@pytest.mark.parametrize("answers", [0, 1])
+def test_told_to_sit_at_once_the_policy_is_still_heard(answers: int) -> None:
+    run = Run(halt_s=1.0).standing()
+    run.tick(0.0, Wish.WALK)
+    walking = run.director.entry
+    run.give(POSE + 0.4, entry=walking - 1)
+    run.tick(0.002, Wish.SIT)
+    assert (run.director.mode, run.director.entry) == (Mode.HALT, walking + 1)
+    # It knows nothing of the halt yet, or nothing of the walk before it.
+    run.give(POSE + 0.4, entry=walking + answers)
+    assert run.tick(0.02).blend == 0.0
+    for _ in range(20):
+        run.give(POSE + 0.4, entry=walking + answers)
+        intent = run.tick(0.02)
+        assert intent.command is not None
+    assert intent.blend == pytest.approx(1.0)
+    np.testing.assert_allclose(intent.command.position, POSE + 0.4)
+    run.tick(1.0)
+    assert (run.director.mode, run.memory.faulted) == (Mode.SIT, False)
+
+
 def test_an_objection_keeps_the_policy_out_and_is_told() -> None:
     run = Run().standing()
     run.objection = "too slow."
@@ -527,6 +551,18 @@ def test_keys_of_a_terminal(terminal: tuple[int, Keyboard]) -> None:
     assert keyboard.stick(2.1, Mode.DAMP).command == (0.0, 0.0, 0.0)
 
 
+def test_a_terminal_that_is_gone_leaves() -> None:
+    master, slave = pty.openpty()
+    keyboard = Keyboard(RANGES, slave)
+    os.write(master, b" w")
+    assert keyboard.stick(0.0, Mode.POLICY).held
+    os.close(master)
+    for _ in range(2):
+        assert keyboard.stick(0.1, Mode.POLICY) == Stick(wish=Wish.QUIT)
+    keyboard.close()
+    os.close(slave)
+
+
 def test_without_a_terminal_there_is_no_keyboard() -> None:
     read, write = os.pipe()
     with pytest.raises(HardwareError, match="--script"):
@@ -577,6 +613,7 @@ def test_a_link_that_there_is_not_is_refused() -> None:
 # --- The log ------------------------------------------------------------------------------------
 
 HEADER = {"robot": "mini_cheetah", "joints": list(ROBOT.joint_names)}
+PER_TICK = {f"/deploy/{topic}" for topic in ("state", "asked", "sent", "timing")}
 
 
 def record(number: int, **changes: Any) -> np.void:
@@ -653,6 +690,82 @@ def test_a_log_cut_anywhere_is_read_up_to_there_or_refused(
     assert len(log.tick) in (10, 20, 30, 40, 50, 60)
     np.testing.assert_array_equal(log.tick, np.arange(len(log.tick)))
     assert log.complete or share < 1.0
+
+
+def test_a_long_log_is_read_chunk_by_chunk_and_only_what_is_asked_for(tmp_path: Path) -> None:
+    path, count = tmp_path / "long.mcap", 2600
+    writer = DeployLogWriter(path, HEADER)
+    for k in range(count):
+        writer.tick(record(k, asked=POSE + k, latency=np.nan if k % 10 else k / 1e4))
+        if k % 10 == 0:
+            step = np.zeros((), dtype=STEP)
+            step["sequence"], step["action"], step["live"] = k // 10, k, 1
+            writer.step(np.frombuffer(step.tobytes(), dtype=STEP)[0])
+        if k % 70 == 0:
+            writer.flush()
+    writer.end(complete=True, figures={})
+    log = read_deploy_log(path)
+    np.testing.assert_array_equal(log.asked, POSE + np.arange(count)[:, None])
+    np.testing.assert_array_equal(log.latency[::10], np.arange(0, count, 10) / 1e4)
+    assert np.isnan(log.latency).sum() == count * 9 // 10
+    np.testing.assert_array_equal(log.action, np.tile(np.arange(0, count, 10)[:, None], 12))
+
+    part = read_deploy_log(path, only=("latency", "action"))
+    for name, value in vars(log).items():
+        found = getattr(part, name)
+        if name in ("latency", "action"):
+            np.testing.assert_array_equal(found, value)
+        elif isinstance(value, np.ndarray):
+            assert (found.shape, found.dtype) == ((0, *value.shape[1:]), value.dtype), name
+        else:
+            assert found == value
+    with pytest.raises(LogError, match=r"asked for speed; the arrays of a log are time, tick"):
+        read_deploy_log(path, only=("latency", "speed"))
+
+
+def test_a_log_of_an_hour_may_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.mcap"
+    rng, writer = np.random.default_rng(0), DeployLogWriter(path, HEADER)
+    for k in range(100):
+        # Numbers of full length, as sensors give them.
+        names = ("position", "velocity", "torque", "asked", "sent", "gyro", "accelerometer")
+        shapes = {name: TICK[name].shape for name in names}
+        writer.tick(record(k, **{name: rng.standard_normal(of) for name, of in shapes.items()}))
+    writer.end(complete=True, figures={})
+    with path.open("rb") as file:
+        batches = list(records(file, path.stat().st_size))
+    ticks = [len(each.data) for batch in batches for each in batch if each.topic in PER_TICK]
+    assert len(ticks) == 400
+    an_hour = 3600 * 500 * sum(ticks) / 100
+    assert MOST_BYTES < an_hour < pronk.deploy.log._MOST_BYTES
+    # That is the bound that holds for it.
+    unpacked = sum(len(each.data) for batch in batches for each in batch)
+    monkeypatch.setattr("pronk.deploy.log._MOST_BYTES", unpacked // 2)
+    with pytest.raises(LogError, match="cut before the first tick"):
+        read_deploy_log(path)
+    with path.open("rb") as file, pytest.raises(DamagedError, match="more than 0 MiB"):
+        list(records(file, path.stat().st_size, unpacked // 2))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"position": [0.0] * 11},
+        {"sequence": 2**63},
+        {"sequence": None},
+        {"velocity": "fast"},
+        {"t": {}},
+    ],
+)
+def test_messages_of_another_kind_are_refused(changes: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = DeployLogWriter(path, HEADER)
+    writer.tick(record(0))
+    body = {name: np.asarray(value).tolist() for name, value in vars(state()).items()}
+    writer._put("state", 0.0, {"t": 0.0, **body, **changes})
+    writer.end(complete=True, figures={})
+    with pytest.raises(LogError, match="its messages are not those of"):
+        read_deploy_log(path)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.jumps import Jump, JumpRules, Series, measure, unasked_height
+from pronk.jumps import Jump, JumpRules, Series, answer, measure, unasked_height
 from pronk.train import evaluate_bars, evaluate_result
 from pronk.train.evaluate_bars import Check, checks, cost_of_jumping
 from pronk.train.evaluate_plan import JUMPS, NEVER, WALKS, Case, Plan
@@ -185,6 +185,22 @@ def test_an_evaluation_comes_back_from_its_file(tmp_path: Path) -> None:
     assert evaluate_result.load(path).speed_errors()["back 2"] == 0.1
 
 
+def test_a_file_from_before_touches_were_counted_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "evaluation.json"
+    whole = evaluation(jumps=(jump("back 2", touched=0.7),))
+    evaluate_result.save(path, whole, [])
+    assert evaluate_result.load(path).jumps[0].touched == 0.7
+    body = json.loads(path.read_text())
+    del body["jumps"][0]["touched"]
+    path.write_text(json.dumps(body))
+    assert math.isnan(evaluate_result.load(path).jumps[0].touched)
+    # What was always there has to be there.
+    del body["jumps"][0]["upright"]
+    path.write_text(json.dumps(body))
+    with pytest.raises(ArtefactError, match="not a whole evaluation \\('upright'\\)"):
+        evaluate_result.load(path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -294,6 +310,7 @@ def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
     on = rng.integers(0, 300, size=count)
     on[::10] = NEVER
     end = np.where(rng.random(count) < 0.3, rng.integers(1, length, size=count), length)
+    touching = rng.random((length, count)) < 0.003
     broken = np.flatnonzero(end < length)[::2]
     state[end[broken], broken, rng.integers(0, 13, size=len(broken))] = math.nan
     command = rng.normal(size=(count, 2))
@@ -304,10 +321,11 @@ def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
         # The input may go on and off; its first rise counts.
         recorder.tell((k >= told) & ((k - told) % 7 < 4), k)
         alive = torch.tensor((k < end) | np.isin(np.arange(count), broken))
-        recorder.add(torch.tensor(state[k]), torch.tensor(airborne[k]), alive)
+        contacts = (torch.tensor(airborne[k]), torch.tensor(touching[k]))
+        recorder.add(torch.tensor(state[k]), *contacts, alive)
     got = recorder.figures(command)
 
-    seen = {"jumped": 0, "hopped": 0, "both": 0, "ran": 0, "upright": 0, "nothing": 0}
+    seen = {"touched": 0, "jumped": 0, "hopped": 0, "both": 0, "ran": 0, "upright": 0, "nothing": 0}
     for i in range(count):
         life = slice(0, end[i])
         whole = Series(
@@ -326,12 +344,114 @@ def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
             seen["nothing"] += 1
         for name, value in vars(expected).items():
             assert got[name][i] == pytest.approx(float(value), abs=1e-5, nan_ok=True), (i, name)
+        touched = False
+        if told_at is not None:
+            main = answer(whole, told_at, rules).main
+            # What fell lies there; without a jump the fall ends the window.
+            lies = np.r_[touching[life, i], np.full(length - end[i], main is not None)]
+            judged = main.touchdown + 60 if main else told_at + 100
+            touched = bool(lies[told_at : judged + 1].any())
+        assert got["touched"][i] == touched, i
+        seen["touched"] += touched
         seen["jumped"] += expected.found
         seen["hopped"] += expected.high_flights > 2
         seen["both"] += expected.long_flights > expected.high_flights > 0
         seen["ran"] += expected.long_flights > 0 and not expected.found
         seen["upright"] += expected.upright
     assert min(seen.values()) > 15, seen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Life:
+    """One robot that is told to jump at sample 20, and whether it touched until it was judged."""
+
+    flights: tuple[tuple[int, int], ...] = ((40, 60),)
+    """First samples in the air and on the ground again."""
+    touches: int = NEVER
+    """The one sample with something else than a foot on the ground."""
+    falls: int = NEVER
+    """From here on it lies on its side."""
+    touched: bool
+
+
+LIVES = {
+    "on its feet all the time": Life(touched=False),
+    "before the command": Life(touches=19, touched=False),
+    "with the command": Life(touches=20, touched=True),
+    "in the air": Life(touches=50, touched=True),
+    ".3 s after touchdown": Life(touches=120, touched=True),
+    "later": Life(touches=121, touched=False),
+    "before a late touchdown": Life(flights=((78, 108),), touches=100, touched=True),
+    "after the longer of two": Life(flights=((40, 60), (75, 105)), touches=130, touched=True),
+    "after the shorter of two": Life(flights=((40, 60), (75, 90)), touches=130, touched=False),
+    "without a jump, .3 s after the command": Life(flights=(), touches=80, touched=True),
+    "without a jump, later": Life(flights=(), touches=81, touched=False),
+    "fell after the jump": Life(falls=100, touched=True),
+    "fell later": Life(falls=121, touched=False),
+    "fell in the air": Life(falls=50, touched=False),
+    "fell before the command": Life(falls=10, touches=30, touched=False),
+}
+
+
+@pytest.mark.train
+def test_what_touches_is_counted_as_a_trial_counts_it() -> None:
+    """Each life by hand, on the device, and as a capture of the virtual robot."""
+    torch = pytest.importorskip("torch")
+    from pronk.hardware.capture import Capture
+    from pronk.robots import load_robot
+    from pronk.train.evaluate_flight import FlightRecorder
+    from pronk.trial.metrics import measure as measure_capture
+    from pronk.trial.protocol import Script
+
+    rules = JumpRules(search_s=0.3, tail_s=0.1, upright_s=0.3)
+    length, count = 200, len(LIVES)
+    state = np.zeros((length, count, 13), np.float32)
+    state[..., 2], state[..., 3] = rules.standing_height, 1.0
+    airborne, touching, lies = (np.zeros((length, count), bool) for _ in range(3))
+    for i, life in enumerate(LIVES.values()):
+        for up, down in life.flights:
+            airborne[up:down, i], state[up:down, i, 2] = True, rules.high + 0.01
+        touching[life.touches : life.touches + 1, i] = True
+        lies[life.falls :, i] = True
+    state[lies, 3:7] = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
+
+    # One more, that walks: nobody tells it to jump, and its knees are on the ground.
+    walker = np.arange(count + 1) == count
+    whole = np.pad(state, ((0, 0), (0, 1), (0, 0)), mode="edge")
+    recorder = FlightRecorder(count + 1, device="cpu", rules=rules, dt=DT)
+    for k in range(length):
+        recorder.tell(torch.tensor(~walker & (k >= 20)), k)
+        recorder.add(
+            torch.tensor(whole[k]),
+            torch.tensor(np.r_[airborne[k], False]),
+            torch.tensor(np.r_[touching[k], True]),
+            torch.tensor(np.r_[~lies[k], True]),
+        )
+    got = recorder.figures(np.tile([1.0, 0.0], (count + 1, 1)))["touched"]
+
+    script = Script(command=(1.0, 0.0, 0.0), stand_s=0.05, run_s=0.05)
+    none = np.zeros((length, 12))
+    for i, (name, life) in enumerate(LIVES.items()):
+        capture = Capture(
+            time=DT * np.arange(length),
+            position=state[:, i, 0:3].astype(float),
+            orientation=state[:, i, 3:7].astype(float),
+            velocity=none[:, :3],
+            angular_velocity=none[:, :3],
+            foot_position=none.reshape(length, 4, 3),
+            contact=np.repeat(~airborne[:, i, None], 4, axis=1),
+            other_contact=touching[:, i] | lies[:, i],
+            joint_position=none,
+            joint_velocity=none,
+            torque=none,
+            electrical_power=none[:, 0],
+            bus_voltage=none[:, 0],
+        )
+        trial = measure_capture(
+            capture, script, load_robot("mini_cheetah"), began=0.0, mass=12.0, rules=rules
+        )
+        assert (trial.touched, got[i]) == (life.touched, life.touched), name
+    assert got[count] == 0.0
 
 
 @pytest.mark.train
@@ -434,6 +554,7 @@ class Seen:
     evaluation: Evaluation
     state: np.ndarray
     airborne: np.ndarray
+    touching: np.ndarray
     alive: np.ndarray
     looks: list[tuple[int, np.ndarray, np.ndarray]]
     """Sample, command and jump input each time the policy looked."""
@@ -458,11 +579,12 @@ def seen() -> Seen:
     state.pos = (0.0, 0.0, state.pos[2] + DROP)
     env = ManagerBasedRlEnv(evaluation_cfg(cfg, SHORT), device="cpu")
     ear = env.metrics_manager.cfg[TERM].func
-    states, airborne, looks, shares = [], [], [], []
+    states, airborne, touching, looks, shares = [], [], [], [], []
 
-    def watch(state: Any, flying: Any, alive: Any) -> None:
+    def watch(state: Any, flying: Any, limbs: Any, alive: Any) -> None:
         states.append((state.numpy().copy(), alive.numpy().copy()))
         airborne.append(flying.numpy().copy())
+        touching.append(limbs.numpy().copy())
 
     def policy(obs: Any) -> Any:
         if not looks:
@@ -487,6 +609,7 @@ def seen() -> Seen:
         evaluation=found,
         state=np.stack([state for state, _ in states]),
         airborne=np.stack(airborne),
+        touching=np.stack(touching),
         alive=np.stack([alive for _, alive in states]),
         looks=looks,
         shares=shares,
@@ -503,6 +626,15 @@ def test_contacts_belong_to_the_positions_they_are_paired_with(seen: Seen) -> No
     assert z[:landing] == pytest.approx(fall, abs=1e-4)
     assert z[landing - 1] - z[landing] == pytest.approx(0.012, abs=1e-3)
     assert z[landing] <= SHORT.rules.standing_height < z[landing - 1]
+
+
+@pytest.mark.train
+def test_what_touches_is_of_the_same_moment(seen: Seen) -> None:
+    """Fallen .3 m and held by soft drives alone they sink onto their knees, feet first."""
+    first = seen.touching[:, :5].argmax(axis=0)
+    landing = seen.airborne[:, :5].argmin(axis=0)
+    assert np.all((first > landing) & (first < landing + 40))
+    assert seen.state[first, range(5), 2].max() < SHORT.rules.standing_height - 0.05
 
 
 @pytest.mark.train
@@ -539,6 +671,9 @@ def test_a_run_says_what_the_definitions_say(seen: Seen) -> None:
             assert jump is not None
             assert found.jumps[0].height.mean == pytest.approx(jump.height, abs=1e-5)
             assert found.jumps[0].height.mean > 1e-4
+            # It did not jump; the other one fell before it was told.
+            knees = seen.touching[first[i] : first[i] + 41, i].any()
+            assert found.jumps[0].touched == knees / 2
     assert [r.unasked.share for r in results] == [1.0, 1.0, 1.0]
     assert [r.unasked.highest for r in results] == pytest.approx([DROP] * 3, abs=2e-3)
     stood = found.walks[1]
@@ -596,6 +731,7 @@ def test_a_run_is_written_and_shown(
     said = capsys.readouterr().out
     assert "forward 2: speed error" in said
     assert "jump side +1: distance" in said
+    assert "touched: anything but a foot on the ground" in said
     assert "velocity RMSE 0.100 m/s" in said
 
 

@@ -252,6 +252,7 @@ def test_the_writer_repeats_damping_and_nothing_else() -> None:
     time.sleep(0.05)
     assert written == [encode_command(CHEETAH, HOLD)]
     assert writer.is_own(written[0])
+    assert not writer.is_own(written[0]), "the same bytes again are somebody else's"
     assert not writer.is_own(b"else")
     writer.damp()
     while len(written) < 5:
@@ -264,6 +265,41 @@ def test_the_writer_repeats_damping_and_nothing_else() -> None:
     writer.stop()
     writer.damp()
     assert len(written) == count
+
+
+def test_a_wire_that_fails_never_ends_the_damping() -> None:
+    wire: list[bytes] = []
+    cut = threading.Event()
+
+    def publish(data: bytes) -> None:
+        if cut.is_set():
+            raise OSError(101, "Network is unreachable")
+        wire.append(data)
+
+    writer = CommandWriter(CHEETAH, publish)
+    try:
+        writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
+        cut.set()
+        # It expires while the wire takes nothing; nobody else is there to damp.
+        until = time.monotonic() + 20.0
+        while writer.counts["not written"] < 5 and time.monotonic() < until:
+            time.sleep(0.01)
+        assert (len(wire), writer.counts["expired"]) == (1, 1)
+        # Whoever commands is told; damping never complains.
+        with pytest.raises(
+            HardwareError, match=r"put on the wire \(\[Errno 101\] Network is unrea"
+        ):
+            writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
+        writer.damp()
+        cut.clear()
+        while len(wire) < 5 and time.monotonic() < until:
+            time.sleep(0.01)
+        assert len(wire) >= 5
+        assert len(set(wire[1:])) == 1
+        assert decode_command(CHEETAH, wire[1]).stiffness.max() == 0.0
+        assert writer.counts["commands"] == 1
+    finally:
+        writer.stop()
 
 
 def test_a_twin_that_dies_leaves_a_link_that_still_closes(twins: dict[str, Process]) -> None:

@@ -71,7 +71,13 @@ def test_other_numbers_of_iterations() -> None:
 def settled(phase: Phase) -> dict[str, tuple[float, float]]:
     """Weights that a phase should have, from its own numbers."""
     w = phase.weights
-    jump = {"dense_jump": -w.dense, "sparse_jump": w.sparse, "rise": w.rise, "reach": w.reach, "hop": -w.hop}
+    jump = {
+        "dense_jump": -w.dense,
+        "sparse_jump": w.sparse,
+        "rise": w.rise,
+        "reach": w.reach,
+        "hop": -w.hop,
+    }
     return {name: (row.walk, jump.get(name, row.jump)) for name, row in ROWS.items()}
 
 

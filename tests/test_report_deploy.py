@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pronk.cli import app
-from pronk.deploy.log import DeployLog, DeployLogWriter, read_deploy_log
+from pronk.deploy.log import DeployLog, read_deploy_log
+from pronk.deploy.log_writer import DeployLogWriter
 from pronk.deploy.reasons import Level, Reason
 from pronk.deploy.records import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
 from pronk.errors import LogError

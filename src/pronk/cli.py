@@ -17,6 +17,7 @@ import typer
 from pronk import __version__
 from pronk.commands import (
     bench,
+    bench_links,
     bench_tick,
     bench_train,
     bench_trial,
@@ -65,6 +66,7 @@ for _command in (bench.match, bench.grid, bench.engine, bench.coverage):
 _bench.command("train")(bench_train.train)
 _bench.command("trial")(bench_trial.trial)
 _bench.command("tick")(bench_tick.tick)
+_bench.command("links")(bench_links.links)
 app.add_typer(_bench, name="bench")
 
 

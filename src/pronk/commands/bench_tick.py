@@ -11,16 +11,17 @@ from pronk.commands import console
 
 
 def tick(
-    policy: Annotated[Path, typer.Argument(help="policy.onnx, whose network runs at each tick.")],
-    seconds: Annotated[float, typer.Option(help="Of each of the four cases.")] = 20.0,
+    policy: Annotated[Path, typer.Argument(help="policy.onnx, which decides at each tick.")],
+    seconds: Annotated[float, typer.Option(help="Of each of the four cases.")] = 40.0,
     json_file: console.JsonOption = None,
 ) -> None:
-    """Lateness at 50 Hz, idle and beside two CPU hogs, with and without real-time scheduling."""
-    from pronk.bench.tick import figures, run, table
+    """Lateness and the policy's answer at 50 Hz: idle, beside CPU hogs, with real time, without."""
+    from pronk.bench.tick import bars, figures, run, table
 
     with console.progress() as report:
         rows = run(policy, seconds, report)
     console.show(table(rows))
+    console.show(bars(rows))
     for line in dict.fromkeys(line for row in rows for line in row.granted):
         console.say(line)
     console.write_json(json_file, figures(rows))

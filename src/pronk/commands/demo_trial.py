@@ -1,9 +1,17 @@
-"""The jumps of `pronk demo`: the shipped policies through a short trial, one of them filmed."""
+"""The jumps of `pronk demo`: the shipped policies through a short trial, one jump filmed.
+
+They are done beside the sweep and the match, in processes of their own that a thread waits for.
+"""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +26,17 @@ FOLDER = "trial"
 """Below the demo's."""
 FILMED = "forward 2"
 """The command that is shown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Jumped:
+    """What came of the jumps."""
+
+    trial: Trial | None = None
+    """None without policies."""
+    videos: tuple[Path, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """How long each part took [s]."""
 
 
 def shipped() -> Path:
@@ -61,6 +80,69 @@ def find(folder: Path | None, robot: Robot) -> tuple[list[Path], str]:
         )
     load_subjects(found, robot)
     return found, ""
+
+
+class _Reporter(console.Reporter):
+    """Progress that ends its work once nobody wants it any more."""
+
+    def __init__(self, report: console.Reporter, stop: threading.Event) -> None:
+        self._report, self._stop = report, stop
+
+    def __call__(self, stage: str, share: float) -> None:
+        """Tell it.
+
+        Raises:
+            PronkError: The work is not wanted any more.
+        """
+        if self._stop.is_set():
+            raise PronkError(f"{stage}: stopped with the rest of the demo.")
+        self._report(stage, share)
+
+
+@contextmanager
+def beside(
+    policies: Sequence[Path],
+    out: Path,
+    *,
+    robot: Robot,
+    jumps: int,
+    seed: int,
+    report: console.Reporter,
+) -> Iterator[Callable[[], Jumped]]:
+    """Jump and film while the block does something else.
+
+    Args:
+        policies: From `find`; without any, nothing is done.
+        out: Folder of the trial.
+        robot: What they are for.
+        jumps: With each of the paper's commands.
+        seed: Of starts and noise.
+        report: Told the share done, from another thread.
+
+    Yields:
+        A function that waits for the end and gives what came of it, or raises what went wrong. A
+        block that is left by an error stops the jumps.
+    """
+    stop = threading.Event()
+    told = _Reporter(report, stop)
+
+    def work() -> Jumped:
+        if not policies:
+            return Jumped()
+        begun = time.perf_counter()
+        found = jump(policies, out, robot=robot, jumps=jumps, seed=seed, report=told)
+        jumped = time.perf_counter()
+        videos = film(found, out, report=told)
+        seconds = {"jump": jumped - begun, "video": time.perf_counter() - jumped}
+        return Jumped(trial=found, videos=videos, seconds=seconds)
+
+    with ThreadPoolExecutor(1) as thread:
+        done = thread.submit(work)
+        try:
+            yield done.result
+        except BaseException:
+            stop.set()
+            raise
 
 
 def jump(

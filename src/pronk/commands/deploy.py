@@ -5,22 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pronk.commands import confirm, console
 from pronk.commands.choices import Base, Link
-from pronk.errors import HardwareError
+from pronk.errors import HardwareError, PronkError
 
 if TYPE_CHECKING:
     from pronk.deploy.operators import Operator
     from pronk.deploy.run import Notice, Outcome
     from pronk.policy.contract import Contract
+    from pronk.trial.protocol import Script
 
 
 _FAILED = 1
 """Exit status of a run that a fault ended."""
+_INTERRUPTED = 130
+"""Exit status of a run that somebody ended by the interrupt key or another signal."""
 
 
 def deploy(
@@ -105,28 +108,31 @@ def deploy(
         any_delay=any_delay,
         real_time=real_time,
     )
+    scripts = None if script is None else _scripts(script, contract, walk_only)
     if interface is not None and link is not Link.TWIN and not yes:
         confirm.before_it_moves(contract.robot, f"{link.value} on {interface}")
-    with _operator(contract, script, walk_only, gamepad, seconds) as (operator, words):
+    with _operator(contract, scripts, gamepad, seconds) as (operator, words):
         console.say(words)
         outcome = fly(plan, operator, _tell)
     _report(outcome)
-    console.wrote(*(path for path in (log, capture) if path is not None))
+    lost = [notice.text for notice in outcome.notices if notice.kind == "lost"]
+    console.wrote(*(path for path in (log, None if lost else capture) if path is not None))
     console.write_json(json_file, outcome.figures())
     console.following(
         f"pronk report {log}"
         if log is not None
         else f"pronk deploy {policy} --link {link.value} --log run.mcap   # keeps everything"
     )
-    if outcome.faults or outcome.refusals:
+    if outcome.faults or outcome.refusals or lost:
         raise typer.Exit(_FAILED)
+    if outcome.interrupted:
+        raise typer.Exit(_INTERRUPTED)
 
 
 @contextmanager
 def _operator(
     contract: Contract,
-    script: str | None,
-    walk_only: bool,
+    scripts: list[Script] | None,
     gamepad: Path | None,
     seconds: float | None,
 ) -> Iterator[tuple[Operator, str]]:
@@ -134,8 +140,8 @@ def _operator(
     from pronk.deploy.hands import HELP, PAD_HELP, Gamepad, Keyboard
     from pronk.deploy.operators import Scripted, Timed
 
-    if script is not None:
-        unattended = Scripted(_scripts(script, contract, walk_only))
+    if scripts is not None:
+        unattended = Scripted(scripts)
         what = f"unattended: {len(unattended.scripts)} scripts, {unattended.seconds:.0f} s."
         yield (unattended if seconds is None else Timed(unattended, seconds)), what
         return
@@ -153,10 +159,23 @@ def _operator(
         held.close()
 
 
-def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Any]:
-    from pronk.trial.protocol import PAPER_COMMANDS, Script, parse_case
+def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
+    """What is asked for, unattended.
 
-    cases = PAPER_COMMANDS if text == "paper" else (parse_case(text),)
+    Raises:
+        PronkError: It is no command, or none that the policy was trained for.
+    """
+    from pronk.trial.protocol import Script, parse_cases
+
+    cases = parse_cases([text])
+    ranges = contract.command_ranges
+    for case in cases:
+        for value, (name, (low, high)) in zip(case.command, ranges.items(), strict=True):
+            if not low <= value <= high:
+                raise PronkError(
+                    f"--script {text}: {name} {value:g} of {case.name!r} is none that the policy "
+                    f"was trained for, {low:g} to {high:g}; ask for one of those."
+                )
     jump_s = 0.5 if contract.jump and not walk_only else 0.0
     return [Script(command=case.command, jump_s=jump_s) for case in cases]
 
@@ -164,7 +183,7 @@ def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Any]:
 def _tell(notice: Notice) -> None:
     """One line for each thing that happened."""
     line = f"{notice.kind}: {notice.text}"
-    if notice.kind in ("fault", "refused", "notice"):
+    if notice.kind in ("fault", "refused", "notice", "lost"):
         console.warn(line)
     else:
         console.err().print(line, markup=False)
@@ -183,6 +202,7 @@ def _report(outcome: Outcome) -> None:
         ("state to command", servo.get("state_to_command")),
         ("policy step late", policy.get("lateness")),
         ("policy's decision", policy.get("decision")),
+        ("the network alone", policy.get("network")),
     )
     keys = ("p50_ms", "p95_ms", "p99_ms", "p99_9_ms", "max_ms")
     for name, figures in rows:

@@ -255,6 +255,7 @@ def show_jumps(evaluation: Evaluation) -> None:
         "one [%]",
         "jumped [%]",
         "upright [%]",
+        "touched [%]",
     )
     for jump in evaluation.jumps:
         console.row(
@@ -271,8 +272,13 @@ def show_jumps(evaluation: Evaluation) -> None:
             percent(jump.single),
             percent(jump.found),
             percent(jump.upright),
+            percent(jump.touched),
         )
     console.show(made)
+    console.say(
+        "  touched: anything but a foot on the ground, from the command to 2 s after touchdown; a "
+        "trial counts no such jump as a success."
+    )
 
 
 def spread(figure: Spread, digits: int = 2) -> str:

@@ -72,5 +72,8 @@ def play(
     finally:
         if pad is not None:
             pad.close()
-    console.say(f"{played.simulated_s:.0f} s of the virtual robot, {len(played.hops)} jumps")
+    console.say(
+        f"{played.simulated_s:.0f} s of the virtual robot in {played.wall_s:.0f} s "
+        f"({played.factor:.2f} x real time), {len(played.hops)} jumps"
+    )
     console.write_json(json, asdict(played))

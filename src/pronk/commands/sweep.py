@@ -135,8 +135,6 @@ def sweep(
     else:
         if not address.local and not yes:
             confirm.before_it_moves(machine.name, str(address))
-        if real_time:
-            sweep_wire.enter_real_time()
         with console.progress() as report:
             recorded = sweep_wire.record_wire(
                 machine,
@@ -145,6 +143,7 @@ def sweep(
                 address,
                 release=release,
                 overwrite=overwrite,
+                real_time=real_time,
                 progress=report.bar(f"ask over {link.value}"),
             )
         figures |= {

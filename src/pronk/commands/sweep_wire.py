@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,36 +14,8 @@ if TYPE_CHECKING:
     from pronk.hardware.preflight import Freshness
     from pronk.robots.robot import Robot
     from pronk.sweep.plan import SweepPlan
+    from pronk.sweep.record_apart import Recorded
     from pronk.sweep.servo import Timing
-
-_PRIORITY = 50
-"""Of SCHED_FIFO: above the virtual robot's, below the kernel's own threads."""
-_SWITCH_S = 0.5e-3
-"""How long one Python thread may keep another from running."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recorded:
-    """What a recording over a wire left."""
-
-    logs: list[Path]
-    virtual: bool
-    servo: dict[str, float | int]
-    """Lateness of the servo's ticks."""
-
-    @property
-    def words(self) -> str:
-        """Whose logs they are."""
-        return "the virtual robot" if self.virtual else "a robot that is not the virtual one"
-
-
-def enter_real_time() -> None:
-    """Ask the system for real-time scheduling and say what it answered."""
-    from pronk.hardware.realtime import Wanted, enter
-
-    sys.setswitchinterval(_SWITCH_S)
-    for answer in enter(Wanted(priority=_PRIORITY)):
-        console.say(answer)
 
 
 def record_wire(
@@ -59,11 +26,12 @@ def record_wire(
     *,
     release: bool = False,
     overwrite: bool = False,
+    real_time: bool = False,
     timing: Timing | None = None,
     fresh: Freshness | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Recorded:
-    """Ask a robot over a wire, all joints over one connection.
+    """Ask a robot over a wire, all joints over one connection that a process of its own has.
 
     Args:
         robot: The robot.
@@ -72,36 +40,38 @@ def record_wire(
         address: Where it is.
         release: Make its own controller let go of the joints first.
         overwrite: Replace logs that are already there.
+        real_time: Ask the system for real-time scheduling, and say what it answered.
         timing: Of the servo; the usual if None.
         fresh: How fresh states must be at first; the usual if None.
         progress: Told the share done, 0 to 1.
 
     Raises:
-        HardwareError: The robot may not be moved or breached a limit; the joints are damped, and
-            what was recorded until then stays.
+        PronkError: The robot may not be moved or breached a limit, or the servo's process was
+            killed; what was recorded until then stays.
     """
-    from pronk.sweep.record import record
-    from pronk.sweep.servo import Servo
+    from pronk.sweep.record_apart import record_apart
+    from pronk.sweep.servo import Timing
+    from pronk.sweep.servo_process import Job
 
-    machine = address.machine(robot, hand=confirm.Person(), release=release, fresh=fresh)
-    servo = Servo(timing)
-    begun = time.time()
+    job = Job(
+        robot=robot,
+        plan=plan,
+        out_dir=out_dir,
+        address=address,
+        release=release,
+        overwrite=overwrite,
+        real_time=real_time,
+        timing=timing or Timing(),
+        fresh=fresh,
+    )
+    logs: list[Path] = []
     try:
-        with _ending_is_an_interrupt():
-            logs = record(
-                machine,
-                robot,
-                plan,
-                out_dir,
-                progress=None if progress is None else lambda share, _: progress(share),
-                overwrite=overwrite,
-                servo=servo,
-                metadata={"link": str(address), "servo_rate_hz": f"{servo.timing.rate_hz:g}"},
-            )
+        return record_apart(
+            job, hand=confirm.Person(), progress=progress, say=console.say, begun=logs.append
+        )
     except BaseException:
-        _say_what_is_kept(out_dir, begun)
+        _say_what_is_kept(out_dir, logs)
         raise
-    return Recorded(logs=logs, virtual=machine.virtual, servo=servo.figures())
 
 
 def tell(recorded: Recorded, out_dir: Path) -> None:
@@ -114,31 +84,14 @@ def tell(recorded: Recorded, out_dir: Path) -> None:
     )
 
 
-def _say_what_is_kept(out_dir: Path, since: float) -> None:
-    """One line on the logs written since then; the last one is that which was cut short."""
-    kept = sorted((path.stat().st_mtime, path) for path in out_dir.glob("*.mcap"))
-    paths = [path for written, path in kept if written >= since]
-    if paths:
-        whole = f"{', '.join(path.stem for path in paths[:-1])} whole, and " if paths[1:] else ""
+def _say_what_is_kept(out_dir: Path, logs: list[Path]) -> None:
+    """One line on the logs that were begun; the last one is that which was cut short."""
+    if logs:
+        whole = f"{', '.join(path.stem for path in logs[:-1])} whole, and " if logs[1:] else ""
         console.warn(
             f"ended early; in {out_dir} are kept {whole}what was recorded until then of "
-            f"{paths[-1].stem}; ask the others with --joints"
+            f"{logs[-1].stem}; ask the others with --joints"
         )
-
-
-@contextmanager
-def _ending_is_an_interrupt() -> Iterator[None]:
-    """Whoever ends the program ends the sweep as the interrupt key does: damped."""
-    try:
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:
-        # Not the main thread: whoever runs this has signals of their own.
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def refuse_without_wire(**options: object) -> None:

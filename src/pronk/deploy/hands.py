@@ -9,6 +9,7 @@ import sys
 import termios
 import tty
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from pronk.deploy.operators import Stick
@@ -69,10 +70,12 @@ class Keyboard:
         tty.setcbreak(self._fd)
         self._command = [0.0, 0.0, 0.0]
         self._held = self._jump = -1e9
+        self._there = True
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
-        termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+        """Give the terminal back as it was, if it is there."""
+        with suppress(termios.error):
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def told(self, kind: str, text: str) -> None:
         """After a change of mode nothing of the old command is left."""
@@ -86,7 +89,10 @@ class Keyboard:
         """What the keys say."""
         del mode
         wish = Wish.NONE
-        for key in self._keys():
+        keys = self._keys()
+        if not self._there:
+            return Stick(wish=Wish.QUIT)
+        for key in keys:
             if key == " ":
                 self._held = now
             elif key in _STEP:
@@ -110,8 +116,12 @@ class Keyboard:
     def _keys(self) -> str:
         keys = b""
         while select.select([self._fd], [], [], 0.0)[0]:
-            part = os.read(self._fd, 256)
+            try:
+                part = os.read(self._fd, 256)
+            except OSError:
+                part = b""
             if not part:
+                self._there = False
                 break
             keys += part
         return keys.decode("ascii", "ignore")

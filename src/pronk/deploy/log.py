@@ -1,4 +1,4 @@
-"""A deployment's log: MCAP, written as it happens, read back as arrays.
+"""A deployment's log, MCAP, read back as arrays; `pronk.deploy.log_writer` writes it.
 
 Each message is JSON with its schema in the file, so that Foxglove and PlotJuggler show it as it
 is. `t` is CLOCK_MONOTONIC in seconds, the clock of everything that is measured; the messages' log
@@ -18,194 +18,32 @@ time is the wall clock.
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import orjson
-from mcap.writer import CompressionType, IndexType, Writer
 from numpy.typing import NDArray
 
-from pronk.deploy.reasons import Level, Reason
-from pronk.deploy.records import VIRTUAL, Mode
+from pronk.deploy.columns import Columns, Field
+from pronk.deploy.log_topics import JOINTS, ROOT, SCHEMA, STEPS, TICKS, TOPICS
+from pronk.deploy.records import VIRTUAL
 from pronk.errors import LogError
 from pronk.files import sha256
 
+if TYPE_CHECKING:
+    from pronk.sweep.mcap_stream import Record
+
 Array = NDArray[np.float64]
 
-SCHEMA = "pronk/deploy/1"
-_ROOT = "/deploy/"
-
-_N: dict[str, Any] = {"type": "number"}
-_I: dict[str, Any] = {"type": "integer"}
-_S: dict[str, Any] = {"type": "string"}
-_B: dict[str, Any] = {"type": "boolean"}
-_NS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
-# Foxglove reads the properties of every object; without them it refuses the channel.
-_O: dict[str, Any] = {"type": "object", "properties": {}}
-
-TOPICS: dict[str, dict[str, dict[str, Any]]] = {
-    "header": {"schema": _S, "robot": _S, "joints": {"type": "array", "items": _S}}
-    | {"link": _S, "policy": _O, "limits": _O, "timing": _O, "versions": _O},
-    "state": {"t": _N, "sequence": _I, "position": _NS, "velocity": _NS, "torque": _NS}
-    | {"gyro": _NS, "accelerometer": _NS, "orientation": _NS, "bus_voltage": _N}
-    | {"robot_time": _N, "temperature": _NS},
-    "asked": {"t": _N, "tick": _I, "mode": _I, "mode_name": _S, "position": _NS, "blend": _N}
-    | {"order": _I, "state_sequence": _I},
-    "sent": {"t": _N, "tick": _I, "position": _NS, "stiffness": _N, "damped": _B, "level": _I}
-    | {"reason": _I, "reason_name": _S},
-    "timing": {"t": _N, "tick": _I, "lateness": _N, "work": _N, "state_age": _N, "latency": _N},
-    "observation": {"t": _N, "step": _I, "state_sequence": _I, "observation": _NS},
-    "action": {"t": _N, "step": _I, "live": _B, "command": _NS, "jump": _B, "action": _NS}
-    | {"target": _NS, "contact": _NS, "linear_velocity": _NS, "lateness": _N, "decision": _N}
-    | {"state_age": _N},
-    "event": {"t": _N, "kind": _S, "text": _S, "reason": _S, "level": _S},
-    "end": {"complete": _B, "figures": _O},
-}
-"""Topic to the fields of its messages."""
-
-
-class DeployLogWriter:
-    """Writes a log as it happens. What was flushed stays readable whatever comes after."""
-
-    def __init__(self, path: Path, header: dict[str, Any]) -> None:
-        """Open `path`, which is replaced, and write the header.
-
-        Raises:
-            LogError: The file cannot be made.
-        """
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream: IO[bytes] = path.open("wb")
-        except OSError as error:
-            raise LogError(f"{path}: cannot be written ({error.strerror}).") from None
-        self._writer = Writer(
-            self._stream, compression=CompressionType.ZSTD, index_types=IndexType.ALL
-        )
-        self._writer.start(profile="", library="pronk")
-        self._channels: dict[str, int] = {}
-        for topic, properties in TOPICS.items():
-            schema = {"title": f"pronk.deploy.{topic}", "type": "object", "properties": properties}
-            number = self._writer.register_schema(
-                f"pronk.deploy.{topic}", "jsonschema", orjson.dumps(schema)
-            )
-            self._channels[topic] = self._writer.register_channel(_ROOT + topic, "json", number)
-        self._wall = time.time() - time.monotonic()
-        policy = header.get("policy") or {}
-        facts = {"schema": SCHEMA, "robot": header.get("robot"), "link": header.get("link")}
-        facts["policy_sha256"] = policy.get("sha256")
-        self._writer.add_metadata("pronk", {key: str(value) for key, value in facts.items()})
-        self._put("header", time.monotonic(), {"schema": SCHEMA, **header})
-        self.flush()
-
-    def tick(self, record: np.void) -> None:
-        """One tick of the servo, a record of `TICK`."""
-        begun, tick = float(record["begun"]), int(record["tick"])
-        state = {
-            "t": float(record["time"]),
-            "sequence": int(record["sequence"]),
-            "bus_voltage": float(record["bus_voltage"]),
-            "robot_time": float(record["robot_time"]),
-        }
-        for name in (
-            "position",
-            "velocity",
-            "torque",
-            "gyro",
-            "accelerometer",
-            "orientation",
-            "temperature",
-        ):
-            state[name] = record[name].tolist()
-        self._put("state", begun, state)
-        mode = Mode(int(record["mode"]))
-        asked = {
-            "t": begun,
-            "tick": tick,
-            "mode": int(mode),
-            "mode_name": mode.name,
-            "position": record["asked"].tolist(),
-            "blend": float(record["blend"]),
-            "order": int(record["order"]),
-            "state_sequence": int(record["order_state"]),
-        }
-        self._put("asked", begun, asked)
-        reason = Reason(int(record["reason"]))
-        sent = {
-            "t": float(record["done"]),
-            "tick": tick,
-            "position": record["sent"].tolist(),
-            "stiffness": float(record["stiffness"]),
-            "damped": bool(record["damped"]),
-            "level": int(record["level"]),
-            "reason": int(reason),
-            "reason_name": reason.name,
-        }
-        self._put("sent", begun, sent)
-        timing = {
-            "t": begun,
-            "tick": tick,
-            "lateness": begun - float(record["deadline"]),
-            "work": float(record["done"]) - begun,
-            "state_age": begun - float(record["time"]),
-            "latency": float(record["latency"]),
-        }
-        self._put("timing", begun, timing)
-
-    def step(self, record: np.void) -> None:
-        """One step of the policy, a record of `STEP`."""
-        begun, step = float(record["begun"]), int(record["sequence"])
-        observation = {
-            "t": begun,
-            "step": step,
-            "state_sequence": int(record["state_sequence"]),
-            "observation": record["observation"].tolist(),
-        }
-        self._put("observation", begun, observation)
-        action = {
-            "t": begun,
-            "step": step,
-            "live": bool(record["live"]),
-            "command": record["command"].tolist(),
-            "jump": bool(record["jump"]),
-            "action": record["action"].tolist(),
-            "target": record["target"].tolist(),
-            "contact": record["contact"].tolist(),
-            "linear_velocity": record["linear_velocity"].tolist(),
-            "lateness": begun - float(record["deadline"]),
-            "decision": float(record["inferred"]) - float(record["observed"]),
-            "state_age": begun - float(record["state_time"]),
-        }
-        self._put("action", begun, action)
-
-    def event(self, record: np.void) -> None:
-        """Something that happened, a record of `EVENT`."""
-        body = {
-            "t": float(record["time"]),
-            "kind": bytes(record["kind"]).decode("ascii"),
-            "text": bytes(record["text"]).decode("ascii"),
-            "reason": Reason(int(record["reason"])).name,
-            "level": Level(int(record["level"])).name,
-        }
-        self._put("event", float(record["time"]), body)
-
-    def flush(self) -> None:
-        """Finish the chunk and hand everything to the operating system."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        self._stream.flush()
-
-    def end(self, *, complete: bool, figures: dict[str, Any]) -> None:
-        """Write the end and close the file."""
-        self._put("end", time.monotonic(), {"complete": complete, "figures": figures})
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._stream.close()
-
-    def _put(self, topic: str, t: float, body: dict[str, Any]) -> None:
-        stamp = round((t + self._wall) * 1e9)
-        # NaN becomes null.
-        self._writer.add_message(self._channels[topic], stamp, orjson.dumps(body), stamp)
+_WRONG = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""What messages of another kind raise when they are read."""
+_MOST_BYTES = 16 * 2**30
+"""Largest size that a log may unpack to, four hours [bytes]. It is parsed chunk by chunk and only
+its numbers are kept, so that a long one costs time where another reader's would cost memory."""
+_NO_LOG = "not a log of a deployment; `pronk deploy POLICY --log FILE` writes one."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +53,7 @@ class DeployEvent:
     time: float
     """CLOCK_MONOTONIC [s]."""
     kind: str
-    """`mode`, `fault`, `refused`, `notice`, `system`, `robot` or `policy`."""
+    """`mode`, `fault`, `refused`, `notice`, `lost`, `system`, `robot` or `policy`."""
     text: str
     reason: str
     """Name of a `Reason`."""
@@ -333,96 +171,107 @@ def is_deploy_log(path: Path) -> bool:
         with path.open("rb") as file:
             for batch in records(file, path.stat().st_size):
                 for record in batch:
-                    return record.topic == _ROOT + "header"
+                    return record.topic == ROOT + "header"
     except (OSError, DamagedError):
         return False
     return False
 
 
-def read_deploy_log(path: Path) -> DeployLog:
+def read_deploy_log(path: Path, *, only: Collection[str] | None = None) -> DeployLog:
     """Read a log; one that was cut anywhere gives what came before.
 
+    The file's text is read chunk by chunk and never held as a whole. A minute's arrays take 25 MB,
+    of which those asked for are kept.
+
+    Args:
+        path: The log.
+        only: Names of the arrays of `DeployLog` to read; the others come without rows. None for
+            all.
+
     Raises:
-        LogError: Not a deployment's log, or cut before its first tick.
+        LogError: Not a deployment's log, or cut before its first tick; or there is no such array.
     """
     from pronk.sweep.mcap_stream import DamagedError, records
 
-    rows: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
-    damage = ""
+    wanted = set(TICKS | STEPS if only is None else only)
+    if strange := wanted - set(TICKS | STEPS):
+        raise LogError(
+            f"{path}: asked for {', '.join(sorted(strange))}; "
+            f"the arrays of a log are {', '.join(TICKS | STEPS)}."
+        )
+    rest: dict[str, list[Any]] = {topic: [] for topic in ("event", "end")}
+    header, columns, damage = None, None, ""
     try:
         with path.open("rb") as file:
-            for batch in records(file, path.stat().st_size):
-                for record in batch:
-                    if record.topic.removeprefix(_ROOT) in rows:
-                        rows[record.topic.removeprefix(_ROOT)].append(record.data)
+            for batch in records(file, path.stat().st_size, _MOST_BYTES):
+                chunk = _sorted(batch)
+                if columns is None:
+                    if not any(chunk.values()):
+                        continue
+                    header = _header(path, chunk["header"])
+                    columns = Columns(_fields(len(header["joints"])), wanted)
+                columns.take(chunk)
+                for topic, bodies in rest.items():
+                    bodies += map(orjson.loads, chunk[topic])
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
     except DamagedError as error:
         damage = str(error)
-    if not rows["header"]:
-        raise LogError(
-            f"{path}: not a log of a deployment; `pronk deploy POLICY --log FILE` writes one."
-        )
+    except _WRONG as error:
+        raise _foreign(path, error) from None
+    if header is None or columns is None:
+        raise LogError(f"{path}: {_NO_LOG}")
     try:
-        return _assemble(path, rows, damage)
-    except LogError:
-        raise
-    except (orjson.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise LogError(
-            f"{path}: its messages are not those of {SCHEMA} ({type(error).__name__})."
-        ) from None
+        return _assemble(path, header, columns, rest, damage)
+    except _WRONG as error:
+        raise _foreign(path, error) from None
 
 
-def _assemble(path: Path, rows: dict[str, list[bytes]], damage: str) -> DeployLog:
-    # One parse of all messages of a topic together: four times faster than one by one.
-    read = {topic: orjson.loads(b"[" + b",".join(rows[topic]) + b"]") for topic in rows}
-    header = read["header"][0]
+def _foreign(path: Path, error: Exception) -> LogError:
+    return LogError(f"{path}: its messages are not those of {SCHEMA} ({type(error).__name__}).")
+
+
+def _sorted(batch: Iterable[Record]) -> dict[str, list[bytes]]:
+    """The messages of a chunk by topic."""
+    chunk: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
+    for record in batch:
+        if record.topic.startswith(ROOT) and record.topic[len(ROOT) :] in chunk:
+            chunk[record.topic[len(ROOT) :]].append(record.data)
+    return chunk
+
+
+def _header(path: Path, bodies: list[bytes]) -> dict[str, Any]:
+    """The header, which comes first."""
+    if not bodies:
+        raise LogError(f"{path}: {_NO_LOG}")
+    header: dict[str, Any] = orjson.loads(bodies[0])
     if header.get("schema") != SCHEMA:
         raise LogError(f"{path}: schema {header.get('schema')!r}; this pronk reads {SCHEMA!r}.")
+    return header
+
+
+def _fields(joints: int) -> dict[str, Field]:
+    """Where the arrays of a robot's log come from."""
+    return {
+        name: replace(of, shape=(joints,)) if of.shape == JOINTS else of
+        for name, of in (TICKS | STEPS).items()
+    }
+
+
+def _assemble(
+    path: Path, header: dict[str, Any], columns: Columns, rest: dict[str, list[Any]], damage: str
+) -> DeployLog:
     # A chunk ends between any two messages: keep the ticks and steps that are there in full.
-    ticks = min(len(read[topic]) for topic in ("state", "asked", "sent", "timing"))
-    steps = min(len(read[topic]) for topic in ("observation", "action"))
+    ticks, steps = (
+        min(columns.counts[topic] for topic in {of.topic for of in fields.values()})
+        for fields in (TICKS, STEPS)
+    )
     if not ticks:
         raise LogError(f"{path}: cut before the first tick; nothing to read.")
-
-    def numbers(topic: str, name: str, dtype: Any = np.float64) -> Any:
-        count = steps if topic in ("observation", "action") else ticks
-        return np.array([row[name] for row in read[topic][:count]], dtype=dtype)
-
-    end = read["end"][0] if read["end"] else {}
+    end = rest["end"][0] if rest["end"] else {}
     return DeployLog(
         header=header,
-        time=numbers("asked", "t"),
-        tick=numbers("asked", "tick", np.int64),
-        mode=numbers("asked", "mode", np.int64),
-        state_time=numbers("state", "t"),
-        state_sequence=numbers("state", "sequence", np.int64),
-        **{
-            name: numbers("state", name)
-            for name in ("position", "velocity", "torque", "gyro", "accelerometer", "orientation")
-        },
-        bus_voltage=numbers("state", "bus_voltage"),
-        asked=numbers("asked", "position"),
-        sent=numbers("sent", "position"),
-        blend=numbers("asked", "blend"),
-        stiffness=numbers("sent", "stiffness"),
-        damped=numbers("sent", "damped", np.bool_),
-        level=numbers("sent", "level", np.int64),
-        reason=numbers("sent", "reason", np.int64),
-        order=numbers("asked", "order", np.int64),
-        **{name: numbers("timing", name) for name in ("lateness", "work", "state_age", "latency")},
-        step_time=numbers("action", "t"),
-        step_live=numbers("action", "live", np.bool_),
-        step_lateness=numbers("action", "lateness"),
-        decision=numbers("action", "decision"),
-        step_state_age=numbers("action", "state_age"),
-        command=numbers("action", "command").reshape(steps, 3),
-        jump=numbers("action", "jump", np.bool_),
-        observation=numbers("observation", "observation"),
-        action=numbers("action", "action"),
-        target=numbers("action", "target"),
-        contact=numbers("action", "contact"),
-        linear_velocity=numbers("action", "linear_velocity"),
+        **columns.arrays(dict.fromkeys(TICKS, ticks) | dict.fromkeys(STEPS, steps)),
         events=tuple(
             DeployEvent(
                 time=row["t"],
@@ -431,7 +280,7 @@ def _assemble(path: Path, rows: dict[str, list[bytes]], damage: str) -> DeployLo
                 reason=row["reason"],
                 level=row["level"],
             )
-            for row in read["event"]
+            for row in rest["event"]
         ),
         complete=bool(end.get("complete", False)) and not damage,
         figures=end.get("figures", {}),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -11,18 +10,23 @@ from typing import Any
 
 import orjson
 
-from pronk.deploy.log import DeployLogWriter
+from pronk.deploy.log_writer import DeployLogWriter
 from pronk.deploy.plan import Names, Shared
+from pronk.deploy.records import Mode
 from pronk.errors import LogError
+from pronk.hardware.terminal import leave
 
 READY = b"ready"
 FLUSH_S = 0.25
 """Longest that something is kept from the file [s]."""
 _NAP_S = 0.02
+_LAST_S = 6.0
+"""Longest that the servo is waited for once nobody else is there: it damps for a second, and the
+link for three at most [s]."""
 
 
 def write_log(path: Path, header: dict[str, Any], names: Names, talk: Connection) -> None:
-    """Body of the logger's process; ends when it is told to, or when its parent is gone.
+    """Body of the logger's process; ends when it is told to, or after the servo if nobody can.
 
     Args:
         path: MCAP file.
@@ -31,7 +35,7 @@ def write_log(path: Path, header: dict[str, Any], names: Names, talk: Connection
         talk: Where it says that the file is open, or why not, and where the word to end comes
             from: JSON, the figures of the run.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave()
     parent = os.getppid()
     shared = Shared(names)
     try:
@@ -48,21 +52,33 @@ def _write(
     writer = DeployLogWriter(path, header)
     talk.send_bytes(READY)
     flushed = time.monotonic()
-    while True:
-        ending = talk.poll() or os.getppid() != parent
+
+    def keep() -> None:
+        nonlocal flushed
         _drain(writer, shared)
-        if ending:
-            break
-        now = time.monotonic()
-        if now - flushed >= FLUSH_S:
+        if time.monotonic() - flushed >= FLUSH_S:
             writer.flush()
-            flushed = now
+            flushed = time.monotonic()
         time.sleep(_NAP_S)
+
+    while not talk.poll() and os.getppid() == parent:
+        keep()
     try:
         figures = orjson.loads(talk.recv_bytes())
-    except EOFError:  # whoever should have told the figures is gone
+    except (EOFError, OSError):
+        # Whoever should have told the figures is gone. The servo damps now: that is kept too.
         figures = {}
+        until = time.monotonic() + _LAST_S
+        while _moving(shared) and time.monotonic() < until:
+            keep()
+    _drain(writer, shared)
     writer.end(complete=bool(figures) and not any(shared.dropped().values()), figures=figures)
+
+
+def _moving(shared: Shared) -> bool:
+    """Whether the servo has begun and not ended."""
+    news = shared.news.read()
+    return news is not None and Mode(int(news["mode"])) is not Mode.ENDED
 
 
 def _drain(writer: DeployLogWriter, shared: Shared) -> None:

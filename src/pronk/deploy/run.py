@@ -22,6 +22,7 @@ from pronk.deploy.records import STICK, Mode, Wish
 from pronk.deploy.servo import serve
 from pronk.deploy.thinker import think
 from pronk.errors import HardwareError, LogError, PronkError
+from pronk.hardware.terminal import Interrupts, unheard
 from pronk.policy.contract import check
 from pronk.policy.runtime import load_policy
 
@@ -40,7 +41,7 @@ class Notice:
     time: float
     """CLOCK_MONOTONIC [s]."""
     kind: str
-    """`mode`, `fault`, `refused`, `notice` or `system`."""
+    """`mode`, `fault`, `refused`, `notice`, `lost`, `system` or `robot`."""
     text: str
     level: int
     """A `Level`."""
@@ -55,6 +56,8 @@ class Outcome:
     policy: dict[str, Any] = field(default_factory=dict)
     """Figures of the policy's process; empty if it was killed."""
     notices: list[Notice] = field(default_factory=list)
+    interrupted: bool = False
+    """Whether somebody ended it by a signal: the interrupt key, or the end of the terminal."""
     trained_delay_s: tuple[float, float] = (0.0, 0.0)
     """Command delays that the policy was trained for [s]."""
 
@@ -89,6 +92,7 @@ class Outcome:
             "trained_delay_s": list(self.trained_delay_s),
             "faults": self.faults,
             "refusals": self.refusals,
+            "interrupted": self.interrupted,
         }
 
 
@@ -120,6 +124,7 @@ class Deployment:
         self.logger: BaseProcess | None = None
         self._stick = np.zeros((), dtype=STICK)
         self._open = False
+        self._interrupts = Interrupts()
 
     def __enter__(self) -> Self:
         """Start everything.
@@ -128,8 +133,8 @@ class Deployment:
             HardwareError: The link could not be opened.
         """
         plan, context = self.plan, get_context("spawn")
-        self.shared = Shared()
-        self._open = True
+        with unheard():
+            self.shared = Shared()
         names = self.shared.names
         trained = self.contract.delay_range_s
         self.write(Stick())
@@ -146,13 +151,18 @@ class Deployment:
             self.logger = context.Process(
                 target=write_log, args=(plan.log, self._header(), names, talk), name="pronk log"
             )
+        self._interrupts.__enter__()
+        self._open = True
         try:
-            self.policy.start()
+            with unheard():
+                self.policy.start()
+                if self.logger is not None:
+                    self.logger.start()
             if self.logger is not None:
-                self.logger.start()
                 self._await_logger(self.logger)
             # Last: what it does from its first tick on has a listener.
-            self.servo.start()
+            with unheard():
+                self.servo.start()
             for end in (servo_end, policy_end):
                 end.close()
             self._await_servo()
@@ -193,7 +203,13 @@ class Deployment:
         return found
 
     def write(self, stick: Stick) -> None:
-        """Tell servo and policy what the operator wants. To be called at 50 Hz or so."""
+        """Tell servo and policy what the operator wants. To be called at 50 Hz or so.
+
+        Raises:
+            KeyboardInterrupt: Somebody wants to end it; only ever here, and not while it closes.
+        """
+        if self._open:
+            self._interrupts.check()
         record = self._stick
         if stick.wish is not Wish.NONE:
             record["wish"] = stick.wish
@@ -223,6 +239,7 @@ class Deployment:
             try:
                 self.write(operator.stick(time.monotonic(), mode))
             except KeyboardInterrupt:
+                self.outcome.interrupted = True
                 self.write(Stick(wish=Wish.QUIT))
                 operator.leave()
             wake = max(wake + 1.0 / _RATE_HZ, time.monotonic())
@@ -253,6 +270,7 @@ class Deployment:
                     process.kill()
                     process.join()
             self.shared.close()
+            self._interrupts.__exit__(None, None, None)
 
     def _stop_servo(self) -> None:
         """Ask it to damp and end, and keep asking: an operator who falls silent is a fault too."""
@@ -261,6 +279,9 @@ class Deployment:
         while self.servo.is_alive() and time.monotonic() < until:
             self.servo.join(1.0 / _RATE_HZ)
             self.write(Stick())
+        if self.servo.is_alive():
+            self.servo.terminate()
+            self.servo.join(_END_S)
 
     def _stop_logger(self, logger: BaseProcess) -> None:
         try:

@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
@@ -18,15 +19,18 @@ from typing import Any
 import numpy as np
 import orjson
 
+from pronk.deploy.hearing import Hearing
 from pronk.deploy.plan import SERVO_PRIORITY, Names, Plan, Shared
 from pronk.deploy.preflight import delay_objection, refusals
 from pronk.deploy.reasons import Level, Reason
-from pronk.deploy.records import NEWS, REAL, TICK, VIRTUAL, Mode, Wish, event, put_state
+from pronk.deploy.records import REAL, VIRTUAL, Mode, Wish
 from pronk.deploy.safety import LEAST_DAMPING_S, Memory, Verdict, fault, filtered
-from pronk.deploy.states import PREFLIGHT_S, Director, Intent, Order
+from pronk.deploy.states import PREFLIGHT_S, Director, Intent
+from pronk.deploy.telling import Telling
 from pronk.errors import PronkError
 from pronk.hardware.machine import Command, Machine, State
-from pronk.hardware.realtime import Histogram, Pace, enter
+from pronk.hardware.realtime import Histogram, Pace, enter, sleep_until
+from pronk.hardware.terminal import leave
 
 _SWITCH_S = 0.5e-3
 """Longest that a thread of the link keeps the loop waiting [s]."""
@@ -43,14 +47,15 @@ def serve(plan: Plan, names: Names, trained: tuple[float, float], end: Connectio
         trained: Command delays that the policy was trained for [s].
         end: Where the figures of the run go when it is over, as JSON.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the operator's process decides
+    leave()  # the operator's process decides
     shared = Shared(names)
     servo = Servo(plan, shared, trained)
     signal.signal(signal.SIGTERM, lambda *_: servo.stop())
     try:
         servo.run()
     finally:
-        end.send_bytes(orjson.dumps(servo.figures()))
+        with suppress(OSError):  # nobody is there any more
+            end.send_bytes(orjson.dumps(servo.figures()))
         end.close()
         shared.close()
 
@@ -66,6 +71,8 @@ class Servo:
         self.robot = plan.robot
         self.limits = plan.safety()
         self.director = Director(self.robot, plan.timing)
+        self.telling = Telling(shared, self.director)
+        self.hearing = Hearing(shared, self.director, plan.stick_valid_s)
         self.memory = Memory()
         self.lateness = Histogram()
         self.latency = Histogram()
@@ -83,12 +90,8 @@ class Servo:
         self._state: State | None = None
         self._stopping = False
         self._parent = os.getppid()
-        self._wishes = 0
-        self._order: Order | None = None
+        self._alone = False
         self._seen: list[State] = []
-        self._last = np.full(len(self.robot.joints), np.nan)
-        self._news = np.zeros((), dtype=NEWS)
-        self._tick = np.zeros((), dtype=TICK)
 
     def stop(self) -> None:
         """Damp and end, soon."""
@@ -96,15 +99,16 @@ class Servo:
 
     def run(self) -> None:
         """Open the machine, tick until told to stop, damp, close."""
-        machine = self.plan.link()
         try:
+            machine = self.plan.link()
             self._open(machine)
             while not self._over():
                 self._one(machine)
         except PronkError as error:
-            self._say("refused", str(error), level=Level.LATCH)
+            self.telling.say("refused", str(error), level=Level.LATCH)
         finally:
-            self._close(machine)
+            if self._machine is not None:
+                self._close(self._machine)
 
     def figures(self) -> dict[str, Any]:
         """Of the run so far."""
@@ -123,18 +127,19 @@ class Servo:
             "interventions": self.interventions,
             "faults": self.faults,
             "refusals": list(self.director.refusals),
-            "dropped": self.shared.dropped(),
+            # Without a log nobody empties the queues to it, and nothing is lost.
+            "dropped": {} if self.plan.log is None else self.shared.dropped(),
         }
 
     def _open(self, machine: Machine) -> None:
         # Before the link starts threads: they inherit what is granted, and so can never hold the
         # interpreter's lock while something less urgent runs.
         for line in enter(self.plan.wanted(SERVO_PRIORITY, 0)):
-            self._say("system", line)
+            self.telling.say("system", line)
         sys.setswitchinterval(_SWITCH_S)
         machine.connect()
         self._machine = machine
-        self._say("robot", VIRTUAL if machine.virtual else REAL)
+        self.telling.say("robot", VIRTUAL if machine.virtual else REAL)
         # The states' clock may be another; everything here is on CLOCK_MONOTONIC.
         self._offset = time.monotonic() - machine.now()
         machine.wait(machine.now())
@@ -145,7 +150,10 @@ class Servo:
         """Whether the loop may end: quit, and damped long enough."""
         assert self._pace is not None
         mode, now = self.director.mode, time.monotonic()
-        if self._stopping or os.getppid() != self._parent:
+        if not self._alone and os.getppid() != self._parent:
+            self._alone = True
+            self.telling.say("notice", "the operator's program has ended")
+        if self._stopping or self._alone:
             self.director.wish(Wish.QUIT)
         if not self.director.quitting():
             return False
@@ -163,33 +171,38 @@ class Servo:
             met = machine.wait(deadline - self._offset)
         except PronkError as error:
             met, trouble = [], str(error)
+            sleep_until(deadline)
         begun = time.monotonic()
         self.lateness.add(begun - deadline)
         self._take(met)
         if self.director.mode is Mode.PREFLIGHT:
             self._preflight(begun)
         if self._state is not None:
-            self._decide(machine, self._state, deadline, begun, trouble)
+            self._decide(machine, self._state, begun, trouble)
+        else:
+            # Nothing to decide on, but the operator is heard, and told.
+            self.hearing.stick(begun)
+            self.telling.publish(None, begun, pace)
         pace.advance(time.monotonic())
 
-    def _decide(
-        self, machine: Machine, state: State, deadline: float, begun: float, trouble: str
-    ) -> None:
+    def _decide(self, machine: Machine, state: State, begun: float, trouble: str) -> None:
         """From a state to what is written to the machine."""
+        pace = self._pace
+        assert pace is not None
         self.age.add(max(0.0, begun - state.time))
         mode, memory, why = self.director.mode, self.memory, ""
-        held, gone = self._stick(begun)
-        fresh = self._orders()
+        held, gone = self.hearing.stick(begun)
+        fresh = self.hearing.orders()
         if trouble:
             memory, why = fault(memory, Level.LATCH, Reason.LINK, begun), trouble
         if gone and mode not in (Mode.IDLE, Mode.PREFLIGHT):
             memory = fault(memory, Level.DAMP, Reason.ENDED, begun)
         intent, memory = self.director.step(
-            begun, state, memory, self._order, objection=self._objection()
+            begun, state, memory, self.hearing.order, objection=self._objection()
         )
         if self.director.notice:
-            self._say("notice", self.director.notice)
-        self._publish(state, begun)
+            self.telling.say("notice", self.director.notice)
+        self.telling.publish(state, begun, pace)
         sent, verdict, memory = self._filter(intent, state, memory, begun, held)
         trouble = self._act(machine, intent, sent)
         done = time.monotonic()
@@ -201,13 +214,14 @@ class Servo:
         if memory.faulted:
             self.director.faulted(begun)
         if self.director.mode is not mode:
-            self._say("mode", self.director.mode.name)
-        order = self._order
+            self.telling.mode()
+        order = self.hearing.order
         latency = np.nan
         if fresh and order is not None and self.director.mode in _THINKING:
             latency = done - order.state_time
             self.latency.add(max(0.0, latency))
-        self._write(state, (deadline, begun, done), intent, sent, verdict, latency)
+        times = (pace.deadline, begun, done)
+        self.telling.tick(pace.tick, state, times, intent, sent, verdict, order, latency)
 
     def _take(self, met: list[State]) -> None:
         for state in met:
@@ -231,38 +245,9 @@ class Servo:
         found = refusals(self._seen, self.robot, self.limits, now=now, seconds=looked)
         self._seen.clear()
         for sentence in found:
-            self._say("refused", sentence)
+            self.telling.say("refused", sentence)
         self.director.preflighted(found, now)
-        self._say("mode", self.director.mode.name)
-
-    def _stick(self, now: float) -> tuple[bool, bool]:
-        """Whether the dead-man button is held, and whether the operator's program is gone."""
-        stick = self.shared.stick.read()
-        if stick is None:
-            return False, now - self.director.since > 10.0 * self.plan.stick_valid_s
-        if int(stick["wishes"]) != self._wishes:
-            self._wishes = int(stick["wishes"])
-            self.director.wish(Wish(int(stick["wish"])))
-        gone = now - float(stick["time"]) > self.plan.stick_valid_s
-        return bool(stick["held"]) and not gone, gone
-
-    def _orders(self) -> bool:
-        """Take the policy's newest order; whether there is a new one."""
-        record = self.shared.orders.read()
-        if record is None or (
-            self._order is not None and int(record["sequence"]) == self._order.sequence
-        ):
-            return False
-        self._order = Order(
-            sequence=int(record["sequence"]),
-            state_sequence=int(record["state_sequence"]),
-            state_time=float(record["state_time"]),
-            made=float(record["made"]),
-            valid_for=float(record["valid_for"]),
-            entry=int(record["entry"]),
-            position=np.array(record["position"]),
-        )
-        return True
+        self.telling.mode()
 
     def _objection(self) -> str:
         if self.plan.any_delay or self.director.mode is not Mode.STAND:
@@ -299,57 +284,12 @@ class Servo:
             return str(error)
         return ""
 
-    def _publish(self, state: State, now: float) -> None:
-        """Tell the others."""
-        assert self._pace is not None
-        news = self._news
-        put_state(news, state, 0.0)
-        news["now"], news["start"] = now, self._pace.start
-        news["mode"], news["entry"] = self.director.mode, self.director.entry
-        self.shared.news.write(news)
-
-    def _write(
-        self,
-        state: State,
-        times: tuple[float, float, float],
-        intent: Intent,
-        sent: Command | None,
-        verdict: Verdict,
-        latency: float,
-    ) -> None:
-        """Put the tick into the logger's queue."""
-        assert self._pace is not None
-        tick = self._tick
-        put_state(tick, state, 0.0)
-        tick["tick"] = self._pace.tick
-        tick["deadline"], tick["begun"], tick["done"] = times
-        tick["mode"], tick["blend"] = self.director.mode, intent.blend
-        tick["asked"] = np.nan if intent.command is None else intent.command.position
-        tick["sent"] = np.nan if sent is None else sent.position
-        tick["stiffness"] = 0.0 if sent is None else intent.stiffness
-        tick["damped"] = sent is None and not intent.silent
-        tick["level"], tick["reason"] = verdict.level, verdict.reason
-        tick["order"] = -1 if self._order is None else self._order.sequence
-        tick["order_state"] = -1 if self._order is None else self._order.state_sequence
-        tick["latency"] = latency
-        self.shared.ticks.put(tick)
-
     def _fault(self, memory: Memory, text: str) -> None:
         self.faults.append(text)
-        self._say("fault", text, reason=memory.reason, level=memory.level)
-
-    def _say(
-        self, kind: str, text: str, *, reason: Reason = Reason.NONE, level: Level = Level.PASS
-    ) -> None:
-        """Tell logger and operator."""
-        record = event(time.monotonic(), kind, text, reason=reason, level=level)
-        self.shared.events.put(record)
-        self.shared.notices.put(record)
+        self.telling.say("fault", text, reason=memory.reason, level=memory.level)
 
     def _close(self, machine: Machine) -> None:
         """Leave the joints damped, whatever happened before, and keep what the cameras saw."""
-        if self._machine is None:
-            return
         quiet = self.director.mode in (Mode.IDLE, Mode.PREFLIGHT)
         try:
             if not quiet and self.director.mode not in (Mode.DAMP, Mode.FAULT):
@@ -359,19 +299,26 @@ class Servo:
                     machine.damp()
                     machine.wait(machine.now() + 1.0 / self.plan.servo_rate_hz)
         finally:
-            self._keep(machine)
-            machine.close()
-            self.director.enter(Mode.ENDED, time.monotonic())
-            self._say("mode", Mode.ENDED.name)
-            if self._state is not None:
-                self._publish(self._state, time.monotonic())
+            try:
+                self._keep(machine)
+            finally:
+                machine.close()
+                self.director.enter(Mode.ENDED, time.monotonic())
+                self.telling.mode()
+                if self._pace is not None:
+                    self.telling.publish(self._state, time.monotonic(), self._pace)
 
     def _keep(self, machine: Machine) -> None:
+        """Save what the cameras saw; a disk that is full harms nothing else."""
         inner = getattr(machine, "inner", None)
-        if self.plan.capture is not None and inner is not None:
-            from pronk.hardware.capture import save
+        if self.plan.capture is None or inner is None:
+            return
+        from pronk.hardware.capture import save
 
+        try:
             save(self.plan.capture, inner.capture())
+        except (OSError, PronkError) as error:
+            self.telling.say("lost", f"what the cameras saw was not kept: {error}")
 
 
 def _same(one: State, other: State) -> bool:

@@ -81,6 +81,8 @@ class Director:
         self._kd = np.array([joint.damping for joint in robot.joints])
         self._path: Path | None = None
         self._blending: float | None = None
+        self._took_over = 0
+        """Entry with which the policy took over."""
         self._wish = Wish.NONE
 
     def enter(self, mode: Mode, t: float) -> None:
@@ -175,6 +177,7 @@ class Director:
             else:
                 self._blending = None
                 self.enter(Mode.POLICY, t)
+                self._took_over = self.entry
         if self.mode is not mode and wish not in (Wish.QUIT, Wish.STAND):
             self._wish = Wish.NONE
         return memory
@@ -197,7 +200,8 @@ class Director:
         assert self._path is not None
         pose = self._path.target(t)
         if self._blending is None:
-            if order is None or order.entry != self.entry:
+            # Told to halt before it has answered, it may answer as before or as told.
+            if order is None or order.entry < self._took_over:
                 if t - self.since > FIRST_ORDER_S:
                     late = Memory(level=Level.LATCH, reason=Reason.EXPIRED, since=t)
                     return Intent(command=None), late

@@ -3,6 +3,10 @@
 It decides from the moment the robot is damped, heard or not: so the network is warm, and the
 latency is known, before the policy's turn comes. Every change of mode begins a new past for it,
 except that it comes to a halt as it was.
+
+Just before each step it decides a few times for nothing, with a sibling of the policy that has a
+past of its own: so the step that counts finds all it needs in the caches, and no bit of what it
+decides is another (`pronk.deploy.rehearsal`).
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,21 +23,19 @@ import orjson
 
 from pronk.deploy.plan import POLICY_PRIORITY, Names, Plan, Shared
 from pronk.deploy.records import ORDERS, STEP, Mode, event, get_state
+from pronk.deploy.rehearsal import rehearse_until
 from pronk.errors import PronkError
 from pronk.hardware.machine import State
-from pronk.hardware.realtime import Histogram, Pace, enter, sleep_until
+from pronk.hardware.realtime import Histogram, Pace, enter
+from pronk.hardware.terminal import leave
 from pronk.policy.contract import Contract
-from pronk.policy.layout import MEASURED_SIZE
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy
 from pronk.trial.pilot import Pilot, measurement
 from pronk.trial.protocol import STILL, Asked
 
 WARM_UP = 20
-"""Steps before the first one that counts."""
-PRIME_S = 1.5e-3
-"""Before each step the network runs once for nothing: in 20 ms its weights have left the cache,
-and a step that has to fetch them takes three times as long [s]."""
+"""Rehearsals before the first step."""
 _PHASE_S = 0.4e-3
 """After the servo's tick, when its news are there: nothing waits for the next tick [s]."""
 _LIVE = (Mode.POLICY, Mode.HALT)
@@ -46,7 +49,7 @@ def think(plan: Plan, names: Names, end: Connection) -> None:
         names: Of the shared memory.
         end: Where the figures of the run go when it is over, as JSON.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave()
     shared = Shared(names)
     thinker = Thinker(plan, shared, load_policy(plan.policy))
     signal.signal(signal.SIGTERM, lambda *_: thinker.stop())
@@ -55,14 +58,15 @@ def think(plan: Plan, names: Names, end: Connection) -> None:
     try:
         thinker.run()
     finally:
-        end.send_bytes(orjson.dumps(thinker.figures()))
+        with suppress(OSError):  # nobody is there any more
+            end.send_bytes(orjson.dumps(thinker.figures()))
         end.close()
         shared.close()
 
 
-def warm_up(policy: Policy, contract: Contract, steps: int = WARM_UP) -> None:
-    """Run the network on a robot that stands, and forget it."""
-    state = State(
+def standing(contract: Contract) -> State:
+    """A robot that stands in its default pose."""
+    return State(
         time=0.0,
         sequence=0,
         position=np.array(contract.default_position),
@@ -72,16 +76,17 @@ def warm_up(policy: Policy, contract: Contract, steps: int = WARM_UP) -> None:
         accelerometer=np.array([0.0, 0.0, 9.81]),
         bus_voltage=0.0,
     )
-    for _ in range(steps):
-        policy.step(measurement(state), STILL)
-    policy.reset()
 
 
 class Thinker:
     """The loop and what it counts."""
 
     def __init__(self, plan: Plan, shared: Shared, policy: Policy) -> None:
-        """Warm the network up."""
+        """Warm the network up.
+
+        Raises:
+            ArtefactError: The policy is not for this robot, or gives no numbers.
+        """
         self.plan = plan
         self.shared = shared
         self.pilot = Pilot(policy, plan.robot)
@@ -89,8 +94,13 @@ class Thinker:
         self.lateness = Histogram()
         self.decision = Histogram()
         """Observation built and network run."""
+        self.network = Histogram()
+        """The network alone."""
+        self._stand_in = Pilot(policy.sibling(), plan.robot)
+        self._standing = standing(policy.contract)
         self._history = History(policy.contract.default_position)
         self._jumps = policy.contract.jump
+        self._least, self._most = zip(*policy.contract.command_ranges.values(), strict=True)
         self._pace: Pace | None = None
         self._entry = -1
         self._mode = Mode.IDLE
@@ -100,8 +110,8 @@ class Thinker:
         self._order = np.zeros((), dtype=ORDERS)
         self._step = np.zeros((), dtype=STEP)
         self._count = 0
-        self._nothing = np.zeros((1, MEASURED_SIZE), np.float32)
-        warm_up(policy, policy.contract)
+        for _ in range(WARM_UP):
+            self.rehearse()
 
     def stop(self) -> None:
         """End at the next step."""
@@ -121,10 +131,13 @@ class Thinker:
                 # On the servo's own grid, so that news are always as young.
                 self._pace = Pace(self.rate_hz, float(news["start"]) + _PHASE_S)
                 self._pace.advance(time.monotonic())
-            sleep_until(self._pace.deadline - PRIME_S)
-            self.pilot.policy.infer(self._nothing)
-            sleep_until(self._pace.deadline)
-            self._one(self._pace)
+            rehearse_until(self._pace.deadline, self.rehearse)
+            self.step(self._pace)
+
+    def rehearse(self) -> None:
+        """Decide for nothing: always the first step of a robot that stands."""
+        self._stand_in.reset()
+        self._stand_in.decide(self._standing, (STILL, False), 0.0)
 
     def figures(self) -> dict[str, Any]:
         """Of the run so far."""
@@ -134,9 +147,11 @@ class Thinker:
             "missed_steps": 0 if pace is None else pace.missed,
             "lateness": self.lateness.figures(),
             "decision": self.decision.figures(),
+            "network": self.network.figures(),
         }
 
-    def _one(self, pace: Pace) -> None:
+    def step(self, pace: Pace) -> None:
+        """The step whose deadline has come: from the newest news to an order."""
         begun = time.monotonic()
         self.lateness.add(begun - pace.deadline)
         deadline = pace.deadline
@@ -162,6 +177,7 @@ class Thinker:
         command, tick = self.pilot.decide(state, (velocity, jump), now)
         inferred = time.monotonic()
         self.decision.add(inferred - now)
+        self.network.add(self.pilot.policy.network_s)
         order = self._order
         order["sequence"] = self._count
         order["state_sequence"], order["state_time"] = state.sequence, state.time
@@ -187,11 +203,14 @@ class Thinker:
         self._complaint = ""
 
     def _asked(self) -> Asked:
-        """What the operator wants now: to stand still unless the policy is in charge."""
+        """What the operator wants now: to stand still unless the policy is in charge.
+
+        Never more than the policy was trained for.
+        """
         stick = self.shared.stick.read()
         if stick is None or self._mode is not Mode.POLICY:
             return STILL, False
-        forward, left, yaw = (float(value) for value in stick["command"])
+        forward, left, yaw = np.clip(stick["command"], self._least, self._most).tolist()
         return (forward, left, yaw), bool(stick["jump"]) and self._jumps
 
     def _complain(self, text: str) -> None:

@@ -207,8 +207,7 @@ def _touch(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
         plant: On the ground.
         place: Positions of the plant. (T, nq)
     """
-    model = plant.model
-    data = mujoco.MjData(model)
+    model, data = plant.model, plant.aside
     qpos, where, none = data.qpos, data.geom_xpos, len(plant.feet)
     feet = np.empty((len(place), none, 3))
     samples, pairs = [], [np.empty((0, 2), dtype=np.intp)]

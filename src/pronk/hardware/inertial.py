@@ -36,13 +36,19 @@ class StandingBody:
     def __init__(self, plant: Plant) -> None:
         """Of a plant on the bench."""
         self._stand = plant.stand
+        self._still: Motion | None = None
+        """Of a rigid stand, as many instants as were last asked for."""
 
     def motion(self, qpos: Array, qvel: Array) -> Motion:
         """The motion at instants, from the plant's positions (n, nq) and velocities (n, nv)."""
-        tilt, rate = np.zeros((len(qpos), 3)), np.zeros((len(qpos), 3))
         if len(self._stand):
-            tilt[:], rate[:] = qpos[:, self._stand], qvel[:, self._stand]
-        return Motion(orientation=of_vector(tilt), rate=rate, force=resting_force(tilt))
+            tilt = qpos[:, self._stand]
+            rate = qvel[:, self._stand]
+            return Motion(orientation=of_vector(tilt), rate=rate, force=resting_force(tilt))
+        if self._still is None or len(self._still.rate) != len(qpos):
+            tilt = np.zeros((len(qpos), 3))
+            self._still = Motion(orientation=of_vector(tilt), rate=tilt, force=resting_force(tilt))
+        return self._still
 
 
 class FreeBody:

@@ -14,12 +14,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pronk.hardware.lcm_codec import (
-    encode_command,
-)
-from pronk.hardware.lcm_layout import (
-    Layout,
-)
+from pronk.errors import HardwareError
+from pronk.hardware.lcm_codec import encode_command
+from pronk.hardware.lcm_layout import Layout
 from pronk.hardware.machine import Command
 
 DAMPING = 1.0
@@ -40,7 +37,7 @@ class CommandWriter:
             publish: Puts bytes on the wire; only ever called by one thread at a time.
         """
         self.counts: Counter[str] = Counter()
-        """`commands`, `expired`."""
+        """`commands`, `expired`, `not written`."""
         self.wrote = False
         """Whether anything was written at all."""
         self._layout = layout
@@ -51,6 +48,7 @@ class CommandWriter:
         )
         # Newest first: a message that comes back is nearly always the last one.
         self._own: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._remembering = threading.Lock()
         self._open, self._damping, self._expires = True, False, math.inf
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._keep, name="pronk lcm writer", daemon=True)
@@ -60,7 +58,8 @@ class CommandWriter:
         """Write a command; one that has expired already becomes damping.
 
         Raises:
-            HardwareError: It is not for twelve joints.
+            HardwareError: It is not for twelve joints, or the wire does not take it; it expires
+                all the same, and is followed by damping.
         """
         data = encode_command(self._layout, command)
         expires = command.made + command.valid_for
@@ -72,10 +71,14 @@ class CommandWriter:
             # The thread looks at the time of expiry again when the last one has come.
             asleep = not self._damping and self._expires == math.inf
             self._damping, self._expires = False, expires
-            self._write(data)
-            self.counts["commands"] += 1
             if asleep and expires < math.inf:
                 self._changed.notify()
+            trouble = self._write(data)
+            if trouble:
+                raise HardwareError(
+                    f"a command could not be put on the wire ({trouble}); see to the network."
+                )
+            self.counts["commands"] += 1
 
     def damp(self) -> None:
         """Write damping now, and go on until the next command. Never raises."""
@@ -90,8 +93,13 @@ class CommandWriter:
         self._thread.join()
 
     def is_own(self, data: bytes) -> bool:
-        """Whether a command on the wire was written here."""
-        return data in self._own
+        """Whether a command on the wire was written here; each comes back once."""
+        with self._remembering:
+            try:
+                self._own.remove(data)
+            except ValueError:
+                return False
+        return True
 
     def _sink_now(self) -> None:
         self._damping, self._expires = True, math.inf
@@ -99,10 +107,18 @@ class CommandWriter:
             self._write(self._sink)
             self._changed.notify()
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, data: bytes) -> str:
+        """Put a message on the wire; what went wrong, or ""."""
         self.wrote = True
-        self._own.appendleft(data)
-        self._publish(data)
+        with self._remembering:
+            self._own.appendleft(data)
+        try:
+            self._publish(data)
+        except Exception as error:
+            # Whatever it is: the thread that damps must outlive it, and try again.
+            self.counts["not written"] += 1
+            return str(error) or type(error).__name__
+        return ""
 
     def _keep(self) -> None:
         with self._changed:

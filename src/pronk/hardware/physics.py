@@ -22,6 +22,9 @@ from pronk.hardware.truth_parts import MachineTruth
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+_LEAST_SHARE = -0.5
+"""No battery here is charged at more than twice its voltage, whatever runs away."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
@@ -146,12 +149,18 @@ class Physics:
             self.step = step
 
     def _sag(self) -> None:
-        """Let the bus voltage follow the power that the motors draw (or give back)."""
+        """Let the bus voltage follow the power P that the motors draw (or give back).
+
+        V = U - R P / V, with P taken as growing with V^2 from what it was at the last V: that of
+        drives at their voltage limit does, and with P held fixed the two would chase each other.
+        Either way it settles on the same V.
+        """
         plant, machine = self.plant, self._machine
         torque, speed = plant.motor_torque(self._act), self._qvel.take(plant.rotor)
         current = torque / plant.constant
         power = float(torque.dot(speed) + (current * current).dot(plant.resistance))
-        sagged = machine.bus_voltage - machine.bus_resistance * power / self._voltage
+        share = machine.bus_resistance * power / self._voltage**2
+        sagged = machine.bus_voltage / (1.0 + max(share, _LEAST_SHARE))
         # A battery gives most at half its voltage; asked for more, it gives no more.
         self._voltage = max(sagged, 0.5 * machine.bus_voltage)
         plant.set_bus_voltage(self._voltage)

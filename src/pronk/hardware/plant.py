@@ -90,6 +90,11 @@ class Plant:
         """Numbers in a raw state: positions, velocities, activations."""
         return int(self.model.nq + self.model.nv + self.model.na)
 
+    @cached_property
+    def aside(self) -> Any:
+        """A mujoco.MjData to compute in, beside the run's: making one takes longer than a look."""
+        return mujoco.MjData(self.model)
+
     def read(self, data: Any, row: Array) -> None:
         """Copy the raw state of a mujoco.MjData into a row, shape (state_size,)."""
         mujoco.mj_getState(self.model, data, row, _STATE)
@@ -135,7 +140,9 @@ class Plant:
             act: Activation of the plant; the currents are in it. Shape (..., na).
         """
         torque = self.constant * act.take(self.current, axis=-1)
-        return np.minimum(np.maximum(torque, self._least_torque), self.effort_limit)
+        np.maximum(torque, self._least_torque, out=torque)
+        limited: Array = np.minimum(torque, self.effort_limit, out=torque)
+        return limited
 
     @cached_property
     def _least_torque(self) -> Array:

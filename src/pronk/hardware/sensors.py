@@ -99,7 +99,7 @@ class Sensors:
         torque = raw.torque / self._scale + self._present(noise.torque)
         if len(self._columns) < total:
             position = self._spread(position, self._default)
-            velocity, torque = (self._spread(v, np.zeros(total)) for v in (velocity, torque))
+            velocity, torque = self._spread(velocity, 0.0), self._spread(torque, 0.0)
         gyro, force = raw.motion.rate + noise.gyro, raw.motion.force + noise.force
         orientation = product(noise.heading, product(raw.motion.orientation, noise.tilt))
         rows = (position, velocity, torque, gyro, force, orientation)
@@ -126,9 +126,10 @@ class Sensors:
         """Columns of the joints that are present."""
         return values if len(self._columns) == values.shape[1] else values[:, self._columns]
 
-    def _spread(self, values: Array, absent: Array) -> Array:
+    def _spread(self, values: Array, absent: Array | float) -> Array:
         """Columns of all joints, those that are absent with a value of their own."""
-        whole = np.tile(absent, (len(values), 1))
+        whole = np.empty((len(values), len(self._default)))
+        whole[:] = absent
         whole[:, self._columns] = values
         return whole
 

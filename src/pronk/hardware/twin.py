@@ -31,6 +31,8 @@ TICK_S = 0.5e-3
 """How often the wire is asked: commands act on the machine at a multiple of this."""
 _CONTEND_S = 0.01
 """Between two commands of the rival and of the robot's own controller."""
+HITCH_S = 0.01
+"""Lateness that is told one by one: half a step of a policy."""
 _SLIP_S = 0.1
 """Lateness beyond which the machine's clock is put back instead of catching up: a robot that was
 stopped does not live its past at once."""
@@ -139,6 +141,8 @@ class Twin:
         self._clamps: tuple[str, ...] = ()
         self._frozen: State | None = None
         self._slipped = self._cpu = 0.0
+        self._zero = math.nan
+        self._hitches: list[tuple[float, float, bool]] = []
         self._late = array("f")
         # Without bit flips the bytes are not even looked at.
         if self._faults.command.flip:
@@ -184,6 +188,7 @@ class Twin:
         start = time.monotonic() - self._machine.now()
         worked = time.process_time()
         ticks = round(self._machine.now() / TICK_S)
+        self._zero, before = start, 0.0
         while not stop():
             ticks += 1
             late = time.monotonic() - start - ticks * TICK_S
@@ -194,6 +199,10 @@ class Twin:
                 self.counts["slips"] += 1
                 self._slipped += late
                 start += late
+                self._zero = start
+            if late > HITCH_S >= before:
+                self._hitches.append((time.monotonic(), late, late > _SLIP_S))
+            before = late
             self._late.append(late)
             self.step(ticks * TICK_S)
         self._cpu += time.process_time() - worked
@@ -202,7 +211,9 @@ class Twin:
         """What happened: counts of the twin, the wire and the faults, and what real time cost.
 
         Lateness is from a tick's instant to its beginning [ms]; the share of the processor is of
-        one core, all threads of the process counted.
+        one core, all threads of the process counted. `zero_s` is when the machine's clock was at
+        zero, on CLOCK_MONOTONIC; a slip moves it on by its lateness. `hitches` are the moments at
+        which ticks began to be late by more than 10 ms: when, by how much [s], whether it slipped.
         """
         late = np.array(self._late or [0.0], dtype=float) * 1e3
         return {
@@ -213,6 +224,8 @@ class Twin:
             "command_faults": dict(self._commands.counts),
             "state_faults": dict(self._states.counts),
             "slipped_s": self._slipped,
+            "zero_s": self._zero,
+            "hitches": self._hitches,
             "cpu_share": self._cpu / max(self._now, TICK_S),
             "ticks": len(self._late),
             "lateness_ms": {

@@ -6,9 +6,11 @@ The same code runs a policy in trials, on the virtual robot and on the real one.
 from __future__ import annotations
 
 import hashlib
+import math
+import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,11 +53,17 @@ class Policy:
         self.sha256 = sha256
         self.inference: Inference | None = None
         """What the network gave in the last `step`; None before the first."""
+        self.network_s = math.nan
+        """How long ONNX Runtime took for its last answer [s]; NaN before the first."""
         self._session = session
         self._jumps = contract.jump
         self._default = np.asarray(contract.default_position)
         self._scale = np.asarray(contract.action_scale)
         self._history = History(contract.default_position)
+
+    def sibling(self) -> Self:
+        """The same network with a past of its own: nothing it does is seen by this one."""
+        return type(self)(self._session, self.contract, sha256=self.sha256)
 
     def reset(self) -> None:
         """Begin anew: the next measurement is taken for the whole past, past actions for zero."""
@@ -108,7 +116,9 @@ class Policy:
     def _run(self, measured: Floats, jump: Floats) -> Inference:
         """The network, for inputs that have been checked."""
         feeds = {"measured": measured, "jump": jump} if self._jumps else {"measured": measured}
+        begun = time.monotonic()
         found = self._session.run(list(_OUTPUTS), feeds)
+        self.network_s = time.monotonic() - begun
         return Inference(
             **{
                 name: finite(f'the policy\'s output "{name}"', value, (len(measured), size))

@@ -1,55 +1,24 @@
-"""A log that is written by a thread of its own, so that no disk can make a servo late."""
+"""A log that another process writes, so that no disk can make a servo late."""
 
 from __future__ import annotations
 
-import queue
-import threading
-from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
-from pronk.errors import HardwareError
+from pronk.sweep.channel import Channel
 from pronk.sweep.log import Segment
-from pronk.sweep.mcap_log import Floats, McapLogWriter
-
-
-class LogWriter(Protocol):
-    """What a recording needs of a log: `McapLogWriter`, at once or apart."""
-
-    def segment(self, segment: Segment) -> int:
-        """Announce a question; returns its number."""
-
-    def sample(
-        self,
-        time: float,
-        command: Floats,
-        position: Floats,
-        velocity: Floats | None = None,
-        torque: Floats | None = None,
-        frequency: float = ...,
-        segment: int = -1,
-    ) -> None:
-        """Write one measured state."""
+from pronk.sweep.mcap_log import LogHeader, McapLogWriter
 
 
 class LogApart:
-    """Hands everything to a `McapLogWriter` in the order it came. A context manager like it.
+    """Stands for the `McapLogWriter` at the other end of a channel, and is used like it."""
 
-    Arrays handed over must not be changed afterwards.
-    """
-
-    def __init__(self, inner: McapLogWriter) -> None:
-        """Start the thread.
-
-        Args:
-            inner: The log; its header is written.
-        """
-        self._inner = inner
-        self._jobs: queue.SimpleQueue[Callable[[], Any] | None] = queue.SimpleQueue()
-        self._failed: OSError | None = None
+    def __init__(self, channel: Channel, path: Path, header: LogHeader) -> None:
+        """Have the log opened there."""
+        self._channel = channel
         self._segments = 0
-        self._thread = threading.Thread(target=self._work, name="pronk sweep log", daemon=True)
-        self._thread.start()
+        channel.put("open", path, header)
 
     def __enter__(self) -> Self:
         return self
@@ -60,58 +29,24 @@ class LogApart:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Write what is waiting and end the log, as `McapLogWriter` does.
-
-        Raises:
-            HardwareError: Something could not be written, and the block did not fail before.
-        """
-        self._jobs.put(None)
-        self._thread.join()
-        try:
-            self._inner.__exit__(kind, error, trace)
-        except OSError as failed:
-            self._failed = self._failed or failed
-        if kind is None:
-            self._check()
+        """End the log: whole if the block succeeded, cut short with the reason otherwise."""
+        self._channel.put("end", error is None, reason_of(error))
 
     def segment(self, segment: Segment) -> int:
-        """Announce a question; returns its number."""
-        self._put(lambda: self._inner.segment(segment))
+        """Announce a question, before its samples; returns its number."""
+        self._channel.put("segment", segment)
         self._segments += 1
         return self._segments - 1
 
-    def sample(
-        self,
-        time: float,
-        command: Floats,
-        position: Floats,
-        velocity: Floats | None = None,
-        torque: Floats | None = None,
-        frequency: float = float("nan"),
-        segment: int = -1,
-    ) -> None:
-        """Write one measured state, soon.
+    def sample(self, *values: Any) -> None:
+        """Write one measured state: the arguments of `McapLogWriter.sample`, in its order."""
+        self._channel.put("sample", *values)
 
-        Raises:
-            HardwareError: An earlier one could not be written.
-        """
-        values = (time, command, position, velocity, torque, frequency, segment)
-        self._put(lambda: self._inner.sample(*values))
 
-    def _put(self, job: Callable[[], Any]) -> None:
-        self._check()
-        self._jobs.put(job)
+Log = McapLogWriter | LogApart
+"""What a recording writes into."""
 
-    def _check(self) -> None:
-        if self._failed is not None:
-            raise HardwareError(
-                f"the log {self._inner.path} cannot be written ({self._failed}); free the disk or "
-                "give another folder."
-            )
 
-    def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                job()
-            except OSError as error:
-                self._failed = self._failed or error
+def reason_of(error: BaseException | None) -> str:
+    """Why a log ends, as `McapLogWriter` says it."""
+    return "" if error is None else f"{type(error).__name__}: {error}".rstrip(": ")

@@ -19,7 +19,7 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 MOST_BYTES = 2 * 2**30
-"""Largest size that all chunks of a file may unpack to [bytes]."""
+"""Largest size that all chunks of a file may unpack to, unless told otherwise [bytes]."""
 _MOST_CHUNK = 256 * 2**20
 """Largest size of one unpacked chunk [bytes]; writers use 1 to 8 MiB."""
 
@@ -41,12 +41,13 @@ class Record:
     data: bytes
 
 
-def records(stream: IO[bytes], size: int) -> Iterator[list[Record]]:
+def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[list[Record]]:
     """Messages of a file, chunk by chunk, in the order written.
 
     Args:
         stream: The file.
         size: Its length [bytes]; no record can be longer.
+        most: Largest size that all its chunks may unpack to [bytes].
 
     Raises:
         DamagedError: The file ends early, or a chunk's checksum does not fit. What was yielded
@@ -60,8 +61,8 @@ def records(stream: IO[bytes], size: int) -> Iterator[list[Record]]:
         for record in reader.records:
             if isinstance(record, Chunk):
                 unpacked += record.uncompressed_size
-                if unpacked > MOST_BYTES:
-                    raise DamagedError(f"its chunks unpack to more than {MOST_BYTES >> 20} MiB")
+                if unpacked > most:
+                    raise DamagedError(f"its chunks unpack to more than {most >> 20} MiB")
                 inside = breakup_chunk(_unpacked(record))
             elif isinstance(record, Schema | Channel | Message):
                 inside = [record]

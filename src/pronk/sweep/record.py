@@ -16,7 +16,7 @@ from pronk.errors import HardwareError
 from pronk.hardware.machine import Machine
 from pronk.robots.robot import Robot
 from pronk.sweep.log import Segment
-from pronk.sweep.log_apart import LogApart, LogWriter
+from pronk.sweep.log_apart import Log
 from pronk.sweep.mcap_log import LogHeader, McapLogWriter
 from pronk.sweep.plan import Ask, SweepPlan
 from pronk.sweep.servo import Servo
@@ -41,6 +41,7 @@ def record(
     overwrite: bool = False,
     servo: Servo | None = None,
     metadata: Mapping[str, str] | None = None,
+    open_log: Callable[[Path, LogHeader], Log] = McapLogWriter,
 ) -> list[Path]:
     """Carry out a plan; one MCAP file per joint, `<prefix><joint>.mcap`.
 
@@ -63,6 +64,7 @@ def record(
             ticks, and the joints are taken hold of softly first. None for a machine whose clock
             waits for whoever asks.
         metadata: What else the logs shall say, for instance of the link.
+        open_log: Opens a log; here, or in another process.
 
     Returns:
         The files, in the order written.
@@ -101,9 +103,7 @@ def record(
         for names, path in zip(sets, paths, strict=True):
             asks = [ask for ask in plan.asks if ask.joints == names]
             header = _header(machine, plan, asks[0].joints, metadata or {})
-            done = _record_set(
-                session, McapLogWriter(path, header), asks, progress, done, total, apart=bool(servo)
-            )
+            done = _record_set(session, open_log(path, header), asks, progress, done, total)
             if progress:
                 progress(done / total, f"wrote {path.name}")
     finally:
@@ -139,18 +139,16 @@ def _header(
 
 def _record_set(
     session: Session,
-    log: McapLogWriter,
+    log: Log,
     asks: Sequence[Ask],
     progress: Progress | None,
     done: float,
     total: float,
-    *,
-    apart: bool,
 ) -> float:
     """Ask everything that goes into one log; returns the seconds done."""
     plan, machine = session.plan, session.machine
     names = plan.robot.joint_names
-    with LogApart(log) if apart else log as writer:
+    with log as writer:
         session.log_to(
             writer, [names.index(name) for name in logged_joints(plan.robot, asks[0].joints)]
         )
@@ -176,7 +174,7 @@ def _record_set(
 
 def _ask(
     session: Session,
-    writer: LogWriter,
+    writer: Log,
     ask: Ask,
     progress: Progress | None,
     done: float,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from pronk.errors import HardwareError
@@ -21,6 +22,9 @@ class Timing:
     """Silence of this program after which the link's writer damps [s]."""
     oldest_state_s: float = 0.1
     """Age of the newest state beyond which the sweep is ended [s]."""
+    silent_s: float = 1.0
+    """Silence of the program that shows progress and writes the log, after which it is ended [s];
+    one that died is known at once."""
 
     def __post_init__(self) -> None:
         """Refuse what is no time.
@@ -39,13 +43,17 @@ class Servo:
     Its ticks are at absolute deadlines: lateness never adds up, and missed ticks are left out.
     """
 
-    def __init__(self, timing: Timing | None = None) -> None:
+    def __init__(
+        self, timing: Timing | None = None, watch: Callable[[], None] = lambda: None
+    ) -> None:
         """Begin; it may serve one recording.
 
         Args:
             timing: Rates and patience; the usual if None.
+            watch: Called at every tick before anything is sent; what it raises ends the recording.
         """
         self.timing = timing or Timing()
+        self._watch = watch
         self.lateness = Histogram()
         """From a tick's deadline to its beginning [s]."""
         self.missed = 0
@@ -80,6 +88,7 @@ class Servo:
         ticks = max(1, round((end - start) * rate))
         tick = 0
         while tick < ticks:
+            self._watch()
             self._send(machine, command)
             tick += 1
             passed = math.ceil((machine.now() - start) * rate)

@@ -12,7 +12,7 @@ from pronk.errors import HardwareError
 from pronk.hardware.machine import Command, Machine, State
 from pronk.robots.robot import Robot
 from pronk.sweep.limits import Limits
-from pronk.sweep.log_apart import LogWriter
+from pronk.sweep.log_apart import Log
 from pronk.sweep.plan import POSE_RAMP_S, SweepPlan
 from pronk.sweep.servo import Servo
 
@@ -55,7 +55,7 @@ class Session:
         self._sent: list[tuple[float, Array, float, int]] = []
         self._waiting: list[State] = []
         self._half = 0.0
-        self._writer: LogWriter | None = None
+        self._writer: Log | None = None
         self._columns: NDArray[np.intp] = np.arange(len(robot.joints))
 
     @property
@@ -63,7 +63,7 @@ class Session:
         """The present tick on the machine's clock, counted so that rounding never adds up [s]."""
         return self._start + self._ticks * self.tick
 
-    def log_to(self, writer: LogWriter, columns: Sequence[int]) -> None:
+    def log_to(self, writer: Log, columns: Sequence[int]) -> None:
         """Log what follows."""
         self._writer = writer
         self._columns = np.array(columns, dtype=np.intp)

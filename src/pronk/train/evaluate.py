@@ -154,6 +154,7 @@ def _jump(
         single=float(single.mean()) if told.any() else 0.0,
         apex=Spread.of(figures["apex"] - plan.rules.standing_height),
         unasked=_unasked(figures["unasked"], plan),
+        touched=float((figures["touched"] > 0.0).mean()),
         **{key: Spread.of(values) for key, values in kept.items()},
     )
 

@@ -1,7 +1,8 @@
 """Jumps of many robots, measured while they run: `pronk.jumps`, with a few numbers a robot.
 
 Called at every physics step, on the device, without waiting for it: everything is a masked update
-of tensors of shape (N,) or (N, 13). The definitions are those of `pronk.jumps`.
+of tensors of shape (N,) or (N, 13). The definitions are those of `pronk.jumps`; whether a robot
+touched is said as in `pronk.trial.metrics`.
 """
 
 from __future__ import annotations
@@ -76,6 +77,9 @@ class FlightRecorder:
         self._deadline = whole(NEVER)
         self._height = number(torch.nan)
         self._unasked = number(-torch.inf)
+        # A robot that fell lies on the ground from then on.
+        self._touched_at = whole(NEVER)
+        self._fell_at = whole(NEVER)
 
     def tell(self, jump: Tensor, at: int) -> None:
         """Robots whose jump input is on at a sample to come; only its first rise counts.
@@ -88,17 +92,20 @@ class FlightRecorder:
         self._on = torch.where(rises, at, self._on)
         self._deadline = torch.where(rises, at + self._search, self._deadline)
 
-    def add(self, state: Tensor, airborne: Tensor, alive: Tensor) -> None:
+    def add(self, state: Tensor, airborne: Tensor, touching: Tensor, alive: Tensor) -> None:
         """One physics step further.
 
         Args:
             state: As `STATE` has it. (N, 13)
             airborne: No foot on the ground. Bool, shape (N,).
+            touching: Anything but a foot on the ground. Bool, shape (N,).
             alive: Not fallen. Once false, or with a number that is not finite, a robot is out.
         """
         k = self.sample
         self.sample += 1
-        self._alive = self._alive & alive & torch.isfinite(state).all(dim=-1)
+        stood = self._alive
+        self._alive = stood & alive & torch.isfinite(state).all(dim=-1)
+        self._fell_at = torch.where(stood & ~self._alive, k, self._fell_at)
         z = state[:, _Z]
         air, ground = self._alive & airborne, self._alive & ~airborne
 
@@ -112,6 +119,8 @@ class FlightRecorder:
         self._run = torch.where(air, self._run + 1, torch.where(ground, 0, self._run))
 
         told = self._alive & (k >= self._on)
+        first = told & touching & (self._touched_at == NEVER)
+        self._touched_at = torch.where(first, k, self._touched_at)
         self._top = torch.where(told, torch.maximum(self._top, z), self._top)
         self._low = torch.where(told, torch.minimum(self._low, z), self._low)
         self._height = torch.where(
@@ -144,14 +153,16 @@ class FlightRecorder:
         self._unasked = torch.where(unasked, highest, self._unasked)
 
     def figures(self, command: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """The fields of `jumps.Jump`, and `unasked`, its `unasked_height`; each (N,).
+        """The fields of `jumps.Jump`, `touched`, and `unasked`, its `unasked_height`; each (N,).
 
         Args:
             command: Forward and left velocity command [m/s]. (N, 2)
 
         Returns:
             Numbers; NaN where a robot did not jump, `height` also where it fell before the
-            command or had none. `upright` is 0 or 1.
+            command or had none. `upright` is 0 or 1, as is `touched`: anything but a foot on the
+            ground from the command to `upright_s` after touchdown, without a jump for `search_s`.
+            One that fell within that time after a jump lies there: it touched.
         """
 
         def plain(value: Tensor) -> NDArray[np.float64]:
@@ -170,11 +181,16 @@ class FlightRecorder:
             "along": along(displacement, up[:, _ORIENTATION], command),
         }
         unasked = plain(self._unasked)
+        jumped = self._main > 0
+        judged = torch.where(jumped, self._down_at + self._upright, self._on + self._search)
+        touched = (self._touched_at < NEVER) & (self._touched_at <= judged)
+        touched |= jumped & (self._fell_at <= judged)
         return {name: np.where(found, value, np.nan) for name, value in jump.items()} | {
             "flights": plain(self._flights),
             "long_flights": plain(self._long_flights),
             "high_flights": plain(self._high_flights),
             "height": plain(self._height),
             "upright": (plain(self._cosine) >= self.rules.upright_cosine).astype(float),
+            "touched": plain(touched),
             "unasked": np.where(np.isfinite(unasked), unasked, np.nan),
         }

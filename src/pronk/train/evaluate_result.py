@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -119,6 +119,9 @@ class JumpResult:
     high_flights: Spread
     """What is counted as jumps."""
     unasked: Unasked
+    touched: float = math.nan
+    """Share of the robots of which anything but a foot touched the ground from the jump input to
+    2 s after touchdown, as a trial counts it; NaN in files older than this figure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,9 +202,14 @@ _NESTED: dict[str, type[Any]] = {"Spread": Spread, "Unasked": Unasked}
 
 
 def _read(kind: type[Any], entry: Mapping[str, Any]) -> Any:
-    """A result from its JSON: null is NaN, lists are tuples."""
+    """A result from its JSON: null is NaN, lists are tuples.
+
+    A figure that older files do not have keeps its default.
+    """
     values: dict[str, Any] = {}
     for f in fields(kind):
+        if f.name not in entry and f.default is not MISSING:
+            continue
         value = entry[f.name]
         if f.type in _NESTED:
             value = _read(_NESTED[str(f.type)], value)

@@ -175,8 +175,10 @@ class Run:
 
     def _hear(self) -> None:
         """One physics step has passed; the contacts now known belong to the state before it."""
-        airborne = ~(self._env.scene["feet"].data.found > 0).any(dim=-1)
-        self.flights.add(self._state, airborne, self._alive)
+        feet, limbs = (
+            (self._env.scene[name].data.found > 0).any(dim=-1) for name in ("feet", "limbs")
+        )
+        self.flights.add(self._state, ~feet, limbs, self._alive)
         self.speeds.add(self._state, self._alive)
         self._state = self._look()
 

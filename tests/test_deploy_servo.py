@@ -1,0 +1,188 @@
+"""The servo's loop on the virtual robot, in a thread here: links that open badly or break."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deploy_faults import FaultyLink
+from pronk.deploy.links import Link
+from pronk.deploy.plan import Plan, Shared
+from pronk.deploy.records import STICK, Mode, Wish
+from pronk.deploy.servo import Servo
+from pronk.deploy.stance import Timing
+from pronk.errors import HardwareError
+from pronk.hardware.machine import Machine
+
+pytestmark = pytest.mark.live
+
+QUICK = Timing(damp_s=0.05, fold_s=0.1, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
+NOWHERE = Path("policy.onnx")
+"""The servo knows nothing of the policy but its orders."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unopened:
+    """A link that cannot even be made. Implements `Opener`."""
+
+    robot: str = "mini_cheetah"
+
+    def __call__(self) -> Machine:
+        raise HardwareError("the library of the link is not installed.")
+
+
+@pytest.fixture
+def faults(tmp_path: Path) -> FaultyLink:
+    names = ("nan", "freeze", "stuck", "broken")
+    return FaultyLink(wire=tmp_path / "wire.txt", **{name: threading.Event() for name in names})
+
+
+class Run:
+    """A servo in a thread, and the operator's end of it."""
+
+    def __init__(self, plan: Plan, shared: Shared) -> None:
+        self.servo = Servo(plan, shared, (0.0, 1.0))
+        self.shared = shared
+        self.said: list[tuple[str, str]] = []
+        self._stick = np.zeros((), dtype=STICK)
+        self._thread = threading.Thread(target=self.servo.run)
+        self.begun = time.monotonic()
+        self._thread.start()
+
+    @property
+    def over(self) -> bool:
+        return not self._thread.is_alive()
+
+    def until(
+        self, there: Callable[[], bool], wish: Wish = Wish.NONE, seconds: float = 20.0
+    ) -> None:
+        """Hold the dead-man button until something is so."""
+        stick, end = self._stick, time.monotonic() + seconds
+        stick["wish"] = wish
+        stick["wishes"] += wish is not Wish.NONE
+        while not there():
+            assert time.monotonic() < end, (self.servo.director.mode, self.said)
+            stick["time"], stick["held"] = time.monotonic(), 1
+            self.shared.stick.write(stick)
+            self.hear()
+            time.sleep(0.005)
+        self.hear()
+
+    def mode(self, mode: Mode, wish: Wish = Wish.NONE) -> None:
+        self.until(lambda: self.servo.director.mode is mode, wish)
+
+    def hear(self) -> None:
+        self.said += [
+            (each["kind"].decode(), each["text"].decode()) for each in self.shared.notices.take()
+        ]
+
+    def texts(self, kind: str) -> list[str]:
+        return [text for which, text in self.said if which == kind]
+
+    def leave(self) -> None:
+        self.until(lambda: self.over, Wish.QUIT)
+        self._thread.join()
+
+
+@contextmanager
+def flown(link: Any, **more: Any) -> Iterator[Run]:
+    shared, before = Shared(), sys.getswitchinterval()
+    plan = Plan(
+        link=link, policy=NOWHERE, timing=QUICK, real_time=False, stick_valid_s=10.0, **more
+    )
+    run = Run(plan, shared)
+    try:
+        yield run
+    finally:
+        run.servo.stop()
+        run.leave()
+        shared.close()
+        # What the servo asks of its process, this one does not want.
+        sys.setswitchinterval(before)
+        gc.unfreeze()
+        gc.enable()
+
+
+def test_a_link_that_cannot_be_opened_says_why() -> None:
+    with flown(Unopened()) as run:
+        run.until(lambda: run.over)
+        assert run.said == [("refused", "the library of the link is not installed.")]
+        assert run.servo.figures()["virtual"] is None
+
+
+def test_without_any_state_the_operator_is_told_and_heard(faults: FaultyLink) -> None:
+    faults.freeze.set()
+    with flown(faults) as run:
+        # Whoever waits for the servo's first word gets it, and a sentence with it.
+        run.until(lambda: run.shared.news.written > 0)
+        run.until(lambda: bool(run.texts("refused")))
+        run.mode(Mode.IDLE)
+        news = run.shared.news.read()
+        assert news is not None
+        assert Mode(int(news["mode"])) in (Mode.PREFLIGHT, Mode.IDLE)
+        # No robot moves, whatever is wished; leaving is granted at once.
+        run.until(lambda: len(run.texts("mode")) == 1, Wish.STAND)
+        asked = time.monotonic()
+        run.leave()
+        assert time.monotonic() - asked < 5.0
+    assert run.texts("mode") == ["IDLE", "ENDED"]
+    assert not faults.wire.read_text()
+
+
+def test_a_link_that_breaks_does_not_make_time_run_ahead(faults: FaultyLink) -> None:
+    with flown(faults) as run:
+        run.mode(Mode.DAMP)
+        run.mode(Mode.STAND, Wish.STAND)
+        faults.broken.set()
+        run.mode(Mode.FAULT)
+        end = time.monotonic() + 0.5
+        run.until(lambda: time.monotonic() > end)
+        pace = run.servo._pace
+        assert pace is not None
+        # Damped tick by tick, not thousands of times in between.
+        ahead = pace.deadline - time.monotonic()
+        assert ahead <= 1.1 / 500.0
+        faults.broken.clear()
+        ticks = run.servo.lateness.count
+        end = time.monotonic() + 0.2
+        run.until(lambda: time.monotonic() > end)
+        assert run.servo.lateness.count > ticks
+        assert run.texts("fault") == ["the cable was pulled out."]
+    assert pace.tick <= 500.0 * (time.monotonic() - pace.start) + 1
+
+
+@pytest.mark.parametrize("log", [None, Path("run.mcap")])
+def test_nothing_is_lost_where_nothing_is_kept(
+    faults: FaultyLink, log: Path | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Nobody empties the queue here: it is full at once.
+    monkeypatch.setattr("pronk.deploy.plan._TICKS", 4)
+    with flown(faults, log=log) as run:
+        run.mode(Mode.DAMP)
+        run.until(lambda: run.shared.ticks.dropped > 0)
+        dropped = run.servo.figures()["dropped"]
+        assert (dropped == {}) if log is None else (dropped["ticks"] > 0)
+
+
+def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
+    folder = tmp_path / "file"
+    folder.write_text("no folder")
+    link = Link(kind="twin", robot="mini_cheetah", base="ground")
+    with flown(link, capture=folder / "seen.npz") as run:
+        run.mode(Mode.DAMP)
+    (why,) = run.texts("lost")
+    assert why.startswith("what the cameras saw was not kept: ")
+    assert run.texts("mode")[-1] == "ENDED"
+    assert run.servo._machine is not None
+    with pytest.raises(HardwareError, match="connect"):
+        run.servo._machine.latest()

@@ -1,0 +1,85 @@
+"""Signals of a terminal: noted by the program in front, unheard by those that move a robot."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from pronk.hardware.terminal import ENDING, TERMINAL, Interrupts, unheard
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_an_interrupt_waits_until_it_is_asked_for(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    interrupts = Interrupts()
+    with interrupts:
+        interrupts.check()
+        for _ in range(2):
+            os.kill(os.getpid(), number)
+        with pytest.raises(KeyboardInterrupt):
+            interrupts.check()
+        interrupts.check()
+    assert signal.getsignal(number) is before
+    interrupts.__exit__(None, None, None)
+    assert signal.getsignal(number) is before
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupts() as interrupts:
+            os.kill(os.getpid(), signal.SIGHUP)
+            interrupts.check()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_another_thread_hears_nothing_and_changes_nothing() -> None:
+    before = {number: signal.getsignal(number) for number in ENDING}
+    found: list[bool] = []
+
+    def enter() -> None:
+        with Interrupts() as interrupts:
+            interrupts.check()
+            found.append({number: signal.getsignal(number) for number in ENDING} == before)
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert found == [True]
+
+
+BORN = "import sys; print('up', flush=True); sys.stdin.readline(); print('alive', flush=True)"
+LEFT = "from pronk.hardware.terminal import leave; leave();" + BORN
+
+
+@pytest.mark.parametrize(("code", "started_unheard"), [(BORN, True), (LEFT, False)])
+def test_a_process_that_moves_a_robot_outlives_its_terminal(
+    code: str, started_unheard: bool
+) -> None:
+    def start() -> subprocess.Popen[str]:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        return subprocess.Popen([sys.executable, "-c", code], text=True, **pipes)
+
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    if started_unheard:
+        with unheard():
+            process = start()
+    else:
+        process = start()
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        own = os.getsid(process.pid) == process.pid
+        assert own is not started_unheard
+        for number in TERMINAL:
+            process.send_signal(number)
+        out, _ = process.communicate("\n")
+        assert (out, process.returncode) == ("alive\n", 0)
