@@ -204,6 +204,8 @@ CASES = [
     ),
     same("trunk_height", 0.05**2, height=torch.tensor(STANDING + 0.05)),
     same("trunk_height", 0.0, height=torch.tensor(0.2)),
+    same("crouch", 0.03**2, height=torch.tensor(STANDING - 0.05)),
+    same("crouch", 0.0, height=torch.tensor(STANDING - 0.01)),
 ]
 
 
@@ -392,7 +394,7 @@ PAPER: dict[str, tuple[float, float]] = {
 """The paper's table, walk and jump; its termination is an event."""
 IN_WALKING_ALONE = {"foot_clearance"}
 """Terms that have the paper's weight, but none in jump mode."""
-CHANGED = {"smoothness", "torque_limits", "torque", "tracking_angular"}
+CHANGED = {"smoothness", "torque_limits", "torque", "tracking_angular", "collision"}
 """Terms with another weight, for the reason that stands beside it."""
 
 
@@ -415,9 +417,11 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
     paper = -500 * 0.02 / PAPER_UNIT
     assert ROWS["termination"].jump <= ROWS["termination"].walk <= paper
     assert ROWS["tracking_angular"].walk * PAPER_UNIT >= PAPER["tracking_angular"][0]
+    assert ROWS["collision"].walk * PAPER_UNIT <= PAPER["collision"][0]
+    assert ROWS["collision"].jump * PAPER_UNIT <= PAPER["collision"][1]
     for name in ("dense_jump", "sparse_jump", "rise", "reach", "hop"):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
-    for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height"):
+    for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch"):
         assert ROWS[name].walk < 0.0
         assert ROWS[name].walk <= ROWS[name].jump <= 0.0
 
@@ -428,6 +432,7 @@ def test_arguments_of_the_papers_terms() -> None:
     assert arguments["foot_clearance"] == {"height": 0.09}
     assert arguments["posture"]["standing"] >= 1.0
     assert arguments["trunk_height"]["height"] == pytest.approx(STANDING, abs=1e-5)
+    assert arguments["crouch"]["height"] == pytest.approx(STANDING - 0.02, abs=1e-5)
 
 
 def test_jump_weights_go_into_the_column_of_jump_mode() -> None:

@@ -54,18 +54,19 @@ PHASES: tuple[Phase, ...] = (
     # Jumping has to be found.
     Phase(
         name="jump_a",
-        iterations=290,
+        iterations=230,
         jump=True,
-        weights=JumpWeights(dense=0.02, sparse=8.0, width=1.0, rise=20.0, reach=10.0, hop=0.0),
-        entropy=0.01,
+        weights=JumpWeights(dense=0.02, sparse=8.0, width=1.0, rise=20.0, reach=8.0, hop=0.0),
+        entropy=0.006,
     ),
-    # And then done alike every time.
+    # And then done alike every time: an actor that explores on (with .003 its standard deviation
+    # was .59 after 560 iterations, .42 before the first jump) walks worse and scatters.
     Phase(
         name="jump_b",
-        iterations=560,
+        iterations=700,
         jump=True,
-        weights=JumpWeights(dense=0.002, sparse=8.0, width=0.3, rise=25.0, reach=10.0, hop=0.5),
-        entropy=0.003,
+        weights=JumpWeights(dense=0.002, sparse=8.0, width=0.3, rise=25.0, reach=8.0, hop=0.5),
+        entropy=0.0005,
         estimator_rate=3e-4,
     ),
 )

@@ -144,3 +144,8 @@ def slip(command: MotionCommand) -> Tensor:
 def trunk_height(command: MotionCommand, height: float) -> Tensor:
     """relu(z - height)^2 of the trunk [m^2]: nobody hops who was not told to."""
     return (command.motion.height - height).clamp_min(0.0).square()
+
+
+def crouch(command: MotionCommand, height: float) -> Tensor:
+    """relu(height - z)^2 of the trunk [m^2]: nobody waits for the next jump with bent knees."""
+    return (height - command.motion.height).clamp_min(0.0).square()
