@@ -27,8 +27,10 @@ from pronk.bench.links_round import Round, Way, fly_round
 from pronk.errors import HardwareError, PronkError
 from pronk.hardware.truth import load_truth
 from pronk.robots import load_robot
-from pronk.trial.job import jump
+from pronk.robots.robot import Robot
+from pronk.trial.job import Job, jump
 from pronk.trial.protocol import PAPER_COMMANDS, STILL, Case, Script
+from pronk.trial.rows import Row
 from pronk.trial.run import Plan, draw, jobs_of, mass_of, versions
 from pronk.trial.subjects import load_subjects
 
@@ -95,7 +97,9 @@ def run(policy: Path, settings: Settings, *, progress: Progress | None = None) -
     begun = time.perf_counter()
     robot = load_robot(_ROBOT)
     (subject,) = load_subjects([policy], robot)
-    load_truth(settings.truth).check_joints(robot.joint_names, str(settings.truth or "truth"))
+    truth = load_truth(settings.truth)
+    truth.check_joints(robot.joint_names, str(settings.truth or "truth"))
+    trial = jobs_of([subject], settings.plan(), robot=robot, truth=truth, out=Path())
     jumps: list[Jump] = []
     rounds: list[dict[str, Any]] = []
     refused: list[str] = []
@@ -104,9 +108,9 @@ def run(policy: Path, settings: Settings, *, progress: Progress | None = None) -
     for number in range(settings.repeats):
         for link in settings.links:
             if link == "trial":
-                jumps += _trial(policy, settings, number)
+                jumps += _trial(trial, number)
             else:
-                flown = _rounds(policy, settings, link, number)
+                flown = _rounds(policy, settings, link, number, robot)
                 jumps += flown[0]
                 rounds += flown[1]
                 refused += flown[2]
@@ -129,11 +133,8 @@ def run(policy: Path, settings: Settings, *, progress: Progress | None = None) -
     )
 
 
-def _trial(policy: Path, settings: Settings, number: int) -> Iterator[Jump]:
+def _trial(jobs: Sequence[tuple[Row, Job]], number: int) -> Iterator[Jump]:
     """One repeat as `pronk trial` does it."""
-    robot, truth = load_robot(_ROBOT), load_truth(settings.truth)
-    subjects = load_subjects([policy], robot)
-    jobs = jobs_of(subjects, settings.plan(), robot=robot, truth=truth, out=Path())
     for row, job in jobs:
         if row.number == number:
             figures = jump(replace(job, keep=None)).figures
@@ -141,14 +142,14 @@ def _trial(policy: Path, settings: Settings, number: int) -> Iterator[Jump]:
 
 
 def _rounds(
-    policy: Path, settings: Settings, link: str, number: int
+    policy: Path, settings: Settings, link: str, number: int, robot: Robot
 ) -> tuple[list[Jump], list[dict[str, Any]], list[str]]:
     """One repeat over a link: one round, or more for what a fault cut off or this computer spoilt.
 
     Returns:
         Jumps, how punctual each round was, and why rounds did not begin.
     """
-    robot, plan = load_robot(_ROBOT), settings.plan()
+    plan, mass = settings.plan(), mass_of(robot)
     drawn = [draw(plan, case, number, robot) for case in settings.cases]
     left = [(case, script) for case, (script, _, _) in zip(settings.cases, drawn, strict=True)]
     jumps: list[Jump] = []
@@ -159,7 +160,7 @@ def _rounds(
         if not left or len(refused) == _TRIES:
             break
         try:
-            flown = _round(policy, settings, link, [script for _, script in left], drawn[0][2])
+            flown = _round(policy, settings, link, [s for _, s in left], drawn[0][2], mass)
         except HardwareError as error:
             refused.append(f"{WORDS[link]}: {error}")
             if len(refused) == _TRIES and not rounds:
@@ -185,7 +186,7 @@ def _rounds(
 
 
 def _round(
-    policy: Path, settings: Settings, link: str, scripts: Sequence[Script], seed: int
+    policy: Path, settings: Settings, link: str, scripts: Sequence[Script], seed: int, mass: float
 ) -> Round:
     way = Way(
         kind=link,
@@ -203,7 +204,7 @@ def _round(
             scripts,
             seed=seed,
             folder=Path(folder),
-            mass=mass_of(load_robot(_ROBOT)),
+            mass=mass,
             rules=settings.plan().rules,
         )
 

@@ -59,7 +59,7 @@ def disturbance(
         hitches: Of the virtual robot: when, how late [s], whether it slipped.
     """
     late = [
-        (f"the {who} paused for {1e3 * pause:.0f} ms")
+        f"the {who} paused for {1e3 * pause:.0f} ms"
         for who, times, most in (
             ("servo", ticks, HITCH_S),
             ("policy", steps, _STEP_S + HITCH_S),

@@ -191,8 +191,10 @@ def _tell(notice: Notice) -> None:
 
 def _report(outcome: Outcome) -> None:
     """The figures of the run."""
+    from pronk.deploy.records import REAL, VIRTUAL
+
     servo, policy = outcome.servo, outcome.policy
-    robot = "the virtual robot" if servo.get("virtual") else "a real robot"
+    robot = VIRTUAL if servo.get("virtual") else REAL
     made = console.table(
         f"Deployment on {robot}", "what [ms]", "n", "median", "95 %", "99 %", "99.9 %", "largest"
     )
