@@ -10,9 +10,10 @@ import sys
 from pathlib import Path
 
 from pronk.deploy.links import Link
+from pronk.deploy.notice import Notice
 from pronk.deploy.operators import Scripted
 from pronk.deploy.plan import Plan
-from pronk.deploy.run import Notice, fly
+from pronk.deploy.run import fly
 from pronk.deploy.stance import Timing
 from pronk.trial.protocol import Script
 

@@ -79,6 +79,39 @@ def test_what_the_networks_read(jump: bool) -> None:
     torch.testing.assert_close(critic.get_latent(obs), torch.cat([truth, *tail], dim=1))
 
 
+def test_noise_is_limited_where_it_is_larger() -> None:
+    algorithm = build(jump=True)
+    actor, obs = algorithm.get_policy(), observe()
+    parameter = actor.distribution.std_param
+    before = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6] * 2
+    with torch.no_grad():
+        parameter.copy_(torch.tensor(before))
+    actor.limit_noise(math.inf)
+    assert parameter.tolist() == pytest.approx(before)
+    actor.limit_noise(0.3)
+    limited = [0.1, 0.2, 0.3, 0.3, 0.3, 0.3] * 2
+    assert parameter.tolist() == pytest.approx(limited)
+    actor(obs, stochastic_output=True)
+    acts_by = torch.tensor(limited).expand(ROBOTS, -1)
+    torch.testing.assert_close(actor.output_std, acts_by)
+    actor.limit_noise(0.5)
+    assert parameter.tolist() == pytest.approx(limited), "a limit is no aim"
+
+
+def test_limited_noise_goes_on_being_learned() -> None:
+    algorithm = build(jump=True)
+    actor = algorithm.get_policy()
+    actor.limit_noise(0.3)
+    parameter = actor.distribution.std_param
+    assert any(p is parameter for g in algorithm.optimizer.param_groups for p in g["params"])
+    assert parameter.requires_grad
+    roll_out(algorithm)
+    algorithm.update()
+    assert actor.distribution.std_param is parameter
+    changed = parameter.detach() - 0.3
+    assert 0.0 < float(changed.abs().max()) < 0.1
+
+
 def test_wrong_observations_are_refused() -> None:
     algorithm = build()
     actor = type(algorithm.get_policy())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field, replace
+import random
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import pytest
@@ -22,10 +23,29 @@ pytestmark = pytest.mark.train
 DT = 1 / 64
 """A power of two, so that times add up exactly."""
 SETTINGS = JumpSettings(
-    liftoff_velocity=2.5, prompt_s=16 * DT, late_s=16 * DT, settle_s=8 * DT, stroke=0.5
+    liftoff_velocity=2.5,
+    hasty_s=DT / 2,
+    ready_s=DT,
+    prompt_s=16 * DT,
+    late_s=16 * DT,
+    leap=0.5,
+    settle_s=8 * DT,
+    stroke=0.5,
+    crouch=0.1875,
+    gap=0.75,
 )
-EVENTS = ("gain", "rise", "reach", "hop")
-TRACES = (*EVENTS, "mode", "since", "best", "stroke", "farthest", "liftoffs", "airborne")
+"""Not even the first step after the command is hasty."""
+WAITS = replace(SETTINGS, hasty_s=4 * DT, ready_s=8 * DT)
+EVENTS = ("gain", "rise", "reach", "gap", "hop")
+TRACES = (
+    *EVENTS,
+    *("mode", "since", "best", "lowest", "stroke", "farthest", "widest", "liftoffs", "airborne"),
+)
+
+Feet = tuple[tuple[float, float], ...]
+STANCE: Feet = ((0.25, -0.125), (0.25, 0.125), (-0.25, -0.125), (-0.25, 0.125))
+"""Feet of a robot at the origin that looks along x: FR, FL, HR, HL."""
+ALL_FOUR = (True, True, True, True)
 
 
 @dataclass(frozen=True)
@@ -38,6 +58,14 @@ class Step:
     speed: float = 0.0
     miss: float = 0.0
     along: float = 0.0
+    ground: tuple[bool, ...] = (True, False, False, False)
+    """Which feet touch it, if not in the air."""
+    feet: Feet = STANCE
+    way: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def contact(self) -> list[bool]:
+        return [touches and not self.air for touches in self.ground]
 
 
 def script(jump: str, air: str, speed: dict[int, float] | None = None) -> list[Step]:
@@ -53,20 +81,22 @@ def play(
     robots: list[list[Step]],
     *,
     width: float = 1.0,
+    asked: JumpSettings = SETTINGS,
     tracker: JumpTracker | None = None,
 ) -> dict[str, list[list[float]]]:
     """Every trace of every robot: name to robots to steps."""
-    tracker = tracker or JumpTracker(len(robots), "cpu", SETTINGS, width)
+    tracker = tracker or JumpTracker(len(robots), "cpu", asked, width)
     traces: dict[str, list[list[float]]] = {name: [[] for _ in robots] for name in TRACES}
     for steps in zip(*robots, strict=True):
-        foot = torch.tensor([[not step.air, False, False, False] for step in steps])
         tracker.advance(
             jump=torch.tensor([step.jump for step in steps]),
-            contact=foot,
+            contact=torch.tensor([step.contact for step in steps]),
             height=torch.tensor([step.height for step in steps]),
             vertical=torch.tensor([step.speed for step in steps]),
             miss=torch.tensor([step.miss for step in steps]),
             along=torch.tensor([step.along for step in steps]),
+            feet=torch.tensor([step.feet for step in steps]),
+            direction=torch.tensor([step.way for step in steps]),
             dt=DT,
         )
         for name in TRACES:
@@ -97,7 +127,13 @@ def test_one_jump_by_hand() -> None:
 
 @pytest.mark.parametrize(
     ("speed", "width", "worth"),
-    [(2.5, 1.0, 1.0), (1.5, 1.0, 0.606531), (3.5, 1.0, 0.606531), (2.1, 0.4, 0.606531)],
+    [
+        (2.5, 1.0, 1.0),
+        (1.5, 1.0, 0.606531),
+        (3.5, 1.0, 0.606531),
+        (2.1, 0.4, 0.606531),
+        (0.5, 1.0, 0.135335),  # of a stride, too
+    ],
 )
 def test_kernel_of_the_lift_off_velocity(speed: float, width: float, worth: float) -> None:
     """exp(-(v - 2.5)^2 / (2 width^2)): one width off is worth exp(-1/2)."""
@@ -114,8 +150,7 @@ def test_half_the_worth_is_for_going_where_the_command_says(
     """1/2 + exp(-miss^2 / (2 width^2)) / 2: one width off costs half of 1 - exp(-1/2)."""
     before = script("011", "000")
     liftoff = Step(jump=True, air=True, speed=2.5, miss=miss)
-    tracker = JumpTracker(1, "cpu", replace(SETTINGS, aim_width=width), 0.7)
-    seen = alone([*before, liftoff], tracker=tracker)
+    seen = alone([*before, liftoff], width=0.7, asked=replace(SETTINGS, aim_width=width))
     assert seen["gain"][-1] == pytest.approx(worth, rel=1e-5)
 
 
@@ -134,6 +169,24 @@ def test_late_jumps_are_worth_less(steps: int, worth: float) -> None:
     assert seen["liftoffs"][-1] == 1
 
 
+@pytest.mark.parametrize(
+    ("steps", "worth"),
+    [(1, 0.0), (4, 0.0), (5, 0.25), (6, 0.5), (8, 1.0), (16, 1.0), (20, 0.75), (32, 0.0)],
+)
+def test_hasty_jumps_are_worth_less(steps: int, worth: float) -> None:
+    """Nothing until 4 steps after the command, in full from 8 on, a line between; then late."""
+    told, waits = "0" + "1" * steps, "0" + "0" * (steps - 1) + "1"
+    seen = alone(script(told, waits, {steps: 2.5}), asked=WAITS)
+    assert seen["gain"][-1] == pytest.approx(worth)
+    assert seen["liftoffs"][-1] == 1, "hasty or not, it is a jump"
+
+
+def test_who_was_hasty_is_paid_for_the_jump_after_it() -> None:
+    seen = alone(script("1" * 10, "0010000001", {2: 2.5, 9: 2.5}), asked=WAITS)
+    assert seen["gain"] == pytest.approx([0.0] * 9 + [1.0])
+    assert [i for i, hop in enumerate(seen["hop"]) if hop] == [9]
+
+
 def test_many_small_hops_earn_no_more_than_the_best() -> None:
     speed = {2: 1.0, 5: 1.5, 8: 1.25, 11: 1.5}
     seen = alone(script("1" * 13, "0010010010010", speed))
@@ -146,11 +199,21 @@ def test_many_small_hops_earn_no_more_than_the_best() -> None:
     assert [i for i, hop in enumerate(seen["hop"]) if hop] == [5, 8, 11]
 
 
-def test_a_micro_hop_before_the_jump_costs_nothing_but_the_hop() -> None:
-    seen = alone(script("1" * 8, "00100011", {2: 0.1, 6: 2.5}))
+@pytest.mark.parametrize(("speed", "hops"), [(0.1, 0), (0.5, 0), (0.625, 1)])
+def test_a_small_hop_before_the_jump_costs_nothing_but_the_hop(speed: float, hops: int) -> None:
+    """A stride, which is slower than .5 m/s, not even that."""
+    seen = alone(script("1" * 8, "00100011", {2: speed, 6: 2.5}))
     jump = alone(script("1" * 8, "00000011", {6: 2.5}))
     assert sum(seen["gain"]) == pytest.approx(sum(jump["gain"]))
-    assert (sum(seen["hop"]), sum(jump["hop"])) == (1, 0)
+    assert (sum(seen["hop"]), sum(jump["hop"])) == (hops, 0)
+    assert (seen["liftoffs"][-1], jump["liftoffs"][-1]) == (1 + hops, 1)
+
+
+def test_strides_after_the_jump_are_no_hops() -> None:
+    """As fast as a leap in the step before lift-off only is fast enough: steps 2, 5 and 8."""
+    seen = alone(script("1" * 10, "0010010010", {2: 2.5, 5: 0.25, 7: 0.75, 8: -1.0}))
+    assert [i for i, hop in enumerate(seen["hop"]) if hop] == [8]
+    assert seen["liftoffs"] == [0, 0, 1, 1, 1, 1, 1, 1, 2, 2]
 
 
 def test_each_command_is_paid_anew() -> None:
@@ -216,8 +279,38 @@ def test_a_deep_landing_is_no_crouch() -> None:
     """Lift-off in step 2: what is lower after it was not pushed from."""
     heights = [0.3, 0.25, 0.4, 0.5, 0.1, 0.3]
     air = [False, False, True, True, False, False]
-    steps = [Step(jump=True, air=a, height=h) for a, h in zip(air, heights, strict=True)]
+    steps = [Step(jump=True, air=a, height=h, speed=2.0) for a, h in zip(air, heights, strict=True)]
     assert alone(steps)["rise"] == pytest.approx([0, 0.05, 0.1, 0.1, 0, 0], abs=1e-6)
+
+
+def test_a_stride_does_not_end_the_crouch() -> None:
+    """Step 1 is in the air of a stride: the crouch of step 3 is still pushed from."""
+    heights = [0.3, 0.3, 0.3, 0.2, 0.4, 0.2]
+    air = [False, True, False, False, True, False]
+    steps = [
+        Step(jump=True, air=a, height=h, speed=v)
+        for a, h, v in zip(air, heights, [0, 0.25, 0, 0, 2, 0], strict=True)
+    ]
+    seen = alone(steps)
+    assert seen["lowest"] == pytest.approx([0.3, 0.3, 0.3, 0.2, 0.2, 0.2])
+    assert seen["rise"] == pytest.approx([0, 0, 0, 0.1, 0.1, 0], abs=1e-6)
+
+
+def test_nobody_is_paid_for_a_crouch_below_the_floor_of_it() -> None:
+    """From .1 as from .1875: a push off the shanks is no longer way."""
+    heights = [0.25, 0.1, 0.125, 0.25, 0.5]
+    seen = alone([Step(jump=True, height=h) for h in heights])
+    assert seen["lowest"] == [0.25, *[0.1875] * 4]
+    assert seen["rise"] == pytest.approx([0, 0.0625, 0, 0, 0.25], abs=1e-6)
+
+
+def test_who_lies_when_the_command_comes_has_way_from_the_floor_of_the_crouch_on() -> None:
+    """And owes nothing for what is below."""
+    heights = [0.1, 0.1, 0.15, 0.25, 0.3]
+    jump = [False, *[True] * 4]
+    seen = alone([Step(jump=j, height=h) for j, h in zip(jump, heights, strict=True)])
+    assert seen["lowest"] == [0.1875] * 5
+    assert seen["rise"] == pytest.approx([0, 0, 0, 0.0625, 0.05], abs=1e-6)
 
 
 def test_reach_is_the_ground_covered_in_the_longest_flight() -> None:
@@ -241,6 +334,96 @@ def test_flights_without_a_command_reach_nothing() -> None:
     assert alone([Step(air=True, along=3.0)] * 6)["reach"] == [0] * 6
 
 
+def leap_over(*places: Feet, way: tuple[float, float] = (1.0, 0.0)) -> list[Step]:
+    """Stands two steps at every place, and flies two steps to the next.
+
+    So it lands in steps 4, 8, 12, ... In the air all feet are far ahead, which clears nothing.
+    """
+    stands = Step(jump=True, ground=ALL_FOUR, way=way)
+    flies = replace(stands, air=True, speed=2.0, feet=moved(50.0 * way[0], 50.0 * way[1]))
+    flights = [[flies, flies, *[replace(stands, feet=place)] * 2] for place in places]
+    return [step for flight in flights for step in flight][2:]
+
+
+def moved(x: float, y: float, feet: Feet = STANCE) -> Feet:
+    return tuple((a + x, b + y) for a, b in feet)
+
+
+def landing(steps: list[Step], **how: Any) -> dict[int, float]:
+    """Steps in which a gap was paid, and how much."""
+    return {i: gap for i, gap in enumerate(alone(steps, **how)["gap"]) if gap}
+
+
+@pytest.mark.parametrize(
+    ("way", "to", "gap"),
+    [
+        # Fore feet left at .25, hind feet come to -.25 + .75.
+        ((1.0, 0.0), (0.75, 0.0), 0.25),
+        # To the right: right feet left at -.125, left feet come to .125 - .5.
+        ((0.0, -1.0), (0.0, -0.5), 0.25),
+        # What it goes to the side of the way is no gap, in it or out of it.
+        ((1.0, 0.0), (0.75, 3.0), 0.25),
+        # FL left at .6 .25 + .8 .125 = .25, HR comes to -.25 + .6 .5 + .8 .5 = .45.
+        ((0.6, 0.8), (0.5, 0.5), 0.2),
+        # Hind feet come down where fore feet left, or before it, or backwards.
+        ((1.0, 0.0), (0.5, 0.0), 0.0),
+        ((1.0, 0.0), (0.25, 0.0), 0.0),
+        ((1.0, 0.0), (-2.0, 0.0), 0.0),
+        # Nobody is told to go anywhere.
+        ((0.0, 0.0), (0.75, 0.0), 0.0),
+    ],
+)
+def test_gap_by_hand(way: tuple[float, float], to: tuple[float, float], gap: float) -> None:
+    """From the front-most foot that left to the hind-most that comes."""
+    seen = alone(leap_over(STANCE, moved(*to), way=way))
+    assert seen["gap"] == pytest.approx([0, 0, 0, 0, gap, 0], abs=1e-6)
+    assert seen["widest"] == pytest.approx([0, 0, 0, 0, gap, gap], abs=1e-6)
+
+
+def test_gap_is_between_where_feet_stood_last_and_all_that_come() -> None:
+    """FR lifts first, at .25, and HL last, where it had stepped to: .375.
+
+    FR lands first, at 1.25; HR is then in the air yet, at .75.
+    """
+
+    def at(fr: float, fl: float, hr: float, hl: float) -> Feet:
+        return ((fr, 0.0), (fl, 0.0), (hr, 0.0), (hl, 0.0))
+
+    steps = [
+        Step(ground=ALL_FOUR, feet=at(0.25, 0.125, -0.25, -0.25)),
+        Step(ground=(False, True, False, True), feet=at(0.5, 0.125, 0.0, 0.375)),
+        Step(ground=(False, False, False, True), feet=at(0.625, 0.5, 0.25, 0.375)),
+        Step(air=True, feet=at(1.0, 0.75, 0.5, 0.5)),
+        Step(feet=at(1.25, 1.0, 0.75, 0.875)),
+        Step(ground=ALL_FOUR, feet=at(1.25, 1.0, 1.0, 1.0)),
+    ]
+    steps = [replace(step, jump=True, speed=2.0, way=(1.0, 0.0)) for step in steps]
+    assert landing(steps) == pytest.approx({4: 0.75 - 0.375})
+
+
+def test_gap_is_paid_up_to_the_widest_that_is_asked_for() -> None:
+    # 2.0 - .5 clears 1.5 m.
+    steps = leap_over(STANCE, moved(2.0, 0.0))
+    assert landing(steps) == pytest.approx({4: 0.75})
+    assert landing(steps, asked=replace(SETTINGS, gap=1.25)) == pytest.approx({4: 1.25})
+    assert landing(steps, asked=replace(SETTINGS, gap=5.0)) == pytest.approx({4: 1.5})
+
+
+def test_gap_is_of_the_best_flight_of_a_command() -> None:
+    """.25, .125 and .375 m: the third is paid for what it is better."""
+    steps = leap_over(STANCE, moved(0.75, 0.0), moved(1.375, 0.0), moved(2.25, 0.0))
+    assert landing(steps) == pytest.approx({4: 0.25, 12: 0.125})
+    anew = [replace(step, jump=i != 5) for i, step in enumerate(steps)]
+    assert landing(anew) == pytest.approx({4: 0.25, 8: 0.125, 12: 0.25})
+
+
+def test_nobody_without_a_command_clears_a_gap() -> None:
+    steps = leap_over(STANCE, moved(0.75, 0.0))
+    assert landing([replace(step, jump=False) for step in steps]) == {}
+    # The command is over, but the flight is still of it.
+    assert landing([replace(step, jump=i < 3) for i, step in enumerate(steps)]) == {4: 0.25}
+
+
 def test_the_next_command_begins_at_its_own_height() -> None:
     heights = [0.3, 0.6, 0.3, 0.3, 0.4]
     jump = [True, True, False, True, True]
@@ -249,22 +432,46 @@ def test_the_next_command_begins_at_its_own_height() -> None:
 
 
 def test_reset_forgets_one_robot_and_no_other() -> None:
-    begun = script("0111111", "0000100", {4: 2.0})
-    goes_on = script("1110", "0010", {2: 2.5})
+    begun = [replace(step, ground=ALL_FOUR) for step in script("0111111", "0000100", {4: 2.0})]
+    # One foot alone touches before this flight: the others stand where they are remembered.
+    goes_on = [
+        replace(step, way=(1.0, 0.0), feet=((-1.0, 0.0),) * 4 if i < 2 else moved(0.375, 0.0))
+        for i, step in enumerate(script("11111", "00110", {2: 2.5}))
+    ]
     tracker = JumpTracker(2, "cpu", SETTINGS, 1.0)
     play([begun, begun], tracker=tracker)
     tracker.reset(torch.tensor([1]))
     after = play([goes_on, goes_on], tracker=tracker)
     whole, anew = alone(begun + goes_on), alone(goes_on)
+    assert (max(whole["gap"]), max(anew["gap"])) == (0.0, 0.125)
     for name in TRACES:
         assert after[name][0] == whole[name][len(begun) :]
         assert after[name][1] == anew[name]
 
 
-@pytest.mark.parametrize("name", ["liftoff_velocity", "prompt_s", "late_s", "settle_s", "stroke"])
-def test_settings_that_are_none_are_refused(name: str) -> None:
-    with pytest.raises(PronkError, match=rf"JumpSettings\.{name} is 0\.0, not positive"):
-        JumpSettings(**{name: 0.0})
+@pytest.mark.parametrize("value", [0.0, -0.1, math.nan])
+@pytest.mark.parametrize("name", [entry.name for entry in fields(JumpSettings)])
+def test_settings_that_are_none_are_refused(name: str, value: float) -> None:
+    with pytest.raises(PronkError, match=rf"JumpSettings\.{name} is {value}, not positive"):
+        JumpSettings(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("hasty", "ready", "prompt"),
+    [(0.2, 0.1, 0.3), (0.1, 0.1, 0.3), (0.1, 0.4, 0.3), (0.4, 0.5, 0.3), (0.4, 0.2, 0.3)],
+)
+def test_times_in_another_order_are_refused(hasty: float, ready: float, prompt: float) -> None:
+    said = f"hasty_s {hasty}, ready_s {ready} and prompt_s {prompt}; they must be in this order"
+    with pytest.raises(PronkError, match=said):
+        JumpSettings(hasty_s=hasty, ready_s=ready, prompt_s=prompt)
+
+
+def test_who_is_ready_may_be_prompt_at_once() -> None:
+    asked = JumpSettings(hasty_s=4 * DT, ready_s=8 * DT, prompt_s=8 * DT, late_s=16 * DT)
+    for steps, worth in ((6, 0.5), (8, 1.0), (12, 0.75)):
+        told, waits = "1" * steps, "0" * (steps - 1) + "1"
+        seen = alone(script(told, waits, {steps - 1: 2.5}), asked=asked)
+        assert seen["gain"][-1] == pytest.approx(worth)
 
 
 # --- Any script -----------------------------------------------------------------------------------
@@ -283,17 +490,20 @@ class Account:
     age: int = 0
     speed: float = 0.0
     scores: list[float] = field(default_factory=list)
+    leaps: int = 0
     highest: float = 0.0
     lowest: float = 0.0
     stroke: float = 0.0
     flown: float = 0.0
     farthest: float = 0.0
+    stood: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, 0.0)] * 4)
+    widest: float = 0.0
 
     def step(self, now: Step) -> dict[str, float]:
         s = self.settings
         new = now.jump and not self.told
         if new:
-            self.age, self.scores, self.farthest = 0, [], 0.0
+            self.age, self.scores, self.leaps, self.farthest, self.widest = 0, [], 0, 0.0, 0.0
         if now.jump:
             self.settled = 0
         elif self.settled is not None and not now.air:
@@ -302,27 +512,49 @@ class Account:
                 self.settled = None
         mode = self.settled is not None
         self.age = self.age + 1 if mode else 0
-        paid = {"gain": 0.0, "hop": 0.0, "rise": 0.0, "reach": 0.0, "mode": float(mode)}
+        paid = dict.fromkeys(EVENTS, 0.0) | {"mode": float(mode)}
         if mode and now.air and not self.was_up:
-            off = (max(self.speed, now.speed) - s.liftoff_velocity) / self.width
-            late = min(max((self.age * DT - s.prompt_s) / s.late_s, 0.0), 1.0)
-            score = math.exp(-(off**2) / 2) * (1.0 - late)
+            speed = max(self.speed, now.speed)
+            off = (speed - s.liftoff_velocity) / self.width
+            score = math.exp(-(off**2) / 2) * self.timely(self.age * DT)
             paid["gain"] = max(score - max(self.scores, default=0.0), 0.0)
-            paid["hop"] = float(len(self.scores) > 0)
             self.scores.append(score)
+            if speed > s.leap:
+                paid["hop"] = float(self.leaps > 0)
+                self.leaps += 1
+        low = max(now.height, s.crouch)
         if not mode or new:
-            self.highest = self.lowest = now.height
-            self.stroke = 0.0
+            self.highest, self.lowest, self.stroke = now.height, low, 0.0
         self.highest = max(self.highest, now.height)
-        if not self.scores:
-            self.lowest = min(self.lowest, now.height)
-        stroke = min(self.highest - self.lowest, s.stroke)
+        if not self.leaps:
+            self.lowest = min(self.lowest, low)
+        stroke = max(min(self.highest - self.lowest, s.stroke), 0.0)
         paid["rise"], self.stroke = stroke - self.stroke, stroke
         self.flown = self.flown + now.along * DT if mode and now.air and self.was_up else 0.0
         if self.flown > self.farthest:
             paid["reach"], self.farthest = self.flown - self.farthest, self.flown
+        if mode and self.was_up and not now.air:
+            along = [
+                [x * now.way[0] + y * now.way[1] for x, y in f] for f in (self.stood, now.feet)
+            ]
+            gap = min(min(along[1]) - max(along[0]), s.gap)
+            if gap > self.widest:
+                paid["gap"], self.widest = gap - self.widest, gap
+        for i, touches in enumerate(now.contact):
+            if touches:
+                self.stood[i] = now.feet[i]
         self.told, self.was_up, self.speed = now.jump, now.air, now.speed
         return paid
+
+    def timely(self, age: float) -> float:
+        """What a lift-off at that time after the command is worth."""
+        s = self.settings
+        corners = (s.hasty_s, s.ready_s, s.prompt_s, s.prompt_s + s.late_s)
+        if not corners[0] < age < corners[3]:
+            return 0.0
+        if age < corners[1]:
+            return (age - s.hasty_s) / (s.ready_s - s.hasty_s)
+        return min(1.0, 1.0 - (age - s.prompt_s) / s.late_s)
 
 
 def stretches(values: st.SearchStrategy[bool]) -> st.SearchStrategy[list[bool]]:
@@ -341,17 +573,40 @@ def scripts(draw: st.DrawFn) -> list[Step]:
     )
     speed = draw(st.lists(st.integers(-96, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     along = draw(st.lists(st.integers(-32, 128).map(lambda i: i / 32), min_size=60, max_size=60))
+    way = draw(st.sampled_from([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)]))
+    feet = wander(random.Random(draw(st.integers(0, 2**32 - 1))), way)
     return [
-        Step(jump=j, air=a, height=h, speed=v, along=u)
-        for j, a, h, v, u in zip(jump, air, height, speed, along, strict=False)
+        Step(jump=j, air=a, height=h, speed=v, along=u, ground=ground, feet=points, way=way)
+        for j, a, h, v, u, (ground, points) in zip(
+            jump, air, height, speed, along, feet, strict=False
+        )
     ]
 
 
+def wander(draw: random.Random, way: tuple[float, float]) -> list[tuple[tuple[bool, ...], Feet]]:
+    """Sixty steps of which feet touch, if any do, and where they are: on the whole further."""
+    steps, x, y = [], 0.0, 0.0
+    for _ in range(60):
+        far = draw.uniform(-0.25, 0.75)
+        x, y = x + far * way[0], y + far * way[1]
+        touches = draw.randrange(1, 16)
+        off = [(draw.uniform(-0.25, 0.25), draw.uniform(-0.25, 0.25)) for _ in range(4)]
+        feet = tuple((x + a, y + b) for a, b in off)
+        steps.append((tuple(bool(touches >> i & 1) for i in range(4)), feet))
+    return steps
+
+
 @settings(max_examples=50)
-@given(steps=scripts(), width=st.sampled_from([0.4, 1.0]))
-def test_any_script_is_paid_as_accounted(steps: list[Step], width: float) -> None:
-    seen = alone(steps, width=width)
-    account = Account(SETTINGS, width)
+@given(
+    steps=scripts(),
+    width=st.sampled_from([0.4, 1.0]),
+    asked=st.sampled_from([SETTINGS, WAITS]),
+)
+def test_any_script_is_paid_as_accounted(
+    steps: list[Step], width: float, asked: JumpSettings
+) -> None:
+    seen = alone(steps, width=width, asked=asked)
+    account = Account(asked, width)
     for i, step in enumerate(steps):
         for name, value in account.step(step).items():
             assert seen[name][i] == pytest.approx(value, abs=1e-5), (name, i)
@@ -363,7 +618,7 @@ def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) 
     seen = alone(steps)
     edges = [i for i, now in enumerate(steps) if now.jump and not (i and steps[i - 1].jump)]
     for begin, end in itertools.pairwise([*edges, len(steps)]):
-        gain, rise, reach, hop = (seen[name][begin:end] for name in EVENTS)
+        gain, rise, reach, gap, hop = (seen[name][begin:end] for name in EVENTS)
         assert min(*gain, 0.0) == 0.0
         assert sum(gain) == pytest.approx(max(seen["best"][begin:end]), abs=1e-5)
         assert sum(gain) <= 1.0 + 1e-5
@@ -371,6 +626,9 @@ def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) 
         assert sum(rise) <= SETTINGS.stroke + 1e-5
         assert min(*reach, 0.0) == 0.0
         assert sum(reach) == pytest.approx(max(seen["farthest"][begin:end]), abs=1e-5)
+        assert min(*gap, 0.0) == 0.0
+        assert sum(gap) == pytest.approx(max(seen["widest"][begin:end]), abs=1e-5)
+        assert sum(gap) <= SETTINGS.gap + 1e-5
         assert sum(hop) == max(max(seen["liftoffs"][begin:end]) - 1, 0)
 
 

@@ -153,6 +153,8 @@ def test_a_joint_moves_as_commanded_and_is_left_damped(
     machine.close()
     with pytest.raises(HardwareError, match="call connect"):
         machine.latest()
+    with pytest.raises(HardwareError, match="must be fixed mechanically"):
+        machine.clamp(("FR_knee",))
 
 
 def test_a_command_that_expires_is_followed_by_damping(twins: dict[str, Process]) -> None:

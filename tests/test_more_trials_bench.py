@@ -12,8 +12,9 @@ from hopper import ROBOT, write_hopper
 from pronk.bench import trial as bench
 from pronk.errors import PronkError
 from pronk.hardware.truth import load_truth
+from pronk.trial.job import Job, jump
 from pronk.trial.protocol import STILL, Case, Script
-from pronk.trial.run import Job, Plan, jobs_of, jump
+from pronk.trial.run import Plan, jobs_of
 from pronk.trial.subjects import load_subjects
 
 SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)

@@ -53,6 +53,7 @@ def test_motion_is_what_mujoco_says(env: Any) -> None:
     model = env.sim.mj_model
     foot = [model.site(f"robot/{leg}_foot").id for leg in c.LEGS]
     ball = [model.geom(f"robot/{leg}_foot_collision").id for leg in c.LEGS]
+    knee = [model.joint(f"robot/{leg}_knee").id for leg in c.LEGS]
     seen = set()
     for i in range(N):
         reference = mujoco.MjData(model)
@@ -61,6 +62,9 @@ def test_motion_is_what_mujoco_says(env: Any) -> None:
         mujoco.mj_forward(model, reference)
         height = reference.site_xpos[foot, 2] - 0.0175
         np.testing.assert_allclose(motion.foot_height[i], height, atol=1e-5)
+        place = reference.site_xpos[foot, :2]
+        np.testing.assert_allclose(motion.foot_position[i], place, atol=1e-5)
+        np.testing.assert_allclose(motion.knee_height[i], reference.xanchor[knee, 2], atol=1e-5)
         twist = np.zeros(6)
         for k, site in enumerate(foot):
             mujoco.mj_objectVelocity(model, reference, mujoco.mjtObj.mjOBJ_SITE, site, twist, 0)
@@ -82,6 +86,7 @@ def test_motion_is_what_mujoco_says(env: Any) -> None:
             "velocity_trunk": trunk.inv().apply(speed[:3]),
             "angular_velocity": speed[3:6],
             "gravity": trunk.inv().apply([0.0, 0.0, -1.0]),
+            "ahead": trunk.apply([1.0, 0.0, 0.0]),
         }.items():
             np.testing.assert_allclose(getattr(motion, name)[i], value, atol=1e-5, err_msg=name)
     assert seen == {True, False}, "some feet in the air, some on the ground"
@@ -152,6 +157,15 @@ def test_measured_once_a_step(env: Any) -> None:
     stir(env, 1)
     assert command.motion is not first
     assert command.tracker.since.tolist() == pytest.approx([0.04] * N)
+
+
+def test_what_was_measured_stays_when_physics_goes_on(env: Any) -> None:
+    motion = motion_command(env).motion
+    before = {name: value.clone() for name, value in vars(motion).items()}
+    env.reset(env_ids=torch.tensor([0]))
+    stir(env, 1)
+    for name in ("height", "gravity", "ahead", "foot_position", "foot_height", "knee_height"):
+        assert torch.equal(getattr(motion, name), before[name]), name
 
 
 def test_parts_other_than_feet_that_touch_are_counted(env: Any) -> None:

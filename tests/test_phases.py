@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -39,7 +40,8 @@ def test_phases_are_the_papers() -> None:
     assert [p.jump for p in PHASES] == [False, True, True]
     assert [p.jump_fraction for p in PHASES] == [0.0, 0.5, 0.5]
     assert (walk.weights.dense, walk.weights.sparse) == (0.0, 0.0)
-    assert (walk.weights.rise, walk.weights.hop) == (0.0, 0.0)
+    rest = walk.weights
+    assert (rest.rise, rest.reach, rest.gap, rest.hop) == (0.0, 0.0, 0.0, 0.0)
     assert weak.weights.dense == pytest.approx(strong.weights.dense / 10)
     assert weak.weights.sparse == strong.weights.sparse > 0.0
     assert strong.weights.width == 1.0, "the paper's expression"
@@ -68,6 +70,57 @@ def test_other_numbers_of_iterations() -> None:
         with_iterations({"walk": 0})
 
 
+# --- How much the network explores ----------------------------------------------------------------
+
+
+def of_noise(*noise: float) -> Phase:
+    first, last = noise
+    return Phase(name="made up", iterations=3, jump=True, noise=(first, last))
+
+
+@pytest.mark.parametrize(
+    ("noise", "done", "largest"),
+    [
+        ((0.8, 0.2), 0.0, 0.8),
+        # sqrt(.8 .2); .8 / 4^(1/4); .8 / 4^(3/4).
+        ((0.8, 0.2), 0.5, 0.4),
+        ((0.8, 0.2), 0.25, 0.565685),
+        ((0.8, 0.2), 0.75, 0.282843),
+        ((0.8, 0.2), 1.0, 0.2),
+        ((0.1, 0.9), 0.5, 0.3),
+        ((0.3, 0.3), 0.7, 0.3),
+    ],
+)
+def test_largest_noise_falls_and_grows_geometrically(
+    noise: tuple[float, float], done: float, largest: float
+) -> None:
+    assert of_noise(*noise).largest_noise(done) == pytest.approx(largest, rel=1e-5)
+
+
+def test_a_phase_without_noise_of_its_own_has_no_limit() -> None:
+    free = Phase(name="made up", iterations=3, jump=True)
+    assert [free.largest_noise(done) for done in (0.0, 0.5, 1.0)] == [math.inf] * 3
+
+
+@pytest.mark.parametrize("noise", [(0.0, 0.2), (0.6, 0.0), (-0.6, 0.2), (0.6, -0.2)])
+def test_a_phase_of_no_noise_is_refused(noise: tuple[float, float]) -> None:
+    with pytest.raises(PronkError, match=r"phase made up has noise .*; both must be positive"):
+        of_noise(*noise)
+
+
+def test_noise_is_limited_in_the_last_phase_alone_and_ends_small() -> None:
+    """What was found is then done alike every time."""
+    *others, last = PHASES
+    assert [p.noise for p in others] == [None] * len(others)
+    limits = [last.largest_noise(i / 10) for i in range(11)]
+    assert limits == sorted(limits, reverse=True)
+    assert limits[0] <= 1.0, "the network begins with 1"
+    assert limits[10] <= 0.5 * limits[0]
+
+
+# --- In an environment ----------------------------------------------------------------------------
+
+
 def settled(phase: Phase) -> dict[str, tuple[float, float]]:
     """Weights that a phase should have, from its own numbers."""
     w = phase.weights
@@ -76,6 +129,7 @@ def settled(phase: Phase) -> dict[str, tuple[float, float]]:
         "sparse_jump": w.sparse,
         "rise": w.rise,
         "reach": w.reach,
+        "gap": w.gap,
         "hop": -w.hop,
     }
     return {name: (row.walk, jump.get(name, row.jump)) for name, row in ROWS.items()}

@@ -29,6 +29,7 @@ from pronk.train.reward_table import (  # noqa: E402
 
 N = small_env.ROBOTS
 STANDING = 0.298970  # .209 cos(.8) + .195 cos(.8) + .0175
+KNEE = 0.153358  # .195 cos(.8) + .0175
 WALKS, JUMPS = 0, 1
 """A robot out of jump mode and one in it; all others are as the first."""
 
@@ -84,9 +85,12 @@ def pretend(env: Any, **fields: Tensor) -> MotionCommand:
         "velocity_trunk": torch.zeros(N, 3),
         "angular_velocity": torch.zeros(N, 3),
         "gravity": every(vector(0.0, 0.0, -1.0)),
+        "ahead": every(vector(1.0, 0.0, 0.0)),
         "contact": torch.ones(N, 4, dtype=torch.bool),
         "force": torch.full((N, 4), 30.0),
+        "foot_position": torch.zeros(N, 4, 2),
         "foot_height": torch.zeros(N, 4),
+        "knee_height": torch.full((N, 4), KNEE),
         "foot_velocity": torch.zeros(N, 4, 3),
         "foot_velocity_change": torch.zeros(N, 4, 3),
         "touching": torch.zeros(N),
@@ -206,11 +210,16 @@ CASES = [
     same("trunk_height", 0.0, height=torch.tensor(0.2)),
     same("crouch", 0.03**2, height=torch.tensor(STANDING - 0.05)),
     same("crouch", 0.0, height=torch.tensor(STANDING - 0.01)),
+    # Of .06 m half, all, a quarter and twice.
+    same("knees", 0.5 + 0.0 + 0.75 + 0.0, knee_height=vector(0.03, 0.06, 0.015, 0.12)),
+    # Sunk into the floor, 2 cm.
+    same("knees", 4.0 / 3.0, knee_height=vector(KNEE, KNEE, KNEE, -0.02)),
+    same("knees", 0.0),
 ]
 
 
 def test_every_term_has_a_case() -> None:
-    own = {"termination", "sparse_jump", "rise", "reach", "hop", "action_rate"}
+    own = {"termination", "sparse_jump", "rise", "reach", "gap", "hop", "action_rate"}
     assert {case.name for case in CASES} | own == set(ROWS)
 
 
@@ -273,6 +282,7 @@ def test_targets_are_what_the_torque_is_asked_for(env: Any) -> None:
         ("sparse_jump", "gain", 4.0),
         ("rise", "rise", 10.0),
         ("reach", "reach", 6.0),
+        ("gap", "gap", 7.0),
         ("hop", "hop", -0.5),
     ],
 )
@@ -282,7 +292,7 @@ def test_an_event_is_worth_its_weight_once(
     """However long the policy step was (D1), and in jump mode only."""
     command = pretend(env)
     env.cfg.decimation = decimation
-    weights = JumpWeights(dense=0.0, sparse=4.0, width=1.0, rise=10.0, reach=6.0, hop=0.5)
+    weights = JumpWeights(dense=0.0, sparse=4.0, width=1.0, rise=10.0, reach=6.0, gap=7.0, hop=0.5)
     enter_phase(env, Phase(name="made up", iterations=1, jump=True, weights=weights))
     getattr(command.tracker, event)[:] = 0.0
     env.reward_manager.compute(dt=env.step_dt)
@@ -369,6 +379,7 @@ def test_a_reward_is_a_number_whatever_physics_gives(env: Any, bad: float) -> No
     usual = reward_sum(env)(env, None).clone()
     for name in ("velocity", "torque", "torque_change", "velocity_trunk", "force", "foot_height"):
         getattr(command.motion, name)[3] = bad
+    command.motion.knee_height[3] = command.tracker.gap[3] = bad
     after = reward_sum(env)(env, None)
     assert torch.isfinite(after).all()
     others = torch.arange(N) != 3
@@ -419,9 +430,9 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
     assert ROWS["tracking_angular"].walk * PAPER_UNIT >= PAPER["tracking_angular"][0]
     assert ROWS["collision"].walk * PAPER_UNIT <= PAPER["collision"][0]
     assert ROWS["collision"].jump * PAPER_UNIT <= PAPER["collision"][1]
-    for name in ("dense_jump", "sparse_jump", "rise", "reach", "hop"):
+    for name in ("dense_jump", "sparse_jump", "rise", "reach", "gap", "hop"):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
-    for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch"):
+    for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch", "knees"):
         assert ROWS[name].walk < 0.0
         assert ROWS[name].walk <= ROWS[name].jump <= 0.0
 
@@ -435,16 +446,32 @@ def test_arguments_of_the_papers_terms() -> None:
     assert arguments["crouch"]["height"] == pytest.approx(STANDING - 0.02, abs=1e-5)
 
 
+def test_a_knee_costs_before_its_skin_is_on_the_ground(env: Any) -> None:
+    """And nothing in a crouch from which the tracker counts the stroke."""
+    skin = max(
+        float(env.sim.mj_model.geom(f"robot/{leg}_{link}_collision").size[0])
+        for leg in ("FR", "FL", "HR", "HL")
+        for link in ("thigh", "shank")
+    )
+    floor = ROWS["knees"].arguments["height"]
+    assert floor > 2.0 * skin > 0.0
+    # With a foot under its hip the knee is as high as the shank's share of the leg.
+    crouch = motion_command(env).tracker.settings.crouch
+    knee = (crouch - 0.0175) * 0.195 / (0.209 + 0.195) + 0.0175
+    assert knee > floor
+
+
 def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
-    weights = JumpWeights(dense=0.1, sparse=2.0, width=0.5, rise=3.0, reach=1.5, hop=0.25)
+    weights = JumpWeights(dense=0.1, sparse=2.0, width=0.5, rise=3.0, reach=1.5, gap=0.75, hop=0.25)
     rows = with_jump_weights(ROWS, weights)
-    changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5, "hop": -0.25}
+    changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
+    changed |= {"gap": 0.75, "hop": -0.25}
     assert {name: rows[name].jump for name in changed} == changed
     assert all(rows[name].walk == 0.0 for name in changed)
     assert {name: row for name, row in rows.items() if name not in changed} == {
         name: row for name, row in ROWS.items() if name not in changed
     }
     assert list(rows) == list(ROWS), "order is that of the living table"
-    rest = {name: row for name, row in ROWS.items() if name not in ("hop", "rise")}
-    with pytest.raises(PronkError, match=r"the reward table has no hop, rise\."):
+    rest = {name: row for name, row in ROWS.items() if name not in ("hop", "gap")}
+    with pytest.raises(PronkError, match=r"the reward table has no gap, hop\."):
         with_jump_weights(rest, weights)

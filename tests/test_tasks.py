@@ -8,6 +8,7 @@ import sys
 from importlib.metadata import entry_points
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -29,6 +30,7 @@ from pronk.robots.mini_cheetah import constants as c  # noqa: E402
 from pronk.train.commands import NAME, motion_command  # noqa: E402
 from pronk.train.phases import phase  # noqa: E402
 from pronk.train.runner import PronkRunner  # noqa: E402
+from pronk.train.scene import FOOT_CONTACT  # noqa: E402
 from pronk.train.tasks import ACTION_SCALE, JUMP_TASK, WALK_TASK, env_cfg  # noqa: E402
 
 N = small_env.ROBOTS
@@ -170,6 +172,56 @@ def test_zero_action_stays_up_and_feet_do_not_sink() -> None:
     assert (env.sim.data.qpos[:, 2] > 0.2).all()
     upright = 1.0 - 2.0 * env.sim.data.qpos[:, 4:6].square().sum(dim=1)
     assert (upright > 0.9).all()
+
+
+def test_the_feet_alone_are_firm(env: Any) -> None:
+    """Here, and in Warp; the robot itself, which match builds on, is as MuJoCo has it."""
+    usual = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
+    )
+    model = env.sim.mj_model
+    assert usual.geom_solref[0, 0] > FOOT_CONTACT[0] >= 2.0 * model.opt.timestep
+    feet = {model.geom(f"robot/{leg}_foot_collision").id for leg in c.LEGS}
+    assert len(feet) == 4
+    expected = [FOOT_CONTACT if i in feet else usual.geom_solref[0] for i in range(model.ngeom)]
+    np.testing.assert_array_equal(model.geom_solref, expected)
+    in_warp = np.broadcast_to(expected, (N, model.ngeom, 2))
+    np.testing.assert_allclose(env.sim.model.geom_solref.expand(N, -1, -1), in_warp, rtol=1e-6)
+    alone = ROBOT.build_spec().compile().geom_solref
+    np.testing.assert_array_equal(alone, np.broadcast_to(usual.geom_solref[0], alone.shape))
+
+
+def test_a_contact_of_a_foot_is_as_firm_as_the_foot(env: Any) -> None:
+    """MuJoCo would take the mean of foot and floor, had the foot no priority."""
+    data = mujoco.MjData(env.sim.mj_model)
+    # On four feet, with the trunk in the floor: the corners of the trunk are as soft as ever.
+    data.qpos[2], data.qpos[3] = 0.04, 1.0
+    mujoco.mj_forward(env.sim.mj_model, data)
+    seen = set()
+    for contact in data.contact:
+        names = {env.sim.mj_model.geom(int(i)).name for i in contact.geom}
+        foot = any(name.endswith("_foot_collision") for name in names)
+        assert tuple(contact.solref) == (FOOT_CONTACT if foot else (0.02, 1.0)), names
+        seen.add(foot)
+    assert seen == {True, False}
+
+
+def test_feet_of_a_robot_that_lands_sink_little(env: Any) -> None:
+    """Coming down at up to 3 m/s, by 1 cm; with MuJoCo's usual softness it is 2."""
+    command, qpos, qvel = motion_command(env), env.sim.data.qpos, env.sim.data.qvel
+    qpos[:, 2], qpos[:, 3:7] = 0.32, torch.tensor([1.0, 0.0, 0.0, 0.0])
+    qpos[:, 7:] = command.default_position
+    qvel[:] = 0.0
+    qvel[:, 2] = -torch.linspace(0.5, 3.0, N)
+    env.cfg.decimation = 1
+    lowest = []
+    for _ in range(40):
+        _, _, terminated, truncated, _ = env.step(torch.zeros(N, 12))
+        assert not (terminated | truncated).any()
+        lowest.append(command.motion.foot_height.amin(dim=1))
+    sunk = -torch.stack(lowest).amin(dim=0)
+    assert (sunk > 0.0).all(), "all have landed"
+    assert float(sunk.max()) < 0.013
 
 
 def test_there_is_room_for_all_contacts_that_can_be(env: Any) -> None:

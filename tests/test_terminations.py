@@ -70,7 +70,7 @@ def test_a_trunk_on_the_ground_is_a_fall(env: Any) -> None:
 
 def test_a_fall_ends_the_episode_of_one_robot(env: Any) -> None:
     env.step(STILL)
-    env.sim.data.qpos[6, 2] = 0.05
+    env.sim.data.qpos[6, 2:7] = torch.tensor([0.1, 0.0, 1.0, 0.0, 0.0])  # on its back
     _, _, terminated, truncated, _ = env.step(STILL)
     assert terminated.tolist() == only(6)
     assert not truncated.any()

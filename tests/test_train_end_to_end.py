@@ -27,11 +27,13 @@ from pronk.train.run_folder import RunFolder
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
+from pronk.train.phases import PHASES  # noqa: E402
+
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 
 SMALL = ("--envs", "16", "--seed", "3", "--device", "cpu", "--logger", "none")
 ALL = ("all", "--gains", "naive", *SMALL, "--phase", "walk=2")
-ALL += ("--phase", "jump_a=1", "--phase", "jump_b=1")
+ALL += ("--phase", "jump_a=1", "--phase", "jump_b=2")
 
 
 @pytest.fixture(autouse=True)
@@ -142,18 +144,18 @@ def test_all_phases_leave_the_whole_folder(uninterrupted):
     assert list(found["phases"]) == ["walk", "jump_a", "jump_b"]
     # 16 robots, 24 steps an iteration.
     steps = {name: phase["env_steps"] for name, phase in found["phases"].items()}
-    assert steps == {"walk": 768, "jump_a": 384, "jump_b": 384}
+    assert steps == {"walk": 768, "jump_a": 384, "jump_b": 768}
     assert all(phase["non_finite"] == 0 for phase in found["phases"].values())
     (session,) = found["sessions"]
     assert session["versions"]["mjlab"]
     assert 0.0 < session["build_s"] < session["seconds"]
     about = checkpoint.about(checkpoint.latest(uninterrupted.checkpoints))
-    assert (about["iteration"], about["phase"], about["env_steps"]) == (4, "jump_b", 1536)
+    assert (about["iteration"], about["phase"], about["env_steps"]) == (5, "jump_b", 1920)
 
 
 def test_the_configuration_says_what_was_trained(uninterrupted):
     config = yaml.safe_load(uninterrupted.config.read_text())
-    assert config["settings"]["iterations"] == {"walk": 2, "jump_a": 1, "jump_b": 1}
+    assert config["settings"]["iterations"] == {"walk": 2, "jump_a": 1, "jump_b": 2}
     groups = config["gains"]["groups"]
     assert {(g["stiffness"], g["damping"]) for g in groups.values()} == {(17.0, 0.4)}
     assert config["randomization"]["friction"] == [0.05, 3.0]
@@ -195,7 +197,7 @@ def test_the_last_policy_reads_the_jump_input_and_the_first_does_not(uninterrupt
         (contract,) = (json.loads(p.value) for p in model.metadata_props)
         assert contract["jump"] == (len(inputs) == 2)
         assert contract["provenance"]["seed"] == 3
-    assert contract["provenance"]["phases"] == {"walk": 2, "jump_a": 1, "jump_b": 1}
+    assert contract["provenance"]["phases"] == {"walk": 2, "jump_a": 1, "jump_b": 2}
 
 
 # --- Interrupted and resumed ---------------------------------------------------------------------
@@ -203,15 +205,21 @@ def test_the_last_policy_reads_the_jump_input_and_the_first_does_not(uninterrupt
 
 def test_stopped_after_every_iteration_it_is_the_same_run(uninterrupted, tmp_path, capsys):
     folder = RunFolder(tmp_path / "run")
-    stops = 0
+    stops, noise = 0, []
     words = (*ALL, "--minutes", "1e-9")
     while not folder.provenance.exists() or not provenance(folder)["finished"]:
         assert train(*words, "--out", folder.path) == 0
         # The settings are those of the run.
         words = ("all", "--minutes", "1e-9", "--resume", "--logger", "none")
         stops += 1
-        assert stops <= 4
-    assert stops == 4
+        noise.append(largest_noise(checkpoint.latest(folder.checkpoints)))
+        assert stops <= 5
+    assert stops == 5
+    # The network begins with 1. Phases without a limit leave it about there; the last one's is
+    # below that after the first of its two iterations, and lower after the second.
+    limits = [PHASES[-1].largest_noise(done) for done in (0.5, 1.0)]
+    assert min(noise[:3]) > 0.9 > limits[0] > limits[1]
+    assert noise[3:] == pytest.approx(limits, rel=1e-6)
     shown = capsys.readouterr().out
     assert "minutes are over" in shown
     assert f"pronk train all --resume --out {folder.path}" in shown
@@ -219,10 +227,16 @@ def test_stopped_after_every_iteration_it_is_the_same_run(uninterrupted, tmp_pat
         assert_same(folder.last_of(phase), uninterrupted.last_of(phase))
     assert folder.policy.read_bytes() != b""
     found = provenance(folder)
-    assert len(found["sessions"]) == 4
+    assert len(found["sessions"]) == 5
     before = provenance(uninterrupted)["phases"]
     for name, phase in found["phases"].items():
         assert phase["env_steps"] == before[name]["env_steps"]
+
+
+def largest_noise(path: Path) -> float:
+    """Largest standard deviation of an action, in a checkpoint."""
+    actor = checkpoint.load(path).tree["algorithm"]["actor_state_dict"]
+    return float(actor["distribution.std_param"].max())
 
 
 def test_killed_without_warning_it_loses_one_interval(uninterrupted, tmp_path):

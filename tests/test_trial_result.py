@@ -185,6 +185,15 @@ def test_the_paper_s_ratios_follow_from_its_table() -> None:
         assert sums["naive"] / sums["matched"] == pytest.approx(ratio, abs=5e-3)
 
 
+def test_the_paper_has_naive_first() -> None:
+    assert published.in_paper_order(["matched", "naive"]) == ["naive", "matched"]
+    # Only that one moves, and there may be none.
+    names = ["policy", "matched", "naive", "naive 2"]
+    assert published.in_paper_order(names) == ["naive", "policy", "matched", "naive 2"]
+    assert published.in_paper_order(iter(("b", "a"))) == ["b", "a"]
+    assert published.in_paper_order([]) == []
+
+
 def test_the_interval_covers_a_known_ratio() -> None:
     rng = np.random.default_rng(5)
     hits, trials = 0, 60

@@ -21,8 +21,9 @@ from pronk.bench.twin_apart import TwinApart
 from pronk.deploy.links import Link
 from pronk.deploy.log import DeployLog, read_deploy_log
 from pronk.deploy.operators import Scripted
+from pronk.deploy.outcome import Outcome
 from pronk.deploy.plan import Plan
-from pronk.deploy.run import Outcome, fly
+from pronk.deploy.run import fly
 from pronk.errors import ArtefactError, HardwareError
 from pronk.hardware import capture as captures
 from pronk.hardware.capture import Capture

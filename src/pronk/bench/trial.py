@@ -31,8 +31,9 @@ from rich.text import Text
 from pronk.errors import PronkError
 from pronk.hardware.truth import Truth, load_truth
 from pronk.robots import load_robot
+from pronk.trial.job import Job, jump
 from pronk.trial.protocol import PAPER_COMMANDS, Case
-from pronk.trial.run import Job, Plan, jobs_of, jump, versions
+from pronk.trial.run import Plan, jobs_of, versions
 from pronk.trial.subjects import load_subjects
 
 Array = NDArray[np.float64]

@@ -14,8 +14,9 @@ from pronk.commands.choices import Base, Link
 from pronk.errors import HardwareError, PronkError
 
 if TYPE_CHECKING:
+    from pronk.deploy.notice import Notice
     from pronk.deploy.operators import Operator
-    from pronk.deploy.run import Notice, Outcome
+    from pronk.deploy.outcome import Outcome
     from pronk.policy.contract import Contract
     from pronk.trial.protocol import Script
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -16,7 +15,9 @@ import orjson
 
 from pronk import __version__
 from pronk.deploy.logger import READY, write_log
+from pronk.deploy.notice import Notice
 from pronk.deploy.operators import Operator, Stick
+from pronk.deploy.outcome import Outcome
 from pronk.deploy.plan import Plan, Shared
 from pronk.deploy.records import STICK, Mode, Wish
 from pronk.deploy.servo import serve
@@ -32,68 +33,6 @@ _START_S = 30.0
 """In which the servo must have opened the link."""
 _END_S = 10.0
 """In which each process must have ended."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Notice:
-    """Something that the servo tells the operator."""
-
-    time: float
-    """CLOCK_MONOTONIC [s]."""
-    kind: str
-    """`mode`, `fault`, `refused`, `notice`, `lost`, `system` or `robot`."""
-    text: str
-    level: int
-    """A `Level`."""
-
-
-@dataclass(kw_only=True)
-class Outcome:
-    """How a deployment went."""
-
-    servo: dict[str, Any] = field(default_factory=dict)
-    """Figures of the servo; empty if it was killed."""
-    policy: dict[str, Any] = field(default_factory=dict)
-    """Figures of the policy's process; empty if it was killed."""
-    notices: list[Notice] = field(default_factory=list)
-    interrupted: bool = False
-    """Whether somebody ended it by a signal: the interrupt key, or the end of the terminal."""
-    trained_delay_s: tuple[float, float] = (0.0, 0.0)
-    """Command delays that the policy was trained for [s]."""
-
-    @property
-    def faults(self) -> list[str]:
-        """What damped the robot."""
-        return [notice.text for notice in self.notices if notice.kind == "fault"]
-
-    @property
-    def refusals(self) -> list[str]:
-        """Why the robot was not moved."""
-        return [notice.text for notice in self.notices if notice.kind == "refused"]
-
-    def delay_words(self) -> str:
-        """The measured delay beside the range that the policy was trained for, in one line."""
-        low, high = (1e3 * edge for edge in self.trained_delay_s)
-        measured = self.servo.get("state_to_command", {})
-        if not measured.get("n"):
-            return f"no delay was measured; the policy was trained for {low:g} to {high:g} ms."
-        p50, p95 = measured["p50_ms"], measured["p95_ms"]
-        where = "within" if p95 <= high else "BEYOND"
-        return (
-            f"state to command {p50:.1f} ms (median), {p95:.1f} ms (95 %), n = {measured['n']}: "
-            f"{where} the {low:g} to {high:g} ms trained for; the drives' own delay comes on top."
-        )
-
-    def figures(self) -> dict[str, Any]:
-        """For JSON and the end of the log."""
-        return {
-            "servo": self.servo,
-            "policy": self.policy,
-            "trained_delay_s": list(self.trained_delay_s),
-            "faults": self.faults,
-            "refusals": self.refusals,
-            "interrupted": self.interrupted,
-        }
 
 
 class Deployment:
@@ -190,15 +129,7 @@ class Deployment:
 
     def notices(self) -> list[Notice]:
         """What the servo has told since the last call; all of it is kept in the outcome too."""
-        found = [
-            Notice(
-                time=float(record["time"]),
-                kind=bytes(record["kind"]).decode("ascii"),
-                text=bytes(record["text"]).decode("ascii"),
-                level=int(record["level"]),
-            )
-            for record in self.shared.notices.take()
-        ]
+        found = [Notice.of(record) for record in self.shared.notices.take()]
         self.outcome.notices += found
         return found
 

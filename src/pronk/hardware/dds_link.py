@@ -16,9 +16,6 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
-
-import numpy as np
 
 from pronk.errors import HardwareError
 from pronk.hardware import dds_idl as idl
@@ -26,21 +23,22 @@ from pronk.hardware.dds_codec import joint_map
 from pronk.hardware.dds_intake import STATE_RATE_HZ, Intake
 from pronk.hardware.dds_net import DdsNetwork, Participant, take
 from pronk.hardware.dds_service import BENCH, CLAMP, Client, own_controller
-from pronk.hardware.dds_writer import REPEAT_S, CommandWriter
+from pronk.hardware.dds_writer import CommandWriter
+from pronk.hardware.link_rules import (
+    ANSWER_S,
+    Hand,
+    await_rest,
+    check_alone,
+    check_still_alone,
+    clamp,
+    fresh_states,
+    waited_for,
+)
 from pronk.hardware.machine import Command, State, TorqueKind
-from pronk.hardware.preflight import WINDOW_S, Freshness, check_rate, check_rest
+from pronk.hardware.preflight import Freshness, check_rest
 from pronk.hardware.twin_dds import COMMANDS, STATES
 from pronk.robots.robot import Robot
 
-Hand = Callable[[tuple[str, ...]], None]
-"""A person at the bench: told which joints to fix, returns when they are."""
-
-_DAMP_AT_LEAST_S = 1.0
-_DAMP_AT_MOST_S = 3.0
-_AT_REST = 0.5
-"""Joint speed below which a robot that is being left counts as at rest [rad/s]."""
-_ANSWER_S = 2.0
-"""How long the robot is given to be heard at first, or to answer a request."""
 _LONGEST_BURST_S = 0.1
 _LONGEST_PAUSE_S = 0.05
 _KEPT_STATES = 10_000
@@ -153,11 +151,7 @@ class DdsMachine:
             HardwareError: Not connected, not possible, or someone else has commanded since.
         """
         self.latest()
-        if self.counts["foreign"]:
-            raise HardwareError(
-                f"another program commands the joints on {COMMANDS} ({self.counts['foreign']} "
-                "commands met); stop it, and connect again."
-            )
+        check_still_alone(self.counts["foreign"], COMMANDS)
         self._writer.send(command)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
@@ -166,22 +160,8 @@ class DdsMachine:
         Raises:
             HardwareError: A joint is unknown, nobody is there to fix it, or no answer came.
         """
-        for name in joints:
-            self._robot.joint(name)
-        if self._bench is not None and self.virtual:
-            held = self._bench.ask(CLAMP, {"joints": list(joints)}, timeout_s=_ANSWER_S)
-            if held is None:
-                raise HardwareError(
-                    f"the virtual robot did not confirm its clamps within {_ANSWER_S:g} s; check "
-                    "that `pronk twin` still runs."
-                )
-        elif self._hand is not None:
-            self._hand(joints)
-        elif joints:
-            raise HardwareError(
-                f"{', '.join(joints)} must be fixed mechanically and nobody is at the bench; "
-                "ask joints that need no clamp, or have someone there who confirms it."
-            )
+        virtual = self.virtual and self._bench is not None
+        clamp(self._robot, joints, hold=self._hold if virtual else None, hand=self._hand)
 
     def damp(self) -> None:
         """Write damping now and go on until a command or the end. Never raises."""
@@ -197,12 +177,7 @@ class DdsMachine:
             return
         if self._writer.wrote:
             self.damp()
-            begun = time.monotonic()
-            while (spent := time.monotonic() - begun) < _DAMP_AT_MOST_S:
-                speed = np.abs(self._latest.velocity).max() if self._latest else 0.0
-                if spent >= _DAMP_AT_LEAST_S and speed < _AT_REST:
-                    break
-                time.sleep(REPEAT_S)
+            await_rest(lambda: self._latest)
         self._open = False
         self._thread.join()
         self._bench = None
@@ -220,15 +195,12 @@ class DdsMachine:
 
     def _preflight(self) -> None:
         begun = time.monotonic()
-        while self._latest is None:
-            if time.monotonic() > begun + _ANSWER_S:
-                raise HardwareError(
-                    f"{self.robot} sent no state on {STATES} within {_ANSWER_S:g} s in "
-                    f"{self._network}"
-                    + (f"; what came was refused: {why}" if (why := self._intake.complaint) else "")
-                    + "; check that the robot or its double runs, the domain and the interface."
-                )
-            time.sleep(0.002)
+        if not waited_for(lambda: self._latest is not None):
+            raise HardwareError(
+                f"{self.robot} sent no state on {STATES} within {ANSWER_S:g} s in {self._network}"
+                + (f"; what came was refused: {why}" if (why := self._intake.complaint) else "")
+                + "; check that the robot or its double runs, the domain and the interface."
+            )
         self.virtual = self._intake.virtual
         if self._joints.virtual_only and not self.virtual:
             raise HardwareError(
@@ -236,30 +208,25 @@ class DdsMachine:
                 f"{self.robot} speaks Unitree's messages; name the robot that it is."
             )
         self._bench = Client(self._participant, BENCH)
-        own_controller(self._participant, release=self._release, timeout_s=_ANSWER_S)
+        own_controller(self._participant, release=self._release, timeout_s=ANSWER_S)
         silent_from = time.monotonic()
         self.counts["foreign"] = 0
         self._check_states(begun)
         time.sleep(max(0.0, silent_from + self._alone_s - time.monotonic()))
-        if self.counts["foreign"]:
-            raise HardwareError(
-                f"someone else commands the joints: {self.counts['foreign']} commands on "
-                f"{COMMANDS} within {self._alone_s:g} s; stop that program, or release the "
-                "robot's own controller."
-            )
+        check_alone(self.counts["foreign"], COMMANDS, self._alone_s)
         self.wait(0.0)
 
+    def _hold(self, joints: tuple[str, ...]) -> bool:
+        """Ask the virtual robot to fix joints; whether it confirmed."""
+        asked = {"joints": list(joints)}
+        return self._bench is not None and (
+            self._bench.ask(CLAMP, asked, timeout_s=ANSWER_S) is not None
+        )
+
     def _check_states(self, begun: float) -> None:
-        # A busy computer may lose its breath once; a robot that is too slow never has it.
-        while True:
-            self.wait(0.0)
-            states = self.wait(time.monotonic() + WINDOW_S)
-            try:
-                check_rate(self.robot, states, STATE_RATE_HZ, self._fresh)
-                break
-            except HardwareError:
-                if time.monotonic() > begun + 2.0 * _ANSWER_S:
-                    raise
+        states = fresh_states(
+            self.robot, self.wait, STATE_RATE_HZ, self._fresh, until=begun + 2.0 * ANSWER_S
+        )
         if len(self._speakers) > 1:
             raise HardwareError(
                 f"{len(self._speakers)} robots speak on {STATES} in {self._network}, expected one; "

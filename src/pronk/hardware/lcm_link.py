@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from pronk.errors import HardwareError
 from pronk.hardware.lcm_layout import (
     layout_of,
 )
-from pronk.hardware.lcm_reader import ANSWER_S, StateReader, waited_for
+from pronk.hardware.lcm_reader import StateReader
 from pronk.hardware.lcm_service import (
     BEACON_CHANNEL,
     BENCH_CHANNEL,
@@ -28,17 +27,21 @@ from pronk.hardware.lcm_service import (
     mode_request,
 )
 from pronk.hardware.lcm_url import open_lcm, url_of
-from pronk.hardware.lcm_writer import DAMP_PERIOD_S, CommandWriter
+from pronk.hardware.lcm_writer import CommandWriter
+from pronk.hardware.link_rules import (
+    ANSWER_S,
+    Hand,
+    await_rest,
+    check_alone,
+    check_still_alone,
+    clamp,
+    fresh_states,
+    waited_for,
+)
 from pronk.hardware.machine import Command, State, TorqueKind
-from pronk.hardware.preflight import WINDOW_S, Freshness, check_rate, check_rest
+from pronk.hardware.preflight import Freshness, check_rest
 from pronk.robots.robot import Robot
 
-Hand = Callable[[tuple[str, ...]], None]
-"""A person at the bench: told which joints to fix, returns when they are."""
-
-_DAMP_AT_LEAST_S, _DAMP_AT_MOST_S = 1.0, 3.0
-_AT_REST = 0.5
-"""Joint speed below which a robot that is being left counts as at rest [rad/s]."""
 _QUEUE = 100
 
 
@@ -177,11 +180,7 @@ class LcmMachine:
         """
         if self._writer is None:
             raise HardwareError(f"the LCM link to {self.robot} is not open; call connect() first.")
-        if self._foreign:
-            raise HardwareError(
-                f"another program commands the joints on {self._layout.command_channel} "
-                f"({self._foreign} commands met); stop it, and connect again."
-            )
+        check_still_alone(self._foreign, self._layout.command_channel)
         values = (command.position, command.stiffness, command.damping)
         if not all(np.isfinite(value).all() for value in values):
             raise HardwareError("a command holds a number that is not finite; it was not sent.")
@@ -193,17 +192,8 @@ class LcmMachine:
         Raises:
             HardwareError: A joint is unknown, nobody is there to fix it, or no answer came.
         """
-        for name in joints:
-            self._robot.joint(name)
-        if self.virtual:
-            self._bench(joints)
-        elif self._hand is not None:
-            self._hand(joints)
-        elif joints:
-            raise HardwareError(
-                f"{', '.join(joints)} must be fixed mechanically and nobody is at the bench; "
-                "ask joints that need no clamp, or have someone there who confirms it."
-            )
+        virtual = self.virtual and self._writer is not None
+        clamp(self._robot, joints, hold=self._hold if virtual else None, hand=self._hand)
 
     def damp(self) -> None:
         """Write damping now and go on until a command or the end. Never raises."""
@@ -220,13 +210,7 @@ class LcmMachine:
             return
         if writer.wrote:
             writer.damp()
-            begun = time.monotonic()
-            while (spent := time.monotonic() - begun) < _DAMP_AT_MOST_S:
-                state = self._reader.latest
-                speed = np.abs(state.velocity).max() if state is not None else 0.0
-                if spent >= _DAMP_AT_LEAST_S and speed < _AT_REST:
-                    break
-                time.sleep(DAMP_PERIOD_S)
+            await_rest(lambda: self._reader.latest)
         writer.stop()
         self._reading = False
         self._thread.join()
@@ -255,24 +239,16 @@ class LcmMachine:
         if self._release:
             self._let_go()
         self._foreign, silent_from = 0, time.monotonic()
-        while True:
-            reader.drain()
-            states = self.wait(time.monotonic() + WINDOW_S)
-            try:
-                check_rate(self.robot, states, layout.state_rate_hz, self._fresh)
-                break
-            except HardwareError:
-                # A busy computer may lose its breath; a robot that is too slow never has it.
-                if time.monotonic() > begun + 2.0 * ANSWER_S:
-                    raise
+        states = fresh_states(
+            self.robot,
+            self.wait,
+            layout.state_rate_hz,
+            self._fresh,
+            until=begun + 2.0 * ANSWER_S,
+        )
         check_rest(self._robot, states)
         time.sleep(max(0.0, silent_from + self._alone_s - time.monotonic()))
-        if self._foreign:
-            raise HardwareError(
-                f"someone else commands the joints: {self._foreign} commands on "
-                f"{layout.command_channel} within {self._alone_s:g} s; stop that program, or "
-                "release the robot's own controller."
-            )
+        check_alone(self._foreign, layout.command_channel, self._alone_s)
         if self._interface is None:
             # It says so ten times a second; someone else's simulator never does.
             waited_for(lambda: reader.virtual)
@@ -288,7 +264,8 @@ class LcmMachine:
                 f"{ANSWER_S:g} s; release it by its own remote."
             )
 
-    def _bench(self, joints: tuple[str, ...]) -> None:
+    def _hold(self, joints: tuple[str, ...]) -> bool:
+        """Ask the virtual robot to fix joints; whether it confirmed."""
         names, request = self._robot.joint_names, time.monotonic_ns()
         data = clamp_message(names, joints, request)
         held = (request, tuple(name for name in names if name in joints))
@@ -296,8 +273,5 @@ class LcmMachine:
         for _ in range(4):
             self._publish(BENCH_CHANNEL, data)
             if waited_for(lambda: self._reader.held == held, ANSWER_S / 4):
-                return
-        raise HardwareError(
-            f"the virtual robot did not confirm its clamps within {ANSWER_S:g} s; check that "
-            "`pronk twin` still runs."
-        )
+                return True
+        return False

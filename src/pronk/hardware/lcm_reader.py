@@ -8,9 +8,7 @@ age is what whoever commands watches.
 
 from __future__ import annotations
 
-import time
 from collections import Counter, deque
-from collections.abc import Callable
 
 from pronk.hardware.lcm_codec import (
     Attitude,
@@ -25,8 +23,6 @@ from pronk.hardware.lcm_message import RefusedError
 from pronk.hardware.lcm_service import read_clamp_message
 from pronk.hardware.machine import State
 
-ANSWER_S = 2.0
-"""How long a robot is given to be heard at first, or to answer a request [s]."""
 _OLDEST_ATTITUDE_S = 0.02
 _NUMBER_JUMP = 1000
 """A count this far from the last is that of a robot that was started again, or a broken one."""
@@ -118,13 +114,3 @@ class StateReader:
     def _refuse(self, error: RefusedError) -> None:
         self.counts[f"refused: {error.reason}"] += 1
         self.complaint = str(error).rstrip(".")
-
-
-def waited_for(done: Callable[[], bool], seconds: float = ANSWER_S) -> bool:
-    """Wait until something is so, at most `seconds`; whether it is."""
-    end = time.monotonic() + seconds
-    while not done():
-        if time.monotonic() >= end:
-            return False
-        time.sleep(0.002)
-    return True

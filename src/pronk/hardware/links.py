@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from pronk.errors import HardwareError
+from pronk.hardware.link_rules import Hand
 from pronk.hardware.machine import Machine
 from pronk.hardware.preflight import Freshness
 from pronk.robots.robot import Robot
-
-Hand = Callable[[tuple[str, ...]], None]
-"""A person at the bench: told which joints to fix, returns when they are."""
 
 WIRES = ("lcm", "dds")
 

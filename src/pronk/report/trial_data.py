@@ -16,7 +16,7 @@ from pronk.report.trial_cells import Published, Values
 from pronk.report.trial_ratios import Ratio
 from pronk.report.trial_traces import Trace
 from pronk.trial.protocol import RATES
-from pronk.trial.published import PAPER_RATIOS, TABLE_III
+from pronk.trial.published import PAPER_RATIOS, TABLE_III, in_paper_order
 from pronk.trial.result import Trial
 from pronk.trial.rows import Row
 
@@ -30,7 +30,7 @@ TRACE_RATE_HZ = 250.0
 
 def policies(trial: Trial) -> list[str]:
     """Names of the policies, a naive one first, as in the paper's table."""
-    return sorted((subject.name for subject in trial.subjects), key=lambda name: name != "naive")
+    return in_paper_order(subject.name for subject in trial.subjects)
 
 
 def values(trial: Trial, figure: str, cases: Sequence[str]) -> Values:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -95,9 +95,7 @@ def part(material: Material, *, anchor: str, title: str = "Trial") -> Part:
         totals=totals(trial),
         checks=bars.checks(trial),
         verdicts=[tables.verdict(trial, other.name) for other in trial.subjects[1:]],
-        table_iii=[
-            _naive_first(tables.table_iii(trial, figure)) for figure in ("height", "distance")
-        ],
+        table_iii=[tables.table_iii(trial, figure) for figure in ("height", "distance")],
         landings=tables.landings(trial),
         bars=tables.bars(trial),
         scatter=tables.scatter(trial) if trial.ratios else None,
@@ -249,19 +247,6 @@ def _kept(trial: Trial, seen: Seen | None) -> str:
     return (
         f"{shown} of {len(trial.rows)} jumps, those whose captures were kept; `pronk trial "
         f"--keep-captures` keeps all.{missing}"
-    )
-
-
-def _naive_first(sheet: tables.Sheet) -> tables.Sheet:
-    """The same with our columns in the paper's order, naive before matched."""
-    order = sorted(
-        range(len(sheet.columns)),
-        key=lambda i: (i > 2, i > 2 and not sheet.columns[i].startswith("naive")),
-    )
-    return replace(
-        sheet,
-        columns=tuple(sheet.columns[i] for i in order),
-        rows=tuple(tuple(row[i] for i in order) for row in sheet.rows),
     )
 
 

@@ -11,6 +11,7 @@ from pronk.report.shell import Part
 from pronk.report.trial_extra import Block, part, place
 from pronk.report.trial_sweeps import Line, Panel, lines
 from pronk.trial.metrics import FIGURES
+from pronk.trial.published import in_paper_order
 from pronk.trial.summary import share_interval
 from pronk.trial.tables import Sheet, number, spread
 from pronk.trial.variation import AS_IT_IS, VARIED_FIGURES, Parameter, Point, Variation
@@ -58,7 +59,7 @@ def success_line(together: Sequence[Sequence[Point]]) -> Line:
 
 def panels(variation: Variation) -> list[Panel]:
     """A column for each parameter; rows of height, distance and success."""
-    policies = sorted((s.name for s in variation.origin.subjects), key=lambda name: name != "naive")
+    policies = in_paper_order(subject.name for subject in variation.origin.subjects)
     rows: list[tuple[str, bool, Callable[[Sequence[Sequence[Point]]], Line]]] = [
         *(
             (f"{name} [m]", False, lambda together, name=name: figure_line(together, name))

@@ -8,6 +8,7 @@ from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial_cells import Values, cells
 from pronk.report.trial_extra import Block, part, place
+from pronk.trial.published import in_paper_order
 from pronk.trial.tables import Sheet, spread
 from pronk.trial.walk import Walks
 from pronk.trial.walk_metrics import SETTLE_S, WALK_FIGURES
@@ -32,18 +33,18 @@ _SHOWN = (
 def values(walks: Walks, figure: str) -> Values:
     """One figure of every walk, by policy and command."""
     return {
-        subject.name: {
+        name: {
             case.name: np.array(
                 [
                     getattr(row.figures, figure)
                     for row in walks.rows
-                    if (row.policy, row.case) == (subject.name, case.name)
+                    if (row.policy, row.case) == (name, case.name)
                 ],
                 dtype=float,
             )
             for case in walks.cases
         }
-        for subject in sorted(walks.origin.subjects, key=lambda subject: subject.name != "naive")
+        for name in in_paper_order(subject.name for subject in walks.origin.subjects)
     }
 
 

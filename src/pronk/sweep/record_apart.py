@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pronk.errors import HardwareError, PronkError
-from pronk.hardware.links import Hand
+from pronk.hardware.link_rules import Hand
 from pronk.hardware.terminal import Interrupts, unheard
 from pronk.sweep.channel import Channel
 from pronk.sweep.log_apart import reason_of

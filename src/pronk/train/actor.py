@@ -192,6 +192,15 @@ class EstimatorActor(JumpModel):
         own = measured[..., self._actor_indices]
         return torch.cat([*estimate, own, *self._jump(obs)], dim=-1)
 
+    def limit_noise(self, largest: float) -> None:
+        """Explore no more than that from now on.
+
+        Args:
+            largest: Standard deviation of an action.
+        """
+        with torch.no_grad():
+            self.distribution.std_param.clamp_(max=largest)
+
     def estimator_input(self, obs: Observations) -> Tensor:
         """What the estimator reads, (..., 102 + jump)."""
         return self._estimator_input(self.obs_normalizer(obs[self.group]), obs)

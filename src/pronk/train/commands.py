@@ -61,7 +61,7 @@ class MotionCommandCfg(CommandTermCfg):
     """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3)."""
     growth: tuple[float, int, int] = (0.35, 1000, 6500)
     """Part of the ranges at first, and the policy steps between which it grows to the whole."""
-    standing: float = 0.1
+    standing: float = 0.15
     """Part of the draws that are zero."""
     one_axis: float = 0.4
     """Part of the draws along one axis alone, as the trials ask."""
@@ -197,6 +197,8 @@ class MotionCommand(CommandTerm):
                     self._motion.velocity_trunk[:, :2] - self.target, dim=-1
                 ),
                 along=self._along(self._motion.velocity_trunk[:, :2]),
+                feet=self._motion.foot_position,
+                direction=self._direction(self._motion.ahead[:, :2]),
                 dt=self._env.step_dt,
             )
         return self._motion
@@ -207,6 +209,16 @@ class MotionCommand(CommandTerm):
         speed = torch.linalg.vector_norm(target, dim=-1)
         part = (velocity * target).sum(dim=-1) / speed.clamp_min(1e-6)
         return torch.minimum(part, speed)
+
+    def _direction(self, ahead: Tensor) -> Tensor:
+        """Unit vector of the velocity asked for, world frame, or zero. (N, 2).
+
+        Args:
+            ahead: The trunk's x axis, world frame, horizontal part. (N, 2)
+        """
+        left = torch.stack((-ahead[:, 1], ahead[:, 0]), dim=-1)
+        way = self.velocity[:, :1] * ahead + self.velocity[:, 1:2] * left
+        return way / torch.linalg.vector_norm(way, dim=-1, keepdim=True).clamp_min(1e-6)
 
     def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
         """Fresh commands for robots that start anew; jumps under way are forgotten."""

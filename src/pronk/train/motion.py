@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from mjlab.entity.data import compute_velocity_from_cvel
-from mjlab.utils.lab_api.math import quat_apply_inverse
+from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from torch import Tensor
 
 from pronk.robots.mini_cheetah import constants
@@ -38,12 +38,18 @@ class Motion:
     """In the trunk's frame [rad/s]. (N, 3)"""
     gravity: Tensor
     """Direction of gravity in the trunk's frame; (0, 0, -1) upright. (N, 3)"""
+    ahead: Tensor
+    """Unit vector of the trunk's x axis, world frame. (N, 3)"""
     contact: Tensor
     """Feet on the ground, bool. (N, 4)"""
     force: Tensor
     """Magnitude of the ground's force on each foot [N]. (N, 4)"""
+    foot_position: Tensor
+    """Horizontal, world frame [m]. (N, 4, 2)"""
     foot_height: Tensor
     """Lowest point of each foot over ground [m]. (N, 4)"""
+    knee_height: Tensor
+    """Axes of the knees over ground [m]. (N, 4)"""
     foot_velocity: Tensor
     """World frame [m/s]. (N, 4, 3)"""
     foot_velocity_change: Tensor
@@ -83,7 +89,8 @@ def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) 
     ).chunk(2)
     foot = physics.site_xpos[:, feet]
     com = physics.subtree_com[:, robot.indexing.root_body_id].unsqueeze(1)
-    shank_velocity = physics.cvel[:, env.sim.model.site_bodyid[feet]]
+    shanks = env.sim.model.site_bodyid[feet]
+    shank_velocity = physics.cvel[:, shanks]
     foot_velocity = compute_velocity_from_cvel(foot, com, shank_velocity)[..., :3]
     torque = robot.actuator_force
     return Motion(
@@ -94,9 +101,12 @@ def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) 
         velocity_trunk=velocity_trunk,
         angular_velocity=qvel[:, 3:6],
         gravity=gravity,
+        ahead=quat_apply(qpos[:, 3:7], torch.eye(3, device=qpos.device)[:1].expand(len(qpos), 3)),
         contact=ground.found > 0,
         force=torch.linalg.vector_norm(ground.force, dim=-1),
+        foot_position=foot[..., :2].clone(),
         foot_height=foot[..., 2] - constants.FOOT_RADIUS,
+        knee_height=physics.xpos[:, shanks, 2],
         foot_velocity=foot_velocity,
         foot_velocity_change=foot_velocity - (before.foot_velocity if before else 0.0),
         touching=(env.scene["limbs"].data.found > 0).sum(dim=-1, dtype=torch.float32),

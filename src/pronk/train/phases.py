@@ -7,6 +7,7 @@ leave the ground with all feet at once; in 2b a tenth of that is left (Table II)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -20,7 +21,7 @@ from pronk.train.reward_table import ROWS, JumpWeights, with_jump_weights
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
-_NO_JUMP = JumpWeights(dense=0.0, sparse=0.0, width=1.0, rise=0.0, reach=0.0, hop=0.0)
+_NO_JUMP = JumpWeights(dense=0.0, sparse=0.0, width=1.0, rise=0.0, reach=0.0, gap=0.0, hop=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +36,8 @@ class Phase:
     weights: JumpWeights = _NO_JUMP
     entropy: float = 0.005
     """Coefficient of PPO's entropy bonus: how much exploring is worth."""
+    noise: tuple[float, float] | None = None
+    """Largest standard deviation of the network's actions, at first and at last; None: any."""
     estimator_rate: float = 1e-3
     """Learning rate of the estimator."""
 
@@ -44,9 +47,22 @@ class Phase:
         return 0.5 if self.jump else 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a phase of no iterations."""
+        """Refuse a phase of no iterations, and noise of none."""
         if self.iterations < 1:
             raise PronkError(f"phase {self.name} has {self.iterations} iterations; 1 or more.")
+        if self.noise is not None and not all(limit > 0.0 for limit in self.noise):
+            raise PronkError(f"phase {self.name} has noise {self.noise}; both must be positive.")
+
+    def largest_noise(self, done: float) -> float:
+        """Largest standard deviation of the network's actions; falls or grows geometrically.
+
+        Args:
+            done: Part of the phase that is over, 0 to 1.
+        """
+        if self.noise is None:
+            return math.inf
+        first, last = self.noise
+        return first * (last / first) ** done
 
 
 PHASES: tuple[Phase, ...] = (
@@ -56,17 +72,22 @@ PHASES: tuple[Phase, ...] = (
         name="jump_a",
         iterations=230,
         jump=True,
-        weights=JumpWeights(dense=0.02, sparse=8.0, width=1.0, rise=20.0, reach=8.0, hop=0.0),
-        entropy=0.006,
+        weights=JumpWeights(
+            dense=0.02, sparse=10.0, width=1.0, rise=20.0, reach=12.0, gap=4.0, hop=0.0
+        ),
+        entropy=0.01,
     ),
-    # And then done alike every time: an actor that explores on (with .003 its standard deviation
-    # was .59 after 560 iterations, .42 before the first jump) walks worse and scatters.
+    # And then done alike every time: an actor that explores on (its standard deviation .59 after
+    # 560 iterations, .42 before the first jump) walks worse and scatters.
     Phase(
         name="jump_b",
         iterations=700,
         jump=True,
-        weights=JumpWeights(dense=0.002, sparse=8.0, width=0.3, rise=25.0, reach=8.0, hop=0.5),
-        entropy=0.0005,
+        weights=JumpWeights(
+            dense=0.002, sparse=10.0, width=0.3, rise=18.0, reach=18.0, gap=8.0, hop=2.0
+        ),
+        entropy=0.0015,
+        noise=(0.65, 0.2),
         estimator_rate=3e-4,
     ),
 )

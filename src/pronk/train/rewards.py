@@ -120,6 +120,11 @@ def reach(command: MotionCommand) -> Tensor:
     return command.per_event(command.tracker.reach)
 
 
+def gap(command: MotionCommand) -> Tensor:
+    """Ground newly cleared by all feet within this command [m], where told to go; an event."""
+    return command.per_event(command.tracker.gap)
+
+
 def hop(command: MotionCommand) -> Tensor:
     """1 per lift-off after the first of one command; an event."""
     return command.per_event(command.tracker.hop)
@@ -144,6 +149,11 @@ def slip(command: MotionCommand) -> Tensor:
 def trunk_height(command: MotionCommand, height: float) -> Tensor:
     """relu(z - height)^2 of the trunk [m^2]: nobody hops who was not told to."""
     return (command.motion.height - height).clamp_min(0.0).square()
+
+
+def knees(command: MotionCommand, height: float) -> Tensor:
+    """Sum of relu(1 - z / height) over the knees' axes: no knee shall come near the ground."""
+    return (1.0 - command.motion.knee_height / height).clamp_min(0.0).sum(dim=-1)
 
 
 def crouch(command: MotionCommand, height: float) -> Tensor:

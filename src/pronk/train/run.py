@@ -15,6 +15,7 @@ import contextlib
 import os
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -122,7 +123,12 @@ class _Run:
             end = self._end_of(phase)
             left = end - runner.current_learning_iteration
             if left > 0:
-                runner.learn(left, init_at_random_ep_len=fresh, on_iteration=self._look_at_clock)
+                self._limit_noise(runner, phase)
+                runner.learn(
+                    left,
+                    init_at_random_ep_len=fresh,
+                    on_iteration=partial(self._after_iteration, phase=phase),
+                )
             finished = runner.current_learning_iteration == end
             if finished:
                 self._finish(runner, phase)
@@ -242,7 +248,12 @@ class _Run:
         """Iterations of the run when the phase is over."""
         return sum(p.iterations for p in self.phases[: self._index(phase) + 1])
 
-    def _look_at_clock(self, runner: PronkRunner) -> None:
+    def _limit_noise(self, runner: PronkRunner, phase: Phase) -> None:
+        left = self._end_of(phase) - runner.current_learning_iteration
+        runner.alg.get_policy().limit_noise(phase.largest_noise(1.0 - left / phase.iterations))
+
+    def _after_iteration(self, runner: PronkRunner, phase: Phase) -> None:
+        self._limit_noise(runner, phase)
         minutes = self.watch.minutes
         if minutes is not None and time.monotonic() - self.begin > 60.0 * minutes:
             runner.stop(f"{minutes:g} minutes are over")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import mujoco
 from mjlab.actuator import DcMotorActuatorCfg
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.scene import SceneCfg
@@ -22,6 +25,12 @@ _LIMB_GEOMS = (
 )
 
 
+FOOT_CONTACT = (0.0105, 1.0)
+"""Time constant [s] and damping ratio of a foot on the ground. MuJoCo's .02 lets the feet of a
+landing robot sink by 19 to 28 mm, so that its shanks touch the floor; less than twice the physics
+step MuJoCo does not take."""
+
+
 def robot_entity(robot: Robot, actuators: tuple[DcMotorActuatorCfg, ...]) -> EntityCfg:
     """The free robot in its default pose, with the drives of training.
 
@@ -30,7 +39,7 @@ def robot_entity(robot: Robot, actuators: tuple[DcMotorActuatorCfg, ...]) -> Ent
         actuators: Drives, from `pronk.train.drives.actuators`.
     """
     return EntityCfg(
-        spec_fn=robot.build_spec,
+        spec_fn=partial(_on_firm_feet, robot),
         init_state=EntityCfg.InitialStateCfg(
             pos=(0.0, 0.0, standing_height()),
             joint_pos={joint.name: joint.default_position for joint in robot.joints},
@@ -39,6 +48,13 @@ def robot_entity(robot: Robot, actuators: tuple[DcMotorActuatorCfg, ...]) -> Ent
         articulation=EntityArticulationInfoCfg(actuators=actuators),
         sort_actuators=True,
     )
+
+
+def _on_firm_feet(robot: Robot) -> mujoco.MjSpec:
+    spec = robot.build_spec()
+    for name in FOOT_GEOMS:
+        spec.geom(name).solref = FOOT_CONTACT
+    return spec
 
 
 def scene(entity: EntityCfg, num_envs: int) -> SceneCfg:

@@ -29,13 +29,15 @@ from pronk.jumps import JumpRules
 from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.trial import run, sheet
+from pronk.trial import sheet
 from pronk.trial.course import Kind, Obstacle, Operator, Verdict, direction, judge, lost
 from pronk.trial.crossing import Crossing, Crossings, rung_of, save
+from pronk.trial.job import Job, body, set_down
 from pronk.trial.pilot import ticks
 from pronk.trial.processes import in_processes
 from pronk.trial.protocol import STILL, Case, Script
 from pronk.trial.result import Subject
+from pronk.trial.run import mass_of
 from pronk.trial.subjects import load_subjects
 
 CROSSED_BY = (
@@ -128,7 +130,7 @@ class Plan:
 class Attempt:
     """One run at an obstacle, with all that it depends on."""
 
-    job: run.Job
+    job: Job
     """Policy, body and start; its script has the command and the times `stand_s`, `jump_s` and
     `keep_s`."""
     obstacle: Obstacle
@@ -142,7 +144,7 @@ def attempt(task: Attempt) -> Verdict:
     """Run once at an obstacle."""
     job, script, rules = task.job, task.job.script, task.job.rules
     along = direction(script.command)
-    machine = run.set_down(job)
+    machine = set_down(job)
     operator = Operator(
         script,
         edge=task.edge,
@@ -202,7 +204,7 @@ def add_crossings(
     search = _Search(subjects, plan, robot=robot, truth=truth)
     while planned := search.next_round():
         tasks = [task for _, task in planned]
-        run.body(tasks[0].job)  # a body that cannot exist is refused here
+        body(tasks[0].job)  # a body that cannot exist is refused here
         found = in_processes(
             attempt,
             tasks,
@@ -289,7 +291,7 @@ class _Search:
                 number=number,
                 **asdict(Verdict(why="")),
             )
-            job = run.Job(
+            job = Job(
                 policy=Path(subject.path),
                 sha256=subject.sha256,
                 robot=self._robot.name,
@@ -299,7 +301,7 @@ class _Search:
                 seed=seed,
                 script=replace(plan.script, command=case.command),
                 rules=plan.rules,
-                mass=run.mass_of(self._robot),
+                mass=mass_of(self._robot),
                 keep=None,
             )
             found.append((row, Attempt(job=job, obstacle=obstacle, edge=edge, lead=lead)))

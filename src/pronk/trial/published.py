@@ -5,7 +5,7 @@ It is shown and compared with, never fitted to.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 Pair = tuple[float, float]
@@ -49,3 +49,12 @@ likely a slip of the pen (reading A4)."""
 PAPER_RATIOS = {"height": 1.48, "distance": 2.08}
 """Ratio of the mean standard deviations, naive over matched, as Table III gives it; the text says
 2.30 for the distance (reading A4)."""
+
+
+def in_paper_order(names: Iterable[str]) -> list[str]:
+    """Names of policies as the columns of Table III have them: `naive` first, others as they came.
+
+    Args:
+        names: Each once, in any order.
+    """
+    return sorted(names, key=lambda name: name != "naive")

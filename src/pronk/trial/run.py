@@ -32,29 +32,13 @@ from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.trial import result
 from pronk.trial.folder import CAPTURES, prepare
-from pronk.trial.job import Job, Jumped, body, flight, jump, set_down
+from pronk.trial.job import Job, Jumped, body, jump
 from pronk.trial.metrics import JumpFigures
 from pronk.trial.processes import in_processes
 from pronk.trial.protocol import PAPER_COMMANDS, RATES, STILL, Case, Script
 from pronk.trial.result import Subject, Trial
 from pronk.trial.rows import Row
 from pronk.trial.subjects import load_subjects
-
-__all__ = [
-    "Job",
-    "Jumped",
-    "Plan",
-    "body",
-    "draw",
-    "flight",
-    "jobs_of",
-    "jump",
-    "load_subjects",
-    "mass_of",
-    "run",
-    "set_down",
-    "versions",
-]
 
 
 @dataclass(frozen=True, kw_only=True)

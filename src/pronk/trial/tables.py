@@ -13,7 +13,7 @@ from typing import Any
 
 from pronk.trial.bars import JUMPS, checks
 from pronk.trial.metrics import FIGURES
-from pronk.trial.published import PAPER_RATIOS, TABLE_III, Pair
+from pronk.trial.published import PAPER_RATIOS, TABLE_III, Pair, in_paper_order
 from pronk.trial.result import COMPARED, Trial
 from pronk.trial.summary import FEWEST, Cell, Ratio, Spread
 
@@ -43,10 +43,7 @@ def sheets(trial: Trial) -> tuple[Sheet, ...]:
 
 def table_iii(trial: Trial, figure: str) -> Sheet:
     """The paper's Table III beside ours, for `height` or `distance`."""
-    # In the paper's order, naive before matched.
-    subjects = sorted(
-        (subject.name for subject in trial.subjects), key=lambda name: name != "naive"
-    )
+    subjects = in_paper_order(subject.name for subject in trial.subjects)
     rows = []
     for case in trial.cases:
         paper = TABLE_III.get(case.name)

@@ -18,11 +18,12 @@ from pronk.errors import PronkError
 from pronk.hardware.truth import Truth, with_changes
 from pronk.robots.robot import Robot
 from pronk.trial import sheet
+from pronk.trial.job import Job, body, jump
 from pronk.trial.metrics import FIGURES
 from pronk.trial.processes import in_processes
 from pronk.trial.protocol import Case
 from pronk.trial.result import Subject
-from pronk.trial.run import Job, Plan, body, jobs_of, jump
+from pronk.trial.run import Plan, jobs_of
 from pronk.trial.subjects import load_subjects
 from pronk.trial.summary import Spread, share_interval
 

@@ -15,9 +15,10 @@ from typing import Any
 from pronk.hardware.truth import Truth
 from pronk.robots.robot import Robot
 from pronk.trial import sheet
+from pronk.trial.job import Job, body, flight
 from pronk.trial.processes import in_processes
 from pronk.trial.protocol import STILL, Case, Script
-from pronk.trial.run import Job, Plan, body, flight, jobs_of
+from pronk.trial.run import Plan, jobs_of
 from pronk.trial.subjects import load_subjects
 from pronk.trial.summary import Spread
 from pronk.trial.walk_metrics import SETTLE_S, WALK_FIGURES, WalkFigures, measure_walk
