@@ -63,7 +63,7 @@ class MotionCommandCfg(CommandTermCfg):
     """Part of the ranges at first, and the policy steps between which it grows to the whole."""
     standing: float = 0.15
     """Part of the draws that are zero."""
-    one_axis: float = 0.4
+    one_axis: float = 0.55
     """Part of the draws along one axis alone, as the trials ask."""
     jump_fraction: float = 0.0
     """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""

@@ -21,20 +21,7 @@ from pronk.trial.protocol import STILL, Case, Script
 from pronk.trial.run import Plan, jobs_of
 from pronk.trial.subjects import load_subjects
 from pronk.trial.summary import Spread
-from pronk.trial.walk_metrics import SETTLE_S, WALK_FIGURES, WalkFigures, measure_walk
-
-__all__ = [
-    "SETTLE_S",
-    "WALKS",
-    "WALK_FIGURES",
-    "Walk",
-    "WalkCell",
-    "Walks",
-    "add_walks",
-    "load",
-    "save",
-    "walk",
-]
+from pronk.trial.walk_metrics import WALK_FIGURES, WalkFigures, measure_walk
 
 SCHEMA = "pronk/trial-walk/1"
 FILE = "walk.json"
