@@ -80,7 +80,7 @@ def test_velocities_are_uniform_over_the_full_ranges(env: Any, command: MotionCo
 
 
 def test_shares_of_standing_and_of_one_axis(env: Any, command: MotionCommand) -> None:
-    """15 of 100 stand, 40 move along one axis, each as often; the rest along all."""
+    """15 of 100 stand, 55 move along one axis, each as often; the rest along all."""
     moves = drawn(command) != 0.0
     axes, total = moves.sum(axis=1), len(moves)
     assert_share((axes == 0).sum(), total, 0.15)
