@@ -245,8 +245,8 @@ def _kept(trial: Trial, seen: Seen | None) -> str:
     if shown == len(trial.rows):
         return f"All {shown} jumps."
     return (
-        f"{shown} of {len(trial.rows)} jumps, those whose captures were kept; `pronk trial "
-        f"--keep-captures` keeps all.{missing}"
+        f"{shown} of {len(trial.rows)} jumps, those whose captures were kept; pronk trial "
+        f"--keep-captures keeps all.{missing}"
     )
 
 
