@@ -19,7 +19,7 @@ from pronk.hardware.dds_codec import JointMap, encode_command
 from pronk.hardware.dds_net import write
 from pronk.hardware.machine import Command
 
-REPEAT_S = 0.004
+_REPEAT_S = 0.004
 """Silence after which the command in force is written again; Unitree's examples write every 1 to
 10 ms."""
 
@@ -88,5 +88,5 @@ class CommandWriter:
 
     def _force(self, data: bytes, expires: float) -> None:
         self._data, self._expires = data, expires
-        self._due = min(time.monotonic() + REPEAT_S, expires)
+        self._due = min(time.monotonic() + _REPEAT_S, expires)
         write(self._out, data, self._counts)

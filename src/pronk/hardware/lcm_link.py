@@ -14,9 +14,7 @@ from collections import Counter
 import numpy as np
 
 from pronk.errors import HardwareError
-from pronk.hardware.lcm_layout import (
-    layout_of,
-)
+from pronk.hardware.lcm_layout import layout_of
 from pronk.hardware.lcm_reader import StateReader
 from pronk.hardware.lcm_service import (
     BEACON_CHANNEL,

@@ -21,7 +21,7 @@ from pronk.hardware.machine import Command
 
 DAMPING = 1.0
 """Of the joints while they are damped [N m s/rad]."""
-DAMP_PERIOD_S = 0.01
+_DAMP_PERIOD_S = 0.01
 """Between two messages of damping."""
 _REMEMBERED = 512
 
@@ -124,7 +124,7 @@ class CommandWriter:
         with self._changed:
             while self._open:
                 if self._damping:
-                    self._changed.wait(DAMP_PERIOD_S)
+                    self._changed.wait(_DAMP_PERIOD_S)
                     if self._damping and self._open:
                         self._write(self._sink)
                 elif (left := self._expires - time.monotonic()) <= 0.0:

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from pronk.sweep.channel import Channel
 from pronk.sweep.log import Segment
-from pronk.sweep.mcap_log import LogHeader, McapLogWriter
+from pronk.sweep.mcap_log import LogHeader, McapLogWriter, reason_of
 
 
 class LogApart:
@@ -45,8 +45,3 @@ class LogApart:
 
 Log = McapLogWriter | LogApart
 """What a recording writes into."""
-
-
-def reason_of(error: BaseException | None) -> str:
-    """Why a log ends, as `McapLogWriter` says it."""
-    return "" if error is None else f"{type(error).__name__}: {error}".rstrip(": ")

@@ -138,8 +138,7 @@ class McapLogWriter:
         trace: TracebackType | None,
     ) -> None:
         """End the log: whole if the block succeeded, cut short with the reason otherwise."""
-        reason = "" if kind is None else f"{kind.__name__}: {error}".rstrip(": ")
-        self.end(complete=kind is None, reason=reason)
+        self.end(complete=error is None, reason=reason_of(error))
 
     def segment(self, segment: Segment) -> int:
         """Announce a question, before its samples; returns its number."""
@@ -201,6 +200,11 @@ class McapLogWriter:
         # NaN and infinity become null.
         data = orjson.dumps(body, option=orjson.OPT_SERIALIZE_NUMPY)
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
+
+
+def reason_of(error: BaseException | None) -> str:
+    """Why a log ends, in words; empty if nothing went wrong."""
+    return "" if error is None else f"{type(error).__name__}: {error}".rstrip(": ")
 
 
 def write_mcap(path: Path, log: SweepLog) -> None:

@@ -190,11 +190,11 @@ class JumpTracker:
         # A crouch counts: the way over which the legs push is what a battery's power is short of.
         goes_on = self.mode & keep
         highest = torch.where(goes_on, self.highest, height)
-        lowest = torch.where(goes_on, self.lowest, height.clamp_min(s.crouch))
+        low = height.clamp_min(s.crouch)
+        lowest = torch.where(goes_on, self.lowest, low)
         stroke = self.stroke * goes_on
         self.highest = torch.maximum(highest, height)
-        pushed_from = torch.minimum(lowest, height.clamp_min(s.crouch))
-        self.lowest = torch.where(self.liftoffs > 0.0, lowest, pushed_from)
+        self.lowest = torch.where(self.liftoffs > 0.0, lowest, torch.minimum(lowest, low))
         self.stroke = (self.highest - self.lowest).clamp(0.0, s.stroke)
         self.rise = self.stroke - stroke
 
