@@ -19,7 +19,7 @@ from pronk.errors import LogError, PronkError, RobotError
 from pronk.robots import load_robot
 from pronk.sweep.csv_log import write_csv
 from pronk.sweep.log import SweepLog
-from pronk.sweep.mcap_log import write_mcap
+from pronk.sweep.mcap_writer import write_mcap
 from pronk.sweep.npz_log import write_npz
 from pronk.sweep.readers import read_log, read_logs
 

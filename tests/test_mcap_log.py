@@ -1,4 +1,4 @@
-"""MCAP logs: round trips, what is left of a cut file, and ROS 2 bags."""
+"""MCAP logs: round trips, and what is left of a cut file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,20 +17,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from mcap_ros2.writer import Writer as RosWriter
 
 from pronk.errors import LogError
 from pronk.sweep.log import Segment, SweepLog
-from pronk.sweep.mcap_log import (
-    END,
-    HEADER,
-    SAMPLE,
-    SEGMENT,
-    LogHeader,
-    McapLogWriter,
-    read_mcap,
-    write_mcap,
-)
+from pronk.sweep.mcap_format import END, HEADER, SAMPLE, SEGMENT, LogHeader
+from pronk.sweep.mcap_reader import read_mcap
+from pronk.sweep.mcap_writer import McapLogWriter, write_mcap
 from pronk.sweep.readers import read_log
 
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
@@ -202,7 +193,8 @@ def test_a_killed_recorder_leaves_a_valid_log(tmp_path: Path) -> None:
         import time
         from pathlib import Path
         from pronk.sweep.log import Segment
-        from pronk.sweep.mcap_log import LogHeader, McapLogWriter
+        from pronk.sweep.mcap_format import LogHeader
+        from pronk.sweep.mcap_writer import McapLogWriter
         header = LogHeader(robot="mini_cheetah", joints=("knee",))
         writer = McapLogWriter(Path({str(path)!r}), header)
         writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))
@@ -266,103 +258,6 @@ def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
     path.write_bytes(data[:start] + b"\x06" + len(record).to_bytes(8, "little") + record)
     with pytest.raises(LogError, match="300 MiB"):
         read_mcap(path)
-
-
-JOINT_STATE = """\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-ARRAY = "float64[] data\n"
-
-
-def bag(path: Path, *, stamped: bool = True, command: str = "/joint_command") -> None:
-    """Two joints at 200 Hz, commands at 50 Hz, recorded by rosbag2 into MCAP."""
-    with path.open("wb") as stream, RosWriter(stream) as writer:
-        state = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
-        plain = writer.register_msgdef("std_msgs/msg/Float64MultiArray", ARRAY)
-
-        def joint_state(names: list[str], values: list[float], when: float) -> dict[str, Any]:
-            stamp = {"sec": int(when), "nanosec": round(when % 1.0 * 1e9)} if stamped else {}
-            return {
-                "header": {"stamp": stamp or {"sec": 0, "nanosec": 0}, "frame_id": ""},
-                "name": names,
-                "position": values,
-                "velocity": [],
-                "effort": [],
-            }
-
-        for k in range(400):
-            when = 100.0 + k / 200.0
-            nano = round(when * 1e9)
-            if k >= 8 and k % 4 == 0:
-                values = [np.sin(0.1 * k), 2.0]
-                if command == "/array":
-                    writer.write_message(command, plain, {"data": values}, nano, nano)
-                else:
-                    message = joint_state(["knee", "hip"], values[::-1], when)
-                    message["name"] = ["hip", "knee"]
-                    writer.write_message(command, state, message, nano, nano)
-            message = joint_state(["knee", "hip"], [np.sin(0.1 * k - 0.2), 2.1], when)
-            writer.write_message("/joint_states", state, message, nano, nano)
-
-
-def test_a_bag_with_two_joint_state_topics(tmp_path: Path) -> None:
-    path = tmp_path / "bag.mcap"
-    bag(path)
-    log = read_log(path, command_topic="/joint_command")
-    assert log.joints == ("knee", "hip")
-    assert log.rate_hz == pytest.approx(200.0)
-    # States before the first command are dropped; the command is the last at or before a state.
-    assert len(log.time) == 392
-    k = np.arange(8, 400)
-    np.testing.assert_allclose(log.command[:, 0], np.sin(0.1 * (k - k % 4)))
-    np.testing.assert_allclose(log.command[:, 1], 2.0)
-    np.testing.assert_allclose(log.position[:, 0], np.sin(0.1 * k - 0.2))
-    assert log.velocity is None
-    assert any("8 states before the first command" in note for note in log.notes)
-
-
-def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
-    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    bag(tmp_path / "bag_0.mcap", stamped=False, command="/array")
-    log = read_log(tmp_path, command_topic="/array", command_field="data")
-    k = np.arange(8, 400)
-    np.testing.assert_allclose(log.command[:, 0], np.sin(0.1 * (k - k % 4)))
-    assert any("times of reception" in note for note in log.notes)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({}, "name it with command_topic"),
-        ({"command_topic": "/elsewhere"}, "no commands on /elsewhere"),
-        ({"measured_topic": "/imu", "command_topic": "/joint_command"}, "no sensor_msgs.* on /imu"),
-        ({"command_topic": "/joint_command", "command_field": "velocity"}, "holds 0 values"),
-        ({"command_topic": "/joint_command", "command_field": "points.0"}, "no field 'points.0'"),
-        ({"command_topic": "/joint_command", "command_field": "header"}, "not a list of numbers"),
-    ],
-)
-def test_a_bag_asked_the_wrong_way_lists_its_topics(
-    tmp_path: Path, options: dict[str, str], words: str
-) -> None:
-    path = tmp_path / "bag.mcap"
-    bag(path)
-    with pytest.raises(LogError, match=words) as caught:
-        read_log(path, **options)  # type: ignore[arg-type]
-    assert "\n" not in str(caught.value)
-    if "topic" in words:
-        assert "/joint_states (sensor_msgs/msg/JointState)" in str(caught.value)
 
 
 def test_topics_mean_nothing_to_a_log_of_pronk(tmp_path: Path) -> None:

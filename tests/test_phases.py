@@ -46,6 +46,11 @@ def test_phases_are_the_papers() -> None:
     assert weak.weights.sparse == strong.weights.sparse > 0.0
     assert strong.weights.width == 1.0, "the paper's expression"
     assert weak.weights.width < strong.weights.width
+    assert strong.weights.collision == rest.collision, (
+        "nobody is taught to fear what is yet to be found"
+    )
+    assert weak.weights.collision > strong.weights.collision
+    assert weak.weights.knees > strong.weights.knees
 
 
 def test_tasks_are_made_of_phases() -> None:
@@ -131,6 +136,8 @@ def settled(phase: Phase) -> dict[str, tuple[float, float]]:
         "reach": w.reach,
         "gap": w.gap,
         "hop": -w.hop,
+        "collision": -w.collision,
+        "knees": -w.knees,
     }
     return {name: (row.walk, jump.get(name, row.jump)) for name, row in ROWS.items()}
 

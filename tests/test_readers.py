@@ -16,7 +16,7 @@ from pronk.robots import load_robot
 from pronk.sweep.checks import check_motion, motion
 from pronk.sweep.csv_log import write_csv
 from pronk.sweep.log import Segment, SweepLog
-from pronk.sweep.mcap_log import write_mcap
+from pronk.sweep.mcap_writer import write_mcap
 from pronk.sweep.npz_log import write_npz
 from pronk.sweep.readers import read_log, read_logs
 from pronk.sweep.timing import check_claim, check_unit, examine

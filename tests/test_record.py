@@ -14,7 +14,7 @@ from pronk.hardware.truth import load_truth
 from pronk.hardware.virtual import VirtualRobot
 from pronk.robots import Robot, load_robot
 from pronk.sweep.log import SweepLog
-from pronk.sweep.mcap_log import read_mcap
+from pronk.sweep.mcap_reader import read_mcap
 from pronk.sweep.plan import SweepPlan, make_plan
 from pronk.sweep.record import logged_joints, record
 from pronk.sweep.signals import Chirp, Multisine

@@ -220,6 +220,7 @@ CASES = [
 
 def test_every_term_has_a_case() -> None:
     own = {"termination", "sparse_jump", "rise", "reach", "gap", "hop", "action_rate"}
+    own |= {"stray_foot"}
     assert {case.name for case in CASES} | own == set(ROWS)
 
 
@@ -253,6 +254,15 @@ def test_terms_are_of_one_robot_each(env: Any, robot: int) -> None:
         after = row.term(command, **row.arguments)
         assert after.shape == (N,)
         assert torch.equal(after[others], before[name][others]), name
+
+
+def test_a_foot_strays_in_the_flight_of_a_jump_alone(env: Any) -> None:
+    """Mean .10, lowest .04: .06 m. On the ground a leg may hang as it likes, so may a trot's."""
+    command = pretend(env, foot_height=vector(0.10, 0.12, 0.14, 0.04))
+    command.tracker.airborne[:] = False
+    command.tracker.airborne[[WALKS, JUMPS]] = True
+    value = ROWS["stray_foot"].term(command)
+    assert value.tolist() == pytest.approx([0.06 if i == JUMPS else 0.0 for i in range(N)])
 
 
 def test_action_rate_by_hand(env: Any) -> None:
@@ -292,7 +302,17 @@ def test_an_event_is_worth_its_weight_once(
     """However long the policy step was (D1), and in jump mode only."""
     command = pretend(env)
     env.cfg.decimation = decimation
-    weights = JumpWeights(dense=0.0, sparse=4.0, width=1.0, rise=10.0, reach=6.0, gap=7.0, hop=0.5)
+    weights = JumpWeights(
+        dense=0.0,
+        sparse=4.0,
+        width=1.0,
+        rise=10.0,
+        reach=6.0,
+        gap=7.0,
+        hop=0.5,
+        collision=5.0,
+        knees=3.0,
+    )
     enter_phase(env, Phase(name="made up", iterations=1, jump=True, weights=weights))
     getattr(command.tracker, event)[:] = 0.0
     env.reward_manager.compute(dt=env.step_dt)
@@ -462,12 +482,24 @@ def test_a_knee_costs_before_its_skin_is_on_the_ground(env: Any) -> None:
 
 
 def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
-    weights = JumpWeights(dense=0.1, sparse=2.0, width=0.5, rise=3.0, reach=1.5, gap=0.75, hop=0.25)
+    weights = JumpWeights(
+        dense=0.1,
+        sparse=2.0,
+        width=0.5,
+        rise=3.0,
+        reach=1.5,
+        gap=0.75,
+        hop=0.25,
+        collision=9.0,
+        knees=4.0,
+    )
     rows = with_jump_weights(ROWS, weights)
     changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
-    changed |= {"gap": 0.75, "hop": -0.25}
+    changed |= {"gap": 0.75, "hop": -0.25, "collision": -9.0, "knees": -4.0}
     assert {name: rows[name].jump for name in changed} == changed
-    assert all(rows[name].walk == 0.0 for name in changed)
+    assert {name: rows[name].walk for name in changed} == {
+        name: ROWS[name].walk for name in changed
+    }
     assert {name: row for name, row in rows.items() if name not in changed} == {
         name: row for name, row in ROWS.items() if name not in changed
     }

@@ -35,7 +35,7 @@ from pronk.hardware.preflight import Freshness
 from pronk.hardware.twin import hold_of
 from pronk.robots import Robot, load_robot
 from pronk.sweep.log import SweepLog
-from pronk.sweep.mcap_log import read_mcap
+from pronk.sweep.mcap_reader import read_mcap
 from pronk.sweep.plan import SweepPlan, make_plan
 from pronk.sweep.record_apart import Recorded
 from pronk.sweep.servo import Timing

@@ -24,7 +24,9 @@ from pronk.sweep.channel import Channel
 from pronk.sweep.limits import Limits
 from pronk.sweep.log import Segment
 from pronk.sweep.log_apart import LogApart
-from pronk.sweep.mcap_log import LogHeader, McapLogWriter, read_mcap
+from pronk.sweep.mcap_format import LogHeader
+from pronk.sweep.mcap_reader import read_mcap
+from pronk.sweep.mcap_writer import McapLogWriter
 from pronk.sweep.plan import SweepPlan, make_plan
 from pronk.sweep.record import record
 from pronk.sweep.record_apart import Desk

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from pronk.errors import ArtefactError
 from pronk.jumps import JumpRules
 from pronk.robots import load_robot
-from pronk.trial import bars, published, result, tables
+from pronk.trial import bars, comparison, published, result, tables
 from pronk.trial import rows as rows_file
 from pronk.trial.metrics import FIGURES, JumpFigures
 from pronk.trial.protocol import PAPER_COMMANDS, Case, Script
@@ -158,10 +158,10 @@ def test_few_jumps_have_a_ratio_and_no_interval() -> None:
 
 def test_tables_say_where_jumps_are_too_few() -> None:
     made = trial()
-    cells = {row[0]: row[1] for row in tables.scatter(made).rows}
+    cells = {row[0]: row[1] for row in comparison.scatter(made).rows}
     assert cells["height"] == "2.00 (too few)"
     assert cells["gap"] == "-"
-    sentence = tables.verdict(made, "naive")
+    sentence = comparison.verdict(made, "naive")
     assert "is 2.00 times as large, with fewer than 5 jumps in a command" in sentence
     assert "interval" in sentence
     assert "nan" not in sentence
@@ -379,7 +379,7 @@ def test_bars_by_hand() -> None:
     ],
 )
 def test_the_verdict_is_one_sentence(naive: tuple[float, ...], says: str) -> None:
-    sentence = tables.verdict(trial({"matched": HEIGHTS * 8, "naive": naive}), "naive")
+    sentence = comparison.verdict(trial({"matched": HEIGHTS * 8, "naive": naive}), "naive")
     assert f"in distance {says}" in sentence
     places = {"is larger, 4.00": "below", "is larger, 1.30": "above"}
     assert says not in places or f"the paper's 2.08 is {places[says]} that interval" in sentence

@@ -25,7 +25,7 @@ from pronk.hardware.virtual import VirtualRobot
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
-from pronk.sweep.mcap_log import read_mcap
+from pronk.sweep.mcap_reader import read_mcap
 from pronk.sweep.plan import make_plan
 from pronk.sweep.record import record
 

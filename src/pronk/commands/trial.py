@@ -12,7 +12,7 @@ from pronk.commands import console
 
 if TYPE_CHECKING:
     from pronk.trial.result import Trial
-    from pronk.trial.tables import Sheet
+    from pronk.trial.table_text import Sheet
 
 ROBOT = "mini_cheetah"
 RATES_JUMPS = 3

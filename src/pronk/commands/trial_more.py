@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pronk.hardware.truth import Truth
     from pronk.robots.robot import Robot
     from pronk.trial.bodies import Bodies
-    from pronk.trial.tables import Sheet
+    from pronk.trial.table_text import Sheet
     from pronk.trial.variation import Variation
 
 
@@ -110,7 +110,7 @@ def variation_sheet(varied: Variation) -> Sheet:
     """Landings and heights at every value, all commands together."""
     import numpy as np
 
-    from pronk.trial.tables import Sheet, number
+    from pronk.trial.table_text import Sheet, number
 
     rows = []
     for each in varied.parameters:
@@ -145,7 +145,7 @@ def variation_sheet(varied: Variation) -> Sheet:
 def bodies_sheet(bodies: Bodies) -> Sheet:
     """Every body: its gains by group, how wrong gains are on it, and the jumps."""
     from pronk.trial.bodies import MATCHED
-    from pronk.trial.tables import Sheet, number
+    from pronk.trial.table_text import Sheet, number
 
     rows = []
     for body in bodies.bodies:

@@ -13,7 +13,7 @@ from pronk.report.deploy_data import Intervention
 from pronk.report.deploy_delay import Delay
 from pronk.report.shell import number
 from pronk.robots.robot import Robot
-from pronk.trial.tables import Sheet
+from pronk.trial.table_text import Sheet
 
 _LEVEL_WORDS = {
     Level.LIMIT: "target moved",

@@ -20,7 +20,7 @@ from pronk.match.result import JointMatch, MatchResult
 from pronk.report import style
 from pronk.report.page import find_gains
 from pronk.trial.result import Subject, Trial
-from pronk.trial.tables import Sheet, number
+from pronk.trial.table_text import Sheet, number
 
 
 def joint_error_db(joint: JointMatch, stiffness: float, damping: float) -> float:

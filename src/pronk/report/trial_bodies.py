@@ -13,7 +13,9 @@ from pronk.report.trial_extra import Block, part, place
 from pronk.report.trial_sweeps import argument
 from pronk.trial.bars import checks
 from pronk.trial.bodies import Bodies, Body
-from pronk.trial.tables import Sheet, number, table_iii, verdict
+from pronk.trial.comparison import verdict
+from pronk.trial.table_text import Sheet, number
+from pronk.trial.tables import table_iii
 
 _OF_POLICY = "training gains of "
 

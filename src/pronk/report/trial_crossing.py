@@ -12,7 +12,7 @@ from pronk.report.trial_extra import Block, part, place
 from pronk.report.trial_sweeps import Line, Panel, lines
 from pronk.trial.crossing import Climb, Crossings
 from pronk.trial.summary import share_interval
-from pronk.trial.tables import Sheet, number
+from pronk.trial.table_text import Sheet, number
 
 PAPER_GAPS = {"forward 2": 0.55, "back 2": 0.50, "side -1": 0.40, "side +1": 0.40}
 """Widest gaps that the paper says its robot could cross, read off video (R3) [m]."""

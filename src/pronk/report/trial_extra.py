@@ -9,7 +9,7 @@ from pronk.report import shell
 from pronk.report.shell import Part, Picture
 from pronk.trial.metrics import Figure
 from pronk.trial.sheet import Origin
-from pronk.trial.tables import Sheet
+from pronk.trial.table_text import Sheet
 
 
 @dataclass(frozen=True, kw_only=True)

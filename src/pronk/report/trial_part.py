@@ -28,10 +28,11 @@ from pronk.report.trial_sweeps import argument
 from pronk.report.trial_traces import heights, rates, torque_speed
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.trial import bars, tables
+from pronk.trial import bars, comparison, tables
 from pronk.trial.protocol import RATES
 from pronk.trial.result import Subject, Trial, load
 from pronk.trial.summary import share_interval
+from pronk.trial.table_text import Sheet, place
 
 _PAPER_GAPS: Published = {
     "matched": {
@@ -94,11 +95,11 @@ def part(material: Material, *, anchor: str, title: str = "Trial") -> Part:
         first=trial.subjects[0].name,
         totals=totals(trial),
         checks=bars.checks(trial),
-        verdicts=[tables.verdict(trial, other.name) for other in trial.subjects[1:]],
+        verdicts=[comparison.verdict(trial, other.name) for other in trial.subjects[1:]],
         table_iii=[tables.table_iii(trial, figure) for figure in ("height", "distance")],
         landings=tables.landings(trial),
         bars=tables.bars(trial),
-        scatter=tables.scatter(trial) if trial.ratios else None,
+        scatter=comparison.scatter(trial) if trial.ratios else None,
         more=[_by_policy(trial, subject.name) for subject in trial.subjects],
         drives=tables.drives(trial),
         definitions=tables.definitions(),
@@ -151,7 +152,7 @@ def _pictures(
     trial: Trial, seen: Seen | None, errors: Mapping[str, float]
 ) -> dict[str, Picture | None]:
     cases = [case.name for case in trial.cases]
-    where = tables.place(trial)
+    where = place(trial)
     height, distance, gap = (values(trial, name, cases) for name in ("height", "distance", "gap"))
     panels = [(words, naive_over_matched(trial, words)) for words in ("distance", "height")]
     drawn: dict[str, Picture | None] = {
@@ -197,7 +198,7 @@ def _seen_pictures(trial: Trial, seen: Seen | None) -> dict[str, Picture | None]
     drawn: dict[str, Picture | None] = dict.fromkeys(("heights", "rates", "torque_speed"))
     if seen is None:
         return drawn
-    where = tables.place(trial)
+    where = place(trial)
     standing = float(trial.rules.get("standing_height", math.nan))
     drawn["heights"] = shell.picture(
         heights(seen.height, standing=standing),
@@ -250,12 +251,12 @@ def _kept(trial: Trial, seen: Seen | None) -> str:
     )
 
 
-def _by_policy(trial: Trial, name: str) -> tables.Sheet:
+def _by_policy(trial: Trial, name: str) -> Sheet:
     """The columns of one policy of the table of all other figures."""
     whole = tables.more(trial)
     head = f"{name}: "
     kept = [i for i, column in enumerate(whole.columns) if column.startswith(head)]
-    return tables.Sheet(
+    return Sheet(
         title=f"{name}: mean +- standard deviation",
         columns=(whole.columns[0], *(whole.columns[i].removeprefix(head) for i in kept)),
         rows=tuple((row[0], *(row[i] for i in kept)) for row in whole.rows),

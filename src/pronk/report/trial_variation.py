@@ -13,7 +13,7 @@ from pronk.report.trial_sweeps import Line, Panel, lines
 from pronk.trial.metrics import FIGURES
 from pronk.trial.published import in_paper_order
 from pronk.trial.summary import share_interval
-from pronk.trial.tables import Sheet, number, spread
+from pronk.trial.table_text import Sheet, number, spread
 from pronk.trial.variation import AS_IT_IS, VARIED_FIGURES, Parameter, Point, Variation
 
 _DRAWN = ("height", "distance")

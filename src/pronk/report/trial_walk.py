@@ -9,7 +9,7 @@ from pronk.report.shell import Part
 from pronk.report.trial_cells import Values, cells
 from pronk.report.trial_extra import Block, part, place
 from pronk.trial.published import in_paper_order
-from pronk.trial.tables import Sheet, spread
+from pronk.trial.table_text import Sheet, spread
 from pronk.trial.walk import Walks
 from pronk.trial.walk_metrics import SETTLE_S, WALK_FIGURES
 

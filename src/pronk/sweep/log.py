@@ -1,6 +1,6 @@
 """SweepLog: what was asked of the joints and what they answered, in memory.
 
-Files are read and written next door (`mcap_log.py`, `readers.py`); this module only says what a
+Files are read and written next door (`readers.py`, `mcap_writer.py`); this module only says what a
 log is and what must be true of one.
 """
 

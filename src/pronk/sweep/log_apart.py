@@ -8,7 +8,8 @@ from typing import Any, Self
 
 from pronk.sweep.channel import Channel
 from pronk.sweep.log import Segment
-from pronk.sweep.mcap_log import LogHeader, McapLogWriter, reason_of
+from pronk.sweep.mcap_format import LogHeader
+from pronk.sweep.mcap_writer import McapLogWriter, reason_of
 
 
 class LogApart:

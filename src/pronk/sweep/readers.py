@@ -16,7 +16,7 @@ from pronk.sweep.checks import check_joints, check_radians
 from pronk.sweep.csv_log import read_csv
 from pronk.sweep.imported import Names
 from pronk.sweep.log import SweepLog
-from pronk.sweep.mcap_log import read_mcap
+from pronk.sweep.mcap_reader import read_mcap
 from pronk.sweep.npz_log import read_npz
 from pronk.sweep.pace import read_pace
 from pronk.sweep.sage import is_sage, read_sage

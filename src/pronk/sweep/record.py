@@ -17,7 +17,8 @@ from pronk.hardware.machine import Machine
 from pronk.robots.robot import Robot
 from pronk.sweep.log import Segment
 from pronk.sweep.log_apart import Log
-from pronk.sweep.mcap_log import LogHeader, McapLogWriter
+from pronk.sweep.mcap_format import LogHeader
+from pronk.sweep.mcap_writer import McapLogWriter
 from pronk.sweep.plan import Ask, SweepPlan
 from pronk.sweep.servo import Servo
 from pronk.sweep.session import Session

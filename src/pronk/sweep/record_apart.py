@@ -17,7 +17,7 @@ from pronk.errors import HardwareError, PronkError
 from pronk.hardware.link_rules import Hand
 from pronk.hardware.terminal import Interrupts, unheard
 from pronk.sweep.channel import Channel
-from pronk.sweep.mcap_log import McapLogWriter, reason_of
+from pronk.sweep.mcap_writer import McapLogWriter, reason_of
 from pronk.sweep.servo_process import Job, serve
 
 _PERIOD_S = 0.01

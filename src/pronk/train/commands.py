@@ -61,9 +61,9 @@ class MotionCommandCfg(CommandTermCfg):
     """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3)."""
     growth: tuple[float, int, int] = (0.35, 1000, 6500)
     """Part of the ranges at first, and the policy steps between which it grows to the whole."""
-    standing: float = 0.15
+    standing: float = 0.1
     """Part of the draws that are zero."""
-    one_axis: float = 0.55
+    one_axis: float = 0.4
     """Part of the draws along one axis alone, as the trials ask."""
     jump_fraction: float = 0.0
     """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""

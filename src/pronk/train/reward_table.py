@@ -52,6 +52,10 @@ class JumpWeights:
     """Per metre of ground newly cleared by all feet."""
     hop: float
     """Per lift-off after the first."""
+    collision: float
+    """Per part other than a foot on the ground in jump mode [1/s]."""
+    knees: float
+    """On knees near the ground in jump mode [1/s]."""
 
 
 ROWS: Mapping[str, Row] = {
@@ -72,7 +76,8 @@ ROWS: Mapping[str, Row] = {
     "smoothness": Row(rewards.smoothness, -0.0002, -0.0001),
     # Paper -20 | -120.
     "orientation": Row(rewards.orientation, -1.0, -6.0),
-    # Paper -50 | -50. Twice as much: at -2.5 a policy set a knee down whenever it stopped.
+    # Paper -50 | -50. Twice as much: at -2.5 a policy set a knee down whenever it stopped. While it
+    # has to find out how to jump, more would teach it not to; then a phase asks for more.
     "collision": Row(rewards.collision, -5.0, -5.0),
     # Paper -900 | -900, -45 here: the drive clips what exceeds the limit, and a position
     # command beyond reach is how a policy asks for full torque. A trace is left.
@@ -105,6 +110,8 @@ ROWS: Mapping[str, Row] = {
     "crouch": Row(rewards.crouch, -500.0, 0.0, {"height": standing_height() - 0.02}),
     # Stopping from -2 m/s, a policy came down on a hind knee. Its skin is 2 cm below its axis.
     "knees": Row(rewards.knees, -3.0, -3.0, {"height": 0.06}),
+    # A policy trotted on in the air and came down on one foot: 40 ms early, thighs on the ground.
+    "stray_foot": Row(rewards.stray_foot, 0.0, -15.0),
 }
 """Every reward, with the weights of phase 1."""
 
@@ -117,7 +124,7 @@ def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str
         weights: The phase's.
 
     Raises:
-        PronkError: The table lacks one of the jump rewards.
+        PronkError: The table lacks one of the rewards that phases weigh.
     """
     changed = {
         "dense_jump": -weights.dense,
@@ -126,6 +133,8 @@ def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str
         "reach": weights.reach,
         "gap": weights.gap,
         "hop": -weights.hop,
+        "collision": -weights.collision,
+        "knees": -weights.knees,
     }
     if missing := sorted(set(changed) - set(rows)):
         raise PronkError(f"the reward table has no {', '.join(missing)}.")

@@ -156,6 +156,16 @@ def knees(command: MotionCommand, height: float) -> Tensor:
     return (1.0 - command.motion.knee_height / height).clamp_min(0.0).sum(dim=-1)
 
 
+def stray_foot(command: MotionCommand) -> Tensor:
+    """How far the lowest foot hangs below the mean of the four in the flight of a jump [m].
+
+    It is the one that ends the flight, and then stands alone.
+    """
+    feet = command.motion.foot_height
+    below = feet.mean(dim=-1) - feet.amin(dim=-1)
+    return below * (command.tracker.airborne & command.tracker.mode)
+
+
 def crouch(command: MotionCommand, height: float) -> Tensor:
     """relu(height - z)^2 of the trunk [m^2]: nobody waits for the next jump with bent knees."""
     return (height - command.motion.height).clamp_min(0.0).square()

@@ -1,34 +1,24 @@
-"""Tables of a trial, as plain data: the paper's Table III beside ours, ratios, bars, definitions.
+"""Tables of a trial: the paper's Table III beside ours, landings, drives, bars, definitions.
 
-A `Sheet` is what the terminal and the page print. No cell is left out: one that could not be
-measured holds a dash and its count says why.
+No cell is left out: one that could not be measured holds a dash and its count says why.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from pronk.trial.bars import JUMPS, checks
+from pronk.trial.comparison import scatter
 from pronk.trial.metrics import FIGURES
-from pronk.trial.published import PAPER_RATIOS, TABLE_III, Pair, in_paper_order
-from pronk.trial.result import COMPARED, Trial
-from pronk.trial.summary import FEWEST, Cell, Ratio, Spread
+from pronk.trial.published import TABLE_III, Pair, in_paper_order
+from pronk.trial.result import Trial
+from pronk.trial.summary import Cell
+from pronk.trial.table_text import Sheet, counted, number, pair, place, spread, virtual_note
 
 DEFINITIONS = "Definitions"
 """Title of the table of equations."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sheet:
-    """A table of text."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...] = ()
 
 
 def sheets(trial: Trial) -> tuple[Sheet, ...]:
@@ -192,66 +182,6 @@ def _extreme(cells: list[Cell], name: str, joint: str, choose: Any, which: str) 
     return float(choose(known)) if known else math.nan
 
 
-def scatter(trial: Trial, other: str | None = None) -> Sheet:
-    """Standard deviations of another policy, the second if None, over those of the first."""
-    first = trial.subjects[0].name
-    other = other or trial.subjects[1].name
-    cases = (None, *(case.name for case in trial.cases))
-    found = {(r.figure, r.case): r for r in trial.ratios if r.other == other}
-    return Sheet(
-        title=f"Standard deviations, {other} over {first}, with 95 % bootstrap intervals",
-        columns=("figure", *(case or "all" for case in cases), "paper, all"),
-        rows=tuple(
-            (
-                figure,
-                *(interval(found[figure, case]).replace(" to ", "-") for case in cases),
-                number(PAPER_RATIOS.get(figure, math.nan), 2),
-            )
-            for figure in COMPARED
-        ),
-        notes=(
-            f"all: ratio of the means over {', '.join(trial.pooled)}.",
-            "paper: naive over matched; its Table III gives 2.08 in distance, its text says 2.30 "
-            "(reading A4).",
-            verdict(trial, other),
-        ),
-    )
-
-
-def verdict(trial: Trial, other: str) -> str:
-    """One sentence on whether the paper's claim holds between the first policy and another."""
-    parts = []
-    for figure in ("distance", "height"):
-        ratio = next(
-            r for r in trial.ratios if (r.figure, r.case, r.other) == (figure, None, other)
-        )
-        claim = PAPER_RATIOS[figure]
-        if not math.isfinite(ratio.value):
-            parts.append(f"in {figure} could not be measured")
-            continue
-        if not math.isfinite(ratio.low):
-            parts.append(
-                f"in {figure} is {ratio.value:.2f} times as large, with fewer than {FEWEST} jumps "
-                "in a command, too few for an interval and for an answer"
-            )
-            continue
-        if ratio.low > 1.0:
-            says = "is larger"
-        elif ratio.high < 1.0:
-            says = "is smaller"
-        else:
-            says = "cannot be told apart"
-        where = "above" if claim > ratio.high else "below" if claim < ratio.low else "within"
-        parts.append(
-            f"in {figure} {says}, {interval(ratio)} times, and the paper's {claim:g} is {where} "
-            "that interval"
-        )
-    return (
-        f"scatter of {other} against {trial.subjects[0].name} on the {place(trial)}: "
-        f"{'; '.join(parts)}."
-    )
-
-
 def bars(trial: Trial) -> Sheet:
     """What the first policy must show."""
     found = checks(trial)
@@ -285,48 +215,3 @@ def definitions() -> Sheet:
             "foot. u: direction of p_d - p_l in the plane.",
         ),
     )
-
-
-def place(trial: Trial) -> str:
-    """Where it was measured, in words."""
-    return "virtual robot" if trial.virtual else "robot"
-
-
-def virtual_note(trial: Trial) -> str:
-    """Where the numbers come from."""
-    where = (
-        "ours: pronk's virtual robot, not a real one" if trial.virtual else "ours: the real robot"
-    )
-    return f"{where}; seed {trial.seed}, truth {str(trial.truth.get('sha256', '-'))[:12]}."
-
-
-def number(value: float, digits: int = 3) -> str:
-    """A number; a dash where it is unknown."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
-
-
-def pair(values: Pair | None) -> str:
-    """Mean and standard deviation of the paper; a dash where it has none."""
-    return f"{values[0]:.3f} +- {values[1]:.3f}" if values else "-"
-
-
-def spread(figure: Spread, digits: int = 3) -> str:
-    """Mean and standard deviation; the value of one jump alone; a dash if none has the figure."""
-    if not figure.n:
-        return "-"
-    mean = number(figure.mean, digits)
-    return f"{mean} +- {number(figure.std, digits)}" if figure.n > 1 else mean
-
-
-def counted(cell: Cell) -> str:
-    """Jumps found of those asked."""
-    return f"({cell.found}/{cell.n})"
-
-
-def interval(ratio: Ratio) -> str:
-    """A ratio and its interval; too few jumps have none."""
-    if not math.isfinite(ratio.value):
-        return "-"
-    if not math.isfinite(ratio.low):
-        return f"{ratio.value:.2f} (too few)"
-    return f"{ratio.value:.2f} ({ratio.low:.2f} to {ratio.high:.2f})"
