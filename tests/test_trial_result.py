@@ -162,7 +162,7 @@ def test_tables_say_where_jumps_are_too_few() -> None:
     assert cells["height"] == "2.00 (too few)"
     assert cells["gap"] == "-"
     sentence = comparison.verdict(made, "naive")
-    assert "is 2.00 times as large, with fewer than 5 jumps in a command" in sentence
+    assert "2.00 times as much, with fewer than 5 jumps in a command" in sentence
     assert "interval" in sentence
     assert "nan" not in sentence
 
@@ -369,20 +369,21 @@ def test_bars_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("naive", "says"),
+    ("naive", "says", "answer"),
     [
-        (tuple(0.44 + 0.4 * (h - 0.44) for h in HEIGHTS * 8), "is smaller"),
-        (tuple(0.44 + 4.0 * (h - 0.44) for h in HEIGHTS * 8), "is larger, 4.00"),
-        (tuple(0.44 + 1.3 * (h - 0.44) for h in HEIGHTS * 8), "is larger, 1.30"),
-        (HEIGHTS * 8, "cannot be told apart"),
-        ((0.4,), "could not be measured"),
+        (tuple(0.44 + 0.4 * (h - 0.44) for h in HEIGHTS * 8), "less", "does not jump more alike"),
+        (tuple(0.44 + 4.0 * (h - 0.44) for h in HEIGHTS * 8), "more, 4.00", "more alike in dist"),
+        (tuple(0.44 + 1.3 * (h - 0.44) for h in HEIGHTS * 8), "more, 1.30", "distance and height."),
+        (HEIGHTS * 8, "cannot be told apart", "does not jump more alike"),
+        ((0.4,), "could not be measured", "no answer yet."),
     ],
 )
-def test_the_verdict_is_one_sentence(naive: tuple[float, ...], says: str) -> None:
+def test_the_verdict_is_one_sentence(naive: tuple[float, ...], says: str, answer: str) -> None:
     sentence = comparison.verdict(trial({"matched": HEIGHTS * 8, "naive": naive}), "naive")
     assert f"in distance {says}" in sentence
-    places = {"is larger, 4.00": "below", "is larger, 1.30": "above"}
+    places = {"more, 4.00": "below", "more, 1.30": "above"}
     assert says not in places or f"the paper's 2.08 is {places[says]} that interval" in sentence
+    assert answer in sentence
     assert sentence.endswith(".")
     assert "on the virtual robot" in sentence
 

@@ -111,7 +111,7 @@ ROWS: Mapping[str, Row] = {
     # Stopping from -2 m/s, a policy came down on a hind knee. Its skin is 2 cm below its axis.
     "knees": Row(rewards.knees, -3.0, -3.0, {"height": 0.06}),
     # A policy trotted on in the air and came down on one foot: 40 ms early, thighs on the ground.
-    "stray_foot": Row(rewards.stray_foot, 0.0, -15.0),
+    "stray_foot": Row(rewards.stray_foot, 0.0, -30.0),
 }
 """Every reward, with the weights of phase 1."""
 

@@ -38,7 +38,9 @@ def scatter(trial: Trial, other: str | None = None) -> Sheet:
 
 def verdict(trial: Trial, other: str) -> str:
     """One sentence on whether the paper's claim holds between the first policy and another."""
-    parts = []
+    parts: list[str] = []
+    shown: list[str] = []
+    unknown = False
     for figure in ("distance", "height"):
         ratio = next(
             r for r in trial.ratios if (r.figure, r.case, r.other) == (figure, None, other)
@@ -46,17 +48,20 @@ def verdict(trial: Trial, other: str) -> str:
         claim = PAPER_RATIOS[figure]
         if not math.isfinite(ratio.value):
             parts.append(f"in {figure} could not be measured")
+            unknown = True
             continue
         if not math.isfinite(ratio.low):
             parts.append(
-                f"in {figure} is {ratio.value:.2f} times as large, with fewer than {FEWEST} jumps "
+                f"in {figure} {ratio.value:.2f} times as much, with fewer than {FEWEST} jumps "
                 "in a command, too few for an interval and for an answer"
             )
+            unknown = True
             continue
         if ratio.low > 1.0:
-            says = "is larger"
+            says = "more"
+            shown.append(figure)
         elif ratio.high < 1.0:
-            says = "is smaller"
+            says = "less"
         else:
             says = "cannot be told apart"
         where = "above" if claim > ratio.high else "below" if claim < ratio.low else "within"
@@ -64,7 +69,11 @@ def verdict(trial: Trial, other: str) -> str:
             f"in {figure} {says}, {interval(ratio)} times, and the paper's {claim:g} is {where} "
             "that interval"
         )
+    first = trial.subjects[0].name
+    if shown:
+        answer = f"so {first} jumps more alike in {' and '.join(shown)}"
+    else:
+        answer = "no answer yet" if unknown else f"so {first} does not jump more alike here"
     return (
-        f"scatter of {other} against {trial.subjects[0].name} on the {place(trial)}: "
-        f"{'; '.join(parts)}."
+        f"scatter of {other} against {first} on the {place(trial)}: {'; '.join(parts)}; {answer}."
     )
