@@ -101,7 +101,7 @@ PHASES: tuple[Phase, ...] = (
     # and .24); it then landed backwards on its thighs, which at 5 a second cost it a centimetre.
     Phase(
         name="jump_b",
-        iterations=800,
+        iterations=700,
         jump=True,
         weights=JumpWeights(
             dense=0.002,
