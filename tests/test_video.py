@@ -22,13 +22,14 @@ from pronk.hardware.truth import load_truth
 from pronk.trial import film as films
 from pronk.trial import overlay, video, videos
 from pronk.trial.film import FPS, Film, plan
-from pronk.trial.frames import HEIGHT, WIDTH, View
+from pronk.trial.frames import HEIGHT, WIDTH
 from pronk.trial.marks import Marks, marks_of
 from pronk.trial.protocol import STILL, Case, Script
 from pronk.trial.render import in_gif
 from pronk.trial.run import Plan as TrialPlan
 from pronk.trial.run import run as run_trial
 from pronk.trial.stage import FOV_DEG, TAPE_M, Tape
+from pronk.trial.view import View
 
 RATE = 200.0
 GRAVITY = 9.81

@@ -27,6 +27,8 @@ _KINDS = {
     "float": ">f4",
     "double": ">f8",
 }
+_NAMES: dict[int, str] = {}
+"""Of the messages made so far, by fingerprint: to say what came where another was expected."""
 _FIELD = re.compile(r"\s*(\w+)\s+(\w+)(?:\[(\d+)\])?\s*")
 
 
@@ -71,6 +73,7 @@ class Message:
                 f"{self.name}: the fields hash to {self.computed_fingerprint:#018x}, expected "
                 f"{self.fingerprint:#018x}; a name, type or length in the table is wrong."
             )
+        _NAMES.setdefault(self.fingerprint, self.name)
 
     @cached_property
     def fields(self) -> tuple[Field, ...]:
@@ -141,11 +144,7 @@ class Message:
         """
         met = int.from_bytes(data[:8], "big")
         if len(data) < 8 or met != self.fingerprint:
-            # Here, because the table is made of messages.
-            from pronk.hardware.lcm_types import MESSAGES
-
-            known = MESSAGES.get(met)
-            got = f"{met:#018x}" + (f" ({known.name})" if known else "")
+            got = f"{met:#018x}" + (f" ({_NAMES[met]})" if met in _NAMES else "")
             raise RefusedError(
                 "fingerprint",
                 f"a message has fingerprint {got}, expected {self.fingerprint:#018x} "

@@ -20,7 +20,8 @@ from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.trial import overlay
 from pronk.trial.film import Film
-from pronk.trial.stage import FOV_DEG, STUDIO_HEIGHT_M, Tape, outdoors, studio
+from pronk.trial.stage import STUDIO_HEIGHT_M, Tape, outdoors, studio
+from pronk.trial.view import View
 
 Array = NDArray[np.float64]
 
@@ -30,57 +31,12 @@ STRIP_HEIGHT = 400
 """Of a strip [px]."""
 _OVERSAMPLE = 2
 """Pixels painted for each pixel shown, each way."""
-_ELEVATION = math.radians(-13.0)
-_DISTANCE = 1.9
 _STUDIO_ELEVATION = math.radians(-5.0)
 _STUDIO_DISTANCE = 3.0
 _GAP_M = 0.06
 """Between the robots of a strip."""
 _MARGIN_M = 0.2
 """Beside the first and the last robot of a strip, and under their feet."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """A camera with perspective."""
-
-    look: Array
-    """Where it looks [m]. (3,)"""
-    azimuth: float
-    """Of its view, in the world [rad]."""
-    elevation: float = _ELEVATION
-    """Of its view, negative down [rad]."""
-    distance: float = _DISTANCE
-    """From where it looks [m]."""
-
-    def pixels(self, points: Array, width: int, height: int) -> Array:
-        """Where points of the world are in an image.
-
-        Args:
-            points: [m]. (N, 3)
-            width: Of the image [px].
-            height: Of the image [px].
-
-        Returns:
-            Right and down of the upper left corner [px]; NaN for points behind the camera. (N, 2)
-        """
-        cosine = math.cos(self.elevation)
-        ahead = np.array(
-            [
-                math.cos(self.azimuth) * cosine,
-                math.sin(self.azimuth) * cosine,
-                math.sin(self.elevation),
-            ]
-        )
-        right = np.array([math.sin(self.azimuth), -math.cos(self.azimuth), 0.0])
-        up = np.cross(right, ahead)
-        relative = np.asarray(points) - (self.look - self.distance * ahead)
-        depth = relative @ ahead
-        depth = np.where(depth > 1e-6, depth, np.nan)
-        focal = 0.5 * height / math.tan(math.radians(0.5 * FOV_DEG))
-        x = 0.5 * width + focal * (relative @ right) / depth
-        y = 0.5 * height - focal * (relative @ up) / depth
-        return np.stack([x, y], axis=-1)
 
 
 class Painter:

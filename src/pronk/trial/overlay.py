@@ -13,8 +13,8 @@ from PIL import Image, ImageDraw, ImageFont
 from pronk.trial.film import Film
 
 if TYPE_CHECKING:
-    from pronk.trial.frames import View
     from pronk.trial.stage import Tape
+    from pronk.trial.view import View
 
 _INK = (24, 28, 34)
 _PAPER = (255, 255, 255)
