@@ -342,6 +342,42 @@ def test_way_in_the_world_of_a_robot_that_looks_elsewhere(
     assert told["feet"] is motion.foot_position
 
 
+@pytest.mark.parametrize(
+    ("asked", "goes", "jumps", "along", "excess", "miss"),
+    [
+        # A leap of .25 asks for 2.25 m/s: no more is paid, a metre a second is too much already.
+        ((2.0, 0.0), (3.0, 1.0), True, 2.25, 1.0, math.hypot(0.75, 1.0)),
+        ((2.0, 0.0), (3.0, 1.0), False, 2.0, 1.0, math.hypot(1.0, 1.0)),
+        ((0.0, -0.5), (1.0, -0.4), True, 0.4, -0.1, math.hypot(1.0, 0.225)),
+        ((-1.0, 0.0), (0.5, 0.0), True, -0.5, -1.5, 1.75),
+        ((0.0, 0.0), (1.0, 1.0), True, 0.0, 0.0, math.sqrt(2.0)),
+    ],
+)
+def test_what_the_tracker_is_told_of_speed(
+    env: Any,
+    command: MotionCommand,
+    monkeypatch: pytest.MonkeyPatch,
+    asked: tuple[float, float],
+    goes: tuple[float, float],
+    jumps: bool,
+    along: float,
+    excess: float,
+    miss: float,
+) -> None:
+    """Looking along x; turning is nobody's way."""
+    told: dict[str, torch.Tensor] = {}
+    monkeypatch.setattr(command.tracker, "advance", lambda **given: told.update(given))
+    monkeypatch.setattr(command, "_motion_step", -1)
+    monkeypatch.setattr(command.cfg, "leap", 0.25)
+    command.tracker.mode[:] = jumps
+    turn(env, yaw=0.0)
+    env.sim.data.qvel[:, :2] = torch.tensor(goes)
+    command.velocity[:] = torch.tensor((*asked, 1.5))
+    _ = command.motion
+    found = [told[name].tolist() for name in ("along", "excess", "miss")]
+    np.testing.assert_allclose(found, [[along] * N, [excess] * N, [miss] * N], atol=1e-5)
+
+
 def test_a_robot_set_down_beyond_a_gap_has_cleared_it(env: Any, command: MotionCommand) -> None:
     """Carried by 0.8 m to where it looks, to +y: what its feet left between them, once."""
     command.scripted = True

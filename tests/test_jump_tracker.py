@@ -39,7 +39,8 @@ WAITS = replace(SETTINGS, hasty_s=4 * DT, ready_s=8 * DT)
 EVENTS = ("gain", "rise", "reach", "gap", "hop")
 TRACES = (
     *EVENTS,
-    *("mode", "since", "best", "lowest", "stroke", "farthest", "widest", "liftoffs", "airborne"),
+    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest", "liftoffs"),
+    "airborne",
 )
 
 Feet = tuple[tuple[float, float], ...]
@@ -58,6 +59,7 @@ class Step:
     speed: float = 0.0
     miss: float = 0.0
     along: float = 0.0
+    excess: float = 0.0
     ground: tuple[bool, ...] = (True, False, False, False)
     """Which feet touch it, if not in the air."""
     feet: Feet = STANCE
@@ -95,6 +97,7 @@ def play(
             vertical=torch.tensor([step.speed for step in steps]),
             miss=torch.tensor([step.miss for step in steps]),
             along=torch.tensor([step.along for step in steps]),
+            excess=torch.tensor([step.excess for step in steps]),
             feet=torch.tensor([step.feet for step in steps]),
             direction=torch.tensor([step.way for step in steps]),
             dt=DT,
@@ -325,6 +328,16 @@ def test_reach_is_the_ground_covered_in_the_longest_flight() -> None:
     assert seen["farthest"][-1] == pytest.approx(5 * DT)
 
 
+def test_a_running_start_above_the_command_is_not_paid() -> None:
+    """Half a metre a second too fast as the command comes: 3.5 m/s of 4. Later haste is a leap."""
+    air = [Step(jump=True, air=i > 1, along=4.0, excess=1.0) for i in range(5)]
+    too_fast, slow = [Step(jump=True, excess=0.5), *air], [Step(jump=True, excess=-0.5), *air]
+    assert alone(too_fast)["farthest"][-1] == pytest.approx(2 * 3.5 * DT)
+    assert alone(slow)["farthest"][-1] == pytest.approx(2 * 4.0 * DT)
+    again = [*slow, Step(), *[Step()] * 8, *too_fast]
+    assert alone(again)["lead"] == [0.0] * 15 + [0.5] * 6
+
+
 def test_flying_backwards_reaches_nothing() -> None:
     steps = [Step(jump=True, air=i > 1, along=-1.0) for i in range(6)]
     assert alone(steps)["reach"] == [0] * 6
@@ -494,6 +507,7 @@ class Account:
     highest: float = 0.0
     lowest: float = 0.0
     stroke: float = 0.0
+    lead: float = 0.0
     flown: float = 0.0
     farthest: float = 0.0
     stood: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, 0.0)] * 4)
@@ -504,6 +518,7 @@ class Account:
         new = now.jump and not self.told
         if new:
             self.age, self.scores, self.leaps, self.farthest, self.widest = 0, [], 0, 0.0, 0.0
+            self.lead = max(now.excess, 0.0)
         if now.jump:
             self.settled = 0
         elif self.settled is not None and not now.air:
@@ -530,7 +545,8 @@ class Account:
             self.lowest = min(self.lowest, low)
         stroke = max(min(self.highest - self.lowest, s.stroke), 0.0)
         paid["rise"], self.stroke = stroke - self.stroke, stroke
-        self.flown = self.flown + now.along * DT if mode and now.air and self.was_up else 0.0
+        gone = (now.along - self.lead) * DT
+        self.flown = self.flown + gone if mode and now.air and self.was_up else 0.0
         if self.flown > self.farthest:
             paid["reach"], self.farthest = self.flown - self.farthest, self.flown
         if mode and self.was_up and not now.air:
@@ -573,12 +589,23 @@ def scripts(draw: st.DrawFn) -> list[Step]:
     )
     speed = draw(st.lists(st.integers(-96, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     along = draw(st.lists(st.integers(-32, 128).map(lambda i: i / 32), min_size=60, max_size=60))
+    excess = draw(st.lists(st.integers(-16, 32).map(lambda i: i / 32), min_size=60, max_size=60))
     way = draw(st.sampled_from([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)]))
     feet = wander(random.Random(draw(st.integers(0, 2**32 - 1))), way)
     return [
-        Step(jump=j, air=a, height=h, speed=v, along=u, ground=ground, feet=points, way=way)
-        for j, a, h, v, u, (ground, points) in zip(
-            jump, air, height, speed, along, feet, strict=False
+        Step(
+            jump=j,
+            air=a,
+            height=h,
+            speed=v,
+            along=u,
+            excess=e,
+            ground=ground,
+            feet=points,
+            way=way,
+        )
+        for j, a, h, v, u, e, (ground, points) in zip(
+            jump, air, height, speed, along, excess, feet, strict=False
         )
     ]
 

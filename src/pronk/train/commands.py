@@ -75,8 +75,7 @@ class MotionCommandCfg(CommandTermCfg):
     leap: float = 0.6
     """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
-    (.60 m at 1 m/s). Ground covered faster is not paid; with 0.75 a policy ran at -2.3 m/s when
-    told -2, to be as fast when a jump came."""
+    (.60 m at 1 m/s). Ground covered faster is not paid."""
     width: float = 1.0
     """Standard deviation of the lift-off kernel [m/s], see `JumpTracker`."""
     settings: JumpSettings = field(default_factory=JumpSettings)
@@ -189,15 +188,16 @@ class MotionCommand(CommandTerm):
         if self._motion is None or self._motion_step != step:
             self._motion = measure_motion(self._env, self.feet, self._motion)
             self._motion_step = step
+            horizontal, target = self._motion.velocity_trunk[:, :2], self.target
+            along = self._along(horizontal)
             self.tracker.advance(
                 jump=self.jump,
                 contact=self._motion.contact,
                 height=self._motion.height,
                 vertical=self._motion.velocity_world[:, 2],
-                miss=torch.linalg.vector_norm(
-                    self._motion.velocity_trunk[:, :2] - self.target, dim=-1
-                ),
-                along=self._along(self._motion.velocity_trunk[:, :2]),
+                miss=torch.linalg.vector_norm(horizontal - target, dim=-1),
+                along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
+                excess=along - torch.linalg.vector_norm(self.velocity[:, :2], dim=-1),
                 feet=self._motion.foot_position,
                 direction=self._direction(self._motion.ahead[:, :2]),
                 dt=self._env.step_dt,
@@ -205,11 +205,10 @@ class MotionCommand(CommandTerm):
         return self._motion
 
     def _along(self, velocity: Tensor) -> Tensor:
-        """Part of a horizontal velocity (N, 2) towards `target`, no more than asked for. (N,)."""
-        target = self.target
-        speed = torch.linalg.vector_norm(target, dim=-1)
-        part = (velocity * target).sum(dim=-1) / speed.clamp_min(1e-6)
-        return torch.minimum(part, speed)
+        """Part of a horizontal velocity (N, 2) towards the command's, zero without one. (N,)."""
+        asked = self.velocity[:, :2]
+        speed = torch.linalg.vector_norm(asked, dim=-1)
+        return (velocity * asked).sum(dim=-1) / speed.clamp_min(1e-6)
 
     def _direction(self, ahead: Tensor) -> Tensor:
         """Unit vector of the velocity asked for, world frame, or zero. (N, 2).
