@@ -188,27 +188,28 @@ class MotionCommand(CommandTerm):
         if self._motion is None or self._motion_step != step:
             self._motion = measure_motion(self._env, self.feet, self._motion)
             self._motion_step = step
-            horizontal, target = self._motion.velocity_trunk[:, :2], self.target
-            along = self._along(horizontal)
-            self.tracker.advance(
-                jump=self.jump,
-                contact=self._motion.contact,
-                height=self._motion.height,
-                vertical=self._motion.velocity_world[:, 2],
-                miss=torch.linalg.vector_norm(horizontal - target, dim=-1),
-                along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
-                excess=along - torch.linalg.vector_norm(self.velocity[:, :2], dim=-1),
-                feet=self._motion.foot_position,
-                direction=self._direction(self._motion.ahead[:, :2]),
-                dt=self._env.step_dt,
-            )
+            self._follow(self._motion)
         return self._motion
 
-    def _along(self, velocity: Tensor) -> Tensor:
-        """Part of a horizontal velocity (N, 2) towards the command's, zero without one. (N,)."""
+    def _follow(self, motion: Motion) -> None:
+        """Tell the tracker what the robots did in the step just simulated."""
+        horizontal, target = motion.velocity_trunk[:, :2], self.target
         asked = self.velocity[:, :2]
         speed = torch.linalg.vector_norm(asked, dim=-1)
-        return (velocity * asked).sum(dim=-1) / speed.clamp_min(1e-6)
+        # The part towards the command, which `target` lies along; zero without one.
+        along = (horizontal * asked).sum(dim=-1) / speed.clamp_min(1e-6)
+        self.tracker.advance(
+            jump=self.jump,
+            contact=motion.contact,
+            height=motion.height,
+            vertical=motion.velocity_world[:, 2],
+            miss=torch.linalg.vector_norm(horizontal - target, dim=-1),
+            along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
+            excess=along - speed,
+            feet=motion.foot_position,
+            direction=self._direction(motion.ahead[:, :2]),
+            dt=self._env.step_dt,
+        )
 
     def _direction(self, ahead: Tensor) -> Tensor:
         """Unit vector of the velocity asked for, world frame, or zero. (N, 2).

@@ -29,8 +29,8 @@ _NO_JUMP = JumpWeights(
     reach=0.0,
     gap=0.0,
     hop=0.0,
-    collision=5.0,
-    knees=3.0,
+    collision=-ROWS["collision"].jump,
+    knees=-ROWS["knees"].jump,
 )
 
 
@@ -82,17 +82,7 @@ PHASES: tuple[Phase, ...] = (
         name="jump_a",
         iterations=230,
         jump=True,
-        weights=JumpWeights(
-            dense=0.02,
-            sparse=16.0,
-            width=1.0,
-            rise=20.0,
-            reach=12.0,
-            gap=4.0,
-            hop=0.0,
-            collision=5.0,
-            knees=3.0,
-        ),
+        weights=replace(_NO_JUMP, dense=0.02, sparse=16.0, rise=20.0, reach=12.0, gap=4.0),
         entropy=0.01,
     ),
     # And then done alike every time: an actor that explores on (its standard deviation .59 after
