@@ -17,7 +17,7 @@ GRIP = 3.0
 @cache
 def quiet() -> Any:
     """Nominal robots, nothing drawn, exact measurements."""
-    from pronk.train.randomization import Randomization
+    from pronk.train.environment.randomization import Randomization
 
     return _built(Randomization.none())
 
@@ -25,7 +25,7 @@ def quiet() -> Any:
 @cache
 def noisy() -> Any:
     """Nominal robots on feet that grip, with the paper's measurement noise."""
-    from pronk.train.randomization import Randomization
+    from pronk.train.environment.randomization import Randomization
 
     paper = Randomization.paper()
     return _built(
@@ -42,14 +42,16 @@ def noisy() -> Any:
 
 def fresh(env: Any) -> Any:
     """The environment as it was when built: first phase, first step, nominal rate, seed 0."""
-    from pronk.train.commands import motion_command
+    from pronk.train.environment.commands import motion_command
+    from pronk.train.environment.reward_sum import reward_sum
+    from pronk.train.environment.reward_table import ROWS
     from pronk.train.phases import PHASES, enter_phase
-    from pronk.train.reward_sum import reward_sum
-    from pronk.train.reward_table import ROWS
 
     reward_sum(env).set_rows(ROWS)
     enter_phase(env, PHASES[0])
     motion_command(env).scripted = False
+    motion_command(env).ranges.grown.zero_()
+    motion_command(env).ranges.kept.zero_()
     env.cfg.decimation = 4
     env.common_step_counter = 0
     motion_command(env)._motion_step = -1  # what was measured in that step was another's

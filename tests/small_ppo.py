@@ -11,8 +11,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from pronk.train.actor import EstimatorActorCfg, JumpCriticCfg
-from pronk.train.ppo import EstimatorPPO, EstimatorPpoCfg
+from pronk.train.learning.actor import EstimatorActorCfg, JumpCriticCfg
+from pronk.train.learning.ppo import EstimatorPPO, EstimatorPpoCfg
 
 ROBOTS = 32
 STEPS = 4

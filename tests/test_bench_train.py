@@ -248,7 +248,7 @@ def small_task() -> str:
     import mjlab.tasks  # noqa: F401 - registers mjlab's own
     from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg, register_mjlab_task
 
-    from pronk.train.runner import PronkRunner
+    from pronk.train.experiment.runner import PronkRunner
     from pronk.train.tasks import JUMP_TASK
 
     name = "Pronk-Bench-Small"

@@ -16,8 +16,8 @@ pytest.importorskip("cyclonedds")
 
 from broken_message import mutated
 from pronk.errors import HardwareError
-from pronk.hardware import dds_idl as idl
-from pronk.hardware.dds_codec import (
+from pronk.hardware.dds import idl
+from pronk.hardware.dds.codec import (
     LowState,
     decode_command,
     decode_state,
@@ -26,8 +26,8 @@ from pronk.hardware.dds_codec import (
     idle_command,
     joint_map,
 )
-from pronk.hardware.dds_layout import HEADER, checksum, pack, record, unpack, wire_size
-from pronk.hardware.lcm_message import RefusedError
+from pronk.hardware.dds.layout import HEADER, checksum, pack, record, unpack, wire_size
+from pronk.hardware.lcm.message import RefusedError
 from pronk.hardware.machine import Command, State
 from pronk.robots import load_robot
 

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from pronk.hardware.dds_codec import encode_state, joint_map
-from pronk.hardware.dds_intake import Intake
+from pronk.hardware.dds.codec import encode_state, joint_map
+from pronk.hardware.dds.intake import Intake
 from pronk.hardware.machine import State
 from pronk.robots import load_robot
 

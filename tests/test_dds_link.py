@@ -18,16 +18,16 @@ pytest.importorskip("cyclonedds")
 
 from broken_message import mutated
 from pronk.errors import HardwareError, RobotError
-from pronk.hardware import dds_idl as idl
-from pronk.hardware.dds_codec import encode_command, joint_map
-from pronk.hardware.dds_link import DdsMachine
-from pronk.hardware.dds_net import DdsNetwork, Message, Participant, take
-from pronk.hardware.dds_service import SWITCHER, Client
+from pronk.hardware.dds import idl
+from pronk.hardware.dds.codec import encode_command, joint_map
+from pronk.hardware.dds.link import DdsMachine
+from pronk.hardware.dds.net import DdsNetwork, Message, Participant, take
+from pronk.hardware.dds.service import SWITCHER, Client
+from pronk.hardware.dds.twin import COMMANDS, STATES, DdsWire
 from pronk.hardware.machine import Command
 from pronk.hardware.preflight import Freshness
 from pronk.hardware.truth import load_truth
 from pronk.hardware.twin import Twin
-from pronk.hardware.twin_dds import COMMANDS, STATES, DdsWire
 from pronk.hardware.virtual import VirtualRobot
 from pronk.robots import load_robot
 

@@ -122,9 +122,9 @@ class Wire:
 def over_lcm(port: int) -> Wire:
     import lcm
 
-    from pronk.hardware.lcm_codec import decode_command, encode_command
-    from pronk.hardware.lcm_layout import CHEETAH
-    from pronk.hardware.lcm_url import url_of
+    from pronk.hardware.lcm.codec import decode_command, encode_command
+    from pronk.hardware.lcm.layout import CHEETAH
+    from pronk.hardware.lcm.url import url_of
 
     mouth, ear = (lcm.LCM(url_of(port=port)) for _ in range(2))
     met: list[tuple[float, bytes]] = []
@@ -148,10 +148,10 @@ def over_lcm(port: int) -> Wire:
 
 
 def over_dds(domain: int) -> Wire:
-    from pronk.hardware import dds_idl as idl
-    from pronk.hardware.dds_codec import decode_command, encode_command, joint_map
-    from pronk.hardware.dds_net import DdsNetwork, Participant, take, write
-    from pronk.hardware.twin_dds import COMMANDS
+    from pronk.hardware.dds import idl
+    from pronk.hardware.dds.codec import decode_command, encode_command, joint_map
+    from pronk.hardware.dds.net import DdsNetwork, Participant, take, write
+    from pronk.hardware.dds.twin import COMMANDS
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
     mouth = own.writer(COMMANDS, idl.LowCmd, raw=True)

@@ -18,9 +18,9 @@ from tensordict import TensorDict  # noqa: E402
 
 from pronk.errors import PronkError  # noqa: E402
 from pronk.policy.layout import ACTOR_INDICES, ESTIMATOR_INDICES  # noqa: E402
-from pronk.train.estimator import Estimator, estimator_losses  # noqa: E402
-from pronk.train.normalization import RolloutNormalization  # noqa: E402
-from pronk.train.ppo import EstimatorPPO, EstimatorPpoCfg  # noqa: E402
+from pronk.train.learning.estimator import Estimator, estimator_losses  # noqa: E402
+from pronk.train.learning.normalization import RolloutNormalization  # noqa: E402
+from pronk.train.learning.ppo import EstimatorPPO, EstimatorPpoCfg  # noqa: E402
 from small_ppo import (  # noqa: E402
     ROBOTS,
     STEPS,

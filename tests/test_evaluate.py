@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pronk.bars import Check
 from pronk.errors import ArtefactError, PronkError
 from pronk.jumps import Jump, JumpRules, Series, answer, measure, unasked_height
-from pronk.train import evaluate_bars, evaluate_result
-from pronk.train.evaluate_bars import Check, checks, cost_of_jumping
-from pronk.train.evaluate_plan import JUMPS, NEVER, WALKS, Case, Plan
-from pronk.train.evaluate_result import (
+from pronk.train.evaluation import bars as evaluate_bars
+from pronk.train.evaluation import result as evaluate_result
+from pronk.train.evaluation.bars import checks, cost_of_jumping
+from pronk.train.evaluation.plan import JUMPS, NEVER, WALKS, Case, Plan
+from pronk.train.evaluation.result import (
     EstimatorResult,
     Evaluation,
     JumpResult,
@@ -283,7 +285,7 @@ def random_turns(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
     """Three hundred robots that do what they like, against `measure` on the series of each."""
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate_flight import FlightRecorder
+    from pronk.train.evaluation.flight import FlightRecorder
 
     rng = np.random.default_rng(8)
     count, length = 300, 360
@@ -399,7 +401,7 @@ def test_what_touches_is_counted_as_a_trial_counts_it() -> None:
     torch = pytest.importorskip("torch")
     from pronk.hardware.capture import Capture
     from pronk.robots import load_robot
-    from pronk.train.evaluate_flight import FlightRecorder
+    from pronk.train.evaluation.flight import FlightRecorder
     from pronk.trial.metrics import measure as measure_capture
     from pronk.trial.protocol import Script
 
@@ -458,7 +460,7 @@ def test_what_touches_is_counted_as_a_trial_counts_it() -> None:
 def test_a_stride_is_in_the_raw_error_and_not_in_the_averaged() -> None:
     """Velocity = command + (.1, 0) + .3 sin: averaged .1, raw the mean of |.1 + .3 sin|."""
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate_walk import SpeedRecorder
+    from pronk.train.evaluation.walk import SpeedRecorder
 
     count, settle, end, average = 3, 150, 550, 100
     command = torch.tensor([[2.0, 0.0, 0.0]] * count)
@@ -495,7 +497,7 @@ def test_a_stride_is_in_the_raw_error_and_not_in_the_averaged() -> None:
 @pytest.mark.train
 def test_a_robot_that_never_settled_has_no_error() -> None:
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate_walk import SpeedRecorder
+    from pronk.train.evaluation.walk import SpeedRecorder
 
     recorder = SpeedRecorder(torch.zeros(1, 3), settle=2, end=5, average=2)
     for _ in range(5):
@@ -506,7 +508,7 @@ def test_a_robot_that_never_settled_has_no_error() -> None:
 @pytest.mark.train
 def test_the_estimator_is_judged_on_robots_that_stand() -> None:
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate_walk import EstimatorRecorder
+    from pronk.train.evaluation.walk import EstimatorRecorder
 
     recorder = EstimatorRecorder(2, "cpu")
     target = torch.tensor([[1.0, 0.0, 1.0, 0.0, 2.0, 0.0, 0.1]] * 2)
@@ -568,9 +570,9 @@ def seen() -> Seen:
     pytest.importorskip("mjlab")
     from mjlab.envs import ManagerBasedRlEnv
 
-    from pronk.train.evaluate import evaluate_policy, evaluation_cfg
-    from pronk.train.evaluate_run import TERM
-    from pronk.train.randomization import Randomization
+    from pronk.train.environment.randomization import Randomization
+    from pronk.train.evaluation.evaluate import evaluate_policy, evaluation_cfg
+    from pronk.train.evaluation.run import TERM
     from pronk.train.tasks import env_cfg
 
     cfg = env_cfg(randomization=replace(Randomization.none(), decimation=(-2, 2)))
@@ -720,7 +722,7 @@ def test_a_run_is_written_and_shown(
     seen: Seen, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from pronk.commands.evaluate import show
-    from pronk.train.evaluate import write
+    from pronk.train.evaluation.evaluate import write
 
     path = tmp_path / "evaluation.json"
     write(path, seen.evaluation)
@@ -740,7 +742,7 @@ def test_an_environment_of_training_is_refused() -> None:
     pytest.importorskip("mjlab")
     from types import SimpleNamespace
 
-    from pronk.train.evaluate import evaluate_policy
+    from pronk.train.evaluation.evaluate import evaluate_policy
 
     plain = SimpleNamespace(metrics_manager=SimpleNamespace(cfg=None), num_envs=6)
     with pytest.raises(PronkError, match="6 robots and no evaluation term; this plan needs one"):
@@ -755,9 +757,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     """The folder of a run with one checkpoint of random weights, and its actor."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("mjlab")
-    from pronk.train import checkpoint
-    from pronk.train.evaluate_subject import blank_actor
-    from pronk.train.run_folder import RunFolder
+    from pronk.train.evaluation.subject import blank_actor
+    from pronk.train.experiment import checkpoint
+    from pronk.train.experiment.run_folder import RunFolder
 
     torch.manual_seed(5)
     actor = blank_actor(jump=True)
@@ -775,7 +777,7 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
     from tensordict import TensorDict
 
     from pronk.robots import load_robot
-    from pronk.train.evaluate_subject import load_subject
+    from pronk.train.evaluation.subject import load_subject
     from pronk.train.gains import training_gains
 
     folder, actor = trained
@@ -797,8 +799,8 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
 @pytest.mark.train
 def test_what_is_no_policy_is_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
     pytest.importorskip("mjlab")
-    from pronk.train import checkpoint
-    from pronk.train.evaluate_subject import load_subject
+    from pronk.train.evaluation.subject import load_subject
+    from pronk.train.experiment import checkpoint
 
     with pytest.raises(ArtefactError, match="no checkpoints in it; expected the folder of a run"):
         load_subject(tmp_path, "cpu")
@@ -823,9 +825,9 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
     from tensordict import TensorDict
 
     from pronk.robots import load_robot
-    from pronk.train.evaluate_subject import load_subject
-    from pronk.train.export import contract_for, export_policy
+    from pronk.train.evaluation.subject import load_subject
     from pronk.train.gains import training_gains
+    from pronk.train.learning.export import contract_for, export_policy
 
     robot = load_robot("mini_cheetah")
     gains = training_gains("naive", robot)
@@ -866,7 +868,7 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
     pytest.importorskip("mjlab")
     from pronk.commands.evaluate import run
     from pronk.robots import load_robot
-    from pronk.train.evaluate_subject import load_subject
+    from pronk.train.evaluation.subject import load_subject
     from pronk.train.gains import training_gains
 
     plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
@@ -888,9 +890,9 @@ def test_one_robot_is_measured_many_times_with_noise_alone() -> None:
     pytest.importorskip("mjlab")
     from pronk.commands.evaluate import Drawn
     from pronk.robots import load_robot
-    from pronk.train.evaluate_run import RANDOMIZATIONS
+    from pronk.train.environment.randomization import delay_steps, events, noise
+    from pronk.train.evaluation.run import RANDOMIZATIONS
     from pronk.train.gains import training_gains
-    from pronk.train.randomization import delay_steps, events, noise
 
     assert {drawn.value for drawn in Drawn} == set(RANDOMIZATIONS)
     full, alone, none = (RANDOMIZATIONS[name] for name in ("full", "noise", "none"))
@@ -909,8 +911,8 @@ def test_a_policy_that_cannot_jump_is_not_asked_to(
 ) -> None:
     pytest.importorskip("mjlab")
     from pronk.commands.evaluate import What, evaluate
-    from pronk.train import checkpoint
-    from pronk.train.evaluate_subject import blank_actor
+    from pronk.train.evaluation.subject import blank_actor
+    from pronk.train.experiment import checkpoint
 
     path = tmp_path / "model_1.pt"
     tree = {"algorithm": {"actor_state_dict": blank_actor(jump=False).state_dict()}}

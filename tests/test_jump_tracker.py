@@ -16,7 +16,7 @@ from pronk.errors import PronkError
 
 torch = pytest.importorskip("torch")
 
-from pronk.train.jump import JumpSettings, JumpTracker  # noqa: E402
+from pronk.train.environment.jump import JumpSettings, JumpTracker  # noqa: E402
 
 pytestmark = pytest.mark.train
 
@@ -33,14 +33,15 @@ SETTINGS = JumpSettings(
     stroke=0.5,
     crouch=0.1875,
     gap=0.75,
+    rear=0.25,
 )
 """Not even the first step after the command is hasty."""
 WAITS = replace(SETTINGS, hasty_s=4 * DT, ready_s=8 * DT)
-EVENTS = ("gain", "rise", "reach", "gap", "hop")
+EVENTS = ("gain", "rise", "reach", "gap", "rear", "hop")
 TRACES = (
     *EVENTS,
-    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest", "liftoffs"),
-    "airborne",
+    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest", "steepest"),
+    *("liftoffs", "airborne"),
 )
 
 Feet = tuple[tuple[float, float], ...]
@@ -64,6 +65,7 @@ class Step:
     """Which feet touch it, if not in the air."""
     feet: Feet = STANCE
     way: tuple[float, float] = (0.0, 0.0)
+    nose: float = 0.0
 
     @property
     def contact(self) -> list[bool]:
@@ -100,6 +102,7 @@ def play(
             excess=torch.tensor([step.excess for step in steps]),
             feet=torch.tensor([step.feet for step in steps]),
             direction=torch.tensor([step.way for step in steps]),
+            nose=torch.tensor([step.nose for step in steps]),
             dt=DT,
         )
         for name in TRACES:
@@ -338,6 +341,28 @@ def test_a_running_start_above_the_command_is_not_paid() -> None:
     assert alone(again)["lead"] == [0.0] * 15 + [0.5] * 6
 
 
+@pytest.mark.parametrize(("steps", "worth"), [(4, 0.0), (6, 0.5), (8, 1.0), (20, 0.75)])
+def test_what_a_hasty_jump_covers_is_worth_as_little_as_its_lift_off(
+    steps: int, worth: float
+) -> None:
+    """It lifts off in that step after the command, flies for three and lands half a metre on."""
+    stands = Step(jump=True, ground=ALL_FOUR, way=(1.0, 0.0))
+    flies = replace(stands, air=True, speed=2.5, along=2.0)
+    lands = replace(stands, feet=moved(1.0, 0.0))
+    seen = alone([*[stands] * (steps - 1), flies, flies, flies, lands], asked=WAITS)
+    assert sum(seen["gain"]) == pytest.approx(worth)
+    assert sum(seen["reach"]) == pytest.approx(worth * 2 * 2.0 * DT)
+    assert sum(seen["gap"]) == pytest.approx(worth * 0.5)
+
+
+def test_the_flight_that_a_command_finds_under_way_covers_nothing() -> None:
+    """Whatever the jump before it was worth."""
+    jump = [Step(jump=True), *[Step(jump=True, air=True, speed=2.5, along=2.0)] * 3]
+    seen = alone([*jump, Step(), Step(air=True, along=2.0), *jump[2:]])
+    assert sum(seen["reach"][:4]) > 0.0
+    assert not any(seen["reach"][4:])
+
+
 def test_flying_backwards_reaches_nothing() -> None:
     steps = [Step(jump=True, air=i > 1, along=-1.0) for i in range(6)]
     assert alone(steps)["reach"] == [0] * 6
@@ -437,6 +462,27 @@ def test_nobody_without_a_command_clears_a_gap() -> None:
     assert landing([replace(step, jump=i < 3) for i, step in enumerate(steps)]) == {4: 0.25}
 
 
+def test_a_running_start_above_the_command_clears_no_gap() -> None:
+    """Half a metre a second too fast, two steps in the air."""
+    steps = leap_over(STANCE, moved(0.75, 0.0))
+    fast = [replace(steps[0], excess=0.5), *steps[1:]]
+    assert landing(fast) == pytest.approx({4: 0.25 - 2 * 0.5 * DT})
+
+
+def test_rearing_up_is_paid_at_lift_off_up_to_the_limit() -> None:
+    """Strides at steps 2 and 10 do not count, the better of two leaps does, and never below 0."""
+    nose = [0.2, 0.2, 0.2, 0.0, 0.125, 0.5, 0.0, 0.75, 0.75, 0.0, 0.2]
+    speed = [0, 0, 0.25, 0, 2, 0, 0, 2, 0, 0, 0.25]
+    air = [False, False, True, False, True, True, False, True, True, False, True]
+    steps = [
+        Step(jump=True, air=a, speed=v, nose=n) for a, v, n in zip(air, speed, nose, strict=True)
+    ]
+    assert alone(steps)["rear"] == [0, 0, 0, 0, 0.125, 0, 0, 0.125, 0, 0, 0]
+    down = [replace(step, nose=-step.nose) for step in steps]
+    assert alone(down)["rear"] == [0] * 11
+    assert alone([replace(step, jump=False) for step in steps])["rear"] == [0] * 11
+
+
 def test_the_next_command_begins_at_its_own_height() -> None:
     heights = [0.3, 0.6, 0.3, 0.3, 0.4]
     jump = [True, True, False, True, True]
@@ -503,6 +549,7 @@ class Account:
     age: int = 0
     speed: float = 0.0
     scores: list[float] = field(default_factory=list)
+    worth: float = 0.0
     leaps: int = 0
     highest: float = 0.0
     lowest: float = 0.0
@@ -512,13 +559,15 @@ class Account:
     farthest: float = 0.0
     stood: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, 0.0)] * 4)
     widest: float = 0.0
+    brought: float = 0.0
+    steepest: float = 0.0
 
     def step(self, now: Step) -> dict[str, float]:
         s = self.settings
         new = now.jump and not self.told
         if new:
             self.age, self.scores, self.leaps, self.farthest, self.widest = 0, [], 0, 0.0, 0.0
-            self.lead = max(now.excess, 0.0)
+            self.lead, self.steepest, self.worth = max(now.excess, 0.0), 0.0, 0.0
         if now.jump:
             self.settled = 0
         elif self.settled is not None and not now.air:
@@ -531,12 +580,16 @@ class Account:
         if mode and now.air and not self.was_up:
             speed = max(self.speed, now.speed)
             off = (speed - s.liftoff_velocity) / self.width
-            score = math.exp(-(off**2) / 2) * self.timely(self.age * DT)
+            self.worth = self.timely(self.age * DT)
+            score = math.exp(-(off**2) / 2) * self.worth
             paid["gain"] = max(score - max(self.scores, default=0.0), 0.0)
             self.scores.append(score)
             if speed > s.leap:
                 paid["hop"] = float(self.leaps > 0)
                 self.leaps += 1
+                steepest = min(now.nose, s.rear)
+                if steepest > self.steepest:
+                    paid["rear"], self.steepest = steepest - self.steepest, steepest
         low = max(now.height, s.crouch)
         if not mode or new:
             self.highest, self.lowest, self.stroke = now.height, low, 0.0
@@ -545,7 +598,7 @@ class Account:
             self.lowest = min(self.lowest, low)
         stroke = max(min(self.highest - self.lowest, s.stroke), 0.0)
         paid["rise"], self.stroke = stroke - self.stroke, stroke
-        gone = (now.along - self.lead) * DT
+        gone = (now.along - self.lead) * self.worth * DT
         self.flown = self.flown + gone if mode and now.air and self.was_up else 0.0
         if self.flown > self.farthest:
             paid["reach"], self.farthest = self.flown - self.farthest, self.flown
@@ -553,9 +606,10 @@ class Account:
             along = [
                 [x * now.way[0] + y * now.way[1] for x, y in f] for f in (self.stood, now.feet)
             ]
-            gap = min(min(along[1]) - max(along[0]), s.gap)
+            gap = min(min(along[1]) - max(along[0]) - self.brought, s.gap) * self.worth
             if gap > self.widest:
                 paid["gap"], self.widest = gap - self.widest, gap
+        self.brought = self.brought + self.lead * DT if now.air else 0.0
         for i, touches in enumerate(now.contact):
             if touches:
                 self.stood[i] = now.feet[i]
@@ -590,6 +644,7 @@ def scripts(draw: st.DrawFn) -> list[Step]:
     speed = draw(st.lists(st.integers(-96, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     along = draw(st.lists(st.integers(-32, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     excess = draw(st.lists(st.integers(-16, 32).map(lambda i: i / 32), min_size=60, max_size=60))
+    nose = draw(st.lists(st.integers(-32, 32).map(lambda i: i / 64), min_size=60, max_size=60))
     way = draw(st.sampled_from([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)]))
     feet = wander(random.Random(draw(st.integers(0, 2**32 - 1))), way)
     return [
@@ -603,9 +658,10 @@ def scripts(draw: st.DrawFn) -> list[Step]:
             ground=ground,
             feet=points,
             way=way,
+            nose=n,
         )
-        for j, a, h, v, u, e, (ground, points) in zip(
-            jump, air, height, speed, along, excess, feet, strict=False
+        for j, a, h, v, u, e, n, (ground, points) in zip(
+            jump, air, height, speed, along, excess, nose, feet, strict=False
         )
     ]
 
@@ -645,7 +701,7 @@ def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) 
     seen = alone(steps)
     edges = [i for i, now in enumerate(steps) if now.jump and not (i and steps[i - 1].jump)]
     for begin, end in itertools.pairwise([*edges, len(steps)]):
-        gain, rise, reach, gap, hop = (seen[name][begin:end] for name in EVENTS)
+        gain, rise, reach, gap, rear, hop = (seen[name][begin:end] for name in EVENTS)
         assert min(*gain, 0.0) == 0.0
         assert sum(gain) == pytest.approx(max(seen["best"][begin:end]), abs=1e-5)
         assert sum(gain) <= 1.0 + 1e-5
@@ -656,6 +712,9 @@ def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) 
         assert min(*gap, 0.0) == 0.0
         assert sum(gap) == pytest.approx(max(seen["widest"][begin:end]), abs=1e-5)
         assert sum(gap) <= SETTINGS.gap + 1e-5
+        assert min(*rear, 0.0) == 0.0
+        assert sum(rear) == pytest.approx(max(seen["steepest"][begin:end]), abs=1e-5)
+        assert sum(rear) <= SETTINGS.rear + 1e-5
         assert sum(hop) == max(max(seen["liftoffs"][begin:end]) - 1, 0)
 
 

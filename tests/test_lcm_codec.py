@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pronk.errors import HardwareError
-from pronk.hardware import lcm_types as types
-from pronk.hardware.lcm_codec import (
+from pronk.hardware.lcm import types
+from pronk.hardware.lcm.codec import (
     decode_attitude,
     decode_command,
     decode_joints,
@@ -21,7 +21,7 @@ from pronk.hardware.lcm_codec import (
     roll_pitch_yaw,
     state_of,
 )
-from pronk.hardware.lcm_layout import (
+from pronk.hardware.lcm.layout import (
     CHEETAH,
     KNEE_RATIO,
     LAYOUTS,
@@ -29,8 +29,8 @@ from pronk.hardware.lcm_layout import (
     Layout,
     layout_of,
 )
-from pronk.hardware.lcm_message import RefusedError
-from pronk.hardware.lcm_service import (
+from pronk.hardware.lcm.message import RefusedError
+from pronk.hardware.lcm.service import (
     clamp_message,
     mode_request,
     read_clamp_message,

@@ -18,17 +18,17 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.hardware.lcm_codec import (
+from pronk.hardware.lcm.codec import (
     decode_command,
     encode_command,
 )
-from pronk.hardware.lcm_layout import (
+from pronk.hardware.lcm.layout import (
     CHEETAH,
 )
-from pronk.hardware.lcm_link import LcmMachine
-from pronk.hardware.lcm_service import REQUEST_CHANNEL, mode_request
-from pronk.hardware.lcm_url import url_of
-from pronk.hardware.lcm_writer import DAMPING, CommandWriter
+from pronk.hardware.lcm.link import LcmMachine
+from pronk.hardware.lcm.service import REQUEST_CHANNEL, mode_request
+from pronk.hardware.lcm.url import url_of
+from pronk.hardware.lcm.writer import DAMPING, CommandWriter
 from pronk.hardware.machine import Command, State
 from pronk.hardware.preflight import Freshness
 from pronk.hardware.twin import hold_of

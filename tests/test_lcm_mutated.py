@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from pronk.hardware.faults import flip_bit
-from pronk.hardware.lcm_codec import (
+from pronk.hardware.lcm.codec import (
     decode_command,
     encode_command,
     encode_state,
 )
-from pronk.hardware.lcm_layout import (
+from pronk.hardware.lcm.layout import (
     LAYOUTS,
     Layout,
 )
-from pronk.hardware.lcm_message import RefusedError
-from pronk.hardware.lcm_reader import StateReader
-from pronk.hardware.lcm_service import BENCH_CHANNEL, REQUEST_CHANNEL
-from pronk.hardware.lcm_types import MESSAGES
+from pronk.hardware.lcm.message import RefusedError
+from pronk.hardware.lcm.reader import StateReader
+from pronk.hardware.lcm.service import BENCH_CHANNEL, REQUEST_CHANNEL
+from pronk.hardware.lcm.types import MESSAGES
 from pronk.hardware.machine import Command, State
 from pronk.hardware.truth import load_truth
 from pronk.hardware.twin import Twin, hold_of
@@ -101,7 +101,7 @@ def undisturbed() -> list[State]:
 def test_a_hundred_thousand_broken_messages_move_nothing(
     layout: Layout, undisturbed: list[State]
 ) -> None:
-    from pronk.hardware.twin_lcm import LcmWire
+    from pronk.hardware.lcm.twin import LcmWire
 
     machine = VirtualRobot(ROBOT, load_truth(None), seed=1, legs=("FR",))
     machine.connect()
@@ -136,7 +136,7 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
 def test_the_same_twin_does_move_when_it_is_told_to(
     layout: Layout, undisturbed: list[State]
 ) -> None:
-    from pronk.hardware.twin_lcm import LcmWire
+    from pronk.hardware.lcm.twin import LcmWire
 
     machine = VirtualRobot(ROBOT, load_truth(None), seed=1, legs=("FR",))
     machine.connect()

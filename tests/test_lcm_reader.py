@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.hardware.lcm_codec import (
+from pronk.hardware.lcm.codec import (
     encode_state,
 )
-from pronk.hardware.lcm_layout import (
+from pronk.hardware.lcm.layout import (
     CHEETAH,
     WTW,
     Layout,
 )
-from pronk.hardware.lcm_reader import StateReader
-from pronk.hardware.lcm_service import clamp_message
-from pronk.hardware.lcm_url import TWIN_PORT, multicast_interface, url_of
+from pronk.hardware.lcm.reader import StateReader
+from pronk.hardware.lcm.service import clamp_message
+from pronk.hardware.lcm.url import TWIN_PORT, multicast_interface, url_of
 from pronk.hardware.machine import State
 from pronk.hardware.preflight import Freshness, check_rate, check_rest, up_of
 from pronk.robots import load_robot

@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
 from pronk.errors import ArtefactError  # noqa: E402
-from pronk.train.memory import Memory, put_back, walk  # noqa: E402
+from pronk.train.experiment.memory import Memory, put_back, walk  # noqa: E402
 
 pytestmark = pytest.mark.train
 

@@ -21,8 +21,8 @@ import small_env  # noqa: E402
 from pronk.policy import layout  # noqa: E402
 from pronk.robots import load_robot  # noqa: E402
 from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.train.commands import motion_command  # noqa: E402
-from pronk.train.observations import CRITIC, CRITIC_JUMP  # noqa: E402
+from pronk.train.environment.commands import motion_command  # noqa: E402
+from pronk.train.environment.observations import CRITIC, CRITIC_JUMP  # noqa: E402
 
 Array = NDArray[np.float64]
 N = small_env.ROBOTS

@@ -23,8 +23,8 @@ from pronk.policy.contract import Contract, check  # noqa: E402
 from pronk.policy.observation import History, Measurement  # noqa: E402
 from pronk.policy.runtime import load_policy  # noqa: E402
 from pronk.robots import load_robot  # noqa: E402
-from pronk.train.export import TOLERANCE, contract_for, export_policy, verify  # noqa: E402
 from pronk.train.gains import TrainingGains, training_gains  # noqa: E402
+from pronk.train.learning.export import TOLERANCE, contract_for, export_policy, verify  # noqa: E402
 from small_ppo import build, observe, roll_out, same, weights  # noqa: E402
 
 pytestmark = pytest.mark.train
@@ -170,8 +170,8 @@ def env() -> Iterator[Any]:
     """Two nominal robots without noise."""
     from mjlab.envs import ManagerBasedRlEnv
 
+    from pronk.train.environment.randomization import Randomization
     from pronk.train.phases import phase
-    from pronk.train.randomization import Randomization
     from pronk.train.tasks import env_cfg
 
     cfg = env_cfg(phase=phase("jump_b"), randomization=Randomization.none(), num_envs=2, seed=3)
@@ -188,7 +188,7 @@ def gravity(quaternion: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 @pytest.mark.slow
 def test_the_contract_is_what_the_environment_does(env: Any) -> None:
-    from pronk.train.commands import motion_command
+    from pronk.train.environment.commands import motion_command
     from pronk.train.tasks import ACTION_SCALE
 
     made = contract(jump=True, action_scale=ACTION_SCALE)

@@ -10,13 +10,13 @@ import pytest
 
 pytest.importorskip("torch")
 
-from pronk.train.processes import gathered, in_any
+from pronk.train.experiment.processes import gathered, in_any
 
 pytestmark = pytest.mark.train
 
 PROGRAM = """
 import sys, torch
-from pronk.train.processes import gathered, in_any
+from pronk.train.experiment.processes import gathered, in_any
 rank, meeting = int(sys.argv[1]), sys.argv[2]
 torch.distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=2)
 two = {"size": 2, "device": "cpu"}

@@ -15,8 +15,8 @@ from rich.console import Console  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from pronk.train.progress import Episodes, ProgressLine, duration, rate  # noqa: E402
-from pronk.train.rollout import make_finite  # noqa: E402
+from pronk.train.experiment.progress import Episodes, ProgressLine, duration, rate  # noqa: E402
+from pronk.train.learning.rollout import make_finite  # noqa: E402
 
 pytestmark = pytest.mark.train
 

@@ -39,11 +39,11 @@ from mjlab.managers.event_manager import EventTermCfg  # noqa: E402
 from mjlab.scene import SceneCfg  # noqa: E402
 from mjlab.terrains import TerrainEntityCfg  # noqa: E402
 
-from pronk.train import draws as drawing  # noqa: E402
-from pronk.train.actions import HeldJointPositionCfg  # noqa: E402
-from pronk.train.drives import PositionDrive, actuators  # noqa: E402
-from pronk.train.randomization import Randomization, delay_steps, events, noise  # noqa: E402
-from pronk.train.scene import robot_entity, simulation  # noqa: E402
+from pronk.train.environment import draws as drawing  # noqa: E402
+from pronk.train.environment.actions import HeldJointPositionCfg  # noqa: E402
+from pronk.train.environment.drives import PositionDrive, actuators  # noqa: E402
+from pronk.train.environment.randomization import Randomization, delay_steps, events, noise  # noqa: E402
+from pronk.train.environment.scene import robot_entity, simulation  # noqa: E402
 
 Array = NDArray[np.float64]
 CHEETAH = load_robot("mini_cheetah")

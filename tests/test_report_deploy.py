@@ -17,8 +17,11 @@ from pronk.deploy.reasons import Level, Reason
 from pronk.deploy.records import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
 from pronk.errors import LogError
 from pronk.hardware.machine import State
-from pronk.report import deploy_data, deploy_part, deploy_words, whole
-from pronk.report.deploy_delay import delay, shift
+from pronk.report import whole
+from pronk.report.deploy import data as deploy_data
+from pronk.report.deploy import part as deploy_part
+from pronk.report.deploy import words as deploy_words
+from pronk.report.deploy.delay import delay, shift
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

@@ -24,19 +24,16 @@ from pronk.jumps import JumpRules
 from pronk.match import gains as gains_file
 from pronk.match import result as match_file
 from pronk.match.result import MatchResult
-from pronk.report import (
-    style,
-    trial_bodies,
-    trial_clips,
-    trial_crossing,
-    trial_data,
-    trial_variation,
-    whole,
-)
-from pronk.report.trial_argument import bode_errors_db, joint_error_db, match_near
-from pronk.report.trial_cells import cells, scatter
-from pronk.report.trial_sweeps import Line, Panel, argument, lines
-from pronk.report.trial_traces import Trace, heights, rates, rms, torque_speed
+from pronk.report import style, whole
+from pronk.report.trial import bodies as trial_bodies
+from pronk.report.trial import clips as trial_clips
+from pronk.report.trial import crossing as trial_crossing
+from pronk.report.trial import data as trial_data
+from pronk.report.trial import variation as trial_variation
+from pronk.report.trial.argument import bode_errors_db, joint_error_db, match_near
+from pronk.report.trial.cells import cells, scatter
+from pronk.report.trial.sweeps import Line, Panel, argument, lines
+from pronk.report.trial.traces import Trace, heights, rates, rms, torque_speed
 from pronk.robots import load_robot
 from pronk.trial import bodies, crossing, published, result, sheet, tables, variation, walk
 from pronk.trial.bodies import Bodies, Body, GainsError

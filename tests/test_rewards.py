@@ -16,16 +16,16 @@ from torch import Tensor  # noqa: E402
 
 import small_env  # noqa: E402
 from pronk.errors import PronkError  # noqa: E402
-from pronk.train.commands import MotionCommand, motion_command  # noqa: E402
-from pronk.train.motion import Motion  # noqa: E402
-from pronk.train.phases import Phase, enter_phase, phase  # noqa: E402
-from pronk.train.reward_sum import reward_sum  # noqa: E402
-from pronk.train.reward_table import (  # noqa: E402
+from pronk.train.environment.commands import MotionCommand, motion_command  # noqa: E402
+from pronk.train.environment.motion import Motion  # noqa: E402
+from pronk.train.environment.reward_sum import reward_sum  # noqa: E402
+from pronk.train.environment.reward_table import (  # noqa: E402
     PAPER_UNIT,
     ROWS,
     JumpWeights,
     with_jump_weights,
 )
+from pronk.train.phases import Phase, enter_phase, phase  # noqa: E402
 
 N = small_env.ROBOTS
 STANDING = 0.298970  # .209 cos(.8) + .195 cos(.8) + .0175
@@ -82,10 +82,10 @@ def pretend(env: Any, **fields: Tensor) -> MotionCommand:
         "velocity": torch.zeros(N, 12),
         "height": torch.full((N,), STANDING),
         "velocity_world": torch.zeros(N, 3),
-        "velocity_trunk": torch.zeros(N, 3),
+        "velocity_heading": torch.zeros(N, 2),
         "angular_velocity": torch.zeros(N, 3),
         "gravity": every(vector(0.0, 0.0, -1.0)),
-        "ahead": every(vector(1.0, 0.0, 0.0)),
+        "heading": every(torch.tensor([1.0, 0.0])),
         "contact": torch.ones(N, 4, dtype=torch.bool),
         "force": torch.full((N, 4), 30.0),
         "foot_position": torch.zeros(N, 4, 2),
@@ -138,14 +138,14 @@ CASES = [
         "tracking_linear",
         math.exp(-0.25 / 0.25),
         math.exp(-(0.613050**2 + 0.556525**2) / 0.25),
-        {"velocity_command": vector(1.0, 0.5, 0.0), "velocity_trunk": vector(0.7, 0.1, 9.0)},
+        {"velocity_command": vector(1.0, 0.5, 0.0), "velocity_heading": torch.tensor([0.7, 0.1])},
     ),
     # Below 1 m/s .35 m/s in proportion: -.4 becomes -.54.
     Case(
         "tracking_linear",
         1.0,
         math.exp(-(0.14**2) / 0.25),
-        {"velocity_command": vector(0.0, -0.4, 2.0), "velocity_trunk": vector(0.0, -0.4, 0.0)},
+        {"velocity_command": vector(0.0, -0.4, 2.0), "velocity_heading": torch.tensor([0.0, -0.4])},
     ),
     same(
         "tracking_angular",
@@ -220,7 +220,7 @@ CASES = [
 
 def test_every_term_has_a_case() -> None:
     own = {"termination", "sparse_jump", "rise", "reach", "gap", "hop", "action_rate"}
-    own |= {"stray_foot"}
+    own |= {"stray_foot", "landing", "rear"}
     assert {case.name for case in CASES} | own == set(ROWS)
 
 
@@ -256,13 +256,35 @@ def test_terms_are_of_one_robot_each(env: Any, robot: int) -> None:
         assert torch.equal(after[others], before[name][others]), name
 
 
-def test_a_foot_strays_in_the_flight_of_a_jump_alone(env: Any) -> None:
+def test_a_foot_strays_as_a_jump_comes_down(env: Any) -> None:
     """Mean .10, lowest .04: .06 m. On the ground a leg may hang as it likes, so may a trot's."""
-    command = pretend(env, foot_height=vector(0.10, 0.12, 0.14, 0.04))
+    feet, down = vector(0.10, 0.12, 0.14, 0.04), vector(2.0, 0.0, -0.1)
+    command = pretend(env, foot_height=feet, velocity_world=down)
     command.tracker.airborne[:] = False
     command.tracker.airborne[[WALKS, JUMPS]] = True
     value = ROWS["stray_foot"].term(command)
     assert value.tolist() == pytest.approx([0.06 if i == JUMPS else 0.0 for i in range(N)])
+    # Who leaps with the fore legs first has the hind ones below as it goes up.
+    command.motion.velocity_world[:, 2] = 0.1
+    assert not ROWS["stray_foot"].term(command).any()
+
+
+def test_a_deep_landing_costs_who_has_jumped(env: Any) -> None:
+    """5 cm below the floor of landings: on the ground, in jump mode and after a lift-off."""
+    floor = ROWS["landing"].arguments["height"]
+    command = pretend(env, height=torch.tensor(floor - 0.05))
+    tracker = command.tracker
+    tracker.airborne[:] = False
+    tracker.liftoffs[:] = 0.0
+    assert not ROWS["landing"].term(command, height=floor).any(), "that is a crouch"
+    tracker.liftoffs[[WALKS, JUMPS]] = 1.0
+    value = ROWS["landing"].term(command, height=floor)
+    assert value.tolist() == pytest.approx([0.05 if i == JUMPS else 0.0 for i in range(N)])
+    tracker.airborne[JUMPS] = True
+    assert not ROWS["landing"].term(command, height=floor).any()
+    tracker.airborne[JUMPS] = False
+    command.motion.height[:] = floor + 0.01
+    assert not ROWS["landing"].term(command, height=floor).any()
 
 
 def test_action_rate_by_hand(env: Any) -> None:
@@ -293,6 +315,7 @@ def test_targets_are_what_the_torque_is_asked_for(env: Any) -> None:
         ("rise", "rise", 10.0),
         ("reach", "reach", 6.0),
         ("gap", "gap", 7.0),
+        ("rear", "rear", 2.0),
         ("hop", "hop", -0.5),
     ],
 )
@@ -309,6 +332,7 @@ def test_an_event_is_worth_its_weight_once(
         rise=10.0,
         reach=6.0,
         gap=7.0,
+        rear=2.0,
         hop=0.5,
         collision=5.0,
         knees=3.0,
@@ -397,7 +421,7 @@ def paid_now(env: Any, name: str) -> Tensor:
 def test_a_reward_is_a_number_whatever_physics_gives(env: Any, bad: float) -> None:
     command = pretend(env)
     usual = reward_sum(env)(env, None).clone()
-    for name in ("velocity", "torque", "torque_change", "velocity_trunk", "force", "foot_height"):
+    for name in ("velocity", "torque", "torque_change", "velocity_heading", "force", "foot_height"):
         getattr(command.motion, name)[3] = bad
     command.motion.knee_height[3] = command.tracker.gap[3] = bad
     after = reward_sum(env)(env, None)
@@ -425,7 +449,7 @@ PAPER: dict[str, tuple[float, float]] = {
 """The paper's table, walk and jump; its termination is an event."""
 IN_WALKING_ALONE = {"foot_clearance"}
 """Terms that have the paper's weight, but none in jump mode."""
-CHANGED = {"smoothness", "torque_limits", "torque", "tracking_angular", "collision"}
+CHANGED = {"smoothness", "torque_limits", "torque", "tracking_angular", "collision", "orientation"}
 """Terms with another weight, for the reason that stands beside it."""
 
 
@@ -450,7 +474,9 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
     assert ROWS["tracking_angular"].walk * PAPER_UNIT >= PAPER["tracking_angular"][0]
     assert ROWS["collision"].walk * PAPER_UNIT <= PAPER["collision"][0]
     assert ROWS["collision"].jump * PAPER_UNIT <= PAPER["collision"][1]
-    for name in ("dense_jump", "sparse_jump", "rise", "reach", "gap", "hop"):
+    assert ROWS["orientation"].walk * PAPER_UNIT == pytest.approx(PAPER["orientation"][0])
+    assert PAPER["orientation"][1] <= ROWS["orientation"].jump * PAPER_UNIT < 0.0
+    for name in ("dense_jump", "sparse_jump", "rise", "reach", "gap", "rear", "hop"):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
     for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch", "knees"):
         assert ROWS[name].walk < 0.0
@@ -489,13 +515,14 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
         rise=3.0,
         reach=1.5,
         gap=0.75,
+        rear=5.0,
         hop=0.25,
         collision=9.0,
         knees=4.0,
     )
     rows = with_jump_weights(ROWS, weights)
     changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
-    changed |= {"gap": 0.75, "hop": -0.25, "collision": -9.0, "knees": -4.0}
+    changed |= {"gap": 0.75, "rear": 5.0, "hop": -0.25, "collision": -9.0, "knees": -4.0}
     assert {name: rows[name].jump for name in changed} == changed
     assert {name: rows[name].walk for name in changed} == {
         name: ROWS[name].walk for name in changed

@@ -16,8 +16,8 @@ from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
 from pronk.drive import clip_torque, stall_torque  # noqa: E402
 from pronk.robots import load_robot  # noqa: E402
 from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.train.randomization import Randomization  # noqa: E402
-from pronk.train.supply import Supply  # noqa: E402
+from pronk.train.environment.randomization import Randomization  # noqa: E402
+from pronk.train.environment.supply import Supply  # noqa: E402
 from pronk.train.tasks import env_cfg  # noqa: E402
 
 pytestmark = pytest.mark.train

@@ -26,9 +26,9 @@ from pronk import cli
 from pronk.commands.confirm import Person
 from pronk.commands.sweep_wire import record_wire
 from pronk.errors import HardwareError, LogError
-from pronk.hardware.lcm_codec import decode_command, encode_command
-from pronk.hardware.lcm_layout import CHEETAH
-from pronk.hardware.lcm_url import url_of
+from pronk.hardware.lcm.codec import decode_command, encode_command
+from pronk.hardware.lcm.layout import CHEETAH
+from pronk.hardware.lcm.url import url_of
 from pronk.hardware.links import Address
 from pronk.hardware.machine import Command
 from pronk.hardware.preflight import Freshness

@@ -15,8 +15,8 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
 from pronk.errors import PronkError  # noqa: E402
-from pronk.train.observations import CRITIC  # noqa: E402
-from pronk.train.symmetry import ACTION, GROUPS, Mirror, with_mirror_image  # noqa: E402
+from pronk.train.environment.observations import CRITIC  # noqa: E402
+from pronk.train.learning.symmetry import ACTION, GROUPS, Mirror, with_mirror_image  # noqa: E402
 from small_ppo import (  # noqa: E402
     SIZES,
     build,
@@ -86,7 +86,7 @@ def test_ppo_learns_from_both_sides(jump: bool) -> None:
     algorithm = build(
         jump=jump,
         symmetry_cfg={
-            "data_augmentation_func": "pronk.train.symmetry:with_mirror_image",
+            "data_augmentation_func": "pronk.train.learning.symmetry:with_mirror_image",
             "use_data_augmentation": True,
             "use_mirror_loss": True,
             "mirror_loss_coeff": 1.0,

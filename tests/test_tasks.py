@@ -27,10 +27,10 @@ from mjlab.tasks.registry import (  # noqa: E402
 import small_env  # noqa: E402
 from pronk.robots import load_robot  # noqa: E402
 from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.train.commands import NAME, motion_command  # noqa: E402
+from pronk.train.environment.commands import NAME, motion_command  # noqa: E402
+from pronk.train.environment.scene import FOOT_CONTACT  # noqa: E402
+from pronk.train.experiment.runner import PronkRunner  # noqa: E402
 from pronk.train.phases import phase  # noqa: E402
-from pronk.train.runner import PronkRunner  # noqa: E402
-from pronk.train.scene import FOOT_CONTACT  # noqa: E402
 from pronk.train.tasks import ACTION_SCALE, JUMP_TASK, WALK_TASK, env_cfg  # noqa: E402
 
 N = small_env.ROBOTS
@@ -69,7 +69,7 @@ def test_mjlabs_list_shows_the_tasks(capsys: pytest.CaptureFixture[str]) -> None
 def test_tasks_are_known_whatever_is_imported_first() -> None:
     """mjlab loads the entry point while it is itself imported: here by a module of ours."""
     code = (
-        "import pronk.train.commands, pronk.train.tasks\n"
+        "import pronk.train.environment.commands, pronk.train.tasks\n"
         "from mjlab.tasks.registry import list_tasks\n"
         "print(*list_tasks())"
     )

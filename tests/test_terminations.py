@@ -15,9 +15,9 @@ import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 import small_env  # noqa: E402
-from pronk.train.commands import motion_command  # noqa: E402
-from pronk.train.observations import CRITIC  # noqa: E402
-from pronk.train.reward_sum import reward_sum  # noqa: E402
+from pronk.train.environment.commands import motion_command  # noqa: E402
+from pronk.train.environment.observations import CRITIC  # noqa: E402
+from pronk.train.environment.reward_sum import reward_sum  # noqa: E402
 
 N = small_env.ROBOTS
 STILL = torch.zeros(N, 12)

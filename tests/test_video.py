@@ -19,17 +19,17 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.hardware.capture import Capture
 from pronk.hardware.ground import Box, Ground
 from pronk.hardware.truth import load_truth
-from pronk.trial import film as films
-from pronk.trial import overlay, video, videos
-from pronk.trial.film import FPS, Film, plan
-from pronk.trial.frames import HEIGHT, WIDTH
 from pronk.trial.marks import Marks, marks_of
+from pronk.trial.pictures import film as films
+from pronk.trial.pictures import overlay, video, videos
+from pronk.trial.pictures.film import FPS, Film, plan
+from pronk.trial.pictures.frames import HEIGHT, WIDTH
+from pronk.trial.pictures.render import in_gif
+from pronk.trial.pictures.stage import FOV_DEG, TAPE_M, Tape
+from pronk.trial.pictures.view import View
 from pronk.trial.protocol import STILL, Case, Script
-from pronk.trial.render import in_gif
 from pronk.trial.run import Plan as TrialPlan
 from pronk.trial.run import run as run_trial
-from pronk.trial.stage import FOV_DEG, TAPE_M, Tape
-from pronk.trial.view import View
 
 RATE = 200.0
 GRAVITY = 9.81

@@ -11,9 +11,9 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
 from pronk.errors import PronkError  # noqa: E402
-from pronk.train.jump_linear import JumpLinear  # noqa: E402
-from pronk.train.ppo import EstimatorPPO  # noqa: E402
-from pronk.train.widen import widen_state  # noqa: E402
+from pronk.train.learning.jump_linear import JumpLinear  # noqa: E402
+from pronk.train.learning.ppo import EstimatorPPO  # noqa: E402
+from pronk.train.learning.widen import widen_state  # noqa: E402
 from small_ppo import (  # noqa: E402
     build,
     observe,

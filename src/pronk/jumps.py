@@ -1,6 +1,6 @@
 """What a jump was: flight phases and the figures of one jump, from the series of one robot.
 
-The definitions stand here, once; `pronk.train.evaluate_flight` computes the same for thousands of
+The definitions stand here, once; `pronk.train.evaluation.flight` computes the same for thousands of
 robots while they run, and a test holds the two together. Samples k = 0, 1, ... are taken at every
 physics step, at times k dt; foot contacts of a sample belong to its position. The trunk is
 followed at the origin of its frame, z up, the world's frame.

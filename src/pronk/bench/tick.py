@@ -28,6 +28,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from pronk.bars import Check
 from pronk.deploy.rehearsal import rehearse_until
 from pronk.deploy.thinker import WARM_UP, standing
 from pronk.errors import PronkError
@@ -35,7 +36,6 @@ from pronk.hardware.machine import State
 from pronk.hardware.realtime import Histogram, Pace, Wanted, enter, sleep_until
 from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
-from pronk.trial.bars import Check
 from pronk.trial.pilot import Pilot
 from pronk.trial.protocol import STILL
 

@@ -19,7 +19,7 @@ from typing import Any
 from pronk.bench.train_contender import Contender
 from pronk.bench.train_result import Rate, Scaling, TaskSpeed, TrainBench, stage_table, table
 from pronk.errors import PronkError
-from pronk.train.devices import find_devices, parse_gpu_ids, require_extra
+from pronk.train.experiment.devices import find_devices, parse_gpu_ids, require_extra
 
 __all__ = ["PEER", "PRONK", "TrainBench", "run", "stage_table", "table"]
 

@@ -16,9 +16,9 @@ from pronk.commands import console
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.train.evaluate_plan import Plan
-    from pronk.train.evaluate_result import Evaluation, Spread
-    from pronk.train.evaluate_subject import Subject
+    from pronk.train.evaluation.plan import Plan
+    from pronk.train.evaluation.result import Evaluation, Spread
+    from pronk.train.evaluation.subject import Subject
     from pronk.train.gains import TrainingGains
 
 
@@ -87,10 +87,10 @@ def evaluate(
 ) -> None:
     """Walk and jump with many robots at once; errors, heights and falls beside the bars."""
     from pronk.robots import load_robot
-    from pronk.train.devices import find_devices, require_extra
-    from pronk.train.evaluate_plan import JUMPS, WALKS, Plan
+    from pronk.train.evaluation.plan import JUMPS, WALKS, Plan
+    from pronk.train.experiment.devices import find_devices, require_extra
+    from pronk.train.experiment.request import ROBOT
     from pronk.train.gains import training_gains
-    from pronk.train.request import ROBOT
 
     require_extra()
     if out.suffix != ".json":
@@ -104,9 +104,9 @@ def evaluate(
     drives = training_gains(gains, load_robot(ROBOT), like=like)
     where = "cuda:0" if find_devices(device.value).device == "cuda" else "cpu"
 
-    from pronk.train import evaluate_result
-    from pronk.train.evaluate import write
-    from pronk.train.evaluate_subject import load_subject
+    from pronk.train.evaluation import result as evaluate_result
+    from pronk.train.evaluation.evaluate import write
+    from pronk.train.evaluation.subject import load_subject
 
     errors = {} if before is None else evaluate_result.load(before).speed_errors()
     subject = load_subject(policy, where)
@@ -140,14 +140,14 @@ def run(
         gains: Of the simulated drives.
         plan: What is asked.
         device: `cpu` or `cuda:0`.
-        randomization: One of `evaluate_run.RANDOMIZATIONS`.
+        randomization: One of `evaluation.run.RANDOMIZATIONS`.
         before: Speed errors to compare with; empty for none.
     """
     from mjlab.envs import ManagerBasedRlEnv
 
-    from pronk.train.evaluate import evaluate_policy, evaluation_cfg
-    from pronk.train.evaluate_run import RANDOMIZATIONS
-    from pronk.train.provenance import device_facts, versions
+    from pronk.train.evaluation.evaluate import evaluate_policy, evaluation_cfg
+    from pronk.train.evaluation.run import RANDOMIZATIONS
+    from pronk.train.experiment.provenance import device_facts, versions
     from pronk.train.tasks import env_cfg
 
     drawn = RANDOMIZATIONS[randomization]
@@ -180,7 +180,7 @@ def run(
 
 def show(evaluation: Evaluation) -> None:
     """Print what was measured, and every bar beside its figure."""
-    from pronk.train.evaluate_bars import checks
+    from pronk.train.evaluation.bars import checks
 
     if evaluation.walks:
         show_walks(evaluation)

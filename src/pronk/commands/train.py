@@ -14,8 +14,8 @@ from pronk.commands import console
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.train.run_folder import RunFolder
-    from pronk.train.settings import TrainSettings
+    from pronk.train.experiment.run_folder import RunFolder
+    from pronk.train.experiment.settings import TrainSettings
 
 
 CPU_RATE = 300.0
@@ -105,11 +105,11 @@ def train(
     json_file: console.JsonOption = None,
 ) -> None:
     """Train a policy that walks, runs and jumps on command."""
-    from pronk.train import provenance
-    from pronk.train.launch import begin_run, launch
-    from pronk.train.request import Request, new_settings, resumed_settings
-    from pronk.train.run_folder import RunFolder
-    from pronk.train.settings import WatchSettings
+    from pronk.train.experiment import provenance
+    from pronk.train.experiment.launch import begin_run, launch
+    from pronk.train.experiment.request import Request, new_settings, resumed_settings
+    from pronk.train.experiment.run_folder import RunFolder
+    from pronk.train.experiment.settings import WatchSettings
 
     watch = WatchSettings(logger=logger.value, save_interval=save_interval, minutes=minutes)
     request = Request(
@@ -183,7 +183,7 @@ def announce(settings: TrainSettings, found: Mapping[str, Any], folder: RunFolde
         f"{words}, seed {settings.seed}; run folder {folder.path}"
     )
     if settings.device == "cpu":
-        from pronk.train.progress import duration
+        from pronk.train.experiment.progress import duration
         from pronk.train.tasks import STEPS_PER_ITERATION
 
         steps = settings.total_iterations * STEPS_PER_ITERATION * settings.envs

@@ -184,7 +184,7 @@ def painted(
         The files.
     """
     from pronk.trial.folder import VIDEOS
-    from pronk.trial.videos import SLOW, record_all
+    from pronk.trial.pictures.videos import SLOW, record_all
 
     return record_all(
         found,

@@ -58,7 +58,8 @@ def more(
     Returns:
         Tables to show, and the files that were written.
     """
-    from pronk.report import trial_crossing, trial_walk
+    from pronk.report.trial import crossing as trial_crossing
+    from pronk.report.trial import walk as trial_walk
     from pronk.trial import bodies as bodies_file
     from pronk.trial import crossing as crossing_file
     from pronk.trial import variation as variation_file

@@ -162,17 +162,17 @@ def _open_wire(
 ) -> tuple[Wire, str]:
     """The robot's end of the wire, and its address in words."""
     if link is TwinLink.LCM:
-        from pronk.hardware.lcm_layout import layout_of
-        from pronk.hardware.lcm_url import url_of
-        from pronk.hardware.twin_lcm import LcmWire
+        from pronk.hardware.lcm.layout import layout_of
+        from pronk.hardware.lcm.twin import LcmWire
+        from pronk.hardware.lcm.url import url_of
 
         if domain is not None:
             raise HardwareError("--domain is of DDS; with --link lcm give --port.")
         url = url_of(port=port)
         wire = LcmWire(robot, layout_of(layout.value), url, mode=mode)
         return wire, f"LCM, messages of {layout.value}, {url}"
-    from pronk.hardware.dds_net import DdsNetwork
-    from pronk.hardware.twin_dds import DdsWire
+    from pronk.hardware.dds.net import DdsNetwork
+    from pronk.hardware.dds.twin import DdsWire
 
     if port is not None:
         raise HardwareError("--port is of LCM; with --link dds give --domain.")

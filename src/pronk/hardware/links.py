@@ -78,7 +78,7 @@ class Address:
                 robot does not fit behind its messages.
         """
         if self.kind == "lcm":
-            from pronk.hardware.lcm_link import LcmMachine
+            from pronk.hardware.lcm.link import LcmMachine
 
             return LcmMachine(
                 robot,
@@ -90,8 +90,8 @@ class Address:
                 alone_s=alone_s,
                 fresh=fresh,
             )
-        from pronk.hardware.dds_link import DdsMachine
-        from pronk.hardware.dds_net import DdsNetwork
+        from pronk.hardware.dds.link import DdsMachine
+        from pronk.hardware.dds.net import DdsNetwork
 
         return DdsMachine(
             robot,

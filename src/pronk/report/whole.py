@@ -19,13 +19,14 @@ from pronk.errors import ArtefactError, LogError
 from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
-from pronk.report import deploy_part, trial_part
 from pronk.report import page as match_page
+from pronk.report.deploy import part as deploy_part
 from pronk.report.shell import Part, page
-from pronk.report.trial_bodies import bodies_part
-from pronk.report.trial_crossing import crossing_part
-from pronk.report.trial_variation import variation_part
-from pronk.report.trial_walk import walk_part
+from pronk.report.trial import part as trial_part
+from pronk.report.trial.bodies import bodies_part
+from pronk.report.trial.crossing import crossing_part
+from pronk.report.trial.variation import variation_part
+from pronk.report.trial.walk import walk_part
 from pronk.trial import bodies, crossing, variation, walk
 from pronk.trial.bars import checks
 from pronk.trial.bodies import Bodies

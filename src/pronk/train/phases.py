@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from pronk.errors import PronkError
-from pronk.train.commands import NAME, MotionCommandCfg, motion_command
-from pronk.train.reward_sum import NAME as TABLE
-from pronk.train.reward_sum import reward_sum
-from pronk.train.reward_table import ROWS, JumpWeights, with_jump_weights
+from pronk.train.environment.commands import NAME, MotionCommandCfg, motion_command
+from pronk.train.environment.reward_sum import NAME as TABLE
+from pronk.train.environment.reward_sum import reward_sum
+from pronk.train.environment.reward_table import ROWS, JumpWeights, with_jump_weights
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
@@ -28,6 +28,7 @@ _NO_JUMP = JumpWeights(
     rise=0.0,
     reach=0.0,
     gap=0.0,
+    rear=0.0,
     hop=0.0,
     collision=-ROWS["collision"].jump,
     knees=-ROWS["knees"].jump,
@@ -64,7 +65,11 @@ class Phase:
             raise PronkError(f"phase {self.name} has noise {self.noise}; both must be positive.")
 
     def largest_noise(self, done: float) -> float:
-        """Largest standard deviation of the network's actions; falls or grows geometrically.
+        """Largest standard deviation of the network's actions; slow at first, fast in the end.
+
+        The less noise, the less a policy may change in an iteration (PPO's step is bound in units
+        of it): with the noise falling by as much every time, jumps grew no further from the middle
+        of the phase on.
 
         Args:
             done: Part of the phase that is over, 0 to 1.
@@ -72,7 +77,7 @@ class Phase:
         if self.noise is None:
             return math.inf
         first, last = self.noise
-        return first * (last / first) ** done
+        return first * (last / first) ** done**2
 
 
 PHASES: tuple[Phase, ...] = (
@@ -82,7 +87,9 @@ PHASES: tuple[Phase, ...] = (
         name="jump_a",
         iterations=230,
         jump=True,
-        weights=replace(_NO_JUMP, dense=0.02, sparse=16.0, rise=20.0, reach=12.0, gap=4.0),
+        weights=replace(
+            _NO_JUMP, dense=0.02, sparse=16.0, rise=20.0, reach=12.0, gap=4.0, rear=10.0
+        ),
         entropy=0.01,
     ),
     # And then done alike every time: an actor that explores on (its standard deviation .59 after
@@ -91,15 +98,16 @@ PHASES: tuple[Phase, ...] = (
     # and .24); it then landed backwards on its thighs, which at 5 a second cost it a centimetre.
     Phase(
         name="jump_b",
-        iterations=700,
+        iterations=680,
         jump=True,
         weights=JumpWeights(
             dense=0.002,
             sparse=16.0,
             width=0.3,
-            rise=10.0,
+            rise=16.0,
             reach=26.0,
             gap=12.0,
+            rear=0.0,
             hop=1.0,
             collision=30.0,
             knees=10.0,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
 
+from pronk.bars import Check
 from pronk.trial.published import TABLE_III
 from pronk.trial.result import Trial
 from pronk.trial.summary import Cell
@@ -19,26 +18,6 @@ SUCCESS = 0.95
 """Bar of the landing success."""
 JUMPS = 20
 """With each command: what the bars are meant for."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """One figure of the first policy and its bar."""
-
-    what: str
-    value: float
-    sense: Literal["<=", ">="]
-    bar: float
-    unit: str = ""
-
-    @property
-    def passed(self) -> bool:
-        """Whether the figure clears the bar; NaN does not."""
-        return self.value <= self.bar if self.sense == "<=" else self.value >= self.bar
-
-    def row(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return {**asdict(self), "passed": self.passed}
 
 
 def checks(trial: Trial) -> list[Check]:

@@ -12,8 +12,8 @@ import tempfile
 from pathlib import Path
 
 from pronk.errors import PronkError
+from pronk.trial.pictures.video import ENDINGS
 from pronk.trial.result import SUMMARY, TABLE
-from pronk.trial.video import ENDINGS
 
 CAPTURES = "captures"
 """Folder of what was seen, beside the table."""

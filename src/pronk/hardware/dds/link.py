@@ -1,0 +1,267 @@
+"""A robot behind Unitree's DDS messages: a Go2, or the virtual robot.
+
+One thread beside the caller's sleeps until a state arrives or a write is due. It stamps and keeps
+what comes, so that a state's age is right however late the caller is, and it repeats the command
+in force, because Unitree's drives are written to all the time and nobody has published what they
+do when that stops. A command that expires becomes damping there and then, without the caller.
+
+What keeps states from being made, each counted: a message that is not what it must be, above all
+one with a wrong checksum; a clock that went back or stood still; values that repeat to the last
+bit, which no live sensor's do (frozen data behind a live clock). A link that makes no states grows
+old, and age is what whoever commands watches.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+
+from pronk.errors import HardwareError
+from pronk.hardware.dds import idl
+from pronk.hardware.dds.codec import joint_map
+from pronk.hardware.dds.intake import STATE_RATE_HZ, Intake
+from pronk.hardware.dds.net import DdsNetwork, Participant, take
+from pronk.hardware.dds.service import BENCH, CLAMP, Client, own_controller
+from pronk.hardware.dds.twin import COMMANDS, STATES
+from pronk.hardware.dds.writer import CommandWriter
+from pronk.hardware.link_rules import (
+    ANSWER_S,
+    Hand,
+    await_rest,
+    check_alone,
+    check_still_alone,
+    clamp,
+    fresh_states,
+    waited_for,
+)
+from pronk.hardware.machine import Command, State, TorqueKind
+from pronk.hardware.preflight import Freshness, check_rest
+from pronk.robots.robot import Robot
+
+_LONGEST_BURST_S = 0.1
+_LONGEST_PAUSE_S = 0.05
+_KEPT_STATES = 10_000
+
+
+class DdsMachine:
+    """A robot with twelve joints behind Unitree's messages. Implements `Machine`.
+
+    `virtual` is known once connected: the virtual robot says in its states what it is.
+    """
+
+    torque_kind: TorqueKind = "measured"  # tau_est, by the drives from their currents
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        network: DdsNetwork | None = None,
+        hand: Hand | None = None,
+        release: bool = False,
+        alone_s: float = 1.0,
+        fresh: Freshness | None = None,
+    ) -> None:
+        """Describe the link; nothing is opened yet.
+
+        Args:
+            robot: Names, order and limits of the joints.
+            network: Where; None for pronk's own domain on loopback.
+            hand: Who fixes joints on a real bench; None if nobody.
+            release: Make the robot's own controller let go of the joints first; a standing robot
+                falls then.
+            alone_s: How long `rt/lowcmd` must be silent before pronk writes to it [s].
+            fresh: How fresh states must be; None for what moving a robot takes.
+
+        Raises:
+            HardwareError: The robot does not fit behind these messages.
+        """
+        self.robot = robot.name
+        self.virtual = False
+        self.counts: Counter[str] = Counter()
+        """What was met: states, commands, `repeats`, `expired`, `foreign`, and why states were
+        not made."""
+        self._robot = robot
+        self._joints = joint_map(robot)
+        self._network = network or DdsNetwork()
+        self._hand = hand
+        self._release = release
+        self._alone_s = alone_s
+        self._fresh = fresh
+        self._bench: Client | None = None
+        self._open = False
+
+    def connect(self) -> None:
+        """Open the link and check that the robot is fit to move. About 2 s.
+
+        In this order: states arrive with right checksums; none of the robot's own controllers
+        holds the joints (or it lets go of them); states come at 500 Hz without gaps, from one
+        robot; gravity points where the attitude says; every joint is within its limits; nobody
+        else commands.
+
+        Raises:
+            HardwareError: A check failed; nothing was written to the robot's joints.
+        """
+        self.close()
+        self._reset()
+        self._participant = Participant(self._network)
+        self._states_in = self._participant.reader(STATES, idl.LowState, raw=True)
+        self._others = self._participant.reader(COMMANDS, idl.LowCmd, raw=True, own=False)
+        out = self._participant.writer(COMMANDS, idl.LowCmd, raw=True)
+        self._writer = CommandWriter(self._joints, out, self.counts)
+        self._wake = self._participant.wake_on(self._states_in, self._others)
+        self._open = True
+        self._thread = threading.Thread(target=self._serve, name="pronk dds", daemon=True)
+        self._thread.start()
+        try:
+            self._preflight()
+        except BaseException:
+            self.close()
+            raise
+
+    def now(self) -> float:
+        """The local monotonic clock [s]."""
+        return time.monotonic()
+
+    def latest(self) -> State:
+        """The newest state, without waiting.
+
+        Raises:
+            HardwareError: Not connected.
+        """
+        state = self._latest if self._open else None
+        if state is None:
+            raise HardwareError(f"the DDS link to {self.robot} is not open; call connect() first.")
+        return state
+
+    def wait(self, until: float) -> list[State]:
+        """Sleep to `until` [s]; return the states that arrived since the last call."""
+        delay = until - time.monotonic()
+        if delay > 0.0:
+            time.sleep(delay)
+        states = []
+        while self._met:
+            states.append(self._met.popleft())
+        return states
+
+    def send(self, command: Command) -> None:
+        """Write a command, and go on writing it until the next or until it expires.
+
+        Raises:
+            HardwareError: Not connected, not possible, or someone else has commanded since.
+        """
+        self.latest()
+        check_still_alone(self.counts["foreign"], COMMANDS)
+        self._writer.send(command)
+
+    def clamp(self, joints: tuple[str, ...]) -> None:
+        """Have joints fixed: by the virtual robot itself, or by a person's hand.
+
+        Raises:
+            HardwareError: A joint is unknown, nobody is there to fix it, or no answer came.
+        """
+        virtual = self.virtual and self._bench is not None
+        clamp(self._robot, joints, hold=self._hold if virtual else None, hand=self._hand)
+
+    def damp(self) -> None:
+        """Write damping now and go on until a command or the end. Never raises."""
+        if self._open:
+            self._writer.damp()
+
+    def close(self) -> None:
+        """Leave the robot damped and at rest, and close; closing twice does no harm.
+
+        Takes 1 s of damping at least, 3 s at most; no time at all if nothing was ever sent.
+        """
+        if not self._open:
+            return
+        if self._writer.wrote:
+            self.damp()
+            await_rest(lambda: self._latest)
+        self._open = False
+        self._thread.join()
+        self._bench = None
+        del self._wake, self._states_in, self._others, self._writer, self._participant
+
+    # --- beginning ------------------------------------------------------------------------------
+
+    def _reset(self) -> None:
+        self.counts.clear()
+        self.virtual = False
+        self._latest: State | None = None
+        self._met: deque[State] = deque(maxlen=_KEPT_STATES)
+        self._intake = Intake(self._joints, self.counts)
+        self._speakers: set[int] = set()
+
+    def _preflight(self) -> None:
+        begun = time.monotonic()
+        if not waited_for(lambda: self._latest is not None):
+            raise HardwareError(
+                f"{self.robot} sent no state on {STATES} within {ANSWER_S:g} s in {self._network}"
+                + (f"; what came was refused: {why}" if (why := self._intake.complaint) else "")
+                + "; check that the robot or its double runs, the domain and the interface."
+            )
+        self.virtual = self._intake.virtual
+        if self._joints.virtual_only and not self.virtual:
+            raise HardwareError(
+                f"what answers in {self._network} is not pronk's virtual robot, and no real "
+                f"{self.robot} speaks Unitree's messages; name the robot that it is."
+            )
+        self._bench = Client(self._participant, BENCH)
+        own_controller(self._participant, release=self._release, timeout_s=ANSWER_S)
+        silent_from = time.monotonic()
+        self.counts["foreign"] = 0
+        self._check_states(begun)
+        time.sleep(max(0.0, silent_from + self._alone_s - time.monotonic()))
+        check_alone(self.counts["foreign"], COMMANDS, self._alone_s)
+        self.wait(0.0)
+
+    def _hold(self, joints: tuple[str, ...]) -> bool:
+        """Ask the virtual robot to fix joints; whether it confirmed."""
+        asked = {"joints": list(joints)}
+        return self._bench is not None and (
+            self._bench.ask(CLAMP, asked, timeout_s=ANSWER_S) is not None
+        )
+
+    def _check_states(self, begun: float) -> None:
+        states = fresh_states(
+            self.robot, self.wait, STATE_RATE_HZ, self._fresh, until=begun + 2.0 * ANSWER_S
+        )
+        if len(self._speakers) > 1:
+            raise HardwareError(
+                f"{len(self._speakers)} robots speak on {STATES} in {self._network}, expected one; "
+                "switch the others off, or take another domain."
+            )
+        check_rest(self._robot, states)
+
+    # --- the thread -----------------------------------------------------------------------------
+
+    def _serve(self) -> None:
+        while self._open:
+            pause = min(max(self._writer.due - time.monotonic(), 0.0), _LONGEST_PAUSE_S)
+            self._wake.wait(int(pause * 1e9))
+            self._receive()
+            self._writer.keep()
+
+    def _receive(self) -> None:
+        arrived = time.monotonic()
+        if take(self._others, self.counts):
+            self._foreign()
+        messages = take(self._states_in, self.counts)
+        for message in messages:
+            # Those that waited together are told apart by when they were sent.
+            before = (
+                messages[-1].sample_info.source_timestamp - message.sample_info.source_timestamp
+            )
+            stamp = arrived - min(max(before * 1e-9, 0.0), _LONGEST_BURST_S)
+            self._speakers.add(message.sample_info.publication_handle)
+            state = self._intake.take(message.data, stamp)
+            if state is not None:
+                self._latest = state
+                self._met.append(state)
+
+    def _foreign(self) -> None:
+        """Another writer: nobody can tell any more what the drives will do, so damp."""
+        self.counts["foreign"] += 1
+        if self._writer.wrote:
+            self._writer.damp()

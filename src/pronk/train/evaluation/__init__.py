@@ -1,0 +1,1 @@
+"""How good a policy is: a thousand robots a command in the training simulator."""
