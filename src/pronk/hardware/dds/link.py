@@ -25,17 +25,9 @@ from pronk.hardware.dds.net import DdsNetwork, Participant, take
 from pronk.hardware.dds.service import BENCH, CLAMP, Client, own_controller
 from pronk.hardware.dds.twin import COMMANDS, STATES
 from pronk.hardware.dds.writer import CommandWriter
-from pronk.hardware.link_rules import (
-    ANSWER_S,
-    Hand,
-    await_rest,
-    check_alone,
-    check_still_alone,
-    clamp,
-    fresh_states,
-    waited_for,
-)
-from pronk.hardware.machine import Command, State, TorqueKind
+from pronk.hardware.link_rules import ANSWER_S, Hand, check_alone, fresh_states, waited_for
+from pronk.hardware.machine import State, TorqueKind
+from pronk.hardware.network_link import NetworkLink
 from pronk.hardware.preflight import Freshness, check_rest
 from pronk.robots.robot import Robot
 
@@ -44,12 +36,16 @@ _LONGEST_PAUSE_S = 0.05
 _KEPT_STATES = 10_000
 
 
-class DdsMachine:
+class DdsMachine(NetworkLink):
     """A robot with twelve joints behind Unitree's messages. Implements `Machine`.
 
-    `virtual` is known once connected: the virtual robot says in its states what it is.
+    Pre-flight, in this order: states arrive with right checksums; none of the robot's own
+    controllers holds the joints (or it lets go of them); states come at 500 Hz without gaps, from
+    one robot; gravity points where the attitude says; every joint is within its limits; nobody
+    else commands.
     """
 
+    wire = "DDS"
     torque_kind: TorqueKind = "measured"  # tau_est, by the drives from their currents
 
     def __init__(
@@ -76,122 +72,59 @@ class DdsMachine:
         Raises:
             HardwareError: The robot does not fit behind these messages.
         """
-        self.robot = robot.name
-        self.virtual = False
+        super().__init__(robot, hand=hand, release=release, alone_s=alone_s, fresh=fresh)
         self.counts: Counter[str] = Counter()
         """What was met: states, commands, `repeats`, `expired`, `foreign`, and why states were
         not made."""
-        self._robot = robot
         self._joints = joint_map(robot)
         self._network = network or DdsNetwork()
-        self._hand = hand
-        self._release = release
-        self._alone_s = alone_s
-        self._fresh = fresh
         self._bench: Client | None = None
-        self._open = False
+        self._serving = False
 
-    def connect(self) -> None:
-        """Open the link and check that the robot is fit to move. About 2 s.
+    # --- beginning and end ----------------------------------------------------------------------
 
-        In this order: states arrive with right checksums; none of the robot's own controllers
-        holds the joints (or it lets go of them); states come at 500 Hz without gaps, from one
-        robot; gravity points where the attitude says; every joint is within its limits; nobody
-        else commands.
-
-        Raises:
-            HardwareError: A check failed; nothing was written to the robot's joints.
-        """
-        self.close()
-        self._reset()
-        self._participant = Participant(self._network)
-        self._states_in = self._participant.reader(STATES, idl.LowState, raw=True)
-        self._others = self._participant.reader(COMMANDS, idl.LowCmd, raw=True, own=False)
-        out = self._participant.writer(COMMANDS, idl.LowCmd, raw=True)
-        self._writer = CommandWriter(self._joints, out, self.counts)
-        self._wake = self._participant.wake_on(self._states_in, self._others)
-        self._open = True
-        self._thread = threading.Thread(target=self._serve, name="pronk dds", daemon=True)
-        self._thread.start()
-        try:
-            self._preflight()
-        except BaseException:
-            self.close()
-            raise
-
-    def now(self) -> float:
-        """The local monotonic clock [s]."""
-        return time.monotonic()
-
-    def latest(self) -> State:
-        """The newest state, without waiting.
-
-        Raises:
-            HardwareError: Not connected.
-        """
-        state = self._latest if self._open else None
-        if state is None:
-            raise HardwareError(f"the DDS link to {self.robot} is not open; call connect() first.")
-        return state
-
-    def wait(self, until: float) -> list[State]:
-        """Sleep to `until` [s]; return the states that arrived since the last call."""
-        delay = until - time.monotonic()
-        if delay > 0.0:
-            time.sleep(delay)
-        states = []
-        while self._met:
-            states.append(self._met.popleft())
-        return states
-
-    def send(self, command: Command) -> None:
-        """Write a command, and go on writing it until the next or until it expires.
-
-        Raises:
-            HardwareError: Not connected, not possible, or someone else has commanded since.
-        """
-        self.latest()
-        check_still_alone(self.counts["foreign"], COMMANDS)
-        self._writer.send(command)
-
-    def clamp(self, joints: tuple[str, ...]) -> None:
-        """Have joints fixed: by the virtual robot itself, or by a person's hand.
-
-        Raises:
-            HardwareError: A joint is unknown, nobody is there to fix it, or no answer came.
-        """
-        virtual = self.virtual and self._bench is not None
-        clamp(self._robot, joints, hold=self._hold if virtual else None, hand=self._hand)
-
-    def damp(self) -> None:
-        """Write damping now and go on until a command or the end. Never raises."""
-        if self._open:
-            self._writer.damp()
-
-    def close(self) -> None:
-        """Leave the robot damped and at rest, and close; closing twice does no harm.
-
-        Takes 1 s of damping at least, 3 s at most; no time at all if nothing was ever sent.
-        """
-        if not self._open:
-            return
-        if self._writer.wrote:
-            self.damp()
-            await_rest(lambda: self._latest)
-        self._open = False
-        self._thread.join()
-        self._bench = None
-        del self._wake, self._states_in, self._others, self._writer, self._participant
-
-    # --- beginning ------------------------------------------------------------------------------
-
-    def _reset(self) -> None:
+    def _open(self) -> None:
         self.counts.clear()
-        self.virtual = False
         self._latest: State | None = None
         self._met: deque[State] = deque(maxlen=_KEPT_STATES)
         self._intake = Intake(self._joints, self.counts)
         self._speakers: set[int] = set()
+        self._participant = Participant(self._network)
+        self._states_in = self._participant.reader(STATES, idl.LowState, raw=True)
+        self._others = self._participant.reader(COMMANDS, idl.LowCmd, raw=True, own=False)
+        out = self._participant.writer(COMMANDS, idl.LowCmd, raw=True)
+        self._commands = CommandWriter(self._joints, out, self.counts)
+        self._wake = self._participant.wake_on(self._states_in, self._others)
+        self._serving = True
+        self._thread = threading.Thread(target=self._serve, name="pronk dds", daemon=True)
+        self._thread.start()
+
+    def _shut(self) -> None:
+        self._serving = False
+        self._thread.join()
+        self._bench = None
+        del self._wake, self._states_in, self._others, self._commands, self._participant
+
+    @property
+    def _writer(self) -> CommandWriter | None:
+        return self._commands if self._serving else None
+
+    @property
+    def _command_topic(self) -> str:
+        return COMMANDS
+
+    @property
+    def _foreign_commands(self) -> int:
+        return self.counts["foreign"]
+
+    def _newest(self) -> State | None:
+        return self._latest
+
+    def _arrived(self) -> list[State]:
+        states = []
+        while self._met:
+            states.append(self._met.popleft())
+        return states
 
     def _preflight(self) -> None:
         begun = time.monotonic()
@@ -237,11 +170,11 @@ class DdsMachine:
     # --- the thread -----------------------------------------------------------------------------
 
     def _serve(self) -> None:
-        while self._open:
-            pause = min(max(self._writer.due - time.monotonic(), 0.0), _LONGEST_PAUSE_S)
+        while self._serving:
+            pause = min(max(self._commands.due - time.monotonic(), 0.0), _LONGEST_PAUSE_S)
             self._wake.wait(int(pause * 1e9))
             self._receive()
-            self._writer.keep()
+            self._commands.keep()
 
     def _receive(self) -> None:
         arrived = time.monotonic()
@@ -263,5 +196,5 @@ class DdsMachine:
     def _foreign(self) -> None:
         """Another writer: nobody can tell any more what the drives will do, so damp."""
         self.counts["foreign"] += 1
-        if self._writer.wrote:
-            self._writer.damp()
+        if self._commands.wrote:
+            self._commands.damp()

@@ -11,8 +11,6 @@ import threading
 import time
 from collections import Counter
 
-import numpy as np
-
 from pronk.errors import HardwareError
 from pronk.hardware.lcm.layout import layout_of
 from pronk.hardware.lcm.reader import StateReader
@@ -26,28 +24,23 @@ from pronk.hardware.lcm.service import (
 )
 from pronk.hardware.lcm.url import open_lcm, url_of
 from pronk.hardware.lcm.writer import CommandWriter
-from pronk.hardware.link_rules import (
-    ANSWER_S,
-    Hand,
-    await_rest,
-    check_alone,
-    check_still_alone,
-    clamp,
-    fresh_states,
-    waited_for,
-)
-from pronk.hardware.machine import Command, State, TorqueKind
+from pronk.hardware.link_rules import ANSWER_S, Hand, check_alone, fresh_states, waited_for
+from pronk.hardware.machine import State, TorqueKind
+from pronk.hardware.network_link import NetworkLink
 from pronk.hardware.preflight import Freshness, check_rest
 from pronk.robots.robot import Robot
 
 _QUEUE = 100
 
 
-class LcmMachine:
+class LcmMachine(NetworkLink):
     """A robot with twelve joints behind LCM. Implements `Machine`.
 
-    `virtual` is known once connected: the virtual robot says on a channel of its own what it is.
+    Pre-flight, in this order: states arrive at the layout's rate without gaps for 200 ms; gravity
+    points where the attitude says; every joint is within its limits; nobody else commands.
     """
+
+    wire = "LCM"
 
     def __init__(
         self,
@@ -84,19 +77,13 @@ class LcmMachine:
                 f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
                 "for twelve."
             )
-        self.robot = robot.name
-        self.virtual = False
+        super().__init__(robot, hand=hand, release=release, alone_s=alone_s, fresh=fresh)
         self.torque_kind: TorqueKind = self._layout.torque_kind
-        self._robot = robot
         self._interface = interface
         self._url = url_of(port=port, interface=interface)
-        self._hand = hand
-        self._release = release
-        self._alone_s = alone_s
-        self._fresh = fresh
         self._foreign = 0
         self._reader = StateReader(self._layout, robot.joint_names)
-        self._writer: CommandWriter | None = None
+        self._commands: CommandWriter | None = None
         self._written: Counter[str] = Counter()
 
     @property
@@ -106,23 +93,14 @@ class LcmMachine:
         met["foreign"] = self._foreign
         return met + self._written
 
-    def connect(self) -> None:
-        """Open the link and check that the robot is fit to move. About a second.
-
-        In this order: states arrive at the layout's rate without gaps for 200 ms; gravity points
-        where the attitude says; every joint is within its limits; nobody else commands.
-
-        Raises:
-            HardwareError: A check failed; nothing was written to the robot's joints.
-        """
-        self.close()
+    def _open(self) -> None:
         layout = self._layout
         reader = self._reader = StateReader(layout, self._robot.joint_names)
-        self.virtual, self._foreign = False, 0
+        self._foreign = 0
         self._responses: list[bytes] = []
         self._in, self._out = open_lcm(self._url), open_lcm(self._url)
         self._publishing = threading.Lock()
-        self._writer = writer = CommandWriter(
+        self._commands = writer = CommandWriter(
             layout, lambda data: self._publish(layout.command_channel, data)
         )
 
@@ -142,78 +120,32 @@ class LcmMachine:
         self._reading = True
         self._thread = threading.Thread(target=self._read, name="pronk lcm reader", daemon=True)
         self._thread.start()
-        try:
-            self._preflight()
-        except BaseException:
-            self.close()
-            raise
 
-    def now(self) -> float:
-        """The local monotonic clock [s]."""
-        return time.monotonic()
-
-    def latest(self) -> State:
-        """The newest state, without waiting.
-
-        Raises:
-            HardwareError: Not connected.
-        """
-        state = self._reader.latest if self._writer else None
-        if state is None:
-            raise HardwareError(f"the LCM link to {self.robot} is not open; call connect() first.")
-        return state
-
-    def wait(self, until: float) -> list[State]:
-        """Sleep to `until` [s]; return the states that arrived since the last call."""
-        delay = until - time.monotonic()
-        if delay > 0.0:
-            time.sleep(delay)
-        return self._reader.drain()
-
-    def send(self, command: Command) -> None:
-        """Put a command on the wire, once. One that has expired already becomes damping.
-
-        Raises:
-            HardwareError: Not connected, not finite, or someone else has commanded since.
-        """
-        if self._writer is None:
-            raise HardwareError(f"the LCM link to {self.robot} is not open; call connect() first.")
-        check_still_alone(self._foreign, self._layout.command_channel)
-        values = (command.position, command.stiffness, command.damping)
-        if not all(np.isfinite(value).all() for value in values):
-            raise HardwareError("a command holds a number that is not finite; it was not sent.")
-        self._writer.send(command)
-
-    def clamp(self, joints: tuple[str, ...]) -> None:
-        """Have joints fixed: by the virtual robot itself, or by a person's hand.
-
-        Raises:
-            HardwareError: A joint is unknown, nobody is there to fix it, or no answer came.
-        """
-        virtual = self.virtual and self._writer is not None
-        clamp(self._robot, joints, hold=self._hold if virtual else None, hand=self._hand)
-
-    def damp(self) -> None:
-        """Write damping now and go on until a command or the end. Never raises."""
-        if self._writer is not None:
-            self._writer.damp()
-
-    def close(self) -> None:
-        """Leave the robot damped and at rest, and close; closing twice does no harm.
-
-        Takes 1 s of damping at least, 3 s at most; no time at all if nothing was ever sent.
-        """
-        writer = self._writer
-        if writer is None:
-            return
-        if writer.wrote:
-            writer.damp()
-            await_rest(lambda: self._reader.latest)
-        writer.stop()
+    def _shut(self) -> None:
+        if self._commands is not None:
+            self._commands.stop()
         self._reading = False
         self._thread.join()
-        self._writer = None
+        self._commands = None
         del self._in, self._out
+
+    @property
+    def _writer(self) -> CommandWriter | None:
+        return self._commands
+
+    @property
+    def _command_topic(self) -> str:
+        return self._layout.command_channel
+
+    @property
+    def _foreign_commands(self) -> int:
+        return self._foreign
+
+    def _newest(self) -> State | None:
+        return self._reader.latest
+
+    def _arrived(self) -> list[State]:
+        return self._reader.drain()
 
     def _read(self) -> None:
         while self._reading:

@@ -55,12 +55,15 @@ class CommandWriter:
         self._thread.start()
 
     def send(self, command: Command) -> None:
-        """Write a command; one that has expired already becomes damping.
+        """Write a command, once; one that has expired already becomes damping.
 
         Raises:
-            HardwareError: It is not for twelve joints, or the wire does not take it; it expires
-                all the same, and is followed by damping.
+            HardwareError: It is not finite or not for twelve joints, and was not sent; or the wire
+                does not take it, and it expires all the same and is followed by damping.
         """
+        values = (command.position, command.stiffness, command.damping)
+        if not all(np.isfinite(value).all() for value in values):
+            raise HardwareError("a command holds a number that is not finite; it was not sent.")
         data = encode_command(self._layout, command)
         expires = command.made + command.valid_for
         with self._changed:

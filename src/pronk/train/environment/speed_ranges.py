@@ -1,4 +1,4 @@
-"""How wide the velocity ranges are: they grow as long as the robots keep their velocities."""
+"""How wide the velocity ranges are: they grow as well as the robots keep their velocities."""
 
 from __future__ import annotations
 
@@ -26,17 +26,23 @@ class Growth:
     start: float = 0.35
     """Part of the ranges at first."""
     keep: float = 0.52
-    """Mean of exp(-|e|^2 / 0.25), e the error of the horizontal velocity [m/s], above which they
-    grow."""
+    """Mean of exp(-|e|^2 / 0.25), e the error of the horizontal velocity [m/s], from which on they
+    grow at full rate."""
+    lose: float = 0.36
+    """The same mean up to which they do not grow; between the two the rate grows linearly. With
+    nothing in between, a run that keeps its velocities by .51 would stay where it is."""
     steps: int = 5000
-    """Policy steps in which they grow to the whole."""
+    """Policy steps in which they grow to the whole at full rate."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot grow."""
         if not 0.0 < self.start <= 1.0:
             raise PronkError(f"ranges begin with a part of {self.start}; above 0, and 1 at most.")
-        if not 0.0 <= self.keep < 1.0:
-            raise PronkError(f"ranges grow above {self.keep}; 0 or more, and less than 1.")
+        if not 0.0 <= self.lose < self.keep < 1.0:
+            raise PronkError(
+                f"ranges stay up to {self.lose} and grow at full rate from {self.keep}; expected "
+                "0 or more, and more, but less than 1."
+            )
         if self.steps < 1:
             raise PronkError(f"ranges grow in {self.steps} policy steps; 1 or more.")
 
@@ -49,7 +55,7 @@ class SpeedRanges:
         self.kept = torch.zeros((), device=device)
         """How well velocities were kept of late, over all robots. ()"""
         self.grown = torch.zeros((), device=device)
-        """Policy steps in which the ranges grew. ()"""
+        """Policy steps at full rate in which they would have grown as far. ()"""
 
     @property
     def part(self) -> Tensor:
@@ -67,11 +73,12 @@ class SpeedRanges:
         # A robot whose physics went wrong keeps nothing.
         kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * walks
         self.kept.lerp_(kernel.sum() / walks.sum().clamp_min(1), _FORGETS)
-        self.grown += self.kept > self._growth.keep
+        law = self._growth
+        self.grown += ((self.kept - law.lose) / (law.keep - law.lose)).clamp(0.0, 1.0)
 
 
 def grown(environment: Mapping[str, Any]) -> Tensor:
-    """Policy steps in which the ranges of a saved environment grew. ().
+    """How far the ranges of a saved environment have grown, as `SpeedRanges.grown` counts. ().
 
     Args:
         environment: From `pronk.train.experiment.state.environment_state`.
