@@ -24,7 +24,6 @@ DT = 1 / 64
 """A power of two, so that times add up exactly."""
 SETTINGS = JumpSettings(
     liftoff_velocity=2.5,
-    hasty_s=DT / 2,
     ready_s=DT,
     prompt_s=16 * DT,
     late_s=16 * DT,
@@ -36,7 +35,7 @@ SETTINGS = JumpSettings(
     rear=0.25,
 )
 """Not even the first step after the command is hasty."""
-WAITS = replace(SETTINGS, hasty_s=4 * DT, ready_s=8 * DT)
+WAITS = replace(SETTINGS, ready_s=8 * DT)
 EVENTS = ("gain", "rise", "reach", "gap", "rear", "hop")
 TRACES = (
     *EVENTS,
@@ -177,10 +176,10 @@ def test_late_jumps_are_worth_less(steps: int, worth: float) -> None:
 
 @pytest.mark.parametrize(
     ("steps", "worth"),
-    [(1, 0.0), (4, 0.0), (5, 0.25), (6, 0.5), (8, 1.0), (16, 1.0), (20, 0.75), (32, 0.0)],
+    [(1, 1 / 64), (2, 1 / 16), (4, 0.25), (6, 0.5625), (8, 1.0), (16, 1.0), (20, 0.75), (32, 0.0)],
 )
 def test_hasty_jumps_are_worth_less(steps: int, worth: float) -> None:
-    """Nothing until 4 steps after the command, in full from 8 on, a line between; then late."""
+    """In full from 8 steps after the command on, before by the square of the time; then late."""
     told, waits = "0" + "1" * steps, "0" + "0" * (steps - 1) + "1"
     seen = alone(script(told, waits, {steps: 2.5}), asked=WAITS)
     assert seen["gain"][-1] == pytest.approx(worth)
@@ -188,8 +187,9 @@ def test_hasty_jumps_are_worth_less(steps: int, worth: float) -> None:
 
 
 def test_who_was_hasty_is_paid_for_the_jump_after_it() -> None:
+    """Lift-offs 3 and 10 steps after the command: 9/64, and the rest."""
     seen = alone(script("1" * 10, "0010000001", {2: 2.5, 9: 2.5}), asked=WAITS)
-    assert seen["gain"] == pytest.approx([0.0] * 9 + [1.0])
+    assert seen["gain"] == pytest.approx([0.0, 0.0, 9 / 64, *[0.0] * 6, 55 / 64])
     assert [i for i, hop in enumerate(seen["hop"]) if hop] == [9]
 
 
@@ -341,7 +341,7 @@ def test_a_running_start_above_the_command_is_not_paid() -> None:
     assert alone(again)["lead"] == [0.0] * 15 + [0.5] * 6
 
 
-@pytest.mark.parametrize(("steps", "worth"), [(4, 0.0), (6, 0.5), (8, 1.0), (20, 0.75)])
+@pytest.mark.parametrize(("steps", "worth"), [(2, 0.0625), (4, 0.25), (8, 1.0), (20, 0.75)])
 def test_what_a_hasty_jump_covers_is_worth_as_little_as_its_lift_off(
     steps: int, worth: float
 ) -> None:
@@ -515,19 +515,15 @@ def test_settings_that_are_none_are_refused(name: str, value: float) -> None:
         JumpSettings(**{name: value})
 
 
-@pytest.mark.parametrize(
-    ("hasty", "ready", "prompt"),
-    [(0.2, 0.1, 0.3), (0.1, 0.1, 0.3), (0.1, 0.4, 0.3), (0.4, 0.5, 0.3), (0.4, 0.2, 0.3)],
-)
-def test_times_in_another_order_are_refused(hasty: float, ready: float, prompt: float) -> None:
-    said = f"hasty_s {hasty}, ready_s {ready} and prompt_s {prompt}; they must be in this order"
+def test_times_in_another_order_are_refused() -> None:
+    said = "ready_s 0.4 and prompt_s 0.3; they must be in this order"
     with pytest.raises(PronkError, match=said):
-        JumpSettings(hasty_s=hasty, ready_s=ready, prompt_s=prompt)
+        JumpSettings(ready_s=0.4, prompt_s=0.3)
 
 
 def test_who_is_ready_may_be_prompt_at_once() -> None:
-    asked = JumpSettings(hasty_s=4 * DT, ready_s=8 * DT, prompt_s=8 * DT, late_s=16 * DT)
-    for steps, worth in ((6, 0.5), (8, 1.0), (12, 0.75)):
+    asked = JumpSettings(ready_s=8 * DT, prompt_s=8 * DT, late_s=16 * DT)
+    for steps, worth in ((4, 0.25), (8, 1.0), (12, 0.75)):
         told, waits = "1" * steps, "0" * (steps - 1) + "1"
         seen = alone(script(told, waits, {steps - 1: 2.5}), asked=asked)
         assert seen["gain"][-1] == pytest.approx(worth)
@@ -619,12 +615,9 @@ class Account:
     def timely(self, age: float) -> float:
         """What a lift-off at that time after the command is worth."""
         s = self.settings
-        corners = (s.hasty_s, s.ready_s, s.prompt_s, s.prompt_s + s.late_s)
-        if not corners[0] < age < corners[3]:
+        if age >= s.prompt_s + s.late_s:
             return 0.0
-        if age < corners[1]:
-            return (age - s.hasty_s) / (s.ready_s - s.hasty_s)
-        return min(1.0, 1.0 - (age - s.prompt_s) / s.late_s)
+        return min(1.0, (age / s.ready_s) ** 2, 1.0 - (age - s.prompt_s) / s.late_s)
 
 
 def stretches(values: st.SearchStrategy[bool]) -> st.SearchStrategy[list[bool]]:

@@ -30,12 +30,12 @@ class JumpSettings:
     prompt_s: float = 0.28
     """A lift-off up to this long after the command is worth the full reward [s], and so are the
     ground and the gap that its flight covers."""
-    hasty_s: float = 0.12
-    """A lift-off up to this long after the command is worth nothing [s]: a policy that pushes at
-    once has 0.1 m and 70 ms for it, which takes a power that batteries do not have."""
     ready_s: float = 0.24
-    """From here on it is worth all, between the two its worth grows linearly [s]. At .18, and where
-    the worth of the lift-off alone was less, policies waited .11 to .17 s and did not crouch."""
+    """From so long after the command on it is worth all; before, the square of the time's part of
+    it [s]. A policy that pushes at once has 0.1 m and 70 ms for it, which takes a power that
+    batteries do not have. With .18, and where the worth of the lift-off alone was less, policies
+    waited .11 to .17 s and did not crouch. Worth nothing up to .12 s, jumps of .09 s stayed what
+    they were: nothing said that .1 would be better."""
     late_s: float = 0.25
     """Beyond that its worth falls linearly to zero over this time [s]."""
     leap: float = 1.0
@@ -62,10 +62,10 @@ class JumpSettings:
         for name in vars(self):
             if not getattr(self, name) > 0.0:
                 raise PronkError(f"JumpSettings.{name} is {getattr(self, name)}, not positive.")
-        if not self.hasty_s < self.ready_s <= self.prompt_s:
+        if not self.ready_s <= self.prompt_s:
             raise PronkError(
-                f"JumpSettings has hasty_s {self.hasty_s}, ready_s {self.ready_s} and prompt_s "
-                f"{self.prompt_s}; they must be in this order."
+                f"JumpSettings has ready_s {self.ready_s} and prompt_s {self.prompt_s}; they must "
+                "be in this order."
             )
 
 
@@ -196,7 +196,7 @@ class JumpTracker:
         prompt = torch.rsub(self.since, (s.prompt_s + s.late_s) / s.late_s, alpha=1.0 / s.late_s)
         # Half the worth is for going up, half for going where the command says as well.
         aim = torch.exp(miss.square() * (-0.5 / s.aim_width**2))
-        ready = (self.since - s.hasty_s) / (s.ready_s - s.hasty_s)
+        ready = (self.since / s.ready_s).square()
         worth = torch.minimum(prompt, ready).clamp(0.0, 1.0)
         self.worth = torch.where(liftoff > 0.0, worth, self.worth * keep)
         score = kernel * (0.5 + 0.5 * aim) * self.worth * liftoff
