@@ -1,26 +1,54 @@
 """Train several policies one after another on one GPU, unattended; start one series for each GPU.
 
-    python tools/train_series.py OUT --gpu 0 m1:1:matched n1:1:naive
-    python tools/train_series.py OUT --gpu 1 m2:2:matched v1:1:matched:/elsewhere/src --evaluate
+    python tools/train_series.py OUT --gpu 0 --evaluate m1:1:matched n1:1:naive
+    python tools/train_series.py OUT --gpu 1 --evaluate v1:1:matched:/elsewhere/src m2:2:best=m1,v1
 
 A job is NAME:SEED:GAINS[:SOURCE]. GAINS are `matched` (--gains) or `naive` with their ranges and
-delay; SOURCE is the src folder of another checkout, where a variant is compared with what is here.
+delay; SOURCE is the src folder of another checkout, a variant of what is here. With `best=NAMES`
+the job waits for those runs, of any series with the same OUT, and takes the source of the one that
+passes most bars; so waits what comes after it.
+
 A job leaves OUT/NAME.tgz: both policies, settings, provenance, curves, and with --evaluate the
-figures of `pronk evaluate`. One that fails leaves OUT/NAME.failed, and the next begins. All of a
-run stays in OUT/NAME.
+figures of `pronk evaluate --what jump`, everything randomized and of one nominal robot. One that
+fails leaves OUT/NAME.failed, and the next begins. All of a run stays in OUT/NAME.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
 import tarfile
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-KEPT = ("policy.onnx", "walk.onnx", "config.yaml", "provenance.json", "*.json", "events.*", "*.txt")
+KEPT = ("*.onnx", "config.yaml", "provenance.json", "full.json", "noise.json", "events.*", "source")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training."""
+
+    name: str
+    seed: str
+    gains: str
+    source: str
+
+    @classmethod
+    def parse(cls, text: str) -> Job:
+        """From NAME:SEED:GAINS[:SOURCE].
+
+        Raises:
+            ValueError: It is something else.
+        """
+        name, seed, gains, *source = text.split(":", 3)
+        if not name or not seed.isdigit() or gains not in ("matched", "naive"):
+            raise ValueError(f"{text}: expected NAME:SEED:matched or NAME:SEED:naive")
+        return cls(name, seed, gains, source[0] if source else str(ROOT / "src"))
 
 
 def main() -> None:
@@ -34,47 +62,89 @@ def main() -> None:
     parser.add_argument("--gains", type=Path, default=ROOT / "policies/gains.yaml")
     parser.add_argument("--task", choices=("all", "together"), default="all")
     parser.add_argument("--evaluate", action="store_true", help="Evaluate every policy as well.")
-    parser.add_argument("--option", action="append", default=[], help="More for `pronk train`.")
+    parser.add_argument("--robots", default="300", help="For each command of an evaluation.")
+    parser.add_argument("--options", default="", help='More for `pronk train`, as in "--envs 64".')
     asked = parser.parse_args()
+    try:
+        jobs = [Job.parse(text) for text in asked.jobs]
+    except ValueError as error:
+        parser.error(str(error))
+    asked.out = asked.out.resolve()
     asked.out.mkdir(parents=True, exist_ok=True)
-    for job in asked.jobs:
-        name, seed, gains, *source = job.split(":", 3)
-        if gains not in ("matched", "naive") or not seed.isdigit():
-            parser.error(f"{job}: expected NAME:SEED:matched or NAME:SEED:naive")
-        drives = [str(asked.gains)] if gains == "matched" else ["naive", "--like", str(asked.gains)]
-        run = asked.out / name
-        train = ["train", asked.task, "--gains", *drives, "--seed", seed, "--out", str(run)]
-        commands = [train + [word for option in asked.option for word in option.split()]]
-        if asked.evaluate:
-            evaluate = ["evaluate", str(run / "policy.onnx"), "--gains", *drives, "--out"]
-            commands += [
-                [*evaluate, str(run / "full.json")],
-                [*evaluate, str(run / "noise.json"), "--randomization", "noise"],
-            ]
-        log = asked.out / f"{name}.log"
-        # The working folder would come first on the path of `python -m`, before a variant's.
-        done = all(_pronk(words, log, asked.gpu, *source) for words in commands)
-        if (run / "policy.onnx").is_file():
-            _keep(run, asked.out / f"{name}.tgz")
-        if not done:
-            log.rename(log.with_suffix(".failed"))
+    for job in jobs:
+        if job.source.startswith("best="):
+            source = best(asked.out, job.source.removeprefix("best=").split(","))
+            job = Job(job.name, job.seed, job.gains, source)
+        train(job, asked)
 
 
-def _pronk(words: list[str], log: Path, gpu: str, source: str = str(ROOT / "src")) -> bool:
-    """Whether a command of pronk did what it was asked for."""
-    path = os.pathsep.join([source, *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu, "PYTHONPATH": path}
-    call = [sys.executable, "-m", "pronk.cli", *words]
+def train(job: Job, asked: argparse.Namespace) -> None:
+    """One training, and its evaluation if asked for."""
+    run, log = asked.out / job.name, asked.out / f"{job.name}.log"
+    gains = str(asked.gains.resolve())
+    drives = ["--gains", gains] if job.gains == "matched" else ["--gains", "naive", "--like", gains]
+    commands = [["train", asked.task, *drives, "--seed", job.seed, "--out", str(run)]]
+    commands[0] += asked.options.split()
+    if asked.evaluate:
+        figures = ["evaluate", str(run / "policy.onnx"), *drives, "--what", "jump"]
+        figures += ["--robots", asked.robots]
+        for kind in ("full", "noise"):
+            commands.append([*figures, "--randomization", kind, "--out", str(run / f"{kind}.json")])
+    environment = {
+        **os.environ,
+        "CUDA_VISIBLE_DEVICES": asked.gpu,
+        "PYTHONPATH": os.pathsep.join(filter(None, [job.source, os.environ.get("PYTHONPATH")])),
+    }
     with log.open("a") as file:
-        return subprocess.run(call, env=environment, stdout=file, stderr=file).returncode == 0
+        # The working folder comes first on the path of `python -m`; it must not be a src folder.
+        done = all(
+            subprocess.run(
+                [sys.executable, "-m", "pronk.cli", *words],
+                env=environment,
+                stdout=file,
+                stderr=file,
+                cwd=asked.out,
+            ).returncode
+            == 0
+            for words in commands
+        )
+    if (run / "policy.onnx").is_file():
+        (run / "source").write_text(job.source)
+        keep(run, asked.out / f"{job.name}.tgz")
+    if not done:
+        log.rename(log.with_suffix(".failed"))
 
 
-def _keep(run: Path, path: Path) -> None:
+def keep(run: Path, path: Path) -> None:
+    """Pack what is worth keeping of a run."""
     aside = path.with_suffix(".aside")
     with tarfile.open(aside, "w:gz") as archive:
         for file in sorted({file for pattern in KEPT for file in run.glob(pattern)}):
             archive.add(file, f"{run.name}/{file.name}")
     aside.rename(path)
+
+
+def best(out: Path, names: list[str]) -> str:
+    """The source of the run that passes most bars, once all are over; the first of equals."""
+    while not all(over(out, name) for name in names):
+        time.sleep(1.0)
+    passed = {name: bars(out / name) for name in names}
+    name = max(names, key=lambda name: passed[name])
+    (out / f"best-of-{'-'.join(names)}.txt").write_text(f"{name} {passed}\n")
+    source = out / name / "source"
+    return source.read_text() if source.is_file() else str(ROOT / "src")
+
+
+def over(out: Path, name: str) -> bool:
+    """Whether a run has come to its end, good or bad."""
+    return any((out / f"{name}.{end}").is_file() for end in ("tgz", "failed"))
+
+
+def bars(run: Path) -> int:
+    """Bars that a run passes in all of its evaluations."""
+    files = [run / name for name in ("full.json", "noise.json")]
+    found = [json.loads(file.read_text())["checks"] for file in files if file.is_file()]
+    return sum(check["passed"] for checks in found for check in checks)
 
 
 if __name__ == "__main__":
