@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
-from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tools_folder import load_tool
 
 os.environ.setdefault("MJLAB_WARP_QUIET", "1")
 pytestmark = [
     pytest.mark.train,
     pytest.mark.skipif(shutil.which("gcc") is None, reason="compiles the engine with gcc"),
 ]
-TOOL = Path(__file__).parents[1] / "tools" / "cpu_engine.py"
 
 
 @pytest.fixture(scope="module")
 def tool() -> Any:
-    spec = importlib.util.spec_from_file_location("cpu_engine", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_tool("cpu_engine")
 
 
 def test_all_that_training_draws_moves_robots_as_warp_moves_them(tool: Any) -> None:

@@ -1,4 +1,4 @@
-"""pronk's commands with MuJoCo's C engine in place of MuJoCo Warp: experiments without a GPU.
+r"""pronk's commands with MuJoCo's C engine in place of MuJoCo Warp: experiments without a GPU.
 
     python tools/cpu_engine.py evaluate policies/matched/policy.onnx --gains policies/gains.yaml
     python tools/cpu_engine.py --net 256x128x64 train all --gains policies/gains.yaml \
@@ -6,9 +6,8 @@
 
 Environment, rewards and learning are pronk's and mjlab's own; only what `Simulation.step` and
 `forward` compute comes from `mj_step` and `mj_forward`, on all cores. States agree with Warp's to
-single precision (a test holds it), and two cores step 1,024 robots about a hundred times faster
-than Warp's CPU device. `--net` trains networks of another size than the paper's, which would
-take most of the time. Needs gcc; the engine is compiled into a temporary folder.
+single precision (a test holds it). `--net` trains networks of another size than the paper's, which
+would take most of the time. Needs gcc; the engine is compiled into a temporary folder.
 """
 
 from __future__ import annotations

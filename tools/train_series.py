@@ -1,7 +1,8 @@
-"""Train several policies one after another on one GPU, unattended; start one series for each GPU.
+r"""Train several policies one after another on one GPU, unattended; start one series for each GPU.
 
     python tools/train_series.py OUT --gpu 0 --evaluate m1:1:matched n1:1:naive
-    python tools/train_series.py OUT --gpu 1 --evaluate v1:1:matched:/elsewhere/src m2:2:best=m1,v1
+    python tools/train_series.py OUT --gpu 1 --evaluate v1:1:matched:/elsewhere/src \
+        m2:2:matched:best=m1,v1
 
 A job is NAME:SEED:GAINS[:SOURCE]. GAINS are `matched` (--gains) or `naive` with their ranges and
 delay; SOURCE is the src folder of another checkout, a variant of what is here. With `best=NAMES`
@@ -22,7 +23,7 @@ import subprocess
 import sys
 import tarfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -73,8 +74,8 @@ def main() -> None:
     asked.out.mkdir(parents=True, exist_ok=True)
     for job in jobs:
         if job.source.startswith("best="):
-            source = best(asked.out, job.source.removeprefix("best=").split(","))
-            job = Job(job.name, job.seed, job.gains, source)
+            names = job.source.removeprefix("best=").split(",")
+            job = replace(job, source=best(asked.out, names))
         train(job, asked)
 
 
@@ -95,23 +96,22 @@ def train(job: Job, asked: argparse.Namespace) -> None:
         "CUDA_VISIBLE_DEVICES": asked.gpu,
         "PYTHONPATH": os.pathsep.join(filter(None, [job.source, os.environ.get("PYTHONPATH")])),
     }
-    with log.open("a") as file:
-        # The working folder comes first on the path of `python -m`; it must not be a src folder.
-        done = all(
-            subprocess.run(
+    for words in commands:
+        with log.open("a") as file:
+            # The working folder is first on the path of `python -m`; it must not be a src folder.
+            done = subprocess.run(
                 [sys.executable, "-m", "pronk.cli", *words],
                 env=environment,
                 stdout=file,
                 stderr=file,
                 cwd=asked.out,
-            ).returncode
-            == 0
-            for words in commands
-        )
+            )
+        if done.returncode != 0:
+            break
     if (run / "policy.onnx").is_file():
         (run / "source").write_text(job.source)
         keep(run, asked.out / f"{job.name}.tgz")
-    if not done:
+    if done.returncode != 0:
         log.rename(log.with_suffix(".failed"))
 
 

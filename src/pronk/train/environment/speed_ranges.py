@@ -76,6 +76,10 @@ class SpeedRanges:
         law = self._growth
         self.grown += ((self.kept - law.lose) / (law.keep - law.lose)).clamp(0.0, 1.0)
 
+    def resume(self, environment: Mapping[str, Any]) -> None:
+        """Go on from where the ranges of a saved environment were, as `grown` reads it."""
+        self.grown.copy_(grown(environment))
+
 
 def grown(environment: Mapping[str, Any]) -> Tensor:
     """How far the ranges of a saved environment have grown, as `SpeedRanges.grown` counts. ().

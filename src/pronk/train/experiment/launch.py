@@ -107,13 +107,7 @@ def _spawn(folder: RunFolder, settings: TrainSettings, watch: WatchSettings, cou
         hostnames=["localhost"],
         workers_per_host=count,
         backend=None,  # rsl_rl makes the process group itself
-        copy_env_vars=(
-            *torchrunx.DEFAULT_ENV_VARS_FOR_COPY,
-            "MUJOCO*",
-            "MJLAB*",
-            "WARP*",
-            "WANDB*",
-        ),
+        copy_env_vars=(*torchrunx.DEFAULT_ENV_VARS_FOR_COPY, *_COPIED),
     )
     launcher.set_logging_handlers(_Handlers(folder.path / "workers.log"))
     launcher.run(train_run, folder, settings, watch)

@@ -27,7 +27,6 @@ from rich.console import Console
 from pronk.errors import ArtefactError
 from pronk.files import sha256
 from pronk.train.environment.commands import motion_command
-from pronk.train.environment.speed_ranges import grown
 from pronk.train.experiment import checkpoint, provenance
 from pronk.train.experiment.devices import check_cuda_graphs, kernel_seconds
 from pronk.train.experiment.resolve import run_contract, run_gains, run_phases, run_randomization
@@ -212,7 +211,7 @@ class _Run:
             state, rate = found.tree["algorithm"], found.tree["learning_rate"]
             walked = found.tree["ranks"][0]["environment"]
             # Speed ranges do not begin anew.
-            motion_command(self.env.unwrapped).ranges.grown.copy_(grown(walked))
+            motion_command(self.env.unwrapped).ranges.resume(walked)
             narrow = True
         else:
             runner.alg.set_estimator_rate(phase.estimator_rate)

@@ -21,7 +21,6 @@ from rich.console import Console
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.train.environment.commands import motion_command
-from pronk.train.environment.speed_ranges import grown
 from pronk.train.experiment import checkpoint
 from pronk.train.experiment.checkpoint import Checkpoint
 from pronk.train.experiment.processes import gathered, in_any
@@ -320,7 +319,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             self._resume(found)
         else:
             environment = found.tree["ranks"][0]["environment"]
-            motion_command(self.env.unwrapped).ranges.grown.copy_(grown(environment))
+            motion_command(self.env.unwrapped).ranges.resume(environment)
         return dict(found.tree["infos"])
 
     def _resume(self, found: Checkpoint) -> None:
