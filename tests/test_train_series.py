@@ -44,7 +44,7 @@ def test_what_is_no_job_is_refused(tool: Any, text: str) -> None:
 
 def test_the_best_passes_most_bars_of_both_evaluations(tool: Any, tmp_path: Path) -> None:
     finished(tmp_path, "a", {"full": 3, "noise": 1}, "/a")
-    finished(tmp_path, "b", {"full": 1, "noise": 4}, "/b")
+    finished(tmp_path, "b", {"full": 1, "trial": 4}, "/b")
     finished(tmp_path, "c", {"full": 4}, "/c")
     (tmp_path / "d.failed").write_text("out of memory")
     assert tool.best(tmp_path, ["a", "b", "c", "d"]) == "/b"

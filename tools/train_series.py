@@ -10,8 +10,9 @@ the job waits for those runs, of any series with the same OUT, and takes the sou
 passes most bars; so waits what comes after it.
 
 A job leaves OUT/NAME.tgz: both policies, settings, provenance, curves, and with --evaluate the
-figures of `pronk evaluate --what jump`, everything randomized and of one nominal robot. One that
-fails leaves OUT/NAME.failed, and the next begins. All of a run stays in OUT/NAME.
+figures of `pronk evaluate --what jump`, everything randomized and of one nominal robot, and those
+of `pronk trial`. One that fails leaves OUT/NAME.failed, and the next begins. All of a run stays in
+OUT/NAME.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-KEPT = ("*.onnx", "config.yaml", "provenance.json", "full.json", "noise.json", "events.*", "source")
+FIGURES = ("full.json", "noise.json", "trial.json")
+KEPT = ("*.onnx", "config.yaml", "provenance.json", *FIGURES, "events.*", "source")
 
 
 @dataclass(frozen=True)
@@ -80,39 +82,53 @@ def main() -> None:
 
 
 def train(job: Job, asked: argparse.Namespace) -> None:
-    """One training, and its evaluation if asked for."""
+    """One training, and its evaluations, all at once, if asked for."""
     run, log = asked.out / job.name, asked.out / f"{job.name}.log"
-    gains = str(asked.gains.resolve())
+    policy, gains = str(run / "policy.onnx"), str(asked.gains.resolve())
     drives = ["--gains", gains] if job.gains == "matched" else ["--gains", "naive", "--like", gains]
-    commands = [["train", asked.task, *drives, "--seed", job.seed, "--out", str(run)]]
-    commands[0] += asked.options.split()
-    if asked.evaluate:
-        figures = ["evaluate", str(run / "policy.onnx"), *drives, "--what", "jump"]
-        figures += ["--robots", asked.robots]
-        for kind in ("full", "noise"):
-            commands.append([*figures, "--randomization", kind, "--out", str(run / f"{kind}.json")])
+    training = ["train", asked.task, *drives, "--seed", job.seed, "--out", str(run)]
+    done = all_well([[*training, *asked.options.split()]], job, asked, log)
+    if done and asked.evaluate:
+        figures = ["evaluate", policy, *drives, "--what", "jump", "--robots", asked.robots]
+        trial = ["trial", policy, "--no-video", "--out", str(run / "trial")]
+        done = all_well(
+            [
+                [*figures, "--randomization", "full", "--out", str(run / "full.json")],
+                [*figures, "--randomization", "noise", "--out", str(run / "noise.json")],
+                [*trial, "--json", str(run / "trial.json")],
+            ],
+            job,
+            asked,
+            log,
+        )
+    if (run / "policy.onnx").is_file():
+        (run / "source").write_text(job.source)
+        keep(run, asked.out / f"{job.name}.tgz")
+    if not done:
+        log.rename(log.with_suffix(".failed"))
+
+
+def all_well(commands: list[list[str]], job: Job, asked: argparse.Namespace, log: Path) -> bool:
+    """Run commands of pronk side by side; whether none failed."""
     environment = {
         **os.environ,
         "CUDA_VISIBLE_DEVICES": asked.gpu,
         "PYTHONPATH": os.pathsep.join(filter(None, [job.source, os.environ.get("PYTHONPATH")])),
     }
-    for words in commands:
-        with log.open("a") as file:
-            # The working folder is first on the path of `python -m`; it must not be a src folder.
-            done = subprocess.run(
+    with log.open("a") as file:
+        # The working folder is first on the path of `python -m`; it must not be a src folder.
+        running = [
+            subprocess.Popen(
                 [sys.executable, "-m", "pronk.cli", *words],
                 env=environment,
                 stdout=file,
                 stderr=file,
                 cwd=asked.out,
             )
-        if done.returncode != 0:
-            break
-    if (run / "policy.onnx").is_file():
-        (run / "source").write_text(job.source)
-        keep(run, asked.out / f"{job.name}.tgz")
-    if done.returncode != 0:
-        log.rename(log.with_suffix(".failed"))
+            for words in commands
+        ]
+        codes = [one.wait() for one in running]
+    return not any(codes)
 
 
 def keep(run: Path, path: Path) -> None:
@@ -141,8 +157,8 @@ def over(out: Path, name: str) -> bool:
 
 
 def bars(run: Path) -> int:
-    """Bars that a run passes in all of its evaluations."""
-    files = [run / name for name in ("full.json", "noise.json")]
+    """Bars that a run passes in all of its evaluations and its trial."""
+    files = [run / name for name in FIGURES]
     found = [json.loads(file.read_text())["checks"] for file in files if file.is_file()]
     return sum(check["passed"] for checks in found for check in checks)
 

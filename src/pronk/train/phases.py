@@ -98,7 +98,7 @@ PHASES: tuple[Phase, ...] = (
     # and .24); it then landed backwards on its thighs, which at 5 a second cost it a centimetre.
     Phase(
         name="jump_b",
-        iterations=680,
+        iterations=650,
         jump=True,
         weights=JumpWeights(
             dense=0.002,
