@@ -81,11 +81,11 @@ class Phase:
 
 
 PHASES: tuple[Phase, ...] = (
-    Phase(name="walk", iterations=310, jump=False),
+    Phase(name="walk", iterations=300, jump=False),
     # Jumping has to be found.
     Phase(
         name="jump_a",
-        iterations=230,
+        iterations=220,
         jump=True,
         weights=replace(
             _NO_JUMP, dense=0.02, sparse=16.0, rise=20.0, reach=12.0, gap=4.0, rear=10.0
@@ -98,7 +98,7 @@ PHASES: tuple[Phase, ...] = (
     # and .24); it then landed backwards on its thighs, which at 5 a second cost it a centimetre.
     Phase(
         name="jump_b",
-        iterations=650,
+        iterations=580,
         jump=True,
         weights=JumpWeights(
             dense=0.002,
