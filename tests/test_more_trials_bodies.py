@@ -20,12 +20,13 @@ from pronk.match.rehearse import Ask, rehearse
 from pronk.match.settings import MatchSettings
 from pronk.response.estimator import Estimator
 from pronk.sweep.signals import Chirp
-from pronk.trial import bode, variation
-from pronk.trial.bode import bode_errors, gains_of
-from pronk.trial.other_truths import GROUP_TORQUE, TOLERANCES, draw, save_truth
+from pronk.trial import variation
 from pronk.trial.protocol import Case, Script
 from pronk.trial.run import Plan
 from pronk.trial.subjects import load_subjects
+from pronk.trial.unseen import bode
+from pronk.trial.unseen.bode import bode_errors, gains_of
+from pronk.trial.unseen.other_truths import GROUP_TORQUE, TOLERANCES, draw, save_truth
 from pronk.trial.variation import AS_IT_IS, Parameter, add_variation
 
 TRUTH = load_truth()

@@ -11,12 +11,13 @@ import pytest
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
 from pronk.hardware.truth import load_truth
-from pronk.trial import climbing, course, crossing, sheet
-from pronk.trial.climbing import Ladder, Plan, add_crossings
-from pronk.trial.course import Verdict
-from pronk.trial.crossing import Crossing, Crossings
+from pronk.trial import sheet
 from pronk.trial.protocol import Case, Script
 from pronk.trial.result import Subject
+from pronk.trial.terrain import climbing, course, crossing
+from pronk.trial.terrain.climbing import Ladder, Plan, add_crossings
+from pronk.trial.terrain.course import Verdict
+from pronk.trial.terrain.crossing import Crossing, Crossings
 
 TRUTH = load_truth()
 SUBJECT = Subject(name="matched", path="policy.onnx", sha256="0" * 64, contract={})

@@ -12,9 +12,9 @@ from pronk.errors import PronkError
 from pronk.hardware.capture import Capture
 from pronk.hardware.ground import Ground
 from pronk.jumps import JumpRules
-from pronk.trial import course
-from pronk.trial.course import Obstacle, Operator, Verdict, direction, judge, lost
 from pronk.trial.protocol import STILL, Script
+from pronk.trial.terrain import course
+from pronk.trial.terrain.course import Obstacle, Operator, Verdict, direction, judge, lost
 from seen_jump import DELAY, SCRIPT, changed, seen_jump
 
 FORWARD, BACK, LEFT = (2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 1.0, 0.0)

@@ -27,11 +27,11 @@ from pronk.hardware.capture import Capture
 from pronk.hardware.truth import load_truth
 from pronk.policy.runtime import load_policy
 from pronk.robots.mini_cheetah.model import standing_height
-from pronk.trial.gamepad import Gamepad
-from pronk.trial.gauge import Gauge
-from pronk.trial.page import WebPage, free_port, readout
-from pronk.trial.play import play
-from pronk.trial.stick import JUMP_S, Pad, Stick, live
+from pronk.trial.live.gamepad import Gamepad
+from pronk.trial.live.gauge import Gauge
+from pronk.trial.live.page import WebPage, free_port, readout
+from pronk.trial.live.play import play
+from pronk.trial.live.stick import JUMP_S, Pad, Stick, live
 
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
 GRAVITY = 9.81

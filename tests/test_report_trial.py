@@ -35,13 +35,16 @@ from pronk.report.trial.cells import cells, scatter
 from pronk.report.trial.sweeps import Line, Panel, argument, lines
 from pronk.report.trial.traces import Trace, heights, rates, rms, torque_speed
 from pronk.robots import load_robot
-from pronk.trial import bodies, crossing, published, result, sheet, tables, variation, walk
-from pronk.trial.bodies import Bodies, Body, GainsError
-from pronk.trial.crossing import Crossing, Crossings
+from pronk.trial import result, sheet, variation, walk
 from pronk.trial.metrics import JumpFigures, measure
+from pronk.trial.outcome import published, tables
 from pronk.trial.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.trial.result import Subject, Trial
 from pronk.trial.rows import Row
+from pronk.trial.terrain import crossing
+from pronk.trial.terrain.crossing import Crossing, Crossings
+from pronk.trial.unseen import bodies
+from pronk.trial.unseen.bodies import Bodies, Body, GainsError
 from pronk.trial.variation import Variation, Varied
 from pronk.trial.walk import Walk, Walks
 from pronk.trial.walk_metrics import WalkFigures

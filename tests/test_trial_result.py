@@ -18,9 +18,10 @@ from hypothesis import strategies as st
 from pronk.errors import ArtefactError
 from pronk.jumps import JumpRules
 from pronk.robots import load_robot
-from pronk.trial import bars, comparison, published, result, tables
+from pronk.trial import result
 from pronk.trial import rows as rows_file
 from pronk.trial.metrics import FIGURES, JumpFigures
+from pronk.trial.outcome import bars, comparison, published, tables
 from pronk.trial.protocol import PAPER_COMMANDS, Case, Script
 from pronk.trial.result import Subject, Trial
 from pronk.trial.rows import Row

@@ -202,7 +202,7 @@ def film(found: Trial, out: Path, *, report: console.Reporter) -> tuple[Path, ..
 def summary(found: Trial) -> None:
     """Print heights, distances and landings."""
     from pronk.commands.trial import show
-    from pronk.trial import tables
+    from pronk.trial.outcome import tables
 
     for figure in ("height", "distance"):
         show(tables.table_iii(found, figure))

@@ -38,10 +38,10 @@ def play(
     from pronk.policy.contract import check
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
-    from pronk.trial.gamepad import Gamepad
-    from pronk.trial.page import WebPage, modules
-    from pronk.trial.play import play as run
-    from pronk.trial.stick import Stick
+    from pronk.trial.live.gamepad import Gamepad
+    from pronk.trial.live.page import WebPage, modules
+    from pronk.trial.live.play import play as run
+    from pronk.trial.live.stick import Stick
 
     modules()
     robot = load_robot("mini_cheetah")

@@ -11,8 +11,8 @@ import typer
 from pronk.commands import console
 
 if TYPE_CHECKING:
+    from pronk.trial.outcome.table_text import Sheet
     from pronk.trial.result import Trial
-    from pronk.trial.table_text import Sheet
 
 ROBOT = "mini_cheetah"
 RATES_JUMPS = 3
@@ -97,8 +97,8 @@ def trial(
     from pronk.hardware.truth import SHIPPED, load_truth
     from pronk.report.whole import write_report
     from pronk.robots import load_robot
-    from pronk.trial import tables
     from pronk.trial.folder import CAPTURES, VIDEOS
+    from pronk.trial.outcome import tables
     from pronk.trial.processes import cores
     from pronk.trial.protocol import parse_cases
     from pronk.trial.result import SUMMARY, TABLE
@@ -230,7 +230,7 @@ def figures(found: Trial, more: Sequence[Sheet] = ()) -> dict[str, Any]:
     """
     from dataclasses import asdict
 
-    from pronk.trial import bars, tables
+    from pronk.trial.outcome import bars, tables
 
     return {
         "virtual": found.virtual,

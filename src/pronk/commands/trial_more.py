@@ -15,8 +15,8 @@ from pronk.commands import console
 if TYPE_CHECKING:
     from pronk.hardware.truth import Truth
     from pronk.robots.robot import Robot
-    from pronk.trial.bodies import Bodies
-    from pronk.trial.table_text import Sheet
+    from pronk.trial.outcome.table_text import Sheet
+    from pronk.trial.unseen.bodies import Bodies
     from pronk.trial.variation import Variation
 
 
@@ -60,13 +60,13 @@ def more(
     """
     from pronk.report.trial import crossing as trial_crossing
     from pronk.report.trial import walk as trial_walk
-    from pronk.trial import bodies as bodies_file
-    from pronk.trial import crossing as crossing_file
     from pronk.trial import variation as variation_file
     from pronk.trial import walk as walk_file
-    from pronk.trial.climbing import Plan as Climbs
-    from pronk.trial.climbing import add_crossings
     from pronk.trial.run import Plan
+    from pronk.trial.terrain import crossing as crossing_file
+    from pronk.trial.terrain.climbing import Plan as Climbs
+    from pronk.trial.terrain.climbing import add_crossings
+    from pronk.trial.unseen import bodies as bodies_file
 
     kept: dict[str, Any] = {
         "robot": robot,
@@ -111,7 +111,7 @@ def variation_sheet(varied: Variation) -> Sheet:
     """Landings and heights at every value, all commands together."""
     import numpy as np
 
-    from pronk.trial.table_text import Sheet, number
+    from pronk.trial.outcome.table_text import Sheet, number
 
     rows = []
     for each in varied.parameters:
@@ -145,8 +145,8 @@ def variation_sheet(varied: Variation) -> Sheet:
 
 def bodies_sheet(bodies: Bodies) -> Sheet:
     """Every body: its gains by group, how wrong gains are on it, and the jumps."""
-    from pronk.trial.bodies import MATCHED
-    from pronk.trial.table_text import Sheet, number
+    from pronk.trial.outcome.table_text import Sheet, number
+    from pronk.trial.unseen.bodies import MATCHED
 
     rows = []
     for body in bodies.bodies:

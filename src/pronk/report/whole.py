@@ -27,11 +27,13 @@ from pronk.report.trial.bodies import bodies_part
 from pronk.report.trial.crossing import crossing_part
 from pronk.report.trial.variation import variation_part
 from pronk.report.trial.walk import walk_part
-from pronk.trial import bodies, crossing, variation, walk
-from pronk.trial.bars import checks
-from pronk.trial.bodies import Bodies
-from pronk.trial.crossing import Crossings
+from pronk.trial import variation, walk
+from pronk.trial.outcome.bars import checks
 from pronk.trial.result import SUMMARY
+from pronk.trial.terrain import crossing
+from pronk.trial.terrain.crossing import Crossings
+from pronk.trial.unseen import bodies
+from pronk.trial.unseen.bodies import Bodies
 from pronk.trial.variation import Variation
 from pronk.trial.walk import Walks
 

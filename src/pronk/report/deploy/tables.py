@@ -14,7 +14,7 @@ from pronk.report.deploy.data import Intervention
 from pronk.report.deploy.delay import Delay
 from pronk.report.shell import number
 from pronk.robots.robot import Robot
-from pronk.trial.table_text import Sheet
+from pronk.trial.outcome.table_text import Sheet
 
 _LEVEL_WORDS = {
     Level.LIMIT: "target moved",

@@ -19,8 +19,8 @@ from pronk.match import result as result_file
 from pronk.match.result import JointMatch, MatchResult
 from pronk.report import style
 from pronk.report.page import find_gains
+from pronk.trial.outcome.table_text import Sheet, number
 from pronk.trial.result import Subject, Trial
-from pronk.trial.table_text import Sheet, number
 
 
 def joint_error_db(joint: JointMatch, stiffness: float, damping: float) -> float:

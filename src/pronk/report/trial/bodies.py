@@ -11,11 +11,11 @@ from pronk.report.trial.cells import Array, Values, cells
 from pronk.report.trial.data import policies, published, values
 from pronk.report.trial.extra import Block, part, place
 from pronk.report.trial.sweeps import argument
-from pronk.trial.bars import checks
-from pronk.trial.bodies import Bodies, Body
-from pronk.trial.comparison import verdict
-from pronk.trial.table_text import Sheet, number
-from pronk.trial.tables import table_iii
+from pronk.trial.outcome.bars import checks
+from pronk.trial.outcome.comparison import verdict
+from pronk.trial.outcome.table_text import Sheet, number
+from pronk.trial.outcome.tables import table_iii
+from pronk.trial.unseen.bodies import Bodies, Body
 
 _OF_POLICY = "training gains of "
 

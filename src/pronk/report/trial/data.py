@@ -15,8 +15,8 @@ from pronk.hardware.capture import Capture
 from pronk.report.trial.cells import Published, Values
 from pronk.report.trial.ratios import Ratio
 from pronk.report.trial.traces import Trace
+from pronk.trial.outcome.published import PAPER_RATIOS, TABLE_III, in_paper_order
 from pronk.trial.protocol import RATES
-from pronk.trial.published import PAPER_RATIOS, TABLE_III, in_paper_order
 from pronk.trial.result import Trial
 from pronk.trial.rows import Row
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pronk.report import shell
 from pronk.report.shell import Part, Picture
 from pronk.trial.metrics import Figure
+from pronk.trial.outcome.table_text import Sheet
 from pronk.trial.sheet import Origin
-from pronk.trial.table_text import Sheet
 
 
 @dataclass(frozen=True, kw_only=True)

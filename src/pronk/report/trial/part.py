@@ -28,11 +28,11 @@ from pronk.report.trial.sweeps import argument
 from pronk.report.trial.traces import heights, rates, torque_speed
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.trial import bars, comparison, tables
+from pronk.trial.outcome import bars, comparison, tables
+from pronk.trial.outcome.table_text import Sheet, place
 from pronk.trial.protocol import RATES
 from pronk.trial.result import Subject, Trial, load
 from pronk.trial.summary import share_interval
-from pronk.trial.table_text import Sheet, place
 
 _PAPER_GAPS: Published = {
     "matched": {

@@ -11,9 +11,9 @@ from pronk.report.shell import Part
 from pronk.report.trial.extra import Block, part, place
 from pronk.report.trial.sweeps import Line, Panel, lines
 from pronk.trial.metrics import FIGURES
-from pronk.trial.published import in_paper_order
+from pronk.trial.outcome.published import in_paper_order
+from pronk.trial.outcome.table_text import Sheet, number, spread
 from pronk.trial.summary import share_interval
-from pronk.trial.table_text import Sheet, number, spread
 from pronk.trial.variation import AS_IT_IS, VARIED_FIGURES, Parameter, Point, Variation
 
 _DRAWN = ("height", "distance")

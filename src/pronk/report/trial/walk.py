@@ -8,8 +8,8 @@ from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.cells import Values, cells
 from pronk.report.trial.extra import Block, part, place
-from pronk.trial.published import in_paper_order
-from pronk.trial.table_text import Sheet, spread
+from pronk.trial.outcome.published import in_paper_order
+from pronk.trial.outcome.table_text import Sheet, spread
 from pronk.trial.walk import Walks
 from pronk.trial.walk_metrics import SETTLE_S, WALK_FIGURES
 

@@ -1,6 +1,7 @@
 """What was crossed: every run at an obstacle, and the largest sizes, as `crossing.json`.
 
-What crossed means is said in `pronk.trial.course`, how sizes grow in `pronk.trial.climbing`.
+What crossed means is said in `pronk.trial.terrain.course`, how sizes grow in
+`pronk.trial.terrain.climbing`.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from functools import cached_property
 from pathlib import Path
 
 from pronk.trial import sheet
-from pronk.trial.course import Kind
 from pronk.trial.protocol import Case
+from pronk.trial.terrain.course import Kind
 
 SCHEMA = "pronk/trial-crossing/1"
 FILE = "crossing.json"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from pronk.bars import Check
-from pronk.trial.published import TABLE_III
+from pronk.trial.outcome.published import TABLE_III
 from pronk.trial.result import Trial
 from pronk.trial.summary import Cell
 

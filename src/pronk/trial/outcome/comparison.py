@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from pronk.trial.published import PAPER_RATIOS
+from pronk.trial.outcome.published import PAPER_RATIOS
+from pronk.trial.outcome.table_text import Sheet, interval, number, place
 from pronk.trial.result import COMPARED, Trial
 from pronk.trial.summary import FEWEST
-from pronk.trial.table_text import Sheet, interval, number, place
 
 
 def scatter(trial: Trial, other: str | None = None) -> Sheet:

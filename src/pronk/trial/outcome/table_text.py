@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pronk.trial.published import Pair
+from pronk.trial.outcome.published import Pair
 from pronk.trial.result import Trial
 from pronk.trial.summary import Cell, Ratio, Spread
 

@@ -19,9 +19,9 @@ from pronk.hardware.capture import Capture
 from pronk.hardware.ground import Ground
 from pronk.policy.contract import COMMANDS
 from pronk.robots.robot import Robot
-from pronk.trial.gauge import Gauge
+from pronk.trial.live.gauge import Gauge
+from pronk.trial.live.stick import Stick
 from pronk.trial.protocol import STILL, Velocity
-from pronk.trial.stick import Stick
 
 _DRAW_S = 1.0 / 30.0
 _WRITE_S = 0.1

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
-from pronk.trial.stick import Pad
+from pronk.trial.live.stick import Pad
 
 
 class Gamepad:

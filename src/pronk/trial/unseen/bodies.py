@@ -1,7 +1,7 @@
 """Bodies never seen: other virtual robots, each matched anew by its own sweep, and the same table.
 
-Every body is drawn around a truth (`pronk.trial.other_truths`), asked by its own sweep, matched,
-and tried with the same script as everything else. Its folder holds all of it:
+Every body is drawn around a truth (`pronk.trial.unseen.other_truths`), asked by its own sweep,
+matched, and tried with the same script as everything else. Its folder holds all of it:
 
     truth.yaml    the body, for a person and for `--truth`
     logs/         its sweep
@@ -35,12 +35,12 @@ from pronk.robots.robot import Robot
 from pronk.sweep.log import SweepLog
 from pronk.sweep.readers import read_logs
 from pronk.trial import result, sheet
-from pronk.trial.bode import bode_errors, gains_of, overall_rms_db
-from pronk.trial.other_truths import GROUP_TORQUE, TOLERANCES, draw, save_truth
-from pronk.trial.own_sweep import GAINS, LOGS, SETTINGS, ask, match_own
 from pronk.trial.result import Subject, Trial
 from pronk.trial.run import Plan, run
 from pronk.trial.subjects import load_subjects
+from pronk.trial.unseen.bode import bode_errors, gains_of, overall_rms_db
+from pronk.trial.unseen.other_truths import GROUP_TORQUE, TOLERANCES, draw, save_truth
+from pronk.trial.unseen.own_sweep import GAINS, LOGS, SETTINGS, ask, match_own
 
 SCHEMA = "pronk/trial-bodies/1"
 FILE = "bodies.json"

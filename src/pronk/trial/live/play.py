@@ -18,10 +18,10 @@ from pronk.hardware.truth import Truth
 from pronk.hardware.virtual import VirtualRobot
 from pronk.policy.runtime import Policy
 from pronk.robots.robot import Robot
-from pronk.trial.gamepad import Gamepad
-from pronk.trial.gauge import Gauge, Hop
+from pronk.trial.live.gamepad import Gamepad
+from pronk.trial.live.gauge import Gauge, Hop
+from pronk.trial.live.stick import Stick
 from pronk.trial.pilot import ticks
-from pronk.trial.stick import Stick
 
 _SEE_S = 0.004
 """From look to look at the robot; a lift-off speed is off by less than 4 cm/s for it."""

@@ -7,7 +7,7 @@ few leads about that distance; every run starts at a place of its own, so that i
 another phase of its gait, which the operator does not look at. A size counts as crossed with the
 lead that did best, if it did so in `enough` of its runs; the sizes grow until no lead does.
 
-What crossed means, and who triggers the jump, is said in `pronk.trial.course`.
+What crossed means, and who triggers the jump, is said in `pronk.trial.terrain.course`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.trial import sheet
-from pronk.trial.course import Kind, Obstacle, Operator, Verdict, direction, judge, lost
-from pronk.trial.crossing import Crossing, Crossings, rung_of, save
 from pronk.trial.job import Job, body, set_down
 from pronk.trial.pilot import ticks
 from pronk.trial.processes import in_processes
@@ -39,6 +37,8 @@ from pronk.trial.protocol import STILL, Case, Script
 from pronk.trial.result import Subject
 from pronk.trial.run import mass_of
 from pronk.trial.subjects import load_subjects
+from pronk.trial.terrain.course import Kind, Obstacle, Operator, Verdict, direction, judge, lost
+from pronk.trial.terrain.crossing import Crossing, Crossings, rung_of, save
 
 CROSSED_BY = (
     Case(name="forward 2", command=(2.0, 0.0, 0.0)),

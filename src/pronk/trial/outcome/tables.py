@@ -9,13 +9,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pronk.trial.bars import JUMPS, checks
-from pronk.trial.comparison import scatter
 from pronk.trial.metrics import FIGURES
-from pronk.trial.published import TABLE_III, Pair, in_paper_order
+from pronk.trial.outcome.bars import JUMPS, checks
+from pronk.trial.outcome.comparison import scatter
+from pronk.trial.outcome.published import TABLE_III, Pair, in_paper_order
+from pronk.trial.outcome.table_text import Sheet, counted, number, pair, place, spread, virtual_note
 from pronk.trial.result import Trial
 from pronk.trial.summary import Cell
-from pronk.trial.table_text import Sheet, counted, number, pair, place, spread, virtual_note
 
 DEFINITIONS = "Definitions"
 """Title of the table of equations."""

@@ -1,0 +1,1 @@
+"""The virtual robot in real time, in a web page: `pronk play`."""

@@ -1,0 +1,1 @@
+"""What a trial came to: tables, bars, the paper's figures beside ours."""

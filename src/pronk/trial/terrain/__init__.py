@@ -1,0 +1,1 @@
+"""Gaps and platforms of growing size, until they are too much."""

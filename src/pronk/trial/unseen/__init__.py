@@ -1,0 +1,1 @@
+"""Bodies that no policy was trained for, each matched anew by its own sweep."""
