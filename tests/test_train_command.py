@@ -26,7 +26,6 @@ from pronk.train.experiment.devices import (
     Devices,
     check_cuda_graphs,
     chosen,
-    kernel_seconds,
     parse_gpu_ids,
 )
 from pronk.train.experiment.run_folder import RunFolder, plain
@@ -309,16 +308,6 @@ def test_only_the_chosen_gpus_are_seen(monkeypatch):
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "3,1"
     Devices(device="cuda", visible=("1", "MIG-a")).claim()
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "1,MIG-a"
-
-
-def test_the_time_of_compiling_is_told_from_that_of_loading():
-    printed = (
-        "Module smooth 52b3ca0 load on device 'cuda:0' took 1500.25 ms  (compiled)\n"
-        "Module solver a3620bc load on device 'cuda:0' took 700.00 ms  (cached)\n"
-        "step took 9.00 ms\n"
-        "Module other 1234567 load on device 'cuda:0' took 499.75 ms  (compiled)\n"
-    )
-    assert kernel_seconds(printed) == pytest.approx(2.0)
 
 
 # --- The folder ----------------------------------------------------------------------------------

@@ -165,6 +165,7 @@ def main() -> None:
     """The command line of pronk, behind `--net` if it is given."""
     from pronk import cli
     from pronk.train import tasks
+    from pronk.train.experiment import kernels
 
     words = sys.argv[1:]
     if words[:1] == ["--net"]:
@@ -173,6 +174,7 @@ def main() -> None:
         tasks.JumpCriticCfg = partial(tasks.JumpCriticCfg, hidden_dims=sizes)  # type: ignore[misc, assignment]
         words = words[2:]
     mjlab_env.Simulation = CpuSimulation
+    kernels.MODULES = ()  # Warp steps nothing here
     sys.argv = ["pronk", *words]
     cli.main()
 

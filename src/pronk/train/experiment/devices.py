@@ -7,7 +7,6 @@ Nothing here starts CUDA in this process: what is counted first and narrowed by
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -16,8 +15,6 @@ from typing import Any, Literal
 from pronk.errors import PronkError
 
 CHOICES = ("auto", "cpu", "cuda")
-_COMPILED = re.compile(r"took ([\d.]+) ms\s+\(compiled\)")
-"""What Warp prints for each module that was not in its cache."""
 _NEEDED = ("torch", "mjlab", "rsl_rl")
 
 
@@ -145,12 +142,3 @@ def check_cuda_graphs(simulation: Any) -> str | None:
         f"its driver supports CUDA {version} (12.4 or newer is needed) and memory pools are "
         f"{'on' if wp.is_mempool_enabled(simulation.wp_device) else 'off'} (they must be on)."
     )
-
-
-def kernel_seconds(printed: str) -> float:
-    """Time that Warp compiled kernels for, by its own account; those in its cache cost none [s].
-
-    Args:
-        printed: What Warp wrote to standard output.
-    """
-    return sum(float(ms) for ms in _COMPILED.findall(printed)) / 1000.0
