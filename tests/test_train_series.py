@@ -42,7 +42,7 @@ def test_what_is_no_job_is_refused(tool: Any, text: str) -> None:
         tool.Job.parse(text)
 
 
-def test_the_best_passes_most_bars_of_both_evaluations(tool: Any, tmp_path: Path) -> None:
+def test_the_best_passes_most_bars_of_evaluations_and_trial(tool: Any, tmp_path: Path) -> None:
     finished(tmp_path, "a", {"full": 3, "noise": 1}, "/a")
     finished(tmp_path, "b", {"full": 1, "trial": 4}, "/b")
     finished(tmp_path, "c", {"full": 4}, "/c")

@@ -100,7 +100,6 @@ class _Run:
         self.console = Console(stderr=True, highlight=False, soft_wrap=True)
         self.gains = run_gains(settings, folder.gains)
         self.phases = run_phases(settings)
-        self.compiled_ahead = 0.0
         self.device = "cpu"
         if settings.device == "cuda":
             self.device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
