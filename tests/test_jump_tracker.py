@@ -32,14 +32,16 @@ SETTINGS = JumpSettings(
     stroke=0.5,
     crouch=0.1875,
     gap=0.75,
-    rear=0.25,
+    fall=8.0,
+    fall_s=8 * DT,
+    likeness_width=0.5,
 )
 """Not even the first step after the command is hasty."""
 WAITS = replace(SETTINGS, ready_s=8 * DT)
-EVENTS = ("gain", "rise", "reach", "gap", "rear", "hop")
+EVENTS = ("gain", "rise", "reach", "gap", "hop")
 TRACES = (
     *EVENTS,
-    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest", "steepest"),
+    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest", "likeness"),
     *("liftoffs", "airborne"),
 )
 
@@ -64,7 +66,6 @@ class Step:
     """Which feet touch it, if not in the air."""
     feet: Feet = STANCE
     way: tuple[float, float] = (0.0, 0.0)
-    nose: float = 0.0
 
     @property
     def contact(self) -> list[bool]:
@@ -101,7 +102,6 @@ def play(
             excess=torch.tensor([step.excess for step in steps]),
             feet=torch.tensor([step.feet for step in steps]),
             direction=torch.tensor([step.way for step in steps]),
-            nose=torch.tensor([step.nose for step in steps]),
             dt=DT,
         )
         for name in TRACES:
@@ -469,18 +469,25 @@ def test_a_running_start_above_the_command_clears_no_gap() -> None:
     assert landing(fast) == pytest.approx({4: 0.25 - 2 * 0.5 * DT})
 
 
-def test_rearing_up_is_paid_at_lift_off_up_to_the_limit() -> None:
-    """Strides at steps 2 and 10 do not count, the better of two leaps does, and never below 0."""
-    nose = [0.2, 0.2, 0.2, 0.0, 0.125, 0.5, 0.0, 0.75, 0.75, 0.0, 0.2]
-    speed = [0, 0, 0.25, 0, 2, 0, 0, 2, 0, 0, 0.25]
-    air = [False, False, True, False, True, True, False, True, True, False, True]
-    steps = [
-        Step(jump=True, air=a, speed=v, nose=n) for a, v, n in zip(air, speed, nose, strict=True)
-    ]
-    assert alone(steps)["rear"] == [0, 0, 0, 0, 0.125, 0, 0, 0.125, 0, 0, 0]
-    down = [replace(step, nose=-step.nose) for step in steps]
-    assert alone(down)["rear"] == [0] * 11
-    assert alone([replace(step, jump=False) for step in steps])["rear"] == [0] * 11
+def test_a_countermovement_falls_brakes_and_pushes() -> None:
+    """8 m/s^2 down for 1/8 s, then 3.5 m/s up in 1/8 s: at rest after 2/7 of that."""
+    times = [0.0, 0.0625, 0.125, 0.125 + 0.125 * 2 / 7, 0.1875, 0.25]
+    asked = SETTINGS.countermovement(torch.tensor(times))
+    assert asked.tolist() == pytest.approx([0.0, -0.5, -1.0, 0.0, 0.75, 2.5], abs=1e-6)
+
+
+def test_likeness_is_paid_from_the_command_to_the_first_leap() -> None:
+    """Told in step 2. A stride (in the air at 4, 5) goes on, the leap at 7 ends it."""
+    asked = [-8 * DT * i for i in range(1, 7)]
+    speed = dict(zip(range(2, 8), asked, strict=True))
+    told = script("0011111111", "0000110110", {**speed, 4: asked[2] - 0.5, 6: 2.0, 7: 2.0})
+    expected = [0, 0, 1, 1, math.exp(-0.5), 1, math.exp(-2 * (2.0 - asked[4]) ** 2), 0, 0, 0]
+    assert alone(told)["likeness"] == pytest.approx(expected, abs=1e-6)
+    # Who never leaps is paid up to `prompt_s`, and again from the next command on.
+    waits = alone(script("1" * 20 + "000000000" + "1", "0" * 30))["likeness"]
+    assert all(value > 0.0 for value in waits[:16])
+    assert waits[16:29] == [0] * 13
+    assert waits[29] == waits[0]
 
 
 def test_the_next_command_begins_at_its_own_height() -> None:
@@ -521,6 +528,11 @@ def test_times_in_another_order_are_refused() -> None:
         JumpSettings(ready_s=0.4, prompt_s=0.3)
 
 
+def test_a_fall_that_goes_on_beyond_the_lift_off_is_refused() -> None:
+    with pytest.raises(PronkError, match=r"fall_s 0\.3, but prompt_s 0\.28; the fall must be over"):
+        JumpSettings(fall_s=0.3)
+
+
 def test_who_is_ready_may_be_prompt_at_once() -> None:
     asked = JumpSettings(ready_s=8 * DT, prompt_s=8 * DT, late_s=16 * DT)
     for steps, worth in ((4, 0.25), (8, 1.0), (12, 0.75)):
@@ -556,14 +568,13 @@ class Account:
     stood: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, 0.0)] * 4)
     widest: float = 0.0
     brought: float = 0.0
-    steepest: float = 0.0
 
     def step(self, now: Step) -> dict[str, float]:
         s = self.settings
         new = now.jump and not self.told
         if new:
             self.age, self.scores, self.leaps, self.farthest, self.widest = 0, [], 0, 0.0, 0.0
-            self.lead, self.steepest, self.worth = max(now.excess, 0.0), 0.0, 0.0
+            self.lead, self.worth = max(now.excess, 0.0), 0.0
         if now.jump:
             self.settled = 0
         elif self.settled is not None and not now.air:
@@ -583,9 +594,10 @@ class Account:
             if speed > s.leap:
                 paid["hop"] = float(self.leaps > 0)
                 self.leaps += 1
-                steepest = min(now.nose, s.rear)
-                if steepest > self.steepest:
-                    paid["rear"], self.steepest = steepest - self.steepest, steepest
+        paid["likeness"] = 0.0
+        if mode and not self.leaps and self.age * DT <= s.prompt_s:
+            off = (now.speed - self.sinking(self.age * DT)) / s.likeness_width
+            paid["likeness"] = math.exp(-(off**2) / 2)
         low = max(now.height, s.crouch)
         if not mode or new:
             self.highest, self.lowest, self.stroke = now.height, low, 0.0
@@ -612,6 +624,14 @@ class Account:
         self.told, self.was_up, self.speed = now.jump, now.air, now.speed
         return paid
 
+    def sinking(self, age: float) -> float:
+        """Vertical velocity of a countermovement at that time."""
+        s = self.settings
+        if age <= s.fall_s:
+            return -s.fall * age
+        part = (age - s.fall_s) / (s.prompt_s - s.fall_s)
+        return (1.0 - part) * -s.fall * s.fall_s + part * s.liftoff_velocity
+
     def timely(self, age: float) -> float:
         """What a lift-off at that time after the command is worth."""
         s = self.settings
@@ -637,7 +657,6 @@ def scripts(draw: st.DrawFn) -> list[Step]:
     speed = draw(st.lists(st.integers(-96, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     along = draw(st.lists(st.integers(-32, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     excess = draw(st.lists(st.integers(-16, 32).map(lambda i: i / 32), min_size=60, max_size=60))
-    nose = draw(st.lists(st.integers(-32, 32).map(lambda i: i / 64), min_size=60, max_size=60))
     way = draw(st.sampled_from([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)]))
     feet = wander(random.Random(draw(st.integers(0, 2**32 - 1))), way)
     return [
@@ -651,10 +670,9 @@ def scripts(draw: st.DrawFn) -> list[Step]:
             ground=ground,
             feet=points,
             way=way,
-            nose=n,
         )
-        for j, a, h, v, u, e, n, (ground, points) in zip(
-            jump, air, height, speed, along, excess, nose, feet, strict=False
+        for j, a, h, v, u, e, (ground, points) in zip(
+            jump, air, height, speed, along, excess, feet, strict=False
         )
     ]
 
@@ -694,7 +712,7 @@ def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) 
     seen = alone(steps)
     edges = [i for i, now in enumerate(steps) if now.jump and not (i and steps[i - 1].jump)]
     for begin, end in itertools.pairwise([*edges, len(steps)]):
-        gain, rise, reach, gap, rear, hop = (seen[name][begin:end] for name in EVENTS)
+        gain, rise, reach, gap, hop = (seen[name][begin:end] for name in EVENTS)
         assert min(*gain, 0.0) == 0.0
         assert sum(gain) == pytest.approx(max(seen["best"][begin:end]), abs=1e-5)
         assert sum(gain) <= 1.0 + 1e-5
@@ -705,9 +723,6 @@ def test_no_script_is_paid_more_than_one_good_jump_a_command(steps: list[Step]) 
         assert min(*gap, 0.0) == 0.0
         assert sum(gap) == pytest.approx(max(seen["widest"][begin:end]), abs=1e-5)
         assert sum(gap) <= SETTINGS.gap + 1e-5
-        assert min(*rear, 0.0) == 0.0
-        assert sum(rear) == pytest.approx(max(seen["steepest"][begin:end]), abs=1e-5)
-        assert sum(rear) <= SETTINGS.rear + 1e-5
         assert sum(hop) == max(max(seen["liftoffs"][begin:end]) - 1, 0)
 
 

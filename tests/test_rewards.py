@@ -220,7 +220,7 @@ CASES = [
 
 def test_every_term_has_a_case() -> None:
     own = {"termination", "sparse_jump", "rise", "reach", "gap", "hop", "action_rate"}
-    own |= {"stray_foot", "landing", "rear"}
+    own |= {"stray_foot", "landing", "countermovement"}
     assert {case.name for case in CASES} | own == set(ROWS)
 
 
@@ -287,6 +287,16 @@ def test_a_deep_landing_costs_who_has_jumped(env: Any) -> None:
     assert not ROWS["landing"].term(command, height=floor).any()
 
 
+def test_likeness_to_a_countermovement_is_paid_as_a_rate(env: Any) -> None:
+    command = pretend(env)
+    command.tracker.likeness[:] = 0.5
+    assert ROWS["countermovement"].term(command).tolist() == [0.5] * N
+    weighed = replace(ROWS["countermovement"], jump=6.0)
+    reward_sum(env).set_rows({**ROWS, "countermovement": weighed})
+    value = paid(env, "countermovement").tolist()
+    assert value == pytest.approx([3.0 if i == JUMPS else 0.0 for i in range(N)])
+
+
 def test_action_rate_by_hand(env: Any) -> None:
     command = pretend(env)
     env.action_manager.process_action(torch.full((N, 12), 0.5))
@@ -315,7 +325,6 @@ def test_targets_are_what_the_torque_is_asked_for(env: Any) -> None:
         ("rise", "rise", 10.0),
         ("reach", "reach", 6.0),
         ("gap", "gap", 7.0),
-        ("rear", "rear", 2.0),
         ("hop", "hop", -0.5),
     ],
 )
@@ -332,7 +341,7 @@ def test_an_event_is_worth_its_weight_once(
         rise=10.0,
         reach=6.0,
         gap=7.0,
-        rear=2.0,
+        countermovement=2.0,
         hop=0.5,
         collision=5.0,
         knees=3.0,
@@ -476,7 +485,7 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
     assert ROWS["collision"].jump * PAPER_UNIT <= PAPER["collision"][1]
     assert ROWS["orientation"].walk * PAPER_UNIT == pytest.approx(PAPER["orientation"][0])
     assert PAPER["orientation"][1] <= ROWS["orientation"].jump * PAPER_UNIT < 0.0
-    for name in ("dense_jump", "sparse_jump", "rise", "reach", "gap", "rear", "hop"):
+    for name in ("dense_jump", "sparse_jump", "rise", "reach", "gap", "countermovement", "hop"):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
     for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch", "knees"):
         assert ROWS[name].walk < 0.0
@@ -515,14 +524,14 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
         rise=3.0,
         reach=1.5,
         gap=0.75,
-        rear=5.0,
+        countermovement=5.0,
         hop=0.25,
         collision=9.0,
         knees=4.0,
     )
     rows = with_jump_weights(ROWS, weights)
     changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
-    changed |= {"gap": 0.75, "rear": 5.0, "hop": -0.25, "collision": -9.0, "knees": -4.0}
+    changed |= {"gap": 0.75, "countermovement": 5.0, "hop": -0.25, "collision": -9.0, "knees": -4.0}
     assert {name: rows[name].jump for name in changed} == changed
     assert {name: rows[name].walk for name in changed} == {
         name: ROWS[name].walk for name in changed

@@ -147,7 +147,6 @@ def run(
 
     from pronk.train.evaluation.evaluate import evaluate_policy, evaluation_cfg
     from pronk.train.evaluation.run import RANDOMIZATIONS
-    from pronk.train.experiment.kernels import compile_ahead
     from pronk.train.experiment.provenance import device_facts, versions
     from pronk.train.tasks import env_cfg
 
@@ -156,7 +155,6 @@ def run(
     with console.progress() as report, redirect_stdout(io.StringIO()):
         report("building", 0.0)
         cfg = evaluation_cfg(env_cfg(gains=gains, randomization=drawn, seed=plan.seed), plan)
-        compile_ahead(device)
         env = ManagerBasedRlEnv(cfg=cfg, device=device)
         report("building", 1.0)
         about = {

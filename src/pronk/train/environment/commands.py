@@ -25,8 +25,6 @@ from pronk.train.gains import TrainingGains
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-_BACKWARD = -0.5
-"""Told to go faster backwards than this, a robot is not asked to rear up: level it goes as far."""
 NAME = "motion"
 """The command term's name in every environment."""
 
@@ -209,7 +207,6 @@ class MotionCommand(CommandTerm):
             excess=along - speed,
             feet=motion.foot_position,
             direction=self._direction(motion.heading),
-            nose=-motion.gravity[:, 0] * (asked[:, 0] > _BACKWARD),
             dt=self._env.step_dt,
         )
         if not self.scripted:

@@ -50,8 +50,8 @@ class JumpWeights:
     """Per metre of ground newly covered in flight."""
     gap: float
     """Per metre of ground newly cleared by all feet."""
-    rear: float
-    """On the sine of the nose-up pitch at lift-off."""
+    countermovement: float
+    """On likeness to a countermovement from the command to lift-off [1/s]."""
     hop: float
     """Per lift-off after the first."""
     collision: float
@@ -104,7 +104,7 @@ ROWS: Mapping[str, Row] = {
     "rise": Row(rewards.rise, 0.0, 0.0),
     "reach": Row(rewards.reach, 0.0, 0.0),
     "gap": Row(rewards.gap, 0.0, 0.0),
-    "rear": Row(rewards.rear, 0.0, 0.0),
+    "countermovement": Row(rewards.countermovement, 0.0, 0.0),
     "hop": Row(rewards.hop, 0.0, 0.0),
     "action_rate": Row(rewards.action_rate, -0.02, -0.005),
     "roll_pitch_rate": Row(rewards.roll_pitch_rate, -0.02, -0.02),
@@ -138,7 +138,7 @@ def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str
         "rise": weights.rise,
         "reach": weights.reach,
         "gap": weights.gap,
-        "rear": weights.rear,
+        "countermovement": weights.countermovement,
         "hop": -weights.hop,
         "collision": -weights.collision,
         "knees": -weights.knees,

@@ -125,9 +125,12 @@ def gap(command: MotionCommand) -> Tensor:
     return command.per_event(command.tracker.gap)
 
 
-def rear(command: MotionCommand) -> Tensor:
-    """New sine of the nose-up pitch at a lift-off of this command; an event."""
-    return command.per_event(command.tracker.rear)
+def countermovement(command: MotionCommand) -> Tensor:
+    """How alike the vertical velocity is to that of a jump that falls, brakes and pushes, 0 to 1.
+
+    From the command to the first lift-off, see `JumpSettings.countermovement`.
+    """
+    return command.tracker.likeness
 
 
 def hop(command: MotionCommand) -> Tensor:
