@@ -41,8 +41,10 @@ def test_phases_are_the_papers() -> None:
     assert [p.jump_fraction for p in PHASES] == [0.0, 0.5, 0.5]
     assert (walk.weights.dense, walk.weights.sparse) == (0.0, 0.0)
     rest = walk.weights
-    assert (rest.rise, rest.reach, rest.gap, rest.rear, rest.hop) == (0.0,) * 5
-    assert strong.weights.rear > weak.weights.rear == 0.0, "a hint is for who has yet to find out"
+    assert (rest.rise, rest.reach, rest.gap, rest.countermovement, rest.hop) == (0.0,) * 5
+    assert strong.weights.countermovement > weak.weights.countermovement == 0.0, (
+        "a hint is for who has yet to find out"
+    )
     assert weak.weights.dense == pytest.approx(strong.weights.dense / 10)
     assert weak.weights.sparse == strong.weights.sparse > 0.0
     assert strong.weights.width == 1.0, "the paper's expression"
@@ -114,10 +116,11 @@ def test_a_phase_of_no_noise_is_refused(noise: tuple[float, float]) -> None:
         of_noise(*noise)
 
 
-def test_noise_is_limited_in_the_last_phase_alone_and_ends_small() -> None:
+def test_noise_is_limited_where_jumps_are_learned_and_ends_small() -> None:
     """What was found is then done alike every time."""
-    *others, last = PHASES
-    assert [p.noise for p in others] == [None] * len(others)
+    walk, strong, last = PHASES
+    assert walk.noise is None
+    assert {strong.largest_noise(i / 10) for i in range(11)} == {last.largest_noise(0.0)}
     limits = [last.largest_noise(i / 10) for i in range(11)]
     assert limits == sorted(limits, reverse=True)
     assert limits[0] <= 1.0, "the network begins with 1"
@@ -136,7 +139,7 @@ def settled(phase: Phase) -> dict[str, tuple[float, float]]:
         "rise": w.rise,
         "reach": w.reach,
         "gap": w.gap,
-        "rear": w.rear,
+        "countermovement": w.countermovement,
         "hop": -w.hop,
         "collision": -w.collision,
         "knees": -w.knees,
