@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -49,11 +50,13 @@ def test_phases_are_the_papers() -> None:
     assert weak.weights.sparse == strong.weights.sparse > 0.0
     assert strong.weights.width == 1.0, "the paper's expression"
     assert weak.weights.width < strong.weights.width
-    assert strong.weights.collision == rest.collision, (
+    assert weak.weights.collision == strong.weights.collision == rest.collision, (
         "nobody is taught to fear what is yet to be found"
     )
-    assert weak.weights.collision > strong.weights.collision
-    assert weak.weights.knees > strong.weights.knees
+    assert weak.final is not None
+    assert weak.final.collision > weak.weights.collision
+    assert weak.final.knees > weak.weights.knees
+    assert (walk.final, strong.final) == (None, None)
 
 
 def test_tasks_are_made_of_phases() -> None:
@@ -110,6 +113,22 @@ def test_a_phase_without_noise_of_its_own_has_no_limit() -> None:
     assert [free.largest_noise(done) for done in (0.0, 0.5, 1.0)] == [math.inf] * 3
 
 
+def test_weights_go_evenly_to_their_final_ones() -> None:
+    first = PHASES[2].weights
+    last = replace(first, width=0.1, rise=6.0, collision=45.0)
+    made = Phase(name="made up", iterations=4, jump=True, weights=first, final=last)
+    assert made.weights_at(0.0) == first
+    assert made.weights_at(1.0) == last
+    middle = made.weights_at(0.25)
+    assert middle.width == pytest.approx(0.75 * first.width + 0.025)
+    assert middle.rise == pytest.approx(0.75 * first.rise + 1.5)
+    assert middle.collision == pytest.approx(0.75 * first.collision + 11.25)
+    assert replace(middle, width=0, rise=0, collision=0) == replace(
+        first, width=0, rise=0, collision=0
+    )
+    assert PHASES[1].weights_at(0.5) == PHASES[1].weights
+
+
 @pytest.mark.parametrize("noise", [(0.0, 0.2), (0.6, 0.0), (-0.6, 0.2), (0.6, -0.2)])
 def test_a_phase_of_no_noise_is_refused(noise: tuple[float, float]) -> None:
     with pytest.raises(PronkError, match=r"phase made up has noise .*; both must be positive"):
@@ -130,9 +149,9 @@ def test_noise_is_limited_where_jumps_are_learned_and_ends_small() -> None:
 # --- In an environment ----------------------------------------------------------------------------
 
 
-def settled(phase: Phase) -> dict[str, tuple[float, float]]:
+def settled(phase: Phase, done: float = 0.0) -> dict[str, tuple[float, float]]:
     """Weights that a phase should have, from its own numbers."""
-    w = phase.weights
+    w = phase.weights_at(done)
     jump = {
         "dense_jump": -w.dense,
         "sparse_jump": w.sparse,
@@ -159,6 +178,16 @@ def test_a_phase_is_the_same_configured_or_entered(env: Any) -> None:
         for rows in (reward_sum(env).rows, cfg.rewards[TABLE].params["rows"]):
             found = {name: (row.walk, row.jump) for name, row in rows.items()}
             assert found == settled(entered)
+
+
+def test_a_phase_is_entered_where_it_has_come_to(env: Any) -> None:
+    last = PHASES[2]
+    for done in (0.5, 1.0, 0.0):
+        enter_phase(env, last, done)
+        found = {name: (row.walk, row.jump) for name, row in reward_sum(env).rows.items()}
+        assert found == settled(last, done)
+        assert motion_command(env).tracker.width == last.weights_at(done).width
+    assert settled(last, 0.5) != settled(last, 0.0)
 
 
 def test_environment_of_a_phase_begins_in_it() -> None:

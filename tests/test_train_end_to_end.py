@@ -29,7 +29,7 @@ from pronk.train.experiment.run_folder import RunFolder
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 from pronk.train.environment.speed_ranges import grown  # noqa: E402
-from pronk.train.phases import PHASES  # noqa: E402
+from pronk.train.phases import PHASES, enter_phase  # noqa: E402
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 
@@ -207,9 +207,18 @@ def test_the_last_policy_reads_the_jump_input_and_the_first_does_not(uninterrupt
 # --- Interrupted and resumed ---------------------------------------------------------------------
 
 
-def test_stopped_after_every_iteration_it_is_the_same_run(uninterrupted, tmp_path, capsys):
+def test_stopped_after_every_iteration_it_is_the_same_run(
+    uninterrupted, tmp_path, capsys, monkeypatch
+):
     folder = RunFolder(tmp_path / "run")
-    stops, noise = 0, []
+    stops, noise, entered = 0, [], []
+
+    def enter(env, phase, done=0.0):
+        if phase.name == "jump_b":
+            entered.append(done)
+        enter_phase(env, phase, done)
+
+    monkeypatch.setattr("pronk.train.experiment.run.enter_phase", enter)
     words = (*ALL, "--minutes", "1e-9")
     while not folder.provenance.exists() or not provenance(folder)["finished"]:
         assert train(*words, "--out", folder.path) == 0
@@ -219,11 +228,13 @@ def test_stopped_after_every_iteration_it_is_the_same_run(uninterrupted, tmp_pat
         noise.append(largest_noise(checkpoint.latest(folder.checkpoints)))
         assert stops <= 5
     assert stops == 5
-    # The network begins with 1. Phases without a limit leave it about there; the last one's is
-    # below that after the first of its two iterations, and lower after the second.
-    limits = [PHASES[-1].largest_noise(done) for done in (0.5, 1.0)]
-    assert min(noise[:3]) > 0.9 > limits[0] > limits[1]
-    assert noise[3:] == pytest.approx(limits, rel=1e-6)
+    # The network begins with 1, and walking has no limit; the last phase's is lower after the
+    # second of its two iterations than after the first.
+    limits = [PHASES[1].largest_noise(1.0), *(PHASES[2].largest_noise(d) for d in (0.5, 1.0))]
+    assert min(noise[:2]) > 0.9 > limits[0] > limits[1] > limits[2]
+    assert noise[2:] == pytest.approx(limits, rel=1e-6)
+    # Its weights go on from where they were: it begins, half is over; it is resumed, all is over.
+    assert entered == [0.0, 0.0, 0.5, 0.5, 0.5, 1.0]
     shown = capsys.readouterr().out
     assert "minutes are over" in shown
     assert f"pronk train all --resume --out {folder.path}" in shown

@@ -115,16 +115,19 @@ class _Run:
         runner: PhaseRunner | None = None
         for phase in self.phases[first:]:
             fresh = runner is None and last is None
-            enter_phase(self.env.unwrapped, phase)
             if runner is None and last is not None:
+                # A checkpoint is of one configuration, which changes within a phase.
+                done = self._part_of(phase, checkpoint.about(last)["iteration"])
+                enter_phase(self.env.unwrapped, phase, done)
                 runner = self._runner(phase)
                 runner.load(last)
             else:
+                enter_phase(self.env.unwrapped, phase)
                 runner = self._successor(runner, phase)
             end = self._end_of(phase)
             left = end - runner.current_learning_iteration
             if left > 0:
-                self._limit_noise(runner, phase)
+                self._go_on(runner, phase)
                 runner.learn(
                     left,
                     init_at_random_ep_len=fresh,
@@ -250,12 +253,19 @@ class _Run:
         """Iterations of the run when the phase is over."""
         return sum(p.iterations for p in self.phases[: self._index(phase) + 1])
 
-    def _limit_noise(self, runner: PronkRunner, phase: Phase) -> None:
-        left = self._end_of(phase) - runner.current_learning_iteration
-        runner.alg.get_policy().limit_noise(phase.largest_noise(1.0 - left / phase.iterations))
+    def _part_of(self, phase: Phase, iteration: int) -> float:
+        """Part of a phase that is over after so many iterations of the run."""
+        return 1.0 - (self._end_of(phase) - iteration) / phase.iterations
+
+    def _go_on(self, runner: PronkRunner, phase: Phase) -> None:
+        """Set what changes within a phase, which the iteration alone decides."""
+        done = self._part_of(phase, runner.current_learning_iteration)
+        runner.alg.get_policy().limit_noise(phase.largest_noise(done))
+        if phase.final is not None:
+            enter_phase(self.env.unwrapped, phase, done)
 
     def _after_iteration(self, runner: PronkRunner, phase: Phase) -> None:
-        self._limit_noise(runner, phase)
+        self._go_on(runner, phase)
         minutes = self.watch.minutes
         if minutes is not None and time.monotonic() - self.begin > 60.0 * minutes:
             runner.stop(f"{minutes:g} minutes are over")
