@@ -345,6 +345,7 @@ def test_an_event_is_worth_its_weight_once(
         hop=0.5,
         collision=5.0,
         knees=3.0,
+        landing=0.0,
     )
     enter_phase(env, Phase(name="made up", iterations=1, jump=True, weights=weights))
     getattr(command.tracker, event)[:] = 0.0
@@ -485,7 +486,16 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
     assert ROWS["collision"].jump * PAPER_UNIT <= PAPER["collision"][1]
     assert ROWS["orientation"].walk * PAPER_UNIT == pytest.approx(PAPER["orientation"][0])
     assert PAPER["orientation"][1] <= ROWS["orientation"].jump * PAPER_UNIT < 0.0
-    for name in ("dense_jump", "sparse_jump", "rise", "reach", "gap", "countermovement", "hop"):
+    for name in (
+        "dense_jump",
+        "sparse_jump",
+        "rise",
+        "reach",
+        "gap",
+        "countermovement",
+        "hop",
+        "landing",
+    ):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
     for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch", "knees"):
         assert ROWS[name].walk < 0.0
@@ -528,10 +538,18 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
         hop=0.25,
         collision=9.0,
         knees=4.0,
+        landing=7.0,
     )
     rows = with_jump_weights(ROWS, weights)
     changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
-    changed |= {"gap": 0.75, "countermovement": 5.0, "hop": -0.25, "collision": -9.0, "knees": -4.0}
+    changed |= {
+        "gap": 0.75,
+        "countermovement": 5.0,
+        "hop": -0.25,
+        "collision": -9.0,
+        "knees": -4.0,
+        "landing": -7.0,
+    }
     assert {name: rows[name].jump for name in changed} == changed
     assert {name: rows[name].walk for name in changed} == {
         name: ROWS[name].walk for name in changed

@@ -58,6 +58,8 @@ class JumpWeights:
     """Per part other than a foot on the ground in jump mode [1/s]."""
     knees: float
     """On knees near the ground in jump mode [1/s]."""
+    landing: float
+    """On how deep a jump is landed [1/(m s)]."""
 
 
 ROWS: Mapping[str, Row] = {
@@ -77,8 +79,8 @@ ROWS: Mapping[str, Row] = {
     # Paper -0.2 | -0.2, which is -0.01 here: a trot changes its torques by 5 N m a step and
     # joint and would pay 3 of the 5.5 that tracking can earn. A fiftieth, jumping a hundredth.
     "smoothness": Row(rewards.smoothness, -0.0002, -0.0001),
-    # Paper -20 | -120, -6 here. A third: what leaps highest and furthest rears up by .3 rad.
-    "orientation": Row(rewards.orientation, -1.0, -2.0),
+    # Paper -20 | -120, -6 here. A sixth: what leaps highest and furthest rears up by .3 rad.
+    "orientation": Row(rewards.orientation, -1.0, -1.0),
     # Paper -50 | -50. Twice as much: at -2.5 a policy set a knee down whenever it stopped. While it
     # has to find out how to jump, more would teach it not to; then a phase asks for more.
     "collision": Row(rewards.collision, -5.0, -5.0),
@@ -115,7 +117,7 @@ ROWS: Mapping[str, Row] = {
     # Stopping from -2 m/s, a policy came down on a hind knee. Its skin is 2 cm below its axis.
     "knees": Row(rewards.knees, -3.0, -3.0, {"height": 0.06}),
     # Jumps alike to 7 mm in the air differed by 25 mm in how deep they landed, .16 to .23 m.
-    "landing": Row(rewards.landing, 0.0, -100.0, {"height": 0.22}),
+    "landing": Row(rewards.landing, 0.0, 0.0, {"height": 0.22}),
     # A policy trotted on in the air and came down on one foot: 40 ms early, thighs on the ground.
     "stray_foot": Row(rewards.stray_foot, 0.0, -30.0),
 }
@@ -142,6 +144,7 @@ def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str
         "hop": -weights.hop,
         "collision": -weights.collision,
         "knees": -weights.knees,
+        "landing": -weights.landing,
     }
     if missing := sorted(set(changed) - set(rows)):
         raise PronkError(f"the reward table has no {', '.join(missing)}.")
