@@ -110,6 +110,7 @@ _WEAK = JumpWeights(
     knees=3.0,
     landing=0.0,
 )
+"""Of 2b, as it begins."""
 PHASES: tuple[Phase, ...] = (
     Phase(name="walk", iterations=300, jump=False),
     # Jumping has to be found, and a countermovement at once: policies that had learned to push
