@@ -371,19 +371,16 @@ def test_what_the_tracker_is_told_of_speed(
     np.testing.assert_allclose(found, [[along] * N, [excess] * N, [miss] * N], atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("forward", "pitch", "nose"),
-    [(1.0, -0.3, 0.3), (0.0, -0.3, 0.3), (1.0, 0.3, -0.3), (-0.4, -0.3, 0.3), (-2.0, -0.3, 0.0)],
-)
-def test_the_fore_legs_leave_first_unless_it_goes_backwards(
+@pytest.mark.parametrize("forward", [1.0, -0.4, -2.0])
+@pytest.mark.parametrize("pitch", [-0.3, 0.3])
+def test_going_up_is_no_way(
     env: Any,
     command: MotionCommand,
     monkeypatch: pytest.MonkeyPatch,
     forward: float,
     pitch: float,
-    nose: float,
 ) -> None:
-    """A trunk that pitches moves ahead as far as it does: what goes up is no way."""
+    """A trunk that pitches moves ahead as far as it does."""
     told: dict[str, torch.Tensor] = {}
     monkeypatch.setattr(command.tracker, "advance", lambda **given: told.update(given))
     monkeypatch.setattr(command, "_motion_step", -1)
@@ -391,10 +388,8 @@ def test_the_fore_legs_leave_first_unless_it_goes_backwards(
     env.sim.data.qvel[:, :3] = torch.tensor([1.0, 0.0, 2.5])
     command.velocity[:] = torch.tensor([forward, 0.0, 0.0])
     _ = command.motion
-    np.testing.assert_allclose(told["nose"], [math.sin(nose)] * N, atol=1e-5)
-    if forward:
-        along = torch.tensor(forward).sign() * 1.0
-        np.testing.assert_allclose(told["along"], [along] * N, atol=1e-5)
+    along = 1.0 if forward > 0.0 else -1.0
+    np.testing.assert_allclose(told["along"], [along] * N, atol=1e-5)
 
 
 def test_a_robot_set_down_beyond_a_gap_has_cleared_it(env: Any, command: MotionCommand) -> None:
