@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -68,7 +69,8 @@ def save(path: Path, schema: str, where: Origin, body: Mapping[str, Any]) -> Pat
     return path
 
 
-def load(path: Path, schema: str, *, writer: str) -> tuple[Origin, dict[str, Any]]:
+@contextmanager
+def load(path: Path, schema: str, *, writer: str) -> Iterator[tuple[Origin, dict[str, Any]]]:
     """Read a sheet: its origin and the whole of it.
 
     Args:
@@ -77,7 +79,7 @@ def load(path: Path, schema: str, *, writer: str) -> tuple[Origin, dict[str, Any
         writer: The command that writes one, for errors.
 
     Raises:
-        ArtefactError: Missing, damaged or of another schema.
+        ArtefactError: Missing, damaged or of another schema, also where the block finds so.
     """
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
@@ -91,16 +93,11 @@ def load(path: Path, schema: str, *, writer: str) -> tuple[Origin, dict[str, Any
     try:
         told = dict(body["origin"])
         told["subjects"] = tuple(Subject(**entry) for entry in told["subjects"])
-        return entry_of(Origin, told), body
-    except (KeyError, TypeError, ValueError) as error:
-        raise damaged(path, writer, error) from error
-
-
-def damaged(path: Path, writer: str, error: Exception) -> ArtefactError:
-    """The error of a sheet whose entries are not what they should be."""
-    return ArtefactError(
-        f"{path}: damaged ({type(error).__name__}: {error}); `{writer}` writes it anew."
-    )
+        yield entry_of(Origin, told), body
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ArtefactError(
+            f"{path}: damaged ({type(error).__name__}: {error}); `{writer}` writes it anew."
+        ) from error
 
 
 def entry_of(kind: type[T], entry: Mapping[str, Any]) -> T:

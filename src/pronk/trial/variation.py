@@ -338,9 +338,7 @@ def load(folder: Path) -> Variation:
     Raises:
         ArtefactError: Missing, damaged or of another schema.
     """
-    path = folder / FILE
-    where, told = sheet.load(path, SCHEMA, writer=WRITER)
-    try:
+    with sheet.load(folder / FILE, SCHEMA, writer=WRITER) as (where, told):
         return Variation(
             origin=where,
             cases=tuple(sheet.entry_of(Case, entry) for entry in told["cases"]),
@@ -348,5 +346,3 @@ def load(folder: Path) -> Variation:
             own={name: float(value) for name, value in told["own"].items()},
             rows=tuple(sheet.entry_of(Varied, entry) for entry in told["rows"]),
         )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise sheet.damaged(path, WRITER, error) from error

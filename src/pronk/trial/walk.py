@@ -201,10 +201,8 @@ def load(folder: Path) -> Walks:
     Raises:
         ArtefactError: Missing, damaged or of another schema.
     """
-    path = folder / FILE
-    where, told = sheet.load(path, SCHEMA, writer=WRITER)
     names = [entry.name for entry in fields(WalkFigures)]
-    try:
+    with sheet.load(folder / FILE, SCHEMA, writer=WRITER) as (where, told):
         return Walks(
             origin=where,
             cases=tuple(sheet.entry_of(Case, entry) for entry in told["cases"]),
@@ -217,5 +215,3 @@ def load(folder: Path) -> Walks:
                 for entry in told["rows"]
             ),
         )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise sheet.damaged(path, WRITER, error) from error

@@ -161,9 +161,7 @@ def load(folder: Path) -> Crossings:
     Raises:
         ArtefactError: Missing, damaged or of another schema.
     """
-    path = folder / FILE
-    where, told = sheet.load(path, SCHEMA, writer=WRITER)
-    try:
+    with sheet.load(folder / FILE, SCHEMA, writer=WRITER) as (where, told):
         return Crossings(
             origin=where,
             cases=tuple(sheet.entry_of(Case, entry) for entry in told["cases"]),
@@ -172,5 +170,3 @@ def load(folder: Path) -> Crossings:
             enough=told["enough"],
             rows=tuple(sheet.entry_of(Crossing, entry) for entry in told["rows"]),
         )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise sheet.damaged(path, WRITER, error) from error

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pronk.errors import ArtefactError, PronkError
+from pronk.errors import PronkError
 from pronk.files import sha256
 from pronk.hardware.truth import Truth, load_truth
 from pronk.match import gains as gains_file
@@ -309,15 +309,9 @@ def load(folder: Path) -> Bodies:
     Raises:
         ArtefactError: A file is missing, damaged or of another schema.
     """
-    path = folder / FILE
-    where, told = sheet.load(path, SCHEMA, writer=WRITER)
-    try:
+    with sheet.load(folder / FILE, SCHEMA, writer=WRITER) as (where, told):
         bodies = tuple(_body(folder, entry) for entry in told["bodies"])
         return Bodies(origin=where, bodies=bodies, tolerances=told["tolerances"])
-    except ArtefactError:
-        raise
-    except (KeyError, TypeError, AttributeError) as error:
-        raise sheet.damaged(path, WRITER, error) from error
 
 
 def _body(folder: Path, entry: Mapping[str, Any]) -> Body:
