@@ -141,7 +141,7 @@ PHASES: tuple[Phase, ...] = (
     # jump, it might teach that there be none.
     Phase(
         name="jump_b",
-        iterations=710,
+        iterations=650,
         jump=True,
         weights=_WEAK,
         final=replace(_WEAK, width=0.25, collision=60.0, knees=40.0, landing=100.0),
