@@ -40,6 +40,14 @@ def noisy() -> Any:
     )
 
 
+@cache
+def drawn() -> Any:
+    """Everything drawn, as in training."""
+    from pronk.train.environment.randomization import Randomization
+
+    return _built(Randomization.paper())
+
+
 def fresh(env: Any) -> Any:
     """The environment as it was when built: first phase, first step, nominal rate, seed 0."""
     from pronk.train.environment.commands import motion_command

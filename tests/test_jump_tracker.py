@@ -483,6 +483,10 @@ def test_likeness_is_paid_from_the_command_to_the_first_leap() -> None:
     told = script("0011111111", "0000110110", {**speed, 4: asked[2] - 0.5, 6: 2.0, 7: 2.0})
     expected = [0, 0, 1, 1, math.exp(-0.5), 1, math.exp(-2 * (2.0 - asked[4]) ** 2), 0, 0, 0]
     assert alone(told)["likeness"] == pytest.approx(expected, abs=1e-6)
+    slow = [replace(step, excess=-0.5) for step in told]
+    assert alone(slow)["likeness"][2] == pytest.approx(math.exp(-0.5), abs=1e-6)
+    fast = [replace(step, excess=0.5) for step in told]
+    assert alone(fast)["likeness"] == alone(told)["likeness"]
     # Who never leaps is paid up to `prompt_s`, and again from the next command on.
     waits = alone(script("1" * 20 + "000000000" + "1", "0" * 30))["likeness"]
     assert all(value > 0.0 for value in waits[:16])
@@ -529,7 +533,7 @@ def test_times_in_another_order_are_refused() -> None:
 
 
 def test_a_fall_that_goes_on_beyond_the_lift_off_is_refused() -> None:
-    with pytest.raises(PronkError, match=r"fall_s 0\.3, but prompt_s 0\.28; the fall must be over"):
+    with pytest.raises(PronkError, match=r"fall_s 0\.3, but prompt_s 0\.26; the fall must be over"):
         JumpSettings(fall_s=0.3)
 
 
@@ -597,7 +601,8 @@ class Account:
         paid["likeness"] = 0.0
         if mode and not self.leaps and self.age * DT <= s.prompt_s:
             off = (now.speed - self.sinking(self.age * DT)) / s.likeness_width
-            paid["likeness"] = math.exp(-(off**2) / 2)
+            late = min(now.excess, 0.0) / s.likeness_width
+            paid["likeness"] = math.exp(-(off**2 + late**2) / 2)
         low = max(now.height, s.crouch)
         if not mode or new:
             self.highest, self.lowest, self.stroke = now.height, low, 0.0

@@ -22,6 +22,7 @@ from pronk.policy import layout  # noqa: E402
 from pronk.robots import load_robot  # noqa: E402
 from pronk.robots.mini_cheetah import constants as c  # noqa: E402
 from pronk.train.environment.commands import motion_command  # noqa: E402
+from pronk.train.environment.draws import draws  # noqa: E402
 from pronk.train.environment.observations import CRITIC, CRITIC_JUMP  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -284,10 +285,44 @@ def test_parts_of_the_critic(env: Any) -> None:
         "foot_contact": everything["target"][:, :4],
         "foot_force": force / (12.0 * 9.81),
         "foot_height": foot_heights(env, qpos),
+        # Nothing is drawn here; tests/test_randomization.py has what is.
+        "voltage": 1.0,
+        "no_load": 1.0,
+        "drop": 0.0,
+        "friction": env.sim.mj_model.geom("robot/FR_foot_collision").friction[0],
+        "base_mass": c.TRUNK.mass,
+        "delay": 0.0,
+        "shank_length": c.SHANK_LENGTH,
+        "stiffness": 17.0,
+        "damping": 0.4,
     }
     assert list(expected) == list(CRITIC)
     for name, value in expected.items():
         close(part(seen, CRITIC, name), value)
+
+
+def test_the_critic_knows_what_was_drawn() -> None:
+    """Stiffness and damping by kind of joint, and of each kind by leg."""
+    env = small_env.drawn()
+    seen = env.step(torch.rand(N, 12) - 0.5)[0]["critic"]
+    found = draws(env)
+    by_kind = [leg * 3 + joint for joint in range(3) for leg in range(4)]
+    expected = {
+        "no_load": found["no_load"][:, None],
+        "drop": 1e3 * found["drop"][:, None],
+        "friction": found["friction"][:, None],
+        "base_mass": found["base_mass"][:, None],
+        "delay": found["delay"][:, None],
+        "shank_length": found["shank_length"],
+        "stiffness": found["stiffness"][:, by_kind],
+        "damping": found["damping"][:, by_kind],
+    }
+    for name, value in expected.items():
+        close(part(seen, CRITIC, name), value)
+        assert name == "delay" or value.std() > 0.0
+    left = part(seen, CRITIC, "voltage")
+    assert torch.all(left < part(seen, CRITIC, "no_load")), "drives draw a current"
+    assert torch.all(left > 0.5)
 
 
 def foot_heights(env: Any, qpos: Array) -> Array:
@@ -320,7 +355,9 @@ def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
     tracker.mode[:] = torch.arange(N) < 3
     tracker.since[:] = torch.arange(N) * 0.02
     tracker.airborne[:] = torch.arange(N) == 1
-    tracker.best[:] = torch.arange(N) / N
+    names = ("best", "stroke", "worth", "lead", "flown", "farthest")
+    for i, name in enumerate(names):
+        getattr(tracker, name)[:] = torch.arange(N) / N + i
     seen = observe(env)
     close(seen["jump"][:, 0], [1.0, 0.0] * (N // 2))
     expected = {
@@ -328,7 +365,7 @@ def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
         "mode": [1.0] * 3 + [0.0] * (N - 3),
         "since": np.arange(N) * 0.02,
         "airborne": [0.0, 1.0] + [0.0] * (N - 2),
-        "best": np.arange(N) / N,
+        **{name: np.arange(N) / N + i for i, name in enumerate(names)},
     }
     assert list(expected) == list(CRITIC_JUMP)
     for name, value in expected.items():

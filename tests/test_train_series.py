@@ -17,13 +17,12 @@ def tool() -> Any:
     return load_tool("train_series")
 
 
-def finished(out: Path, name: str, passed: dict[str, int], source: str) -> None:
-    """A run that passes so many of four bars in each evaluation."""
+def finished(out: Path, name: str, passed: int, source: str) -> None:
+    """A run that passes so many of four bars in its trial."""
     run = out / name
     run.mkdir()
-    for kind, count in passed.items():
-        checks = [{"passed": i < count} for i in range(4)]
-        (run / f"{kind}.json").write_text(json.dumps({"checks": checks}))
+    checks = [{"passed": i < passed} for i in range(4)]
+    (run / "trial.json").write_text(json.dumps({"checks": checks}))
     (run / "source").write_text(source)
     (run / "policy.onnx").write_bytes(b"network")
     (run / "model_50.pt").write_bytes(b"state")
@@ -42,15 +41,15 @@ def test_what_is_no_job_is_refused(tool: Any, text: str) -> None:
         tool.Job.parse(text)
 
 
-def test_the_best_passes_most_bars_of_evaluations_and_trial(tool: Any, tmp_path: Path) -> None:
-    finished(tmp_path, "a", {"full": 3, "noise": 1}, "/a")
-    finished(tmp_path, "b", {"full": 1, "trial": 4}, "/b")
-    finished(tmp_path, "c", {"full": 4}, "/c")
+def test_the_best_passes_most_bars_of_its_trial(tool: Any, tmp_path: Path) -> None:
+    finished(tmp_path, "a", 2, "/a")
+    finished(tmp_path, "b", 3, "/b")
+    finished(tmp_path, "c", 2, "/c")
     (tmp_path / "d.failed").write_text("out of memory")
     assert tool.best(tmp_path, ["a", "b", "c", "d"]) == "/b"
     assert tool.best(tmp_path, ["a", "c"]) == "/a", "the first of equals"
     said = (tmp_path / "best-of-a-b-c-d.txt").read_text()
-    assert said == "b {'a': 4, 'b': 5, 'c': 4, 'd': 0}\n"
+    assert said == "b {'a': 2, 'b': 3, 'c': 2, 'd': 0}\n"
 
 
 def test_a_run_under_way_is_waited_for(tool: Any, tmp_path: Path) -> None:
@@ -62,8 +61,8 @@ def test_a_run_under_way_is_waited_for(tool: Any, tmp_path: Path) -> None:
 
 
 def test_policies_figures_and_curves_are_kept(tool: Any, tmp_path: Path) -> None:
-    finished(tmp_path, "a", {"full": 3}, "/a")
+    finished(tmp_path, "a", 3, "/a")
     tool.keep(tmp_path / "a", tmp_path / "kept.tgz")
     with tarfile.open(tmp_path / "kept.tgz") as archive:
-        assert sorted(archive.getnames()) == ["a/full.json", "a/policy.onnx", "a/source"]
+        assert sorted(archive.getnames()) == ["a/policy.onnx", "a/source", "a/trial.json"]
     assert not (tmp_path / "kept.aside").exists()

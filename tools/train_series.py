@@ -1,7 +1,7 @@
 r"""Train several policies one after another on one GPU, unattended; start one series for each GPU.
 
-    python tools/train_series.py OUT --gpu 0 --evaluate m1:1:matched n1:1:naive
-    python tools/train_series.py OUT --gpu 1 --evaluate v1:1:matched:/elsewhere/src \
+    python tools/train_series.py OUT --gpu 0 --trial m1:1:matched n1:1:naive
+    python tools/train_series.py OUT --gpu 1 --trial v1:1:matched:/elsewhere/src \
         m2:2:matched:best=m1,v1
 
 A job is NAME:SEED:GAINS[:SOURCE]. GAINS are `matched` (--gains) or `naive` with their ranges and
@@ -9,8 +9,7 @@ delay; SOURCE is the src folder of another checkout, a variant of what is here. 
 the job waits for those runs, of any series with the same OUT, and takes the source of the one that
 passes most bars; so waits what comes after it.
 
-A job leaves OUT/NAME.tgz: both policies, settings, provenance, curves, and with --evaluate the
-figures of `pronk evaluate --what jump`, everything randomized and of one nominal robot, and those
+A job leaves OUT/NAME.tgz: both policies, settings, provenance, curves, and with --trial the figures
 of `pronk trial`. One that fails leaves OUT/NAME.failed, and the next begins. All of a run stays in
 OUT/NAME.
 """
@@ -28,8 +27,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-FIGURES = ("full.json", "noise.json", "trial.json")
-KEPT = ("*.onnx", "config.yaml", "provenance.json", *FIGURES, "events.*", "source")
+FIGURES = "trial.json"
+KEPT = ("*.onnx", "config.yaml", "provenance.json", FIGURES, "events.*", "source")
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,7 @@ def main() -> None:
     parser.add_argument("--gpu", default="0", help="What CUDA_VISIBLE_DEVICES shall say.")
     parser.add_argument("--gains", type=Path, default=ROOT / "policies/gains.yaml")
     parser.add_argument("--task", choices=("all", "together"), default="all")
-    parser.add_argument("--evaluate", action="store_true", help="Evaluate every policy as well.")
-    parser.add_argument("--robots", default="300", help="For each command of an evaluation.")
+    parser.add_argument("--trial", action="store_true", help="Try every policy as well.")
     parser.add_argument("--options", default="", help='More for `pronk train`, as in "--envs 64".')
     asked = parser.parse_args()
     try:
@@ -82,25 +80,15 @@ def main() -> None:
 
 
 def train(job: Job, asked: argparse.Namespace) -> None:
-    """One training, and its evaluations, all at once, if asked for."""
+    """One training, and its trial if asked for."""
     run, log = asked.out / job.name, asked.out / f"{job.name}.log"
     policy, gains = str(run / "policy.onnx"), str(asked.gains.resolve())
     drives = ["--gains", gains] if job.gains == "matched" else ["--gains", "naive", "--like", gains]
     training = ["train", asked.task, *drives, "--seed", job.seed, "--out", str(run)]
-    done = all_well([[*training, *asked.options.split()]], job, asked, log)
-    if done and asked.evaluate:
-        figures = ["evaluate", policy, *drives, "--what", "jump", "--robots", asked.robots]
-        trial = ["trial", policy, "--no-video", "--out", str(run / "trial")]
-        done = all_well(
-            [
-                [*figures, "--randomization", "full", "--out", str(run / "full.json")],
-                [*figures, "--randomization", "noise", "--out", str(run / "noise.json")],
-                [*trial, "--json", str(run / "trial.json")],
-            ],
-            job,
-            asked,
-            log,
-        )
+    done = pronk([*training, *asked.options.split()], job, asked, log)
+    if done and asked.trial:
+        words = ["trial", policy, "--no-video", "--out", str(run / "trial")]
+        done = pronk([*words, "--json", str(run / FIGURES)], job, asked, log)
     if (run / "policy.onnx").is_file():
         (run / "source").write_text(job.source)
         keep(run, asked.out / f"{job.name}.tgz")
@@ -108,8 +96,8 @@ def train(job: Job, asked: argparse.Namespace) -> None:
         log.rename(log.with_suffix(".failed"))
 
 
-def all_well(commands: list[list[str]], job: Job, asked: argparse.Namespace, log: Path) -> bool:
-    """Run commands of pronk side by side; whether none failed."""
+def pronk(words: list[str], job: Job, asked: argparse.Namespace, log: Path) -> bool:
+    """Run a command of pronk; whether it did not fail."""
     environment = {
         **os.environ,
         "CUDA_VISIBLE_DEVICES": asked.gpu,
@@ -117,18 +105,9 @@ def all_well(commands: list[list[str]], job: Job, asked: argparse.Namespace, log
     }
     with log.open("a") as file:
         # The working folder is first on the path of `python -m`; it must not be a src folder.
-        running = [
-            subprocess.Popen(
-                [sys.executable, "-m", "pronk.cli", *words],
-                env=environment,
-                stdout=file,
-                stderr=file,
-                cwd=asked.out,
-            )
-            for words in commands
-        ]
-        codes = [one.wait() for one in running]
-    return not any(codes)
+        command = [sys.executable, "-m", "pronk.cli", *words]
+        done = subprocess.run(command, env=environment, stdout=file, stderr=file, cwd=asked.out)
+    return done.returncode == 0
 
 
 def keep(run: Path, path: Path) -> None:
@@ -157,10 +136,10 @@ def over(out: Path, name: str) -> bool:
 
 
 def bars(run: Path) -> int:
-    """Bars that a run passes in all of its evaluations and its trial."""
-    files = [run / name for name in FIGURES]
-    found = [json.loads(file.read_text())["checks"] for file in files if file.is_file()]
-    return sum(check["passed"] for checks in found for check in checks)
+    """Bars that a run passes in its trial."""
+    file = run / FIGURES
+    checks = json.loads(file.read_text())["checks"] if file.is_file() else []
+    return sum(check["passed"] for check in checks)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from torch import Tensor
 from pronk.robots.robot import Robot
 from pronk.train.environment.jump import JumpSettings, JumpTracker
 from pronk.train.environment.motion import Motion, measure_motion
-from pronk.train.environment.scene import FEET
+from pronk.train.environment.scene import FEET, FOOT_GEOMS
 from pronk.train.environment.speed_ranges import Growth, SpeedRanges
 from pronk.train.gains import TrainingGains
 
@@ -130,6 +130,9 @@ class MotionCommand(CommandTerm):
         feet, _ = env.scene["robot"].find_sites(FEET, preserve_order=True)
         self.feet: Tensor = env.scene["robot"].indexing.site_ids[feet].long()
         """The foot sites' ids in the model. (4,)"""
+        geoms, _ = env.scene["robot"].find_geoms(FOOT_GEOMS, preserve_order=True)
+        self.foot_geoms: Tensor = env.scene["robot"].indexing.geom_ids[geoms].long()
+        """Ids of the feet themselves. (4,)"""
         self._motion: Motion | None = None
         self._motion_step = -1
 

@@ -27,7 +27,7 @@ class JumpSettings:
 
     liftoff_velocity: float = 2.5
     """Desired vertical velocity of the trunk at lift-off [m/s] (paper, section IV)."""
-    prompt_s: float = 0.28
+    prompt_s: float = 0.26
     """A lift-off up to this long after the command is worth the full reward [s], and so are the
     ground and the gap that its flight covers."""
     ready_s: float = 0.24
@@ -35,8 +35,9 @@ class JumpSettings:
     it [s]: a push at once takes a power that batteries do not have. It has to be so from the first
     jump on: policies that had learned to jump after .10 s never waited, whatever they were paid.
     """
-    late_s: float = 0.25
-    """Beyond that its worth falls linearly to zero over this time [s]."""
+    late_s: float = 0.12
+    """Beyond that its worth falls linearly to zero over this time [s]. Over .25 s three of three
+    policies came to lift off after .31 s: a deeper fall, a higher jump, and not as far."""
     leap: float = 1.0
     """A lift-off slower than this is a stride: no hop, and not the end of the crouch [m/s]."""
     settle_s: float = 0.3
@@ -151,8 +152,8 @@ class JumpTracker:
         self.gap = zeros()
         """What `widest` gained in the last step [m]."""
         self.likeness = zeros()
-        """How alike `vertical` is to a countermovement's, 0 to 1; 0 from the first lift-off or
-        `prompt_s` on."""
+        """How alike the velocity is to a countermovement's at no less than the speed told, 0 to 1;
+        0 from the first lift-off or `prompt_s` on."""
         self.hop = zeros()
         """1 where the last step was a lift-off after the first of its command."""
 
@@ -226,7 +227,9 @@ class JumpTracker:
         self.hop = leap * (liftoffs > 0.0)
         self.liftoffs = liftoffs + leap
         before = self.mode & (self.liftoffs == 0.0) & (self.since <= s.prompt_s)
+        # A fall that ends in a stop is none: it shall go on as fast as it is told to.
         off = (vertical - s.countermovement(self.since)).square()
+        off = off + excess.clamp_max(0.0).square()
         self.likeness = torch.exp(off * (-0.5 / s.likeness_width**2)) * before
 
         # A crouch counts: the way over which the legs push is what a battery's power is short of.

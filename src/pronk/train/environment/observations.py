@@ -14,6 +14,7 @@ from mjlab.utils.noise import UniformNoiseCfg
 from torch import Tensor
 
 from pronk.policy.layout import ACTIONS, HISTORY
+from pronk.train.environment.actions import HeldJointPosition
 from pronk.train.environment.commands import motion_command
 
 if TYPE_CHECKING:
@@ -33,10 +34,31 @@ CRITIC = {
     "foot_contact": 4,
     "foot_force": 4,
     "foot_height": 4,
+    "voltage": 1,
+    "no_load": 1,
+    "drop": 1,
+    "friction": 1,
+    "base_mass": 1,
+    "delay": 1,
+    "shank_length": 4,
+    "stiffness": 12,
+    "damping": 12,
 }
-"""Parts of the critic's vector, in order, and their sizes."""
+"""Parts of the critic's vector, in order, and their sizes. What was drawn for a robot is among
+them: how high it jumps is its battery's, and to a critic that does not know would be luck."""
 
-CRITIC_JUMP = {"jump": 1, "mode": 1, "since": 1, "airborne": 1, "best": 1}
+CRITIC_JUMP = {
+    "jump": 1,
+    "mode": 1,
+    "since": 1,
+    "airborne": 1,
+    "best": 1,
+    "stroke": 1,
+    "worth": 1,
+    "lead": 1,
+    "flown": 1,
+    "farthest": 1,
+}
 """Parts of what the critic reads of a jump, from phase 2 on."""
 
 _BODY_WEIGHT = 12.0 * 9.81
@@ -85,7 +107,7 @@ def target(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def critic(env: ManagerBasedRlEnv) -> Tensor:
-    """The parts of `CRITIC`. (N, 61)."""
+    """The parts of `CRITIC`. (N, 95)."""
     robot = env.scene["robot"].data
     ground = env.scene["feet"].data
     feet = motion_command(env).feet
@@ -102,13 +124,40 @@ def critic(env: ManagerBasedRlEnv) -> Tensor:
             (ground.found > 0).float(),
             torch.linalg.vector_norm(ground.force, dim=-1) / _BODY_WEIGHT,
             robot.data.site_xpos[:, feet, 2],
+            *body(env),
         ],
         dim=-1,
     )
 
 
+def body(env: ManagerBasedRlEnv) -> list[Tensor]:
+    """The parts of `CRITIC` that were drawn for each robot, in order. (N, size) each.
+
+    As `pronk.train.environment.draws.draws` has them, but stiffness and damping by kind of joint,
+    and of each kind by leg, and `drop` in 1/kW: what is normalised must not be much smaller than 1.
+    `voltage` is what is left of the battery's, over the rated one.
+    """
+    model, held = env.sim.model, env.action_manager.get_term("joint_position")
+    assert isinstance(held, HeldJointPosition)
+    feet, supply = motion_command(env).foot_geoms, held.supply
+    drives = env.scene["robot"].actuators
+    parts = [
+        supply.voltage,
+        supply.no_load,
+        1e3 * supply.drop,
+        model.geom_friction[:, feet[:1], 0],
+        model.body_mass[:, env.scene["robot"].indexing.body_ids[:1]],
+        held.lag,
+        -model.geom_pos[:, feet, 2],
+        *(drive.stiffness for drive in drives),
+        *(drive.damping for drive in drives),
+    ]
+    # A field that is not drawn is stored once for all robots.
+    return [part.expand(env.num_envs, -1) for part in parts]
+
+
 def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
-    """The parts of `CRITIC_JUMP`. (N, 5)."""
+    """The parts of `CRITIC_JUMP`. (N, 10)."""
     tracker = motion_command(env).tracker
     return torch.cat(
         [
@@ -117,6 +166,11 @@ def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
             tracker.since[:, None],
             tracker.airborne.float()[:, None],
             tracker.best[:, None],
+            tracker.stroke[:, None],
+            tracker.worth[:, None],
+            tracker.lead[:, None],
+            tracker.flown[:, None],
+            tracker.farthest[:, None],
         ],
         dim=-1,
     )

@@ -83,6 +83,20 @@ _KINDS: Mapping[str, _Kind] = {
     "since": _SCALAR,
     "airborne": _SCALAR,
     "best": _SCALAR,
+    "stroke": _SCALAR,
+    "worth": _SCALAR,
+    "lead": _SCALAR,
+    "flown": _SCALAR,
+    "farthest": _SCALAR,
+    "voltage": _SCALAR,
+    "no_load": _SCALAR,
+    "drop": _SCALAR,
+    "friction": _SCALAR,
+    "base_mass": _SCALAR,
+    "delay": _SCALAR,
+    "shank_length": _FEET,
+    "stiffness": _FEET,
+    "damping": _FEET,
 }
 """Kind of every part. A part longer than its kind is a history of it."""
 
