@@ -13,6 +13,7 @@ pytest.importorskip("mjlab")
 
 from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
 
+import small_env  # noqa: E402
 from pronk.drive import clip_torque, stall_torque  # noqa: E402
 from pronk.robots import load_robot  # noqa: E402
 from pronk.robots.mini_cheetah import constants as c  # noqa: E402
@@ -124,3 +125,20 @@ def test_batteries_are_drawn_with_everything_else() -> None:
     }
     none = replace(Randomization.paper(), bus_voltage=None)
     assert "supply" not in env_cfg(num_envs=1, randomization=none).events
+
+
+def test_a_robot_whose_physics_went_wrong_has_a_battery_again() -> None:
+    """Power that is no number must not stay in the voltage, nor in the drives' limits."""
+    env = small_env.drawn()
+    small_env.fresh(env)
+    supply = env.action_manager.get_term("joint_position").supply
+    still = torch.zeros(small_env.ROBOTS, 12)
+    env.step(still)
+    env.sim.data.qvel[3, 7] = float("nan")
+    env.step(still)
+    assert env.termination_manager.get_term("non_finite")[3]
+    assert float(supply.voltage[3, 0]) == pytest.approx(float(supply.no_load[3, 0]))
+    env.step(still)
+    drives = env.scene["robot"].actuators
+    assert all(torch.isfinite(drive.saturation_effort).all() for drive in drives)
+    assert 0.7 < float(supply.voltage[3, 0]) < 1.1

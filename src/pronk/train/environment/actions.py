@@ -110,16 +110,19 @@ class HeldJointPosition(JointPositionAction):
         return target
 
     def reset(self, env_ids: Tensor | slice | None = None) -> None:
-        """Draw delays of new episodes; until a target arrives the default pose is in force.
+        """Draw delays of new episodes, which batteries begin at rest.
+
+        Until a target arrives the default pose is in force.
 
         Args:
             env_ids: Which robots; all if None.
         """
         super().reset(env_ids)
+        which = slice(None) if env_ids is None else env_ids
+        self.supply.rest(which)
         low, high = self.cfg.delay_steps
         if high == 0:
             return
-        which = slice(None) if env_ids is None else env_ids
         self._targets[:, which] = self._rest[which]
         if low < high:
             drawn = torch.randint(low, high + 1, self.lag.shape, device=self.device)

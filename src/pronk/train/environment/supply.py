@@ -86,6 +86,15 @@ class Supply:
         self.voltage.lerp_(sagged, _FOLLOW)
         self._give()
 
+    def rest(self, robots: torch.Tensor | slice) -> None:
+        """Forget what was drawn from some batteries: power that is no number leaves no voltage.
+
+        Args:
+            robots: Which.
+        """
+        if not self.idle:
+            self.voltage[robots] = self.no_load[robots]
+
     def _give(self) -> None:
         for drive, rated in self._drives:
             torch.mul(rated, self.voltage, out=drive.saturation_effort)
