@@ -285,7 +285,7 @@ def test_parts_of_the_critic(env: Any) -> None:
         "foot_contact": everything["target"][:, :4],
         "foot_force": force / (12.0 * 9.81),
         "foot_height": foot_heights(env, qpos),
-        # Nothing is drawn here; tests/test_randomization.py has what is.
+        # Nothing is drawn here; the next test has what is.
         "voltage": 1.0,
         "no_load": 1.0,
         "drop": 0.0,
@@ -303,7 +303,7 @@ def test_parts_of_the_critic(env: Any) -> None:
 
 def test_the_critic_knows_what_was_drawn() -> None:
     """Stiffness and damping by kind of joint, and of each kind by leg."""
-    env = small_env.drawn()
+    env = small_env.fresh(small_env.drawn())
     seen = env.step(torch.rand(N, 12) - 0.5)[0]["critic"]
     found = draws(env)
     by_kind = [leg * 3 + joint for joint in range(3) for leg in range(4)]

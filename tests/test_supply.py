@@ -129,8 +129,7 @@ def test_batteries_are_drawn_with_everything_else() -> None:
 
 def test_a_robot_whose_physics_went_wrong_has_a_battery_again() -> None:
     """Power that is no number must not stay in the voltage, nor in the drives' limits."""
-    env = small_env.drawn()
-    small_env.fresh(env)
+    env = small_env.fresh(small_env.drawn())
     supply = env.action_manager.get_term("joint_position").supply
     still = torch.zeros(small_env.ROBOTS, 12)
     env.step(still)

@@ -146,10 +146,11 @@ def truth(model: mujoco.MjModel, data: mujoco.MjData, action: Array) -> Array:
         "foot_contact": (force > 0.0).astype(float),
         "foot_force": force,
         "foot_height": np.array([data.site(f"{leg}_foot").xpos[2] for leg in LEGS]),
-        # A robot that is its own mirror image.
-        **{name: np.ones(size) for name, size in list(CRITIC.items())[11:]},
     }
-    assert parts.keys() == CRITIC.keys()
+    # What is drawn: a robot that is its own mirror image.
+    drawn = list(CRITIC)[len(parts) :]
+    parts |= {name: np.ones(CRITIC[name]) for name in drawn}
+    assert list(parts) == list(CRITIC)
     return np.concatenate([parts[name] for name in CRITIC])
 
 
