@@ -137,6 +137,7 @@ def test_half_of_the_robots_jump_in_phase_2(env: Any, command: MotionCommand, na
         command.reset(EVERYBODY)
         jumps = watch(command, 250).any(axis=0)
         assert (jumps == (command._rank < 0.5).numpy()).all()
+        assert (jumps == command.jumper.numpy()).all()
     assert abs(jumps.sum() - N // 2) <= 1
 
 
@@ -145,6 +146,20 @@ def test_half_of_any_number_of_robots_is_half() -> None:
     for count in (16, 1000, 4096, 16384):
         rank = (torch.arange(count) * 0.6180339887) % 1.0
         assert abs(int((rank < 0.5).sum()) - count / 2) <= 2
+
+
+def test_the_time_until_a_jump_input_changes_is_known(env: Any, command: MotionCommand) -> None:
+    enter_phase(env, phase("jump_a"))
+    command.reset(EVERYBODY)
+    changes = 0
+    for _ in range(250):
+        left, before = command.jump_left.clone(), command.jump.clone()
+        command.compute(DT)
+        changed = command.jump != before
+        changes += int(changed.sum())
+        assert torch.equal(changed, command.jumper & (left <= DT))
+    assert changes > N, "half of them, on and off, more than once"
+    assert not command.jump_left[~command.jumper].any()
 
 
 def test_walking_again_ends_all_jumps(env: Any, command: MotionCommand) -> None:

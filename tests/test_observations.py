@@ -24,6 +24,7 @@ from pronk.robots.mini_cheetah import constants as c  # noqa: E402
 from pronk.train.environment.commands import motion_command  # noqa: E402
 from pronk.train.environment.draws import draws  # noqa: E402
 from pronk.train.environment.observations import CRITIC, CRITIC_JUMP  # noqa: E402
+from pronk.train.phases import enter_phase, phase  # noqa: E402
 
 Array = NDArray[np.float64]
 N = small_env.ROBOTS
@@ -269,6 +270,7 @@ def test_parts_of_the_critic(env: Any) -> None:
     action = torch.rand(N, 12)
     env.action_manager.process_action(action)
     qpos, qvel = put(env)
+    motion_command(env).time_left[:] = torch.arange(N) / 4
     everything = observe(env)
     seen = everything["critic"]
     turned = Rotation.from_quat(qpos[:, [4, 5, 6, 3]])
@@ -277,6 +279,7 @@ def test_parts_of_the_critic(env: Any) -> None:
         "angular_velocity": qvel[:, 3:6],
         "projected_gravity": turned.inv().apply([0.0, 0.0, -1.0]),
         "command": motion_command(env).velocity,
+        "time_left": np.arange(N)[:, None] / 4,
         "joint_position": qpos[:, 7:] - DEFAULT,
         "joint_velocity": qvel[:, 6:],
         "action": action,
@@ -350,6 +353,7 @@ def test_critic_of_a_robot_that_stands(env: Any) -> None:
 
 
 def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
+    enter_phase(env, phase("jump_a"))
     command, tracker = motion_command(env), motion_command(env).tracker
     command.jump[:] = torch.arange(N) % 2 == 0
     tracker.mode[:] = torch.arange(N) < 3
@@ -358,6 +362,8 @@ def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
     names = ("best", "stroke", "worth", "lead", "flown", "farthest")
     for i, name in enumerate(names):
         getattr(tracker, name)[:] = torch.arange(N) / N + i
+    command._jump_left[:] = torch.arange(N) / 8 + 0.125
+    jumper = command._rank < 0.5
     seen = observe(env)
     close(seen["jump"][:, 0], [1.0, 0.0] * (N // 2))
     expected = {
@@ -366,6 +372,8 @@ def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
         "since": np.arange(N) * 0.02,
         "airborne": [0.0, 1.0] + [0.0] * (N - 2),
         **{name: np.arange(N) / N + i for i, name in enumerate(names)},
+        "jumper": jumper,
+        "jump_left": np.where(jumper, np.arange(N) / 8 + 0.125, 0.0),
     }
     assert list(expected) == list(CRITIC_JUMP)
     for name, value in expected.items():

@@ -91,6 +91,7 @@ def pretend(env: Any, **fields: Tensor) -> MotionCommand:
         "foot_position": torch.zeros(N, 4, 2),
         "foot_height": torch.zeros(N, 4),
         "knee_height": torch.full((N, 4), KNEE),
+        "leg_length": torch.full((N, 4), 0.28),
         "foot_velocity": torch.zeros(N, 4, 3),
         "foot_velocity_change": torch.zeros(N, 4, 3),
         "touching": torch.zeros(N),

@@ -138,6 +138,7 @@ def truth(model: mujoco.MjModel, data: mujoco.MjData, action: Array) -> Array:
         "angular_velocity": turning,
         "projected_gravity": to_trunk @ np.array([0.0, 0.0, -1.0]),
         "command": np.array([velocity[0], velocity[1], turning[2]]),
+        "time_left": np.array([3.0]),
         "joint_position": data.qpos[7:] - DEFAULT,
         "joint_velocity": data.qvel[6:],
         "action": action,

@@ -21,7 +21,7 @@ from pronk.train.environment.reward_sum import reward_sum  # noqa: E402
 
 N = small_env.ROBOTS
 STILL = torch.zeros(N, 12)
-FORCE = slice(53, 57)
+FORCE = slice(54, 58)
 """Forces of the feet, in the critic's vector."""
 
 

@@ -15,9 +15,10 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
+from pronk.robots.mini_cheetah.constants import DEFAULT_POSITION
 from pronk.robots.robot import Robot
 from pronk.train.environment.jump import JumpSettings, JumpTracker
-from pronk.train.environment.motion import Motion, measure_motion
+from pronk.train.environment.motion import Motion, leg_length, measure_motion
 from pronk.train.environment.scene import FEET, FOOT_GEOMS
 from pronk.train.environment.speed_ranges import Growth, SpeedRanges
 from pronk.train.gains import TrainingGains
@@ -133,6 +134,9 @@ class MotionCommand(CommandTerm):
         geoms, _ = env.scene["robot"].find_geoms(FOOT_GEOMS, preserve_order=True)
         self.foot_geoms: Tensor = env.scene["robot"].indexing.geom_ids[geoms].long()
         """Ids of the feet themselves. (4,)"""
+        knee = torch.tensor(DEFAULT_POSITION["knee"])
+        self._standing_leg = float(leg_length(knee))
+        """Length of a leg in the default pose [m]."""
         self._motion: Motion | None = None
         self._motion_step = -1
 
@@ -151,6 +155,16 @@ class MotionCommand(CommandTerm):
         speed = torch.linalg.vector_norm(horizontal, dim=-1)
         faster = (self.cfg.leap * speed.clamp_max(1.0) + self.tracker.lead) * self.tracker.mode
         return horizontal * (1.0 + faster / speed.clamp_min(1e-6))[:, None]
+
+    @property
+    def jumper(self) -> Tensor:
+        """Gets jump inputs. Bool, (N,)."""
+        return self._rank < self.cfg.jump_fraction
+
+    @property
+    def jump_left(self) -> Tensor:
+        """Time until the jump input changes [s]; 0 where it never does. (N,)."""
+        return self._jump_left * self.jumper
 
     @property
     def standing(self) -> Tensor:
@@ -210,6 +224,7 @@ class MotionCommand(CommandTerm):
             excess=along - speed,
             feet=motion.foot_position,
             direction=self._direction(motion.heading),
+            stretch=motion.leg_length - self._standing_leg,
             dt=self._env.step_dt,
         )
         if not self.scripted:
@@ -256,7 +271,7 @@ class MotionCommand(CommandTerm):
             self.jump.zero_()
             return
         self._jump_left -= dt
-        turn = (self._jump_left <= 0.0) & (self._rank < self.cfg.jump_fraction)
+        turn = (self._jump_left <= 0.0) & self.jumper
         self.jump = self.jump ^ turn
         self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
 

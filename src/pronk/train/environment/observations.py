@@ -26,6 +26,7 @@ CRITIC = {
     "angular_velocity": 3,
     "projected_gravity": 3,
     "command": 3,
+    "time_left": 1,
     "joint_position": 12,
     "joint_velocity": 12,
     "action": 12,
@@ -45,7 +46,8 @@ CRITIC = {
     "damping": 12,
 }
 """Parts of the critic's vector, in order, and their sizes. What was drawn for a robot is among
-them: how high it jumps is its battery's, and to a critic that does not know would be luck."""
+them, and how long its velocity command lasts: to a critic that does not know, what a robot earns
+would be luck."""
 
 CRITIC_JUMP = {
     "jump": 1,
@@ -58,8 +60,12 @@ CRITIC_JUMP = {
     "lead": 1,
     "flown": 1,
     "farthest": 1,
+    "jumper": 1,
+    "jump_left": 1,
 }
-"""Parts of what the critic reads of a jump, from phase 2 on."""
+"""Parts of what the critic reads of a jump, from phase 2 on. Commands come at random and are worth
+more than seconds of walking: whether one will come, and when, would else be the most of what
+separates one return from another, and hide what an action did."""
 
 _BODY_WEIGHT = 12.0 * 9.81
 """Unit of the foot forces that the critic reads [N]."""
@@ -107,15 +113,16 @@ def target(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def critic(env: ManagerBasedRlEnv) -> Tensor:
-    """The parts of `CRITIC`. (N, 95)."""
+    """The parts of `CRITIC`. (N, 96)."""
     robot = env.scene["robot"].data
     ground = env.scene["feet"].data
-    feet = motion_command(env).feet
+    terms = motion_command(env)
     return torch.cat(
         [
             angular_velocity(env),
             projected_gravity(env),
             command(env),
+            terms.time_left[:, None],
             joint_position(env),
             joint_velocity(env),
             action(env),
@@ -123,7 +130,7 @@ def critic(env: ManagerBasedRlEnv) -> Tensor:
             env.sim.data.qpos[:, 2:3],
             (ground.found > 0).float(),
             torch.linalg.vector_norm(ground.force, dim=-1) / _BODY_WEIGHT,
-            robot.data.site_xpos[:, feet, 2],
+            robot.data.site_xpos[:, terms.feet, 2],
             *body(env),
         ],
         dim=-1,
@@ -157,8 +164,9 @@ def body(env: ManagerBasedRlEnv) -> list[Tensor]:
 
 
 def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
-    """The parts of `CRITIC_JUMP`. (N, 10)."""
-    tracker = motion_command(env).tracker
+    """The parts of `CRITIC_JUMP`. (N, 12)."""
+    command = motion_command(env)
+    tracker = command.tracker
     return torch.cat(
         [
             jump(env),
@@ -171,6 +179,8 @@ def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
             tracker.lead[:, None],
             tracker.flown[:, None],
             tracker.farthest[:, None],
+            command.jumper.float()[:, None],
+            command.jump_left[:, None],
         ],
         dim=-1,
     )

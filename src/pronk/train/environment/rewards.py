@@ -126,7 +126,7 @@ def gap(command: MotionCommand) -> Tensor:
 
 
 def countermovement(command: MotionCommand) -> Tensor:
-    """How alike the vertical velocity is to that of a jump that falls, brakes and pushes, 0 to 1.
+    """How alike the legs' lengths are to those of a jump that falls, brakes and pushes, 0 to 1.
 
     From the command to the first lift-off, see `JumpSettings.countermovement`.
     """
