@@ -228,11 +228,12 @@ def test_stopped_after_every_iteration_it_is_the_same_run(
         noise.append(largest_noise(checkpoint.latest(folder.checkpoints)))
         assert stops <= 5
     assert stops == 5
-    # The network begins with 1. Phases without a limit leave it about there; the last one's is
-    # below that after the first of its two iterations, and lower after the second.
-    limits = [PHASES[-1].largest_noise(done) for done in (0.5, 1.0)]
-    assert min(noise[:3]) > 0.9 > limits[0] > limits[1]
-    assert noise[3:] == pytest.approx(limits, rel=1e-6)
+    # The network begins with 1. A phase without a limit leaves it about there; that of 2a is below
+    # that, the last one's lower after the first of its two iterations, and after the second.
+    limits = [PHASES[1].largest_noise(1.0)]
+    limits += [PHASES[2].largest_noise(done) for done in (0.5, 1.0)]
+    assert min(noise[:2]) > 0.9 > limits[0] > limits[1] > limits[2]
+    assert noise[2:] == pytest.approx(limits, rel=1e-6)
     # Its weights go on from where they were: it begins, half is over; it is resumed, all is over.
     assert entered == [0.0, 0.0, 0.5, 0.5, 0.5, 1.0]
     shown = capsys.readouterr().out

@@ -63,6 +63,8 @@ class HeldJointPosition(JointPositionAction):
         """Delay in this episode [physics steps]. Shape (N, 1)."""
         self.supply = Supply(self._entity)
         """What the drives are fed from."""
+        self.led: Tensor | None = None
+        """What a hand adds to the coming targets [rad], (N, joints); None: nothing."""
         everything = self._target_ids.tolist() == list(range(self._entity.num_joints))
         # A slice costs a view where a list of indices costs a kernel.
         self._joints: slice | Tensor = slice(None) if everything else self._target_ids
@@ -83,6 +85,8 @@ class HeldJointPosition(JointPositionAction):
             actions: The network's. Shape (N, joints).
         """
         super().process_actions(actions)
+        if self.led is not None:
+            self._processed_actions += self.led
         count = len(self._ages)
         self._newest = (self._newest + 1) % count
         self._ages = [0, *self._ages[:-1]]

@@ -15,8 +15,10 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk.robots.mini_cheetah.constants import DEFAULT_POSITION
+from pronk.robots.mini_cheetah.constants import DEFAULT_POSITION, TOTAL_MASS
 from pronk.robots.robot import Robot
+from pronk.train.environment.actions import HeldJointPosition
+from pronk.train.environment.guidance import guidance
 from pronk.train.environment.jump import JumpSettings, JumpTracker
 from pronk.train.environment.motion import Motion, leg_length, measure_motion
 from pronk.train.environment.scene import FEET, FOOT_GEOMS
@@ -114,6 +116,11 @@ class MotionCommand(CommandTerm):
         """[N m]. (12,)"""
         self.scripted = False
         """True: nobody but the caller changes `velocity` and `jump`."""
+        self.led = 0.0
+        """Part of a countermovement's guidance that is given, 0 to 1; a phase sets it."""
+        self._guidance = guidance(
+            cfg.settings, self.stiffness, self.damping, TOTAL_MASS, env.step_dt
+        )
         self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
         self.ranges = SpeedRanges(cfg.growth, device)
         self._jump_left = torch.zeros(count, device=device)
@@ -260,8 +267,14 @@ class MotionCommand(CommandTerm):
         # Rewards have read the feet before `forward`, and mjlab keeps what was read until a robot
         # resets; what is observed after this shall be of now.
         self._env.scene["feet"].update(0.0)
-        if self.scripted or env_ids is not None:
+        if env_ids is not None:
             return
+        if not self.scripted:
+            self._pass(dt)
+        self._lead()
+
+    def _pass(self, dt: float | Tensor) -> None:
+        """Draw anew what has run out after a time."""
         self.time_left -= dt
         due = self.time_left <= 0.0
         velocity, time, on, off = self._draw(self.num_envs)
@@ -274,6 +287,21 @@ class MotionCommand(CommandTerm):
         turn = (self._jump_left <= 0.0) & self.jumper
         self.jump = self.jump ^ turn
         self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
+
+    def _lead(self) -> None:
+        """Tell the action what a hand adds in the coming step."""
+        action = self._env.action_manager.get_term("joint_position")
+        assert isinstance(action, HeldJointPosition)
+        if self.led == 0.0:
+            action.led = None
+            return
+        tracker, last = self.tracker, len(self._guidance) - 1
+        # The tracker hears of a new command when the step that it began is over.
+        begins = self.jump & ~tracker.commanded
+        steps = (tracker.since / self._env.step_dt).round().long().clamp_max(last)
+        on_the_ground = tracker.mode & (tracker.liftoffs == 0.0)
+        steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last))
+        action.led = self.led * self._guidance[steps]
 
     def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
