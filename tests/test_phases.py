@@ -130,6 +130,24 @@ def test_weights_go_evenly_to_their_final_ones() -> None:
     assert PHASES[1].weights_at(0.5) == PHASES[1].weights
 
 
+def test_a_hand_lets_go_evenly_from_phase_to_phase() -> None:
+    walk, strong, weak = PHASES
+    assert [walk.led_at(done) for done in (0.0, 0.5, 1.0)] == [0.0] * 3
+    assert strong.led_at(0.0) == 1.0
+    assert strong.led_at(1.0) == pytest.approx(weak.led_at(0.0))
+    assert weak.led_at(1.0) == 0.0, "a policy jumps by itself in the end"
+    made = Phase(name="made up", iterations=4, jump=True, led=(0.8, 0.4))
+    assert [made.led_at(done) for done in (0.0, 0.25, 1.0)] == pytest.approx([0.8, 0.7, 0.4])
+
+
+@pytest.mark.parametrize("led", [(-0.1, 0.0), (0.5, 1.1), (math.nan, 0.0)])
+def test_a_hand_that_leads_by_less_than_nothing_or_more_than_all_is_refused(
+    led: tuple[float, float],
+) -> None:
+    with pytest.raises(PronkError, match=r"phase made up leads by .*; both must be 0 to 1"):
+        Phase(name="made up", iterations=3, jump=True, led=led)
+
+
 @pytest.mark.parametrize("noise", [(0.0, 0.2), (0.6, 0.0), (-0.6, 0.2), (0.6, -0.2)])
 def test_a_phase_of_no_noise_is_refused(noise: tuple[float, float]) -> None:
     with pytest.raises(PronkError, match=r"phase made up has noise .*; both must be positive"):
