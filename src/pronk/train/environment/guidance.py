@@ -40,7 +40,7 @@ def guidance(
 
     A drive gives stiffness (target - q) - damping qdot, so a target lies beyond where its joint
     shall be by what torque and speed there ask for. Led like that, a policy that only walks left
-    the ground at all of the paper's five commands, with .9 to 1.7 m/s and none of its speed lost.
+    the ground at all of the paper's five commands, with .9 to 1.7 m/s upwards.
 
     Args:
         settings: Of the jump.
