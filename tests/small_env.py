@@ -58,7 +58,6 @@ def fresh(env: Any) -> Any:
     reward_sum(env).set_rows(ROWS)
     enter_phase(env, PHASES[0])
     motion_command(env).scripted = False
-    motion_command(env).led = 0.0
     motion_command(env).ranges.grown.zero_()
     motion_command(env).ranges.kept.zero_()
     env.cfg.decimation = 4

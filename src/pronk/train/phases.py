@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pronk.errors import PronkError
 from pronk.train.environment.commands import NAME, MotionCommandCfg, motion_command
 from pronk.train.environment.reward_sum import NAME as TABLE
@@ -58,12 +60,17 @@ class Phase:
     """Learning rate of the estimator."""
 
     @property
+    def changes(self) -> bool:
+        """Whether what `enter_phase` sets goes on changing while it lasts."""
+        return self.final is not None or self.led[0] != self.led[1]
+
+    @property
     def jump_fraction(self) -> float:
         """Part of the robots that get the jump input."""
         return 0.5 if self.jump else 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a phase of no iterations, and noise of none."""
+        """Refuse a phase of no iterations, noise of none, and more guidance than all of it."""
         if self.iterations < 1:
             raise PronkError(f"phase {self.name} has {self.iterations} iterations; 1 or more.")
         if not all(0.0 <= part <= 1.0 for part in self.led):
@@ -82,7 +89,7 @@ class Phase:
         now = {}
         for name in (entry.name for entry in fields(JumpWeights)):
             first, last = getattr(self.weights, name), getattr(self.final, name)
-            now[name] = first + done * (last - first)
+            now[name] = float(np.interp(done, (0.0, 1.0), (first, last)))
         return JumpWeights(**now)
 
     def led_at(self, done: float) -> float:
@@ -130,9 +137,10 @@ PHASES: tuple[Phase, ...] = (
     Phase(name="walk", iterations=300, jump=False),
     # Jumping has to be found, and a countermovement at once: policies that had learned to push
     # without one never came to it. Hinted at by the trunk's velocity nothing was learned here:
-    # eight trainings found a jump 40 to 400 iterations into 2b, whose kernel said nothing (width
-    # .3) of jumps as slow as theirs, and what was found late was not done well by the end. So they
-    # are led at first, the hint is for each leg and goes on into 2b, and the kernel narrows there.
+    # seven of eight trainings found a jump 40 to 400 iterations into 2b, whose kernel said nothing
+    # (width .3) of jumps as slow as theirs, and one none; what was found late was not done well by
+    # the end. So robots are led at first, the hint is for each leg and goes on into 2b, and the
+    # kernel narrows there.
     # The entropy bonus alone would drive the noise from .5 to 1.0 in 170 iterations.
     Phase(
         name="jump_a",
@@ -147,7 +155,7 @@ PHASES: tuple[Phase, ...] = (
     # backwards, a robot stands until its thighs are on the ground, a centimetre of way at 5 a
     # second: 6 of 20 such landings were well. Asked for before there is a jump, it might teach that
     # there be none, so it comes to cost more; 60, 40 and 100 made 280 of 300 landings well, of
-    # three seeds, that fell to .11 m and lost .8 of 2.4 m/s. What jumps are worth falls by a third:
+    # three seeds, but the first fell to .11 m and lost .8 of 2.4 m/s. What jumps are worth falls:
     # with as much as at first walking came to be .18 m/s too fast, turning .2 rad/s too slow.
     Phase(
         name="jump_b",
@@ -225,4 +233,5 @@ def enter_phase(env: ManagerBasedRlEnv, phase: Phase, done: float = 0.0) -> None
     weights = phase.weights_at(done)
     command.tracker.width = weights.width
     command.cfg.jump_fraction = phase.jump_fraction
+    command.led = phase.led_at(done)
     table.set_rows(with_jump_weights(table.rows, weights))

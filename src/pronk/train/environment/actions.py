@@ -124,6 +124,8 @@ class HeldJointPosition(JointPositionAction):
         super().reset(env_ids)
         which = slice(None) if env_ids is None else env_ids
         self.supply.rest(which)
+        if self.led is not None:
+            self.led[which] = 0.0
         low, high = self.cfg.delay_steps
         if high == 0:
             return

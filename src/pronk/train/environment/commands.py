@@ -15,12 +15,12 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk.robots.mini_cheetah.constants import DEFAULT_POSITION, TOTAL_MASS
+from pronk.robots.mini_cheetah.constants import TOTAL_MASS
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
 from pronk.train.environment.guidance import guidance
 from pronk.train.environment.jump import JumpSettings, JumpTracker
-from pronk.train.environment.motion import Motion, leg_length, measure_motion
+from pronk.train.environment.motion import STANDING_LEG, Motion, measure_motion
 from pronk.train.environment.scene import FEET, FOOT_GEOMS
 from pronk.train.environment.speed_ranges import Growth, SpeedRanges
 from pronk.train.gains import TrainingGains
@@ -141,9 +141,6 @@ class MotionCommand(CommandTerm):
         geoms, _ = env.scene["robot"].find_geoms(FOOT_GEOMS, preserve_order=True)
         self.foot_geoms: Tensor = env.scene["robot"].indexing.geom_ids[geoms].long()
         """Ids of the feet themselves. (4,)"""
-        knee = torch.tensor(DEFAULT_POSITION["knee"])
-        self._standing_leg = float(leg_length(knee))
-        """Length of a leg in the default pose [m]."""
         self._motion: Motion | None = None
         self._motion_step = -1
 
@@ -231,7 +228,7 @@ class MotionCommand(CommandTerm):
             excess=along - speed,
             feet=motion.foot_position,
             direction=self._direction(motion.heading),
-            stretch=motion.leg_length - self._standing_leg,
+            stretch=motion.leg_length - STANDING_LEG,
             dt=self._env.step_dt,
         )
         if not self.scripted:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pronk.robots.mini_cheetah import constants as c
 from pronk.train.environment.jump import JumpSettings
-from pronk.train.environment.motion import leg_length
+from pronk.train.environment.motion import STANDING_LEG
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -56,20 +56,17 @@ def guidance(
     # Each target is for the end of its step.
     time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)
     default = torch.tensor([c.DEFAULT_POSITION[name] for name in c.LEG_JOINTS]).double()
-    standing = leg_length(default[c.LEG_JOINTS.index("knee")])
 
     def angles(at: Tensor) -> Tensor:
-        pitch, knee = leg_angles(standing + settings.countermovement(at))
+        pitch, knee = leg_angles(STANDING_LEG + settings.countermovement(at))
         return torch.stack((torch.zeros_like(pitch), pitch, knee), dim=-1)
 
     pose, rate = angles(time), (angles(time + _STEP) - angles(time - _STEP)) / (2.0 * _STEP)
-    lowest = -settings.fall * settings.fall_s
-    push = (settings.liftoff_velocity - lowest) / (settings.prompt_s - settings.fall_s)
-    upwards = torch.where(time < settings.fall_s, -settings.fall, push)
+    upwards = torch.where(time < settings.fall_s, -settings.fall, settings.push)
     force = (0.25 * mass * (upwards + GRAVITY)).clamp_min(0.0)
     torque = torch.zeros_like(pose)
     # The force passes through the hip; the knee is behind it and would bend.
     torque[:, 2] = force * c.THIGH_LENGTH * pose[:, 1].sin()
-    legs = [value.repeat(1, 4) for value in (pose - default, torque, rate)]
-    added = legs[0] + (legs[1] + damping.double().cpu() * legs[2]) / stiffness.double().cpu()
+    offset, torque, rate = (value.repeat(1, 4) for value in (pose - default, torque, rate))
+    added = offset + (torque + damping.double().cpu() * rate) / stiffness.double().cpu()
     return torch.cat((added, torch.zeros_like(added[:1]))).float().to(stiffness.device)

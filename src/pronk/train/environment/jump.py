@@ -81,21 +81,25 @@ class JumpSettings:
                 "must be over before."
             )
 
+    @property
+    def push(self) -> float:
+        """Acceleration upwards from the end of the fall to lift-off [m/s^2]."""
+        return (self.liftoff_velocity + self.fall * self.fall_s) / (self.prompt_s - self.fall_s)
+
     def countermovement(self, since: Tensor) -> Tensor:
         """How much longer than in the default pose a leg is in a jump that falls and pushes [m].
 
-        The trunk goes down with `fall` for `fall_s`, then its velocity rises evenly to
+        The trunk goes down with `fall` for `fall_s`, then its velocity rises evenly, by `push`, to
         `liftoff_velocity` at `prompt_s`, and the feet stay where they are: over the way that is
         left to the push it takes about a third of the power of a jump at once.
 
         Args:
             since: Time since the command [s]; any shape.
         """
-        lowest = -self.fall * self.fall_s
-        rate = (self.liftoff_velocity - lowest) / (self.prompt_s - self.fall_s)
         falls = since.clamp_max(self.fall_s)
         pushes = (since - self.fall_s).clamp_min(0.0)
-        return -0.5 * self.fall * falls.square() + (lowest + 0.5 * rate * pushes) * pushes
+        pushed = (-self.fall * self.fall_s + 0.5 * self.push * pushes) * pushes
+        return pushed - 0.5 * self.fall * falls.square()
 
 
 class JumpTracker:

@@ -87,6 +87,10 @@ def leg_length(knee: Tensor) -> Tensor:
     return (thigh**2 + shank**2 + 2.0 * thigh * shank * torch.cos(knee)).sqrt()
 
 
+STANDING_LEG = float(leg_length(torch.tensor(constants.DEFAULT_POSITION["knee"]).double()))
+"""Length of a leg in the default pose [m]."""
+
+
 def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) -> Motion:
     """Measure the step just simulated.
 

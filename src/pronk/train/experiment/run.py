@@ -261,8 +261,7 @@ class _Run:
         """Set what changes within a phase, which the iteration alone decides."""
         done = self._part_of(phase, runner.current_learning_iteration)
         runner.alg.get_policy().limit_noise(phase.largest_noise(done))
-        motion_command(self.env.unwrapped).led = phase.led_at(done)
-        if phase.final is not None:
+        if phase.changes:
             enter_phase(self.env.unwrapped, phase, done)
 
     def _after_iteration(self, runner: PronkRunner, phase: Phase) -> None:
