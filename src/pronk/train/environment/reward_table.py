@@ -79,8 +79,8 @@ ROWS: Mapping[str, Row] = {
     # Paper -0.2 | -0.2, which is -0.01 here: a trot changes its torques by 5 N m a step and
     # joint and would pay 3 of the 5.5 that tracking can earn. A fiftieth, jumping a hundredth.
     "smoothness": Row(rewards.smoothness, -0.0002, -0.0001),
-    # Paper -20 | -120, -6 here. A sixth: what leaps highest and furthest rears up by .3 rad.
-    "orientation": Row(rewards.orientation, -1.0, -1.0),
+    # Paper -20 | -120, -6 here. Half: what leaps highest and furthest rears up by .3 rad.
+    "orientation": Row(rewards.orientation, -1.0, -3.0),
     # Paper -50 | -50. Twice as much: at -2.5 a policy set a knee down whenever it stopped. While it
     # has to find out how to jump, more would teach it not to; then a phase asks for more.
     "collision": Row(rewards.collision, -5.0, -5.0),
