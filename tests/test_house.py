@@ -29,7 +29,7 @@ ROOMS = (
     "commands",
     "cli",
 )
-SHARED = {"errors", "files", "bars"}  # leaves that every room may use
+SHARED = {"errors", "files", "bars", "opengl"}  # leaves that every room may use
 # The virtual robot's truth is hidden from what is judged by it.
 BLIND = ("match", "train", "response")
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hopper import ROBOT, write_hopper
+from pronk import opengl
 from pronk.errors import ArtefactError, PronkError
 from pronk.hardware.capture import Capture
 from pronk.hardware.ground import Box, Ground
@@ -321,6 +324,26 @@ def test_the_environment_names_one_backend(monkeypatch: pytest.MonkeyPatch) -> N
     assert found["MUJOCO_GL"] == "osmesa"
     assert "PYOPENGL_PLATFORM" not in found
     assert "MUJOCO_GL" not in video.environment("")
+
+
+def test_only_the_painter_needs_the_opengl_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """MuJoCo itself cannot be imported with an unknown or a missing one."""
+    monkeypatch.setenv("PRONK_GL", "")  # so that it is put back
+    monkeypatch.delenv("PRONK_GL")
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    missing = tmp_path / "policy.onnx"
+    command = ["trial", str(missing), "--out", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-m", "pronk.cli", *command], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2, done.stderr
+    assert "defect" not in done.stderr
+    assert str(missing) in done.stderr.replace("\n", "")
+    opengl.keep_out()
+    assert os.environ["MUJOCO_GL"] == "disable"
+    assert opengl.asked() == "nonsense"
 
 
 # --- Of a trial ---------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from pronk import __version__
+from pronk import __version__, opengl
 from pronk.commands import (
     bench,
     bench_links,
@@ -137,6 +137,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Entry point of the `pronk` command."""
+    opengl.keep_out()
     sys.exit(run(sys.argv[1:]))
 
 

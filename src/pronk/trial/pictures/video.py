@@ -16,6 +16,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+from pronk import opengl
 from pronk.errors import PronkError
 from pronk.trial.pictures import film as films
 from pronk.trial.pictures.film import Film
@@ -66,8 +67,7 @@ def find_gl() -> str:
         VideoError: None does.
     """
     candidates = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
-    if chosen:
+    if chosen := opengl.asked():
         candidates = [chosen] + [name for name in candidates if name != chosen]
     for name in candidates:
         try:

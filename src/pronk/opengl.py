@@ -1,0 +1,26 @@
+"""Which OpenGL paints, kept out of the processes that paint nothing.
+
+MuJoCo loads the OpenGL that MUJOCO_GL names as it is imported, and cannot be imported where that is
+missing. Of pronk only the process that paints needs one (`pronk.trial.pictures.render`).
+"""
+
+from __future__ import annotations
+
+import os
+
+_MUJOCO = "MUJOCO_GL"
+_ASKED = "PRONK_GL"
+_NONE = "disable"
+"""MuJoCo's word for no OpenGL."""
+
+
+def keep_out() -> None:
+    """Let MuJoCo load no OpenGL in this process and those it starts; `asked` still tells which."""
+    if chosen := os.environ.get(_MUJOCO):
+        os.environ.setdefault(_ASKED, chosen)
+        os.environ[_MUJOCO] = _NONE
+
+
+def asked() -> str:
+    """The value of MUJOCO_GL that the user has set, in small letters; empty if none."""
+    return os.environ.get(_ASKED, os.environ.get(_MUJOCO, "")).lower()
