@@ -157,7 +157,7 @@ PHASES: tuple[Phase, ...] = (
     # there be none, so it comes to cost more; 60, 40 and 100 made 280 of 300 landings well, of
     # three seeds, but the first fell to .11 m and lost .8 of 2.4 m/s. What jumps are worth falls:
     # with as much as at first walking came to be .18 m/s too fast, turning .2 rad/s too slow; led,
-    # and with worth down to 10, 8, 22 and 9, it was within .1 m/s and .1 rad/s.
+    # and with worth down to 12, 10, 28 and 11, it was within .14 m/s and .1 rad/s.
     Phase(
         name="jump_b",
         iterations=560,
