@@ -18,6 +18,7 @@ import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 import small_env  # noqa: E402
+from parts import where  # noqa: E402
 from pronk.policy import layout  # noqa: E402
 from pronk.robots import load_robot  # noqa: E402
 from pronk.robots.mini_cheetah import constants as c  # noqa: E402
@@ -68,8 +69,7 @@ def scripted(env: Any) -> Any:
 
 def part(vector: Tensor, sizes: dict[str, int], name: str) -> Tensor:
     """A named stretch of a vector."""
-    names = list(sizes)
-    return vector.split(list(sizes.values()), dim=1)[names.index(name)]
+    return vector[:, where(sizes, name)]
 
 
 def measured(observation: dict[str, Tensor], name: str) -> Tensor:

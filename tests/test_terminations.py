@@ -15,6 +15,7 @@ import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 import small_env  # noqa: E402
+from parts import where  # noqa: E402
 from pronk.train.environment.commands import motion_command  # noqa: E402
 from pronk.train.environment.observations import CRITIC  # noqa: E402
 from pronk.train.environment.reward_sum import reward_sum  # noqa: E402
@@ -144,8 +145,7 @@ def test_physics_gone_wrong_ends_one_robot_and_touches_no_other(
 
     But for one part of what the critic reads, see `played`.
     """
-    start = sum(list(CRITIC.values())[: list(CRITIC).index("foot_force")])
-    assert slice(start, start + CRITIC["foot_force"]) == FORCE
+    assert where(CRITIC, "foot_force") == FORCE
     usual, wrong = played(env, {}), played(env, bad)
     others = torch.arange(N) != 3
     for step, (expected, found) in enumerate(zip(usual, wrong, strict=True)):

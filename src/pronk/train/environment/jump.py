@@ -53,7 +53,7 @@ class JumpSettings:
     turn_width: float = 1.0
     """Standard deviation of the kernel that asks the trunk not to turn as it leaves the ground
     [rad/s]: nothing stops that in the air, and at 2 m/s policies came down with the nose .3 rad low
-    after .4 s, one fore foot first and early."""
+    after .4 s, one fore foot first and early. It has not mended that: with it they still do."""
     stroke: float = 0.5
     """Height of a jump, from its lowest to its highest trunk, up to which it is rewarded [m]: the
     paper calls .45 m the physical limit. Beyond it a strong robot shall rather go far."""
