@@ -179,6 +179,7 @@ def settled(phase: Phase, done: float = 0.0) -> dict[str, tuple[float, float]]:
         "gap": w.gap,
         "countermovement": w.countermovement,
         "hop": -w.hop,
+        "orientation": -w.orientation,
         "collision": -w.collision,
         "knees": -w.knees,
         "landing": -w.landing,

@@ -224,7 +224,6 @@ class MotionCommand(CommandTerm):
             height=motion.height,
             vertical=motion.velocity_world[:, 2],
             miss=torch.linalg.vector_norm(horizontal - target, dim=-1),
-            turn=torch.linalg.vector_norm(motion.angular_velocity[:, :2], dim=-1),
             along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
             excess=along - speed,
             feet=motion.foot_position,

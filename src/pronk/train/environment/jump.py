@@ -50,10 +50,6 @@ class JumpSettings:
     aim_width: float = 0.5
     """Standard deviation of the kernel that asks where the jump goes [m/s]: a running robot has a
     tenth of a second to speed up, so a kernel as narrow as that of the lift-off says nothing."""
-    turn_width: float = 1.0
-    """Standard deviation of the kernel that asks the trunk not to turn as it leaves the ground
-    [rad/s]: nothing stops that in the air, and at 2 m/s policies came down with the nose .3 rad low
-    after .4 s, one fore foot first and early. It has not mended that: with it they still do."""
     stroke: float = 0.5
     """Height of a jump, from its lowest to its highest trunk, up to which it is rewarded [m]: the
     paper calls .45 m the physical limit. Beyond it a strong robot shall rather go far."""
@@ -190,7 +186,6 @@ class JumpTracker:
         height: Tensor,
         vertical: Tensor,
         miss: Tensor,
-        turn: Tensor,
         along: Tensor,
         excess: Tensor,
         feet: Tensor,
@@ -206,7 +201,6 @@ class JumpTracker:
             height: Trunk over ground [m].
             vertical: Vertical velocity of the trunk [m/s].
             miss: Distance of its horizontal velocity from the one asked for [m/s].
-            turn: Roll and pitch rate of the trunk together [rad/s].
             along: Part of its horizontal velocity in the direction asked for [m/s].
             excess: How much more it is than the velocity command [m/s].
             feet: Horizontal positions of the feet, world frame [m], shape (N, 4, 2).
@@ -234,9 +228,8 @@ class JumpTracker:
         deviation = (speed - s.liftoff_velocity).square()
         kernel = torch.exp(deviation * (-0.5 / self.width**2))
         prompt = torch.rsub(self.since, (s.prompt_s + s.late_s) / s.late_s, alpha=1.0 / s.late_s)
-        # Half the worth is for going up, half for going where the command says, and level, as well.
-        off_aim = (miss / s.aim_width).square() + (turn / s.turn_width).square()
-        aim = torch.exp(-0.5 * off_aim)
+        # Half the worth is for going up, half for going where the command says as well.
+        aim = torch.exp(miss.square() * (-0.5 / s.aim_width**2))
         ready = (self.since / s.ready_s).square()
         calm = torch.exp(self.lead.square() * (-0.5 / s.haste**2))
         worth = torch.minimum(prompt, ready).clamp(0.0, 1.0) * calm
