@@ -15,7 +15,6 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk.robots.mini_cheetah.constants import TOTAL_MASS
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
 from pronk.train.environment.guidance import guidance
@@ -118,9 +117,7 @@ class MotionCommand(CommandTerm):
         """True: nobody but the caller changes `velocity` and `jump`."""
         self.led = 0.0
         """Part of a countermovement's guidance that is given, 0 to 1; a phase sets it."""
-        self._guidance = guidance(
-            cfg.settings, self.stiffness, self.damping, TOTAL_MASS, env.step_dt
-        )
+        self._guidance = guidance(cfg.settings, self.stiffness, self.damping, env.physics_dt)
         self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
         self.ranges = SpeedRanges(cfg.growth, device)
         self._jump_left = torch.zeros(count, device=device)
@@ -295,10 +292,11 @@ class MotionCommand(CommandTerm):
         tracker, last = self.tracker, len(self._guidance) - 1
         # The tracker hears of a new command when the step that it began is over.
         begins = self.jump & ~tracker.commanded
-        steps = (tracker.since / self._env.step_dt).round().long().clamp_max(last)
-        on_the_ground = tracker.mode & (tracker.liftoffs == 0.0)
-        steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last))
-        action.led = self.led * self._guidance[steps]
+        passed = (tracker.since / self._env.physics_dt).round().long() * ~begins
+        on_the_ground = tracker.mode & (tracker.liftoffs == 0.0) & (passed < last)
+        # For the end of the coming step, however long it is (D1).
+        row = (passed + self._env.cfg.decimation - 1).clamp_max(last - 1)
+        action.led = self.led * self._guidance[torch.where(begins | on_the_ground, row, last)]
 
     def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
