@@ -290,7 +290,7 @@ def test_target_in_jump_mode_is_a_leap(
     assert leap[2] == pytest.approx([0.0, -0.675])
     assert leap[3] == [0.0, 0.0]
     # Who was told to jump while .5 m/s too fast is asked for that on top: -.5 becomes -1.175.
-    monkeypatch.setattr(command.tracker, "lead", torch.full((N,), 0.5))
+    monkeypatch.setattr(command.tracker, "pace", torch.full((N,), 0.5))
     leap = command.target[:4].tolist()
     assert leap[0] == pytest.approx([2.85, 0.0])
     assert leap[1] == pytest.approx([-1.88, 1.41])
@@ -429,6 +429,7 @@ def test_a_robot_set_down_beyond_a_gap_has_cleared_it(env: Any, command: MotionC
 
     for _ in range(12):  # so that it is not hasty
         assert not step().any()
+    command.tracker.pace[:] = 0.0  # as if it had run as told
     left = command.motion.foot_position.clone()
     assert command.motion.contact.all()
     qpos[:, 1] += 0.8

@@ -38,10 +38,11 @@ SETTINGS = JumpSettings(
     fall_s=8 * DT,
     likeness_width=0.0625,
     haste=1e6,
+    sloth=1e6,
 )
-"""Not even the first step after the command is hasty, and no running start too fast."""
+"""Not even the first step after the command is hasty, and no running start too fast or slow."""
 WAITS = replace(SETTINGS, ready_s=8 * DT)
-CALM = replace(WAITS, haste=0.5)
+CALM = replace(WAITS, haste=0.5, sloth=0.8)
 EVENTS = ("gain", "rise", "reach", "gap", "hop")
 TRACES = (
     *EVENTS,
@@ -475,12 +476,15 @@ def test_a_running_start_above_the_command_clears_no_gap() -> None:
     assert landing(fast) == pytest.approx({4: 0.25 - 2 * 0.5 * DT})
 
 
-def test_a_running_start_above_the_command_takes_worth_from_a_jump() -> None:
-    """By a kernel of what it is too fast as the command comes; slower, or faster later, by none."""
+@pytest.mark.parametrize(("excess", "widths"), [(0.5, 1.0), (1.0, 2.0), (-0.8, 1.0), (-1.2, 1.5)])
+def test_a_running_start_off_the_command_takes_worth_from_a_jump(
+    excess: float, widths: float
+) -> None:
+    """By a kernel of what it is too fast or slow as the command comes; later it may be faster."""
     told, waits = "1" * 9, "0" * 8 + "1"
-    for excess, worth in ((0.5, math.exp(-0.5)), (1.0, math.exp(-2.0)), (-1.0, 1.0), (0.0, 1.0)):
+    for pace, worth in ((excess, math.exp(-(widths**2) / 2)), (0.0, 1.0)):
         first, *others = script(told, waits, {8: 2.5})
-        steps = [replace(first, excess=excess), *(replace(step, excess=0.7) for step in others)]
+        steps = [replace(first, excess=pace), *(replace(step, excess=0.7) for step in others)]
         assert alone(steps, asked=CALM)["gain"][-1] == pytest.approx(worth)
 
 
@@ -594,7 +598,7 @@ class Account:
     highest: float = 0.0
     lowest: float = 0.0
     stroke: float = 0.0
-    lead: float = 0.0
+    pace: float = 0.0
     flown: float = 0.0
     farthest: float = 0.0
     stood: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, 0.0)] * 4)
@@ -606,7 +610,7 @@ class Account:
         new = now.jump and not self.told
         if new:
             self.age, self.scores, self.leaps, self.farthest, self.widest = 0, [], 0, 0.0, 0.0
-            self.lead, self.worth = max(now.excess, 0.0), 0.0
+            self.pace, self.worth = now.excess, 0.0
         if now.jump:
             self.settled = 0
         elif self.settled is not None and not now.air:
@@ -615,11 +619,13 @@ class Account:
                 self.settled = None
         mode = self.settled is not None
         self.age = self.age + 1 if mode else 0
+        lead = max(self.pace, 0.0)
         paid = dict.fromkeys(EVENTS, 0.0) | {"mode": float(mode)}
         if mode and now.air and not self.was_up:
             speed = max(self.speed, now.speed)
             off = (speed - s.liftoff_velocity) / self.width
-            self.worth = self.timely(self.age * DT) * math.exp(-((self.lead / s.haste) ** 2) / 2)
+            off_pace = self.pace / (s.haste if self.pace > 0.0 else s.sloth)
+            self.worth = self.timely(self.age * DT) * math.exp(-(off_pace**2) / 2)
             score = math.exp(-(off**2) / 2) * self.worth
             paid["gain"] = max(score - max(self.scores, default=0.0), 0.0)
             self.scores.append(score)
@@ -639,7 +645,7 @@ class Account:
             self.lowest = min(self.lowest, low)
         stroke = max(min(self.highest - self.lowest, s.stroke), 0.0)
         paid["rise"], self.stroke = stroke - self.stroke, stroke
-        gone = (now.along - self.lead) * self.worth * DT
+        gone = (now.along - lead) * self.worth * DT
         self.flown = self.flown + gone if mode and now.air and self.was_up else 0.0
         if self.flown > self.farthest:
             paid["reach"], self.farthest = self.flown - self.farthest, self.flown
@@ -650,7 +656,7 @@ class Account:
             gap = min(min(along[1]) - max(along[0]) - self.brought, s.gap) * self.worth
             if gap > self.widest:
                 paid["gap"], self.widest = gap - self.widest, gap
-        self.brought = self.brought + self.lead * DT if now.air else 0.0
+        self.brought = self.brought + lead * DT if now.air else 0.0
         for i, touches in enumerate(now.contact):
             if touches:
                 self.stood[i] = now.feet[i]

@@ -359,7 +359,7 @@ def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
     tracker.mode[:] = torch.arange(N) < 3
     tracker.since[:] = torch.arange(N) * 0.02
     tracker.airborne[:] = torch.arange(N) == 1
-    names = ("best", "stroke", "worth", "lead", "flown", "farthest")
+    names = ("best", "stroke", "worth", "pace", "flown", "farthest")
     for i, name in enumerate(names):
         getattr(tracker, name)[:] = torch.arange(N) / N + i
     command._jump_left[:] = torch.arange(N) / 8 + 0.125

@@ -499,9 +499,10 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
         "landing",
     ):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
-    for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch", "knees"):
+    for name in ("action_rate", "slip", "trunk_height", "crouch", "knees"):
         assert ROWS[name].walk < 0.0
         assert ROWS[name].walk <= ROWS[name].jump <= 0.0
+    assert ROWS["roll_pitch_rate"].jump < ROWS["roll_pitch_rate"].walk < 0.0
 
 
 def test_arguments_of_the_papers_terms() -> None:

@@ -162,7 +162,7 @@ PHASES: tuple[Phase, ...] = (
     # and with worth down to 12, 10, 28 and 11, it was within .14 m/s and .1 rad/s.
     Phase(
         name="jump_b",
-        iterations=600,
+        iterations=560,
         jump=True,
         weights=_WEAK,
         final=replace(

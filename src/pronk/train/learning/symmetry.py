@@ -85,7 +85,7 @@ _KINDS: Mapping[str, _Kind] = {
     "best": _SCALAR,
     "stroke": _SCALAR,
     "worth": _SCALAR,
-    "lead": _SCALAR,
+    "pace": _SCALAR,
     "flown": _SCALAR,
     "farthest": _SCALAR,
     "jumper": _SCALAR,
