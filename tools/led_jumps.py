@@ -16,11 +16,12 @@ from pathlib import Path
 import cpu_engine
 import mjlab.envs.manager_based_rl_env as mjlab_env
 import numpy as np
-import onnxruntime
 import torch
+from tensordict import TensorDict
 
 from pronk.robots import load_robot
 from pronk.train.environment.commands import motion_command
+from pronk.train.evaluation.subject import load_subject
 from pronk.train.gains import training_gains
 from pronk.train.phases import enter_phase, phase
 from pronk.train.tasks import env_cfg
@@ -34,7 +35,7 @@ WALK, STRIDE, JUMP = 80, 16, 17
 def main() -> None:
     """Walk, jump, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("policy", type=Path, help="policy.onnx or walk.onnx.")
+    parser.add_argument("policy", type=Path, help="policy.onnx, or a run.")
     parser.add_argument("--gains", type=Path, required=True)
     parser.add_argument("--robots", type=int, default=64, help="A command.")
     parser.add_argument("--seed", type=int, default=0)
@@ -63,8 +64,8 @@ def led(policy: Path, gains: Path, robots: int, seed: int) -> dict[str, np.ndarr
     enter_phase(env, phase("jump_a"))
     command = motion_command(env)
     command.scripted, command.led = True, 1.0
-    network = onnxruntime.InferenceSession(policy)
-    asks, untold = [entry.name for entry in network.get_inputs()], np.zeros((count, 1), np.float32)
+    subject = load_subject(policy, "cpu")
+    untold = {"jump": torch.zeros(count, 1)}
     told = torch.tensor(COMMANDS).repeat(robots, 1)
     begins = WALK + (torch.arange(count) // len(COMMANDS)) % STRIDE
     observed, _ = env.reset()
@@ -74,9 +75,8 @@ def led(policy: Path, gains: Path, robots: int, seed: int) -> dict[str, np.ndarr
     for step in range(WALK + STRIDE + JUMP):
         command.jump[:] = step >= begins
         command.compute(0.0)  # leads the coming step
-        inputs = {"measured": observed["measured"].numpy(), "jump": untold}
-        (action,) = network.run(["action"], {name: inputs[name] for name in asks})
-        observed = env.step(torch.as_tensor(action))[0]
+        action = subject.act(TensorDict({**observed, **untold}, batch_size=[count]))
+        observed = env.step(action)[0]
         motion = command.motion
         up.append(motion.velocity_world[:, 2].clone())
         along.append((motion.velocity_heading[:, :2] * way).sum(dim=1))
