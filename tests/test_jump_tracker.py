@@ -16,8 +16,6 @@ from pronk.errors import PronkError
 
 torch = pytest.importorskip("torch")
 
-from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.robots.mini_cheetah.model import standing_height  # noqa: E402
 from pronk.train.environment.jump import JumpSettings, JumpTracker  # noqa: E402
 
 pytestmark = pytest.mark.train
@@ -34,9 +32,6 @@ SETTINGS = JumpSettings(
     stroke=0.5,
     crouch=0.1875,
     gap=0.75,
-    fall=8.0,
-    fall_s=8 * DT,
-    likeness_width=0.0625,
     haste=1e6,
     sloth=1e6,
 )
@@ -46,7 +41,7 @@ CALM = replace(WAITS, haste=0.5, sloth=0.8)
 EVENTS = ("gain", "rise", "reach", "gap", "hop")
 TRACES = (
     *EVENTS,
-    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest", "likeness"),
+    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest"),
     *("liftoffs", "airborne"),
 )
 
@@ -71,7 +66,6 @@ class Step:
     """Which feet touch it, if not in the air."""
     feet: Feet = STANCE
     way: tuple[float, float] = (0.0, 0.0)
-    stretch: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
     @property
     def contact(self) -> list[bool]:
@@ -108,7 +102,6 @@ def play(
             excess=torch.tensor([step.excess for step in steps]),
             feet=torch.tensor([step.feet for step in steps]),
             direction=torch.tensor([step.way for step in steps]),
-            stretch=torch.tensor([step.stretch for step in steps]),
             dt=DT,
         )
         for name in TRACES:
@@ -488,44 +481,6 @@ def test_a_running_start_off_the_command_takes_worth_from_a_jump(
         assert alone(steps, asked=CALM)["gain"][-1] == pytest.approx(worth)
 
 
-def test_a_countermovement_falls_brakes_and_pushes() -> None:
-    """8 m/s^2 down for 1/8 s, 1/16 m; then 3.5 m/s up in 1/8 s: at rest after 2/7 of that."""
-    times = [0.0, 0.0625, 0.125, 0.125 + 0.125 * 2 / 7, 0.25]
-    rests = 0.0625 + 0.5 * 1.0 * 0.125 * 2 / 7
-    rises = 0.5 * 2.5 * 0.125 * 5 / 7
-    asked = SETTINGS.countermovement(torch.tensor(times))
-    expected = [0.0, -0.015625, -0.0625, -rests, rises - rests]
-    assert asked.tolist() == pytest.approx(expected, abs=1e-6)
-
-
-def test_legs_of_a_countermovement_lie_within_what_a_leg_can_do() -> None:
-    """Between a trunk on its knees and a straight leg."""
-    asked = JumpSettings().countermovement(torch.linspace(0.0, JumpSettings().prompt_s, 100))
-    standing = standing_height() - c.FOOT_RADIUS
-    assert float(asked.min()) + standing + c.FOOT_RADIUS == pytest.approx(0.2, abs=0.01)
-    assert 0.3 < float(asked[-1]) + standing < 0.95 * (c.THIGH_LENGTH + c.SHANK_LENGTH)
-
-
-def test_likeness_is_paid_from_the_command_to_the_first_leap() -> None:
-    """Told in step 2. A stride (in the air at 4, 5) goes on, the leap at 7 ends it."""
-    asked = [-4 * (DT * i) ** 2 for i in range(1, 7)]
-    legs = {i + 2: (way,) * 4 for i, way in enumerate(asked)}
-    legs[4] = (asked[2] - 0.0625,) * 4
-    legs[6] = (asked[4] + 0.0625, asked[4] - 0.125, asked[4], asked[4])
-    told = [
-        replace(step, stretch=legs.get(i, step.stretch))
-        for i, step in enumerate(script("0011111111", "0000110110", {6: 2.0, 7: 2.0}))
-    ]
-    two = (math.exp(-0.5) + math.exp(-2.0) + 2.0) / 4.0
-    expected = [0, 0, 1, 1, math.exp(-0.5), 1, two, 0, 0, 0]
-    assert alone(told)["likeness"] == pytest.approx(expected, abs=1e-6)
-    # Who never leaps is paid up to `prompt_s`, and again from the next command on.
-    waits = alone(script("1" * 20 + "000000000" + "1", "0" * 30))["likeness"]
-    assert all(value > 0.0 for value in waits[:16])
-    assert waits[16:29] == [0] * 13
-    assert waits[29] == waits[0]
-
-
 def test_the_next_command_begins_at_its_own_height() -> None:
     heights = [0.3, 0.6, 0.3, 0.3, 0.4]
     jump = [True, True, False, True, True]
@@ -562,11 +517,6 @@ def test_times_in_another_order_are_refused() -> None:
     said = "ready_s 0.4 and prompt_s 0.3; they must be in this order"
     with pytest.raises(PronkError, match=said):
         JumpSettings(ready_s=0.4, prompt_s=0.3)
-
-
-def test_a_fall_that_goes_on_beyond_the_lift_off_is_refused() -> None:
-    with pytest.raises(PronkError, match=r"fall_s 0\.3, but prompt_s 0\.28; the fall must be over"):
-        JumpSettings(fall_s=0.3)
 
 
 def test_who_is_ready_may_be_prompt_at_once() -> None:
@@ -632,11 +582,6 @@ class Account:
             if speed > s.leap:
                 paid["hop"] = float(self.leaps > 0)
                 self.leaps += 1
-        paid["likeness"] = 0.0
-        if mode and not self.leaps and self.age * DT <= s.prompt_s:
-            asked = self.sinking(self.age * DT)
-            offs = [(length - asked) / s.likeness_width for length in now.stretch]
-            paid["likeness"] = sum(math.exp(-(off**2) / 2) for off in offs) / 4
         low = max(now.height, s.crouch)
         if not mode or new:
             self.highest, self.lowest, self.stroke = now.height, low, 0.0
@@ -663,17 +608,6 @@ class Account:
         self.told, self.was_up, self.speed = now.jump, now.air, now.speed
         return paid
 
-    def sinking(self, age: float) -> float:
-        """How much longer legs are in a countermovement at that time: its speed, summed up."""
-        s, steps = self.settings, 1000
-        total = 0.0
-        for i in range(steps):
-            at = (i + 0.5) / steps * age
-            part = (at - s.fall_s) / (s.prompt_s - s.fall_s)
-            pushes = (1.0 - part) * -s.fall * s.fall_s + part * s.liftoff_velocity
-            total += (-s.fall * at if at <= s.fall_s else pushes) * age / steps
-        return total
-
     def timely(self, age: float) -> float:
         """What a lift-off at that time after the command is worth."""
         s = self.settings
@@ -699,8 +633,6 @@ def scripts(draw: st.DrawFn) -> list[Step]:
     speed = draw(st.lists(st.integers(-96, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     along = draw(st.lists(st.integers(-32, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     excess = draw(st.lists(st.integers(-16, 32).map(lambda i: i / 32), min_size=60, max_size=60))
-    legs = st.tuples(*[st.integers(-16, 8).map(lambda i: i / 128)] * 4)
-    stretch = draw(st.lists(legs, min_size=60, max_size=60))
     way = draw(st.sampled_from([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)]))
     feet = wander(random.Random(draw(st.integers(0, 2**32 - 1))), way)
     return [
@@ -714,10 +646,9 @@ def scripts(draw: st.DrawFn) -> list[Step]:
             ground=ground,
             feet=points,
             way=way,
-            stretch=lengths,
         )
-        for j, a, h, v, u, e, (ground, points), lengths in zip(
-            jump, air, height, speed, along, excess, feet, stretch, strict=False
+        for j, a, h, v, u, e, (ground, points) in zip(
+            jump, air, height, speed, along, excess, feet, strict=False
         )
     ]
 

@@ -24,7 +24,11 @@ from pronk.robots import load_robot  # noqa: E402
 from pronk.robots.mini_cheetah import constants as c  # noqa: E402
 from pronk.train.environment.commands import motion_command  # noqa: E402
 from pronk.train.environment.draws import draws  # noqa: E402
-from pronk.train.environment.observations import CRITIC, CRITIC_JUMP  # noqa: E402
+from pronk.train.environment.observations import (  # noqa: E402
+    CRITIC,
+    CRITIC_JUMP,
+    DEMONSTRATION,
+)
 from pronk.train.phases import enter_phase, phase  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -109,6 +113,7 @@ def test_groups_and_their_sizes(env: Any) -> None:
         "critic": (N, sum(CRITIC.values())),
         "critic_jump": (N, sum(CRITIC_JUMP.values())),
         "target": (N, layout.ESTIMATE_SIZE),
+        "demonstration": (N, sum(DEMONSTRATION.values())),
     }
     assert layout.MEASURED_SIZE == 105
     assert all(group.dtype == torch.float32 for group in observe(env).values())

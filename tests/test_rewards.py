@@ -91,7 +91,6 @@ def pretend(env: Any, **fields: Tensor) -> MotionCommand:
         "foot_position": torch.zeros(N, 4, 2),
         "foot_height": torch.zeros(N, 4),
         "knee_height": torch.full((N, 4), KNEE),
-        "leg_length": torch.full((N, 4), 0.28),
         "foot_velocity": torch.zeros(N, 4, 3),
         "foot_velocity_change": torch.zeros(N, 4, 3),
         "touching": torch.zeros(N),
@@ -221,7 +220,7 @@ CASES = [
 
 def test_every_term_has_a_case() -> None:
     own = {"termination", "sparse_jump", "rise", "reach", "gap", "hop", "action_rate"}
-    own |= {"stray_foot", "landing", "countermovement"}
+    own |= {"stray_foot", "landing"}
     assert {case.name for case in CASES} | own == set(ROWS)
 
 
@@ -288,16 +287,6 @@ def test_a_deep_landing_costs_who_has_jumped(env: Any) -> None:
     assert not ROWS["landing"].term(command, height=floor).any()
 
 
-def test_likeness_to_a_countermovement_is_paid_as_a_rate(env: Any) -> None:
-    command = pretend(env)
-    command.tracker.likeness[:] = 0.5
-    assert ROWS["countermovement"].term(command).tolist() == [0.5] * N
-    weighed = replace(ROWS["countermovement"], jump=6.0)
-    reward_sum(env).set_rows({**ROWS, "countermovement": weighed})
-    value = paid(env, "countermovement").tolist()
-    assert value == pytest.approx([3.0 if i == JUMPS else 0.0 for i in range(N)])
-
-
 def test_action_rate_by_hand(env: Any) -> None:
     command = pretend(env)
     env.action_manager.process_action(torch.full((N, 12), 0.5))
@@ -342,7 +331,6 @@ def test_an_event_is_worth_its_weight_once(
         rise=10.0,
         reach=6.0,
         gap=7.0,
-        countermovement=2.0,
         hop=0.5,
         orientation=3.0,
         collision=5.0,
@@ -494,7 +482,6 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
         "rise",
         "reach",
         "gap",
-        "countermovement",
         "hop",
         "landing",
     ):
@@ -537,7 +524,6 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
         rise=3.0,
         reach=1.5,
         gap=0.75,
-        countermovement=5.0,
         hop=0.25,
         orientation=6.0,
         collision=9.0,
@@ -548,7 +534,6 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
     changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
     changed |= {
         "gap": 0.75,
-        "countermovement": 5.0,
         "hop": -0.25,
         "orientation": -6.0,
         "collision": -9.0,

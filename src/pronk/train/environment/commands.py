@@ -17,9 +17,9 @@ from torch import Tensor
 
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
-from pronk.train.environment.guidance import guidance
+from pronk.train.environment.demonstration import demonstration
 from pronk.train.environment.jump import JumpSettings, JumpTracker
-from pronk.train.environment.motion import STANDING_LEG, Motion, measure_motion
+from pronk.train.environment.motion import Motion, measure_motion
 from pronk.train.environment.scene import FEET, FOOT_GEOMS
 from pronk.train.environment.speed_ranges import Growth, SpeedRanges
 from pronk.train.gains import TrainingGains
@@ -116,8 +116,12 @@ class MotionCommand(CommandTerm):
         self.scripted = False
         """True: nobody but the caller changes `velocity` and `jump`."""
         self.led = 0.0
-        """Part of a countermovement's guidance that is given, 0 to 1; a phase sets it."""
-        self._guidance = guidance(cfg.settings, self.stiffness, self.damping, env.physics_dt)
+        """Part of the way to what they are shown that robots are led, 0 to 1; a phase sets it."""
+        self._demonstration = demonstration().to(device)
+        self.shown = self.default_position.clone()
+        """Joint targets that robots are shown for the coming step [rad]. (N, 12)"""
+        self.showing = torch.zeros(count, dtype=torch.bool, device=device)
+        """Whether they are. (N,)"""
         self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
         self.ranges = SpeedRanges(cfg.growth, device)
         self._jump_left = torch.zeros(count, device=device)
@@ -225,7 +229,6 @@ class MotionCommand(CommandTerm):
             excess=along - speed,
             feet=motion.foot_position,
             direction=self._direction(motion.heading),
-            stretch=motion.leg_length - STANDING_LEG,
             dt=self._env.step_dt,
         )
         if not self.scripted:
@@ -265,7 +268,7 @@ class MotionCommand(CommandTerm):
             return
         if not self.scripted:
             self._pass(dt)
-        self._lead()
+        self._show()
 
     def _pass(self, dt: float | Tensor) -> None:
         """Draw anew what has run out after a time."""
@@ -282,21 +285,25 @@ class MotionCommand(CommandTerm):
         self.jump = self.jump ^ turn
         self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
 
-    def _lead(self) -> None:
-        """Tell the action what a hand adds in the coming step."""
+    def _show(self) -> None:
+        """What robots are shown in the coming step, and how far they are led there."""
         action = self._env.action_manager.get_term("joint_position")
         assert isinstance(action, HeldJointPosition)
-        if self.led == 0.0:
-            action.led = None
+        action.shown = None
+        if self.cfg.jump_fraction <= 0.0:
+            self.showing.zero_()
             return
-        tracker, last = self.tracker, len(self._guidance) - 1
+        tracker, whole = self.tracker, self._demonstration.duration
         # The tracker hears of a new command when the step that it began is over.
         begins = self.jump & ~tracker.commanded
-        passed = (tracker.since / self._env.physics_dt).round().long() * ~begins
-        on_the_ground = tracker.mode & (tracker.liftoffs == 0.0) & (passed < last)
-        # For the end of the coming step, however long it is (D1).
-        row = (passed + self._env.cfg.decimation - 1).clamp_max(last - 1)
-        action.led = self.led * self._guidance[torch.where(begins | on_the_ground, row, last)]
+        passed = tracker.since * ~begins
+        landed = (tracker.liftoffs > 0.0) & ~tracker.airborne
+        # Time is a sum of steps: what is a millisecond short of the end is at the end.
+        under_way = tracker.mode & ~landed & (passed < whole - 1e-3)
+        self.showing = begins | under_way
+        self.shown = self._demonstration.at(passed, self.velocity[:, :2])
+        if self.led > 0.0:
+            action.shown = (self.shown, self.led * self.showing[:, None])
 
     def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""

@@ -61,12 +61,6 @@ class JumpSettings:
     policy fell with folded legs to 0.12 m, onto its shanks, and lost a quarter of its speed."""
     gap: float = 1.0
     """Gap up to which clearing it is rewarded [m]; the longest known of this size is .7 m."""
-    fall: float = 9.0
-    """Acceleration downwards with which a countermovement begins [m/s^2]: all but free fall."""
-    fall_s: float = 0.12
-    """How long it falls [s]; 6.5 cm, and 2.5 more until it is at rest."""
-    likeness_width: float = 0.05
-    """Standard deviation of the kernel that compares legs' lengths with a countermovement's [m]."""
 
     def __post_init__(self) -> None:
         """Refuse what is not positive."""
@@ -78,31 +72,6 @@ class JumpSettings:
                 f"JumpSettings has ready_s {self.ready_s} and prompt_s {self.prompt_s}; they must "
                 "be in this order."
             )
-        if not self.fall_s < self.prompt_s:
-            raise PronkError(
-                f"JumpSettings has fall_s {self.fall_s}, but prompt_s {self.prompt_s}; the fall "
-                "must be over before."
-            )
-
-    @property
-    def push(self) -> float:
-        """Acceleration upwards from the end of the fall to lift-off [m/s^2]."""
-        return (self.liftoff_velocity + self.fall * self.fall_s) / (self.prompt_s - self.fall_s)
-
-    def countermovement(self, since: Tensor) -> Tensor:
-        """How much longer than in the default pose a leg is in a jump that falls and pushes [m].
-
-        The trunk goes down with `fall` for `fall_s`, then its velocity rises evenly, by `push`, to
-        `liftoff_velocity` at `prompt_s`, and the feet stay where they are: over the way that is
-        left to the push it takes about a third of the power of a jump at once.
-
-        Args:
-            since: Time since the command [s]; any shape.
-        """
-        falls = since.clamp_max(self.fall_s)
-        pushes = (since - self.fall_s).clamp_min(0.0)
-        pushed = (-self.fall * self.fall_s + 0.5 * self.push * pushes) * pushes
-        return pushed - 0.5 * self.fall * falls.square()
 
 
 class JumpTracker:
@@ -165,9 +134,6 @@ class JumpTracker:
         """Worth of the widest gap that a flight of this command has cleared [m]."""
         self.gap = zeros()
         """What `widest` gained in the last step [m]."""
-        self.likeness = zeros()
-        """How alike the legs' lengths are to a countermovement's, 0 to 1; 0 from the first lift-off
-        or `prompt_s` on."""
         self.hop = zeros()
         """1 where the last step was a lift-off after the first of its command."""
 
@@ -198,7 +164,6 @@ class JumpTracker:
         excess: Tensor,
         feet: Tensor,
         direction: Tensor,
-        stretch: Tensor,
         dt: float,
     ) -> None:
         """One policy step further.
@@ -213,7 +178,6 @@ class JumpTracker:
             excess: How much more it is than the velocity command [m/s].
             feet: Horizontal positions of the feet, world frame [m], shape (N, 4, 2).
             direction: Unit vector of where it is asked to go, world frame, or zero, shape (N, 2).
-            stretch: How much longer each leg is than in the default pose [m], shape (N, 4).
             dt: Duration of the step [s].
         """
         s = self.settings
@@ -251,11 +215,6 @@ class JumpTracker:
         liftoffs = self.liftoffs * keep
         self.hop = leap * (liftoffs > 0.0)
         self.liftoffs = liftoffs + leap
-        before = self.mode & (self.liftoffs == 0.0) & (self.since <= s.prompt_s)
-        # Leg by leg: what one of them does shows in its own length at once, in the trunk's velocity
-        # together with three others and later. Of that nothing was learned in 170 iterations.
-        off = (stretch - s.countermovement(self.since)[:, None]).square()
-        self.likeness = torch.exp(off * (-0.5 / s.likeness_width**2)).mean(dim=-1) * before
 
         # A crouch counts: the way over which the legs push is what a battery's power is short of.
         goes_on = self.mode & keep

@@ -67,6 +67,10 @@ CRITIC_JUMP = {
 more than seconds of walking: whether one will come, and when, would else be the most of what
 separates one return from another, and hide what an action did."""
 
+DEMONSTRATION = {"action": 12, "showing": 1}
+"""Parts of what a policy learns to do as it is shown: the action that would do so, and whether it
+is shown anything in the coming step."""
+
 _BODY_WEIGHT = 12.0 * 9.81
 """Unit of the foot forces that the critic reads [N]."""
 
@@ -137,6 +141,14 @@ def critic(env: ManagerBasedRlEnv) -> Tensor:
     )
 
 
+def demonstration(env: ManagerBasedRlEnv) -> Tensor:
+    """The parts of `DEMONSTRATION`. (N, 13)."""
+    command, held = motion_command(env), env.action_manager.get_term("joint_position")
+    assert isinstance(held, HeldJointPosition)
+    action = (command.shown - command.default_position) / held.scale
+    return torch.cat([action, command.showing.float()[:, None]], dim=-1)
+
+
 def body(env: ManagerBasedRlEnv) -> list[Tensor]:
     """The parts of `CRITIC` that were drawn for each robot, in order. (N, size) each.
 
@@ -202,7 +214,7 @@ def _trunk_axes(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def groups(noise: Noise) -> dict[str, ObservationGroupCfg]:
-    """The observation groups `measured`, `jump`, `critic`, `critic_jump` and `target`.
+    """The groups `measured`, `jump`, `critic`, `critic_jump`, `target` and `demonstration`.
 
     Args:
         noise: Noise by measured part (`position`, `velocity`, `angular_velocity`, `gravity`); None
@@ -232,4 +244,5 @@ def groups(noise: Noise) -> dict[str, ObservationGroupCfg]:
         "critic": plain(critic),
         "critic_jump": plain(critic_jump),
         "target": plain(target),
+        "demonstration": plain(demonstration),
     }

@@ -50,8 +50,6 @@ class JumpWeights:
     """Per metre of ground newly covered in flight."""
     gap: float
     """Per metre of ground newly cleared by all feet."""
-    countermovement: float
-    """On likeness to a countermovement from the command to lift-off [1/s]."""
     hop: float
     """Per lift-off after the first."""
     orientation: float
@@ -109,7 +107,6 @@ ROWS: Mapping[str, Row] = {
     "rise": Row(rewards.rise, 0.0, 0.0),
     "reach": Row(rewards.reach, 0.0, 0.0),
     "gap": Row(rewards.gap, 0.0, 0.0),
-    "countermovement": Row(rewards.countermovement, 0.0, 0.0),
     "hop": Row(rewards.hop, 0.0, 0.0),
     "action_rate": Row(rewards.action_rate, -0.02, -0.005),
     # Walking at -.1, four of four trainings ran .9 to 1.6 m/s, or hardly backwards, when told 2.
@@ -144,7 +141,6 @@ def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str
         "rise": weights.rise,
         "reach": weights.reach,
         "gap": weights.gap,
-        "countermovement": weights.countermovement,
         "hop": -weights.hop,
         "orientation": -weights.orientation,
         "collision": -weights.collision,

@@ -125,14 +125,6 @@ def gap(command: MotionCommand) -> Tensor:
     return command.per_event(command.tracker.gap)
 
 
-def countermovement(command: MotionCommand) -> Tensor:
-    """How alike the legs' lengths are to those of a jump that falls, brakes and pushes, 0 to 1.
-
-    From the command to the first lift-off, see `JumpSettings.countermovement`.
-    """
-    return command.tracker.likeness
-
-
 def hop(command: MotionCommand) -> Tensor:
     """1 per lift-off after the first of one command; an event."""
     return command.per_event(command.tracker.hop)

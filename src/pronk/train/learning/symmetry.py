@@ -27,7 +27,7 @@ from torch import Tensor
 from pronk.errors import PronkError
 from pronk.policy.layout import ESTIMATE, MEASURED
 from pronk.robots.mini_cheetah.constants import LEG_JOINTS, LEGS
-from pronk.train.environment.observations import CRITIC, CRITIC_JUMP
+from pronk.train.environment.observations import CRITIC, CRITIC_JUMP, DEMONSTRATION
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
     "measured": {name: part.size for name, part in MEASURED.items()},
@@ -35,6 +35,7 @@ GROUPS: Mapping[str, Mapping[str, int]] = {
     "critic": CRITIC,
     "critic_jump": CRITIC_JUMP,
     "target": ESTIMATE,
+    "demonstration": DEMONSTRATION,
 }
 """Parts of every group of observations, in order, and their sizes."""
 
@@ -90,6 +91,7 @@ _KINDS: Mapping[str, _Kind] = {
     "farthest": _SCALAR,
     "jumper": _SCALAR,
     "jump_left": _SCALAR,
+    "showing": _SCALAR,
     "time_left": _SCALAR,
     "voltage": _SCALAR,
     "no_load": _SCALAR,
