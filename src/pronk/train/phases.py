@@ -191,8 +191,8 @@ PHASES: tuple[Phase, ...] = (
         entropy=0.0,
         noise=(0.5, 0.2),
         # Let go of mostly within the last 8 of 60 iterations, a small network lost its jump (2,048
-        # robots: lift-offs earned 1.0 a second at a quarter of the lead, .2 when it was gone); evenly
-        # within 90, .7 at last, and ground covered in flight still grew.
+        # robots: lift-offs earned 1.0 a second at a quarter of the lead, .2 when it was gone);
+        # evenly within 90, .7 at last, and ground covered in flight still grew.
         led=(0.6, 0.0),
         following=(5e-4, 0.0),
         estimator_rate=3e-4,
