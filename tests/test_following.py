@@ -107,8 +107,6 @@ def test_who_it_was_before_and_the_optimizer_are_part_of_the_state() -> None:
     assert same(weights(other.before), weights(algorithm.before))
     assert not same(weights(other.before.mlp), weights(algorithm.get_policy().mlp))
     assert not same(weights(other.before.mlp), first), "PPO's first update comes before"
-    algorithm.following_rate = 0.0
-    assert "before_state_dict" not in algorithm.save(), "of no use any more"
     states = [a.following_optimizer.state_dict()["state"] for a in (algorithm, other)]
     assert len(states[0]) == len(list(algorithm.get_policy().mlp.parameters()))
     for key, moments in states[0].items():

@@ -231,7 +231,7 @@ class EstimatorPPO(PPO):
         """State of the networks and all optimizers."""
         state: dict[str, Any] = super().save()
         state["following_optimizer_state_dict"] = self.following_optimizer.state_dict()
-        if self.follows and self.following_rate > 0.0:
+        if self.follows:
             state["before_state_dict"] = self.before.state_dict()
         state["estimator_optimizer_state_dict"] = self.estimator_optimizer.state_dict()
         return state
