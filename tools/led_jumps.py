@@ -1,9 +1,9 @@
-r"""What the hand of `train/environment/guidance.py` does with a policy that only walks.
+r"""What a policy that only walks does when it is led through the jump that training shows.
 
     python tools/led_jumps.py policies/matched/policy.onnx --gains policies/gains.yaml
 
 Robots in which everything is drawn, batteries included, walk with each command and are then told to
-jump, each at another moment of its stride. All of the hand is given; a policy that knows how to
+jump, each at another moment of its stride. They are led all the way; a policy that knows how to
 jump is not told. Physics is that of `cpu_engine.py`. Printed is what a robot had when it was
 fastest upwards, up to 0.34 s after the command.
 """
