@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +37,8 @@ from tensordict import TensorDict
 
 from pronk.files import sha256
 from pronk.robots import load_robot
+from pronk.robots.mini_cheetah.constants import LEG_JOINTS as PARTS
+from pronk.robots.robot import Joint
 from pronk.train.environment.commands import MotionCommandCfg, motion_command
 from pronk.train.environment.demonstration import JOINTS, SCHEMA_VERSION
 from pronk.train.environment.randomization import Randomization
@@ -218,19 +220,23 @@ def table(aside: bool, knots: np.ndarray) -> torch.Tensor:
     """
     legs = knots.reshape(len(knots), 2, 3, len(KNOTS))
     time = STEP_S * np.arange(PUSH)
-    robot = load_robot("mini_cheetah")
     found = np.empty((len(knots), PUSH, len(JOINTS)))
-    for i, joint in enumerate(robot.joints):
-        leg, name = joint.name.split("_", 1)
-        pair = int(leg[1] == "L") if aside else int(leg[0] == "H")
-        part = ("hip_roll", "hip_pitch", "knee").index(name)
-        sign = -1.0 if not aside and name == "hip_roll" and leg[1] == "R" else 1.0
-        folds, stretches = GUESS.get(name, (0.0, 0.0))
+    for i, (joint, pair, part, sign) in enumerate(_places(aside)):
+        folds, stretches = GUESS.get(PARTS[part], (0.0, 0.0))
         guess = np.interp(KNOTS, (0.0, 0.04, 0.1, 0.14, 0.26), (0, folds, folds, 0, stretches))
         for one in range(len(knots)):
             beyond = np.interp(time, KNOTS, guess + legs[one, pair, part])
             found[one, :, i] = joint.default_position + sign * beyond
     return torch.tensor(found, dtype=torch.float32)
+
+
+def _places(aside: bool) -> Iterator[tuple[Joint, int, int, float]]:
+    """Of every joint: it, where a candidate has it (pair of legs, part of a leg), and its sign."""
+    for joint in load_robot("mini_cheetah").joints:
+        leg, name = joint.name.split("_", 1)
+        pair = int(leg[1] == "L") if aside else int(leg[0] == "H")
+        sign = -1.0 if not aside and name == "hip_roll" and leg[1] == "R" else 1.0
+        yield joint, pair, PARTS.index(name), sign
 
 
 def flight(aside: bool, push: torch.Tensor, poses: np.ndarray) -> torch.Tensor:
@@ -242,13 +248,8 @@ def flight(aside: bool, push: torch.Tensor, poses: np.ndarray) -> torch.Tensor:
         poses: Of hip roll, hip pitch and knee beyond standing, (candidates, 2 * 3).
     """
     pairs = poses.reshape(len(poses), 2, 3)
-    robot = load_robot("mini_cheetah")
     pose = np.empty((len(poses), len(JOINTS)))
-    for i, joint in enumerate(robot.joints):
-        leg, name = joint.name.split("_", 1)
-        pair = int(leg[1] == "L") if aside else int(leg[0] == "H")
-        sign = -1.0 if not aside and name == "hip_roll" and leg[1] == "R" else 1.0
-        part = ("hip_roll", "hip_pitch", "knee").index(name)
+    for i, (joint, pair, part, sign) in enumerate(_places(aside)):
         pose[:, i] = joint.default_position + sign * pairs[:, pair, part]
     last = push[-1].expand(len(poses), 1, -1)
     share = (torch.arange(1, ROWS - PUSH + 1) / TUCK).clamp_max(1.0)[None, :, None]

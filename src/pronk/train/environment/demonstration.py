@@ -76,15 +76,15 @@ class Demonstration:
         nodes = self.forward
         least, most = (1.0 + BEYOND) * nodes[0], (1.0 + BEYOND) * nodes[-1]
         ahead = velocity[:, :1].clamp(least, most)
-        left = torch.bucketize(ahead, nodes[1:-1].contiguous())
-        part = (ahead - nodes[left]) / (nodes[left + 1] - nodes[left])
+        below = torch.bucketize(ahead, nodes[1:-1].contiguous())
+        part = (ahead - nodes[below]) / (nodes[below + 1] - nodes[below])
         shares = ahead.new_zeros(len(ahead), len(nodes) + 2)
-        shares.scatter_(1, left, 1.0 - part).scatter_(1, left + 1, part)
+        shares.scatter_(1, below, 1.0 - part).scatter_(1, below + 1, part)
         side = velocity[:, 1] / self.aside
-        right, left_side = (way.clamp(0.0, 1.0 + BEYOND) for way in (-side, side))
-        shares[:, -2], shares[:, -1] = right, left_side
+        right, left = (way.clamp(0.0, 1.0 + BEYOND) for way in (-side, side))
+        shares[:, -2], shares[:, -1] = right, left
         standing = nodes.abs().argmin()
-        return shares - (right + left_side)[:, None] * torch.nn.functional.one_hot(
+        return shares - (right + left)[:, None] * torch.nn.functional.one_hot(
             standing, shares.shape[1]
         )
 

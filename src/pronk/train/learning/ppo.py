@@ -1,8 +1,9 @@
 """PPO with the estimator beside it.
 
-An iteration is PPO's update, then some supervised steps of the estimator on the same rollout, then
-the statistics of the normalisation. In this order nothing that the actor's log-probabilities rest
-on changes before PPO has used them.
+An iteration is PPO's update, then some supervised steps of the estimator on the same rollout, some
+of the actor where it is shown what to do (`following.py`), then the statistics of the
+normalisation. In this order nothing that the actor's log-probabilities rest on changes before PPO
+has used them.
 """
 
 from __future__ import annotations
