@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +18,7 @@ from pronk.train.environment.commands import motion_command  # noqa: E402
 from pronk.train.environment.demonstration import (  # noqa: E402
     JOINTS,
     Demonstration,
+    GainsName,
     demonstration,
     mirrored,
     parse,
@@ -94,9 +94,10 @@ def test_robots_are_shown_what_is_theirs() -> None:
     assert found == pytest.approx([100.0, 20.0, 310.0], abs=1e-3)
 
 
-def test_what_is_shown_to_the_mini_cheetah() -> None:
-    shown = demonstration()
-    assert JumpSettings().prompt_s < shown.duration == pytest.approx(0.7)
+@pytest.mark.parametrize("gains", ["matched", "naive"])
+def test_what_is_shown_to_the_mini_cheetah(gains: GainsName) -> None:
+    shown = demonstration(gains)
+    assert JumpSettings().prompt_s < shown.duration == pytest.approx(1.0)
     robot = load_robot("mini_cheetah")
     default = torch.tensor([joint.default_position for joint in robot.joints])
     *ahead, right, left = shown.targets
@@ -107,13 +108,12 @@ def test_what_is_shown_to_the_mini_cheetah() -> None:
         assert torch.allclose(mirrored(targets), targets)
     assert torch.equal(mirrored(right), left)
     assert not torch.allclose(right, left)
-    # Legs fold, stretch until they leave the ground, and go into a pose in which they land.
+    # Legs fold, and stretch until they leave the ground.
     for targets in shown.targets:
         knee = (targets - default)[:, 2::3].mean(dim=1)
         assert float(knee[:6].max()) > 0.3
         assert float(knee[9:14].min()) < -0.5
-        assert torch.equal(targets[20:], targets[20].expand(16, 12))
-    assert float((shown.targets - default).abs().max()) < math.pi
+    assert float((shown.targets - default).abs().max()) <= 1.6 + 1e-6
 
 
 @pytest.mark.parametrize(
@@ -159,10 +159,9 @@ def test_robots_that_are_led_leave_the_ground_and_others_do_not() -> None:
 def test_robots_are_led_part_of_the_way_from_their_own_targets(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With policy steps of 10 to 30 ms (D1), until they have landed or nothing more is shown."""
+    """With policy steps of 10 to 30 ms (D1), until nothing more is shown."""
     env = small_env.fresh(small_env.quiet())
     command, action = motion_command(env), env.action_manager.get_term("joint_position")
-    tracker = command.tracker
     enter_phase(env, phase("jump_a"))
     command.led, command.scripted = 0.25, True
     # What is shown stands out from what robots do of their own.
@@ -180,15 +179,6 @@ def test_robots_are_led_part_of_the_way_from_their_own_targets(
         command.compute(0.0)
         shows = passed < 0.26 - 1e-6
         assert command.showing.tolist() == [shows] * 2 + [False] * (small_env.ROBOTS - 2), passed
-        if passed == pytest.approx(0.13):
-            before = tracker.liftoffs.clone(), tracker.airborne.clone()
-            tracker.liftoffs[1] = 1.0
-            for airborne in (True, False):
-                tracker.airborne[1] = airborne
-                command.compute(0.0)
-                assert command.showing[:2].tolist() == [True, airborne], "until it has landed"
-            tracker.liftoffs[:], tracker.airborne[:] = before
-            command.compute(0.0)
         env.step(mine)
         led = torch.lerp(own, torch.full_like(own, 0.5), 0.25 * shows)
         assert torch.allclose(action._processed_actions[:2], led[:2], atol=1e-6), passed
@@ -214,7 +204,7 @@ def test_what_is_shown_is_observed_as_the_action_that_would_do_so() -> None:
     assert group[:, 12].tolist() == [1.0] * 2 + [0.0] * (small_env.ROBOTS - 2)
     robot = load_robot("mini_cheetah")
     default = torch.tensor([joint.default_position for joint in robot.joints])
-    row = demonstration().targets[4, 0]
+    row = demonstration(command.cfg.gains).targets[4, 0]
     assert torch.allclose(group[0, :12] * 0.35 + default, row, atol=1e-5)
     # Where nobody jumps nothing is shown.
     enter_phase(env, phase("walk"))

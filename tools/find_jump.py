@@ -1,16 +1,20 @@
-r"""Search for the jump that training shows to a policy, `jump_demonstration.yaml`.
+r"""Search for the jump that training shows to a policy, `jump_demonstration_*.yaml`.
 
     python tools/find_jump.py walk1.onnx walk2.onnx --gains policies/gains.yaml --out jump.yaml
+    python tools/find_jump.py walk3.onnx --gains naive --like policies/gains.yaml --out naive.yaml
 
-CMA-ES over joint targets from the jump command to lift-off, for each of `COMMANDS` on its own.
+CMA-ES over joint targets from the jump command until the robot walks on, command by command: first
+those up to lift-off, then those of flight and landing, then all of them together. A quarter of the
+robots is told what lies half way to the command before, and shown the mean of both jumps.
 A candidate is tried on robots that walk by the policies given, each told to jump at another moment
-of its stride; from then on all targets are the candidate's, whatever the policy says. Robots are
-nominal, on a battery as training draws them in the middle. What counts is the ground covered in
-flight, with the trunk at standing height again at its end, then the speed upwards; tilting,
-turning, lying low, a late lift-off and targets far from standing cost. Then, with batteries of
-all kinds, a pose of the legs in flight is searched with which the policies, left to themselves
-again shortly before touchdown, land and walk on. Physics is that of `cpu_engine.py`; commands are
-searched side by side, a process each. Needs `pronk[bench]` for `cma`.
+of its stride and with a battery of its own; from then on all targets are the candidate's, until the
+policies, which know of no jump, are left to themselves again.
+
+What counts is the ground covered in flight and the height; tilting, turning, a late lift-off,
+anything but feet on the ground, jumps that are not alike, falls, and not walking on cost. A policy
+comes to jump as it was shown, with what is shown wrong as well, so the search knows of all that a
+jump is judged by. Physics is that of `cpu_engine.py`; what does not wait for another is searched
+side by side, a process each. Needs `pronk[bench]` for `cma`.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -43,170 +48,327 @@ from pronk.train.environment.commands import MotionCommandCfg, motion_command
 from pronk.train.environment.demonstration import JOINTS, SCHEMA_VERSION
 from pronk.train.environment.randomization import Randomization
 from pronk.train.evaluation.subject import Subject, load_subject
-from pronk.train.gains import training_gains
+from pronk.train.experiment.state import environment_state, restore_environment
+from pronk.train.gains import TrainingGains, training_gains
 from pronk.train.phases import phase
 from pronk.train.tasks import env_cfg
 
-COMMANDS = ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (-1.0, 0.0), (-2.0, 0.0), (0.0, -1.0))
-"""Forward and left [m/s]: the paper's, and those between; to the left it is the mirror image."""
+STAND = (0.0, 0.0)
+CHAINS = (((1.0, 0.0), (2.0, 0.0)), ((-1.0, 0.0), (-2.0, 0.0)), ((0.0, -1.0),))
+"""Forward and left [m/s]: the paper's, and those on the way there from a standing robot; to the
+left it is the mirror image. Each search begins with what the one before it found."""
 LEAP = float(MotionCommandCfg.__dataclass_fields__["leap"].default)
 """How much faster than told a jump may go [m/s], for commands below 1 m/s in proportion: ground
 covered faster is not paid in training either."""
 STEP_S = 0.02
-PUSH = 14
-"""Rows of what is found up to lift-off: the last is for 0.26 s after the command."""
-ROWS = 36
-"""All: the last is for 0.7 s after the command, a few hundredths before touchdown."""
-TUCK = 5
-"""Rows in which the legs go over into the pose in which they land."""
+PUSH_S, WHOLE_S = 0.26, 1.0
+"""From the command to lift-off, and to the end of what is shown, a quarter of a second after
+touchdown [s]."""
+PUSH, ROWS = (round(seconds / STEP_S) + 1 for seconds in (PUSH_S, WHOLE_S))
+KNOTS = np.concatenate([np.linspace(0.0, PUSH_S, 9), [0.36, 0.48, 0.6, 0.7, 0.8, 0.9, WHOLE_S]])
+"""Moments between which targets go evenly [s]."""
+PUSH_KNOTS = 9
+GUESS = {"hip_pitch": (-0.35, 0.5), "knee": (0.8, -1.0)}
+"""What the search begins with, beyond standing [rad]: legs fold for 0.1 s, and then stretch; in
+flight they stand."""
+FARTHEST = 1.6
+"""No target is farther from standing [rad]: drives give all they have for less."""
 FASTEST = 2.6
 """More speed upwards is worth nothing [m/s]: 2.5 is asked for."""
-KNOTS = np.linspace(0.0, 0.26, 9)
-"""Moments between which targets go evenly [s]."""
-GUESS = {"hip_pitch": (-0.35, 0.5), "knee": (0.8, -1.0)}
-"""What the search begins with, beyond standing [rad]: legs fold for 0.1 s, and then stretch."""
-VOLTAGE, RESISTANCE = 24.0, 0.07
-"""Battery [V], with wires [ohm]: training draws 22.2 to 25.2 and 0.03 to 0.1."""
-WALK, STRIDE, JUMP, LAND = 60, 16, 18, 65
-"""Policy steps to get under way, over which the commands to jump are spread, of a jump up to
-lift-off, and of one that is landed and walked on from."""
-CANDIDATES, MOMENTS = 24, 16
-"""Tried together, the first being the mean; and on so many robots each."""
+HIGHEST = 0.48
+"""More height is worth nothing [m], nor is what the landing adds by going deep."""
+DEEP, KNEE = 0.2, 0.07
+"""A trunk [m] and knees [m] lower than this cost: what is near the ground touches it at times."""
+VOLTAGE, RESISTANCE = (23.6, 24.4), (0.085, 0.055)
+"""Batteries, a weak and a strong one [V], with wires [ohm]: training draws 22.2 to 25.2 and 0.03 to
+0.1."""
+DRAWN = Randomization(
+    decimation=(0, 0),
+    friction=(0.5, 1.2),
+    shank_length=(0.187, 0.193),
+    base_mass=(-0.2, 0.6),
+    push_velocity=0.0,
+    push_yaw_rate=0.0,
+)
+"""Robots that differ a little, so that jumps are landed by others as well. Batteries are not drawn
+but dealt out."""
+WALK, STRIDE, JUMP, AFTER = 60, 16, 18, 30
+"""Policy steps to get under way, over which robots begin to, of a jump up to lift-off, and after
+what is shown."""
+MOMENTS = 16
+"""Robots that try a candidate."""
+BETWEEN = torch.tensor([(i + i // 4) % 4 == 3 for i in range(MOMENTS)])
+"""Which of them are told what lies between the command and the one before."""
 STANDING = 0.30
 """Trunk over ground [m]."""
 
 
 @dataclass(frozen=True)
-class Jumps:
+class Series:
+    """What robots did, policy step by policy step. Shape (steps, robots) each."""
+
+    x: torch.Tensor
+    y: torch.Tensor
+    height: torch.Tensor
+    up: torch.Tensor
+    """[m/s]"""
+    along: torch.Tensor
+    """Along the command [m/s]."""
+    turn: torch.Tensor
+    """[rad/s]"""
+    tilt: torch.Tensor
+    """Sine."""
+    stands: torch.Tensor
+    """A foot is on the ground: 1."""
+    lowest_foot: torch.Tensor
+    """Over ground [m]."""
+    foot_up: torch.Tensor
+    """Velocity of that foot upwards [m/s]."""
+    lowest_knee: torch.Tensor
+    """Over ground [m]."""
+    touching: torch.Tensor
+    """Something else than a foot is on the ground: 1."""
+    fell: torch.Tensor
+    """The episode ended: 1."""
+
+    def top(self) -> Top:
+        """When they were fastest upwards, up to `JUMP` steps on."""
+        step = self.up[:JUMP].argmax(dim=0)
+        robot = torch.arange(len(step))
+        return Top(
+            step=step,
+            **{n: getattr(self, n)[step, robot] for n in ("up", "along", "turn", "tilt", "height")},
+        )
+
+    def flight(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Ground covered in flight [m], and height over the lowest trunk before it [m]. (robots,).
+
+        Touchdown and lift-off lie between two steps; where, the lowest foot tells, which was or
+        will be on the ground. Ground is 0 without a flight.
+        """
+        rows, robot = torch.arange(len(self.up))[:, None], torch.arange(self.up.shape[1])
+        airborne = self.stands < 0.5
+        # The flight that the trunk is highest in.
+        highest = torch.where(airborne, self.height, -1.0).argmax(dim=0)
+        grounded = ~airborne
+        first = torch.where(grounded & (rows < highest), rows, -1).amax(dim=0) + 1
+        last = torch.where(grounded & (rows > highest), rows, len(rows)).amin(dim=0) - 1
+        way = []
+        for step, sign in ((first, -1.0), (last, 1.0)):
+            speed = (-sign * self.foot_up[step, robot]).clamp_min(0.5)
+            time = (self.lowest_foot[step, robot] / speed).clamp(0.0, STEP_S)
+            way.append(time * self.along[step, robot].abs())
+        far = torch.hypot(*(v[last, robot] - v[first, robot] for v in (self.x, self.y)))
+        flew = airborne.any(dim=0)
+        high = self.height[:ROWS].amax(dim=0) - self.height[:JUMP].amin(dim=0)
+        return (far + way[0] + way[1]) * flew, high
+
+
+@dataclass(frozen=True)
+class Top:
     """What robots had when they were fastest upwards. Shape (robots,) each."""
 
+    step: torch.Tensor
     up: torch.Tensor
     along: torch.Tensor
     turn: torch.Tensor
-    height: torch.Tensor
     tilt: torch.Tensor
-    after: torch.Tensor
-    lowest: torch.Tensor
-    fell: torch.Tensor
-    last_tilt: torch.Tensor
-    last_turn: torch.Tensor
-    last_along: torch.Tensor
+    height: torch.Tensor
 
-    def landing(self, told: float) -> torch.Tensor:
-        """The same for how a jump is landed."""
-        lost = (told - self.last_along).clamp_min(0.0)
-        low = (0.15 - self.lowest).clamp_min(0.0)
-        return -2.0 * self.fell - self.last_tilt - 0.1 * self.last_turn - 0.2 * lost - 5.0 * low
-
-    def way(self, fastest: float) -> torch.Tensor:
+    def way(self, fastest: torch.Tensor) -> torch.Tensor:
         """Ground covered until the trunk is at standing height again, no faster than that [m]."""
         root = (self.up.square() + 2.0 * 9.81 * (self.height - STANDING)).clamp_min(0.0).sqrt()
-        return self.along.clamp_max(fastest) * (self.up + root) / 9.81
+        return self.along.minimum(fastest) * (self.up + root) / 9.81
 
-    def score(self, told: float) -> torch.Tensor:
-        """What the search makes as large as it can, for a commanded speed [m/s]."""
-        goes = self.up.clamp_max(FASTEST)
-        if told:
-            goes = self.way(told + LEAP * min(told, 1.0)) + 0.25 * goes
-        return (
-            goes
-            - 0.15 * (self.turn - 0.2).clamp_min(0.0)
-            - (self.tilt - 0.05).clamp_min(0.0)
-            - 3.0 * (self.after - 0.26).clamp_min(0.0)
-            - 3.0 * (0.17 - self.lowest).clamp_min(0.0)
-            - self.fell
-        )
+
+def fastest(told: torch.Tensor) -> torch.Tensor:
+    """Speed that ground covered in flight is worth something up to [m/s]."""
+    return (told + LEAP * told.clamp_max(1.0)) * (told > 0.0)
+
+
+def push_score(seen: Series, told: torch.Tensor) -> torch.Tensor:
+    """How good jumps are by what they were at lift-off. (robots,).
+
+    Args:
+        seen: Up to lift-off.
+        told: Commanded speeds [m/s]. (robots,)
+    """
+    top = seen.top()
+    after = (top.step + 1) * STEP_S
+    return (
+        top.way(fastest(told))
+        + 0.4 * top.up.clamp_max(FASTEST)
+        - 0.15 * (top.turn - 0.2).clamp_min(0.0)
+        - (top.tilt - 0.05).clamp_min(0.0)
+        - 3.0 * (after - 0.26).clamp_min(0.0)
+        - 3.0 * (0.17 - seen.height[:JUMP].amin(dim=0)).clamp_min(0.0)
+        - 3.0 * (KNEE - seen.lowest_knee[:JUMP].amin(dim=0)).clamp_min(0.0)
+        - _touches(seen.touching[:JUMP])
+        - seen.fell[:JUMP].amax(dim=0)
+    )
+
+
+def whole_score(seen: Series, told: torch.Tensor) -> torch.Tensor:
+    """How good jumps are that were landed. (robots,).
+
+    Args:
+        seen: Until they walk on.
+        told: Commanded speeds [m/s]. (robots,)
+    """
+    top = seen.top()
+    way, high = seen.flight()
+    lost = (told - seen.along[-10:].mean(dim=0)).clamp_min(0.0)
+    return (
+        1.5 * way.minimum(0.5 * fastest(told))
+        + 2.0 * high.clamp_max(HIGHEST)
+        - 0.3 * (top.up - FASTEST).clamp_min(0.0)
+        - 0.1 * seen.turn[PUSH:ROWS].amax(dim=0)
+        - seen.tilt[:ROWS].amax(dim=0)
+        - seen.tilt[-1]
+        - 0.1 * seen.turn[-1]
+        - 0.2 * lost
+        - 3.0 * ((top.step + 1) * STEP_S - 0.28).clamp_min(0.0)
+        - 3.0 * (0.17 - seen.height[:JUMP].amin(dim=0)).clamp_min(0.0)
+        - 4.0 * (DEEP - seen.height[JUMP:].amin(dim=0)).clamp_min(0.0)
+        - 5.0 * (KNEE - seen.lowest_knee.amin(dim=0)).clamp_min(0.0)
+        - _touches(seen.touching)
+        - 2.0 * seen.fell.amax(dim=0)
+    )
+
+
+def unlike(seen: Series, told: torch.Tensor) -> torch.Tensor:
+    """Standard deviations of way [m] and speed upwards [0.3 m/s] over the robots of a candidate.
+
+    Those that are told something else are left out. (candidates,)
+    """
+    top = seen.top()
+    kinds = (top.way(told + LEAP) * (told > 0.0), 0.3 * top.up)
+    return sum((kind.view(-1, MOMENTS)[:, ~BETWEEN].std(dim=1) for kind in kinds), torch.zeros(()))
+
+
+def _touches(touching: torch.Tensor) -> torch.Tensor:
+    """Once is bad, long is worse."""
+    return 0.3 * touching.amax(dim=0) + 0.1 * touching.sum(dim=0)
 
 
 class Stand:
     """Robots that try candidates for one command."""
 
-    def __init__(self, told: tuple[float, float], policies: list[Path], gains: Path) -> None:
+    def __init__(
+        self,
+        told: tuple[float, float],
+        before: tuple[float, float],
+        policies: list[Path],
+        gains: TrainingGains,
+        candidates: int,
+    ) -> None:
         mjlab_env.Simulation = cpu_engine.CpuSimulation
         cpu_engine.CpuSimulation.threads = 1
         torch.set_num_threads(1)
-        self.count = CANDIDATES * MOMENTS
+        self.count = candidates * MOMENTS
         cfg = env_cfg(
-            gains=training_gains(gains, load_robot("mini_cheetah")),
+            gains=gains,
             num_envs=self.count,
             phase=phase("jump_a"),
-            randomization=Randomization.none(),
+            randomization=DRAWN,
         )
         self.env = mjlab_env.ManagerBasedRlEnv(cfg, device="cpu")
         self.command = motion_command(self.env)
         self.command.scripted = True
-        self.held = self.env.action_manager.get_term("joint_position")
         self.subjects: list[Subject] = [load_subject(path, "cpu") for path in policies]
-        robot = torch.arange(self.count)
-        self.asks = robot % len(policies)
-        self.begins = WALK + (robot % MOMENTS) // len(policies) * STRIDE // (
-            MOMENTS // len(policies)
-        )
-        self.told = torch.tensor([*told, 0.0]).expand(self.count, 3)
-        speed = self.told.norm(dim=1, keepdim=True).clamp_min(1e-6)
-        self.way = (self.told / speed)[:, :2]
+        self.asks = torch.arange(self.count) % len(policies)
+        self.between = BETWEEN.repeat(candidates)
+        half = torch.tensor([told, before]).mean(dim=0)
+        self.told = torch.where(self.between[:, None], half, torch.tensor(told))
+        """(robots, 2)"""
+        self.speed = self.told.norm(dim=1)
+        """(robots,)"""
+        self.way = torch.tensor(told) / max(float(np.hypot(*told)), 1e-6)
+        self.start = self._walk()
 
     @torch.no_grad()
-    def jump(self, targets: torch.Tensor, steps: int = JUMP) -> Jumps:
-        """Try candidates: (candidates, rows, 12) [rad]; what counts is up to so many steps on."""
-        env, command, robot = self.env, self.command, torch.arange(self.count)
-        mine = targets.repeat_interleave(MOMENTS, dim=0)
-        # Every candidate begins alike. mjlab's own seed would be that of the search as well.
-        torch.manual_seed(0)
-        observed, _ = env.reset()
+    def _walk(self) -> dict[str, Any]:
+        """Robots under way, each at another moment of its stride, those of all candidates alike."""
+        torch.manual_seed(0)  # mjlab's own seed would be that of the search as well
+        observed, _ = self.env.reset()
+        moment = torch.arange(self.count) % MOMENTS
         rated = load_robot("mini_cheetah").joints[0].drive.bus_voltage
-        rows = targets.shape[1]
-        volts, ohms = torch.full((self.count, 1), VOLTAGE), torch.full((self.count, 1), RESISTANCE)
-        if steps > JUMP:
-            spread = torch.linspace(-1.0, 1.0, MOMENTS)[torch.randperm(MOMENTS)]
-            spread = spread.repeat(self.count // MOMENTS)[:, None]
-            volts, ohms = volts + 1.0 * spread, ohms - 0.03 * spread
-        self.held.supply.set(volts, ohms, rated)
-        command.velocity[:] = self.told
-        seen = []
-        for step in range(WALK + STRIDE + steps):
-            command.jump[:] = step >= self.begins
-            command.compute(0.0)
-            since = step - self.begins
-            leads = ((since >= 0) & (since < rows)).float()[:, None]
-            self.held.shown = (mine[robot, since.clamp(0, rows - 1)], leads)
-            groups = TensorDict(
-                {**observed, "jump": torch.zeros(self.count, 1)}, batch_size=[self.count]
+        # Neither moment nor policy shall have batteries of one kind.
+        strength = ((moment * 7) % MOMENTS)[:, None] / (MOMENTS - 1)
+        volts, ohms = (low + (high - low) * strength for low, high in (VOLTAGE, RESISTANCE))
+        held: Any = self.env.action_manager.get_term("joint_position")
+        held.supply.set(volts, ohms, rated)
+        begins = moment // len(self.subjects) * STRIDE * len(self.subjects) // MOMENTS
+        under_way = torch.nn.functional.pad(self.told, (0, 1))
+        for step in range(WALK + STRIDE):
+            self.command.velocity[:] = under_way * (step >= begins)[:, None]
+            observed = self.env.step(self._decide(observed))[0]
+        return {name: self._alike(value) for name, value in environment_state(self.env).items()}
+
+    def _alike(self, value: Any) -> Any:
+        """What is remembered of robots, of those of all candidates as of the first one's."""
+        if not isinstance(value, torch.Tensor) or self.count not in value.shape:
+            return value
+        dim = value.shape.index(self.count)
+        times = [1] * value.ndim
+        times[dim] = self.count // MOMENTS
+        return value.narrow(dim, 0, MOMENTS).repeat(times)
+
+    def _decide(self, observed: Any) -> torch.Tensor:
+        """What the policies do."""
+        untold = {**observed, "jump": torch.zeros(self.count, 1)}
+        groups = TensorDict(untold, batch_size=[self.count])
+        action = torch.zeros(self.count, len(JOINTS))
+        for number, subject in enumerate(self.subjects):
+            asked = self.asks == number
+            action[asked] = subject.act(groups[asked])
+        return action
+
+    @torch.no_grad()
+    def jump(self, targets: torch.Tensor, steps: int, before: torch.Tensor | None = None) -> Series:
+        """Try candidates.
+
+        Args:
+            targets: Joint targets, (candidates, rows, 12) [rad].
+            steps: So many, from the command on.
+            before: Those of the command before, (rows, 12); None: those between are shown
+                `targets` as well.
+        """
+        env, motions = self.env, []
+        held: Any = env.action_manager.get_term("joint_position")
+        restore_environment(env, self.start)
+        env.sim._given = False  # what was drawn has changed
+        mine = targets.repeat_interleave(self.count // len(targets), dim=0)
+        if before is not None:
+            mine = torch.where(self.between[:, None, None], 0.5 * (mine + before), mine)
+        asked = (mine - held._offset[:, None]) / held._scale
+        observed = env.obs_buf
+        for step in range(steps):
+            led = step < targets.shape[1]
+            observed = env.step(asked[:, step] if led else self._decide(observed))[0]
+            motions.append(self._seen())
+        return Series(*torch.stack(motions).unbind(dim=1))
+
+    def _seen(self) -> torch.Tensor:
+        motion, robot = self.command.motion, torch.arange(self.count)
+        low, foot = motion.foot_height.min(dim=1)
+        place = self.env.sim.data.qpos
+        return torch.stack(
+            (
+                place[:, 0],
+                place[:, 1],
+                motion.height,
+                motion.velocity_world[:, 2],
+                motion.velocity_heading @ self.way,
+                motion.angular_velocity.norm(dim=1),
+                motion.gravity[:, :2].norm(dim=1),
+                motion.contact.any(dim=1).float(),
+                low,
+                motion.foot_velocity[robot, foot, 2],
+                motion.knee_height.amin(dim=1),
+                (motion.touching > 0).float(),
+                self.env.termination_manager.terminated.float(),
             )
-            action = torch.zeros(self.count, len(JOINTS))
-            for number, subject in enumerate(self.subjects):
-                asked = self.asks == number
-                action[asked] = subject.act(groups[asked])
-            observed = env.step(action)[0]
-            motion = command.motion
-            seen.append(
-                torch.stack(
-                    (
-                        motion.velocity_world[:, 2],
-                        (motion.velocity_heading[:, :2] * self.way).sum(dim=1),
-                        motion.angular_velocity.norm(dim=1),
-                        motion.height,
-                        env.scene["robot"].data.projected_gravity_b[:, :2].norm(dim=1),
-                        env.termination_manager.terminated.float(),
-                    )
-                )
-            )
-        window = (self.begins + torch.arange(steps)[:, None])[:, None].expand(steps, 6, -1)
-        seen = torch.stack(seen).gather(0, window)
-        top = seen[:JUMP, 0].argmax(dim=0)
-        up, along, turn, height, tilt, _ = seen[top, :, robot].T
-        return Jumps(
-            up=up,
-            along=along,
-            turn=turn,
-            height=height,
-            tilt=tilt,
-            after=(top + 1) * STEP_S,
-            lowest=seen[:, 3].amin(dim=0),
-            fell=seen[:, 5].amax(dim=0),
-            last_tilt=seen[-1, 4],
-            last_turn=seen[-1, 2],
-            last_along=seen[-1, 1],
         )
 
 
@@ -216,16 +378,19 @@ def table(aside: bool, knots: np.ndarray) -> torch.Tensor:
     Args:
         aside: To a side, right legs and left legs have targets of their own, else fore and hind
             legs, left as right.
-        knots: Beyond `GUESS`, (candidates, 2 * 3 * knots).
+        knots: Beyond `GUESS`, (candidates, 2 * 3 * knots), as many as `KNOTS` or only the first.
     """
-    legs = knots.reshape(len(knots), 2, 3, len(KNOTS))
-    time = STEP_S * np.arange(PUSH)
-    found = np.empty((len(knots), PUSH, len(JOINTS)))
+    legs = knots.reshape(len(knots), 2, 3, -1)
+    moments = KNOTS[: legs.shape[-1]]
+    time = STEP_S * np.arange(round(moments[-1] / STEP_S) + 1)
+    found = np.empty((len(knots), len(time), len(JOINTS)))
     for i, (joint, pair, part, sign) in enumerate(_places(aside)):
         folds, stretches = GUESS.get(PARTS[part], (0.0, 0.0))
-        guess = np.interp(KNOTS, (0.0, 0.04, 0.1, 0.14, 0.26), (0, folds, folds, 0, stretches))
+        guess = np.interp(
+            moments, (0.0, 0.04, 0.1, 0.14, PUSH_S, 0.36), (0, folds, folds, 0, stretches, 0.0)
+        )
         for one in range(len(knots)):
-            beyond = np.interp(time, KNOTS, guess + legs[one, pair, part])
+            beyond = np.interp(time, moments, guess + legs[one, pair, part])
             found[one, :, i] = joint.default_position + sign * beyond
     return torch.tensor(found, dtype=torch.float32)
 
@@ -239,108 +404,195 @@ def _places(aside: bool) -> Iterator[tuple[Joint, int, int, float]]:
         yield joint, pair, PARTS.index(name), sign
 
 
-def flight(aside: bool, push: torch.Tensor, poses: np.ndarray) -> torch.Tensor:
-    """Jumps with a pose in flight added [rad]. (candidates, rows, 12).
-
-    Args:
-        aside: As in `table`.
-        push: Targets up to lift-off, (rows, 12).
-        poses: Of hip roll, hip pitch and knee beyond standing, (candidates, 2 * 3).
-    """
-    pairs = poses.reshape(len(poses), 2, 3)
-    pose = np.empty((len(poses), len(JOINTS)))
-    for i, (joint, pair, part, sign) in enumerate(_places(aside)):
-        pose[:, i] = joint.default_position + sign * pairs[:, pair, part]
-    last = push[-1].expand(len(poses), 1, -1)
-    share = (torch.arange(1, ROWS - PUSH + 1) / TUCK).clamp_max(1.0)[None, :, None]
-    flown = torch.lerp(last, torch.tensor(pose, dtype=torch.float32)[:, None], share)
-    return torch.cat((push.expand(len(poses), -1, -1), flown), dim=1)
-
-
 def climb(
-    size: int,
+    begin: np.ndarray,
     step: float,
     generations: int,
     seed: int,
     score: Callable[[np.ndarray, bool], torch.Tensor],
+    candidates: int,
 ) -> np.ndarray:
-    """CMA-ES from zero: the mean it comes to. `score` is told every tenth time to say how it is."""
-    options = {"popsize": CANDIDATES - 1, "seed": seed, "verbose": -9, "CMA_diagonal": 30}
-    strategy = cma.CMAEvolutionStrategy(np.zeros(size), step, options)
+    """CMA-ES: the mean it comes to. `score` is told every twentieth time to say how it is."""
+    options = {"popsize": candidates - 1, "seed": seed, "verbose": -9, "CMA_diagonal": 30}
+    strategy = cma.CMAEvolutionStrategy(begin, step, options)
     for generation in range(generations):
         asked = strategy.ask()
-        scores = score(np.vstack([strategy.mean, *asked]), generation % 10 == 0)
+        scores = score(np.vstack([strategy.mean, *asked]), generation % 20 == 0)
         strategy.tell(asked, [-float(found) for found in scores[1:]])
     mean: np.ndarray = strategy.mean
-    score(np.tile(mean, (CANDIDATES, 1)), True)
+    score(np.tile(mean, (candidates, 1)), True)
     return mean
 
 
 def search(
-    told: tuple[float, float], policies: list[Path], gains: Path, generations: int, seed: int
-) -> list[list[float]]:
-    """The best for a command: joint targets, (rows, 12)."""
-    stand = Stand(told, policies, gains)
-    speed, aside = float(np.hypot(*told)), told[1] != 0.0
+    told: tuple[float, float],
+    before: tuple[float, float],
+    nearby: torch.Tensor | None,
+    begin: torch.Tensor | None,
+    *,
+    policies: list[Path],
+    gains: TrainingGains,
+    generations: tuple[int, int, int],
+    seed: int,
+) -> torch.Tensor:
+    """The best for a command: joint targets, (rows, 12) [rad].
 
-    def say(jumps: Jumps, scores: torch.Tensor) -> None:
-        figures = ", ".join(
-            f"{name} {values[:MOMENTS].mean():.2f} +- {values[:MOMENTS].std():.2f}"
-            for name, values in vars(jumps).items()
-        )
-        print(f"{told} m/s: score {scores[0]:.3f}, {figures}", file=sys.stderr, flush=True)
+    Args:
+        told: The command [m/s].
+        before: The command that was searched before.
+        nearby: Targets that were found there; None: it is the first search.
+        begin: Targets to begin with, of an earlier search; None: with `nearby`, or `GUESS`.
+        policies: Who walks.
+        gains: Nominal gains of the drives.
+        generations: As of the command line.
+        seed: Of CMA.
+    """
+    candidates = 20
+    stand = Stand(told, before, policies, gains, candidates)
+    aside = told[1] != 0.0
+    guess = table(aside, np.zeros((1, 2 * 3 * len(KNOTS))))[0]
+    first = next(targets for targets in (begin, nearby, guess) if targets is not None)
+    step = 0.15 if first is guess else 0.1
+    rest = torch.tensor([joint.default_position for joint in load_robot("mini_cheetah").joints])
+
+    def targets(knots: np.ndarray) -> torch.Tensor:
+        """Of candidates, who change the first: (candidates, 2, 3, knots)."""
+        found = first + table(aside, knots.reshape(len(knots), -1)) - guess
+        return rest + (found - rest).clamp(-FARTHEST, FARTHEST)
+
+    def score(
+        knots: np.ndarray,
+        says: bool,
+        steps: int,
+        good: Callable[[Series, torch.Tensor], torch.Tensor],
+    ) -> torch.Tensor:
+        tried = targets(knots)
+        seen = stand.jump(tried, steps, nearby)
+        # Far from standing, what is shown is hard to follow; far from its neighbour, what is shown
+        # between them is not what either of them does.
+        far = 0.02 * (tried - rest).square().mean(dim=(1, 2))
+        if nearby is not None:
+            far = far + 0.02 * (tried - nearby).square().mean(dim=(1, 2))
+        scores = good(seen, stand.speed).view(-1, MOMENTS).mean(dim=1)
+        scores = scores - unlike(seen, stand.speed) - far
+        if says:
+            say(told, seen, scores)
+        return scores
 
     def pushes(knots: np.ndarray, says: bool) -> torch.Tensor:
-        jumps = stand.jump(table(aside, knots))
-        # Far from standing, what is shown is hard to follow.
-        far = torch.tensor(0.02 * np.square(knots).mean(axis=1)).repeat_interleave(MOMENTS)
-        scores = (jumps.score(speed) - far).view(-1, MOMENTS).mean(dim=1)
-        if says:
-            say(jumps, scores)
-        return scores
+        changes = knots.reshape(len(knots), 2, 3, PUSH_KNOTS)
+        later = ((0, 0), (0, 0), (0, 0), (0, len(KNOTS) - PUSH_KNOTS))
+        return score(np.pad(changes, later), says, JUMP, push_score)
 
-    knots = climb(2 * 3 * len(KNOTS), 0.15, generations, seed, pushes)
-    (push,) = table(aside, knots[None])
+    push = climb(np.zeros(6 * PUSH_KNOTS), step, generations[0], seed, pushes, candidates)
 
-    def lands(poses: np.ndarray, says: bool) -> torch.Tensor:
-        jumps = stand.jump(flight(aside, push, poses), steps=LAND)
-        scores = jumps.landing(speed).view(-1, MOMENTS).mean(dim=1)
-        if says:
-            say(jumps, scores)
-        return scores
+    def lands(knots: np.ndarray, says: bool) -> torch.Tensor:
+        changes = knots.reshape(len(knots), 2, 3, -1)
+        pushed = np.tile(push.reshape(1, 2, 3, -1), (len(knots), 1, 1, 1))
+        whole = np.concatenate((pushed, changes), axis=-1)
+        return score(whole, says, ROWS + AFTER, whole_score)
 
-    pose = climb(2 * 3, 0.2, generations // 4, seed, lands)
-    (best,) = flight(aside, push, pose[None])
-    return [[round(float(target), 3) for target in row] for row in best]
+    later = 6 * (len(KNOTS) - PUSH_KNOTS)
+    lands_best = climb(np.zeros(later), step, generations[1], seed, lands, candidates)
+
+    def together(knots: np.ndarray, says: bool) -> torch.Tensor:
+        whole = knots.reshape(len(knots), 2, 3, -1)
+        return score(whole, says, ROWS + AFTER, whole_score)
+
+    both = [knots.reshape(2, 3, -1) for knots in (push, lands_best)]
+    whole = np.concatenate(both, axis=-1).ravel()
+    found = climb(whole, 0.03, generations[2], seed, together, candidates)
+    return targets(found.reshape(1, 2, 3, -1))[0]
+
+
+def say(told: tuple[float, float], seen: Series, scores: torch.Tensor) -> None:
+    """How the first candidate is; where it jumps as told, then between."""
+    (way, high), top = seen.flight(), seen.top()
+    for name, who in (("", ~BETWEEN), (" between", BETWEEN)):
+        one = torch.cat((who, torch.zeros(len(way) - MOMENTS, dtype=torch.bool)))
+        figures = {
+            "way": way[one],
+            "high": high[one],
+            "up": top.up[one],
+            "along": top.along[one],
+            "after": (top.step[one] + 1) * STEP_S,
+            "touched": seen.touching[:, one].amax(dim=0),
+            "fell": seen.fell[:, one].amax(dim=0),
+            "turn": top.turn[one],
+            "tilt": seen.tilt[:ROWS, one].amax(dim=0),
+        }
+        text = ", ".join(f"{what} {f.mean():.3f} +- {f.std():.3f}" for what, f in figures.items())
+        print(f"{told}{name}: score {scores[0]:.3f}, {text}", file=sys.stderr, flush=True)
+
+
+def chain(
+    commands: tuple[tuple[float, float], ...],
+    nearby: torch.Tensor,
+    begins: dict[tuple[float, float], torch.Tensor],
+    **settings: Any,
+) -> list[torch.Tensor]:
+    """Search one command after the other, from a standing robot's jump on: targets of each."""
+    found, before = [], STAND
+    for told in commands:
+        nearby = search(told, before, nearby, begins.get(told), **settings)
+        found.append(nearby)
+        before = told
+    return found
+
+
+def earlier(path: Path) -> dict[tuple[float, float], torch.Tensor]:
+    """What an earlier search wrote: targets by command."""
+    jumps = yaml.safe_load(path.read_text(encoding="utf-8"))["jumps"]
+    return {(jump["forward"], jump["left"]): torch.tensor(jump["targets"]) for jump in jumps}
+
+
+def _rounded(targets: torch.Tensor) -> list[list[float]]:
+    return [[round(float(target), 3) for target in row] for row in targets]
 
 
 def main() -> None:
     """Search all commands, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policies", type=Path, nargs="+", help="walk.onnx of one run or several.")
-    parser.add_argument("--gains", type=Path, required=True)
-    parser.add_argument("--generations", type=int, default=40)
+    parser.add_argument("--gains", required=True, help="gains.yaml, or naive, --like one.")
+    parser.add_argument("--like", type=Path)
+    parser.add_argument(
+        "--generations",
+        type=int,
+        nargs=3,
+        default=(100, 40, 20),
+        help="Of the push, of flight and landing, of all together.",
+    )
+    parser.add_argument("--begin", type=Path, help="Go on from what this tool wrote.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
-    one = partial(
-        search,
-        policies=asked.policies,
-        gains=asked.gains,
-        generations=asked.generations,
-        seed=asked.seed,
-    )
+    settings: dict[str, Any] = {
+        "policies": asked.policies,
+        "gains": training_gains(asked.gains, load_robot("mini_cheetah"), like=asked.like),
+        "generations": tuple(asked.generations),
+        "seed": asked.seed,
+    }
+    begins = earlier(asked.begin) if asked.begin else {}
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
-        found = dict(zip(COMMANDS, pool.map(one, COMMANDS), strict=True))
+        first = (STAND, STAND, None, begins.get(STAND))
+        standing = pool.submit(search, *first, **settings).result()
+        one = partial(chain, nearby=standing, begins=begins, **settings)
+        chains = list(pool.map(one, CHAINS))
+    commands = (STAND, *(told for several in CHAINS for told in several))
+    tables = (standing, *(targets for several in chains for targets in several))
+    words = " ".join(str(number) for number in asked.generations)
+    kind = "naive" if asked.like else "matched"
     content = {
         "schema_version": SCHEMA_VERSION,
-        "found_by": f"tools/find_jump.py --generations {asked.generations} --seed {asked.seed}",
+        "found_by": f"tools/find_jump.py --generations {words} --seed {asked.seed}",
+        "gains": kind,
         "with": [{"policy": sha256(path)} for path in asked.policies],
         "step_s": STEP_S,
         "joints": list(JOINTS),
         "jumps": [
-            {"forward": forward, "left": left, "targets": targets}
-            for (forward, left), targets in found.items()
+            {"forward": forward, "left": left, "targets": _rounded(targets)}
+            for (forward, left), targets in zip(commands, tables, strict=True)
         ],
     }
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
-from pronk.train.environment.demonstration import demonstration
+from pronk.train.environment.demonstration import GainsName, demonstration
 from pronk.train.environment.jump import JumpSettings, JumpTracker
 from pronk.train.environment.motion import Motion, measure_motion
 from pronk.train.environment.scene import FEET, FOOT_GEOMS
@@ -80,6 +80,8 @@ class MotionCommandCfg(CommandTermCfg):
     """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not paid."""
+    gains: GainsName = "matched"
+    """Kind of gains that the jump they are shown was found with."""
     width: float = 1.0
     """Standard deviation of the lift-off kernel [m/s], see `JumpTracker`."""
     settings: JumpSettings = field(default_factory=JumpSettings)
@@ -117,7 +119,7 @@ class MotionCommand(CommandTerm):
         """True: nobody but the caller changes `velocity` and `jump`."""
         self.led = 0.0
         """Part of the way to what they are shown that robots are led, 0 to 1; a phase sets it."""
-        self._demonstration = demonstration().to(device)
+        self._demonstration = demonstration(cfg.gains).to(device)
         self.shown = self.default_position.clone()
         """Joint targets that robots are shown for the coming step [rad]. (N, 12)"""
         self.showing = torch.zeros(count, dtype=torch.bool, device=device)
@@ -297,9 +299,8 @@ class MotionCommand(CommandTerm):
         # The tracker hears of a new command when the step that it began is over.
         begins = self.jump & ~tracker.commanded
         passed = tracker.since * ~begins
-        landed = (tracker.liftoffs > 0.0) & ~tracker.airborne
         # Time is a sum of steps: what is a millisecond short of the end is at the end.
-        under_way = tracker.mode & ~landed & (passed < whole - 1e-3)
+        under_way = tracker.mode & (passed < whole - 1e-3)
         self.showing = begins | under_way
         self.shown = self._demonstration.at(passed, self.velocity[:, :2])
         if self.led > 0.0:

@@ -1,4 +1,4 @@
-"""A jump that is shown: joint targets for every moment from the jump command to touchdown.
+"""A jump that is shown: joint targets for every moment from the jump command until it is landed.
 
 A jump asks something else of twelve drives at every moment of a quarter of a second, and to learn
 that by trying takes longer than training lasts. A policy that had been led through a poor one
@@ -6,7 +6,9 @@ that by trying takes longer than training lasts. A policy that had been led thro
 m/s upwards and 1.8 forward; CMA-ES over what is added to its joint targets had 2.6 and 2.5 m/s
 after 100 generations. So robots are led through a good jump at first, and the policy learns to do
 the same (`pronk.train.learning.following`), until both let go. What is shown was found in the
-training simulator by `tools/find_jump.py`; `jump_demonstration.yaml` is what it wrote.
+training simulator by `tools/find_jump.py`; `jump_demonstration_matched.yaml` is what it wrote, and
+`jump_demonstration_naive.yaml` what it wrote with naive gains: who trains with those knows of no
+others.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import yaml
@@ -25,7 +27,8 @@ from pronk.robots import load_robot
 
 SCHEMA_VERSION = 1
 JOINTS = tuple(joint.name for joint in load_robot("mini_cheetah").joints)
-FILE = "jump_demonstration.yaml"
+FILE = "jump_demonstration_{}.yaml"
+GainsName = Literal["matched", "naive"]
 BEYOND = 0.25
 """Commands faster than the fastest one shown change the jump further, up to this much faster."""
 
@@ -103,13 +106,16 @@ def mirrored(targets: Tensor) -> Tensor:
     return (legs * legs.new_tensor([-1.0, 1.0, 1.0])).flatten(-2)
 
 
-def demonstration() -> Demonstration:
+def demonstration(gains: GainsName = "matched") -> Demonstration:
     """What is shown to the Mini Cheetah.
+
+    Args:
+        gains: Kind of gains that it was found with.
 
     Raises:
         ArtefactError: The file is not one of this version, or its tables do not fit together.
     """
-    source = files("pronk.train.environment") / FILE
+    source = files("pronk.train.environment") / FILE.format(gains)
     return parse(yaml.safe_load(source.read_text(encoding="utf-8")), str(source))
 
 
