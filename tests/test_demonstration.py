@@ -18,12 +18,12 @@ from pronk.train.environment.commands import motion_command  # noqa: E402
 from pronk.train.environment.demonstration import (  # noqa: E402
     JOINTS,
     Demonstration,
-    GainsName,
     demonstration,
     mirrored,
     parse,
 )
 from pronk.train.environment.jump import JumpSettings  # noqa: E402
+from pronk.train.gains import GainsName  # noqa: E402
 from pronk.train.phases import enter_phase, phase  # noqa: E402
 
 pytestmark = pytest.mark.train

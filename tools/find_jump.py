@@ -486,21 +486,22 @@ def search(
 
     push = climb(np.zeros(6 * PUSH_KNOTS), step, generations[0], seed, pushes, candidates)
 
-    def lands(knots: np.ndarray, says: bool) -> torch.Tensor:
-        changes = knots.reshape(len(knots), 2, 3, -1)
-        pushed = np.tile(push.reshape(1, 2, 3, -1), (len(knots), 1, 1, 1))
-        whole = np.concatenate((pushed, changes), axis=-1)
-        return score(whole, says, ROWS + AFTER, whole_score)
-
-    later = 6 * (len(KNOTS) - PUSH_KNOTS)
-    lands_best = climb(np.zeros(later), step, generations[1], seed, lands, candidates)
-
     def together(knots: np.ndarray, says: bool) -> torch.Tensor:
         whole = knots.reshape(len(knots), 2, 3, -1)
         return score(whole, says, ROWS + AFTER, whole_score)
 
-    both = [knots.reshape(2, 3, -1) for knots in (push, lands_best)]
-    whole = np.concatenate(both, axis=-1).ravel()
+    def after_push(knots: np.ndarray) -> np.ndarray:
+        """Candidates of flight and landing, each after the push that was found."""
+        changes = knots.reshape(len(knots), 2, 3, -1)
+        pushed = np.tile(push.reshape(1, 2, 3, -1), (len(knots), 1, 1, 1))
+        return np.concatenate((pushed, changes), axis=-1)
+
+    def lands(knots: np.ndarray, says: bool) -> torch.Tensor:
+        return together(after_push(knots), says)
+
+    later = 6 * (len(KNOTS) - PUSH_KNOTS)
+    landing = climb(np.zeros(later), step, generations[1], seed, lands, candidates)
+    whole = after_push(landing[None]).ravel()
     found = climb(whole, 0.03, generations[2], seed, together, candidates)
     return targets(found.reshape(1, 2, 3, -1))[0]
 
@@ -582,11 +583,10 @@ def main() -> None:
     commands = (STAND, *(told for several in CHAINS for told in several))
     tables = (standing, *(targets for several in chains for targets in several))
     words = " ".join(str(number) for number in asked.generations)
-    kind = "naive" if asked.like else "matched"
     content = {
         "schema_version": SCHEMA_VERSION,
         "found_by": f"tools/find_jump.py --generations {words} --seed {asked.seed}",
-        "gains": kind,
+        "gains": settings["gains"].name,
         "with": [{"policy": sha256(path)} for path in asked.policies],
         "step_s": STEP_S,
         "joints": list(JOINTS),

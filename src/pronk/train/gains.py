@@ -28,11 +28,14 @@ NAIVE_DAMPING_RANGE = 0.05
 """Half-width of the randomization of naive damping [N m s/rad] (paper D4)."""
 
 
+GainsName = Literal["naive", "matched"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainingGains:
     """Nominal gains and their ranges, per joint group, and what they rest on."""
 
-    name: Literal["naive", "matched"]
+    name: GainsName
     robot: str
     """Name of the robot."""
     groups: Mapping[str, GroupGains]

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
-from pronk.train.environment.demonstration import GainsName, demonstration
+from pronk.train.environment.demonstration import demonstration
 from pronk.train.environment.jump import JumpSettings, JumpTracker
 from pronk.train.environment.motion import Motion, measure_motion
 from pronk.train.environment.scene import FEET, FOOT_GEOMS
 from pronk.train.environment.speed_ranges import Growth, SpeedRanges
-from pronk.train.gains import TrainingGains
+from pronk.train.gains import GainsName, TrainingGains
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import yaml
@@ -24,11 +24,11 @@ from torch import Tensor
 
 from pronk.errors import ArtefactError
 from pronk.robots import load_robot
+from pronk.train.gains import GainsName
 
 SCHEMA_VERSION = 1
 JOINTS = tuple(joint.name for joint in load_robot("mini_cheetah").joints)
 FILE = "jump_demonstration_{}.yaml"
-GainsName = Literal["matched", "naive"]
 BEYOND = 0.25
 """Commands faster than the fastest one shown change the jump further, up to this much faster."""
 

@@ -53,7 +53,7 @@ def lesson(before: EstimatorActor, observations: TensorDict, *, least: int = 256
     rows = observations.flatten(0, 1)
     shows = rows[GROUP][:, -1] > 0.5
     order = torch.randperm(len(shows), device=shows.device)
-    # How to land is nobody's lesson.
+    # Told to jump, and shown nothing any more: nobody's lesson.
     walks = ~shows & (rows["jump"][:, 0] == 0.0)
     first, other = order[shows[order]], order[walks[order]]
     chosen = torch.cat([first, other[: max(len(first), least)]])
