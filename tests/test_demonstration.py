@@ -97,7 +97,7 @@ def test_robots_are_shown_what_is_theirs() -> None:
 @pytest.mark.parametrize("gains", ["matched", "naive"])
 def test_what_is_shown_to_the_mini_cheetah(gains: GainsName) -> None:
     shown = demonstration(gains)
-    assert JumpSettings().prompt_s < shown.duration == pytest.approx(1.0)
+    assert JumpSettings().prompt_s < shown.duration == pytest.approx(0.8)
     robot = load_robot("mini_cheetah")
     default = torch.tensor([joint.default_position for joint in robot.joints])
     *ahead, right, left = shown.targets
@@ -159,9 +159,10 @@ def test_robots_that_are_led_leave_the_ground_and_others_do_not() -> None:
 def test_robots_are_led_part_of_the_way_from_their_own_targets(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With policy steps of 10 to 30 ms (D1), until nothing more is shown."""
+    """With policy steps of 10 to 30 ms (D1), until they have landed or nothing more is shown."""
     env = small_env.fresh(small_env.quiet())
     command, action = motion_command(env), env.action_manager.get_term("joint_position")
+    tracker = command.tracker
     enter_phase(env, phase("jump_a"))
     command.led, command.scripted = 0.25, True
     # What is shown stands out from what robots do of their own.
@@ -179,6 +180,15 @@ def test_robots_are_led_part_of_the_way_from_their_own_targets(
         command.compute(0.0)
         shows = passed < 0.26 - 1e-6
         assert command.showing.tolist() == [shows] * 2 + [False] * (small_env.ROBOTS - 2), passed
+        if passed == pytest.approx(0.13):
+            before = tracker.liftoffs.clone(), tracker.airborne.clone()
+            tracker.liftoffs[1] = 1.0
+            for airborne in (True, False):
+                tracker.airborne[1] = airborne
+                command.compute(0.0)
+                assert command.showing[:2].tolist() == [True, airborne], "until it has landed"
+            tracker.liftoffs[:], tracker.airborne[:] = before
+            command.compute(0.0)
         env.step(mine)
         led = torch.lerp(own, torch.full_like(own, 0.5), 0.25 * shows)
         assert torch.allclose(action._processed_actions[:2], led[:2], atol=1e-6), passed

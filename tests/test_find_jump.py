@@ -161,7 +161,9 @@ def test_climbing_finds_the_top(tool: Any) -> None:
 
 
 @pytest.mark.parametrize("told", [(2.0, 0.0), (0.0, -1.0)])
-def test_robots_jump_as_shown_and_land(tool: Any, told: tuple[float, float]) -> None:
+def test_robots_jump_as_shown_and_land(
+    tool: Any, monkeypatch: pytest.MonkeyPatch, told: tuple[float, float]
+) -> None:
     """The committed jumps, of a policy that walks and has not been searched with."""
     gains = training_gains(POLICIES / "gains.yaml", load_robot("mini_cheetah"))
     policies = [POLICIES / "matched" / "policy.onnx"]
@@ -180,6 +182,17 @@ def test_robots_jump_as_shown_and_land(tool: Any, told: tuple[float, float]) -> 
     assert float(seen.touching[: tool.JUMP, told_so].amax(dim=0).mean()) < 0.5
     assert float(seen.fell[:, told_so].amax(dim=0).mean()) < 0.2
     assert float(seen.top().up[still].mean()) < 1.0
+    # Who has landed is left to the policy, here one that stands, whatever a candidate would do.
+    other = jump.clone()
+    other[-3:] += 1.0
+    monkeypatch.setattr(stand, "_decide", lambda _: torch.zeros(stand.count, 12))
+    seen = stand.jump(torch.stack((jump, other)), tool.ROWS + tool.AFTER)
+    airborne = seen.stands[tool.PUSH :, mine] < 0.5
+    landed = (airborne.int().cummax(dim=0).values.bool() & ~airborne)[: tool.ROWS - tool.PUSH - 3]
+    same = (seen.height[:, mine] == seen.height[:, still]).all(dim=0)
+    stays = seen.fell[:, mine].amax(dim=0) == 0.0  # who falls is set down anew, at random
+    assert same[stays].tolist() == landed.any(dim=0)[stays].tolist()
+    assert 0.3 < float(same.float().mean()) < 1.0
     # Robots of all candidates are the same ones: until they differ, they do the same.
     again = stand.jump(torch.stack((jump, jump)), tool.PUSH)
     assert torch.equal(again.up[:, mine], again.up[:, still])

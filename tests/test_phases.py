@@ -54,6 +54,10 @@ def test_phases_are_the_papers() -> None:
     assert weak.final.collision > weak.weights.collision
     assert weak.final.knees > weak.weights.knees
     assert weak.final.landing > weak.weights.landing > strong.weights.landing == 0.0
+    # A fall comes to cost what a good jump is worth: .45 m high, 1 m far, a gap of .6 m.
+    last = weak.final
+    assert last.fall >= last.sparse + 0.45 * last.rise + last.reach + 0.6 * last.gap
+    assert last.fall > weak.weights.fall > strong.weights.fall
     assert (walk.final, strong.final) == (None, None)
 
 
@@ -191,6 +195,7 @@ def settled(phase: Phase, done: float = 0.0) -> dict[str, tuple[float, float]]:
         "collision": -w.collision,
         "knees": -w.knees,
         "landing": -w.landing,
+        "termination": -w.fall,
     }
     return {name: (row.walk, jump.get(name, row.jump)) for name, row in ROWS.items()}
 

@@ -336,6 +336,7 @@ def test_an_event_is_worth_its_weight_once(
         collision=5.0,
         knees=3.0,
         landing=0.0,
+        fall=10.0,
     )
     enter_phase(env, Phase(name="made up", iterations=1, jump=True, weights=weights))
     getattr(command.tracker, event)[:] = 0.0
@@ -529,6 +530,7 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
         collision=9.0,
         knees=4.0,
         landing=7.0,
+        fall=8.0,
     )
     rows = with_jump_weights(ROWS, weights)
     changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
@@ -539,6 +541,7 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
         "collision": -9.0,
         "knees": -4.0,
         "landing": -7.0,
+        "termination": -8.0,
     }
     assert {name: rows[name].jump for name in changed} == changed
     assert {name: rows[name].walk for name in changed} == {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,31 @@ def test_it_does_as_shown_and_then_as_the_policy_that_is_not_told(tool: Any) -> 
     walks.reset()
     again = policy.step(stands, (1.0, 0.0, 0.0))
     np.testing.assert_array_equal(again, walks.step(stands, (1.0, 0.0, 0.0)))
+
+
+def test_what_has_landed_is_left_to_the_policy(tool: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, contract = demonstration(), load_policy(POLICY).contract
+    policy = tool.AsShown(load_policy(POLICY)._session, contract)
+    policy.shown = shown
+    default = np.array(contract.default_position)
+    stands = Measurement(
+        angular_velocity=np.zeros(3),
+        projected_gravity=np.array([0.0, 0.0, -1.0]),
+        position=default,
+        velocity=np.zeros(12),
+    )
+    forward = shown.targets[shown.forward.tolist().index(1.0)].numpy()
+    # A stride before the push is over is no flight.
+    grounded = [not (row in (5, 6) or 14 <= row < 30) for row in range(40)]
+    feels = policy._run
+    for row, ground in enumerate(grounded):
+        contact = np.array([[0.1, 0.1, 0.9 * ground, 0.1]], np.float32)
+        monkeypatch.setattr(
+            policy, "_run", lambda *given, now=contact: replace(feels(*given), contact=now)
+        )
+        target = policy.step(stands, (1.0, 0.0, 0.0), row < 25)
+        as_shown = np.abs(target - forward[row]).max() < 1e-5
+        assert as_shown == (row < 30), row
 
 
 def test_what_is_shown_jumps_on_the_virtual_robot(tool: Any) -> None:

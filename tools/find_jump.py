@@ -3,12 +3,12 @@ r"""Search for the jump that training shows to a policy, `jump_demonstration_*.y
     python tools/find_jump.py walk1.onnx walk2.onnx --gains policies/gains.yaml --out jump.yaml
     python tools/find_jump.py walk3.onnx --gains naive --like policies/gains.yaml --out naive.yaml
 
-CMA-ES over joint targets from the jump command until the robot walks on, command by command: first
-those up to lift-off, then those of flight and landing, then all of them together. A quarter of the
-robots is told what lies half way to the command before, and shown the mean of both jumps.
+CMA-ES over joint targets from the jump command until touchdown, command by command: first those up
+to lift-off, then those of the flight, then all of them together. A quarter of the robots is told
+what lies half way to the command before, and shown the mean of both jumps.
 A candidate is tried on robots that walk by the policies given, each told to jump at another moment
-of its stride and with a battery of its own; from then on all targets are the candidate's, until the
-policies, which know of no jump, are left to themselves again.
+of its stride and with a battery of its own; from then on all targets are the candidate's, until a
+foot is on the ground again and the policies, which know of no jump, land it and walk on.
 
 What counts is the ground covered in flight and the height; tilting, turning, a late lift-off,
 anything but feet on the ground, jumps that are not alike, falls, and not walking on cost. A policy
@@ -61,11 +61,10 @@ LEAP = float(MotionCommandCfg.__dataclass_fields__["leap"].default)
 """How much faster than told a jump may go [m/s], for commands below 1 m/s in proportion: ground
 covered faster is not paid in training either."""
 STEP_S = 0.02
-PUSH_S, WHOLE_S = 0.26, 1.0
-"""From the command to lift-off, and to the end of what is shown, a quarter of a second after
-touchdown [s]."""
+PUSH_S, WHOLE_S = 0.26, 0.8
+"""From the command to lift-off, and to the latest touchdown [s]."""
 PUSH, ROWS = (round(seconds / STEP_S) + 1 for seconds in (PUSH_S, WHOLE_S))
-KNOTS = np.concatenate([np.linspace(0.0, PUSH_S, 9), [0.36, 0.48, 0.6, 0.7, 0.8, 0.9, WHOLE_S]])
+KNOTS = np.concatenate([np.linspace(0.0, PUSH_S, 9), [0.36, 0.48, 0.6, 0.7, WHOLE_S]])
 """Moments between which targets go evenly [s]."""
 PUSH_KNOTS = 9
 GUESS = {"hip_pitch": (-0.35, 0.5), "knee": (0.8, -1.0)}
@@ -95,6 +94,8 @@ but dealt out."""
 WALK, STRIDE, JUMP, AFTER = 60, 16, 18, 30
 """Policy steps to get under way, over which robots begin to, of a jump up to lift-off, and after
 what is shown."""
+ALIKE = 2.0
+"""Weight of jumps that are not alike."""
 MOMENTS = 16
 """Robots that try a candidate."""
 BETWEEN = torch.tensor([(i + i // 4) % 4 == 3 for i in range(MOMENTS)])
@@ -329,7 +330,7 @@ class Stand:
         """Try candidates.
 
         Args:
-            targets: Joint targets, (candidates, rows, 12) [rad].
+            targets: Joint targets until touchdown, (candidates, rows, 12) [rad].
             steps: So many, from the command on.
             before: Those of the command before, (rows, 12); None: those between are shown
                 `targets` as well.
@@ -342,10 +343,18 @@ class Stand:
         if before is not None:
             mine = torch.where(self.between[:, None, None], 0.5 * (mine + before), mine)
         asked = (mine - held._offset[:, None]) / held._scale
-        observed = env.obs_buf
+        observed, tracker = env.obs_buf, self.command.tracker
+        # Commands and their tracker know of the jump, which policies are not told of.
+        self.command.jump[:] = True
         for step in range(steps):
-            led = step < targets.shape[1]
-            observed = env.step(asked[:, step] if led else self._decide(observed))[0]
+            landed = (tracker.liftoffs > 0.0) & ~tracker.airborne
+            if step >= asked.shape[1]:
+                action = self._decide(observed)
+            elif landed.any():
+                action = torch.where(landed[:, None], self._decide(observed), asked[:, step])
+            else:
+                action = asked[:, step]
+            observed = env.step(action)[0]
             motions.append(self._seen())
         return Series(*torch.stack(motions).unbind(dim=1))
 
@@ -474,7 +483,7 @@ def search(
         if nearby is not None:
             far = far + 0.02 * (tried - nearby).square().mean(dim=(1, 2))
         scores = good(seen, stand.speed).view(-1, MOMENTS).mean(dim=1)
-        scores = scores - unlike(seen, stand.speed) - far
+        scores = scores - ALIKE * unlike(seen, stand.speed) - far
         if says:
             say(told, seen, scores)
         return scores
@@ -491,17 +500,17 @@ def search(
         return score(whole, says, ROWS + AFTER, whole_score)
 
     def after_push(knots: np.ndarray) -> np.ndarray:
-        """Candidates of flight and landing, each after the push that was found."""
+        """Candidates of the flight, each after the push that was found."""
         changes = knots.reshape(len(knots), 2, 3, -1)
         pushed = np.tile(push.reshape(1, 2, 3, -1), (len(knots), 1, 1, 1))
         return np.concatenate((pushed, changes), axis=-1)
 
-    def lands(knots: np.ndarray, says: bool) -> torch.Tensor:
+    def flies(knots: np.ndarray, says: bool) -> torch.Tensor:
         return together(after_push(knots), says)
 
     later = 6 * (len(KNOTS) - PUSH_KNOTS)
-    landing = climb(np.zeros(later), step, generations[1], seed, lands, candidates)
-    whole = after_push(landing[None]).ravel()
+    flight = climb(np.zeros(later), step, generations[1], seed, flies, candidates)
+    whole = after_push(flight[None]).ravel()
     found = climb(whole, 0.03, generations[2], seed, together, candidates)
     return targets(found.reshape(1, 2, 3, -1))[0]
 
@@ -544,7 +553,7 @@ def chain(
 def earlier(path: Path) -> dict[tuple[float, float], torch.Tensor]:
     """What an earlier search wrote: targets by command."""
     jumps = yaml.safe_load(path.read_text(encoding="utf-8"))["jumps"]
-    return {(jump["forward"], jump["left"]): torch.tensor(jump["targets"]) for jump in jumps}
+    return {(jump["forward"], jump["left"]): torch.tensor(jump["targets"])[:ROWS] for jump in jumps}
 
 
 def _rounded(targets: torch.Tensor) -> list[list[float]]:
@@ -562,7 +571,7 @@ def main() -> None:
         type=int,
         nargs=3,
         default=(100, 40, 20),
-        help="Of the push, of flight and landing, of all together.",
+        help="Of the push, of the flight, of all together.",
     )
     parser.add_argument("--begin", type=Path, help="Go on from what this tool wrote.")
     parser.add_argument("--seed", type=int, default=1)

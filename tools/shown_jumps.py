@@ -3,9 +3,9 @@ r"""The jump that training shows, done open loop on the virtual robot: what ther
     python tools/shown_jumps.py walk.onnx
     python tools/shown_jumps.py policies/matched/policy.onnx --jump jump.yaml --jumps 20
 
-A policy walks; from the jump command on the joint targets are those shown, until there are no more,
-and then the policy goes on. It is never told to jump. Script, draws and figures are those of
-`pronk trial`.
+A policy walks; from the jump command on the joint targets are those shown, until its estimator
+feels ground again, and then the policy lands it and goes on. It is never told to jump. Script,
+draws and figures are those of `pronk trial`.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ from pronk.trial.pilot import fly
 from pronk.trial.protocol import PAPER_COMMANDS, Case
 from pronk.trial.run import Plan, draw, mass_of
 
+PUSH_S = 0.26
+"""After the jump command feet leave the ground no sooner [s]."""
 FIGURES = {
     "height": "m",
     "distance": "m",
@@ -52,6 +54,7 @@ class AsShown(Policy):
     shown: Demonstration
     _row = 1 << 30
     _told = False
+    _flew = False
 
     def reset(self) -> None:
         """Begin anew."""
@@ -63,11 +66,15 @@ class AsShown(Policy):
     ) -> NDArray[np.float64]:
         """As `Policy.step`."""
         if jump and not self._told:
-            self._row = 0
+            self._row, self._flew = 0, False
         self._told = jump
         measured = self._history.observe(measurement, command)
         self.inference = self._run(measured[None], np.zeros((1, 1), np.float32))
         action = self.inference.action[0]
+        grounded = bool((self.inference.contact[0] > 0.5).any())
+        if self._flew and grounded:
+            self._row = 1 << 30
+        self._flew |= not grounded and self._row * self.shown.step_s > PUSH_S
         if self._row < self.shown.targets.shape[1]:
             since = torch.tensor([self.shown.step_s * self._row])
             asked = torch.tensor(np.asarray(command, dtype=np.float32)[None, :2])

@@ -60,6 +60,8 @@ class JumpWeights:
     """On knees near the ground in jump mode [1/s]."""
     landing: float
     """On how deep a jump is landed [1/(m s)]."""
+    fall: float
+    """Per fall in jump mode."""
 
 
 ROWS: Mapping[str, Row] = {
@@ -146,6 +148,7 @@ def with_jump_weights(rows: Mapping[str, Row], weights: JumpWeights) -> dict[str
         "collision": -weights.collision,
         "knees": -weights.knees,
         "landing": -weights.landing,
+        "termination": -weights.fall,
     }
     if missing := sorted(set(changed) - set(rows)):
         raise PronkError(f"the reward table has no {', '.join(missing)}.")
