@@ -29,17 +29,21 @@ def tool() -> Any:
     return load_tool("shown_jumps")
 
 
+def standing() -> Measurement:
+    """A robot that stands."""
+    return Measurement(
+        angular_velocity=np.zeros(3),
+        projected_gravity=np.array([0.0, 0.0, -1.0]),
+        position=np.array([joint.default_position for joint in load_robot("mini_cheetah").joints]),
+        velocity=np.zeros(12),
+    )
+
+
 def test_it_does_as_shown_and_then_as_the_policy_that_is_not_told(tool: Any) -> None:
     walks, shown = load_policy(POLICY), demonstration()
     policy = tool.AsShown(load_policy(POLICY)._session, walks.contract)
     policy.shown = shown
-    default = np.array([joint.default_position for joint in load_robot("mini_cheetah").joints])
-    stands = Measurement(
-        angular_velocity=np.zeros(3),
-        projected_gravity=np.array([0.0, 0.0, -1.0]),
-        position=default,
-        velocity=np.zeros(12),
-    )
+    stands = standing()
     forward = shown.targets[shown.forward.tolist().index(1.0)].numpy()
     rows = len(forward)
     for step in range(3 + rows):
@@ -61,13 +65,7 @@ def test_what_has_landed_is_left_to_the_policy(tool: Any, monkeypatch: pytest.Mo
     shown, contract = demonstration(), load_policy(POLICY).contract
     policy = tool.AsShown(load_policy(POLICY)._session, contract)
     policy.shown = shown
-    default = np.array(contract.default_position)
-    stands = Measurement(
-        angular_velocity=np.zeros(3),
-        projected_gravity=np.array([0.0, 0.0, -1.0]),
-        position=default,
-        velocity=np.zeros(12),
-    )
+    stands = standing()
     forward = shown.targets[shown.forward.tolist().index(1.0)].numpy()
     # A stride before the push is over is no flight.
     grounded = [not (row in (5, 6) or 14 <= row < 30) for row in range(40)]

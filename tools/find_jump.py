@@ -94,8 +94,6 @@ but dealt out."""
 WALK, STRIDE, JUMP, AFTER = 60, 16, 18, 30
 """Policy steps to get under way, over which robots begin to, of a jump up to lift-off, and after
 what is shown."""
-ALIKE = 2.0
-"""Weight of jumps that are not alike."""
 MOMENTS = 16
 """Robots that try a candidate."""
 BETWEEN = torch.tensor([(i + i // 4) % 4 == 3 for i in range(MOMENTS)])
@@ -483,7 +481,7 @@ def search(
         if nearby is not None:
             far = far + 0.02 * (tried - nearby).square().mean(dim=(1, 2))
         scores = good(seen, stand.speed).view(-1, MOMENTS).mean(dim=1)
-        scores = scores - ALIKE * unlike(seen, stand.speed) - far
+        scores = scores - unlike(seen, stand.speed) - far
         if says:
             say(told, seen, scores)
         return scores

@@ -140,6 +140,7 @@ def sentence(jumps: list[JumpFigures]) -> str:
     means = (
         f"{name.replace('_', ' ')} {np.nanmean(of(name)):.3f} +- {np.nanstd(of(name)):.3f} {unit}"
         for name, unit in FIGURES.items()
+        if np.isfinite(of(name)).any()
     )
     counts = (f"{flag} {int(of(flag).sum())}" for flag in ("success", "touched", "fell"))
     return f"{', '.join(means)}; of {len(jumps)}: {', '.join(counts)}"

@@ -1,4 +1,4 @@
-"""A jump that is shown: joint targets for every moment from the jump command until it is landed.
+"""A jump that is shown: joint targets for every moment from the jump command to touchdown.
 
 A jump asks something else of twelve drives at every moment of a quarter of a second, and to learn
 that by trying takes longer than training lasts. A policy that had been led through a poor one
