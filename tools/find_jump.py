@@ -345,7 +345,7 @@ class Stand:
         # Commands and their tracker know of the jump, which policies are not told of.
         self.command.jump[:] = True
         for step in range(steps):
-            landed = (tracker.liftoffs > 0.0) & ~tracker.airborne
+            landed = tracker.landed
             if step >= asked.shape[1]:
                 action = self._decide(observed)
             elif landed.any():

@@ -1,4 +1,4 @@
-r"""The jump that training shows, done open loop on the virtual robot: what there is to learn.
+r"""The jump that training shows, done on the virtual robot: what there is to learn.
 
     python tools/shown_jumps.py walk.onnx
     python tools/shown_jumps.py policies/matched/policy.onnx --jump jump.yaml --jumps 20
@@ -48,18 +48,22 @@ FIGURES = {
 }
 
 
+_OVER = 1 << 30
+"""A row after all that is shown."""
+
+
 class AsShown(Policy):
     """Walks by a network, and jumps as it is shown."""
 
     shown: Demonstration
-    _row = 1 << 30
+    _row = _OVER
     _told = False
     _flew = False
 
     def reset(self) -> None:
         """Begin anew."""
         super().reset()
-        self._row, self._told = 1 << 30, False
+        self._row, self._told = _OVER, False
 
     def step(
         self, measurement: Measurement, command: ArrayLike, jump: bool = False
@@ -73,7 +77,7 @@ class AsShown(Policy):
         action = self.inference.action[0]
         grounded = bool((self.inference.contact[0] > 0.5).any())
         if self._flew and grounded:
-            self._row = 1 << 30
+            self._row = _OVER
         self._flew |= not grounded and self._row * self.shown.step_s > PUSH_S
         if self._row < self.shown.targets.shape[1]:
             since = torch.tensor([self.shown.step_s * self._row])

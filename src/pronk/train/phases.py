@@ -175,9 +175,9 @@ PHASES: tuple[Phase, ...] = (
     # there be none; shown one from the first day on, a policy jumps no lower, and scatters less,
     # with half of the cost from the beginning of 2b (one run each). 60, 40 and 100 made 280 of 300
     # landings well, of three seeds, but the first fell to .11 m and lost .8 of 2.4 m/s.
-    # A fall comes to cost what a jump is worth: with 10, two policies leapt 1.3 m where they were
-    # shown .9, and fell in .4 of these landings (forward at 2 m/s); after 90 small iterations more
-    # with 50 (1,280 robots) one fell in .02 of them, and jumped as well. A trial forgives no touch,
+    # A fall comes to cost what a jump is worth: with 10, two policies fell in .4 of their landings
+    # forward at 2 m/s (one leapt 1.3 m there and was shown .9); after 90 small iterations more with
+    # 50 (1,280 robots) that one fell in .02, and jumped as well. A trial forgives no touch,
     # and most last 20 ms, 1 at 45 a second: 56 more with 300 left 10 of 33 landings with one, of
     # 64, and were .1 m less far; 52 with 150 left 31. What jumps are worth falls:
     # with as much as at first walking came to be .18 m/s too fast, turning .2 rad/s too slow; led,

@@ -299,10 +299,9 @@ class MotionCommand(CommandTerm):
         # The tracker hears of a new command when the step that it began is over.
         begins = self.jump & ~tracker.commanded
         passed = tracker.since * ~begins
-        # Landing has to answer to what it comes to; nobody is shown how.
-        landed = (tracker.liftoffs > 0.0) & ~tracker.airborne
-        # Time is a sum of steps: what is a millisecond short of the end is at the end.
-        under_way = tracker.mode & ~landed & (passed < whole - 1e-3)
+        # Landing has to answer to what it comes to; nobody is shown how. Time is a sum of steps:
+        # what is a millisecond short of the end is at the end.
+        under_way = tracker.mode & ~tracker.landed & (passed < whole - 1e-3)
         self.showing = begins | under_way
         self.shown = self._demonstration.at(passed, self.velocity[:, :2])
         if self.led > 0.0:

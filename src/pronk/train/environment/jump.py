@@ -142,6 +142,11 @@ class JumpTracker:
         """How much faster than told it went when this command came, if it did [m/s]."""
         return self.pace.clamp_min(0.0)
 
+    @property
+    def landed(self) -> Tensor:
+        """On the ground again after a lift-off of this command. Bool, (N,)."""
+        return (self.liftoffs > 0.0) & ~self.airborne
+
     def reset(self, env_ids: Tensor) -> None:
         """Forget everything of some robots.
 

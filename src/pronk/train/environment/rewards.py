@@ -173,8 +173,7 @@ def landing(command: MotionCommand, height: float) -> Tensor:
     The height of a jump is counted from its lowest trunk, and that was where it landed.
     """
     tracker = command.tracker
-    landed = (tracker.liftoffs > 0.0) & ~tracker.airborne & tracker.mode
-    return (height - command.motion.height).clamp_min(0.0) * landed
+    return (height - command.motion.height).clamp_min(0.0) * (tracker.landed & tracker.mode)
 
 
 def crouch(command: MotionCommand, height: float) -> Tensor:
