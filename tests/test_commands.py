@@ -18,6 +18,7 @@ pytestmark = pytest.mark.train
 import torch  # noqa: E402
 
 import small_env  # noqa: E402
+from pronk.policy.stride import MOST_S  # noqa: E402
 from pronk.train.environment.commands import MotionCommand, motion_command  # noqa: E402
 from pronk.train.phases import enter_phase, phase  # noqa: E402
 
@@ -116,12 +117,12 @@ def test_time_passes_in_proportion_to_the_step(command: MotionCommand) -> None:
 # --- Jump -----------------------------------------------------------------------------------------
 
 
-def watch(command: MotionCommand, steps: int) -> Array:
-    """The jump input of every robot in many steps. (steps, N)"""
+def watch(command: MotionCommand, steps: int, what: str = "jump") -> Array:
+    """The jump input of every robot in many steps, or whether it is asked for. (steps, N)"""
     seen = []
     for _ in range(steps):
         command.compute(DT)
-        seen.append(command.jump.clone())
+        seen.append(getattr(command, what).clone())
     return np.int64(torch.stack(seen).numpy())
 
 
@@ -148,14 +149,14 @@ def test_half_of_any_number_of_robots_is_half() -> None:
         assert abs(int((rank < 0.5).sum()) - count / 2) <= 2
 
 
-def test_the_time_until_a_jump_input_changes_is_known(env: Any, command: MotionCommand) -> None:
+def test_the_time_until_a_jump_is_asked_for_is_known(env: Any, command: MotionCommand) -> None:
     enter_phase(env, phase("jump_a"))
     command.reset(EVERYBODY)
     changes = 0
     for _ in range(250):
-        left, before = command.jump_left.clone(), command.jump.clone()
+        left, before = command.jump_left.clone(), command.asked.clone()
         command.compute(DT)
-        changed = command.jump != before
+        changed = command.asked != before
         changes += int(changed.sum())
         assert torch.equal(changed, command.jumper & (left <= DT))
     assert changes > N, "half of them, on and off, more than once"
@@ -170,11 +171,11 @@ def test_walking_again_ends_all_jumps(env: Any, command: MotionCommand) -> None:
     assert not watch(command, 100).any()
 
 
-def test_jump_input_is_held_for_a_random_interval(env: Any, command: MotionCommand) -> None:
+def test_jumps_are_asked_for_for_a_random_interval(env: Any, command: MotionCommand) -> None:
     """C4: on and off for times drawn from their ranges, to the length of a step."""
     enter_phase(env, phase("jump_a"))
     command.reset(EVERYBODY)
-    seen = watch(command, 6000)
+    seen = watch(command, 6000, "asked")
     on, off = [], []
     for jump in seen.T[seen.any(axis=0)]:
         edges = np.flatnonzero(np.diff(jump, prepend=0))
@@ -188,6 +189,39 @@ def test_jump_input_is_held_for_a_random_interval(env: Any, command: MotionComma
         assert max(spans) <= high + DT + 1e-5
         assert kstest(spans, "uniform", args=(low, high - low + DT)).statistic < 0.15
         assert max(spans) - min(spans) > 0.85 * (high - low)
+
+
+def test_the_jump_input_waits_for_the_stride(
+    env: Any, command: MotionCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot whose knees change over is told at once, one that stands after the longest wait."""
+    enter_phase(env, phase("jump_a"))
+    command.reset(EVERYBODY)
+    env.sim.data.qpos[:, 7 + 2 :: 3] = 1.6
+    knee = env.sim.data.qpos[:, 7 + 2]
+    knee[::2] = 1.5
+    command.compute(DT)
+    command._jump_left[:] = 0.0
+    command.compute(DT)
+    assert torch.equal(command.asked, command.jumper)
+    assert not command.jump.any()
+    knee[::2] = 1.7
+    command.compute(DT)
+    assert torch.equal(command.jump, command.jumper & (EVERYBODY % 2 == 0))
+    later = watch(command, round(0.3 / DT))
+    assert torch.equal(torch.tensor(later[-1] > 0), command.jumper)
+    # Two steps of the wait were over before.
+    standing = later[:, (command.jumper & (EVERYBODY % 2 == 1)).numpy()]
+    assert (standing.argmax(axis=0) + 2 == round(MOST_S / DT)).all()
+    # A script may wait as well.
+    monkeypatch.setattr(command, "scripted", True)
+    monkeypatch.setattr(command, "waits", True)
+    command.asked[:] = False
+    command.compute(DT)
+    assert not command.jump.any()
+    command.asked[:] = True
+    watch(command, round(MOST_S / DT) + 1)
+    assert command.jump.all()
 
 
 # --- Who is left alone ----------------------------------------------------------------------------

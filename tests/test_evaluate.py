@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from pronk.bars import Check
 from pronk.errors import ArtefactError, PronkError
 from pronk.jumps import Jump, JumpRules, Series, answer, measure, unasked_height
+from pronk.policy.stride import MOST_S
 from pronk.train.evaluation import bars as evaluate_bars
 from pronk.train.evaluation import result as evaluate_result
 from pronk.train.evaluation.bars import checks, cost_of_jumping
@@ -189,9 +190,10 @@ def test_an_evaluation_comes_back_from_its_file(tmp_path: Path) -> None:
 
 def test_a_file_from_before_touches_were_counted_is_read(tmp_path: Path) -> None:
     path = tmp_path / "evaluation.json"
-    whole = evaluation(jumps=(jump("back 2", touched=0.7),))
+    whole = evaluation(jumps=(jump("back 2", touched=0.7, waited=0.1),))
     evaluate_result.save(path, whole, [])
     assert evaluate_result.load(path).jumps[0].touched == 0.7
+    assert evaluate_result.load(path).jumps[0].waited == 0.1
     body = json.loads(path.read_text())
     del body["jumps"][0]["touched"]
     path.write_text(json.dumps(body))
@@ -253,7 +255,7 @@ def test_every_robot_has_its_command_and_its_times() -> None:
     assert np.array_equal(on, plan.times(DT)["on"][plan.walkers :] * DT)
     assert not np.array_equal(on, replace(plan, seed=5).times(DT)["on"][plan.walkers :] * DT)
     assert plan.seconds == 20.0
-    assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
+    assert replace(plan, walks=()).seconds == pytest.approx(4.0 + MOST_S + 1.5 + 1.0 + 2.0)
 
 
 @pytest.mark.parametrize(
@@ -644,11 +646,18 @@ def test_the_policy_sees_the_command_of_the_moment(seen: Seen) -> None:
     commands, times = SHORT.commands(), SHORT.times(DT)
     samples = [sample for sample, _, _ in seen.looks]
     assert {2, 3, 4, 5, 6} == set(np.diff(samples))
-    for sample, command, jump in seen.looks:
+    for sample, command, _ in seen.looks:
         moving = (times["start"] <= sample) & (sample < times["stop"])
         assert np.array_equal(command, np.where(moving[:, None], commands, 0.0))
-        assert np.array_equal(jump, (times["on"] <= sample) & (sample < times["off"]))
-    assert any(jump.any() for _, _, jump in seen.looks)
+    # The jump input comes within the longest wait after it is asked for, and stays as long.
+    now = np.array(samples)[:, None]
+    asked = (times["on"] <= now) & (now < times["off"])
+    jumps = np.array([jump > 0.0 for _, _, jump in seen.looks])
+    for robot in np.flatnonzero(asked.any(axis=0)):
+        wait = int(jumps[:, robot].argmax() - asked[:, robot].argmax())
+        assert 0 <= wait <= round(MOST_S / 0.02)
+        assert jumps[:, robot].sum() == asked[:, robot].sum() - wait
+    assert not jumps[~asked].any()
 
 
 @pytest.mark.train

@@ -169,6 +169,7 @@ def run(
                 subject.act,
                 env,
                 plan,
+                waits=subject.waits,
                 estimate=subject.estimate,
                 progress=report.bar("walking and jumping"),
                 about=about,
@@ -279,6 +280,12 @@ def show_jumps(evaluation: Evaluation) -> None:
         "  touched: anything but a foot on the ground, from the command to 2 s after touchdown; a "
         "trial counts no such jump as a success."
     )
+    waited = [jump.waited for jump in evaluation.jumps if jump.waited >= 0.0]
+    if waited:
+        console.say(
+            f"  after: since the jump input, which came {max(waited):.2f} s at most after it was "
+            "asked for."
+        )
 
 
 def spread(figure: Spread, digits: int = 2) -> str:

@@ -41,6 +41,7 @@ def from_json(text: str, *, source: object) -> Contract:
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         got = body.get("schema") if isinstance(body, dict) else type(body).__name__
         raise ArtefactError(f"{source}: schema {got!r}; this pronk reads {SCHEMA!r}.")
+    body = {"waits_for_stride": False} | body  # files older than this field do not wait
     odd = (set(_READERS) | {"schema"}) ^ set(body)
     if odd:
         raise ArtefactError(
@@ -134,6 +135,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "command_ranges": lambda value: _mapping(value, _pair),
     "jump": _flag,
     "lift_off_velocity": lambda value: None if value is None else _number(value),
+    "waits_for_stride": _flag,
     "provenance": _mapping,
     "versions": lambda value: _mapping(value, _text),
 }

@@ -20,6 +20,7 @@ from pronk.policy.contract import Contract, measured_layout
 from pronk.policy.contract_json import METADATA_KEY, from_json
 from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
 from pronk.policy.observation import Floats, History, Measurement, finite
+from pronk.policy.stride import StrideGate
 
 WRITER = "`pronk train` writes one"
 _OUTPUTS = {"action": JOINTS, **ESTIMATE}
@@ -39,7 +40,7 @@ class Inference:
 
 
 class Policy:
-    """A network, its contract, and the history of the one robot that `step` runs."""
+    """A network, its contract, and the past of the one robot that `step` runs."""
 
     def __init__(self, session: Any, contract: Contract, *, sha256: str = "") -> None:
         """Wrap what `load_policy` has opened and checked.
@@ -60,6 +61,7 @@ class Policy:
         self._default = np.asarray(contract.default_position)
         self._scale = np.asarray(contract.action_scale)
         self._history = History(contract.default_position)
+        self._gate = StrideGate(np.zeros(1), policy_rate_hz=contract.policy_rate_hz)
 
     def sibling(self) -> Self:
         """The same network with a past of its own: nothing it does is seen by this one."""
@@ -68,6 +70,7 @@ class Policy:
     def reset(self) -> None:
         """Begin anew: the next measurement is taken for the whole past, past actions for zero."""
         self._history.reset()
+        self._gate.reset()
         self.inference = None
 
     def step(
@@ -78,7 +81,8 @@ class Policy:
         Args:
             measurement: Of now.
             command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
-            jump: The jump input.
+            jump: Whether a jump is asked for; if the contract says so, the network hears of it
+                when the legs change over (`pronk.policy.stride`).
 
         Returns:
             Joint position targets in the order of the contract, absolute [rad]. (12,)
@@ -88,7 +92,10 @@ class Policy:
         """
         self._refuse_jump(jump)
         measured = self._history.observe(measurement, command)
-        self.inference = self._run(measured[None], np.full((1, 1), jump, np.float32))
+        told = np.array([jump])
+        if self.contract.waits_for_stride:
+            told = self._gate(np.asarray(measurement.position)[None], told)
+        self.inference = self._run(measured[None], told[None].astype(np.float32))
         action = self.inference.action[0]
         self._history.acted(action)
         target: NDArray[np.float64] = self._default + self._scale * action

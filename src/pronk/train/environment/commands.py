@@ -1,4 +1,4 @@
-"""What the robot is told: velocities, redrawn now and then, and the jump input.
+"""What the robot is told: velocities, redrawn now and then, and to jump, as its stride allows.
 
 Checklist C1 to C4. Speed ranges grow from a part of the full range to the whole: with +-3 m/s
 from the first step a policy learns to stand, since the tracking reward has no slope so far away
@@ -15,6 +15,7 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
+from pronk.policy.stride import StrideGate
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
 from pronk.train.environment.demonstration import demonstration
@@ -71,11 +72,11 @@ class MotionCommandCfg(CommandTermCfg):
     """Part of the draws along one axis alone, as the trials ask."""
     jump_fraction: float = 0.0
     """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""
-    jump_on_s: tuple[float, float] = (0.4, 0.7)
-    """Time that the jump input is held [s]: less than preparation and flight together, so that
-    one command means one jump."""
+    jump_on_s: tuple[float, float] = (0.5, 0.7)
+    """Time that a jump is asked for [s]: less than preparation and flight together, so that one
+    command means one jump, and enough to lift off in what the stride leaves of it."""
     jump_off_s: tuple[float, float] = (1.0, 2.5)
-    """Time between jump inputs [s]."""
+    """Time in between [s]."""
     leap: float = 0.6
     """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
@@ -102,8 +103,10 @@ class MotionCommand(CommandTerm):
         count, device = self.num_envs, self.device
         self.velocity = torch.zeros(count, 3, device=device)
         """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. Shape (N, 3)."""
+        self.asked = torch.zeros(count, dtype=torch.bool, device=device)
+        """Whether a jump is asked for. Shape (N,)."""
         self.jump = torch.zeros(count, dtype=torch.bool, device=device)
-        """Jump input. Shape (N,)."""
+        """Jump input: follows `asked` as the stride comes to the moment. Shape (N,)."""
         data = env.scene["robot"].data
         self.default_position: Tensor = data.default_joint_pos
         """[rad]. (N, 12)"""
@@ -116,7 +119,10 @@ class MotionCommand(CommandTerm):
         self.effort_limit = torch.tensor(cfg.drive.effort_limit, device=device)
         """[N m]. (12,)"""
         self.scripted = False
-        """True: nobody but the caller changes `velocity` and `jump`."""
+        """True: nobody but the caller changes `velocity` and `jump`, or `asked` if a script
+        waits."""
+        self.waits = False
+        """Whether in a script, too, `jump` follows `asked`."""
         self.led = 0.0
         """Part of the way to what they are shown that robots are led, 0 to 1; a phase sets it."""
         self._demonstration = demonstration(cfg.gains).to(device)
@@ -127,6 +133,7 @@ class MotionCommand(CommandTerm):
         self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
         self.ranges = SpeedRanges(cfg.growth, device)
         self._jump_left = torch.zeros(count, device=device)
+        self._gate = StrideGate(torch.zeros(count, device=device), policy_rate_hz=1.0 / env.step_dt)
         self._limits = torch.tensor(cfg.limits, device=device)
         moving = 1.0 - cfg.standing
         kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
@@ -170,7 +177,7 @@ class MotionCommand(CommandTerm):
 
     @property
     def jump_left(self) -> Tensor:
-        """Time until the jump input changes [s]; 0 where it never does. (N,)."""
+        """Time until a jump is asked for, or no more [s]; 0 where it never is. (N,)."""
         return self._jump_left * self.jumper
 
     @property
@@ -250,6 +257,7 @@ class MotionCommand(CommandTerm):
         """Fresh commands for robots that start anew; jumps under way are forgotten."""
         assert isinstance(env_ids, Tensor)
         self.tracker.reset(env_ids)
+        self._gate.reset(env_ids)
         if self._motion is not None:
             self._motion.forget(env_ids)
         if self.scripted:
@@ -257,6 +265,7 @@ class MotionCommand(CommandTerm):
         velocity, time, _, off = self._draw(len(env_ids))
         self.velocity[env_ids] = velocity
         self.time_left[env_ids] = time
+        self.asked[env_ids] = False
         self.jump[env_ids] = False
         self._jump_left[env_ids] = off
         return {}
@@ -270,6 +279,8 @@ class MotionCommand(CommandTerm):
             return
         if not self.scripted:
             self._pass(dt)
+        if self.waits or not self.scripted:
+            self.jump.copy_(self._gate(self._env.scene["robot"].data.joint_pos, self.asked))
         self._show()
 
     def _pass(self, dt: float | Tensor) -> None:
@@ -280,12 +291,12 @@ class MotionCommand(CommandTerm):
         self.velocity = torch.where(due[:, None], velocity, self.velocity)
         self.time_left = torch.where(due, time, self.time_left)
         if self.cfg.jump_fraction <= 0.0:
-            self.jump.zero_()
+            self.asked.zero_()
             return
         self._jump_left -= dt
         turn = (self._jump_left <= 0.0) & self.jumper
-        self.jump = self.jump ^ turn
-        self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
+        self.asked = self.asked ^ turn
+        self._jump_left = torch.where(turn, torch.where(self.asked, on, off), self._jump_left)
 
     def _show(self) -> None:
         """What robots are shown in the coming step, and how far they are led there."""

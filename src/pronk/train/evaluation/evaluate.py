@@ -60,6 +60,7 @@ def evaluate_policy(
     env: Any,
     plan: Plan,
     *,
+    waits: bool = True,
     estimate: Estimate | None = None,
     progress: Callable[[float], None] | None = None,
     about: Mapping[str, Any] | None = None,
@@ -72,6 +73,7 @@ def evaluate_policy(
         env: Built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
             random generators of the process are seeded with the plan's seed.
         plan: What is asked.
+        waits: Whether the jump input waits for the stride (`pronk.policy.stride`).
         estimate: The policy's estimator, to be judged as well.
         progress: Called with the share done, 0 to 1.
         about: Kept with the result: where policy and gains come from.
@@ -81,13 +83,14 @@ def evaluate_policy(
         PronkError: The environment was not built for this plan.
     """
     began = time.perf_counter()
-    run = Run(env.unwrapped, plan).go(policy, estimate, progress or _silent)
-    fell_at = run.fell_at.cpu().numpy()
+    run = Run(env.unwrapped, plan, waits=waits).go(policy, estimate, progress or _silent)
+    fell_at, on = run.fell_at.cpu().numpy(), run.flights.on.cpu().numpy()
     figures = {
         **run.flights.figures(plan.commands()[:, :2]),
         **run.speeds.figures(),
         "fell": fell_at <= steps(plan.walk_s, run.dt),
-        "told": plan.times(run.dt)["on"] < fell_at,
+        "told": on < fell_at,
+        "waited": (on - plan.times(run.dt)["on"]) * run.dt,
         "non_finite": run.non_finite.cpu().numpy(),
     }
     cases = [
@@ -155,6 +158,7 @@ def _jump(
         apex=Spread.of(figures["apex"] - plan.rules.standing_height),
         unasked=_unasked(figures["unasked"], plan),
         touched=float((figures["touched"] > 0.0).mean()),
+        waited=float(figures["waited"][told].max()) if told.any() else math.nan,
         **{key: Spread.of(values) for key, values in kept.items()},
     )
 

@@ -54,7 +54,8 @@ class FlightRecorder:
             return torch.full((count,), value, dtype=torch.int64, device=device)
 
         self._alive = torch.ones(count, dtype=torch.bool, device=device)
-        self._on = whole(NEVER)
+        self.on = whole(NEVER)
+        """Sample at which each robot's jump input rises; `NEVER` while it has not."""
         # The flight under way, or the last one.
         self._run = whole()
         self._up = number(0.0, STATE_SIZE)
@@ -88,8 +89,8 @@ class FlightRecorder:
             jump: Bool, shape (N,).
             at: The sample.
         """
-        rises = jump & (self._on == NEVER)
-        self._on = torch.where(rises, at, self._on)
+        rises = jump & (self.on == NEVER)
+        self.on = torch.where(rises, at, self.on)
         self._deadline = torch.where(rises, at + self._search, self._deadline)
 
     def add(self, state: Tensor, airborne: Tensor, touching: Tensor, alive: Tensor) -> None:
@@ -118,7 +119,7 @@ class FlightRecorder:
         self._land(k, state, ground & (self._run >= self._least))
         self._run = torch.where(air, self._run + 1, torch.where(ground, 0, self._run))
 
-        told = self._alive & (k >= self._on)
+        told = self._alive & (k >= self.on)
         first = told & touching & (self._touched_at == NEVER)
         self._touched_at = torch.where(first, k, self._touched_at)
         self._top = torch.where(told, torch.maximum(self._top, z), self._top)
@@ -132,7 +133,7 @@ class FlightRecorder:
 
     def _land(self, k: int, state: Tensor, lands: Tensor) -> None:
         """End the flights of robots that have ground under a foot again."""
-        asked = (self._up_at >= self._on) & (self._up_at <= self._on + self._search)
+        asked = (self._up_at >= self.on) & (self._up_at <= self.on + self._search)
         own = lands & asked
         long = own & (self._run >= self._long)
         self._flights += own
@@ -173,7 +174,7 @@ class FlightRecorder:
         velocity = up[:, _VELOCITY]
         jump = {
             "apex": plain(self._main_peak),
-            "delay": plain(self._main_up_at - self._on) * self.dt,
+            "delay": plain(self._main_up_at - self.on) * self.dt,
             "duration": plain(self._main) * self.dt,
             "vertical": velocity[:, 2],
             "horizontal": np.hypot(velocity[:, 0], velocity[:, 1]),
@@ -182,7 +183,7 @@ class FlightRecorder:
         }
         unasked = plain(self._unasked)
         jumped = self._main > 0
-        judged = torch.where(jumped, self._down_at + self._upright, self._on + self._search)
+        judged = torch.where(jumped, self._down_at + self._upright, self.on + self._search)
         touched = (self._touched_at < NEVER) & (self._touched_at <= judged)
         touched |= jumped & (self._fell_at <= judged)
         return {name: np.where(found, value, np.nan) for name, value in jump.items()} | {

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import PronkError
 from pronk.jumps import JumpRules, steps
+from pronk.policy.stride import MOST_S
 
 NEVER = 2**30
 """A sample that does not come."""
@@ -71,11 +72,11 @@ class Plan:
     stand_s: float = 1.0
     """Before a jumping robot is told to run [s]."""
     run_s: float = 2.5
-    """From there to the jump input, at least [s]."""
+    """From there until a jump is asked for, at least [s]."""
     spread_s: float = 0.5
-    """The jump input comes up to this much later, uniformly [s]."""
+    """It is asked for up to this much later, uniformly [s]."""
     jump_s: float = 0.5
-    """Length of the jump input [s]."""
+    """As long as that [s]; the jump input waits for the stride meanwhile."""
     keep_s: float = 0.5
     """From its end to the command to stop [s]."""
     rules: JumpRules = field(default_factory=JumpRules)
@@ -117,7 +118,7 @@ class Plan:
     def seconds(self) -> float:
         """Simulated time [s]: the walks, and the latest jump until it is judged."""
         walks = self.walk_s if self.walks else 0.0
-        told = self.stand_s + self.run_s + self.spread_s
+        told = self.stand_s + self.run_s + self.spread_s + MOST_S
         # A flight takes less than a second: 1 s is a jump of 1.2 m.
         jumps = told + self.rules.search_s + 1.0 + self.rules.upright_s if self.jumps else 0.0
         return max(walks, jumps)
@@ -131,7 +132,7 @@ class Plan:
         """When each robot is told what, in samples of `dt`; each of shape (N,).
 
         Returns:
-            `start` and `stop` of the velocity command, `on` and `off` of the jump input; `NEVER`
+            `start` and `stop` of the velocity command, `on` and `off` of asking for a jump; `NEVER`
             for what does not happen.
         """
         count = self.size - self.walkers

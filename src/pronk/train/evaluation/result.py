@@ -95,7 +95,7 @@ class JumpResult:
     command: tuple[float, float, float]
     robots: int
     told: int
-    """Robots that stood when the jump input came."""
+    """Robots that had not fallen when the jump input came."""
     found: float
     """Share of the robots that jumped."""
     upright: float
@@ -122,6 +122,9 @@ class JumpResult:
     touched: float = math.nan
     """Share of the robots of which anything but a foot touched the ground from the jump input to
     2 s after touchdown, as a trial counts it; NaN in files older than this figure."""
+    waited: float = math.nan
+    """Longest time from asking for a jump to the jump input [s] (`pronk.policy.stride`); NaN in
+    files older than this figure."""
 
 
 @dataclass(frozen=True, kw_only=True)

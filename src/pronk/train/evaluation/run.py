@@ -88,8 +88,13 @@ def evaluation_cfg(cfg: ManagerBasedRlEnvCfg, plan: Plan) -> ManagerBasedRlEnvCf
 class Run:
     """A plan under way in an environment."""
 
-    def __init__(self, env: ManagerBasedRlEnv, plan: Plan) -> None:
+    def __init__(self, env: ManagerBasedRlEnv, plan: Plan, *, waits: bool) -> None:
         """Prepare.
+
+        Args:
+            env: Where it happens.
+            plan: What is asked.
+            waits: Whether the jump input waits for the stride.
 
         Raises:
             PronkError: The environment was not built for this plan.
@@ -104,6 +109,7 @@ class Run:
         self._ear: Ear = terms[TERM].func
         self._env, self._plan = env, plan
         self._motion = motion_command(env)
+        self._waits = waits
         self.dt = dt = env.physics_dt
         device = env.device
         self._command = torch.tensor(plan.commands(), dtype=torch.float32, device=device)
@@ -136,13 +142,15 @@ class Run:
         """
         # Not inference mode: the environment would be left with tensors that nobody may write to.
         with torch.no_grad():
-            before, self._motion.scripted = self._motion.scripted, True
+            motion = self._motion
+            before = motion.scripted, motion.waits
+            motion.scripted, motion.waits = True, self._waits
             self._ear.listener = self._hear
             try:
                 self._steps(policy, estimate, progress)
             finally:
                 self._ear.listener = None
-                self._motion.scripted = before
+                motion.scripted, motion.waits = before
         return self
 
     def _steps(
@@ -154,6 +162,7 @@ class Run:
         self._state = self._look()
         while (now := self.flights.sample) < end:
             progress(now / end)
+            self.flights.tell(self._motion.jump, now)
             groups = TensorDict(obs, batch_size=[env.num_envs])
             if estimate is not None and self._settle <= now < self._walks_end:
                 self.estimates.add(estimate(groups), groups["target"], self._alive)
@@ -170,8 +179,7 @@ class Run:
         moving = (when["start"] <= sample) & (sample < when["stop"])
         jump = (when["on"] <= sample) & (sample < when["off"])
         self._motion.velocity.copy_(torch.where(moving[:, None], self._command, 0.0))
-        self._motion.jump.copy_(jump)
-        self.flights.tell(jump, sample)
+        (self._motion.asked if self._waits else self._motion.jump).copy_(jump)
 
     def _hear(self) -> None:
         """One physics step has passed; the contacts now known belong to the state before it."""

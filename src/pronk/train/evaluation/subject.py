@@ -45,6 +45,8 @@ class Subject:
     """Observation groups to contact probabilities (N, 4) and trunk velocity [m/s] (N, 3)."""
     jump: bool
     """Whether it knows the jump input."""
+    waits: bool
+    """Whether its jump input waits for the stride (`pronk.policy.stride`)."""
     about: dict[str, Any]
     """File, hash, and what the file says of itself."""
 
@@ -90,7 +92,7 @@ def _trained(path: Path, device: str) -> Subject:
         ) from error
     actor = actor.to(device).eval()
     about = {"file": str(path), "sha256": sha256(path), **stored.about}
-    return Subject(act=actor, estimate=actor.estimate, jump=jump, about=about)
+    return Subject(act=actor, estimate=actor.estimate, jump=jump, waits=jump, about=about)
 
 
 def blank_actor(*, jump: bool) -> EstimatorActor:
@@ -131,7 +133,13 @@ def _exported(path: Path, device: str) -> Subject:
         "versions": dict(contract.versions),
     }
     runner = _Exported(policy, device)
-    return Subject(act=runner.act, estimate=runner.estimate, jump=contract.jump, about=about)
+    return Subject(
+        act=runner.act,
+        estimate=runner.estimate,
+        jump=contract.jump,
+        waits=contract.waits_for_stride,
+        about=about,
+    )
 
 
 class _Exported:

@@ -1,0 +1,84 @@
+"""When in the stride a jump begins: the jump input waits until the legs change over.
+
+In a trot the front right and the hind left leg go together, and so do the other two. A jump begins
+as the knees of one pair, either of them, bend beyond those of the other one, wherever in its stride
+the robot was as the jump was asked for: in training, in trials and on the robot alike. How far a
+jump goes and whether it is landed depends on that moment more than on anything else that differs
+between two jumps of one robot (docs/training.md has the figures), and the wait for it is half a
+stride at most.
+
+Works on arrays of NumPy and of PyTorch, of one robot and of many.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+MOST_S = 0.16
+"""Nobody waits longer [s]: half a stride takes 0.08 s at 2 m/s, 0.10 s at 1 m/s and 0.15 s at
+0.4 m/s, and a robot that stands has none."""
+_FIRST, _SECOND = (2, 11), (5, 8)
+"""Knees of the front right and the hind left leg, and of the front left and the hind right one, in
+the order of joints that `pronk.policy.layout` has."""
+
+
+def apart(position: Any) -> Any:
+    """How far front right and hind left knee are bent beyond the other two, together [rad]. (...,).
+
+    Args:
+        position: Of the joints, absolute or relative to a pose alike on all legs [rad]. (..., 12)
+    """
+    first, second = (sum(position[..., knee] for knee in pair) for pair in (_FIRST, _SECOND))
+    return first - second
+
+
+class StrideGate:
+    """Lets the jump inputs of one robot or several pass when their strides come to the moment."""
+
+    def __init__(self, like: Any, *, policy_rate_hz: float) -> None:
+        """Begin as after `reset`.
+
+        Args:
+            like: Zeros, one for each robot: an array of NumPy or PyTorch, of any shape.
+            policy_rate_hz: How often it will be called.
+        """
+        self._most = round(MOST_S * policy_rate_hz)
+        self._apart, self._waited, self._passed = 0.0 * like, 0.0 * like, like > 0.0
+
+    def reset(self, which: Any = ...) -> None:
+        """Forget the stride and what was asked.
+
+        Args:
+            which: Index of the robots; all of them if left out.
+        """
+        self._apart, self._waited, self._passed = (
+            _zeroed(value, which) for value in (self._apart, self._waited, self._passed)
+        )
+
+    def __call__(self, position: Any, asked: Any) -> Any:
+        """The jump input that the network gets; call it once a policy step.
+
+        Once it has passed, it stays until nobody asks any more; who lets go before does not jump.
+
+        Args:
+            position: Of the joints, as `apart` takes them [rad]. (..., 12)
+            asked: Whether a jump is asked for. Bool, (...,).
+
+        Returns:
+            Bool, (...,).
+        """
+        now = apart(position)
+        before = self._apart
+        changes_over = ((before < 0.0) & (now >= 0.0)) | ((before > 0.0) & (now <= 0.0))
+        late = self._waited >= self._most
+        self._passed = asked & (self._passed | changes_over | late)
+        self._waited = (self._waited + 1.0) * asked
+        self._apart = now
+        return self._passed
+
+
+def _zeroed(value: Any, which: Any) -> Any:
+    """A copy with zeros (or False) at an index."""
+    found = value.clone() if hasattr(value, "clone") else value.copy()
+    found[which] = 0
+    return found
