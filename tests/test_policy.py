@@ -347,7 +347,7 @@ def test_the_network_hears_of_a_jump_when_the_legs_change_over(tmp_path: Path) -
     fed: list[float] = []
     run = jumper._run
     jumper._run = lambda read, jump: fed.append(float(jump[0, 0])) or run(read, jump)  # type: ignore
-    assert [hears(knee, True) for knee in (0.2, 0.1, 0.3, -0.1, -0.2)] == [False] * 3 + [True] * 2
+    assert [hears(knee, True) for knee in (0.2, -0.1, -0.2, 0.1, -0.3)] == [False] * 3 + [True] * 2
     assert not hears(0.3, False)
     # One whose contract does not say so hears at once, as do those older than that word.
     at_once = load_policy(write_policy(tmp_path))

@@ -1,11 +1,12 @@
 """When in the stride a jump begins: the jump input waits until the legs change over.
 
 In a trot the front right and the hind left leg go together, and so do the other two. A jump begins
-as the knees of one pair, either of them, bend beyond those of the other one, wherever in its stride
-the robot was as the jump was asked for: in training, in trials and on the robot alike. How far a
-jump goes and whether it is landed depends on that moment more than on anything else that differs
-between two jumps of one robot (docs/training.md has the figures), and the wait for it is half a
-stride at most.
+as the knees of that pair bend beyond those of the other one, wherever in its stride the robot was
+as the jump was asked for: in training, in trials and on the robot alike. How far a jump goes and
+whether it is landed depends on that moment more than on anything else that differs between two
+jumps of one robot (docs/training.md has the figures), and the wait for it is a stride at most. The
+moment at which the other pair bends beyond that one would do as well for a robot whose left side is
+its right side mirrored; none is.
 
 Works on arrays of NumPy and of PyTorch, of one robot and of many.
 """
@@ -14,9 +15,9 @@ from __future__ import annotations
 
 from typing import Any
 
-MOST_S = 0.16
-"""Nobody waits longer [s]: half a stride takes 0.08 s at 2 m/s, 0.10 s at 1 m/s and 0.15 s at
-0.4 m/s, and a robot that stands has none."""
+MOST_S = 0.26
+"""Nobody waits longer [s]: a stride takes 0.16 s at 2 m/s, 0.20 s at 1 m/s and 0.27 s at 0.5 m/s,
+and a robot that stands has none."""
 _FIRST, _SECOND = (2, 11), (5, 8)
 """Knees of the front right and the hind left leg, and of the front left and the hind right one, in
 the order of joints that `pronk.policy.layout` has."""
@@ -68,8 +69,7 @@ class StrideGate:
             Bool, (...,).
         """
         now = apart(position)
-        before = self._apart
-        changes_over = ((before < 0.0) & (now >= 0.0)) | ((before > 0.0) & (now <= 0.0))
+        changes_over = (self._apart < 0.0) & (now >= 0.0)
         late = self._waited >= self._most
         self._passed = asked & (self._passed | changes_over | late)
         self._waited = (self._waited + 1.0) * asked
