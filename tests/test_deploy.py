@@ -594,8 +594,14 @@ def test_a_gamepad(tmp_path: Path) -> None:
     assert stick.command == pytest.approx((3.0, -0.5, 0.0), abs=1e-3)
     say(1, 1, 5)
     assert pad.stick(0.2, Mode.POLICY).jump
+    say(0, 1, 5)  # a tap asks for as long as training did, and so does a button that is held
+    assert pad.stick(0.68, Mode.POLICY).jump
+    assert not pad.stick(0.72, Mode.POLICY).jump
+    say(1, 1, 5)
+    assert pad.stick(0.8, Mode.POLICY).jump
+    assert not pad.stick(1.4, Mode.POLICY).jump
     os.close(wire)
-    stick = pad.stick(0.3, Mode.POLICY)
+    stick = pad.stick(1.5, Mode.POLICY)
     assert not stick.held, "unplugged is let go"
     assert stick.command == (0.0, 0.0, 0.0)
     pad.close()

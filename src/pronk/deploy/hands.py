@@ -34,7 +34,8 @@ _WISHES = {
     "q": Wish.QUIT,
 }
 _JUMP_S = 0.5
-"""Length of the jump input after one press, that of training [s]."""
+"""How long one press asks for a jump, as in training [s]: in less, the stride might not come to
+where a jump may begin (`pronk.policy.stride`)."""
 _REPEAT_S = 0.8
 """A key counts as held for this long after it was heard: the longest usual delay before a keyboard
 repeats a key is 0.66 s."""
@@ -167,6 +168,8 @@ class Gamepad:
         self._ranges = tuple(ranges.values())
         self._axes: dict[int, float] = {}
         self._buttons: dict[int, bool] = {}
+        self._pressed = False
+        self._jump = -1e9
         self._there = True
 
     def close(self) -> None:
@@ -181,7 +184,7 @@ class Gamepad:
 
     def stick(self, now: float, mode: Mode) -> Stick:
         """What sticks and buttons say."""
-        del now, mode
+        del mode
         wish = self._read()
         if not self._there:
             return Stick(wish=wish)
@@ -190,9 +193,13 @@ class Gamepad:
             push * (high if push > 0.0 else -low)
             for push, (low, high) in zip(pushed, self._ranges, strict=True)
         )
+        pressed = self._buttons.get(_RIGHT_BUMPER, False)
+        if pressed and not self._pressed:
+            self._jump = now
+        self._pressed = pressed
         return Stick(
             command=(forward, left, yaw),
-            jump=self._buttons.get(_RIGHT_BUMPER, False),
+            jump=now - self._jump < _JUMP_S,
             held=self._buttons.get(_LEFT_BUMPER, False),
             wish=wish,
         )
