@@ -74,6 +74,7 @@ def _summary(contract: Contract) -> dict[str, Any]:
         "command_ranges",
         "jump",
         "lift_off_velocity",
+        "waits_for_stride",
         "joint_names",
         "stiffness",
         "damping",
