@@ -542,7 +542,7 @@ SHORT = Plan(
     stand_s=0.6,
     run_s=0.2,
     spread_s=0.2,
-    jump_s=0.2,
+    jump_s=0.4,
     keep_s=0.1,
     # No grace: the fall at the start is a flight that nobody asked for.
     rules=JumpRules(search_s=0.2, tail_s=0.1, upright_s=0.2, grace_s=0.001),
