@@ -11,8 +11,6 @@ many of them were well, and how high and far they went.
 from __future__ import annotations
 
 import argparse
-import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +19,12 @@ from numpy.typing import NDArray
 
 from pronk.hardware.truth import SHIPPED, load_truth
 from pronk.policy.runtime import load_policy
-from pronk.policy.stride import apart
+from pronk.policy.stride import apart, changes_over
 from pronk.robots import load_robot
 from pronk.trial.job import Job, set_down
 from pronk.trial.metrics import JumpFigures, measure
 from pronk.trial.pilot import fly
+from pronk.trial.processes import cores, in_processes
 from pronk.trial.run import Plan, jobs_of
 from pronk.trial.subjects import load_subjects
 
@@ -38,7 +37,7 @@ def since_change(position: NDArray[np.float64], step: int) -> int | None:
         step: Until this one; 0 if it is the first after the change.
     """
     bent = apart(position[: step + 1])
-    changes = np.flatnonzero((bent[:-1] < 0.0) & (bent[1:] >= 0.0)) + 1
+    changes = np.flatnonzero(changes_over(bent[:-1], bent[1:])) + 1
     return step - int(changes[-1]) if len(changes) else None
 
 
@@ -86,8 +85,7 @@ def main() -> None:
         out=Path(),
     )
     jobs = [replace(job, keep=None) for _, job in planned]
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(told_at_once, jobs, chunksize=4))
+    found = in_processes(told_at_once, jobs, processes=cores())
     for case in plan.cases:
         mine = [
             each for (row, _), each in zip(planned, found, strict=True) if row.case == case.name

@@ -33,6 +33,16 @@ def apart(position: Any) -> Any:
     return first - second
 
 
+def changes_over(before: Any, now: Any) -> Any:
+    """Whether the legs change over from one policy step to the next. Bool, (...,).
+
+    Args:
+        before: `apart` at the first. (...,)
+        now: At the second. (...,)
+    """
+    return (before < 0.0) & (now >= 0.0)
+
+
 class StrideGate:
     """Lets the jump inputs of one robot or several pass when their strides come to the moment."""
 
@@ -69,9 +79,8 @@ class StrideGate:
             Bool, (...,).
         """
         now = apart(position)
-        changes_over = (self._apart < 0.0) & (now >= 0.0)
         late = self._waited >= self._most
-        self._passed = asked & (self._passed | changes_over | late)
+        self._passed = asked & (self._passed | changes_over(self._apart, now) | late)
         self._waited = (self._waited + 1.0) * asked
         self._apart = now
         return self._passed
