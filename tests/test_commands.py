@@ -309,25 +309,26 @@ def test_scripted_commands_are_the_callers(env: Any, command: MotionCommand) -> 
 def test_target_in_jump_mode_is_a_leap(
     command: MotionCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Here .35 m/s more, in proportion below 1 m/s; never another direction."""
+    """.35 m/s more, less far from 1 m/s, by .1 for each m/s beyond; never another direction."""
     monkeypatch.setattr(command.cfg, "leap", 0.35)
+    monkeypatch.setattr(command.cfg, "leap_falls", 0.1)
     command.velocity[:4] = torch.tensor(
         [[2.0, 0.0, 1.0], [-1.2, 0.9, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, 1.0]]
     )
     command.tracker.mode[:] = False
     assert torch.equal(command.target, command.velocity[:, :2])
     command.tracker.mode[:] = True
-    # 2 + .35; (-1.2, .9) of length 1.5 to length 1.85; -.5 * 1.35.
+    # 2 + .35 - .1; (-1.2, .9) of length 1.5 to length 1.5 + .35 - .05; -.5 * 1.35.
     leap = command.target[:4].tolist()
-    assert leap[0] == pytest.approx([2.35, 0.0])
-    assert leap[1] == pytest.approx([-1.48, 1.11])
+    assert leap[0] == pytest.approx([2.25, 0.0])
+    assert leap[1] == pytest.approx([-1.44, 1.08])
     assert leap[2] == pytest.approx([0.0, -0.675])
     assert leap[3] == [0.0, 0.0]
     # Who was told to jump while .5 m/s too fast is asked for that on top: -.5 becomes -1.175.
     monkeypatch.setattr(command.tracker, "pace", torch.full((N,), 0.5))
     leap = command.target[:4].tolist()
-    assert leap[0] == pytest.approx([2.85, 0.0])
-    assert leap[1] == pytest.approx([-1.88, 1.41])
+    assert leap[0] == pytest.approx([2.75, 0.0])
+    assert leap[1] == pytest.approx([-1.84, 1.38])
     assert leap[2] == pytest.approx([0.0, -1.175])
     assert leap[3] == [0.0, 0.0]
 
@@ -411,6 +412,7 @@ def test_what_the_tracker_is_told_of_speed(
     monkeypatch.setattr(command.tracker, "advance", lambda **given: told.update(given))
     monkeypatch.setattr(command, "_motion_step", -1)
     monkeypatch.setattr(command.cfg, "leap", 0.25)
+    monkeypatch.setattr(command.cfg, "leap_falls", 0.0)
     command.tracker.mode[:] = jumps
     turn(env, yaw=0.0)
     env.sim.data.qvel[:, :2] = torch.tensor(goes)
