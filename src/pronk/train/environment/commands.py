@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 NAME = "motion"
 """The command term's name in every environment."""
+PRACTICED = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-2.0, 0.0, 0.0))
+"""Forward, left [m/s], yaw rate [rad/s]: the paper's five jumps (Table III)."""
 
 
 @dataclass(kw_only=True)
@@ -72,6 +74,11 @@ class MotionCommandCfg(CommandTermCfg):
     """Part of the draws along one axis alone, as the trials ask."""
     jump_fraction: float = 0.0
     """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""
+    practice: float = 0.5
+    """Part of these robots' draws that lie about `PRACTICED`, each as often. Of all other draws 1
+    in 100 comes as near to 2 m/s straight ahead, too rarely to learn how to land there."""
+    practice_spread: tuple[float, float, float] = (0.25, 0.1, 0.2)
+    """Half-widths of the uniform draws about them: forward, left [m/s], yaw rate [rad/s]."""
     jump_on_s: tuple[float, float] = (0.5, 0.7)
     """Time that a jump is asked for [s]: less than preparation and flight together, so that one
     command means one jump, and enough to lift off in what the stride leaves of it."""
@@ -142,6 +149,8 @@ class MotionCommand(CommandTerm):
         kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
         self._kinds = torch.tensor([*kinds, moving], device=device)
         """Where, in [0, 1], draws along x, y and yaw alone, of all and of none end."""
+        self._practiced = torch.tensor(PRACTICED, device=device)
+        self._spread = torch.tensor(cfg.practice_spread, device=device)
         self._axes = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)]).to(device)
         """Axes that each kind of draw moves along."""
         spans = torch.tensor([cfg.resampling_time_range, cfg.jump_on_s, cfg.jump_off_s])
@@ -267,7 +276,7 @@ class MotionCommand(CommandTerm):
             self._motion.forget(env_ids)
         if self.scripted:
             return {}
-        velocity, time, _, off = self._draw(len(env_ids))
+        velocity, time, _, off = self._draw(self.jumper[env_ids])
         self.velocity[env_ids] = velocity
         self.time_left[env_ids] = time
         self.asked[env_ids] = False
@@ -292,7 +301,7 @@ class MotionCommand(CommandTerm):
         """Draw anew what has run out after a time."""
         self.time_left -= dt
         due = self.time_left <= 0.0
-        velocity, time, on, off = self._draw(self.num_envs)
+        velocity, time, on, off = self._draw(self.jumper)
         self.velocity = torch.where(due[:, None], velocity, self.velocity)
         self.time_left = torch.where(due, time, self.time_left)
         if self.cfg.jump_fraction <= 0.0:
@@ -323,12 +332,23 @@ class MotionCommand(CommandTerm):
         if self.led > 0.0:
             action.shown = (self.shown, self.led * self.showing[:, None])
 
-    def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
-        drawn = torch.rand(7, count, device=self.device)
+    def _draw(self, jumper: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Velocity (count, 3), and times until the next, with jump and without it (count,) [s].
+
+        Args:
+            jumper: Whether a robot to be told gets jump inputs. Bool, (count,)
+        """
+        drawn = torch.rand(9, len(jumper), device=self.device)
         axes = self._axes[torch.bucketize(drawn[3], self._kinds)]
-        velocity = (drawn[:3].T - 0.5) * (2.0 * self.ranges.part * self._limits) * axes
-        time, on, off = torch.lerp(self._least, self._most, drawn[4:])
+        spread = 2.0 * drawn[:3].T - 1.0
+        practices = jumper & (drawn[7] < self.cfg.practice)
+        about = self._practiced[(drawn[8] * len(PRACTICED)).long()]
+        velocity = torch.where(
+            practices[:, None],
+            (about + spread * self._spread) * self.ranges.part,
+            spread * (self.ranges.part * self._limits) * axes,
+        )
+        time, on, off = torch.lerp(self._least, self._most, drawn[4:7])
         return velocity, time, on, off
 
     def _update_metrics(self) -> None:
