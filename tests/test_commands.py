@@ -92,7 +92,7 @@ def test_shares_of_standing_and_of_one_axis(env: Any, command: MotionCommand) ->
         assert_share((moves[:, axis] & (axes == 1)).sum(), total, 0.4 / 3)
 
 
-def test_half_of_what_jumpers_are_told_lies_about_the_papers_jumps(
+def test_most_of_what_jumpers_are_told_lies_about_the_papers_jumps(
     env: Any, command: MotionCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each as often, spread evenly; walkers are told what they were told in phase 1."""
@@ -102,13 +102,13 @@ def test_half_of_what_jumpers_are_told_lies_about_the_papers_jumps(
     jumper = command.jumper.numpy()
     told, walkers = velocity[:, jumper].reshape(-1, 3), velocity[:, ~jumper].reshape(-1, 3)
     assert_share((walkers == 0.0).all(axis=1).sum(), len(walkers), 0.1)
-    assert_share((told == 0.0).all(axis=1).sum(), len(told), 0.05)
+    assert_share((told == 0.0).all(axis=1).sum(), len(told), 0.03)
     spread = np.array([0.25, 0.1, 0.2])
     for jump in ((1, 0, 0), (2, 0, 0), (0, -1, 0), (0, 1, 0), (-2, 0, 0)):
         off = (told - jump) / spread
         # Draws along one axis are at 0 on the others; of those along all few are as near.
         near = off[((np.abs(off) <= 1.0) & (off != 0.0)).all(axis=1)]
-        assert_share(len(near), len(told), 0.1)
+        assert_share(len(near), len(told), 0.14)
         for axis in range(3):
             assert kstest(near[:, axis], "uniform", args=(-1.0, 2.0)).pvalue > 1e-3
     monkeypatch.setattr(command.cfg, "practice", 0.0)
