@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from pronk import paper
 from pronk.policy.stride import MOST_S
 from pronk.robots import load_robot
 from pronk.train.environment.commands import motion_command
@@ -27,7 +28,7 @@ from pronk.train.gains import training_gains
 from pronk.train.phases import enter_phase, phase
 from pronk.train.tasks import env_cfg
 
-COMMANDS = ((1.0, 0.0), (2.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-2.0, 0.0), (0.0, 0.0))
+COMMANDS = (*(told[:2] for told in paper.JUMPS.values()), (0.0, 0.0))
 """Forward and left [m/s]: the paper's, and none."""
 WALK, STRIDE, JUMP = 80, 16, 17
 """Policy steps to get under way, over which jumps are asked for, and of a jump."""

@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from pronk import paper
 from pronk.errors import PronkError
 from pronk.policy.contract import COMMANDS
 
@@ -50,15 +51,8 @@ class Case:
             )
 
 
-PAPER_COMMANDS = (
-    Case(name="forward 1", command=(1.0, 0.0, 0.0)),
-    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
-    Case(name="side -1", command=(0.0, -1.0, 0.0)),
-    Case(name="side +1", command=(0.0, 1.0, 0.0)),
-    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
-)
-"""The paper's five, in the order of its Table III. Positive sideways is to the left: the paper
-does not say, and its robot is symmetric."""
+PAPER_COMMANDS = tuple(Case(name=name, command=told) for name, told in paper.JUMPS.items())
+"""The paper's five."""
 
 RATES = Case(name="forward 2.25", command=(2.25, 0.0, 0.0))
 """At which the paper draws roll and pitch rates (R7)."""

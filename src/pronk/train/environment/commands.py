@@ -15,6 +15,7 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
+from pronk import paper
 from pronk.policy.stride import StrideGate
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
 NAME = "motion"
 """The command term's name in every environment."""
-PRACTICED = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-2.0, 0.0, 0.0))
-"""Forward, left [m/s], yaw rate [rad/s]: the paper's five jumps (Table III)."""
 
 
 @dataclass(kw_only=True)
@@ -75,9 +74,10 @@ class MotionCommandCfg(CommandTermCfg):
     jump_fraction: float = 0.0
     """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""
     practice: float = 0.7
-    """Part of these robots' draws that lie about `PRACTICED`, each as often. Of all other draws 1
-    in 100 comes as near to 2 m/s straight ahead, too rarely to learn how to land there, and most
-    are faster sideways or turning than any trial asks: 3 in 5 episodes ended in a fall."""
+    """Part of these robots' draws that lie about the paper's five jumps, each as often. Of all
+    other draws 1 in 100 comes as near to 2 m/s straight ahead, too rarely to learn how to land
+    there, and most are faster sideways or turning than any trial asks: 3 in 5 episodes ended in a
+    fall."""
     practice_spread: tuple[float, float, float] = (0.25, 0.1, 0.2)
     """Half-widths of the uniform draws about them: forward, left [m/s], yaw rate [rad/s]."""
     jump_on_s: tuple[float, float] = (0.5, 0.7)
@@ -150,7 +150,7 @@ class MotionCommand(CommandTerm):
         kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
         self._kinds = torch.tensor([*kinds, moving], device=device)
         """Where, in [0, 1], draws along x, y and yaw alone, of all and of none end."""
-        self._practiced = torch.tensor(PRACTICED, device=device)
+        self._practiced = torch.tensor(tuple(paper.JUMPS.values()), device=device)
         self._spread = torch.tensor(cfg.practice_spread, device=device)
         self._axes = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)]).to(device)
         """Axes that each kind of draw moves along."""
@@ -343,7 +343,7 @@ class MotionCommand(CommandTerm):
         axes = self._axes[torch.bucketize(drawn[3], self._kinds)]
         spread = 2.0 * drawn[:3].T - 1.0
         practices = jumper & (drawn[7] < self.cfg.practice)
-        about = self._practiced[(drawn[8] * len(PRACTICED)).long()]
+        about = self._practiced[(drawn[8] * len(self._practiced)).long()]
         velocity = torch.where(
             practices[:, None],
             (about + spread * self._spread) * self.ranges.part,

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk import paper
 from pronk.errors import PronkError
 from pronk.jumps import JumpRules, steps
 from pronk.policy.stride import MOST_S
@@ -43,14 +44,8 @@ WALKS = (
 )
 """Velocities that the policy is asked to keep."""
 
-JUMPS = (
-    Case(name="forward 1", command=(1.0, 0.0, 0.0)),
-    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
-    Case(name="side -1", command=(0.0, -1.0, 0.0)),
-    Case(name="side +1", command=(0.0, 1.0, 0.0)),
-    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
-)
-"""The paper's five (Table III)."""
+JUMPS = tuple(Case(name=name, command=told) for name, told in paper.JUMPS.items())
+"""The paper's five."""
 
 
 @dataclass(frozen=True, kw_only=True)
