@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from pronk import paper
+from pronk.policy import paper
 from pronk.policy.stride import MOST_S
 from pronk.robots import load_robot
 from pronk.train.environment.commands import motion_command

@@ -15,8 +15,8 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pronk import paper
 from pronk.errors import PronkError
+from pronk.policy import paper
 from pronk.policy.contract import COMMANDS
 
 Velocity = tuple[float, float, float]

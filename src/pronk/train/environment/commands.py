@@ -15,7 +15,7 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk import paper
+from pronk.policy import paper
 from pronk.policy.stride import StrideGate
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk import paper
 from pronk.errors import PronkError
 from pronk.jumps import JumpRules, steps
+from pronk.policy import paper
 from pronk.policy.stride import MOST_S
 
 NEVER = 2**30
