@@ -17,7 +17,7 @@ from pronk.train.learning.ppo import EstimatorPPO, EstimatorPpoCfg
 ROBOTS = 32
 STEPS = 4
 ACTIONS = 12
-SIZES = {"measured": 105, "jump": 1, "critic": 96, "critic_jump": 13, "target": 7}
+SIZES = {"measured": 105, "jump": 1, "critic": 96, "critic_jump": 12, "target": 7}
 SIZES |= {"demonstration": 13}
 
 

@@ -175,28 +175,24 @@ def test_robots_jump_as_shown_and_land(
     mine, still = slice(tool.MOMENTS), slice(tool.MOMENTS, None)
     told_so = torch.cat((~tool.BETWEEN, torch.zeros_like(tool.BETWEEN)))
     way, high = seen.flight()
-    assert float(way[told_so].mean()) > (0.8 if told[0] else 0.5)
+    assert float(way[told_so].mean()) > (0.8 if told[0] else 0.6)
     assert float(high[told_so].mean()) > 0.35
     assert float(seen.top().step[told_so].max() + 1) * tool.STEP_S <= 0.3
     # Robots differ: with some of them it does.
-    crouching = float(seen.touching[: tool.JUMP, told_so].amax(dim=0).mean())
-    assert crouching < (0.5 if told[0] else 0.9), "this policy bounds, which goes lower sideways"
+    assert float(seen.touching[: tool.JUMP, told_so].amax(dim=0).mean()) < 0.5
     assert float(seen.fell[:, told_so].amax(dim=0).mean()) < 0.2
     assert float(seen.top().up[still].mean()) < 1.0
     # Who has landed is left to the policy, here one that stands, whatever a candidate would do.
     other = jump.clone()
     other[-3:] += 1.0
-    walks, command = stand._decide, stand.command
-    monkeypatch.setattr(stand, "_decide", lambda observed: walks(observed) * ~command.jump[:, None])
+    monkeypatch.setattr(stand, "_decide", lambda _: torch.zeros(stand.count, 12))
     seen = stand.jump(torch.stack((jump, other)), tool.ROWS + tool.AFTER)
-    airborne = seen.stands[: tool.ROWS, mine] < 0.5
-    flew = airborne[tool.PUSH : -4].any(dim=0)
-    # Where each of the last three targets is shown or not, what is seen before says.
-    landed = flew & ~airborne[-4:-1].any(dim=0)
+    airborne = seen.stands[tool.PUSH :, mine] < 0.5
+    landed = (airborne.int().cummax(dim=0).values.bool() & ~airborne)[: tool.ROWS - tool.PUSH - 3]
     same = (seen.height[:, mine] == seen.height[:, still]).all(dim=0)
     stays = seen.fell[:, mine].amax(dim=0) == 0.0  # who falls is set down anew, at random
-    assert same[stays].tolist() == landed[stays].tolist()
-    assert 0.1 < float(same.float().mean()) < 1.0
+    assert same[stays].tolist() == landed.any(dim=0)[stays].tolist()
+    assert 0.3 < float(same.float().mean()) < 1.0
     # Robots of all candidates are the same ones: until they differ, they do the same.
     again = stand.jump(torch.stack((jump, jump)), tool.PUSH)
     assert torch.equal(again.up[:, mine], again.up[:, still])

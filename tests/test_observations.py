@@ -360,7 +360,6 @@ def test_critic_of_a_robot_that_stands(env: Any) -> None:
 def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
     enter_phase(env, phase("jump_a"))
     command, tracker = motion_command(env), motion_command(env).tracker
-    command.asked[:] = torch.arange(N) < 4
     command.jump[:] = torch.arange(N) % 2 == 0
     tracker.mode[:] = torch.arange(N) < 3
     tracker.since[:] = torch.arange(N) * 0.02
@@ -373,7 +372,6 @@ def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
     seen = observe(env)
     close(seen["jump"][:, 0], [1.0, 0.0] * (N // 2))
     expected = {
-        "asked": [1.0] * 4 + [0.0] * (N - 4),
         "jump": [1.0, 0.0] * (N // 2),
         "mode": [1.0] * 3 + [0.0] * (N - 3),
         "since": np.arange(N) * 0.02,

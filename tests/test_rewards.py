@@ -44,7 +44,6 @@ def env(built: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     small_env.fresh(built)
     motion_command(built).scripted = True
     monkeypatch.setattr(motion_command(built).cfg, "leap", 0.35)
-    monkeypatch.setattr(motion_command(built).cfg, "leap_falls", 0.0)
     return built
 
 

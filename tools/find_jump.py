@@ -6,10 +6,9 @@ r"""Search for the jump that training shows to a policy, `jump_demonstration_*.y
 CMA-ES over joint targets from the jump command until touchdown, command by command: first those up
 to lift-off, then those of the flight, then all of them together. A quarter of the robots is told
 what lies half way to the command before, and shown the mean of both jumps.
-A candidate is tried on robots that walk by the policies given, each with a battery of its own and
-asked to jump at another time; once its stride has come to the moment, all targets are the
-candidate's, until a foot is on the ground again and the policies, which know of no jump, land it
-and walk on.
+A candidate is tried on robots that walk by the policies given, each told to jump at another moment
+of its stride and with a battery of its own; from then on all targets are the candidate's, until a
+foot is on the ground again and the policies, which know of no jump, land it and walk on.
 
 What counts is the ground covered in flight and the height; tilting, turning, a late lift-off,
 anything but feet on the ground, jumps that are not alike, falls, and not walking on cost. A policy
@@ -42,7 +41,6 @@ import yaml
 from tensordict import TensorDict
 
 from pronk.files import sha256
-from pronk.policy.stride import MOST_S
 from pronk.robots import load_robot
 from pronk.robots.mini_cheetah.constants import LEG_JOINTS as PARTS
 from pronk.robots.robot import Joint
@@ -96,8 +94,6 @@ but dealt out."""
 WALK, STRIDE, JUMP, AFTER = 60, 16, 18, 30
 """Policy steps to get under way, over which robots begin to, of a jump up to lift-off, and after
 what is shown."""
-WAIT = round(MOST_S / STEP_S) + 1
-"""Policy steps from being asked to the jump input, at most."""
 MOMENTS = 16
 """Robots that try a candidate."""
 BETWEEN = torch.tensor([(i + i // 4) % 4 == 3 for i in range(MOMENTS)])
@@ -333,40 +329,32 @@ class Stand:
 
         Args:
             targets: Joint targets until touchdown, (candidates, rows, 12) [rad].
-            steps: So many, from the jump input on.
+            steps: So many, from the command on.
             before: Those of the command before, (rows, 12); None: those between are shown
                 `targets` as well.
         """
         env, motions = self.env, []
         held: Any = env.action_manager.get_term("joint_position")
         restore_environment(env, self.start)
-        torch.manual_seed(0)  # who waits is seen with noise, the same for every candidate
         env.sim._given = False  # what was drawn has changed
         mine = targets.repeat_interleave(self.count // len(targets), dim=0)
         if before is not None:
             mine = torch.where(self.between[:, None, None], 0.5 * (mine + before), mine)
         asked = (mine - held._offset[:, None]) / held._scale
-        observed, command = env.obs_buf, self.command
+        observed, tracker = env.obs_buf, self.command.tracker
         # Commands and their tracker know of the jump, which policies are not told of.
-        command.waits = True
-        command.asked[:] = True
-        robot, passed = torch.arange(self.count), torch.zeros(self.count, dtype=torch.long)
-        begins = passed.clone()
-        for step in range(steps + WAIT):
-            begins[(passed == 0) & ~command.jump] = step + 1
-            shown = command.jump & ~command.tracker.landed & (passed < asked.shape[1])
-            action = asked[robot, passed.clamp_max(asked.shape[1] - 1)]
-            if not shown.all():
-                walks = self._decide(observed)
-                # What is measured is noisy; until they jump, robots of all candidates do alike.
-                walks = torch.where((passed > 0)[:, None], walks, self._alike(walks))
-                action = torch.where(shown[:, None], action, walks)
-            passed += command.jump
+        self.command.jump[:] = True
+        for step in range(steps):
+            landed = tracker.landed
+            if step >= asked.shape[1]:
+                action = self._decide(observed)
+            elif landed.any():
+                action = torch.where(landed[:, None], self._decide(observed), asked[:, step])
+            else:
+                action = asked[:, step]
             observed = env.step(action)[0]
             motions.append(self._seen())
-        series = torch.stack(motions)
-        rows = (begins + torch.arange(steps)[:, None])[:, None].expand(-1, series.shape[1], -1)
-        return Series(*series.gather(0, rows).unbind(dim=1))
+        return Series(*torch.stack(motions).unbind(dim=1))
 
     def _seen(self) -> torch.Tensor:
         motion, robot = self.command.motion, torch.arange(self.count)

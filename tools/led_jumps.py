@@ -2,10 +2,10 @@ r"""What a policy that only walks does when it is led through the jump that trai
 
     python tools/led_jumps.py policies/matched/policy.onnx --gains policies/gains.yaml
 
-Robots in which everything is drawn, batteries included, walk with each command and are then asked
-to jump, each at another moment of its stride, and jump when the stride allows. They are led all the
-way; a policy that knows how to jump is not told. Physics is that of `cpu_engine.py`. Printed is
-what a robot had when it was fastest upwards, up to 0.34 s after the jump input.
+Robots in which everything is drawn, batteries included, walk with each command and are then told to
+jump, each at another moment of its stride. They are led all the way; a policy that knows how to
+jump is not told. Physics is that of `cpu_engine.py`. Printed is what a robot had when it was
+fastest upwards, up to 0.34 s after the command.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import torch
 from tensordict import TensorDict
 
 from pronk.policy import paper
-from pronk.policy.stride import MOST_S
 from pronk.robots import load_robot
 from pronk.train.environment.commands import motion_command
 from pronk.train.evaluation.subject import load_subject
@@ -31,9 +30,7 @@ from pronk.train.tasks import env_cfg
 COMMANDS = (*(told[:2] for told in paper.JUMPS.values()), (0.0, 0.0))
 """Forward and left [m/s]: the paper's, and none."""
 WALK, STRIDE, JUMP = 80, 16, 17
-"""Policy steps to get under way, over which jumps are asked for, and of a jump."""
-WAIT = round(MOST_S * 50)
-"""Policy steps from being asked to the jump input, at most."""
+"""Policy steps to get under way, over which the commands to jump are spread, and of a jump."""
 
 
 def main() -> None:
@@ -67,20 +64,18 @@ def led(policy: Path, gains: Path, robots: int, seed: int) -> dict[str, np.ndarr
     env = mjlab_env.ManagerBasedRlEnv(cfg, device="cpu")
     enter_phase(env, phase("jump_a"))
     command = motion_command(env)
-    command.scripted = command.waits = True
-    command.led = 1.0
+    command.scripted, command.led = True, 1.0
     subject = load_subject(policy, "cpu")
     untold = {"jump": torch.zeros(count, 1)}
     told = torch.tensor(COMMANDS).repeat(robots, 1)
-    asked = WALK + (torch.arange(count) // len(COMMANDS)) % STRIDE
-    begins = torch.full((count,), WALK + STRIDE + WAIT)
+    begins = WALK + (torch.arange(count) // len(COMMANDS)) % STRIDE
     observed, _ = env.reset()
     command.velocity[:] = torch.nn.functional.pad(told, (0, 1))
     up, along, turn = [], [], []
     way = torch.nn.functional.normalize(told, dim=1)
-    for step in range(WALK + STRIDE + WAIT + JUMP):
-        begins = torch.where(command.jump, begins.clamp_max(step), begins)
-        command.asked[:] = step >= asked
+    for step in range(WALK + STRIDE + JUMP):
+        command.jump[:] = step >= begins
+        command.compute(0.0)  # leads the coming step
         action = subject.act(TensorDict({**observed, **untold}, batch_size=[count]))
         observed = env.step(action)[0]
         motion = command.motion

@@ -1,4 +1,4 @@
-"""What the robot is told: velocities, redrawn now and then, and to jump, as its stride allows.
+"""What the robot is told: velocities, redrawn now and then, and the jump input.
 
 Checklist C1 to C4. Speed ranges grow from a part of the full range to the whole: with +-3 m/s
 from the first step a policy learns to stand, since the tracking reward has no slope so far away
@@ -15,7 +15,6 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk.policy import paper
 from pronk.policy.stride import StrideGate
 from pronk.robots.robot import Robot
 from pronk.train.environment.actions import HeldJointPosition
@@ -73,25 +72,15 @@ class MotionCommandCfg(CommandTermCfg):
     """Part of the draws along one axis alone, as the trials ask."""
     jump_fraction: float = 0.0
     """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""
-    practice: float = 0.7
-    """Part of these robots' draws that lie about the paper's five jumps, each as often. Of all
-    other draws 1 in 100 comes as near to 2 m/s straight ahead, too rarely to learn how to land
-    there, and most are faster sideways or turning than any trial asks: 3 in 5 episodes ended in a
-    fall."""
-    practice_spread: tuple[float, float, float] = (0.25, 0.1, 0.2)
-    """Half-widths of the uniform draws about them: forward, left [m/s], yaw rate [rad/s]."""
-    jump_on_s: tuple[float, float] = (0.5, 0.7)
-    """Time that a jump is asked for [s]: less than preparation and flight together, so that one
-    command means one jump, and enough to lift off in what the stride leaves of it."""
+    jump_on_s: tuple[float, float] = (0.4, 0.7)
+    """Time that the jump input is held [s]: less than preparation and flight together, so that
+    one command means one jump."""
     jump_off_s: tuple[float, float] = (1.0, 2.5)
-    """Time in between [s]."""
+    """Time between jump inputs [s]."""
     leap: float = 0.6
     """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not paid."""
-    leap_falls: float = 0.2
-    """By how much less for each m/s of command beyond 1 m/s [1]. With as much at 2 m/s as at 1,
-    policies leapt 1.35 m there in training, of 1.10 wanted, low, and came down hard."""
     gains: GainsName = "matched"
     """Kind of gains that the jump they are shown was found with."""
     width: float = 1.0
@@ -114,10 +103,10 @@ class MotionCommand(CommandTerm):
         count, device = self.num_envs, self.device
         self.velocity = torch.zeros(count, 3, device=device)
         """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. Shape (N, 3)."""
-        self.asked = torch.zeros(count, dtype=torch.bool, device=device)
-        """Whether a jump is asked for. Shape (N,)."""
         self.jump = torch.zeros(count, dtype=torch.bool, device=device)
-        """Jump input: follows `asked` as the stride comes to the moment. Shape (N,)."""
+        """Jump input. Shape (N,)."""
+        self.asked = torch.zeros_like(self.jump)
+        """Whether a script that `waits` asks for a jump. Shape (N,)."""
         data = env.scene["robot"].data
         self.default_position: Tensor = data.default_joint_pos
         """[rad]. (N, 12)"""
@@ -130,10 +119,11 @@ class MotionCommand(CommandTerm):
         self.effort_limit = torch.tensor(cfg.drive.effort_limit, device=device)
         """[N m]. (12,)"""
         self.scripted = False
-        """True: nobody but the caller changes `velocity` and `jump`, or `asked` if a script
-        waits."""
+        """True: nobody but the caller changes `velocity` and `jump`."""
         self.waits = False
-        """Whether in a script, too, `jump` follows `asked`."""
+        """Whether in a script `jump` follows `asked` when the stride comes to the moment
+        (`pronk.policy.stride`). In training it never waits: a robot that has jumped at any moment
+        lands better when told at one (docs/training.md)."""
         self.led = 0.0
         """Part of the way to what they are shown that robots are led, 0 to 1; a phase sets it."""
         self._demonstration = demonstration(cfg.gains).to(device)
@@ -150,8 +140,6 @@ class MotionCommand(CommandTerm):
         kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
         self._kinds = torch.tensor([*kinds, moving], device=device)
         """Where, in [0, 1], draws along x, y and yaw alone, of all and of none end."""
-        self._practiced = torch.tensor(tuple(paper.JUMPS.values()), device=device)
-        self._spread = torch.tensor(cfg.practice_spread, device=device)
         self._axes = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)]).to(device)
         """Axes that each kind of draw moves along."""
         spans = torch.tensor([cfg.resampling_time_range, cfg.jump_on_s, cfg.jump_off_s])
@@ -180,9 +168,7 @@ class MotionCommand(CommandTerm):
         """
         horizontal = self.velocity[:, :2]
         speed = torch.linalg.vector_norm(horizontal, dim=-1)
-        leap = self.cfg.leap * speed.clamp_max(1.0)
-        leap -= self.cfg.leap_falls * (speed - 1.0).clamp_min(0.0)
-        faster = (leap + self.tracker.lead) * self.tracker.mode
+        faster = (self.cfg.leap * speed.clamp_max(1.0) + self.tracker.lead) * self.tracker.mode
         return horizontal * (1.0 + faster / speed.clamp_min(1e-6))[:, None]
 
     @property
@@ -192,7 +178,7 @@ class MotionCommand(CommandTerm):
 
     @property
     def jump_left(self) -> Tensor:
-        """Time until a jump is asked for, or no more [s]; 0 where it never is. (N,)."""
+        """Time until the jump input changes [s]; 0 where it never does. (N,)."""
         return self._jump_left * self.jumper
 
     @property
@@ -277,10 +263,9 @@ class MotionCommand(CommandTerm):
             self._motion.forget(env_ids)
         if self.scripted:
             return {}
-        velocity, time, _, off = self._draw(self.jumper[env_ids])
+        velocity, time, _, off = self._draw(len(env_ids))
         self.velocity[env_ids] = velocity
         self.time_left[env_ids] = time
-        self.asked[env_ids] = False
         self.jump[env_ids] = False
         self._jump_left[env_ids] = off
         return {}
@@ -294,7 +279,7 @@ class MotionCommand(CommandTerm):
             return
         if not self.scripted:
             self._pass(dt)
-        if self.waits or not self.scripted:
+        elif self.waits:
             self.jump.copy_(self._gate(self._env.scene["robot"].data.joint_pos, self.asked))
         self._show()
 
@@ -302,16 +287,16 @@ class MotionCommand(CommandTerm):
         """Draw anew what has run out after a time."""
         self.time_left -= dt
         due = self.time_left <= 0.0
-        velocity, time, on, off = self._draw(self.jumper)
+        velocity, time, on, off = self._draw(self.num_envs)
         self.velocity = torch.where(due[:, None], velocity, self.velocity)
         self.time_left = torch.where(due, time, self.time_left)
         if self.cfg.jump_fraction <= 0.0:
-            self.asked.zero_()
+            self.jump.zero_()
             return
         self._jump_left -= dt
         turn = (self._jump_left <= 0.0) & self.jumper
-        self.asked = self.asked ^ turn
-        self._jump_left = torch.where(turn, torch.where(self.asked, on, off), self._jump_left)
+        self.jump = self.jump ^ turn
+        self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
 
     def _show(self) -> None:
         """What robots are shown in the coming step, and how far they are led there."""
@@ -333,23 +318,12 @@ class MotionCommand(CommandTerm):
         if self.led > 0.0:
             action.shown = (self.shown, self.led * self.showing[:, None])
 
-    def _draw(self, jumper: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Velocity (count, 3), and times until the next, with jump and without it (count,) [s].
-
-        Args:
-            jumper: Whether a robot to be told gets jump inputs. Bool, (count,)
-        """
-        drawn = torch.rand(9, len(jumper), device=self.device)
+    def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
+        drawn = torch.rand(7, count, device=self.device)
         axes = self._axes[torch.bucketize(drawn[3], self._kinds)]
-        spread = 2.0 * drawn[:3].T - 1.0
-        practices = jumper & (drawn[7] < self.cfg.practice)
-        about = self._practiced[(drawn[8] * len(self._practiced)).long()]
-        velocity = torch.where(
-            practices[:, None],
-            (about + spread * self._spread) * self.ranges.part,
-            spread * (self.ranges.part * self._limits) * axes,
-        )
-        time, on, off = torch.lerp(self._least, self._most, drawn[4:7])
+        velocity = (drawn[:3].T - 0.5) * (2.0 * self.ranges.part * self._limits) * axes
+        time, on, off = torch.lerp(self._least, self._most, drawn[4:])
         return velocity, time, on, off
 
     def _update_metrics(self) -> None:

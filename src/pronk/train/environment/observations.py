@@ -50,7 +50,6 @@ them, and how long its velocity command lasts: to a critic that does not know, w
 would be luck."""
 
 CRITIC_JUMP = {
-    "asked": 1,
     "jump": 1,
     "mode": 1,
     "since": 1,
@@ -177,12 +176,11 @@ def body(env: ManagerBasedRlEnv) -> list[Tensor]:
 
 
 def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
-    """The parts of `CRITIC_JUMP`. (N, 13)."""
+    """The parts of `CRITIC_JUMP`. (N, 12)."""
     command = motion_command(env)
     tracker = command.tracker
     return torch.cat(
         [
-            command.asked.float()[:, None],
             jump(env),
             tracker.mode.float()[:, None],
             tracker.since[:, None],

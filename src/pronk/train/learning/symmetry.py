@@ -91,7 +91,6 @@ _KINDS: Mapping[str, _Kind] = {
     "farthest": _SCALAR,
     "jumper": _SCALAR,
     "jump_left": _SCALAR,
-    "asked": _SCALAR,
     "showing": _SCALAR,
     "time_left": _SCALAR,
     "voltage": _SCALAR,
