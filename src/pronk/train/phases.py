@@ -178,14 +178,15 @@ PHASES: tuple[Phase, ...] = (
     # comes to cost what a jump is worth: with 10, two policies fell in .4 of their landings forward
     # at 2 m/s (one leapt 1.3 m there and was shown .9); after 90 small iterations more with 50
     # (1,280 robots) that one fell in .02, and jumped as well. With 60 at last, noise .2, a policy
-    # landed 99 of 100 on the virtual robot well; of two that jumped at one moment of their stride
-    # in training already, that one 63, one with 100 and .14 88, but turning became .1 to .2 rad/s
-    # slower, for .05 (one run each). A trial forgives no touch, and most last 20 ms, 1 at 45 a
-    # second: 56 more with 300 left 10 of 33 landings with one, of 64, and were .1 m less far; 52
-    # with 150 left 31. Ground covered stays worth as much: with 16 at last both of those were paid
-    # 1.5 a second for jumps, one with 28 2.2, and touches and falls cost 3. What jumps are worth
-    # falls: with as much as at first walking came to be .18 m/s too fast, turning .2 rad/s too
-    # slow; led, and with worth down to 12, 10, 28 and 11, it was within .14 m/s and .1 rad/s.
+    # landed 99 of 100 on the virtual robot well (not on others); of two that jumped at one moment
+    # of their stride in training already, that one 63, one with 100 and .14 88, but turning became
+    # .1 to .2 rad/s slower, for .05 (one run each). A trial forgives no touch, and most last 20 ms,
+    # 1 at 45 a second: 56 more with 300 left 10 of 33 landings with one, of 64, and were .1 m less
+    # far; 52 with 150 left 31. Ground covered stays worth as much: with 16 at last both of those
+    # were paid 1.5 a second for jumps, one with 28 2.2, and touches and falls cost 3. What jumps
+    # are worth falls: with as much as at first walking came to be .18 m/s too fast, turning .2
+    # rad/s too slow; led, and with worth down to 12, 10, 28 and 11, it was within .14 m/s and .1
+    # rad/s.
     Phase(
         name="jump_b",
         iterations=560,
