@@ -5,9 +5,9 @@ as the knees of that pair bend beyond those of the other one, wherever in its st
 as the jump was asked for: in trials, evaluations and on the robot alike. How far a jump goes and
 whether it is landed depends on that moment more than on anything else that differs between two
 jumps of one robot (docs/training.md has the figures), and the wait for it is a stride at most. In
-training jumps begin at any moment: who has landed them all lands that one best. The moment at which
-the other pair bends beyond that one would do as well for a robot whose left side is its right side
-mirrored; none is.
+training jumps begin at any moment; three trainings that waited, too, landed fewer. The moment at
+which the other pair bends beyond that one would do as well for a robot whose left side is its right
+side mirrored; none is.
 
 Works on arrays of NumPy and of PyTorch, of one robot and of many.
 """
