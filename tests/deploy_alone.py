@@ -9,13 +9,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pronk.deploy.links import Link
-from pronk.deploy.notice import Notice
-from pronk.deploy.operators import Scripted
-from pronk.deploy.plan import Plan
-from pronk.deploy.run import fly
-from pronk.deploy.stance import Timing
-from pronk.trial.protocol import Script
+from pronk.evaluation.protocol import Script
+from pronk.runtime.events import Notice
+from pronk.runtime.link import Link
+from pronk.runtime.operators import Scripted
+from pronk.runtime.plan import Plan
+from pronk.runtime.run import fly
+from pronk.runtime.trajectories import Timing
 
 QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
 PATIENT = {"damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}

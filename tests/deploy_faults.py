@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pronk.deploy.links import Link, Paced
 from pronk.errors import HardwareError
-from pronk.hardware.machine import Command, State
+from pronk.links.machine import Command, State
+from pronk.runtime.link import Link, Paced
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from pronk.hardware.capture import Capture
+from pronk.evaluation.protocol import Script
 from pronk.robots.mini_cheetah.constants import FOOT_RADIUS
-from pronk.trial.protocol import Script
+from pronk.virtual.capture import Capture
 
 DT = 1e-3
 G = 9.81

@@ -17,7 +17,7 @@ GRIP = 3.0
 @cache
 def quiet() -> Any:
     """Nominal robots, nothing drawn, exact measurements."""
-    from pronk.train.environment.randomization import Randomization
+    from pronk.train.mdp.randomization import Randomization
 
     return _built(Randomization.none())
 
@@ -25,7 +25,7 @@ def quiet() -> Any:
 @cache
 def noisy() -> Any:
     """Nominal robots on feet that grip, with the paper's measurement noise."""
-    from pronk.train.environment.randomization import Randomization
+    from pronk.train.mdp.randomization import Randomization
 
     paper = Randomization.paper()
     return _built(
@@ -43,16 +43,16 @@ def noisy() -> Any:
 @cache
 def drawn() -> Any:
     """Everything drawn, as in training."""
-    from pronk.train.environment.randomization import Randomization
+    from pronk.train.mdp.randomization import Randomization
 
     return _built(Randomization.paper())
 
 
 def fresh(env: Any) -> Any:
     """The environment as it was when built: first phase, first step, nominal rate, seed 0."""
-    from pronk.train.environment.commands import motion_command
-    from pronk.train.environment.reward_sum import reward_sum
-    from pronk.train.environment.reward_table import ROWS
+    from pronk.train.mdp.commands import motion_command
+    from pronk.train.mdp.reward_sum import reward_sum
+    from pronk.train.mdp.reward_table import ROWS
     from pronk.train.phases import PHASES, enter_phase
 
     reward_sum(env).set_rows(ROWS)

@@ -11,8 +11,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from pronk.train.learning.actor import EstimatorActorCfg, JumpCriticCfg
-from pronk.train.learning.ppo import EstimatorPPO, EstimatorPpoCfg
+from pronk.train.rl.actor import EstimatorActorCfg, JumpCriticCfg
+from pronk.train.rl.ppo import EstimatorPPO, EstimatorPpoCfg
 
 ROBOTS = 32
 STEPS = 4

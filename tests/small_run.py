@@ -26,7 +26,7 @@ def build(folder: Path | None, *, seed: int, save_interval: int = 2, phase: str 
     from rich.console import Console
 
     from pronk.train import phases
-    from pronk.train.experiment.runner import PronkRunner
+    from pronk.train.runner.runner import PronkRunner
     from pronk.train.tasks import env_cfg, rl_cfg
 
     torch.set_num_threads(1)

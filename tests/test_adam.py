@@ -11,10 +11,10 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from pronk.train.experiment import checkpoint  # noqa: E402
-from pronk.train.experiment.checkpoint import Checkpoint  # noqa: E402
-from pronk.train.learning import adam  # noqa: E402
-from small_ppo import build, one_thread, roll_out, same, weights  # noqa: E402, F401
+from pronk.train.rl import adam
+from pronk.train.runner import checkpoint
+from pronk.train.runner.checkpoint import Checkpoint
+from small_ppo import build, one_thread, roll_out, same, weights  # noqa: F401
 
 pytestmark = [pytest.mark.train, pytest.mark.usefixtures("one_thread")]
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
+from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.readers import read_log
 from pronk.match import gains as gains_file
 from pronk.match.arm.fit import fit_drive
 from pronk.match.arm.match import ArmMatch, drives_of, match_arm
-from pronk.match.arm.simulation import ArmBench, JointDrive, held_mean, moves_together
-from pronk.match.arm.trust import trusted_frequency, trusted_samples
+from pronk.match.arm.sample_mask import trusted_frequency, trusted_samples
 from pronk.match.predict import predict
 from pronk.robots import load_robot
-from pronk.sweep.log import Segment, SweepLog
-from pronk.sweep.readers import read_log
+from pronk.simulators.chain import ArmBench, JointDrive, held_mean, moves_together
 
 SO101 = Path(__file__).resolve().parents[2] / "shared" / "data" / "so101"
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the SO-101 recordings are not here")

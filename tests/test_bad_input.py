@@ -16,12 +16,12 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from pronk.errors import LogError, PronkError, RobotError
+from pronk.logs.csv_reader import write_csv
+from pronk.logs.joint_log import SweepLog
+from pronk.logs.mcap_writer import write_mcap
+from pronk.logs.npz_reader import write_npz
+from pronk.logs.readers import read_log, read_logs
 from pronk.robots import load_robot
-from pronk.sweep.csv_log import write_csv
-from pronk.sweep.log import SweepLog
-from pronk.sweep.mcap_writer import write_mcap
-from pronk.sweep.npz_log import write_npz
-from pronk.sweep.readers import read_log, read_logs
 
 ROBOT = load_robot("mini_cheetah")
 OPTIONS: dict[str, dict[str, Any]] = {

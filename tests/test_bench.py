@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pronk.bench.known_truth import (
+from benchmarks.known_truth import (
     JOINT,
     SCENARIOS,
     KnownTruth,
@@ -22,14 +22,14 @@ from pronk.bench.known_truth import (
     coloured_noise,
     delayed,
 )
-from pronk.bench.match import BenchResult, fit_pronk, run, table
-from pronk.bench.peers import Estimate, fit_cma, fit_sysid
-from pronk.bench.replay import Replay
-from pronk.bench.result import row
+from benchmarks.match import BenchResult, fit_pronk, run, table
+from benchmarks.peers import Estimate, fit_cma, fit_sysid
+from benchmarks.replay import Replay
+from benchmarks.result import row
 from pronk.errors import LogError, PronkError
+from pronk.logs.joint_log import SweepLog
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.sweep.log import SweepLog
 
 QUIET = Scenario(name="quiet", words="no noise", noise_rad=0.0)
 BOUNDS = ((13.0, 27.0), (0.1, 0.7))

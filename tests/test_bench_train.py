@@ -8,18 +8,10 @@ import json
 import pytest
 from rich.console import Console
 
-from pronk.bench.train import in_turn, run
-from pronk.bench.train_result import (
-    Rate,
-    Scaling,
-    TaskSpeed,
-    TrainBench,
-    ratio,
-    stage_table,
-    table,
-)
-from pronk.bench.train_stages import REST, StageCost, Stages, costs, counted
-from pronk.commands.bench_train import train
+from benchmarks.train import in_turn, run
+from benchmarks.train_result import Rate, Scaling, TaskSpeed, TrainBench, ratio, stage_table, table
+from benchmarks.train_stages import REST, StageCost, Stages, costs, counted
+from pronk.cli.bench_train import train
 from pronk.errors import PronkError
 
 
@@ -248,7 +240,7 @@ def small_task() -> str:
     import mjlab.tasks  # noqa: F401 - registers mjlab's own
     from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg, register_mjlab_task
 
-    from pronk.train.experiment.runner import PronkRunner
+    from pronk.train.runner.runner import PronkRunner
     from pronk.train.tasks import JUMP_TASK
 
     name = "Pronk-Bench-Small"

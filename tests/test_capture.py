@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError, HardwareError
 from pronk.files import save_arrays
-from pronk.hardware.capture import SCHEMA, Capture, load, save
-from pronk.hardware.ground import Start
-from pronk.hardware.machine import Command
-from pronk.hardware.rotor import MotorConstants
-from pronk.hardware.truth import load_truth
-from pronk.hardware.virtual import VirtualRobot
+from pronk.links.machine import Command
 from pronk.robots import load_robot
+from pronk.virtual.capture import SCHEMA, Capture, load, save
+from pronk.virtual.ground import Start
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.rotor import MotorConstants
+from pronk.virtual.sim_params import load_truth
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pronk.errors import ArtefactError
-from pronk.train.experiment import checkpoint
-from pronk.train.experiment.checkpoint import Checkpoint
+from pronk.train.runner import checkpoint
+from pronk.train.runner.checkpoint import Checkpoint
 
 ABOUT = {"iteration": 12, "phase": "walk", "versions": {"pronk": "0.1.0", "torch": None}}
 TREE: dict[str, Any] = {

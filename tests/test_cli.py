@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pronk import cli
+from pronk.cli import main as cli
 from pronk.errors import PronkError
-from pronk.sweep.readers import find_logs
+from pronk.logs.readers import find_logs
 
 COMMANDS = (
     "sweep",
@@ -67,7 +67,7 @@ def test_help_names_every_command(capsys):
 
 def test_help_loads_no_heavy_library():
     code = (
-        "import sys, pronk.cli; heavy = ('numpy', 'scipy', 'matplotlib', 'mujoco', 'jinja2');"
+        "import sys, pronk.cli.main; heavy = ('numpy', 'scipy', 'matplotlib', 'mujoco', 'jinja2');"
         "print([name for name in heavy if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

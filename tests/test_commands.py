@@ -15,12 +15,12 @@ from scipy.stats import binom, kstest
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import torch  # noqa: E402
+import torch
 
-import small_env  # noqa: E402
-from pronk.policy.stride import MOST_S  # noqa: E402
-from pronk.train.environment.commands import MotionCommand, motion_command  # noqa: E402
-from pronk.train.phases import enter_phase, phase  # noqa: E402
+import small_env
+from pronk.policy.stride import MOST_S
+from pronk.train.mdp.commands import MotionCommand, motion_command
+from pronk.train.phases import enter_phase, phase
 
 Array = NDArray[np.float64]
 N = small_env.ROBOTS

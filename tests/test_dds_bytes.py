@@ -16,8 +16,8 @@ pytest.importorskip("cyclonedds")
 
 from broken_message import mutated
 from pronk.errors import HardwareError
-from pronk.hardware.dds import idl
-from pronk.hardware.dds.codec import (
+from pronk.links.dds import idl
+from pronk.links.dds.codec import (
     LowState,
     decode_command,
     decode_state,
@@ -26,9 +26,9 @@ from pronk.hardware.dds.codec import (
     idle_command,
     joint_map,
 )
-from pronk.hardware.dds.layout import HEADER, checksum, pack, record, unpack, wire_size
-from pronk.hardware.lcm.message import RefusedError
-from pronk.hardware.machine import Command, State
+from pronk.links.dds.layout import HEADER, checksum, pack, record, unpack, wire_size
+from pronk.links.lcm.message import RefusedError
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from pronk.hardware.dds.codec import encode_state, joint_map
-from pronk.hardware.dds.intake import Intake
-from pronk.hardware.machine import State
+from pronk.links.dds.codec import encode_state, joint_map
+from pronk.links.dds.state_decoder import Intake
+from pronk.links.machine import State
 from pronk.robots import load_robot
 
 JOINTS = joint_map(load_robot("mini_cheetah"))

@@ -18,18 +18,18 @@ pytest.importorskip("cyclonedds")
 
 from broken_message import mutated
 from pronk.errors import HardwareError, RobotError
-from pronk.hardware.dds import idl
-from pronk.hardware.dds.codec import encode_command, joint_map
-from pronk.hardware.dds.link import DdsMachine
-from pronk.hardware.dds.net import DdsNetwork, Message, Participant, take
-from pronk.hardware.dds.service import SWITCHER, Client
-from pronk.hardware.dds.twin import COMMANDS, STATES, DdsWire
-from pronk.hardware.machine import Command
-from pronk.hardware.preflight import Freshness
-from pronk.hardware.truth import load_truth
-from pronk.hardware.twin import Twin
-from pronk.hardware.virtual import VirtualRobot
+from pronk.links.dds import idl
+from pronk.links.dds.address import DdsNetwork, Message, Participant, take
+from pronk.links.dds.codec import encode_command, joint_map
+from pronk.links.dds.link import DdsMachine
+from pronk.links.dds.service import SWITCHER, Client
+from pronk.links.machine import Command
+from pronk.links.preflight import Freshness
 from pronk.robots import load_robot
+from pronk.virtual.dds_server import COMMANDS, STATES, DdsWire
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.server import Twin
+from pronk.virtual.sim_params import load_truth
 
 pytestmark = pytest.mark.live
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hopper import ROBOT, write_hopper
-from pronk.commands import console, demo_trial
+from pronk.cli import console, demo_trial
 from pronk.errors import ArtefactError, PronkError
 
 pytest.importorskip("onnxruntime")

@@ -12,19 +12,13 @@ from pronk.errors import ArtefactError
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-import small_env  # noqa: E402
-from pronk.robots import load_robot  # noqa: E402
-from pronk.train.environment.commands import motion_command  # noqa: E402
-from pronk.train.environment.demonstration import (  # noqa: E402
-    JOINTS,
-    Demonstration,
-    demonstration,
-    mirrored,
-    parse,
-)
-from pronk.train.environment.jump import JumpSettings  # noqa: E402
-from pronk.train.gains import GainsName  # noqa: E402
-from pronk.train.phases import enter_phase, phase  # noqa: E402
+import small_env
+from pronk.robots import load_robot
+from pronk.train.gains import GainsName
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.demonstration import JOINTS, Demonstration, demonstration, mirrored, parse
+from pronk.train.mdp.jump import JumpSettings
+from pronk.train.phases import enter_phase, phase
 
 pytestmark = pytest.mark.train
 

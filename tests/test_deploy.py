@@ -17,26 +17,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import pronk.deploy.log
-from pronk.deploy.hands import Gamepad, Keyboard
-from pronk.deploy.limits import Limits
-from pronk.deploy.links import Link
-from pronk.deploy.log import is_deploy_log, read_deploy_log
-from pronk.deploy.log_writer import DeployLogWriter
-from pronk.deploy.operators import Scripted, Stick, Timed
-from pronk.deploy.preflight import delay_objection, refusals
-from pronk.deploy.reasons import Level, Reason
-from pronk.deploy.records import EVENT, STEP, TICK, Mode, Wish, event, get_state, put_state
-from pronk.deploy.safety import Memory, fault
-from pronk.deploy.shared import Mailbox, Ring
-from pronk.deploy.stance import Timing, folded_pose, minimum_jerk, sit_down, stand_up
-from pronk.deploy.states import FIRST_ORDER_S, Director, Order
+import pronk.runtime.log
 from pronk.errors import HardwareError, LogError, RobotError
-from pronk.hardware.machine import State
-from pronk.hardware.realtime import Histogram, Pace
+from pronk.evaluation.protocol import Script
+from pronk.links.machine import State
+from pronk.links.realtime import Histogram, Pace
+from pronk.logs.mcap_stream import MOST_BYTES, DamagedError, records
 from pronk.robots import load_robot
-from pronk.sweep.mcap_stream import MOST_BYTES, DamagedError, records
-from pronk.trial.protocol import Script
+from pronk.runtime.limits import Limits
+from pronk.runtime.link import Link
+from pronk.runtime.log import is_deploy_log, read_deploy_log
+from pronk.runtime.log_writer import DeployLogWriter
+from pronk.runtime.operators import Scripted, Stick, Timed
+from pronk.runtime.preflight import delay_objection, refusals
+from pronk.runtime.reasons import Level, Reason
+from pronk.runtime.records import EVENT, STEP, TICK, Mode, Wish, event, get_state, put_state
+from pronk.runtime.safety import Memory, fault
+from pronk.runtime.shared import Mailbox, Ring
+from pronk.runtime.states import FIRST_ORDER_S, Director, Order
+from pronk.runtime.teleop import Gamepad, Keyboard
+from pronk.runtime.trajectories import Timing, folded_pose, minimum_jerk, sit_down, stand_up
 
 ROBOT = load_robot("mini_cheetah")
 LIMITS = Limits.of(ROBOT)
@@ -743,10 +743,10 @@ def test_a_log_of_an_hour_may_be_read(tmp_path: Path, monkeypatch: pytest.Monkey
     ticks = [len(each.data) for batch in batches for each in batch if each.topic in PER_TICK]
     assert len(ticks) == 400
     an_hour = 3600 * 500 * sum(ticks) / 100
-    assert MOST_BYTES < an_hour < pronk.deploy.log._MOST_BYTES
+    assert MOST_BYTES < an_hour < pronk.runtime.log._MOST_BYTES
     # That is the bound that holds for it.
     unpacked = sum(len(each.data) for batch in batches for each in batch)
-    monkeypatch.setattr("pronk.deploy.log._MOST_BYTES", unpacked // 2)
+    monkeypatch.setattr("pronk.runtime.log._MOST_BYTES", unpacked // 2)
     with pytest.raises(LogError, match="cut before the first tick"):
         read_deploy_log(path)
     with path.open("rb") as file, pytest.raises(DamagedError, match="more than 0 MiB"):

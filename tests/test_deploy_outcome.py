@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pronk.deploy.notice import Notice
-from pronk.deploy.outcome import Outcome
-from pronk.deploy.reasons import Level
-from pronk.deploy.records import EVENT, TEXT, event
+from pronk.runtime.events import Notice
+from pronk.runtime.reasons import Level
+from pronk.runtime.records import EVENT, TEXT, event
+from pronk.runtime.summary import Outcome
 
 
 def notice(kind: str, text: str) -> Notice:

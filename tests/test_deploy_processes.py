@@ -19,19 +19,18 @@ from typer.testing import CliRunner
 
 from deploy_faults import FaultyLink, writes
 from hopper import write_hopper
-from pronk.commands.deploy import deploy
-from pronk.deploy.log import is_deploy_log, read_deploy_log
-from pronk.deploy.operators import Stick
-from pronk.deploy.plan import Plan
-from pronk.deploy.reasons import Reason
-from pronk.deploy.records import Mode, Wish
-from pronk.deploy.run import Deployment
-from pronk.deploy.stance import Timing
+from pronk.cli.deploy import deploy
 from pronk.errors import ArtefactError, HardwareError, PronkError
-from pronk.hardware.capture import load as load_capture
 
 # Reading a log for the first time would keep this process from holding the stick.
-from pronk.sweep import mcap_stream as _mcap_stream  # noqa: F401
+from pronk.runtime.log import is_deploy_log, read_deploy_log
+from pronk.runtime.operators import Stick
+from pronk.runtime.plan import Plan
+from pronk.runtime.reasons import Reason
+from pronk.runtime.records import Mode, Wish
+from pronk.runtime.run import Deployment
+from pronk.runtime.trajectories import Timing
+from pronk.virtual.capture import load as load_capture
 
 pytestmark = pytest.mark.live
 

@@ -22,18 +22,18 @@ import numpy as np
 import pytest
 
 from hopper import write_hopper
-from pronk.deploy.log import read_deploy_log
-from pronk.deploy.operators import Stick
-from pronk.deploy.plan import Plan
-from pronk.deploy.records import Mode, Wish
-from pronk.deploy.run import Deployment
-from pronk.deploy.stance import Timing
 from pronk.errors import HardwareError
-from pronk.hardware.links import Address
-from pronk.hardware.machine import Command, Machine
-from pronk.hardware.preflight import Freshness
-from pronk.hardware.twin import hold_of
+from pronk.links.machine import Command, Machine
+from pronk.links.open import Address
+from pronk.links.preflight import Freshness
 from pronk.robots import load_robot
+from pronk.runtime.log import read_deploy_log
+from pronk.runtime.operators import Stick
+from pronk.runtime.plan import Plan
+from pronk.runtime.records import Mode, Wish
+from pronk.runtime.run import Deployment
+from pronk.runtime.trajectories import Timing
+from pronk.virtual.server import hold_of
 
 pytestmark = pytest.mark.live
 
@@ -122,9 +122,9 @@ class Wire:
 def over_lcm(port: int) -> Wire:
     import lcm
 
-    from pronk.hardware.lcm.codec import decode_command, encode_command
-    from pronk.hardware.lcm.layout import CHEETAH
-    from pronk.hardware.lcm.url import url_of
+    from pronk.links.lcm.address import url_of
+    from pronk.links.lcm.codec import decode_command, encode_command
+    from pronk.links.lcm.layout import CHEETAH
 
     mouth, ear = (lcm.LCM(url_of(port=port)) for _ in range(2))
     met: list[tuple[float, bytes]] = []
@@ -148,10 +148,10 @@ def over_lcm(port: int) -> Wire:
 
 
 def over_dds(domain: int) -> Wire:
-    from pronk.hardware.dds import idl
-    from pronk.hardware.dds.codec import decode_command, encode_command, joint_map
-    from pronk.hardware.dds.net import DdsNetwork, Participant, take, write
-    from pronk.hardware.dds.twin import COMMANDS
+    from pronk.links.dds import idl
+    from pronk.links.dds.address import DdsNetwork, Participant, take, write
+    from pronk.links.dds.codec import decode_command, encode_command, joint_map
+    from pronk.virtual.dds_server import COMMANDS
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
     mouth = own.writer(COMMANDS, idl.LowCmd, raw=True)
@@ -183,7 +183,16 @@ def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
     )
     where = ("--port", str(port)) if lcm else ("--domain", str(domain))
     running = subprocess.Popen(
-        [sys.executable, "-m", "pronk.cli", "twin", "--realtime", "--link", request.param, *where],
+        [
+            sys.executable,
+            "-m",
+            "pronk.cli.main",
+            "twin",
+            "--realtime",
+            "--link",
+            request.param,
+            *where,
+        ],
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from deploy_faults import FaultyLink
-from pronk.deploy.links import Link
-from pronk.deploy.plan import Plan, Shared
-from pronk.deploy.records import STICK, Mode, Wish
-from pronk.deploy.servo import Servo
-from pronk.deploy.stance import Timing
 from pronk.errors import HardwareError
-from pronk.hardware.machine import Machine
+from pronk.links.machine import Machine
+from pronk.runtime.link import Link
+from pronk.runtime.plan import Plan, Shared
+from pronk.runtime.records import STICK, Mode, Wish
+from pronk.runtime.servo import Servo
+from pronk.runtime.trajectories import Timing
 
 pytestmark = pytest.mark.live
 
@@ -166,7 +166,7 @@ def test_nothing_is_lost_where_nothing_is_kept(
     faults: FaultyLink, log: Path | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Nobody empties the queue here: it is full at once.
-    monkeypatch.setattr("pronk.deploy.plan._TICKS", 4)
+    monkeypatch.setattr("pronk.runtime.plan._TICKS", 4)
     with flown(faults, log=log) as run:
         run.mode(Mode.DAMP)
         run.until(lambda: run.shared.ticks.dropped > 0)

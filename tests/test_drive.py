@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pronk import drive
+from pronk.actuator import model as drive
 from pronk.robots import load_robot
 
 HIP = {"gear_ratio": 6.0, "torque_constant": 0.05, "bus_voltage": 24.0}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError, PronkError
+from pronk.excitation.signals import Chirp
+from pronk.logs.joint_log import SweepLog
 from pronk.match.drive import match_drives
-from pronk.match.rehearse import Ask, rehearse
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.robots import load_robot
-from pronk.sweep.log import SweepLog
-from pronk.sweep.signals import Chirp
 
 ROBOT = load_robot("mini_cheetah")
 TRUTH = {"damping": 0.33, "armature": 0.0055, "frictionloss": 0.3}

@@ -21,11 +21,11 @@ from asked_joint import (
     steps_command,
 )
 from pronk.errors import LogError, PronkError
+from pronk.logs.joint_log import Segment, SweepLog
 from pronk.response import Estimator, FrequencyResponse, estimate, fit_delay
 from pronk.response.analytic import second_order, simulate_second_order
 from pronk.response.grid import Grid, grid_over, held_mean
 from pronk.response.spectra import layout, segment_spectra, sums
-from pronk.sweep.log import Segment, SweepLog
 
 SO101 = Path(__file__).resolve().parents[2] / "shared" / "data" / "so101"
 

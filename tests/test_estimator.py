@@ -13,15 +13,15 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from rsl_rl.algorithms import PPO  # noqa: E402
-from tensordict import TensorDict  # noqa: E402
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
 
-from pronk.errors import PronkError  # noqa: E402
-from pronk.policy.layout import ACTOR_INDICES, ESTIMATOR_INDICES  # noqa: E402
-from pronk.train.learning.estimator import Estimator, estimator_losses  # noqa: E402
-from pronk.train.learning.normalization import RolloutNormalization  # noqa: E402
-from pronk.train.learning.ppo import EstimatorPPO, EstimatorPpoCfg  # noqa: E402
-from small_ppo import (  # noqa: E402
+from pronk.errors import PronkError
+from pronk.policy.layout import ACTOR_INDICES, ESTIMATOR_INDICES
+from pronk.train.rl.estimator import Estimator, estimator_losses
+from pronk.train.rl.normalization import RolloutNormalization
+from pronk.train.rl.ppo import EstimatorPPO, EstimatorPpoCfg
+from small_ppo import (
     ROBOTS,
     STEPS,
     build,

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pronk.bars import Check
 from pronk.errors import ArtefactError, PronkError
-from pronk.jumps import Jump, JumpRules, Series, answer, measure, unasked_height
+from pronk.evaluation.criteria import Check
+from pronk.evaluation.jumps import Jump, JumpRules, Series, answer, measure, unasked_height
 from pronk.policy.stride import MOST_S
-from pronk.train.evaluation import bars as evaluate_bars
-from pronk.train.evaluation import result as evaluate_result
-from pronk.train.evaluation.bars import checks, cost_of_jumping
-from pronk.train.evaluation.plan import JUMPS, NEVER, WALKS, Case, Plan
-from pronk.train.evaluation.result import (
+from pronk.train.evaluate import bars as evaluate_bars
+from pronk.train.evaluate import result as evaluate_result
+from pronk.train.evaluate.bars import checks, cost_of_jumping
+from pronk.train.evaluate.plan import JUMPS, NEVER, WALKS, Case, Plan
+from pronk.train.evaluate.result import (
     EstimatorResult,
     Evaluation,
     JumpResult,
@@ -287,7 +287,7 @@ def random_turns(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
     """Three hundred robots that do what they like, against `measure` on the series of each."""
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluation.flight import FlightRecorder
+    from pronk.train.evaluate.flight import FlightRecorder
 
     rng = np.random.default_rng(8)
     count, length = 300, 360
@@ -401,11 +401,11 @@ LIVES = {
 def test_what_touches_is_counted_as_a_trial_counts_it() -> None:
     """Each life by hand, on the device, and as a capture of the virtual robot."""
     torch = pytest.importorskip("torch")
-    from pronk.hardware.capture import Capture
+    from pronk.evaluation.metrics import measure as measure_capture
+    from pronk.evaluation.protocol import Script
     from pronk.robots import load_robot
-    from pronk.train.evaluation.flight import FlightRecorder
-    from pronk.trial.metrics import measure as measure_capture
-    from pronk.trial.protocol import Script
+    from pronk.train.evaluate.flight import FlightRecorder
+    from pronk.virtual.capture import Capture
 
     rules = JumpRules(search_s=0.3, tail_s=0.1, upright_s=0.3)
     length, count = 200, len(LIVES)
@@ -462,7 +462,7 @@ def test_what_touches_is_counted_as_a_trial_counts_it() -> None:
 def test_a_stride_is_in_the_raw_error_and_not_in_the_averaged() -> None:
     """Velocity = command + (.1, 0) + .3 sin: averaged .1, raw the mean of |.1 + .3 sin|."""
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluation.walk import SpeedRecorder
+    from pronk.train.evaluate.walk import SpeedRecorder
 
     count, settle, end, average = 3, 150, 550, 100
     command = torch.tensor([[2.0, 0.0, 0.0]] * count)
@@ -499,7 +499,7 @@ def test_a_stride_is_in_the_raw_error_and_not_in_the_averaged() -> None:
 @pytest.mark.train
 def test_a_robot_that_never_settled_has_no_error() -> None:
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluation.walk import SpeedRecorder
+    from pronk.train.evaluate.walk import SpeedRecorder
 
     recorder = SpeedRecorder(torch.zeros(1, 3), settle=2, end=5, average=2)
     for _ in range(5):
@@ -510,7 +510,7 @@ def test_a_robot_that_never_settled_has_no_error() -> None:
 @pytest.mark.train
 def test_the_estimator_is_judged_on_robots_that_stand() -> None:
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluation.walk import EstimatorRecorder
+    from pronk.train.evaluate.walk import EstimatorRecorder
 
     recorder = EstimatorRecorder(2, "cpu")
     target = torch.tensor([[1.0, 0.0, 1.0, 0.0, 2.0, 0.0, 0.1]] * 2)
@@ -572,9 +572,9 @@ def seen() -> Seen:
     pytest.importorskip("mjlab")
     from mjlab.envs import ManagerBasedRlEnv
 
-    from pronk.train.environment.randomization import Randomization
-    from pronk.train.evaluation.evaluate import evaluate_policy, evaluation_cfg
-    from pronk.train.evaluation.run import TERM
+    from pronk.train.evaluate.evaluate import evaluate_policy, evaluation_cfg
+    from pronk.train.evaluate.run import TERM
+    from pronk.train.mdp.randomization import Randomization
     from pronk.train.tasks import env_cfg
 
     cfg = env_cfg(randomization=replace(Randomization.none(), decimation=(-2, 2)))
@@ -730,8 +730,8 @@ def test_progress_rises_to_one(seen: Seen) -> None:
 def test_a_run_is_written_and_shown(
     seen: Seen, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pronk.commands.evaluate import show
-    from pronk.train.evaluation.evaluate import write
+    from pronk.cli.evaluate import show
+    from pronk.train.evaluate.evaluate import write
 
     path = tmp_path / "evaluation.json"
     write(path, seen.evaluation)
@@ -751,7 +751,7 @@ def test_an_environment_of_training_is_refused() -> None:
     pytest.importorskip("mjlab")
     from types import SimpleNamespace
 
-    from pronk.train.evaluation.evaluate import evaluate_policy
+    from pronk.train.evaluate.evaluate import evaluate_policy
 
     plain = SimpleNamespace(metrics_manager=SimpleNamespace(cfg=None), num_envs=6)
     with pytest.raises(PronkError, match="6 robots and no evaluation term; this plan needs one"):
@@ -766,9 +766,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     """The folder of a run with one checkpoint of random weights, and its actor."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("mjlab")
-    from pronk.train.evaluation.subject import blank_actor
-    from pronk.train.experiment import checkpoint
-    from pronk.train.experiment.run_folder import RunFolder
+    from pronk.train.evaluate.subject import blank_actor
+    from pronk.train.runner import checkpoint
+    from pronk.train.runner.run_folder import RunFolder
 
     torch.manual_seed(5)
     actor = blank_actor(jump=True)
@@ -786,7 +786,7 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
     from tensordict import TensorDict
 
     from pronk.robots import load_robot
-    from pronk.train.evaluation.subject import load_subject
+    from pronk.train.evaluate.subject import load_subject
     from pronk.train.gains import training_gains
 
     folder, actor = trained
@@ -808,8 +808,8 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
 @pytest.mark.train
 def test_what_is_no_policy_is_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
     pytest.importorskip("mjlab")
-    from pronk.train.evaluation.subject import load_subject
-    from pronk.train.experiment import checkpoint
+    from pronk.train.evaluate.subject import load_subject
+    from pronk.train.runner import checkpoint
 
     with pytest.raises(ArtefactError, match="no checkpoints in it; expected the folder of a run"):
         load_subject(tmp_path, "cpu")
@@ -834,9 +834,9 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
     from tensordict import TensorDict
 
     from pronk.robots import load_robot
-    from pronk.train.evaluation.subject import load_subject
+    from pronk.train.evaluate.subject import load_subject
     from pronk.train.gains import training_gains
-    from pronk.train.learning.export import contract_for, export_policy
+    from pronk.train.rl.export import contract_for, export_policy
 
     robot = load_robot("mini_cheetah")
     gains = training_gains("naive", robot)
@@ -875,9 +875,9 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
 @pytest.mark.train
 def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> None:
     pytest.importorskip("mjlab")
-    from pronk.commands.evaluate import run
+    from pronk.cli.evaluate import run
     from pronk.robots import load_robot
-    from pronk.train.evaluation.subject import load_subject
+    from pronk.train.evaluate.subject import load_subject
     from pronk.train.gains import training_gains
 
     plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
@@ -897,11 +897,11 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
 @pytest.mark.train
 def test_one_robot_is_measured_many_times_with_noise_alone() -> None:
     pytest.importorskip("mjlab")
-    from pronk.commands.evaluate import Drawn
+    from pronk.cli.evaluate import Drawn
     from pronk.robots import load_robot
-    from pronk.train.environment.randomization import delay_steps, events, noise
-    from pronk.train.evaluation.run import RANDOMIZATIONS
+    from pronk.train.evaluate.run import RANDOMIZATIONS
     from pronk.train.gains import training_gains
+    from pronk.train.mdp.randomization import delay_steps, events, noise
 
     assert {drawn.value for drawn in Drawn} == set(RANDOMIZATIONS)
     full, alone, none = (RANDOMIZATIONS[name] for name in ("full", "noise", "none"))
@@ -919,9 +919,9 @@ def test_a_policy_that_cannot_jump_is_not_asked_to(
     trained: tuple[Path, Any], tmp_path: Path
 ) -> None:
     pytest.importorskip("mjlab")
-    from pronk.commands.evaluate import What, evaluate
-    from pronk.train.evaluation.subject import blank_actor
-    from pronk.train.experiment import checkpoint
+    from pronk.cli.evaluate import What, evaluate
+    from pronk.train.evaluate.subject import blank_actor
+    from pronk.train.runner import checkpoint
 
     path = tmp_path / "model_1.pt"
     tree = {"algorithm": {"actor_state_dict": blank_actor(jump=False).state_dict()}}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pronk.drive import clip_torque
+from pronk.actuator.model import clip_torque
 from pronk.errors import PronkError
 from pronk.match.export import EXPORTS, export_text, group_drives
 from pronk.match.gains import JointGains, MatchedGains, Simulator
@@ -82,7 +82,7 @@ def test_mjlab_actuators_attach_to_the_robot() -> None:
     from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
     from mjlab.entity.entity import Entity
 
-    from pronk.robots.spec import free_spec
+    from pronk.robots.model import free_spec
 
     space: dict[str, object] = {}
     exec(export_text(matched(), "mjlab"), space)

@@ -16,9 +16,9 @@ pytest.importorskip("mjlab")
 pytest.importorskip("cma")
 os.environ.setdefault("MJLAB_WARP_QUIET", "1")
 
-from pronk.robots import load_robot  # noqa: E402
-from pronk.train.environment.demonstration import demonstration, mirrored  # noqa: E402
-from pronk.train.gains import training_gains  # noqa: E402
+from pronk.robots import load_robot
+from pronk.train.gains import training_gains
+from pronk.train.mdp.demonstration import demonstration, mirrored
 
 pytestmark = [
     pytest.mark.train,

@@ -10,9 +10,9 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
-from pronk.train.learning.following import follow, lesson  # noqa: E402
-from pronk.train.learning.symmetry import with_mirror_image  # noqa: E402
-from small_ppo import ROBOTS, STEPS, build, observe, one_thread, roll_out, same, weights  # noqa: E402, F401
+from pronk.train.rl.following import follow, lesson
+from pronk.train.rl.symmetry import with_mirror_image
+from small_ppo import ROBOTS, STEPS, build, observe, one_thread, roll_out, same, weights  # noqa: F401
 
 pytestmark = [pytest.mark.train, pytest.mark.usefixtures("one_thread")]
 

@@ -8,7 +8,7 @@ import pytest
 
 from pronk.robots.go2 import GO2
 from pronk.robots.go2 import constants as c
-from pronk.robots.spec import bench_spec, free_spec
+from pronk.robots.model import bench_spec, free_spec
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_other_legs_mirror_the_front_right_one(name: str) -> None:
 
 def test_the_map_of_the_motors_is_the_identity() -> None:
     pytest.importorskip("cyclonedds")
-    from pronk.hardware.dds.codec import joint_map
+    from pronk.links.dds.codec import joint_map
 
     joints = joint_map(GO2)
     np.testing.assert_array_equal(joints.sign, np.ones(12))

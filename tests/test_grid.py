@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError
-from pronk.match.ask import Job, Simulator
+from pronk.excitation.signals import Chirp
 from pronk.match.grid import (
     DIVERGED_DB,
     GridSearch,
@@ -20,13 +20,13 @@ from pronk.match.grid import (
     search_all,
     weights,
 )
+from pronk.match.measured_joint import Target, merged, targets
 from pronk.match.quick import quick_search
-from pronk.match.rehearse import Ask, rehearse
 from pronk.match.settings import MatchSettings
-from pronk.match.target import Target, merged, targets
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot
-from pronk.sweep.signals import Chirp
+from pronk.simulators.batch import Job, Simulator
 
 ROBOT = load_robot("mini_cheetah")
 SETTINGS = MatchSettings()

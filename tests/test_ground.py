@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pronk.errors import HardwareError, RobotError
-from pronk.hardware import quaternion
-from pronk.hardware.ground import Box, Ground, Start
-from pronk.hardware.inertial import moving_force
-from pronk.hardware.machine import Command, State
-from pronk.hardware.plant import build_plant, legs_of
-from pronk.hardware.transport import Transport, sinking
-from pronk.hardware.truth import SHIPPED, Truth, load_truth, parse_truth, with_changes
-from pronk.hardware.truth_parts import AttitudeTruth, TrunkTruth
-from pronk.hardware.virtual import VirtualRobot
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
+from pronk.virtual import quaternion
+from pronk.virtual.ground import Box, Ground, Start
+from pronk.virtual.imu_motion import moving_force
+from pronk.virtual.plant import build_plant, legs_of
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import SHIPPED, Truth, load_truth, parse_truth, with_changes
+from pronk.virtual.sim_params_parts import AttitudeTruth, TrunkTruth
+from pronk.virtual.transport import Transport, sinking
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pronk.hardware.truth import SHIPPED, load_truth
+from pronk.evaluation.metrics import JumpFigures
+from pronk.evaluation.run import Plan, jobs_of
+from pronk.evaluation.subjects import load_subjects
 from pronk.robots import load_robot
-from pronk.trial.metrics import JumpFigures
-from pronk.trial.run import Plan, jobs_of
-from pronk.trial.subjects import load_subjects
+from pronk.virtual.sim_params import SHIPPED, load_truth
 from tools_folder import FOLDER, load_tool
 
 pytest.importorskip("onnxruntime")

@@ -16,7 +16,7 @@ from pronk.errors import PronkError
 
 torch = pytest.importorskip("torch")
 
-from pronk.train.environment.jump import JumpSettings, JumpTracker  # noqa: E402
+from pronk.train.mdp.jump import JumpSettings, JumpTracker
 
 pytestmark = pytest.mark.train
 

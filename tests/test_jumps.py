@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pronk.errors import PronkError
-from pronk.jumps import (
+from pronk.evaluation.jumps import (
     Jump,
     JumpRules,
     Series,

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pronk.errors import HardwareError
-from pronk.hardware.lcm import types
-from pronk.hardware.lcm.codec import (
+from pronk.links.lcm import types
+from pronk.links.lcm.codec import (
     decode_attitude,
     decode_command,
     decode_joints,
@@ -21,22 +21,15 @@ from pronk.hardware.lcm.codec import (
     roll_pitch_yaw,
     state_of,
 )
-from pronk.hardware.lcm.layout import (
-    CHEETAH,
-    KNEE_RATIO,
-    LAYOUTS,
-    WTW,
-    Layout,
-    layout_of,
-)
-from pronk.hardware.lcm.message import RefusedError
-from pronk.hardware.lcm.service import (
+from pronk.links.lcm.layout import CHEETAH, KNEE_RATIO, LAYOUTS, WTW, Layout, layout_of
+from pronk.links.lcm.message import RefusedError
+from pronk.links.lcm.service import (
     clamp_message,
     mode_request,
     read_clamp_message,
     read_mode_request,
 )
-from pronk.hardware.machine import Command, State
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 
 BOTH = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)

@@ -18,21 +18,16 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.hardware.lcm.codec import (
-    decode_command,
-    encode_command,
-)
-from pronk.hardware.lcm.layout import (
-    CHEETAH,
-)
-from pronk.hardware.lcm.link import LcmMachine
-from pronk.hardware.lcm.service import REQUEST_CHANNEL, mode_request
-from pronk.hardware.lcm.url import url_of
-from pronk.hardware.lcm.writer import DAMPING, CommandWriter
-from pronk.hardware.machine import Command, State
-from pronk.hardware.preflight import Freshness
-from pronk.hardware.twin import hold_of
+from pronk.links.lcm.address import url_of
+from pronk.links.lcm.codec import decode_command, encode_command
+from pronk.links.lcm.layout import CHEETAH
+from pronk.links.lcm.link import LcmMachine
+from pronk.links.lcm.service import REQUEST_CHANNEL, mode_request
+from pronk.links.lcm.writer import DAMPING, CommandWriter
+from pronk.links.machine import Command, State
+from pronk.links.preflight import Freshness
 from pronk.robots import load_robot
+from pronk.virtual.server import hold_of
 
 pytestmark = pytest.mark.live
 
@@ -58,7 +53,7 @@ class Process:
     port: int = field(default_factory=free_port)
 
     def __post_init__(self) -> None:
-        code = "import typer; from pronk.commands.twin import twin; typer.run(twin)"
+        code = "import typer; from pronk.cli.simulate import twin; typer.run(twin)"
         words = ["--layout", self.layout, "--port", str(self.port), "--json", self.json]
         self.running = subprocess.Popen(
             [sys.executable, "-c", code, *map(str, words)],

@@ -7,25 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from pronk.hardware.faults import flip_bit
-from pronk.hardware.lcm.codec import (
-    decode_command,
-    encode_command,
-    encode_state,
-)
-from pronk.hardware.lcm.layout import (
-    LAYOUTS,
-    Layout,
-)
-from pronk.hardware.lcm.message import RefusedError
-from pronk.hardware.lcm.reader import StateReader
-from pronk.hardware.lcm.service import BENCH_CHANNEL, REQUEST_CHANNEL
-from pronk.hardware.lcm.types import MESSAGES
-from pronk.hardware.machine import Command, State
-from pronk.hardware.truth import load_truth
-from pronk.hardware.twin import Twin, hold_of
-from pronk.hardware.virtual import VirtualRobot
+from pronk.links.lcm.codec import decode_command, encode_command, encode_state
+from pronk.links.lcm.layout import LAYOUTS, Layout
+from pronk.links.lcm.message import RefusedError
+from pronk.links.lcm.reader import StateReader
+from pronk.links.lcm.service import BENCH_CHANNEL, REQUEST_CHANNEL
+from pronk.links.lcm.types import MESSAGES
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
+from pronk.virtual.faults import flip_bit
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.server import Twin, hold_of
+from pronk.virtual.sim_params import load_truth
 
 lcm = pytest.importorskip("lcm")
 
@@ -101,7 +94,7 @@ def undisturbed() -> list[State]:
 def test_a_hundred_thousand_broken_messages_move_nothing(
     layout: Layout, undisturbed: list[State]
 ) -> None:
-    from pronk.hardware.lcm.twin import LcmWire
+    from pronk.virtual.lcm_server import LcmWire
 
     machine = VirtualRobot(ROBOT, load_truth(None), seed=1, legs=("FR",))
     machine.connect()
@@ -136,7 +129,7 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
 def test_the_same_twin_does_move_when_it_is_told_to(
     layout: Layout, undisturbed: list[State]
 ) -> None:
-    from pronk.hardware.lcm.twin import LcmWire
+    from pronk.virtual.lcm_server import LcmWire
 
     machine = VirtualRobot(ROBOT, load_truth(None), seed=1, legs=("FR",))
     machine.connect()

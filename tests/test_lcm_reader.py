@@ -9,19 +9,13 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.hardware.lcm.codec import (
-    encode_state,
-)
-from pronk.hardware.lcm.layout import (
-    CHEETAH,
-    WTW,
-    Layout,
-)
-from pronk.hardware.lcm.reader import StateReader
-from pronk.hardware.lcm.service import clamp_message
-from pronk.hardware.lcm.url import TWIN_PORT, multicast_interface, url_of
-from pronk.hardware.machine import State
-from pronk.hardware.preflight import Freshness, check_rate, check_rest, up_of
+from pronk.links.lcm.address import TWIN_PORT, multicast_interface, url_of
+from pronk.links.lcm.codec import encode_state
+from pronk.links.lcm.layout import CHEETAH, WTW, Layout
+from pronk.links.lcm.reader import StateReader
+from pronk.links.lcm.service import clamp_message
+from pronk.links.machine import State
+from pronk.links.preflight import Freshness, check_rate, check_rest, up_of
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.hardware.lcm.message import Message, RefusedError
-from pronk.hardware.lcm.types import MESSAGES, SPI_DATA, identify
+from pronk.links.lcm.message import Message, RefusedError
+from pronk.links.lcm.types import MESSAGES, SPI_DATA, identify
 
 # Fingerprints and lengths as lcm-gen 1.5.3 gave them for the two stacks' own .lcm files.
 KNOWN = {

@@ -8,17 +8,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from pronk.match.ask import Job, Simulator
+from pronk.excitation.signals import Chirp
 from pronk.match.grid import axes, search
-from pronk.match.linear import plant
+from pronk.match.measured_joint import DB, Target, targets
 from pronk.match.quick import quick_search
 from pronk.match.refine import refine
-from pronk.match.rehearse import Ask, rehearse
 from pronk.match.settings import MatchSettings
-from pronk.match.simulate import Bench
-from pronk.match.target import DB, Target, targets
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.robots import load_robot
-from pronk.sweep.signals import Chirp
+from pronk.simulators.batch import Job, Simulator
+from pronk.simulators.linear import plant
+from pronk.simulators.mujoco import Bench
 
 ROBOT = load_robot("mini_cheetah")
 SETTINGS = MatchSettings()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError, RobotError
-from pronk.hardware import link_rules
-from pronk.hardware.link_rules import (
+from pronk.links import link_checks as link_rules
+from pronk.links.link_checks import (
     await_rest,
     check_alone,
     check_still_alone,
@@ -18,7 +18,7 @@ from pronk.hardware.link_rules import (
     fresh_states,
     waited_for,
 )
-from pronk.hardware.machine import State
+from pronk.links.machine import State
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

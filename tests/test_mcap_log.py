@@ -19,11 +19,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from pronk.errors import LogError
-from pronk.sweep.log import Segment, SweepLog
-from pronk.sweep.mcap_format import END, HEADER, SAMPLE, SEGMENT, LogHeader
-from pronk.sweep.mcap_reader import read_mcap
-from pronk.sweep.mcap_writer import McapLogWriter, write_mcap
-from pronk.sweep.readers import read_log
+from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.mcap_format import END, HEADER, SAMPLE, SEGMENT, LogHeader
+from pronk.logs.mcap_reader import read_mcap
+from pronk.logs.mcap_writer import McapLogWriter, write_mcap
+from pronk.logs.readers import read_log
 
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
 

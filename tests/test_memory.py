@@ -13,8 +13,8 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from pronk.errors import ArtefactError  # noqa: E402
-from pronk.train.experiment.memory import Memory, put_back, walk  # noqa: E402
+from pronk.errors import ArtefactError
+from pronk.train.runner.memory import Memory, put_back, walk
 
 pytestmark = pytest.mark.train
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import trial as bench
 from hopper import ROBOT, write_hopper
-from pronk.bench import trial as bench
 from pronk.errors import PronkError
-from pronk.hardware.truth import load_truth
-from pronk.trial.job import Job, jump
-from pronk.trial.protocol import STILL, Case, Script
-from pronk.trial.run import Plan, jobs_of
-from pronk.trial.subjects import load_subjects
+from pronk.evaluation.job import Job, jump
+from pronk.evaluation.protocol import STILL, Case, Script
+from pronk.evaluation.run import Plan, jobs_of
+from pronk.evaluation.subjects import load_subjects
+from pronk.virtual.sim_params import load_truth
 
 SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)
 

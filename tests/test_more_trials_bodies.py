@@ -13,21 +13,21 @@ from hypothesis import strategies as st
 
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
-from pronk.hardware.truth import load_truth
-from pronk.hardware.virtual import VirtualRobot
+from pronk.evaluation import variation
+from pronk.evaluation.protocol import Case, Script
+from pronk.evaluation.run import Plan
+from pronk.evaluation.subjects import load_subjects
+from pronk.evaluation.unseen import bode
+from pronk.evaluation.unseen.bode import bode_errors, gains_of
+from pronk.evaluation.unseen.other_params import GROUP_TORQUE, TOLERANCES, draw, save_truth
+from pronk.evaluation.variation import AS_IT_IS, Parameter, add_variation
+from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
-from pronk.match.rehearse import Ask, rehearse
 from pronk.match.settings import MatchSettings
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
-from pronk.sweep.signals import Chirp
-from pronk.trial import variation
-from pronk.trial.protocol import Case, Script
-from pronk.trial.run import Plan
-from pronk.trial.subjects import load_subjects
-from pronk.trial.unseen import bode
-from pronk.trial.unseen.bode import bode_errors, gains_of
-from pronk.trial.unseen.other_truths import GROUP_TORQUE, TOLERANCES, draw, save_truth
-from pronk.trial.variation import AS_IT_IS, Parameter, add_variation
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import load_truth
 
 TRUTH = load_truth()
 QUICK = MatchSettings(method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False)

@@ -10,14 +10,14 @@ import pytest
 
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
-from pronk.hardware.truth import load_truth
-from pronk.trial import sheet
-from pronk.trial.protocol import Case, Script
-from pronk.trial.result import Subject
-from pronk.trial.terrain import climbing, course, crossing
-from pronk.trial.terrain.climbing import Ladder, Plan, add_crossings
-from pronk.trial.terrain.course import Verdict
-from pronk.trial.terrain.crossing import Crossing, Crossings
+from pronk.evaluation import result_io as sheet
+from pronk.evaluation.protocol import Case, Script
+from pronk.evaluation.result import Subject
+from pronk.evaluation.terrain import climbing, course, crossing
+from pronk.evaluation.terrain.climbing import Ladder, Plan, add_crossings
+from pronk.evaluation.terrain.course import Verdict
+from pronk.evaluation.terrain.crossing import Crossing, Crossings
+from pronk.virtual.sim_params import load_truth
 
 TRUTH = load_truth()
 SUBJECT = Subject(name="matched", path="policy.onnx", sha256="0" * 64, contract={})

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from pronk.errors import PronkError
-from pronk.hardware.capture import Capture
-from pronk.hardware.ground import Ground
-from pronk.jumps import JumpRules
-from pronk.trial.protocol import STILL, Script
-from pronk.trial.terrain import course
-from pronk.trial.terrain.course import Obstacle, Operator, Verdict, direction, judge, lost
+from pronk.evaluation.jumps import JumpRules
+from pronk.evaluation.protocol import STILL, Script
+from pronk.evaluation.terrain import course
+from pronk.evaluation.terrain.course import Obstacle, Operator, Verdict, direction, judge, lost
+from pronk.virtual.capture import Capture
+from pronk.virtual.ground import Ground
 from seen_jump import DELAY, SCRIPT, changed, seen_jump
 
 FORWARD, BACK, LEFT = (2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 1.0, 0.0)

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError
-from pronk.hardware.capture import Capture
-from pronk.hardware.truth import load_truth
-from pronk.trial import walk
-from pronk.trial.protocol import Case, Script
-from pronk.trial.walk_metrics import SETTLE_S, WalkFigures, measure_walk
+from pronk.evaluation import walk
+from pronk.evaluation.protocol import Case, Script
+from pronk.evaluation.walk_metrics import SETTLE_S, WalkFigures, measure_walk
+from pronk.virtual.capture import Capture
+from pronk.virtual.sim_params import load_truth
 from seen_jump import STANDING, changed
 
 DT = 0.002

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import torch  # noqa: E402
+import torch
 
-import small_env  # noqa: E402
-from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.train.environment.commands import motion_command  # noqa: E402
+import small_env
+from pronk.robots.mini_cheetah import constants as c
+from pronk.train.mdp.commands import motion_command
 
 Array = NDArray[np.float64]
 N = small_env.ROBOTS

@@ -14,22 +14,18 @@ from scipy.stats import kstest
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import torch  # noqa: E402
-from torch import Tensor  # noqa: E402
+import torch
+from torch import Tensor
 
-import small_env  # noqa: E402
-from parts import where  # noqa: E402
-from pronk.policy import layout  # noqa: E402
-from pronk.robots import load_robot  # noqa: E402
-from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.train.environment.commands import motion_command  # noqa: E402
-from pronk.train.environment.draws import draws  # noqa: E402
-from pronk.train.environment.observations import (  # noqa: E402
-    CRITIC,
-    CRITIC_JUMP,
-    DEMONSTRATION,
-)
-from pronk.train.phases import enter_phase, phase  # noqa: E402
+import small_env
+from parts import where
+from pronk.policy import layout
+from pronk.robots import load_robot
+from pronk.robots.mini_cheetah import constants as c
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.draws import draws
+from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP, DEMONSTRATION
+from pronk.train.phases import enter_phase, phase
 
 Array = NDArray[np.float64]
 N = small_env.ROBOTS

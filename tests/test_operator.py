@@ -16,10 +16,10 @@ from asked_joint import (
     steps_command,
 )
 from pronk.errors import LogError, PronkError
+from pronk.logs.joint_log import SweepLog
 from pronk.response import Estimator, H1Operator, estimate, operators
 from pronk.response.analytic import simulate_second_order
 from pronk.response.operator import combine
-from pronk.sweep.log import SweepLog
 
 
 def applied(log: SweepLog, settings: Estimator) -> tuple[np.ndarray, np.ndarray]:

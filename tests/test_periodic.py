@@ -14,10 +14,10 @@ from asked_joint import (
     steps_command,
 )
 from pronk.errors import LogError
+from pronk.logs.joint_log import SweepLog
 from pronk.response import Estimator, distortion, estimate
 from pronk.response.analytic import second_order
 from pronk.response.periodic import read_periods
-from pronk.sweep.log import SweepLog
 
 
 def multisine(answer, *, questions: int = 1, noise: float = 0.0, **kw) -> SweepLog:  # type: ignore[no-untyped-def]

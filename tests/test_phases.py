@@ -13,21 +13,14 @@ from pronk.errors import PronkError
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import small_env  # noqa: E402
-from pronk.train.environment.commands import NAME, motion_command  # noqa: E402
-from pronk.train.environment.reward_sum import NAME as TABLE  # noqa: E402
-from pronk.train.environment.reward_sum import reward_sum  # noqa: E402
-from pronk.train.environment.reward_table import ROWS  # noqa: E402
-from pronk.train.experiment.settings import PHASES_OF  # noqa: E402
-from pronk.train.phases import (  # noqa: E402
-    PHASES,
-    Phase,
-    configure_phase,
-    enter_phase,
-    phase,
-    with_iterations,
-)
-from pronk.train.tasks import env_cfg  # noqa: E402
+import small_env
+from pronk.train.mdp.commands import NAME, motion_command
+from pronk.train.mdp.reward_sum import NAME as TABLE
+from pronk.train.mdp.reward_sum import reward_sum
+from pronk.train.mdp.reward_table import ROWS
+from pronk.train.phases import PHASES, Phase, configure_phase, enter_phase, phase, with_iterations
+from pronk.train.runner.settings import PHASES_OF
+from pronk.train.tasks import env_cfg
 
 
 @pytest.fixture(scope="module")

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError, RobotError
+from pronk.excitation.signals import Chirp, Multisine
+from pronk.logs.joint_log import SweepLog
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.pipeline import match_logs
-from pronk.match.rehearse import Ask, rehearse
 from pronk.match.result import MatchResult
 from pronk.match.settings import MatchSettings
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot
-from pronk.sweep.log import SweepLog
-from pronk.sweep.signals import Chirp, Multisine
 
 ROBOT = load_robot("mini_cheetah")
 QUICK = MatchSettings(

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pronk.errors import PlanError, RobotError
+from pronk.excitation.plan import SweepPlan, make_plan
+from pronk.excitation.signals import Chirp, Multisine
+from pronk.excitation.worst_case import Uncertainty, forecast
 from pronk.robots import load_robot
-from pronk.sweep.forecast import Uncertainty, forecast
-from pronk.sweep.plan import SweepPlan, make_plan
-from pronk.sweep.signals import Chirp, Multisine
 
 ROBOT = load_robot("mini_cheetah")
 SHORT = Chirp(length_s=4.0, stop_hz=15.0)

@@ -21,17 +21,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hopper import DEFAULT, ROBOT, write_hopper
-from pronk.cli import run
+from pronk.cli.main import run
 from pronk.errors import PronkError
-from pronk.hardware.capture import Capture
-from pronk.hardware.truth import load_truth
+from pronk.evaluation.live.gamepad import Gamepad
+from pronk.evaluation.live.joystick import JUMP_S, Pad, Stick, live
+from pronk.evaluation.live.page import WebPage, free_port, readout
+from pronk.evaluation.live.play import play
+from pronk.evaluation.live.readout import Gauge
 from pronk.policy.runtime import load_policy
 from pronk.robots.mini_cheetah.model import standing_height
-from pronk.trial.live.gamepad import Gamepad
-from pronk.trial.live.gauge import Gauge
-from pronk.trial.live.page import WebPage, free_port, readout
-from pronk.trial.live.play import play
-from pronk.trial.live.stick import JUMP_S, Pad, Stick, live
+from pronk.virtual.capture import Capture
+from pronk.virtual.sim_params import load_truth
 
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
 GRAVITY = 9.81
@@ -147,7 +147,7 @@ def test_a_jump_is_read_as_it_was() -> None:
 
 
 def test_a_stride_is_no_jump() -> None:
-    # v^2 / 2g is 2.5 cm: less than the 3 cm that `pronk.jumps` asks for.
+    # v^2 / 2g is 2.5 cm: less than the 3 cm that `pronk.evaluation.jumps` asks for.
     assert flown(0.7).hops == []
 
 
@@ -270,7 +270,7 @@ def test_ctrl_c_ends_the_game_cleanly(hopper: Path, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
     words = ["play", str(hopper), "--port", "18770", "--no-gamepad", "--json", str(figures)]
     process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "pronk.cli", *words],
+        [sys.executable, "-u", "-m", "pronk.cli.main", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -15,17 +15,17 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 pytest.importorskip("onnxruntime")
 
-from tensordict import TensorDict  # noqa: E402
+from tensordict import TensorDict
 
-from pronk.errors import ArtefactError  # noqa: E402
-from pronk.match.gains import GroupGains  # noqa: E402
-from pronk.policy.contract import Contract, check  # noqa: E402
-from pronk.policy.observation import History, Measurement  # noqa: E402
-from pronk.policy.runtime import load_policy  # noqa: E402
-from pronk.robots import load_robot  # noqa: E402
-from pronk.train.gains import TrainingGains, training_gains  # noqa: E402
-from pronk.train.learning.export import TOLERANCE, contract_for, export_policy, verify  # noqa: E402
-from small_ppo import build, observe, roll_out, same, weights  # noqa: E402
+from pronk.errors import ArtefactError
+from pronk.match.gains import GroupGains
+from pronk.policy.contract import Contract, check
+from pronk.policy.observation import History, Measurement
+from pronk.policy.runtime import load_policy
+from pronk.robots import load_robot
+from pronk.train.gains import TrainingGains, training_gains
+from pronk.train.rl.export import TOLERANCE, contract_for, export_policy, verify
+from small_ppo import build, observe, roll_out, same, weights
 
 pytestmark = pytest.mark.train
 
@@ -170,7 +170,7 @@ def env() -> Iterator[Any]:
     """Two nominal robots without noise."""
     from mjlab.envs import ManagerBasedRlEnv
 
-    from pronk.train.environment.randomization import Randomization
+    from pronk.train.mdp.randomization import Randomization
     from pronk.train.phases import phase
     from pronk.train.tasks import env_cfg
 
@@ -188,7 +188,7 @@ def gravity(quaternion: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 @pytest.mark.slow
 def test_the_contract_is_what_the_environment_does(env: Any) -> None:
-    from pronk.train.environment.commands import motion_command
+    from pronk.train.mdp.commands import motion_command
     from pronk.train.tasks import ACTION_SCALE
 
     made = contract(jump=True, action_scale=ACTION_SCALE)
@@ -210,7 +210,7 @@ def test_the_contract_is_what_the_environment_does(env: Any) -> None:
 @pytest.mark.slow
 def test_the_runtime_runs_as_training_did(env: Any, tmp_path: Path) -> None:
     """Measured vector, jump input, action and targets, step by step, through a reset of one."""
-    from pronk.train.environment.commands import motion_command
+    from pronk.train.mdp.commands import motion_command
     from pronk.train.tasks import ACTION_SCALE
 
     torch.manual_seed(11)

@@ -9,13 +9,13 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError
+from pronk.logs.joint_log import Segment, SweepLog
 from pronk.match.gains import JointGains, MatchedGains, Simulator
 from pronk.match.predict import predict
 from pronk.match.prediction import r2, rmse
-from pronk.match.question import question
-from pronk.match.simulate import simulate
 from pronk.robots import load_robot
-from pronk.sweep.log import Segment, SweepLog
+from pronk.simulators.command_trace import question
+from pronk.simulators.mujoco import simulate
 
 ROBOT = load_robot("mini_cheetah")
 MADE_WITH = {"FL_hip_roll": (20.0, 0.5), "HR_knee": (22.0, 0.55)}

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from pronk.train.experiment.processes import gathered, in_any
+from pronk.train.runner.processes import gathered, in_any
 
 pytestmark = pytest.mark.train
 

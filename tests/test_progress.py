@@ -11,12 +11,12 @@ torch = pytest.importorskip("torch")
 
 pytest.importorskip("tensordict")
 
-from rich.console import Console  # noqa: E402
-from tensordict import TensorDict  # noqa: E402
-from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
+from rich.console import Console
+from tensordict import TensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from pronk.train.experiment.progress import Episodes, ProgressLine, duration, rate  # noqa: E402
-from pronk.train.learning.rollout import make_finite  # noqa: E402
+from pronk.train.rl.rollout import make_finite
+from pronk.train.runner.progress import Episodes, ProgressLine, duration, rate
 
 pytestmark = pytest.mark.train
 

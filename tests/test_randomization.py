@@ -19,31 +19,31 @@ from scipy.stats import chisquare, kstest
 
 from pronk.errors import PronkError, RobotError
 from pronk.match.gains import GroupGains
-from pronk.match.question import Question
-from pronk.match.simulate import simulate
 from pronk.robots import load_robot
 from pronk.robots.mini_cheetah import constants as c
-from pronk.robots.spec import bench_spec
+from pronk.robots.model import bench_spec
+from pronk.simulators.command_trace import Question
+from pronk.simulators.mujoco import simulate
 from pronk.train.gains import TrainingGains, training_gains
 
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import torch  # noqa: E402
-from mjlab.actuator import DcMotorActuator  # noqa: E402
-from mjlab.actuator.actuator import ActuatorCmd  # noqa: E402
-from mjlab.entity import EntityArticulationInfoCfg, EntityCfg  # noqa: E402
-from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg  # noqa: E402
-from mjlab.envs.mdp import reset_scene_to_default  # noqa: E402
-from mjlab.managers.event_manager import EventTermCfg  # noqa: E402
-from mjlab.scene import SceneCfg  # noqa: E402
-from mjlab.terrains import TerrainEntityCfg  # noqa: E402
+import torch
+from mjlab.actuator import DcMotorActuator
+from mjlab.actuator.actuator import ActuatorCmd
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.envs.mdp import reset_scene_to_default
+from mjlab.managers.event_manager import EventTermCfg
+from mjlab.scene import SceneCfg
+from mjlab.terrains import TerrainEntityCfg
 
-from pronk.train.environment import draws as drawing  # noqa: E402
-from pronk.train.environment.actions import HeldJointPositionCfg  # noqa: E402
-from pronk.train.environment.drives import PositionDrive, actuators  # noqa: E402
-from pronk.train.environment.randomization import Randomization, delay_steps, events, noise  # noqa: E402
-from pronk.train.environment.scene import robot_entity, simulation  # noqa: E402
+from pronk.train.mdp import draws as drawing
+from pronk.train.mdp.actions import HeldJointPositionCfg
+from pronk.train.mdp.drives import PositionDrive, actuators
+from pronk.train.mdp.randomization import Randomization, delay_steps, events, noise
+from pronk.train.mdp.scene import robot_entity, simulation
 
 Array = NDArray[np.float64]
 CHEETAH = load_robot("mini_cheetah")

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 import pronk
 from pronk.errors import LogError, RobotError
+from pronk.logs.checks import check_motion, motion
+from pronk.logs.csv_reader import write_csv
+from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.mcap_writer import write_mcap
+from pronk.logs.npz_reader import write_npz
+from pronk.logs.readers import read_log, read_logs
+from pronk.logs.timing import check_claim, check_unit, examine
 from pronk.robots import load_robot
-from pronk.sweep.checks import check_motion, motion
-from pronk.sweep.csv_log import write_csv
-from pronk.sweep.log import Segment, SweepLog
-from pronk.sweep.mcap_writer import write_mcap
-from pronk.sweep.npz_log import write_npz
-from pronk.sweep.readers import read_log, read_logs
-from pronk.sweep.timing import check_claim, check_unit, examine
 
 SHARED = Path(pronk.__file__).parents[3] / "shared"
 SO101 = SHARED / "data" / "so101"
@@ -279,7 +279,7 @@ def test_pace_reader_leaves_pytorch_alone(tmp_path: Path) -> None:
     time = torch.arange(50) / 400.0
     torch.save({"time": time, "dof_pos": time[:, None], "des_dof_pos": time[:, None]}, path)
     code = (
-        "import sys; from pronk.sweep.readers import read_log;"
+        "import sys; from pronk.logs.readers import read_log;"
         f"log = read_log({str(path)!r}, joint_names=['a']);"
         "print(len(log.time), 'torch' in sys.modules)"
     )

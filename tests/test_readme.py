@@ -28,7 +28,7 @@ def test_the_example_runs(
 
 
 def test_every_command_named_is_a_command() -> None:
-    from pronk.cli import app
+    from pronk.cli.main import app
 
     known = {command.name for command in app.registered_commands} | {
         group.name for group in app.registered_groups

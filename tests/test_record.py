@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError, PlanError
-from pronk.hardware.machine import State
-from pronk.hardware.truth import load_truth
-from pronk.hardware.virtual import VirtualRobot
+from pronk.excitation.plan import SweepPlan, make_plan
+from pronk.excitation.signals import Chirp, Multisine
+from pronk.links.machine import State
+from pronk.logs.joint_log import SweepLog
+from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import Robot, load_robot
-from pronk.sweep.log import SweepLog
-from pronk.sweep.mcap_reader import read_mcap
-from pronk.sweep.plan import SweepPlan, make_plan
-from pronk.sweep.record import logged_joints, record
-from pronk.sweep.signals import Chirp, Multisine
+from pronk.runtime.sweep.record import logged_joints, record
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import load_truth
 
 ROBOT = load_robot("mini_cheetah")
 TRUTH = load_truth(None)

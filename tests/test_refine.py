@@ -9,18 +9,18 @@ import pytest
 from scipy.signal import lfilter
 
 from pronk.errors import IdentifiabilityError
+from pronk.excitation.signals import Chirp
 from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
-from pronk.match.ask import Simulator
 from pronk.match.engine import engine_gap
 from pronk.match.interval import interval, measurement_error_db
+from pronk.match.measured_joint import Target, targets
 from pronk.match.refine import refine
-from pronk.match.rehearse import Ask, rehearse
 from pronk.match.settings import MatchSettings
-from pronk.match.target import Target, targets
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimate import operators
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot
-from pronk.sweep.signals import Chirp
+from pronk.simulators.batch import Simulator
 
 ROBOT = load_robot("mini_cheetah")
 SETTINGS = MatchSettings()

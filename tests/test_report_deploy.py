@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pronk.cli import app
-from pronk.deploy.log import DeployLog, read_deploy_log
-from pronk.deploy.log_writer import DeployLogWriter
-from pronk.deploy.reasons import Level, Reason
-from pronk.deploy.records import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
+from pronk.cli.main import app
 from pronk.errors import LogError
-from pronk.hardware.machine import State
+from pronk.links.machine import State
 from pronk.report import whole
 from pronk.report.deploy import data as deploy_data
 from pronk.report.deploy import part as deploy_part
 from pronk.report.deploy import words as deploy_words
 from pronk.report.deploy.delay import delay, shift
 from pronk.robots import load_robot
+from pronk.runtime.log import DeployLog, read_deploy_log
+from pronk.runtime.log_writer import DeployLogWriter
+from pronk.runtime.reasons import Level, Reason
+from pronk.runtime.records import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])

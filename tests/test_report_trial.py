@@ -16,11 +16,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pronk import cli
+from pronk.cli import main as cli
 from pronk.errors import ArtefactError
-from pronk.hardware import capture as captures
-from pronk.hardware.capture import Capture
-from pronk.jumps import JumpRules
+from pronk.evaluation import result, variation, walk
+from pronk.evaluation import result_io as sheet
+from pronk.evaluation.jumps import JumpRules
+from pronk.evaluation.metrics import JumpFigures, measure
+from pronk.evaluation.outcome import published, tables
+from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
+from pronk.evaluation.result import Subject, Trial
+from pronk.evaluation.rows import Row
+from pronk.evaluation.terrain import crossing
+from pronk.evaluation.terrain.crossing import Crossing, Crossings
+from pronk.evaluation.unseen import bodies
+from pronk.evaluation.unseen.bodies import Bodies, Body, GainsError
+from pronk.evaluation.variation import Variation, Varied
+from pronk.evaluation.walk import Walk, Walks
+from pronk.evaluation.walk_metrics import WalkFigures
 from pronk.match import gains as gains_file
 from pronk.match import result as match_file
 from pronk.match.result import MatchResult
@@ -35,19 +47,8 @@ from pronk.report.trial.cells import cells, scatter
 from pronk.report.trial.sweeps import Line, Panel, argument, lines
 from pronk.report.trial.traces import Trace, heights, rates, rms, torque_speed
 from pronk.robots import load_robot
-from pronk.trial import result, sheet, variation, walk
-from pronk.trial.metrics import JumpFigures, measure
-from pronk.trial.outcome import published, tables
-from pronk.trial.protocol import PAPER_COMMANDS, RATES, Case
-from pronk.trial.result import Subject, Trial
-from pronk.trial.rows import Row
-from pronk.trial.terrain import crossing
-from pronk.trial.terrain.crossing import Crossing, Crossings
-from pronk.trial.unseen import bodies
-from pronk.trial.unseen.bodies import Bodies, Body, GainsError
-from pronk.trial.variation import Variation, Varied
-from pronk.trial.walk import Walk, Walks
-from pronk.trial.walk_metrics import WalkFigures
+from pronk.virtual import capture as captures
+from pronk.virtual.capture import Capture
 from seen_jump import DT, SCRIPT, STANDING, Z_OFF, G, seen_jump
 from test_report import synthetic
 
@@ -93,7 +94,7 @@ def made(
     keep: bool = True,
     times: int = 1,
 ) -> Trial:
-    """A trial in a folder, measured by `pronk.trial.metrics` on jumps made by hand."""
+    """A trial in a folder, measured by `pronk.evaluation.metrics` on jumps made by hand."""
     rows = []
     for name in policies:
         for case in cases:

@@ -24,8 +24,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import small_run
 from pronk.errors import ArtefactError, PronkError
-from pronk.train.experiment import checkpoint
-from pronk.train.experiment.state import (
+from pronk.train.runner import checkpoint
+from pronk.train.runner.state import (
     INTEGRATION,
     environment_state,
     random_state,

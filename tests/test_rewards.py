@@ -11,21 +11,16 @@ import pytest
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import torch  # noqa: E402
-from torch import Tensor  # noqa: E402
+import torch
+from torch import Tensor
 
-import small_env  # noqa: E402
-from pronk.errors import PronkError  # noqa: E402
-from pronk.train.environment.commands import MotionCommand, motion_command  # noqa: E402
-from pronk.train.environment.motion import Motion  # noqa: E402
-from pronk.train.environment.reward_sum import reward_sum  # noqa: E402
-from pronk.train.environment.reward_table import (  # noqa: E402
-    PAPER_UNIT,
-    ROWS,
-    JumpWeights,
-    with_jump_weights,
-)
-from pronk.train.phases import Phase, enter_phase, phase  # noqa: E402
+import small_env
+from pronk.errors import PronkError
+from pronk.train.mdp.commands import MotionCommand, motion_command
+from pronk.train.mdp.motion import Motion
+from pronk.train.mdp.reward_sum import reward_sum
+from pronk.train.mdp.reward_table import PAPER_UNIT, ROWS, JumpWeights, with_jump_weights
+from pronk.train.phases import Phase, enter_phase, phase
 
 N = small_env.ROBOTS
 STANDING = 0.298970  # .209 cos(.8) + .195 cos(.8) + .0175

@@ -10,8 +10,8 @@ from pronk.errors import RobotError
 from pronk.robots import ROBOT_NAMES, load_robot
 from pronk.robots.inertia import Inertia, joined
 from pronk.robots.mini_cheetah import constants as cheetah
+from pronk.robots.model import free_spec
 from pronk.robots.so101 import constants as so101
-from pronk.robots.spec import free_spec
 
 
 @pytest.fixture(scope="module")

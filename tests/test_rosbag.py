@@ -10,7 +10,7 @@ import pytest
 from mcap_ros2.writer import Writer as RosWriter
 
 from pronk.errors import LogError
-from pronk.sweep.readers import read_log
+from pronk.logs.readers import read_log
 
 JOINT_STATE = """\
 std_msgs/Header header

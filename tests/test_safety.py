@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pronk.deploy.limits import Limits
-from pronk.deploy.reasons import TEXTS, Level, Reason
-from pronk.deploy.rules import Asked, judge
-from pronk.deploy.safety import LEAST_DAMPING_S, Memory, fault, filtered, released, tilt
 from pronk.errors import RobotError
-from pronk.hardware.machine import Command, State
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
+from pronk.runtime.limits import Limits
+from pronk.runtime.reasons import TEXTS, Level, Reason
+from pronk.runtime.rules import Asked, judge
+from pronk.runtime.safety import LEAST_DAMPING_S, Memory, fault, filtered, released, tilt
 
 ROBOT = load_robot("mini_cheetah")
 LIMITS = Limits.of(ROBOT)

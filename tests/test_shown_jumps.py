@@ -13,12 +13,12 @@ from tools_folder import FOLDER, load_tool
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from pronk.policy.observation import Measurement  # noqa: E402
-from pronk.policy.runtime import load_policy  # noqa: E402
-from pronk.robots import load_robot  # noqa: E402
-from pronk.train.environment.demonstration import demonstration  # noqa: E402
-from pronk.trial.metrics import JumpFigures  # noqa: E402
-from pronk.trial.protocol import PAPER_COMMANDS  # noqa: E402
+from pronk.evaluation.metrics import JumpFigures
+from pronk.evaluation.protocol import PAPER_COMMANDS
+from pronk.policy.observation import Measurement
+from pronk.policy.runtime import load_policy
+from pronk.robots import load_robot
+from pronk.train.mdp.demonstration import demonstration
 
 pytestmark = pytest.mark.train
 POLICY = FOLDER.parent / "policies" / "matched" / "policy.onnx"

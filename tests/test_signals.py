@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson
 
 from pronk.errors import PlanError
-from pronk.sweep.correlation import correlation, correlation_note, uncorrelated_multisines
-from pronk.sweep.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
+from pronk.excitation.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
+from pronk.logs.correlation import correlation, correlation_note, uncorrelated_multisines
 
 ALL: tuple[Signal, ...] = (Chirp(), LogChirp(), Multisine(), SineSteps())
 

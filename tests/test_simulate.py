@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pronk.errors import LogError
-from pronk.match.question import Question, policy_clock, question
-from pronk.match.rehearse import Ask, rehearse
-from pronk.match.simulate import Bench, simulate
+from pronk.excitation.signals import Chirp
+from pronk.logs.joint_log import Segment, SweepLog
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.robots import load_robot
+from pronk.robots.model import bench_spec
 from pronk.robots.robot import Robot
-from pronk.robots.spec import bench_spec
-from pronk.sweep.log import Segment, SweepLog
-from pronk.sweep.signals import Chirp
+from pronk.simulators.command_trace import Question, policy_clock, question
+from pronk.simulators.mujoco import Bench, simulate
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])

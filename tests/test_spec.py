@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import chirp
 
-from pronk.drive import clip_torque, pd_torque
+from pronk.actuator.model import clip_torque, pd_torque
 from pronk.errors import RobotError
 from pronk.robots import load_robot
+from pronk.robots.model import bench_spec, free_spec, set_drive_gains, set_passive
 from pronk.robots.robot import Robot
-from pronk.robots.spec import bench_spec, free_spec, set_drive_gains, set_passive
 
 Array = NDArray[np.float64]
 CHEETAH, ARM = load_robot("mini_cheetah"), load_robot("so101")

@@ -11,10 +11,10 @@ from pronk.errors import ArtefactError, PronkError
 
 torch = pytest.importorskip("torch")
 
-import small_env  # noqa: E402
-from pronk.train.environment.commands import motion_command  # noqa: E402
-from pronk.train.environment.speed_ranges import Growth, SpeedRanges, grown  # noqa: E402
-from pronk.train.experiment.state import environment_state  # noqa: E402
+import small_env
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.speed_ranges import Growth, SpeedRanges, grown
+from pronk.train.runner.state import environment_state
 
 pytestmark = pytest.mark.train
 

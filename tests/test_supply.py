@@ -11,15 +11,15 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
+from mjlab.envs import ManagerBasedRlEnv
 
-import small_env  # noqa: E402
-from pronk.drive import clip_torque, stall_torque  # noqa: E402
-from pronk.robots import load_robot  # noqa: E402
-from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.train.environment.randomization import Randomization  # noqa: E402
-from pronk.train.environment.supply import Supply  # noqa: E402
-from pronk.train.tasks import env_cfg  # noqa: E402
+import small_env
+from pronk.actuator.model import clip_torque, stall_torque
+from pronk.robots import load_robot
+from pronk.robots.mini_cheetah import constants as c
+from pronk.train.mdp.randomization import Randomization
+from pronk.train.mdp.supply import Supply
+from pronk.train.tasks import env_cfg
 
 pytestmark = pytest.mark.train
 

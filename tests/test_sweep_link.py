@@ -22,24 +22,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pronk import cli
-from pronk.commands.confirm import Person
-from pronk.commands.sweep_wire import record_wire
+from pronk.cli import main as cli
+from pronk.cli.confirm import Person
+from pronk.cli.sweep_wire import record_wire
 from pronk.errors import HardwareError, LogError
-from pronk.hardware.lcm.codec import decode_command, encode_command
-from pronk.hardware.lcm.layout import CHEETAH
-from pronk.hardware.lcm.url import url_of
-from pronk.hardware.links import Address
-from pronk.hardware.machine import Command
-from pronk.hardware.preflight import Freshness
-from pronk.hardware.twin import hold_of
+from pronk.excitation.plan import SweepPlan, make_plan
+from pronk.excitation.signals import Chirp
+from pronk.links.lcm.address import url_of
+from pronk.links.lcm.codec import decode_command, encode_command
+from pronk.links.lcm.layout import CHEETAH
+from pronk.links.machine import Command
+from pronk.links.open import Address
+from pronk.links.preflight import Freshness
+from pronk.logs.joint_log import SweepLog
+from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import Robot, load_robot
-from pronk.sweep.log import SweepLog
-from pronk.sweep.mcap_reader import read_mcap
-from pronk.sweep.plan import SweepPlan, make_plan
-from pronk.sweep.record_apart import Recorded
-from pronk.sweep.servo import Timing
-from pronk.sweep.signals import Chirp
+from pronk.runtime.sweep.record_subprocess import Recorded
+from pronk.runtime.sweep.servo import Timing
+from pronk.virtual.server import hold_of
 
 pytestmark = pytest.mark.live
 
@@ -74,7 +74,7 @@ def port() -> Iterator[int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         number = int(probe.getsockname()[1])
-    code = "import typer; from pronk.commands.twin import twin; typer.run(twin)"
+    code = "import typer; from pronk.cli.simulate import twin; typer.run(twin)"
     running = subprocess.Popen(
         [sys.executable, "-c", code, "--port", str(number)],
         stdout=subprocess.PIPE,

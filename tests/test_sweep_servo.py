@@ -15,24 +15,24 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.hardware.machine import Command, State
-from pronk.hardware.truth import load_truth
-from pronk.hardware.twin import hold_of
-from pronk.hardware.virtual import VirtualRobot
+from pronk.excitation.plan import SweepPlan, make_plan
+from pronk.excitation.signals import Chirp
+from pronk.links.machine import Command, State
+from pronk.logs.joint_log import Segment
+from pronk.logs.mcap_format import LogHeader
+from pronk.logs.mcap_reader import read_mcap
+from pronk.logs.mcap_writer import McapLogWriter
 from pronk.robots import load_robot
-from pronk.sweep.channel import Channel
-from pronk.sweep.limits import Limits
-from pronk.sweep.log import Segment
-from pronk.sweep.log_apart import LogApart
-from pronk.sweep.mcap_format import LogHeader
-from pronk.sweep.mcap_reader import read_mcap
-from pronk.sweep.mcap_writer import McapLogWriter
-from pronk.sweep.plan import SweepPlan, make_plan
-from pronk.sweep.record import record
-from pronk.sweep.record_apart import Desk
-from pronk.sweep.servo import Servo, Timing
-from pronk.sweep.servo_process import Owner
-from pronk.sweep.signals import Chirp
+from pronk.runtime.sweep.channel import Channel
+from pronk.runtime.sweep.limits import Limits
+from pronk.runtime.sweep.log_subprocess import LogApart
+from pronk.runtime.sweep.record import record
+from pronk.runtime.sweep.record_subprocess import Desk
+from pronk.runtime.sweep.servo import Servo, Timing
+from pronk.runtime.sweep.servo_process import Owner
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.server import hold_of
+from pronk.virtual.sim_params import load_truth
 
 ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
@@ -248,7 +248,7 @@ def test_a_servo_that_is_stuck_is_killed(
     tmp_path: Path, ends: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     servo, owner = ends
-    monkeypatch.setattr("pronk.sweep.record_apart._SILENT_S", 0.01)
+    monkeypatch.setattr("pronk.runtime.sweep.record_subprocess._SILENT_S", 0.01)
     desk = desk_at(owner, kill=lambda: servo.finish(0.0))
     LogApart(servo, tmp_path / "x.mcap", HEADER)
     desk.attend()

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from pronk.robots import load_robot
 from pronk.robots.mini_cheetah.constants import LEGS
-from pronk.robots.spec import free_spec
+from pronk.robots.model import free_spec
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from parts import where  # noqa: E402
-from pronk.errors import PronkError  # noqa: E402
-from pronk.train.environment.observations import CRITIC  # noqa: E402
-from pronk.train.learning.symmetry import ACTION, GROUPS, Mirror, with_mirror_image  # noqa: E402
-from small_ppo import (  # noqa: E402
+from parts import where
+from pronk.errors import PronkError
+from pronk.train.mdp.observations import CRITIC
+from pronk.train.rl.symmetry import ACTION, GROUPS, Mirror, with_mirror_image
+from small_ppo import (
     SIZES,
     build,
     observe,
@@ -94,7 +94,7 @@ def test_ppo_learns_from_both_sides(jump: bool) -> None:
     algorithm = build(
         jump=jump,
         symmetry_cfg={
-            "data_augmentation_func": "pronk.train.learning.symmetry:with_mirror_image",
+            "data_augmentation_func": "pronk.train.rl.symmetry:with_mirror_image",
             "use_data_augmentation": True,
             "use_mirror_loss": True,
             "mirror_loss_coeff": 1.0,

@@ -15,23 +15,23 @@ import pytest
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import torch  # noqa: E402
-from mjlab.scripts.list_envs import list_environments  # noqa: E402
-from mjlab.tasks.registry import (  # noqa: E402
+import torch
+from mjlab.scripts.list_envs import list_environments
+from mjlab.tasks.registry import (
     list_tasks,
     load_env_cfg,
     load_rl_cfg,
     load_runner_cls,
 )
 
-import small_env  # noqa: E402
-from pronk.robots import load_robot  # noqa: E402
-from pronk.robots.mini_cheetah import constants as c  # noqa: E402
-from pronk.train.environment.commands import NAME, motion_command  # noqa: E402
-from pronk.train.environment.scene import FOOT_CONTACT  # noqa: E402
-from pronk.train.experiment.runner import PronkRunner  # noqa: E402
-from pronk.train.phases import phase  # noqa: E402
-from pronk.train.tasks import ACTION_SCALE, JUMP_TASK, WALK_TASK, env_cfg  # noqa: E402
+import small_env
+from pronk.robots import load_robot
+from pronk.robots.mini_cheetah import constants as c
+from pronk.train.mdp.commands import NAME, motion_command
+from pronk.train.mdp.scene import FOOT_CONTACT
+from pronk.train.phases import phase
+from pronk.train.runner.runner import PronkRunner
+from pronk.train.tasks import ACTION_SCALE, JUMP_TASK, WALK_TASK, env_cfg
 
 N = small_env.ROBOTS
 ROBOT = load_robot("mini_cheetah")
@@ -69,7 +69,7 @@ def test_mjlabs_list_shows_the_tasks(capsys: pytest.CaptureFixture[str]) -> None
 def test_tasks_are_known_whatever_is_imported_first() -> None:
     """mjlab loads the entry point while it is itself imported: here by a module of ours."""
     code = (
-        "import pronk.train.environment.commands, pronk.train.tasks\n"
+        "import pronk.train.mdp.commands, pronk.train.tasks\n"
         "from mjlab.tasks.registry import list_tasks\n"
         "print(*list_tasks())"
     )

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
-import torch  # noqa: E402
-from torch import Tensor  # noqa: E402
+import torch
+from torch import Tensor
 
-import small_env  # noqa: E402
-from parts import where  # noqa: E402
-from pronk.train.environment.commands import motion_command  # noqa: E402
-from pronk.train.environment.observations import CRITIC  # noqa: E402
-from pronk.train.environment.reward_sum import reward_sum  # noqa: E402
+import small_env
+from parts import where
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.observations import CRITIC
+from pronk.train.mdp.reward_sum import reward_sum
 
 N = small_env.ROBOTS
 STILL = torch.zeros(N, 12)

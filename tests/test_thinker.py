@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 import pronk
-from pronk.bench.tick import CASES, WAYS, Row, Way, bars, checks, figures, run, table
-from pronk.deploy.links import Link
-from pronk.deploy.plan import Plan, Shared
-from pronk.deploy.records import NEWS, STICK, Mode, put_state
-from pronk.deploy.rehearsal import LEAD_S, rehearse_until
-from pronk.deploy.thinker import Thinker, standing
+from benchmarks.tick import CASES, WAYS, Row, Way, bars, checks, figures, run, table
 from pronk.errors import PronkError
-from pronk.hardware.machine import State
-from pronk.hardware.realtime import Pace
+from pronk.links.machine import State
+from pronk.links.realtime import Pace
 from pronk.policy.runtime import load_policy
+from pronk.runtime.link import Link
+from pronk.runtime.plan import Plan, Shared
+from pronk.runtime.policy_process import Thinker, standing
+from pronk.runtime.records import NEWS, STICK, Mode, put_state
+from pronk.runtime.warmup import LEAD_S, rehearse_until
 
 pytest.importorskip("onnxruntime")
 

@@ -17,19 +17,14 @@ import numpy as np
 import pytest
 import yaml
 
-from pronk import cli
+from pronk.cli import main as cli
 from pronk.errors import ArtefactError, PronkError
 from pronk.match import gains as gains_file
-from pronk.train.experiment import checkpoint, provenance
-from pronk.train.experiment.checkpoint import Checkpoint
-from pronk.train.experiment.devices import (
-    Devices,
-    check_cuda_graphs,
-    chosen,
-    parse_gpu_ids,
-)
-from pronk.train.experiment.run_folder import RunFolder, plain
-from pronk.train.experiment.settings import TrainSettings, WatchSettings
+from pronk.train.runner import checkpoint, provenance
+from pronk.train.runner.checkpoint import Checkpoint
+from pronk.train.runner.devices import Devices, check_cuda_graphs, chosen, parse_gpu_ids
+from pronk.train.runner.run_folder import RunFolder, plain
+from pronk.train.runner.settings import TrainSettings, WatchSettings
 
 
 def settings(**changes) -> TrainSettings:
@@ -268,7 +263,7 @@ def test_what_a_task_trains():
 @pytest.mark.train
 def test_together_takes_as_many_steps_as_in_sequence() -> None:
     pytest.importorskip("mjlab")
-    from pronk.train.experiment.request import Request, new_settings
+    from pronk.train.runner.request import Request, new_settings
 
     asked = {
         task: new_settings(Request(task=task, gains="naive", device="cpu"))[0]

@@ -21,15 +21,15 @@ import numpy as np
 import pytest
 import yaml
 
-from pronk import cli
+from pronk.cli import main as cli
 from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator, save
-from pronk.train.experiment import checkpoint
-from pronk.train.experiment.run_folder import RunFolder
+from pronk.train.runner import checkpoint
+from pronk.train.runner.run_folder import RunFolder
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
-from pronk.train.environment.speed_ranges import grown  # noqa: E402
-from pronk.train.phases import PHASES, enter_phase  # noqa: E402
+from pronk.train.mdp.speed_ranges import grown
+from pronk.train.phases import PHASES, enter_phase
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 
@@ -163,9 +163,7 @@ def test_the_configuration_says_what_was_trained(uninterrupted):
     assert config["randomization"]["friction"] == [0.05, 3.0]
     rows = {phase: terms["table"]["rows"] for phase, terms in config["rewards"].items()}
     assert rows["walk"].keys() == rows["jump_b"].keys()
-    assert (
-        rows["walk"]["tracking_linear"]["term"] == "pronk.train.environment.rewards:tracking_linear"
-    )
+    assert rows["walk"]["tracking_linear"]["term"] == "pronk.train.mdp.rewards:tracking_linear"
     # A tenth of the dense reward is left in phase 2b (Table II).
     dense = [rows[phase]["dense_jump"]["jump"] for phase in ("walk", "jump_a", "jump_b")]
     assert dense[0] == 0.0
@@ -218,7 +216,7 @@ def test_stopped_after_every_iteration_it_is_the_same_run(
             entered.append(done)
         enter_phase(env, phase, done)
 
-    monkeypatch.setattr("pronk.train.experiment.run.enter_phase", enter)
+    monkeypatch.setattr("pronk.train.runner.run.enter_phase", enter)
     words = (*ALL, "--minutes", "1e-9")
     while not folder.provenance.exists() or not provenance(folder)["finished"]:
         assert train(*words, "--out", folder.path) == 0

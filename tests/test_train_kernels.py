@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pronk.train.experiment.kernels import MODULES, compile_ahead, kernel_seconds
+from pronk.train.runner.kernels import MODULES, compile_ahead, kernel_seconds
 
 
 def test_the_time_of_compiling_is_told_from_that_of_loading() -> None:
@@ -36,7 +36,7 @@ def test_every_module_is_of_this_mujoco_warp_and_has_kernels(
 
 def test_a_module_that_is_no_more_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "pronk.train.experiment.kernels.MODULES", ("mujoco_warp._src.gone", MODULES[-1])
+        "pronk.train.runner.kernels.MODULES", ("mujoco_warp._src.gone", MODULES[-1])
     )
     given: list[str] = []
     monkeypatch.setattr(
@@ -49,7 +49,7 @@ def test_a_module_that_is_no_more_is_left_out(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_full_cache_costs_nothing(tmp_path: Path) -> None:
     code = (
-        "import pronk.train.experiment.kernels as k;"
+        "import pronk.train.runner.kernels as k;"
         "k.MODULES = k.MODULES[-1:];"
         "print(k.compile_ahead('cpu'))"
     )

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pronk.hardware.capture import Capture
-from pronk.jumps import JumpRules
+from pronk.evaluation.jumps import JumpRules
+from pronk.evaluation.metrics import FIGURES, JumpFigures, measure
 from pronk.robots import load_robot
-from pronk.trial.metrics import FIGURES, JumpFigures, measure
+from pronk.virtual.capture import Capture
 from seen_jump import (
     CROUCH,
     DELAY,

@@ -11,13 +11,21 @@ from scipy.spatial.transform import Rotation
 
 from hopper import DEFAULT, ROBOT, STRAIGHT, write_hopper
 from pronk.errors import ArtefactError, HardwareError
-from pronk.hardware.ground import Start
-from pronk.hardware.machine import Command, State
-from pronk.hardware.truth import load_truth
-from pronk.hardware.virtual import VirtualRobot
+from pronk.evaluation.protocol import STILL, Script
+from pronk.links.machine import Command, State
 from pronk.policy.runtime import Policy, load_policy
-from pronk.trial.pilot import Tick, check_standing, fly, hold, measurement, projected_gravity, ticks
-from pronk.trial.protocol import STILL, Script
+from pronk.runtime.rollout import (
+    Tick,
+    check_standing,
+    fly,
+    hold,
+    measurement,
+    projected_gravity,
+    ticks,
+)
+from pronk.virtual.ground import Start
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import load_truth
 
 pytest.importorskip("onnxruntime")
 

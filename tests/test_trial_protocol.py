@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pronk.errors import PronkError
-from pronk.trial.protocol import PAPER_COMMANDS, RATES, STILL, Case, Script, parse_case, parse_cases
+from pronk.evaluation.protocol import (
+    PAPER_COMMANDS,
+    RATES,
+    STILL,
+    Case,
+    Script,
+    parse_case,
+    parse_cases,
+)
 
 COMMAND = (2.0, 0.0, 0.5)
 

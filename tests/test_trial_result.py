@@ -16,16 +16,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pronk.errors import ArtefactError
-from pronk.jumps import JumpRules
+from pronk.evaluation import result
+from pronk.evaluation import rows as rows_file
+from pronk.evaluation.jumps import JumpRules
+from pronk.evaluation.metrics import FIGURES, JumpFigures
+from pronk.evaluation.outcome import comparison, published, tables
+from pronk.evaluation.outcome import criteria as bars
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case, Script
+from pronk.evaluation.result import Subject, Trial
+from pronk.evaluation.rows import Row
+from pronk.evaluation.summary import Spread, ratio_of_scatter, share_interval
 from pronk.robots import load_robot
-from pronk.trial import result
-from pronk.trial import rows as rows_file
-from pronk.trial.metrics import FIGURES, JumpFigures
-from pronk.trial.outcome import bars, comparison, published, tables
-from pronk.trial.protocol import PAPER_COMMANDS, Case, Script
-from pronk.trial.result import Subject, Trial
-from pronk.trial.rows import Row
-from pronk.trial.summary import Spread, ratio_of_scatter, share_interval
 
 ROBOT = load_robot("mini_cheetah")
 SCRIPT = Script(command=(0.0, 0.0, 0.0))

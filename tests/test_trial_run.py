@@ -12,18 +12,18 @@ import typer
 import yaml
 
 from hopper import ROBOT, write_hopper
-from pronk.commands.trial import trial as trial_command
+from pronk.cli.trial import trial as trial_command
 from pronk.errors import ArtefactError, PronkError, RobotError
+from pronk.evaluation import result
+from pronk.evaluation.folder import prepare
+from pronk.evaluation.metrics import measure
+from pronk.evaluation.processes import in_processes
+from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, STILL, Case, Script
+from pronk.evaluation.run import Plan, draw, jobs_of, run
+from pronk.evaluation.subjects import load_subjects
 from pronk.files import sha256
-from pronk.hardware import capture
-from pronk.hardware.truth import SHIPPED, load_truth
-from pronk.trial import result
-from pronk.trial.folder import prepare
-from pronk.trial.metrics import measure
-from pronk.trial.processes import in_processes
-from pronk.trial.protocol import PAPER_COMMANDS, RATES, STILL, Case, Script
-from pronk.trial.run import Plan, draw, jobs_of, run
-from pronk.trial.subjects import load_subjects
+from pronk.virtual import capture
+from pronk.virtual.sim_params import SHIPPED, load_truth
 
 pytest.importorskip("onnxruntime")
 

@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from pronk.errors import RobotError
-from pronk.hardware.plant import build_plant
-from pronk.hardware.truth import SHIPPED, load_truth, parse_truth
 from pronk.robots import load_robot
+from pronk.virtual.plant import build_plant
+from pronk.virtual.sim_params import SHIPPED, load_truth, parse_truth
 
 BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
 ROBOT = load_robot("mini_cheetah")

@@ -12,15 +12,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from pronk.commands.twin import twin as twin_command
+from pronk.cli.simulate import twin as twin_command
 from pronk.errors import HardwareError
-from pronk.hardware.capture import load
-from pronk.hardware.faults import Faults, parse_faults
-from pronk.hardware.machine import Command, State
-from pronk.hardware.truth import load_truth
-from pronk.hardware.twin import TICK_S, Silence, Spoil, Twin, hold_of
-from pronk.hardware.virtual import VirtualRobot
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
+from pronk.virtual.capture import load
+from pronk.virtual.faults import Faults, parse_faults
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.server import TICK_S, Silence, Spoil, Twin, hold_of
+from pronk.virtual.sim_params import load_truth
 
 APP = typer.Typer()
 APP.command()(twin_command)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pronk.errors import HardwareError
-from pronk.hardware.faults import Faults, Lane, LaneFaults, flip_bit, parse_faults
+from pronk.virtual.faults import Faults, Lane, LaneFaults, flip_bit, parse_faults
 
 
 def through(faults: LaneFaults, count: int = 4000, seed: int = 0, after: float = 0.0) -> tuple[

@@ -19,20 +19,20 @@ from scipy.spatial.transform import Rotation
 from hopper import ROBOT, write_hopper
 from pronk import opengl
 from pronk.errors import ArtefactError, PronkError
-from pronk.hardware.capture import Capture
-from pronk.hardware.ground import Box, Ground
-from pronk.hardware.truth import load_truth
-from pronk.trial.marks import Marks, marks_of
-from pronk.trial.pictures import film as films
-from pronk.trial.pictures import overlay, video, videos
-from pronk.trial.pictures.film import FPS, Film, plan
-from pronk.trial.pictures.frames import HEIGHT, WIDTH
-from pronk.trial.pictures.render import in_gif
-from pronk.trial.pictures.stage import FOV_DEG, TAPE_M, Tape
-from pronk.trial.pictures.view import View
-from pronk.trial.protocol import STILL, Case, Script
-from pronk.trial.run import Plan as TrialPlan
-from pronk.trial.run import run as run_trial
+from pronk.evaluation.jump_events import Marks, marks_of
+from pronk.evaluation.pictures import film as films
+from pronk.evaluation.pictures import overlay, video, videos
+from pronk.evaluation.pictures.film import FPS, Film, plan
+from pronk.evaluation.pictures.frames import HEIGHT, WIDTH
+from pronk.evaluation.pictures.render import in_gif
+from pronk.evaluation.pictures.stage import FOV_DEG, TAPE_M, Tape
+from pronk.evaluation.pictures.view import View
+from pronk.evaluation.protocol import STILL, Case, Script
+from pronk.evaluation.run import Plan as TrialPlan
+from pronk.evaluation.run import run as run_trial
+from pronk.virtual.capture import Capture
+from pronk.virtual.ground import Box, Ground
+from pronk.virtual.sim_params import load_truth
 
 RATE = 200.0
 GRAVITY = 9.81
@@ -336,7 +336,10 @@ def test_only_the_painter_needs_the_opengl_that_is_asked_for(
     missing = tmp_path / "policy.onnx"
     command = ["trial", str(missing), "--out", str(tmp_path / "out")]
     done = subprocess.run(
-        [sys.executable, "-m", "pronk.cli", *command], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "pronk.cli.main", *command],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 2, done.stderr
     assert "defect" not in done.stderr

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from pronk.errors import HardwareError, RobotError
-from pronk.hardware.machine import Command, State
-from pronk.hardware.plant import build_plant
-from pronk.hardware.rotor import MotorConstants
-from pronk.hardware.truth import Truth, load_truth
-from pronk.hardware.virtual import VirtualRobot
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
+from pronk.virtual.plant import build_plant
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.rotor import MotorConstants
+from pronk.virtual.sim_params import Truth, load_truth
 
 Array = NDArray[np.float64]
 

@@ -12,16 +12,16 @@ import pytest
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.match.ask import Simulator
-from pronk.match.device import DEVICES, bench_on
+from pronk.excitation.signals import Chirp
 from pronk.match.grid import search
-from pronk.match.rehearse import Ask, rehearse
+from pronk.match.measured_joint import targets
 from pronk.match.settings import MatchSettings
-from pronk.match.simulate import Bench
-from pronk.match.target import targets
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot
-from pronk.sweep.signals import Chirp
+from pronk.simulators.batch import Simulator
+from pronk.simulators.device import DEVICES, bench_on
+from pronk.simulators.mujoco import Bench
 
 Array = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ def test_a_missing_extra_is_refused_in_one_sentence() -> None:
     code = (
         "import sys; sys.modules['mujoco_warp'] = None\n"
         "from pronk.errors import PronkError\n"
-        "from pronk.match.device import bench_on\n"
+        "from pronk.simulators.device import bench_on\n"
         "try: bench_on('cuda')\n"
         "except PronkError as error: print(error)"
     )

@@ -10,11 +10,11 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-from pronk.errors import PronkError  # noqa: E402
-from pronk.train.learning.jump_linear import JumpLinear  # noqa: E402
-from pronk.train.learning.ppo import EstimatorPPO  # noqa: E402
-from pronk.train.learning.widen import widen_state  # noqa: E402
-from small_ppo import (  # noqa: E402
+from pronk.errors import PronkError
+from pronk.train.rl.jump_linear import JumpLinear
+from pronk.train.rl.ppo import EstimatorPPO
+from pronk.train.rl.widen import widen_state
+from small_ppo import (
     build,
     observe,
     one_thread,  # noqa: F401

@@ -18,16 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
+from pronk.excitation.plan import make_plan
 from pronk.files import write_text
-from pronk.hardware.truth import SCHEMA, SHIPPED, Truth, load_truth, parse_truth
-from pronk.hardware.truth_parts import JointTruth
-from pronk.hardware.virtual import VirtualRobot
+from pronk.logs.mcap_reader import read_mcap
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
-from pronk.sweep.mcap_reader import read_mcap
-from pronk.sweep.plan import make_plan
-from pronk.sweep.record import record
+from pronk.runtime.sweep.record import record
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import SCHEMA, SHIPPED, Truth, load_truth, parse_truth
+from pronk.virtual.sim_params_parts import JointTruth
 
 LEGS = ("FR", "FL", "HR", "HL")
 # Paper, Table I: stiffness and damping by leg.

@@ -163,9 +163,9 @@ class CpuSimulation(Simulation):
 
 def main() -> None:
     """The command line of pronk, behind `--net` if it is given."""
-    from pronk import cli
+    from pronk.cli import main as cli
     from pronk.train import tasks
-    from pronk.train.experiment import kernels
+    from pronk.train.runner import kernels
 
     words = sys.argv[1:]
     if words[:1] == ["--net"]:

@@ -44,13 +44,13 @@ from pronk.files import sha256
 from pronk.robots import load_robot
 from pronk.robots.mini_cheetah.constants import LEG_JOINTS as PARTS
 from pronk.robots.robot import Joint
-from pronk.train.environment.commands import MotionCommandCfg, motion_command
-from pronk.train.environment.demonstration import JOINTS, SCHEMA_VERSION
-from pronk.train.environment.randomization import Randomization
-from pronk.train.evaluation.subject import Subject, load_subject
-from pronk.train.experiment.state import environment_state, restore_environment
+from pronk.train.evaluate.subject import Subject, load_subject
 from pronk.train.gains import TrainingGains, training_gains
+from pronk.train.mdp.commands import MotionCommandCfg, motion_command
+from pronk.train.mdp.demonstration import JOINTS, SCHEMA_VERSION
+from pronk.train.mdp.randomization import Randomization
 from pronk.train.phases import phase
+from pronk.train.runner.state import environment_state, restore_environment
 from pronk.train.tasks import env_cfg
 
 STAND = (0.0, 0.0)

@@ -17,16 +17,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.hardware.truth import SHIPPED, load_truth
+from pronk.evaluation.job import Job, set_down
+from pronk.evaluation.metrics import JumpFigures, measure
+from pronk.evaluation.processes import cores, in_processes
+from pronk.evaluation.run import Plan, jobs_of
+from pronk.evaluation.subjects import load_subjects
 from pronk.policy.runtime import load_policy
 from pronk.policy.stride import apart, changes_over
 from pronk.robots import load_robot
-from pronk.trial.job import Job, set_down
-from pronk.trial.metrics import JumpFigures, measure
-from pronk.trial.pilot import fly
-from pronk.trial.processes import cores, in_processes
-from pronk.trial.run import Plan, jobs_of
-from pronk.trial.subjects import load_subjects
+from pronk.runtime.rollout import fly
+from pronk.virtual.sim_params import SHIPPED, load_truth
 
 
 def since_change(position: NDArray[np.float64], step: int) -> int | None:

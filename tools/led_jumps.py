@@ -21,9 +21,9 @@ from tensordict import TensorDict
 
 from pronk.policy import paper
 from pronk.robots import load_robot
-from pronk.train.environment.commands import motion_command
-from pronk.train.evaluation.subject import load_subject
+from pronk.train.evaluate.subject import load_subject
 from pronk.train.gains import training_gains
+from pronk.train.mdp.commands import motion_command
 from pronk.train.phases import enter_phase, phase
 from pronk.train.tasks import env_cfg
 

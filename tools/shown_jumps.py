@@ -25,16 +25,16 @@ import torch
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from pronk.hardware.truth import SHIPPED, load_truth
+from pronk.evaluation.job import Job, set_down
+from pronk.evaluation.metrics import JumpFigures, measure
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case
+from pronk.evaluation.run import Plan, draw, mass_of
 from pronk.policy.observation import Measurement
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
-from pronk.train.environment.demonstration import Demonstration, demonstration, parse
-from pronk.trial.job import Job, set_down
-from pronk.trial.metrics import JumpFigures, measure
-from pronk.trial.pilot import fly
-from pronk.trial.protocol import PAPER_COMMANDS, Case
-from pronk.trial.run import Plan, draw, mass_of
+from pronk.runtime.rollout import fly
+from pronk.train.mdp.demonstration import Demonstration, demonstration, parse
+from pronk.virtual.sim_params import SHIPPED, load_truth
 
 PUSH_S = 0.26
 """After the jump command feet leave the ground no sooner [s]."""

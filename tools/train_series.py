@@ -105,7 +105,7 @@ def pronk(words: list[str], job: Job, asked: argparse.Namespace, log: Path) -> b
     }
     with log.open("a") as file:
         # The working folder is first on the path of `python -m`; it must not be a src folder.
-        command = [sys.executable, "-m", "pronk.cli", *words]
+        command = [sys.executable, "-m", "pronk.cli.main", *words]
         done = subprocess.run(command, env=environment, stdout=file, stderr=file, cwd=asked.out)
     return done.returncode == 0
 

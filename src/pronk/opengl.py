@@ -1,7 +1,7 @@
 """Which OpenGL paints, kept out of the processes that paint nothing.
 
 MuJoCo loads the OpenGL that MUJOCO_GL names as it is imported, and cannot be imported where that is
-missing. Of pronk only the process that paints needs one (`pronk.trial.pictures.render`).
+missing. Of pronk only the process that paints needs one (`pronk.evaluation.pictures.render`).
 """
 
 from __future__ import annotations

@@ -18,18 +18,18 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from pronk.errors import IdentifiabilityError, PronkError
+from pronk.logs.joint_log import SweepLog
 from pronk.match.drive_parameters import DRIVE_MODE, KINDS, gains_covariance
 from pronk.match.gains import JointGains
 from pronk.match.identifiability import EXPERIMENTS, bench_experiment, require_identifiable
+from pronk.match.measured_joint import DB, Target, gains_on_drive, logs_by_joint, merged, targets
 from pronk.match.ranges import matched_gains
 from pronk.match.refine import residual_db
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
-from pronk.match.simulate import Bench
-from pronk.match.target import DB, Target, gains_on_drive, logs_by_joint, merged, targets
+from pronk.robots.model import set_passive
 from pronk.robots.robot import Robot
-from pronk.robots.spec import set_passive
-from pronk.sweep.log import SweepLog
+from pronk.simulators.mujoco import Bench
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.ask import Job, Simulator
+from pronk.excitation.signals import Chirp
 from pronk.match.grid import axes
+from pronk.match.measured_joint import DB, targets
 from pronk.match.quick import quick_search
-from pronk.match.rehearse import Ask, rehearse
 from pronk.match.settings import MatchSettings
-from pronk.match.target import DB, targets
+from pronk.match.synthetic_log import Ask, rehearse
 from pronk.robots.robot import Robot
-from pronk.sweep.signals import Chirp
+from pronk.simulators.batch import Job, Simulator
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

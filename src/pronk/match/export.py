@@ -17,8 +17,8 @@ import yaml
 from pronk.errors import PronkError
 from pronk.match.gains import MatchedGains
 from pronk.robots import load_robot
+from pronk.robots.model import add_drives, free_spec
 from pronk.robots.robot import Robot
-from pronk.robots.spec import add_drives, free_spec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +178,7 @@ def mjcf_text(gains: MatchedGains) -> str:
 
     Its torque is the PD law with the groups' gains, clipped by the torque-speed line and the
     effort limit. MuJoCo treats native drives explicitly under Euler only, so the integrator is
-    Euler: it gives the trajectories of the training simulator (see `pronk.robots.spec`). Joints
+    Euler: it gives the trajectories of the training simulator (see `pronk.robots.model`). Joints
     that were not matched have the robot's published gains. MuJoCo knows no delay of a position
     command in its drives; a matched delay is named in the comment.
     """

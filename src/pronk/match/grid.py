@@ -17,10 +17,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.ask import Simulator
-from pronk.match.simulate import Bench
-from pronk.match.target import Target
+from pronk.match.measured_joint import Target
 from pronk.robots.robot import Robot
+from pronk.simulators.batch import Simulator
+from pronk.simulators.mujoco import Bench
 
 Array = NDArray[np.float64]
 

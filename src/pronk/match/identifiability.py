@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, PronkError
+from pronk.robots.model import bench_spec
 from pronk.robots.robot import Robot
-from pronk.robots.spec import bench_spec
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

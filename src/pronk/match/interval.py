@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pronk.errors import IdentifiabilityError
+from pronk.match.measured_joint import DB, FLOOR_DB
 from pronk.match.refine import Fit, residual_db
-from pronk.match.target import DB, FLOOR_DB
 
 Array = NDArray[np.float64]
 

@@ -10,21 +10,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.logs.joint_log import SweepLog
 from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
-from pronk.match.ask import Job, Simulator
 from pronk.match.command_delay import command_delay
-from pronk.match.doubts import armature_flags, doubts, missing
+from pronk.match.diagnostics import armature_flags, doubts, missing
 from pronk.match.gains import JointGains
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
 from pronk.match.interval import interval
+from pronk.match.measured_joint import Target, gains_on_drive, logs_by_joint, merged, targets
 from pronk.match.quick import quick_search
 from pronk.match.ranges import matched_gains
 from pronk.match.refine import Fit, refine
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
-from pronk.match.target import Target, gains_on_drive, logs_by_joint, merged, targets
 from pronk.robots.robot import Robot
-from pronk.sweep.log import SweepLog
+from pronk.simulators.batch import Job, Simulator
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]

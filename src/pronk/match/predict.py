@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError
+from pronk.logs.joint_log import Segment, SweepLog
 from pronk.match.arm.match import drives_of
-from pronk.match.arm.simulation import ArmBench, JointDrive, held_mean, moves_together
 from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.measured_joint import gains_on_drive
 from pronk.match.prediction import JointPrediction, Prediction
-from pronk.match.question import Question, question
-from pronk.match.simulate import simulate
-from pronk.match.target import gains_on_drive
 from pronk.robots.robot import Robot
-from pronk.sweep.log import Segment, SweepLog
+from pronk.simulators.chain import ArmBench, JointDrive, held_mean, moves_together
+from pronk.simulators.command_trace import Question, question
+from pronk.simulators.mujoco import simulate
 
 Array = NDArray[np.float64]
 

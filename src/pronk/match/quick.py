@@ -17,11 +17,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.ask import Job, Simulator
 from pronk.match.grid import GridSearch, mean_square, weights
-from pronk.match.linear import Plant, plant
+from pronk.match.measured_joint import DB, Target
 from pronk.match.refine import Fit, refine
-from pronk.match.target import DB, Target
+from pronk.simulators.batch import Job, Simulator
+from pronk.simulators.linear import Plant, plant
 
 Array = NDArray[np.float64]
 

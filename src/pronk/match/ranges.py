@@ -30,11 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import RobotError
+from pronk.logs.joint_log import SweepLog
 from pronk.match.ellipsoid import enclosing, interval_points
 from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator
+from pronk.robots.model import bench_spec
 from pronk.robots.robot import Robot
-from pronk.robots.spec import bench_spec
-from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
 Rule = Literal["cover", "paper"]

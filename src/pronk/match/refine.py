@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.ask import Job, Simulator
-from pronk.match.target import DB, Target
+from pronk.match.measured_joint import DB, Target
+from pronk.simulators.batch import Job, Simulator
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

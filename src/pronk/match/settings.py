@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pronk.errors import PronkError
-from pronk.match.device import DEVICES
 from pronk.response.estimator import Estimator
+from pronk.simulators.device import DEVICES
 
 
 @dataclass(frozen=True, kw_only=True)

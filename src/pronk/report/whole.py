@@ -14,8 +14,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pronk.deploy.log import is_deploy_log
 from pronk.errors import ArtefactError, LogError
+from pronk.evaluation import variation, walk
+from pronk.evaluation.outcome.criteria import checks
+from pronk.evaluation.result import SUMMARY
+from pronk.evaluation.terrain import crossing
+from pronk.evaluation.terrain.crossing import Crossings
+from pronk.evaluation.unseen import bodies
+from pronk.evaluation.unseen.bodies import Bodies
+from pronk.evaluation.variation import Variation
+from pronk.evaluation.walk import Walks
 from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
@@ -27,15 +35,7 @@ from pronk.report.trial.bodies import bodies_part
 from pronk.report.trial.crossing import crossing_part
 from pronk.report.trial.variation import variation_part
 from pronk.report.trial.walk import walk_part
-from pronk.trial import variation, walk
-from pronk.trial.outcome.bars import checks
-from pronk.trial.result import SUMMARY
-from pronk.trial.terrain import crossing
-from pronk.trial.terrain.crossing import Crossings
-from pronk.trial.unseen import bodies
-from pronk.trial.unseen.bodies import Bodies
-from pronk.trial.variation import Variation
-from pronk.trial.walk import Walks
+from pronk.runtime.log import is_deploy_log
 
 NAME = "report.html"
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from pronk.errors import LogError
+from pronk.logs.joint_log import SweepLog
 from pronk.response.estimator import Estimator
 from pronk.response.grid import analysis_rate
 from pronk.response.periodic import read_periods
 from pronk.response.steps import read_steps
-from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError, PronkError
+from pronk.logs.joint_log import Segment, SweepLog
 from pronk.response.delay import fit_delay
 from pronk.response.distortion import third_harmonic
 from pronk.response.estimator import Estimator
@@ -18,7 +19,6 @@ from pronk.response.periodic import estimate_multisine, multisine_operator
 from pronk.response.response import FrequencyResponse
 from pronk.response.spectra import Sums, layout, rests, segment_spectra, sums, total
 from pronk.response.steps import estimate_steps
-from pronk.sweep.log import Segment, SweepLog
 
 Array = NDArray[np.float64]
 

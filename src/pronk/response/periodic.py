@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
+from pronk.logs.joint_log import SweepLog
 from pronk.response.estimator import Estimator
 from pronk.response.grid import Grid, analysis_rate, held_mean, hold, interpolate
 from pronk.response.operator import H1Operator
 from pronk.response.response import FrequencyResponse
-from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

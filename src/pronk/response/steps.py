@@ -16,11 +16,11 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import get_window
 
 from pronk.errors import LogError
+from pronk.logs.joint_log import SweepLog
 from pronk.response.estimator import Estimator
 from pronk.response.grid import Grid, held_mean, hold, interpolate
 from pronk.response.periodic import combined
 from pronk.response.response import FrequencyResponse
-from pronk.sweep.log import SweepLog
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -2,7 +2,8 @@
 
 A `Robot` is data: its joints in the order of every file and table, the drive of each joint, the
 gains on those drives, and how a bench test of each joint is set up. The physics that these
-numbers enter is in `pronk.drive`; the MuJoCo model built from them is in `pronk.robots.spec`.
+numbers enter is in `pronk.actuator.model`; the MuJoCo model built from them is in
+`pronk.robots.model`.
 """
 
 from __future__ import annotations

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pronk.errors import PronkError
-from pronk.train.environment.commands import NAME, MotionCommandCfg, motion_command
-from pronk.train.environment.reward_sum import NAME as TABLE
-from pronk.train.environment.reward_sum import reward_sum
-from pronk.train.environment.reward_table import ROWS, JumpWeights, with_jump_weights
+from pronk.train.mdp.commands import NAME, MotionCommandCfg, motion_command
+from pronk.train.mdp.reward_sum import NAME as TABLE
+from pronk.train.mdp.reward_sum import reward_sum
+from pronk.train.mdp.reward_table import ROWS, JumpWeights, with_jump_weights
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg

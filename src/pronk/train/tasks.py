@@ -16,21 +16,21 @@ from mjlab.tasks.registry import register_mjlab_task
 from mjlab.viewer import ViewerConfig
 
 from pronk.robots import load_robot
-from pronk.train.environment import observations, terminations
-from pronk.train.environment.actions import HeldJointPositionCfg
-from pronk.train.environment.commands import NAME, MotionCommandCfg, NominalDrive
-from pronk.train.environment.draws import draw_start
-from pronk.train.environment.drives import actuators
-from pronk.train.environment.randomization import Randomization, delay_steps, events, noise
-from pronk.train.environment.reward_sum import NAME as TABLE
-from pronk.train.environment.reward_sum import RewardSum
-from pronk.train.environment.reward_table import ROWS
-from pronk.train.environment.scene import robot_entity, scene, simulation
-from pronk.train.experiment.runner import PronkRunner
 from pronk.train.gains import NAIVE, TrainingGains, training_gains
-from pronk.train.learning.actor import EstimatorActorCfg, JumpCriticCfg
-from pronk.train.learning.ppo import EstimatorPpoCfg
+from pronk.train.mdp import observations, terminations
+from pronk.train.mdp.actions import HeldJointPositionCfg
+from pronk.train.mdp.commands import NAME, MotionCommandCfg, NominalDrive
+from pronk.train.mdp.draws import draw_start
+from pronk.train.mdp.drives import actuators
+from pronk.train.mdp.randomization import Randomization, delay_steps, events, noise
+from pronk.train.mdp.reward_sum import NAME as TABLE
+from pronk.train.mdp.reward_sum import RewardSum
+from pronk.train.mdp.reward_table import ROWS
+from pronk.train.mdp.scene import robot_entity, scene, simulation
 from pronk.train.phases import Phase, configure_phase, phase
+from pronk.train.rl.actor import EstimatorActorCfg, JumpCriticCfg
+from pronk.train.rl.ppo import EstimatorPpoCfg
+from pronk.train.runner.runner import PronkRunner
 
 WALK_TASK = "Pronk-Walk-MiniCheetah"
 JUMP_TASK = "Pronk-Jump-MiniCheetah"
@@ -141,7 +141,7 @@ def rl_cfg(*, jump: bool, seed: int = 0, entropy: float = 0.005) -> RslRlOnPolic
             estimator_velocity_coef=4.0,
             # Robot and task are alike left and right: every sample teaches two.
             symmetry_cfg={
-                "data_augmentation_func": "pronk.train.learning.symmetry:with_mirror_image",
+                "data_augmentation_func": "pronk.train.rl.symmetry:with_mirror_image",
                 "use_data_augmentation": True,
             },
         ),

@@ -19,12 +19,12 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from pronk.errors import IdentifiabilityError, LogError
+from pronk.logs.joint_log import SweepLog
 from pronk.match.arm.problem import DriveProblem, stacked
-from pronk.match.arm.simulation import ArmBench, Drives, JointDrive
 from pronk.match.drive_parameters import DRIVE_MODE, KINDS, PARAMETERS, asked_of
 from pronk.match.identifiability import EXPERIMENTS
 from pronk.robots.robot import Robot
-from pronk.sweep.log import SweepLog
+from pronk.simulators.chain import ArmBench, Drives, JointDrive
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]

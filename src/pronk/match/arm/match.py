@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError, PronkError
+from pronk.logs.joint_log import SweepLog
 from pronk.match.arm.fit import DriveFit, DriveJoint, fit_drive
-from pronk.match.arm.simulation import ArmBench, Drives, JointDrive
 from pronk.match.drive_parameters import DRIVE_MODE, GAINS_MODE, PARAMETERS, gains_covariance
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.identifiability import EXPERIMENTS
@@ -25,7 +25,7 @@ from pronk.match.result import JointMatch
 from pronk.response.estimate import estimate
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
-from pronk.sweep.log import SweepLog
+from pronk.simulators.chain import ArmBench, Drives, JointDrive
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]

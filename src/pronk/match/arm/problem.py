@@ -1,7 +1,7 @@
 """The least-squares problem of an arm that moved all its joints at once.
 
 Residuals are simulated less recorded positions over the samples that can be believed
-(`pronk.match.arm.trust`). One joint's parameters move its own position far more than its
+(`pronk.match.arm.sample_mask`). One joint's parameters move its own position far more than its
 neighbours', so the Jacobian is taken block-diagonal: one simulation per kind of parameter, in
 which the parameter of every joint is moved at once.
 """
@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.arm.simulation import ArmBench, Drives, JointDrive, asked_joints
-from pronk.match.arm.trust import trusted_samples
+from pronk.match.arm.sample_mask import trusted_samples
 from pronk.match.drive_parameters import KINDS, PARAMETERS
+from pronk.simulators.chain import ArmBench, Drives, JointDrive, asked_joints
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

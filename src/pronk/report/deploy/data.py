@@ -13,10 +13,10 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from pronk.deploy.log import DeployLog
-from pronk.deploy.reasons import Level, Reason
-from pronk.deploy.records import Mode
-from pronk.sweep.mcap_stream import DamagedError, records
+from pronk.logs.mcap_stream import DamagedError, records
+from pronk.runtime.log import DeployLog
+from pronk.runtime.reasons import Level, Reason
+from pronk.runtime.records import Mode
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.deploy.log import DeployLog
 from pronk.report.deploy.data import Spread, flying, spread
 from pronk.robots.robot import Robot
+from pronk.runtime.log import DeployLog
 
 Array = NDArray[np.float64]
 

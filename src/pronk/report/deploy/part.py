@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.deploy.log import DeployLog, read_deploy_log
 from pronk.errors import PronkError
 from pronk.report import shell
 from pronk.report.deploy import data as deploy_data
@@ -23,6 +22,7 @@ from pronk.report.shell import Part
 from pronk.report.trial.extra import Block
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
+from pronk.runtime.log import DeployLog, read_deploy_log
 
 Array = NDArray[np.float64]
 

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pronk.deploy.log import DeployLog
-from pronk.deploy.reasons import Level
+from pronk.evaluation.outcome.table_text import Sheet
 from pronk.report.deploy import data as deploy_data
 from pronk.report.deploy import times as deploy_times
 from pronk.report.deploy.data import Intervention
 from pronk.report.deploy.delay import Delay
 from pronk.report.shell import number
 from pronk.robots.robot import Robot
-from pronk.trial.outcome.table_text import Sheet
+from pronk.runtime.log import DeployLog
+from pronk.runtime.reasons import Level
 
 _LEVEL_WORDS = {
     Level.LIMIT: "target moved",

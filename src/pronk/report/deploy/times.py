@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from pronk.deploy.log import DeployLog
 from pronk.report import style
 from pronk.report.deploy.data import flying, seconds, spread, until_fault
+from pronk.runtime.log import DeployLog
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from pronk.deploy.log import DeployLog
-from pronk.deploy.records import Mode
 from pronk.report import style
 from pronk.report.deploy.data import flying, in_force, seconds, stretches, tilt
+from pronk.runtime.log import DeployLog
+from pronk.runtime.records import Mode
 
 Array = NDArray[np.float64]
 

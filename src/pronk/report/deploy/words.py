@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pronk.deploy.log import DeployLog
-from pronk.deploy.reasons import Level
-from pronk.deploy.records import REAL, VIRTUAL
 from pronk.report.deploy.data import FLYING, missed, seconds, stretches
 from pronk.report.deploy.delay import Delay
 from pronk.report.deploy.traces import MODE_WORDS, jumps
+from pronk.runtime.log import DeployLog
+from pronk.runtime.reasons import Level
+from pronk.runtime.records import REAL, VIRTUAL
 
 
 def machine(log: DeployLog) -> str:

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from pronk.errors import ArtefactError
+from pronk.evaluation.outcome.table_text import Sheet, number
+from pronk.evaluation.result import Subject, Trial
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.result import JointMatch, MatchResult
 from pronk.report import style
 from pronk.report.page import find_gains
-from pronk.trial.outcome.table_text import Sheet, number
-from pronk.trial.result import Subject, Trial
 
 
 def joint_error_db(joint: JointMatch, stiffness: float, damping: float) -> float:

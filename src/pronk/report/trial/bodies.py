@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from pronk.evaluation.outcome.comparison import verdict
+from pronk.evaluation.outcome.criteria import checks
+from pronk.evaluation.outcome.table_text import Sheet, number
+from pronk.evaluation.outcome.tables import table_iii
+from pronk.evaluation.unseen.bodies import Bodies, Body
 from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.cells import Array, Values, cells
 from pronk.report.trial.data import policies, published, values
 from pronk.report.trial.extra import Block, part, place
 from pronk.report.trial.sweeps import argument
-from pronk.trial.outcome.bars import checks
-from pronk.trial.outcome.comparison import verdict
-from pronk.trial.outcome.table_text import Sheet, number
-from pronk.trial.outcome.tables import table_iii
-from pronk.trial.unseen.bodies import Bodies, Body
 
 _OF_POLICY = "training gains of "
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pronk.errors import ArtefactError
+from pronk.evaluation.result import SUMMARY
 from pronk.report.shell import Picture
-from pronk.trial.result import SUMMARY
 
 LARGEST_BYTES = 1_500_000
 """A moving picture larger than this is made smaller before it goes into the page."""

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
+from pronk.evaluation.outcome.table_text import Sheet, number
+from pronk.evaluation.summary import share_interval
+from pronk.evaluation.terrain.crossing import Climb, Crossings
 from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.extra import Block, part, place
 from pronk.report.trial.sweeps import Line, Panel, lines
-from pronk.trial.outcome.table_text import Sheet, number
-from pronk.trial.summary import share_interval
-from pronk.trial.terrain.crossing import Climb, Crossings
 
 PAPER_GAPS = {"forward 2": 0.55, "back 2": 0.50, "side -1": 0.40, "side +1": 0.40}
 """Widest gaps that the paper says its robot could cross, read off video (R3) [m]."""

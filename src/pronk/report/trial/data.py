@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.hardware import capture as capture_file
-from pronk.hardware.capture import Capture
+from pronk.evaluation.outcome.published import PAPER_RATIOS, TABLE_III, in_paper_order
+from pronk.evaluation.protocol import RATES
+from pronk.evaluation.result import Trial
+from pronk.evaluation.rows import Row
 from pronk.report.trial.cells import Published, Values
 from pronk.report.trial.ratios import Ratio
 from pronk.report.trial.traces import Trace
-from pronk.trial.outcome.published import PAPER_RATIOS, TABLE_III, in_paper_order
-from pronk.trial.protocol import RATES
-from pronk.trial.result import Trial
-from pronk.trial.rows import Row
+from pronk.virtual import capture as capture_file
+from pronk.virtual.capture import Capture
 
 Array = NDArray[np.float64]
 

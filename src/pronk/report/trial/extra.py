@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from pronk.evaluation.metrics import Figure
+from pronk.evaluation.outcome.table_text import Sheet
+from pronk.evaluation.result_io import Origin
 from pronk.report import shell
 from pronk.report.shell import Part, Picture
-from pronk.trial.metrics import Figure
-from pronk.trial.outcome.table_text import Sheet
-from pronk.trial.sheet import Origin
 
 
 @dataclass(frozen=True, kw_only=True)

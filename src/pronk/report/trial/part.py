@@ -9,30 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from pronk.errors import RobotError
+from pronk.evaluation.outcome import comparison, tables
+from pronk.evaluation.outcome import criteria as bars
+from pronk.evaluation.outcome.table_text import Sheet, place
+from pronk.evaluation.protocol import RATES
+from pronk.evaluation.result import Subject, Trial, load
+from pronk.evaluation.summary import share_interval
 from pronk.match.result import MatchResult
 from pronk.report import shell, style
 from pronk.report.shell import Part, Picture
 from pronk.report.trial.argument import bode_errors_db, joint_errors, match_near
 from pronk.report.trial.cells import Published, cells, scatter
 from pronk.report.trial.clips import Clips, clips
-from pronk.report.trial.data import (
-    Seen,
-    naive_over_matched,
-    policies,
-    published,
-    see,
-    values,
-)
+from pronk.report.trial.data import Seen, naive_over_matched, policies, published, see, values
 from pronk.report.trial.ratios import ratios
 from pronk.report.trial.sweeps import argument
 from pronk.report.trial.traces import heights, rates, torque_speed
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.trial.outcome import bars, comparison, tables
-from pronk.trial.outcome.table_text import Sheet, place
-from pronk.trial.protocol import RATES
-from pronk.trial.result import Subject, Trial, load
-from pronk.trial.summary import share_interval
 
 _PAPER_GAPS: Published = {
     "matched": {

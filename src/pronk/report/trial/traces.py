@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from pronk.drive import torque_limits
+from pronk.actuator.model import torque_limits
 from pronk.report import style
 from pronk.report.trial.style import looks
 from pronk.robots.robot import Robot

@@ -6,15 +6,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from pronk.evaluation.metrics import FIGURES
+from pronk.evaluation.outcome.published import in_paper_order
+from pronk.evaluation.outcome.table_text import Sheet, number, spread
+from pronk.evaluation.summary import share_interval
+from pronk.evaluation.variation import AS_IT_IS, VARIED_FIGURES, Parameter, Point, Variation
 from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.extra import Block, part, place
 from pronk.report.trial.sweeps import Line, Panel, lines
-from pronk.trial.metrics import FIGURES
-from pronk.trial.outcome.published import in_paper_order
-from pronk.trial.outcome.table_text import Sheet, number, spread
-from pronk.trial.summary import share_interval
-from pronk.trial.variation import AS_IT_IS, VARIED_FIGURES, Parameter, Point, Variation
 
 _DRAWN = ("height", "distance")
 _TABLED = ("height", "distance", "gap")

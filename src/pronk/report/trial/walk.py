@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from pronk.evaluation.outcome.published import in_paper_order
+from pronk.evaluation.outcome.table_text import Sheet, spread
+from pronk.evaluation.walk import Walks
+from pronk.evaluation.walk_metrics import SETTLE_S, WALK_FIGURES
 from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.cells import Values, cells
 from pronk.report.trial.extra import Block, part, place
-from pronk.trial.outcome.published import in_paper_order
-from pronk.trial.outcome.table_text import Sheet, spread
-from pronk.trial.walk import Walks
-from pronk.trial.walk_metrics import SETTLE_S, WALK_FIGURES
 
 PAPER_WALKS = ("forward 2", "back 2", "side -1", "side +1")
 """Velocities of the paper's R4."""

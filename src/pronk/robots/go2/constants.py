@@ -58,7 +58,7 @@ NO_LOAD_SPEED = {"hip_roll": 30.1, "hip_pitch": 30.1, "knee": 20.07}  # [urdf] v
 ARMATURE_AT_HIP = 0.01  # [mj] [kg m^2]
 JOINT_FRICTION, JOINT_DAMPING = 0.2, 0.1  # [mj] [N m], [N m s/rad]
 BUS_VOLTAGE = 28.8  # battery, 8 cells of 3.6 V [V]
-_EMF_FACTOR, _TORQUE_FACTOR = 2.0, 1.5  # as for every drive here, see pronk.drive
+_EMF_FACTOR, _TORQUE_FACTOR = 2.0, 1.5  # as for every drive here, see pronk.actuator.model
 
 
 def drive(joint: str) -> Drive:

@@ -1,0 +1,183 @@
+"""Command line of the benchmarks: `python -m benchmarks NAME`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pronk.cli import console
+from pronk.cli.main import run_app
+from pronk.errors import PronkError
+
+
+def match(
+    trials: Annotated[int, typer.Option(help="Logs of each scenario.")] = 5,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    json_file: console.JsonOption = None,
+) -> None:
+    """Match logs of known truth with pronk, mujoco.sysid and CMA-ES; bias, coverage, time."""
+    import orjson
+
+    from benchmarks.match import run, table
+
+    def one_bar(_: str, share: float) -> None:
+        report("bench", share)
+
+    with console.progress() as report:
+        result = run(trials, seed, one_bar)
+    console.show(table(result))
+    console.write_json(json_file, orjson.loads(result.to_json()))
+    console.following("pronk bench match --trials 20   # steadier coverage, about 20 s a log")
+
+
+def grid(
+    points: Annotated[int, typer.Option(help="Points of each axis; the paper has 50.")] = 50,
+    json_file: console.JsonOption = None,
+) -> None:
+    """The paper's grid on twelve joints of known truth, beside a bare mujoco.rollout loop."""
+    from dataclasses import asdict
+
+    from benchmarks.search import run, table
+
+    with console.progress() as report:
+        result = run(report, points=points)
+    console.show(table(result))
+    derived = {"steps_per_second": result.steps_per_second, "ratio": result.ratio}
+    console.write_json(json_file, asdict(result) | derived)
+    console.following("pronk bench engine   # what the simulator's step does to a joint")
+
+
+def engine(json_file: console.JsonOption = None) -> None:
+    """The same drive at a 0.25 ms step and in the 5 ms training simulator, before and after."""
+    from benchmarks.engine import run, table
+
+    with console.progress() as report:
+        gaps = run(report)
+    console.show(table(gaps))
+    console.write_json(
+        json_file,
+        {
+            gap.joint: {
+                "gains": gap.gains,
+                "equal_gains_rms_db": gap.equal_gains_rms_db,
+                "equal_gains_max_db": gap.equal_gains_max_db,
+                "matched_gains": gap.matched_gains,
+                "matched_rms_db": gap.matched_rms_db,
+            }
+            for gap in gaps
+        },
+    )
+    console.following("pronk bench coverage   # whether the intervals hold what they say")
+
+
+def coverage(
+    trials: Annotated[int, typer.Option(help="Logs of each joint.")] = 200,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    json_file: console.JsonOption = None,
+) -> None:
+    """How often the 95 % intervals hold the truth under coloured noise."""
+    from dataclasses import asdict
+
+    from benchmarks.coverage import run, table
+
+    with console.progress() as report:
+        rows = run(trials, seed, report)
+    console.show(table(rows))
+    console.write_json(json_file, {one.joint: asdict(one) for one in rows})
+    console.following("pronk bench match   # the same question to mujoco.sysid and CMA-ES")
+
+
+def tick(
+    policy: Annotated[Path, typer.Argument(help="policy.onnx, which decides at each tick.")],
+    seconds: Annotated[float, typer.Option(help="Of each of the four cases.")] = 40.0,
+    json_file: console.JsonOption = None,
+) -> None:
+    """Lateness and the policy's answer at 50 Hz: idle, beside CPU hogs, with real time, without."""
+    from benchmarks.tick import bars, figures, run, table
+
+    with console.progress() as report:
+        rows = run(policy, seconds, report)
+    console.show(table(rows))
+    console.show(bars(rows))
+    for line in dict.fromkeys(line for row in rows for line in row.granted):
+        console.say(line)
+    console.write_json(json_file, figures(rows))
+    console.following(f"pronk deploy {policy} --script 1,0,0   # the whole loop, on the twin")
+
+
+def train(
+    envs: Annotated[str, typer.Option(help="Numbers of environments.")] = "4096,16384",
+    steps: Annotated[int, typer.Option(help="Steps in a block of stepping.")] = 50,
+    iterations: Annotated[int, typer.Option(help="Iterations in a block of training.")] = 1,
+    repeats: Annotated[int, typer.Option(help="Blocks of each task, taken in turn.")] = 4,
+    device: Annotated[str, typer.Option(help="auto, cuda or cpu (to try it out).")] = "auto",
+    gpu_ids: Annotated[
+        str | None,
+        typer.Option(help="GPUs, such as 0,1: training on one and on all of them as well."),
+    ] = None,
+    json_file: console.JsonOption = None,
+) -> None:
+    """Steps per second of the jump task and of mjlab's own Go1 task, stage by stage."""
+    from benchmarks.train import run, stage_table, table
+
+    begin = time.perf_counter()
+
+    def line(text: str) -> None:
+        seconds = time.perf_counter() - begin
+        console.err().print(f"{seconds:6.1f} s  {text}", markup=False)
+
+    result = run(
+        line,
+        envs=_numbers(envs),
+        steps=steps,
+        iterations=iterations,
+        repeats=repeats,
+        device=device,
+        gpu_ids=gpu_ids,
+    )
+    console.show(table(result))
+    console.show(stage_table(result))
+    console.write_json(json_file, result.figures())
+    console.following("pronk train all   # trains with the environment that was measured")
+
+
+def _numbers(text: str) -> list[int]:
+    words = [word.strip() for word in text.split(",")]
+    if not all(word.isdigit() for word in words):
+        raise PronkError(f"--envs {text!r}: expected whole numbers, such as 4096,16384.")
+    return [int(word) for word in words]
+
+
+def trial(
+    policy: Annotated[Path, typer.Argument(help="policy.onnx.", metavar="POLICY")],
+    repeats: Annotated[int, typer.Option(help="Runs of each loop, taken in turn.")] = 7,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Body of the virtual robot; the one that ships with pronk if left out."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the jump's start and noise.")] = 0,
+    json_file: console.JsonOption = None,
+) -> None:
+    """Simulated seconds per second of the whole trial loop and of bare mj_step, over one run."""
+    from benchmarks.trial import run, table
+    from pronk.virtual.sim_params import load_truth
+
+    with console.progress() as report:
+        result = run(policy, truth=load_truth(truth), repeats=repeats, seed=seed, progress=report)
+    console.show(table(result))
+    console.write_json(json_file, result.figures())
+    console.following(f"pronk trial {policy} --out out/trial   # 20 jumps with each command")
+
+
+app = typer.Typer(
+    help="pronk beside its peers, on the same data, in one run.", add_completion=False
+)
+for _command in (match, grid, engine, coverage, tick, train, trial):
+    app.command(_command.__name__)(_command)
+
+if __name__ == "__main__":
+    sys.exit(run_app(app, sys.argv[1:], "python -m benchmarks"))

@@ -1,0 +1,1 @@
+"""Physics of the DC motor and gearbox that drive a joint."""

@@ -1,1 +1,0 @@
-"""pronk beside its peers, on the same data, in one run."""

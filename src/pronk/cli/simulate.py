@@ -1,0 +1,218 @@
+"""`pronk twin`: the virtual robot as a process of its own, behind real bytes."""
+
+from __future__ import annotations
+
+import signal
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pronk.cli import console
+from pronk.cli.choices import Base, Layout
+from pronk.errors import HardwareError
+
+if TYPE_CHECKING:
+    from pronk.robots.robot import Robot
+    from pronk.virtual.server import Twin, Wire
+
+
+_PRIORITY = 30
+"""Of SCHED_FIFO; below that of whoever commands."""
+_LATE_MS = 5.0
+"""Lateness of one tick in a hundred above which a virtual robot no longer moves like one [ms]."""
+
+
+class TwinLink(StrEnum):
+    """The wire that the virtual robot speaks."""
+
+    LCM = "lcm"
+    DDS = "dds"
+
+
+class Silence(StrEnum):
+    """What the drives do when commands stop."""
+
+    HOLD = "hold"
+    ZERO = "zero"
+    DAMP = "damp"
+
+
+def twin(
+    robot: Annotated[
+        str, typer.Argument(help="Robot, for instance mini_cheetah.")
+    ] = "mini_cheetah",
+    link: Annotated[TwinLink, typer.Option(help="The wire.")] = TwinLink.LCM,
+    layout: Annotated[
+        Layout,
+        typer.Option(help="Messages on LCM: Cheetah-Software's, or walk-these-ways'."),
+    ] = Layout.CHEETAH,
+    base: Annotated[
+        Base, typer.Option(help="bench: the trunk is fixed; ground: it stands and moves freely.")
+    ] = Base.BENCH,
+    truth: Annotated[
+        Path | None, typer.Option(help="Truth of the virtual robot, instead of the shipped one.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of all noise and all faults.")] = 0,
+    port: Annotated[
+        int | None, typer.Option(help="UDP port on this computer (LCM); 7768 if left out.")
+    ] = None,
+    domain: Annotated[
+        int | None, typer.Option(help="Domain on this computer (DDS); 77 if left out, never 0.")
+    ] = None,
+    faults: Annotated[
+        str,
+        typer.Option(
+            help="What goes wrong, for instance 'loss=0.3,state.delay=5ms,jitter=2ms,nan=0.01,"
+            "flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=4s,after=2s'."
+        ),
+    ] = "",
+    silence: Annotated[
+        Silence, typer.Option(help="What the drives do when commands stop.")
+    ] = Silence.HOLD,
+    silence_after: Annotated[
+        float, typer.Option(help="Time without a command after which they do it, in s.")
+    ] = 0.1,
+    mode: Annotated[
+        str,
+        typer.Option(
+            help="The robot's own controller that holds the joints at first; released if left out. "
+            "LCM: stand_up, balance_stand, locomotion, recovery_stand; DDS: normal, ai, advanced, "
+            "mcf."
+        ),
+    ] = "",
+    duration: Annotated[
+        float | None, typer.Option(help="End after this time, in s; Ctrl-C ends it too.")
+    ] = None,
+    capture: Annotated[
+        Path | None,
+        typer.Option(help="Write what a motion-capture rig saw to this .npz (--base ground)."),
+    ] = None,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Ask the system for real-time scheduling.")
+    ] = False,
+    json_file: console.JsonOption = None,
+) -> None:
+    """Run the virtual robot in real time, behind the very bytes of a real one.
+
+    Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
+    """
+    from pronk.links.realtime import Wanted, enter
+    from pronk.robots import load_robot
+    from pronk.virtual.capture import save
+    from pronk.virtual.faults import parse_faults
+    from pronk.virtual.robot import VirtualRobot
+    from pronk.virtual.server import Silence as WhenSilent
+    from pronk.virtual.server import Twin, hold_of
+    from pronk.virtual.sim_params import load_truth
+
+    if capture is not None and base is not Base.GROUND:
+        raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
+    known = load_robot(robot)
+    wrong = parse_faults(faults)
+    when_silent = WhenSilent(action=silence.value, after_s=silence_after)
+    machine = VirtualRobot(
+        known,
+        load_truth(truth),
+        seed=seed,
+        base=base.value,
+        capture_rate_hz=1000.0 if capture else None,
+    )
+    if realtime:
+        # Before the wire is open, so that its threads are scheduled alike.
+        for answer in enter(Wanted(priority=_PRIORITY, lock=False)):
+            console.say(answer)
+    wire, where = _open_wire(link, known, layout, port=port, domain=domain, mode=mode)
+    try:
+        machine.connect()
+        lives = Twin(
+            machine, wire, hold=hold_of(known), faults=wrong, silence=when_silent, seed=seed
+        )
+        console.say(
+            f"ready: the virtual {known.name} on the {base.value}, seed {seed}, on {where}; "
+            "Ctrl-C ends it"
+        )
+        _run(lives, duration)
+        figures = lives.figures()
+        if capture is not None:
+            save(capture, machine.capture())
+            console.wrote(capture)
+    finally:
+        wire.close()
+        machine.close()
+    _tell(figures)
+    console.write_json(json_file, figures)
+    way = f"--link {link.value}"
+    way += f" --layout {layout.value}" if layout is not Layout.CHEETAH else ""
+    way += f" --port {port}" if port is not None else ""
+    way += f" --domain {domain}" if domain is not None else ""
+    console.following(f"pronk sweep {robot} {way} --out DIR   # while a twin runs")
+
+
+def _open_wire(
+    link: TwinLink,
+    robot: Robot,
+    layout: Layout,
+    *,
+    port: int | None,
+    domain: int | None,
+    mode: str,
+) -> tuple[Wire, str]:
+    """The robot's end of the wire, and its address in words."""
+    if link is TwinLink.LCM:
+        from pronk.links.lcm.address import url_of
+        from pronk.links.lcm.layout import layout_of
+        from pronk.virtual.lcm_server import LcmWire
+
+        if domain is not None:
+            raise HardwareError("--domain is of DDS; with --link lcm give --port.")
+        url = url_of(port=port)
+        wire = LcmWire(robot, layout_of(layout.value), url, mode=mode)
+        return wire, f"LCM, messages of {layout.value}, {url}"
+    from pronk.links.dds.address import DdsNetwork
+    from pronk.virtual.dds_server import DdsWire
+
+    if port is not None:
+        raise HardwareError("--port is of LCM; with --link dds give --domain.")
+    network = DdsNetwork() if domain is None else DdsNetwork(domain=domain)
+    return DdsWire(robot, network, mode=mode), str(network)
+
+
+def _run(lives: Twin, duration: float | None) -> None:
+    """Live until Ctrl-C, a SIGTERM, or the end of the time given."""
+    asked: list[int] = []
+    end = time.monotonic() + duration if duration is not None else float("inf")
+    before = {
+        number: signal.signal(number, lambda got, _: asked.append(got))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        lives.run(lambda: bool(asked) or time.monotonic() >= end)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _tell(figures: dict[str, Any]) -> None:
+    """One line of what happened."""
+    wire: dict[str, int] = figures["wire"]
+    refused = sum(count for name, count in wire.items() if name.startswith("refused"))
+    late = figures["lateness_ms"]
+    console.say(
+        f"the virtual robot lived {figures['duration_s']:.1f} s: {wire.get('states', 0)} states, "
+        f"{wire.get('commands', 0)} commands, {refused} messages refused; ticks late by "
+        f"{late['p50']:.2f} ms (median), {late['p99']:.2f} ms (p99); "
+        f"{100 * figures['cpu_share']:.0f} % of one core"
+    )
+    if late["p99"] > _LATE_MS:
+        console.warn(
+            f"1 in 100 ticks was late by {late['p99']:.0f} ms or more: this computer is too busy, "
+            "and what was measured on the wire is not what an idle one would give"
+        )
+    if figures["slipped_s"]:
+        console.warn(
+            f"this computer was too busy for real time: the robot stood still for "
+            f"{figures['slipped_s']:.2f} s in {figures['twin']['slips']} pieces"
+        )

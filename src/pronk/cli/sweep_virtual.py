@@ -1,0 +1,111 @@
+"""`pronk sweep` on the virtual robot in this program: faster than real time, legs side by side."""
+
+from __future__ import annotations
+
+import os
+import queue
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pronk.errors import PlanError
+
+if TYPE_CHECKING:
+    from pronk.excitation.plan import SweepPlan
+    from pronk.robots.robot import Robot
+
+
+def record_twin(
+    robot: Robot,
+    plan: SweepPlan,
+    out_dir: Path,
+    *,
+    truth: Path | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> list[Path]:
+    """Ask the virtual robot, legs side by side in processes of their own.
+
+    On a rigid bench legs do not feel each other, so each process simulates one leg.
+
+    Args:
+        robot: The robot.
+        plan: What to ask; checked by the caller.
+        out_dir: Folder for the logs.
+        truth: Truth file; the shipped one if None.
+        seed: Of all noise; each leg takes its own from it.
+        overwrite: Replace logs that are already there.
+        progress: Told the share done, 0 to 1.
+
+    Returns:
+        The logs, in the order of the robot's joints.
+    """
+    from pronk.virtual.plant import legs_of
+    from pronk.virtual.sim_params import load_truth
+
+    # Read it here once, so that a bad file is one message and not one per process.
+    load_truth(truth).check_joints(robot.joint_names, str(truth or "truth"))
+    if len(plan.sets) != len(plan.joints):
+        raise PlanError("several joints asked at once: the virtual robot is asked one at a time.")
+    jobs = []
+    for index, leg in enumerate(legs_of(robot)):
+        asked = tuple(name for name in plan.joints if name.split("_")[0] == leg)
+        if asked:
+            jobs.append((leg, asked, seed * 1000 + index))
+    context = get_context("spawn")
+    with (
+        context.Manager() as manager,
+        ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), mp_context=context) as pool,
+    ):
+        told: queue.Queue[tuple[str, float]] = manager.Queue()
+        running = {
+            pool.submit(_record_leg, plan, leg, asked, out_dir, truth, s, overwrite, told)
+            for leg, asked, s in jobs
+        }
+        shares = {leg: 0.0 for leg, _, _ in jobs}
+        weight = {leg: len(asked) / len(plan.joints) for leg, asked, _ in jobs}
+        done: list[Path] = []
+        while running:
+            finished, running = wait(running, timeout=0.2, return_when=FIRST_EXCEPTION)
+            while not told.empty():
+                leg, share = told.get()
+                shares[leg] = share
+            if progress is not None:
+                progress(sum(weight[leg] * share for leg, share in shares.items()))
+            for future in finished:
+                done += future.result()
+    if progress is not None:
+        progress(1.0)
+    order = {name: i for i, name in enumerate(robot.joint_names)}
+    return sorted(done, key=lambda path: order.get(path.stem, len(order)))
+
+
+def _record_leg(
+    plan: SweepPlan,
+    leg: str,
+    joints: Sequence[str],
+    out_dir: Path,
+    truth: Path | None,
+    seed: int,
+    overwrite: bool,
+    told: queue.Queue[tuple[str, float]],
+) -> list[Path]:
+    """Ask one leg; runs in a process of its own."""
+    from pronk.runtime.sweep.record import record
+    from pronk.virtual.robot import VirtualRobot
+    from pronk.virtual.sim_params import load_truth
+
+    machine = VirtualRobot(plan.robot, load_truth(truth), seed=seed, legs=(leg,))
+    return record(
+        machine,
+        plan.robot,
+        plan,
+        out_dir,
+        progress=lambda share, _: told.put((leg, share)),
+        joints=joints,
+        overwrite=overwrite,
+        metadata={"link": "twin, in this program"},
+    )

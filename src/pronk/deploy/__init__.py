@@ -1,1 +1,0 @@
-"""A policy on a machine: control loop, safety filter, start and stop."""

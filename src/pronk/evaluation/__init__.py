@@ -1,0 +1,1 @@
+"""Scripted jump trials of policies, and what is measured in them."""

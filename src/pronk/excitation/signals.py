@@ -1,0 +1,380 @@
+"""Signals: the questions a joint can be asked, as command offsets about the pose.
+
+A signal is sampled at the ticks of the policy (50 Hz) and each sample is held until the next
+tick. Every signal is ramped in and out by half a cosine and its last sample is zero, so that the
+joint is left where it was met.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import chirp
+
+from pronk.errors import PlanError
+
+Array = NDArray[np.float64]
+
+POLICY_RATE_HZ = 50.0
+"""Rate of the commands (paper S4)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal(ABC):
+    """Base of the signals."""
+
+    kind: ClassVar[str]
+    """Name in `pronk.logs.joint_log.SIGNAL_KINDS`."""
+
+    amplitude: float = 0.25
+    """Peak of the command about the pose [rad] (paper F3)."""
+    ramp_s: float = 0.5
+    """Length of the ramp at each end [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be asked.
+
+        Raises:
+            PlanError: A number is not finite, not positive or out of order.
+        """
+        self._positive("amplitude")
+        if not (np.isfinite(self.ramp_s) and self.ramp_s >= 0.0):
+            raise PlanError(
+                f"{type(self).__name__}.ramp_s is {self.ramp_s}; expected 0 s or more, for "
+                "instance 0.5."
+            )
+
+    @property
+    @abstractmethod
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency asked [Hz]."""
+
+    @property
+    def period_s(self) -> float | None:
+        """Period between the ramps [s]; None if the signal does not repeat."""
+        return None
+
+    def samples(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
+        """Command offsets at the ticks [rad], shape (ticks,); the first and the last are zero.
+
+        Raises:
+            PlanError: The signal does not fit the rate: a held command carries nothing above
+                half its rate (paper F4, reading A15).
+        """
+        if self.band_hz[1] > 0.5 * rate_hz * (1.0 + 1e-9):
+            raise PlanError(
+                f"{type(self).__name__} asks up to {self.band_hz[1]:g} Hz, but commands at "
+                f"{rate_hz:g} Hz reach {0.5 * rate_hz:g} Hz; lower the highest frequency."
+            )
+        return self._samples(rate_hz)
+
+    def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
+        """Instantaneous frequency at the ticks [Hz], shape (ticks,); NaN where there is none."""
+        return self._frequency(rate_hz)
+
+    @abstractmethod
+    def _samples(self, rate_hz: float) -> Array: ...
+
+    @abstractmethod
+    def _frequency(self, rate_hz: float) -> Array: ...
+
+    def duration_s(self, rate_hz: float = POLICY_RATE_HZ) -> float:
+        """Time from the first tick to the end of the last one [s]."""
+        return len(self.frequency(rate_hz)) / rate_hz
+
+    def with_amplitude(self, amplitude: float) -> Self:
+        """The same question, louder or softer [rad]."""
+        return replace(self, amplitude=amplitude)
+
+    def _positive(self, *names: str) -> None:
+        for name in names:
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise PlanError(
+                    f"{type(self).__name__}.{name} is {value}; expected a positive number."
+                )
+
+    def _ordered(self, low: float, high: float) -> None:
+        if not (np.isfinite(low) and np.isfinite(high) and 0.0 < low < high):
+            raise PlanError(
+                f"{type(self).__name__} asks from {low} to {high} Hz; expected two positive "
+                "frequencies, the lower one first, for instance 0.1 and 25."
+            )
+
+
+def ramps(ticks: int, ramp_ticks: int) -> Array:
+    """Half a cosine up from 0, ones, half a cosine down to exactly 0, shape (ticks,).
+
+    Raises:
+        PlanError: The two ramps do not fit.
+    """
+    if 2 * ramp_ticks > ticks:
+        raise PlanError(
+            f"two ramps of {ramp_ticks} ticks do not fit a signal of {ticks}; shorten the ramp or "
+            "lengthen the signal."
+        )
+    window = np.ones(ticks)
+    rise = 0.5 * (1.0 - np.cos(np.pi * np.arange(ramp_ticks) / max(ramp_ticks, 1)))
+    window[:ramp_ticks] = rise
+    window[ticks - ramp_ticks :] = rise[::-1]
+    # Even an abrupt signal begins and ends at rest.
+    window[0] = window[-1] = 0.0
+    return window
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chirp(Signal):
+    """Linear chirp; the defaults are the paper's (F2, F3; 20 s and linear are our reading)."""
+
+    kind = "chirp"
+
+    start_hz: float = 0.1
+    stop_hz: float = 25.0
+    length_s: float = 20.0
+    """Ramps included [s]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive("length_s")
+        self._ordered(self.start_hz, self.stop_hz)
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency asked [Hz]."""
+        return self.start_hz, self.stop_hz
+
+    def _time(self, rate_hz: float) -> Array:
+        return np.arange(max(2, round(self.length_s * rate_hz))) / rate_hz
+
+    def _samples(self, rate_hz: float) -> Array:
+        time = self._time(rate_hz)
+        wave = chirp(
+            time,
+            f0=self.start_hz,
+            t1=self.length_s,
+            f1=self.stop_hz,
+            method="linear" if self.kind == "chirp" else "logarithmic",
+            phi=-90.0,  # a sine: it begins at zero
+        )
+        return np.asarray(self.amplitude * wave * ramps(len(time), round(self.ramp_s * rate_hz)))
+
+    def _frequency(self, rate_hz: float) -> Array:
+        share = self._time(rate_hz) / self.length_s
+        return np.asarray(self.start_hz + (self.stop_hz - self.start_hz) * share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogChirp(Chirp):
+    """Logarithmic chirp: the same time in every octave, so far more of it at low frequency."""
+
+    kind = "log_chirp"
+
+    def _frequency(self, rate_hz: float) -> Array:
+        share = self._time(rate_hz) / self.length_s
+        return np.asarray(self.start_hz * (self.stop_hz / self.start_hz) ** share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multisine(Signal):
+    """Random-phase odd multisine: many sines at once, all odd harmonics of one period.
+
+    Even harmonics are left silent, so whatever answers there is nonlinearity. Of `draws` seeded
+    phase draws the one with the smallest crest factor (peak over root mean square) is taken. The
+    ramps lie outside the whole periods. (Pintelon and Schoukens, *System Identification: A
+    Frequency Domain Approach*, 2nd ed., sections 2.6 and 4.3.)
+    """
+
+    kind = "multisine"
+
+    low_hz: float = 0.1
+    high_hz: float = 20.0
+    lines: int = 40
+    """Lines on the logarithmic grid, before those that fall on the same odd harmonic merge."""
+    length_s: float = 10.0
+    """One period [s]; the lines are odd multiples of its inverse."""
+    periods: int = 4
+    """Whole periods between the ramps; an estimator drops the first as transient."""
+    tilt: float = 0.5
+    """A line's amplitude falls with its frequency to this power; 0 is flat. Speed and torque at
+    the high lines are what limits a flat one."""
+    harmonics: tuple[int, ...] = ()
+    """Take these odd harmonics instead of the logarithmic grid."""
+    draws: int = 200
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive("length_s", "lines", "periods", "draws")
+        self._ordered(self.low_hz, self.high_hz)
+        if not (np.isfinite(self.tilt) and self.tilt >= 0.0):
+            raise PlanError(f"Multisine.tilt is {self.tilt}; expected 0 or more.")
+        if any(h < 1 or h % 2 == 0 for h in self.harmonics):
+            raise PlanError(
+                f"Multisine.harmonics are {self.harmonics}; expected odd positive numbers."
+            )
+        if not self.harmonic_numbers:
+            raise PlanError(
+                f"Multisine: no odd multiple of {1.0 / self.length_s:g} Hz lies between "
+                f"{self.low_hz:g} and {self.high_hz:g} Hz; lengthen the period."
+            )
+
+    @property
+    def harmonic_numbers(self) -> tuple[int, ...]:
+        """Odd harmonics that are asked, increasing."""
+        if self.harmonics:
+            return tuple(sorted(set(self.harmonics)))
+        return odd_harmonics(self.low_hz, self.high_hz, self.length_s, self.lines)
+
+    @property
+    def lines_hz(self) -> Array:
+        """Frequencies that are asked [Hz], increasing."""
+        return np.asarray(np.array(self.harmonic_numbers) / self.length_s)
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency asked [Hz]."""
+        return float(self.lines_hz[0]), float(self.lines_hz[-1])
+
+    @property
+    def period_s(self) -> float:
+        """Period between the ramps [s]."""
+        return self.length_s
+
+    def _ticks(self, rate_hz: float) -> tuple[int, int]:
+        """Ticks in a period and in a ramp."""
+        exact = self.length_s * rate_hz
+        if abs(exact - round(exact)) > 1e-6:
+            raise PlanError(
+                f"Multisine.length_s is {self.length_s} s, {exact:.3f} ticks at {rate_hz:g} Hz; "
+                f"a period must be whole ticks, for instance {round(exact) / rate_hz:g} s."
+            )
+        return round(exact), round(self.ramp_s * rate_hz)
+
+    def one_period(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
+        """One period at the ticks, scaled to the amplitude [rad], shape (length_s * rate_hz,).
+
+        Raises:
+            PlanError: A line lies at or above half the rate, or the period is not whole ticks.
+        """
+        ticks, _ = self._ticks(rate_hz)
+        numbers = np.array(self.harmonic_numbers)
+        if 2 * numbers[-1] >= ticks:
+            raise PlanError(
+                f"Multisine: the line at {self.lines_hz[-1]:g} Hz does not lie below half the rate "
+                f"of the commands ({0.5 * rate_hz:g} Hz)."
+            )
+        phases = np.random.default_rng(self.seed).uniform(
+            0.0, 2.0 * np.pi, (self.draws, len(numbers))
+        )
+        spectrum = np.zeros((self.draws, ticks // 2 + 1), dtype=complex)
+        spectrum[:, numbers] = numbers**-self.tilt * np.exp(1j * phases)
+        waves = np.fft.irfft(spectrum, ticks, axis=1)
+        crest = np.abs(waves).max(axis=1) / np.sqrt((waves**2).mean(axis=1))
+        best = waves[np.argmin(crest)]
+        return np.asarray(self.amplitude * best / np.abs(best).max())
+
+    def _samples(self, rate_hz: float) -> Array:
+        ticks, ramp = self._ticks(rate_hz)
+        count = self.periods * ticks
+        # Run the period on into both ramps, so that no phase jumps where they meet.
+        index = np.arange(-ramp, count + max(ramp, 1)) % ticks
+        return np.asarray(self.one_period(rate_hz)[index] * ramps(len(index), ramp))
+
+    def _frequency(self, rate_hz: float) -> Array:
+        ticks, ramp = self._ticks(rate_hz)
+        return np.full(self.periods * ticks + ramp + max(ramp, 1), np.nan)
+
+
+def odd_harmonics(low_hz: float, high_hz: float, period_s: float, lines: int) -> tuple[int, ...]:
+    """Odd multiples of `1 / period_s` nearest to a logarithmic grid between two frequencies."""
+    slack = 1e-9
+    lowest = 2 * int(np.ceil((low_hz * period_s * (1.0 - slack) - 1.0) / 2.0)) + 1
+    highest = 2 * int(np.floor((high_hz * period_s * (1.0 + slack) - 1.0) / 2.0)) + 1
+    wanted = np.geomspace(low_hz, high_hz, lines) * period_s
+    odd = 2 * np.round((wanted - 1.0) / 2.0).astype(int) + 1
+    if lowest > highest:
+        return ()
+    return tuple(int(h) for h in np.unique(np.clip(odd, lowest, highest)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SineSteps(Signal):
+    """One sine after another, each held until the joint has settled and then measured.
+
+    Each frequency is moved to the nearest one of which `measure_cycles` are whole ticks; the
+    phase runs on from step to step, so the command never jumps. The ramps lie before the first
+    step and after the last and have no frequency of their own (NaN).
+    """
+
+    kind = "sine_steps"
+
+    frequencies_hz: tuple[float, ...] = tuple(
+        float(f) for f in np.round(np.geomspace(0.5, 20.0, 16), 3)
+    )
+    settle_cycles: int = 3
+    """Cycles before the measurement, and at least `settle_s`."""
+    settle_s: float = 0.5
+    measure_cycles: int = 5
+    """Cycles measured, and at least `measure_s`."""
+    measure_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive("settle_cycles", "measure_cycles")
+        bad = [f for f in self.frequencies_hz if not (np.isfinite(f) and f > 0.0)]
+        if bad or not self.frequencies_hz:
+            raise PlanError(
+                f"SineSteps.frequencies_hz are {self.frequencies_hz}; expected positive numbers."
+            )
+        for name in ("settle_s", "measure_s"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise PlanError(f"SineSteps.{name} is {getattr(self, name)}; expected 0 or more.")
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency asked [Hz]."""
+        return min(self.frequencies_hz), max(self.frequencies_hz)
+
+    def windows(self, rate_hz: float = POLICY_RATE_HZ) -> tuple[tuple[int, int, float], ...]:
+        """First tick, end tick and exact frequency [Hz] of each measurement, whole cycles.
+
+        Raises:
+            PlanError: A frequency does not lie below half the rate.
+        """
+        if max(self.frequencies_hz) >= 0.5 * rate_hz:
+            raise PlanError(
+                f"SineSteps asks {max(self.frequencies_hz):g} Hz, but commands at {rate_hz:g} Hz "
+                f"stay below {0.5 * rate_hz:g} Hz; lower the highest frequency."
+            )
+        windows, tick = [], round(self.ramp_s * rate_hz)
+        for wanted in self.frequencies_hz:
+            cycles = max(self.measure_cycles, int(np.ceil(self.measure_s * wanted)))
+            measured = round(cycles * rate_hz / wanted)
+            exact = cycles * rate_hz / measured
+            settle = int(np.ceil(max(self.settle_cycles / exact, self.settle_s) * rate_hz))
+            windows.append((tick + settle, tick + settle + measured, exact))
+            tick += settle + measured
+        return tuple(windows)
+
+    def _frequency(self, rate_hz: float) -> Array:
+        windows = self.windows(rate_hz)
+        ramp = round(self.ramp_s * rate_hz)
+        frequency = np.full(windows[-1][1] + max(ramp, 1), np.nan)
+        begin = ramp
+        for _, end, exact in windows:
+            frequency[begin:end] = exact
+            begin = end
+        return frequency
+
+    def _samples(self, rate_hz: float) -> Array:
+        windows, frequency = self.windows(rate_hz), self.frequency(rate_hz)
+        # The first and the last sine run on into the ramps.
+        frequency[: windows[0][0]] = windows[0][2]
+        frequency[windows[-1][1] :] = windows[-1][2]
+        turns = np.concatenate(([0.0], np.cumsum(frequency)[:-1] / rate_hz))
+        window = ramps(len(turns), round(self.ramp_s * rate_hz))
+        return np.asarray(self.amplitude * np.sin(2.0 * np.pi * turns) * window)

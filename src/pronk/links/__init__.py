@@ -1,0 +1,1 @@
+"""Links to machines: states and commands over LCM and DDS."""

@@ -1,0 +1,185 @@
+"""Unitree's services: a question and its answer on two topics, in JSON.
+
+A request carries an id of its own and the number of a function (`api_id`); the response carries
+both again, and a code, 0 for done. `motion_switcher` (1001 CheckMode, 1003 ReleaseMode) says which
+of the robot's own controllers holds the joints, and makes it let go. Older firmware has
+`robot_state` (1001 ServiceSwitch) instead.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from pronk.errors import HardwareError
+from pronk.links.dds import idl
+from pronk.links.dds.address import Participant, take
+
+SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
+STATES, SERVICE_SWITCH = "robot_state", 1001
+BENCH, CLAMP = "pronk_bench", 1
+"""Of the virtual robot alone: whoever is at its bench asks for clamps."""
+
+DONE, UNKNOWN_API, BAD_PARAMETER = 0, 3203, 3204
+"""Codes of a response; the errors are unitree_sdk2's for a function that there is not, and for a
+parameter that cannot be."""
+
+_POLL_S = 0.002
+_RELEASE_TRIES, _RELEASE_PAUSE_S = 10, 0.2
+
+Answer = Callable[[int, Any], tuple[int, Any]]
+"""From a function's number and its parameter to the code and what is answered."""
+
+
+class Client:
+    """Who asks a service."""
+
+    def __init__(self, participant: Participant, service: str) -> None:
+        """Prepare to ask; nothing is sent."""
+        self._service = service
+        self._requests = participant.writer(f"rt/api/{service}/request", idl.Request)
+        self._responses = participant.reader(f"rt/api/{service}/response", idl.Response)
+
+    def ask(self, api_id: int, parameter: Any, *, timeout_s: float = 2.0) -> Any | None:
+        """Ask, and ask again while there is no answer.
+
+        Args:
+            api_id: Number of the function.
+            parameter: What JSON can hold.
+            timeout_s: How long to try in all [s].
+
+        Returns:
+            What was answered; None if nothing was.
+
+        Raises:
+            HardwareError: The service answered with another code than 0.
+        """
+        identity = idl.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
+        header = idl.RequestHeader(
+            identity=identity,
+            lease=idl.RequestLease(id=0),
+            policy=idl.RequestPolicy(priority=0, noreply=False),
+        )
+        request = idl.Request(header=header, parameter=json.dumps(parameter), binary=[])
+        end = time.monotonic() + timeout_s
+        again = -1.0
+        while time.monotonic() < end:
+            if time.monotonic() >= again and self._requests.get_matched_subscriptions():
+                self._requests.write(request)
+                again = time.monotonic() + timeout_s / 4
+            for response in take(self._responses, Counter()):
+                if response.header.identity == identity:
+                    return self._answer(api_id, response)
+            time.sleep(_POLL_S)
+        return None
+
+    def _answer(self, api_id: int, response: Any) -> Any:
+        code = response.header.status.code
+        if code != DONE:
+            raise HardwareError(
+                f"the robot's service {self._service} answered {code} to function {api_id}, "
+                "expected 0; switch by the robot's own remote or app instead."
+            )
+        try:
+            return json.loads(response.data or "null") or {}
+        except ValueError:
+            raise HardwareError(
+                f"the robot's service {self._service} answered {response.data[:60]!r} to function "
+                f"{api_id}, expected JSON; is its firmware one that pronk knows?"
+            ) from None
+
+
+class Server:
+    """Who answers for a service: the virtual robot. One thread, never blocks, never raises."""
+
+    def __init__(
+        self, participant: Participant, service: str, answer: Answer, counts: Counter[str]
+    ) -> None:
+        """Begin to listen.
+
+        Args:
+            participant: Whose.
+            service: Its name.
+            answer: What to answer.
+            counts: Where refused requests are counted.
+        """
+        self._requests = participant.reader(f"rt/api/{service}/request", idl.Request)
+        self._responses = participant.writer(f"rt/api/{service}/response", idl.Response)
+        self._reply = answer
+        self._counts = counts
+
+    def poll(self) -> None:
+        """Answer what has come."""
+        for request in take(self._requests, self._counts):
+            identity = request.header.identity
+            try:
+                parameter = json.loads(request.parameter or "null")
+            except (ValueError, RecursionError):
+                code, data = BAD_PARAMETER, None
+            else:
+                code, data = self._reply(identity.api_id, parameter)
+            if code != DONE:
+                self._counts["refused: request"] += 1
+            status = idl.ResponseStatus(code=code)
+            header = idl.ResponseHeader(identity=identity, status=status)
+            text = "" if data is None else json.dumps(data)
+            self._responses.write(idl.Response(header=header, data=text, binary=[]))
+
+
+def own_controller(participant: Participant, *, release: bool, timeout_s: float = 2.0) -> str:
+    """See that none of the robot's own controllers holds the joints.
+
+    Args:
+        participant: Who asks.
+        release: Make it let go if one does. A standing robot falls then.
+        timeout_s: How long the robot is given to answer each question [s].
+
+    Returns:
+        The name of the one that was made to let go; empty if none had to be.
+
+    Raises:
+        HardwareError: One holds them and may not be, or could not be, released; or the robot
+            does not answer.
+    """
+    switcher = Client(participant, SWITCHER)
+    answer = switcher.ask(CHECK_MODE, {}, timeout_s=timeout_s)
+    if answer is None:
+        if release and _switched_off(participant, timeout_s):
+            return "sport_mode"
+        raise HardwareError(
+            f"the robot did not answer on its service {SWITCHER} within {timeout_s:g} s, so it is "
+            "not known whether its own controller is off; check the network, and its firmware."
+        )
+    held = name = _name(answer)
+    for _ in range(_RELEASE_TRIES if release else 0):
+        if not name:
+            break
+        switcher.ask(RELEASE_MODE, {}, timeout_s=timeout_s)
+        time.sleep(_RELEASE_PAUSE_S)
+        name = _name(switcher.ask(CHECK_MODE, {}, timeout_s=timeout_s))
+    if name and release:
+        raise HardwareError(
+            f"the robot's own controller {name!r} did not let go of the joints after "
+            f"{_RELEASE_TRIES} requests; switch it off by the robot's app."
+        )
+    if name:
+        raise HardwareError(
+            f"the robot's own controller {name!r} holds the joints; lay the robot down or hang it "
+            "up, and have the controller released (--release)."
+        )
+    return held
+
+
+def _name(answer: Any) -> str:
+    name = answer.get("name", "") if isinstance(answer, dict) else ""
+    return name if isinstance(name, str) else str(name)
+
+
+def _switched_off(participant: Participant, timeout_s: float) -> bool:
+    """Ask older firmware to end its sport mode; whether it answered."""
+    states = Client(participant, STATES)
+    parameter = {"name": "sport_mode", "switch": 0}
+    return states.ask(SERVICE_SWITCH, parameter, timeout_s=timeout_s) is not None

@@ -1,0 +1,83 @@
+"""From the bytes of `rt/lowstate` to numbered states, and why some make none. No sockets.
+
+Unitree's states carry no number, but the robot's clock in milliseconds; at 500 Hz it tells how many
+states were lost on the way.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from pronk.links.dds.codec import TICKS_PER_S, JointMap, decode_state
+from pronk.links.lcm.message import RefusedError
+from pronk.links.machine import State
+
+STATE_RATE_HZ = 500.0
+"""Of `rt/lowstate`."""
+_TICKS_BACK = 1000
+"""A robot's clock that is this much earlier than the last was started again [ms]."""
+_TICKS_AHEAD = 500
+"""A robot's clock that runs ahead of this computer's by more than this between two states has
+jumped [ms]."""
+_LEAST_STEP_S = 1e-6
+
+
+class Intake:
+    """What has come of a robot's states so far."""
+
+    def __init__(self, joints: JointMap, counts: Counter[str]) -> None:
+        """Begin.
+
+        Args:
+            joints: Of the robot.
+            counts: Where everything met is counted: `states`, `out of order`, `clock jumps`,
+                `repeated` (the same to the last bit, as no live sensor is), `refused: REASON`.
+        """
+        self.counts = counts
+        self.virtual = False
+        """Whether the last state said that it is a virtual robot's."""
+        self.complaint = ""
+        """Why the last refused message was refused, one sentence."""
+        self._joints = joints
+        self._tick: int | None = None
+        self._time = -float("inf")
+        self._sequence = -1
+        self._measured = b""
+
+    def take(self, data: bytes, arrived: float) -> State | None:
+        """The state that a message brings, if it brings one. Never raises.
+
+        Args:
+            data: What came, whatever it is.
+            arrived: When, on the local clock [s]. States that came together are put 1 us apart.
+        """
+        try:
+            return self._take(data, arrived)
+        except RefusedError as error:
+            self.counts[f"refused: {error.reason}"] += 1
+            self.complaint = str(error).rstrip(".")
+            return None
+
+    def _take(self, data: bytes, arrived: float) -> State | None:
+        said = decode_state(self._joints, data)
+        steps = 1
+        if self._tick is not None:
+            ahead = (said.tick - self._tick + 2**31) % 2**32 - 2**31
+            if -_TICKS_BACK < ahead <= 0:
+                self.counts["out of order"] += 1
+                return None
+            if ahead < 0 or ahead > 1e3 * (arrived - self._time) + _TICKS_AHEAD:
+                self.counts["clock jumps"] += 1
+            else:
+                steps = max(1, round(ahead * STATE_RATE_HZ / TICKS_PER_S))
+        arrived = max(arrived, self._time + _LEAST_STEP_S)
+        state = said.state(time=arrived, sequence=self._sequence + steps)
+        self._tick, self._time, self._sequence = said.tick, arrived, state.sequence
+        measured = said.measured
+        if measured == self._measured:
+            self.counts["repeated"] += 1
+            return None
+        self._measured = measured
+        self.virtual = said.virtual
+        self.counts["states"] += 1
+        return state

@@ -1,0 +1,339 @@
+"""What a simulation is held against: a measured response and the way to it from positions.
+
+With the command given, the H1 estimate is linear in the position, `response = position @ matrix`,
+so the simulated positions of a whole grid become responses in one product, through the very
+windows and segments that the log went through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import IdentifiabilityError, LogError
+from pronk.logs.joint_log import SweepLog
+from pronk.match.settings import MatchSettings
+from pronk.response.estimate import estimate, log_rate, questions
+from pronk.response.estimator import Estimator
+from pronk.response.operator import H1Operator
+from pronk.response.periodic import multisine_operator
+from pronk.response.response import FrequencyResponse
+from pronk.robots.robot import Robot
+from pronk.simulators.command_trace import Question, question
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+DB = 20.0 / np.log(10.0)
+"""Decibels per neper: `20 log10(gain) = DB * log(gain)`."""
+FLOOR_DB = 0.1
+"""Smallest believed deviation of a measured gain [dB]. Coherence near 1 would otherwise let a few
+frequencies outvote the band, though the model itself is not better than this."""
+_TAIL = 2e-4
+"""Absolute error of gain that leaving out the end of the log would cause in a joint that follows
+its command: 0.002 dB at gain 1. Over the paper's grid it was 0.001 dB; nodes differ by 0.02 dB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A joint's measured response at one amplitude, ready to be compared with simulations."""
+
+    question: Question
+    sign: float
+    """Between this joint's coordinate and that of the joint simulated in its place."""
+    measured: FrequencyResponse
+    matrix: ComplexArray
+    """From position about the pose at the start of each step to response, shape (steps, f)."""
+    inside: NDArray[np.bool_]
+    """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
+    heard: Array
+    """The part of `matrix` that the fit needs, real and imaginary columns side by side (one real
+    product is faster than one of complex numbers), shape (steps heard, 2 inside). The estimator
+    hears nothing of the frequencies inside after these steps, so they need not be simulated."""
+
+    doubts: tuple[str, ...] = ()
+    """What could not be used beside it."""
+
+    @property
+    def joint(self) -> str:
+        """The joint asked."""
+        return self.question.joint
+
+    @property
+    def omega(self) -> Array:
+        """Angular frequencies of the fit [rad/s], shape (inside,)."""
+        return self.measured.omega[self.inside]
+
+    @property
+    def steps(self) -> int:
+        """Steps that the fit needs."""
+        return len(self.heard)
+
+    def answer(self, position: Array) -> ComplexArray:
+        """Response at the frequencies inside, in this joint's coordinate.
+
+        Args:
+            position: Of the joint simulated, about the pose, shape (..., at least `steps`) [rad].
+
+        Returns:
+            Shape (..., inside).
+        """
+        # A constant is no answer; without it nothing is cut off where the steps end at rest.
+        moved = position[..., : self.steps] - position[..., :1]
+        pair = moved @ self.heard
+        half = pair.shape[-1] // 2
+        return np.asarray(self.sign * (pair[..., :half] + 1j * pair[..., half:]))
+
+    def whole_answer(self, position: Array) -> ComplexArray:
+        """Response at all frequencies, shape (..., f), for positions of shape (..., all steps)."""
+        position = position[..., : len(self.matrix)]
+        # Two real products: a mixed one would first turn the positions complex.
+        return np.asarray(
+            self.sign * (position @ self.matrix.real + 1j * (position @ self.matrix.imag))
+        )
+
+    def deviation_db(self) -> Array:
+        """Standard deviation of the measured gain from its coherence [dB], shape (inside,).
+
+        `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
+        eq. 9.90), in dB, not below `FLOOR_DB`.
+        """
+        coherence = np.clip(self.measured.coherence[self.inside], 1e-9, 1.0)
+        averages = np.maximum(self.measured.averages[self.inside], 1.0)
+        relative = np.sqrt((1.0 - coherence) / (2.0 * averages * coherence))
+        return np.asarray(np.hypot(DB * relative, FLOOR_DB))
+
+    def error_db(self, simulated: ComplexArray) -> Array:
+        """Gain of a simulation over the measured one, inside the band [dB], shape (..., inside).
+
+        Args:
+            simulated: Response, shape (..., inside).
+        """
+        measured = np.abs(self.measured.response[self.inside])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(DB * (np.log(np.abs(simulated)) - np.log(measured)))
+
+
+def logs_by_joint(logs: Sequence[SweepLog], robot: Robot) -> dict[str, list[SweepLog]]:
+    """Which logs ask which joint, joints in the robot's order.
+
+    Raises:
+        LogError: No log asks any joint.
+        RobotError: A log asks a joint that the robot has not.
+    """
+    where: dict[str, list[SweepLog]] = {}
+    for log in logs:
+        names = {name for segment in log.segments for name in segment.joints}
+        # A log that does not say whom it asked asked those whose command moves.
+        for i, name in enumerate(log.joints):
+            if name in names or (not log.segments and np.ptp(log.command[:, i]) > 0.0):
+                where.setdefault(name, []).append(log)
+    for name in where:
+        robot.joint(name)
+    if not where:
+        raise LogError(
+            f"{len(logs)} logs ask no joint; expected questions to some of "
+            f"{', '.join(robot.joint_names)}."
+        )
+    return {name: where[name] for name in robot.joint_names if name in where}
+
+
+def gains_on_drive(log: SweepLog, joint: str, robot: Robot) -> tuple[float, float]:
+    """Stiffness and damping on the real drive: the log's if it has them, else the robot's."""
+    known, column = robot.joint(joint), log.column(joint)
+    return (
+        known.stiffness if log.stiffness is None else float(log.stiffness[column]),
+        known.damping if log.damping is None else float(log.damping[column]),
+    )
+
+
+def targets(
+    log: SweepLog,
+    joint: str,
+    robot: Robot,
+    settings: MatchSettings,
+    *,
+    band_hz: tuple[float, float] | None = None,
+) -> list[Target]:
+    """Estimate a joint's responses and prepare each for comparison, largest amplitude first.
+
+    Sine steps are left out: they are read step by step and have no single matrix.
+
+    Args:
+        log: The log.
+        joint: The joint; the log must hold questions to it.
+        robot: The robot.
+        settings: Estimator and coherence limit.
+        band_hz: Frequencies to compare; the joint's band if not given.
+
+    Raises:
+        LogError: The joint was not asked or did not move, or its unit is unknown.
+        IdentifiabilityError: Too little of the band is coherent at the largest amplitude.
+    """
+    chosen = tuple(segment for segment in log.segments if segment.kind != "sine_steps")
+    if log.segments:
+        if not any(joint in segment.joints for segment in chosen):
+            raise LogError(
+                f"{log.source or 'log'}: {joint} was asked by sine steps alone; match a chirp or a "
+                "multisine, and keep the steps to check it."
+            )
+        log = replace(log, segments=chosen)
+    measured = estimate(log, joint, settings.estimator)
+    parts = questions(log, joint)
+    rate_hz = log_rate([part for repeats in parts for part in repeats])
+    found: list[Target] = []
+    doubts: list[str] = []
+    for repeats, response in zip(parts, measured, strict=True):
+        operator = _operator(repeats[0], joint, settings.estimator, rate_hz)
+        try:
+            found.append(target(repeats[0], operator, response, robot, settings, band_hz=band_hz))
+        except IdentifiabilityError as error:
+            # The largest amplitude must be usable; a smaller one only checks it.
+            if not found:
+                raise
+            doubts.append(f"the answer at {response.amplitude:.3g} rad is left out: {error}")
+    found[0] = replace(found[0], doubts=tuple(doubts))
+    return found
+
+
+def _operator(part: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
+    """The estimate of one question as a matrix; repeats need one between them."""
+    segment, command = part.segments[0], part.command[:, part.column(joint)]
+    if segment.kind == "multisine" and segment.period_s is not None:
+        return multisine_operator(part.time, command, segment.period_s, estimator, rate_hz=rate_hz)
+    return H1Operator.build(part.time, command, estimator, rate_hz=rate_hz)
+
+
+def target(
+    part: SweepLog,
+    operator: H1Operator,
+    measured: FrequencyResponse,
+    robot: Robot,
+    settings: MatchSettings,
+    *,
+    band_hz: tuple[float, float] | None = None,
+) -> Target:
+    """Prepare the comparison of one measured response.
+
+    Args:
+        part: The question, one segment; of several repeats any one, their commands being the same.
+        operator: The estimate of that question as a matrix.
+        measured: The response.
+        robot: The robot.
+        settings: Coherence limit.
+        band_hz: Frequencies to compare; the joint's band if not given.
+
+    Raises:
+        LogError: The unit is unknown, or a clamped joint stood elsewhere.
+        IdentifiabilityError: Too little of the band is coherent, or the joint did not move.
+    """
+    joint = measured.joint
+    asked = question(part, part.segments[0], joint, robot)
+    matrix = operator.matrix(asked.time)
+    low, high = band_hz or robot.joint(joint).band_hz
+    inside = _inside(measured, low, high, settings, part.source or "log")
+    return Target(
+        question=asked,
+        sign=robot.joint(joint).original[1],
+        measured=measured,
+        matrix=matrix,
+        inside=inside,
+        heard=_heard(matrix, inside, asked.mirrored(robot)[2]),
+    )
+
+
+def merged(found: Sequence[Sequence[Target]]) -> list[Target]:
+    """Targets of one joint from several logs, repeats of the same question put together.
+
+    Args:
+        found: Targets of each log.
+
+    Returns:
+        One target an amplitude, largest first.
+    """
+    groups: dict[tuple[object, ...], list[Target]] = {}
+    for goal in (goal for row in found for goal in row):
+        measured = goal.measured
+        key = (round(measured.amplitude, 4), measured.estimator, len(measured.omega))
+        groups.setdefault(key, []).append(goal)
+    out = []
+    for goals in groups.values():
+        first = goals[0]
+        alike = [g for g in goals if np.allclose(g.measured.omega, first.measured.omega)]
+        if len(alike) < len(goals):
+            raise LogError(
+                f"{first.joint} was asked at {first.measured.amplitude:.3g} rad in several logs "
+                "whose responses have different frequencies; match them one at a time."
+            )
+        out.append(first if len(goals) == 1 else _together(goals))
+    return sorted(out, key=lambda goal: -goal.measured.amplitude)
+
+
+def _together(goals: Sequence[Target]) -> Target:
+    """One target from repeats in several logs, each log counting by its repeats."""
+    share = np.array([len(goal.measured.repeats) for goal in goals], dtype=np.float64)
+    share /= share.sum()
+    each = [goal.measured for goal in goals]
+    measured = replace(
+        each[0],
+        response=np.asarray(sum(w * r.response for w, r in zip(share, each, strict=True))),
+        coherence=np.asarray(sum(w * r.coherence for w, r in zip(share, each, strict=True))),
+        averages=np.asarray(sum(r.averages for r in each)),
+        repeats=np.concatenate([r.repeats for r in each]),
+        source=", ".join(dict.fromkeys(r.source for r in each)),
+    )
+    # Frequencies that any of the logs cannot be believed at are left out.
+    inside = np.logical_and.reduce([goal.inside for goal in goals])
+    first = goals[0]
+    kept = inside[first.inside]
+    heard = first.heard[:, np.concatenate([kept, kept])]
+    doubts = tuple(dict.fromkeys(doubt for goal in goals for doubt in goal.doubts))
+    return replace(first, measured=measured, inside=inside, heard=heard, doubts=doubts)
+
+
+def _inside(
+    measured: FrequencyResponse, low: float, high: float, settings: MatchSettings, where: str
+) -> NDArray[np.bool_]:
+    """Frequencies of the band that can be believed; refuses a band that mostly cannot be."""
+    band = measured.band(low, high)
+    if int(band.sum()) < 3:
+        raise IdentifiabilityError(
+            f"{where}: {measured.joint} was answered at {int(band.sum())} frequencies between "
+            f"{low:g} and {high:g} Hz; the match needs at least 3, so ask for longer or higher."
+        )
+    coherent = measured.band(low, high, settings.coherence_min)
+    moved = np.abs(measured.response[band]).max()
+    if not moved > 1e-3:
+        raise IdentifiabilityError(
+            f"{where}: {measured.joint} did not move (largest gain {moved:.1e} between {low:g} and "
+            f"{high:g} Hz); check that its drive is on and that the column is the right one."
+        )
+    if 2 * int(coherent.sum()) < int(band.sum()):
+        raise IdentifiabilityError(
+            f"{where}: {measured.joint} is coherent (at least {settings.coherence_min:g}) at only "
+            f"{int(coherent.sum())} of {int(band.sum())} frequencies between {low:g} and {high:g} "
+            "Hz; repeat the sweep with a larger amplitude, a stiffer base or more repeats."
+        )
+    return coherent
+
+
+def _heard(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array) -> Array:
+    """Rows and columns of the matrix that the fit needs (`Target.heard`).
+
+    A chirp leaves the band long before it ends; the windows of the segments after that hold next
+    to nothing of the band's frequencies. The rows end where all remaining positions together move
+    no gain by `_TAIL`, judged by a joint that follows its command perfectly.
+
+    Args:
+        matrix: Shape (steps, f).
+        inside: Frequencies of the fit, shape (f,).
+        command: Command about the pose [rad], shape (steps,).
+    """
+    chosen = matrix[:, inside]
+    tail = np.abs(np.cumsum((chosen * command[:, None])[::-1], axis=0)[::-1]).max(axis=1)
+    loud = np.nonzero(tail > _TAIL)[0]
+    steps = min(int(loud[-1]) + 2, len(matrix)) if len(loud) else len(matrix)
+    return np.hstack([chosen[:steps].real, chosen[:steps].imag])

@@ -1,0 +1,1 @@
+"""The real-time loop: servo, safety filter, state machine, policy process and log."""

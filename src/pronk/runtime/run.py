@@ -1,0 +1,296 @@
+"""A deployment: its processes, and the operator's end of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import orjson
+
+from pronk import __version__
+from pronk.errors import HardwareError, LogError, PronkError
+from pronk.links.terminal import Interrupts, unheard
+from pronk.policy.contract import check
+from pronk.policy.runtime import load_policy
+from pronk.runtime.events import Notice
+from pronk.runtime.logger import READY, write_log
+from pronk.runtime.operators import Operator, Stick
+from pronk.runtime.plan import Plan, Shared
+from pronk.runtime.policy_process import think
+from pronk.runtime.records import STICK, Mode, Wish
+from pronk.runtime.servo import serve
+from pronk.runtime.summary import Outcome
+
+_RATE_HZ = 50.0
+"""Of the operator's program."""
+_START_S = 30.0
+"""In which the servo must have opened the link."""
+_END_S = 10.0
+"""In which each process must have ended."""
+
+
+class Deployment:
+    """Runs the processes of a plan. A context manager; leaving it damps, then ends them all.
+
+    Attributes:
+        servo: The servo's process.
+        policy: The policy's.
+        logger: The logger's; None without a log.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Check what can be checked before any process starts.
+
+        Raises:
+            ArtefactError: The policy cannot be read, or is not for this robot.
+            PronkError: ONNX Runtime is not installed.
+        """
+        policy = load_policy(plan.policy)
+        check(policy.contract, plan.robot)
+        plan.safety()
+        self.plan = plan
+        self.contract = policy.contract
+        self.policy_sha256 = policy.sha256
+        self.outcome = Outcome(trained_delay_s=policy.contract.delay_range_s)
+        self.servo: BaseProcess
+        self.policy: BaseProcess
+        self.logger: BaseProcess | None = None
+        self._stick = np.zeros((), dtype=STICK)
+        self._open = False
+        self._interrupts = Interrupts()
+
+    def __enter__(self) -> Self:
+        """Start everything.
+
+        Raises:
+            HardwareError: The link could not be opened.
+        """
+        plan, context = self.plan, get_context("spawn")
+        with unheard():
+            self.shared = Shared()
+        names = self.shared.names
+        trained = self.contract.delay_range_s
+        self.write(Stick())
+        self._servo_end, servo_end = context.Pipe(duplex=False)
+        self._policy_end, policy_end = context.Pipe(duplex=False)
+        self.servo = context.Process(
+            target=serve, args=(plan, names, trained, servo_end), name="pronk servo"
+        )
+        self.policy = context.Process(
+            target=think, args=(plan, names, policy_end), name="pronk policy"
+        )
+        if plan.log is not None:
+            talk, self._logger_end = context.Pipe()
+            self.logger = context.Process(
+                target=write_log, args=(plan.log, self._header(), names, talk), name="pronk log"
+            )
+        self._interrupts.__enter__()
+        self._open = True
+        try:
+            with unheard():
+                self.policy.start()
+                if self.logger is not None:
+                    self.logger.start()
+            if self.logger is not None:
+                self._await_logger(self.logger)
+            # Last: what it does from its first tick on has a listener.
+            with unheard():
+                self.servo.start()
+            for end in (servo_end, policy_end):
+                end.close()
+            self._await_servo()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Damp and end."""
+        self.close()
+
+    @property
+    def mode(self) -> Mode:
+        """What the servo is doing; `ENDED` too if its process is gone."""
+        if not self.servo.is_alive():
+            return Mode.ENDED
+        news = self.shared.news.read()
+        return Mode.IDLE if news is None else Mode(int(news["mode"]))
+
+    def notices(self) -> list[Notice]:
+        """What the servo has told since the last call; all of it is kept in the outcome too."""
+        found = [Notice.of(record) for record in self.shared.notices.take()]
+        self.outcome.notices += found
+        return found
+
+    def write(self, stick: Stick) -> None:
+        """Tell servo and policy what the operator wants. To be called at 50 Hz or so.
+
+        Raises:
+            KeyboardInterrupt: Somebody wants to end it; only ever here, and not while it closes.
+        """
+        if self._open:
+            self._interrupts.check()
+        record = self._stick
+        if stick.wish is not Wish.NONE:
+            record["wish"] = stick.wish
+            record["wishes"] += 1
+        record["time"] = time.monotonic()
+        record["held"], record["jump"] = stick.held, stick.jump
+        record["command"] = stick.command
+        self.shared.stick.write(record)
+
+    def fly(
+        self, operator: Operator, tell: Callable[[Notice], None] = lambda notice: None
+    ) -> Outcome:
+        """Let an operator have the stick until they leave or the servo ends.
+
+        Args:
+            operator: Says what is wanted, 50 times a second.
+            tell: Called with everything the servo has to say.
+        """
+        wake = time.monotonic()
+        while True:
+            for notice in self.notices():
+                operator.told(notice.kind, notice.text)
+                tell(notice)
+            mode = self.mode
+            if mode is Mode.ENDED:
+                break
+            try:
+                self.write(operator.stick(time.monotonic(), mode))
+            except KeyboardInterrupt:
+                self.outcome.interrupted = True
+                self.write(Stick(wish=Wish.QUIT))
+                operator.leave()
+            wake = max(wake + 1.0 / _RATE_HZ, time.monotonic())
+            time.sleep(max(0.0, wake - time.monotonic()))
+        for notice in self.notices():
+            tell(notice)
+        return self.outcome
+
+    def close(self) -> None:
+        """Damp, end all processes, finish the log; twice does no harm."""
+        if not self._open:
+            return
+        self._open = False
+        try:
+            if self.servo.pid is not None:
+                self._stop_servo()
+            self.outcome.servo = _received(self._servo_end)
+            if self.policy.pid is not None:
+                self.policy.terminate()
+                self.policy.join(_END_S)
+            self.outcome.policy = _received(self._policy_end)
+            self.notices()
+            if self.logger is not None and self.logger.pid is not None:
+                self._stop_logger(self.logger)
+        finally:
+            for process in (self.servo, self.policy, self.logger):
+                if process is not None and process.is_alive():
+                    process.kill()
+                    process.join()
+            self.shared.close()
+            self._interrupts.__exit__(None, None, None)
+
+    def _stop_servo(self) -> None:
+        """Ask it to damp and end, and keep asking: an operator who falls silent is a fault too."""
+        until = time.monotonic() + _END_S
+        self.write(Stick(wish=Wish.QUIT))
+        while self.servo.is_alive() and time.monotonic() < until:
+            self.servo.join(1.0 / _RATE_HZ)
+            self.write(Stick())
+        if self.servo.is_alive():
+            self.servo.terminate()
+            self.servo.join(_END_S)
+
+    def _stop_logger(self, logger: BaseProcess) -> None:
+        try:
+            self._logger_end.send_bytes(orjson.dumps(self.outcome.figures()))
+        except OSError:
+            return  # it was killed; what it flushed is there
+        logger.join(_END_S)
+
+    def _await_logger(self, logger: BaseProcess) -> None:
+        until = time.monotonic() + _START_S
+        while not self._logger_end.poll(0.05):
+            self.write(Stick())
+            if logger.exitcode is not None or time.monotonic() > until:
+                raise LogError(f"{self.plan.log}: the process that writes the log did not start.")
+        answer = self._logger_end.recv_bytes()
+        if answer != READY:
+            raise LogError(answer.decode())
+
+    def _await_servo(self) -> None:
+        until = time.monotonic() + _START_S
+        while self.shared.news.written == 0:
+            self.write(Stick())
+            self.servo.join(0.05)
+            self.notices()
+            if self.servo.exitcode is not None:
+                why = " ".join(self.outcome.refusals) or "its process ended without a word"
+                raise HardwareError(f"the link {self.plan.link.robot} was not opened: {why}")
+            if time.monotonic() > until:
+                raise HardwareError(
+                    f"the link was not open after {_START_S:.0f} s; check the robot and the cable."
+                )
+
+    def _header(self) -> dict[str, Any]:
+        import onnxruntime
+
+        robot, limits = self.plan.robot, self.plan.safety()
+        link = self.plan.link
+        return {
+            "robot": robot.name,
+            "joints": list(robot.joint_names),
+            "link": str(link),
+            "policy": {
+                "file": str(self.plan.policy),
+                "sha256": self.policy_sha256,
+                "gains": self.contract.gains,
+                "gains_sha256": self.contract.gains_sha256,
+                "delay_range_s": list(self.contract.delay_range_s),
+                "jump": self.contract.jump,
+                "virtual": self.contract.virtual,
+            },
+            "limits": {
+                name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, value in vars(limits).items()
+            },
+            "timing": vars(self.plan.timing),
+            "versions": {"pronk": __version__, "onnxruntime": onnxruntime.__version__},
+        }
+
+
+def _received(end: Connection) -> dict[str, Any]:
+    """What a process said when it ended; nothing if it could not."""
+    try:
+        if end.poll(1.0):
+            found: dict[str, Any] = orjson.loads(end.recv_bytes())
+            return found
+    except (EOFError, OSError):
+        pass
+    return {}
+
+
+def fly(plan: Plan, operator: Operator, tell: Callable[[Notice], None]) -> Outcome:
+    """Run a deployment from beginning to end.
+
+    Raises:
+        PronkError: It could not start.
+    """
+    with Deployment(plan) as deployment:
+        outcome = deployment.fly(operator, tell)
+    if not outcome.servo:
+        raise PronkError("the servo's process was killed; the robot's own watchdog had to stop it.")
+    return outcome

@@ -1,0 +1,229 @@
+"""The question a joint was asked, as the training simulator will be asked it.
+
+The log says which command was in force at each measured instant; the simulator holds a command
+for whole physics steps, and a policy's command for `decimation` of them. The jitter of the
+timestamps (tens of microseconds) must not move a command by a whole step, so the instants at
+which the command was seen to change are fitted by the clock of the policy, and the command is
+read in the middle of each tick of that clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import LogError
+from pronk.logs.joint_log import Segment, SweepLog
+from pronk.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+_OFF_CLOCK = 0.25
+"""Largest median distance of a change from the policy's clock, as a share of a tick, with which
+the command is still taken for one held at the policy's rate."""
+_SAME = 1e-6
+"""Commands closer than this are the same question [rad]: far below an encoder count."""
+_POSE_SLACK = 0.05
+"""How far a clamped joint may be from where the bench model clamps it [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """One command to one joint, at every physics step of the training simulator."""
+
+    joint: str
+    """The joint that was asked."""
+    start: float
+    """Instant of the first step, on the clock of the log [s]."""
+    timestep: float
+    """Physics step [s]."""
+    command: Array
+    """Target position in force during each step [rad], shape (steps,)."""
+    pose: Array
+    """Position that every joint of the robot is held at, robot's order [rad], shape (joints,)."""
+    amplitude: float = float("nan")
+    """Peak of the command about the pose [rad]."""
+    policy_held: bool = True
+    """True if the command was found to be held at the policy's rate."""
+
+    @property
+    def time(self) -> Array:
+        """Start of each step, on the clock of the log [s], shape (steps,)."""
+        return np.asarray(self.start + self.timestep * np.arange(len(self.command)))
+
+    def mirrored(self, robot: Robot) -> tuple[str, float, Array]:
+        """The joint to simulate, the sign between them, and the command about its own centre.
+
+        Returns:
+            Name of the original joint, sign, and `sign * (command - pose)` [rad], shape (steps,).
+        """
+        name, sign = robot.joint(self.joint).original
+        centre = self.pose[robot.joint_names.index(self.joint)]
+        return name, sign, np.asarray(sign * (self.command - centre))
+
+    def same_as(self, other: Question, robot: Robot, *, sign: float = 1.0) -> bool:
+        """True if both lead to the same simulation of the same original joint.
+
+        One may rest longer than the other at the end. The pose of the joints of the chain must
+        agree as well, mirrored.
+
+        Args:
+            other: The question to compare with.
+            robot: The robot.
+            sign: With -1, true if the other way round they would.
+        """
+        mine, theirs = self.mirrored(robot), other.mirrored(robot)
+        if mine[0] != theirs[0]:
+            return False
+        short, long = sorted((mine[2], sign * theirs[2]), key=len)
+        return (
+            bool(np.abs(long[: len(short)] - short).max() < _SAME)
+            and bool(np.abs(long[len(short) :] - short[-1]).max(initial=0.0) < _SAME)
+            and np.allclose(original_pose(self, robot), original_pose(other, robot), atol=1e-3)
+        )
+
+
+def original_pose(question: Question, robot: Robot) -> Array:
+    """Pose of the original joint's chain that mirrors the question's pose [rad], shape (chain,)."""
+    asked = robot.joint(question.joint)
+    original = robot.joint(asked.original[0])
+    index = {name: i for i, name in enumerate(robot.joint_names)}
+    pose = []
+    # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
+    for own, first in zip(asked.chain, original.chain, strict=True):
+        sign = robot.joint(own).original[1] * robot.joint(first).original[1]
+        pose.append(sign * question.pose[index[own]])
+    return np.array(pose)
+
+
+def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float]:
+    """Phase of the clock on which a held command changes.
+
+    Args:
+        time: Measured timestamps [s], shape (n,).
+        command: Command in force at each [rad], shape (n,).
+        tick: Period of the clock [s].
+
+    Returns:
+        An instant at which a tick begins [s], and the median distance of the changes from the
+        ticks as a share of `tick` (0.25 is what changes at random instants give). A command that
+        never changes begins at the first timestamp, at distance 0.
+    """
+    changes = time[1:][np.diff(command) != 0.0]
+    if len(changes) == 0:
+        return float(time[0]), 0.0
+    # Circular mean: the phase that all changes share, whatever ticks lie between them.
+    turns = np.exp(2j * np.pi * (changes - time[0]) / tick)
+    phase = float(np.angle(turns.mean())) / (2.0 * np.pi) * tick
+    distance = (changes - time[0] - phase) / tick
+    distance -= np.round(distance)
+    # Jitter must not split the first tick: let the clock begin at the change nearest the start.
+    return float(time[0] + phase), float(np.median(np.abs(distance)))
+
+
+def held(time: Array, command: Array, instants: Array) -> Array:
+    """Command in force at given instants (the last one logged at or before each)."""
+    index = np.searchsorted(time, instants, side="right") - 1
+    return np.asarray(command[np.clip(index, 0, len(time) - 1)])
+
+
+def question(
+    log: SweepLog, segment: Segment, joint: str, robot: Robot, *, until: float | None = None
+) -> Question:
+    """What the simulator must be asked to repeat one segment of a log.
+
+    Args:
+        log: The log.
+        segment: The part of it to repeat.
+        joint: The joint whose command is taken; the rest are held at the pose.
+        robot: Gives the policy's rate, the physics step and the default pose.
+        until: Stop at this instant [s]; the segment's end if not given.
+
+    Raises:
+        LogError: The joint was not asked in the segment, its unit is unknown, or a joint that is
+            clamped in the bench model stood elsewhere.
+    """
+    where = log.source or "log"
+    if joint not in segment.joints:
+        raise LogError(
+            f"{where}: {joint} is not asked between {segment.start:.3f} and {segment.stop:.3f} s; "
+            f"{', '.join(segment.joints)} are."
+        )
+    if log.unit(joint) != "rad":
+        raise LogError(
+            f"{where}: {joint} is in unit {log.unit(joint)!r}; the simulator needs radians, so "
+            "give the scale to the reader."
+        )
+    part = log.cut(segment)
+    command = part.command[:, part.column(joint)]
+    tick = robot.timestep_s * robot.decimation
+    clock, distance = policy_clock(part.time, command, tick)
+    on_clock = distance <= _OFF_CLOCK * 0.6
+    # Begin with the tick in which the log begins, so that ticks and steps stay aligned.
+    start = (
+        clock + np.floor((part.time[0] - clock) / tick + 0.5) * tick if on_clock else part.time[0]
+    )
+    end = part.time[-1] if until is None else min(until, float(part.time[-1]))
+    if on_clock:
+        ticks = int(np.ceil((end - start) / tick))
+        middle = start + (np.arange(ticks) + 0.5) * tick
+        values = held(part.time, command, middle)
+        early = _early_ticks(values)
+        start -= early * tick
+        steps = np.repeat(np.concatenate([np.full(early, values[0]), values]), robot.decimation)
+    else:
+        count = int(np.ceil((end - start) / robot.timestep_s))
+        middle = start + (np.arange(count) + 0.5) * robot.timestep_s
+        steps = held(part.time, command, middle)
+    return Question(
+        joint=joint,
+        start=float(start),
+        timestep=robot.timestep_s,
+        command=steps,
+        pose=_pose(part, joint, robot),
+        amplitude=segment.amplitude,
+        policy_held=bool(on_clock),
+    )
+
+
+def _early_ticks(values: Array) -> int:
+    """Ticks to begin before the log, so that repeats of a question begin alike.
+
+    Whether the log caught the tick it began in is chance; a rest before the first change is
+    therefore lengthened to a multiple of five ticks. A log that begins in motion is left alone.
+    """
+    changes = np.nonzero(np.diff(values) != 0.0)[0]
+    rest = int(changes[0]) + 1 if len(changes) else len(values)
+    # Plans rest for multiples of five ticks (0.1 s) give or take one: keep clear of those.
+    return 0 if rest < 2 else -(-(rest + 2) // 5) * 5 - rest
+
+
+def _pose(log: SweepLog, joint: str, robot: Robot) -> Array:
+    """Pose of every joint of the robot.
+
+    The log's; where it has none, the first command of each of its joints, and the default
+    position of joints that it does not have.
+    """
+    pose = np.array([j.default_position for j in robot.joints])
+    logged = log.command[0] if log.pose is None else log.pose
+    for i, name in enumerate(robot.joint_names):
+        if name in log.joints and log.unit(name) == "rad":
+            pose[i] = logged[log.column(name)]
+    for name in robot.joint(joint).clamped:
+        default = robot.joint(name).default_position
+        stood = pose[robot.joint_names.index(name)]
+        if abs(stood - default) > _POSE_SLACK:
+            raise LogError(
+                f"{log.source or 'log'}: {name} was clamped at {stood:.3f} rad while {joint} was "
+                f"asked; the bench model of {robot.name} clamps it at {default:.3f} rad."
+            )
+    return pose
+
+
+def asked(log: SweepLog, joint: str) -> list[Segment]:
+    """Segments in which a joint was asked, largest amplitude first, then by repeat."""
+    found = [segment for segment in log.segments if joint in segment.joints]
+    # NaN amplitudes (imported logs that do not say) keep the order of the log.
+    return sorted(found, key=lambda s: (-np.nan_to_num(s.amplitude), s.repeat, s.start))

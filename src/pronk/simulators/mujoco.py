@@ -1,0 +1,285 @@
+"""The training simulator, asked the way a joint was asked on the bench.
+
+The model is `pronk.robots.model.bench_spec`: fixed base, the joint's own chain, explicit PD at the
+start of each 5 ms step, clipped by the torque-speed curve. One native MuJoCo model holds all of
+it, so `mujoco.rollout` runs thousands of gain pairs on its threads with no Python in the loop,
+and the trajectories are those of the training environment (held by a test of the robots' room).
+
+Only the asked joint's position is kept (a `jointpos` sensor, read at the start of each step);
+the other state columns are never stored. A joint that mirrors another is simulated as that other
+(`Joint.original`), so mirror-image legs cost one simulation.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pronk.errors import RobotError
+from pronk.robots.model import bench_spec, set_drive_gains
+from pronk.robots.robot import Robot
+from pronk.simulators.command_trace import Question, original_pose
+
+Array = NDArray[np.float64]
+
+CHUNK = 100
+"""Simulations in flight at once: 100 x 5,000 steps x 3 commands are 12 MB."""
+_SAG_ROUNDS = 4
+"""Rounds of `q = target - gravity(q) / stiffness`; each gains two digits at 17 N m/rad."""
+
+
+@dataclass
+class Count:
+    """Physics steps done and the wall time they took, to report steps per second."""
+
+    steps: int = 0
+    seconds: float = 0.0
+
+    @property
+    def rate(self) -> float:
+        """Physics steps per second; NaN before the first."""
+        return self.steps / self.seconds if self.seconds > 0.0 else float("nan")
+
+
+class Bench:
+    """One joint on the bench, ready to be asked with many gain pairs.
+
+    Built for the original of a mirrored family; positions and commands are about the pose, in
+    the original's own sign.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        joint: str,
+        *,
+        armature: float | None = None,
+        frictionloss: float | None = None,
+        held_stiffness: Mapping[str, float] | None = None,
+        held_damping: Mapping[str, float] | None = None,
+        threads: int = 2,
+        chunk: int = CHUNK,
+    ) -> None:
+        """Compile the model.
+
+        Args:
+            robot: The robot.
+            joint: The joint to ask; the original of a mirrored family.
+            armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
+            frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+            held_stiffness: Gains of the joints that are held [N m/rad]; the robot's if not given.
+            held_damping: Gains of the joints that are held [N m s/rad]; the robot's if not given.
+            threads: Threads of the simulator.
+            chunk: Simulations in flight at once.
+        """
+        self.robot = robot
+        self.joint = robot.joint(joint)
+        spec = bench_spec(
+            robot,
+            joint,
+            stiffness=held_stiffness,
+            damping=held_damping,
+            armature=None if armature is None else {joint: armature},
+            frictionloss=None if frictionloss is None else {joint: frictionloss},
+        )
+        spec.add_sensor(
+            name="asked",
+            type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            objname=joint,
+        )
+        self.model = spec.compile()
+        self.chain = tuple(
+            mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_JOINT, i)
+            for i in range(self.model.njnt)
+        )
+        if joint not in self.chain:
+            raise RobotError(f"the bench model of {joint} holds {', '.join(self.chain)} instead.")
+        self.index = self.chain.index(joint)
+        self.threads = threads
+        self.chunk = chunk
+        self.count = Count()
+        self._stiffness = np.array(
+            [(held_stiffness or {}).get(name, robot.joint(name).stiffness) for name in self.chain]
+        )
+        self._sensor = int(self.model.sensor_adr[self.model.sensor("asked").id])
+        # One actuator a joint; map joint order to the columns of ctrl.
+        self._ctrl = np.array([self.model.actuator(name).id for name in self.chain])
+        self._models: list[mujoco.MjModel] = []
+        self._data = [mujoco.MjData(self.model) for _ in range(threads)]
+        self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._pool.close()
+
+    def pose(self, question: Question) -> Array:
+        """Where the chain of this model is held for a question [rad], shape (chain,)."""
+        chain = self.robot.joint(self.joint.name).chain or (self.joint.name,)
+        by_name = dict(zip(chain, original_pose(question, self.robot), strict=True))
+        return np.array(
+            [by_name.get(name, self.robot.joint(name).default_position) for name in self.chain]
+        )
+
+    @property
+    def actuator(self) -> int:
+        """Column of the asked joint's command."""
+        return int(self._ctrl[self.index])
+
+    def control(self, pose: Array) -> Array:
+        """Commands that hold the chain at a pose [rad], shape (actuators,)."""
+        out = np.zeros(self.model.nu)
+        out[self._ctrl] = pose
+        return out
+
+    def torque_model(self) -> mujoco.MjModel:
+        """A copy whose asked joint takes a torque [N m] and has no dry friction of its own."""
+        model = copy.copy(self.model)
+        i = self.actuator
+        model.actuator_gaintype[i] = mujoco.mjtGain.mjGAIN_FIXED
+        model.actuator_biastype[i] = mujoco.mjtBias.mjBIAS_NONE
+        model.actuator_dyntype[i] = mujoco.mjtDyn.mjDYN_NONE
+        model.actuator_gainprm[i] = 0.0
+        model.actuator_gainprm[i, 0] = 1.0
+        model.actuator_ctrllimited[i] = False
+        model.actuator_forcelimited[i] = False
+        model.dof_frictionloss[self.index] = 0.0
+        return model
+
+    def _equilibrium(self, target: Array, stiffness: float) -> Array:
+        """Positions at rest with the drives at a target: what gravity leaves, shape (chain,)."""
+        data = self._data[0]
+        gains = self._stiffness.copy()
+        gains[self.index] = stiffness
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:] = target
+        for _ in range(_SAG_ROUNDS):
+            mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_comPos(self.model, data)
+            mujoco.mj_comVel(self.model, data)
+            mujoco.mj_rne(self.model, data, 0, data.qfrc_bias)
+            data.qpos[:] = target - data.qfrc_bias / gains
+        return np.array(data.qpos)
+
+    def run(
+        self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
+    ) -> Iterator[tuple[slice, Array]]:
+        """Ask, and yield the asked joint's answers a chunk at a time.
+
+        Args:
+            commands: Command about the pose during each step [rad], each of shape (steps,); one
+                for all simulations, or one each.
+            poses: Pose of the chain [rad], each of shape (chain,); one for all or one each.
+            stiffness: Gains of the asked joint [N m/rad], shape (b,).
+            damping: Gains of the asked joint [N m s/rad], shape (b,).
+
+        Yields:
+            Which simulations, and the position about the pose at the start of each step [rad],
+            shape (chunk, steps). The array is reused: take what is needed before going on.
+        """
+        total, steps = len(stiffness), len(commands[0])
+        size = min(self.chunk, total)
+        while len(self._models) < size:
+            self._models.append(copy.copy(self.model))
+        control = np.empty((size, steps, self.model.nu))
+        sensor = np.empty((size, steps, self.model.nsensordata))
+        width = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        initial = np.zeros((size, width))
+        centre = np.empty(size)
+        shared = len(commands) == 1 and len(poses) == 1
+        rest: dict[float, Array] = {}
+        for begin in range(0, total, size):
+            part = slice(begin, min(begin + size, total))
+            n = part.stop - part.start
+            for row, i in enumerate(range(part.start, part.stop)):
+                kp = float(stiffness[i])
+                set_drive_gains(
+                    self._models[row], self.joint.name, self.joint.drive, kp, float(damping[i])
+                )
+                if not shared or begin == 0:
+                    pose = poses[0 if len(poses) == 1 else i]
+                    centre[row] = pose[self.index]
+                    control[row][:, self._ctrl] = pose
+                    control[row][:, self.actuator] += commands[0 if len(commands) == 1 else i]
+                if not shared or kp not in rest:
+                    rest[kp] = self._equilibrium(control[row][0, self._ctrl], kp)
+                initial[row, 1 : 1 + self.model.nq] = rest[kp]
+            before = time.perf_counter()
+            self._pool.rollout(
+                self._models[:n],
+                self._data,
+                initial[:n],
+                control[:n],
+                sensordata=sensor[:n],
+                nstep=steps,
+                skip_checks=True,
+                control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
+            )
+            self.count.seconds += time.perf_counter() - before
+            self.count.steps += n * steps
+            yield part, sensor[:n, :, self._sensor] - centre[:n, None]
+
+
+def simulate(
+    robot: Robot,
+    question: Question,
+    stiffness: ArrayLike,
+    damping: ArrayLike,
+    *,
+    armature: float | None = None,
+    frictionloss: float | None = None,
+    held_stiffness: Mapping[str, float] | None = None,
+    held_damping: Mapping[str, float] | None = None,
+    threads: int = 2,
+) -> Array:
+    """Position of the asked joint in the training simulator, for many gain pairs.
+
+    The simulation begins at rest where gravity leaves the joint with its first command.
+
+    Args:
+        robot: The robot.
+        question: What was asked.
+        stiffness: Gains of the asked joint [N m/rad], shape (b,) or a scalar.
+        damping: Gains of the asked joint [N m s/rad], shape (b,) or a scalar.
+        armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
+        frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+        held_stiffness: Gains of the joints that are held; the robot's if not given.
+        held_damping: Gains of the joints that are held; the robot's if not given.
+        threads: Threads of the simulator.
+
+    Returns:
+        Position at the start of each step [rad], shape (b, steps), at `question.time`.
+    """
+    kp, kd = np.broadcast_arrays(
+        np.atleast_1d(np.asarray(stiffness, dtype=np.float64)),
+        np.atleast_1d(np.asarray(damping, dtype=np.float64)),
+    )
+    name, sign, command = question.mirrored(robot)
+    centre = question.pose[robot.joint_names.index(question.joint)]
+    out = np.empty((len(kp), len(command)))
+    with Bench(
+        robot,
+        name,
+        armature=armature,
+        frictionloss=frictionloss,
+        held_stiffness=held_stiffness,
+        held_damping=held_damping,
+        threads=threads,
+    ) as bench:
+        for part, position in bench.run([command], [bench.pose(question)], kp, kd):
+            out[part] = centre + sign * position
+    return out

@@ -1,0 +1,288 @@
+"""The bench on a GPU: thousands of gain pairs at once in MuJoCo Warp.
+
+The model is the one that `pronk.simulators.mujoco.Bench` rolls out on the processor, and every
+simulation is asked the same; what differs is the arithmetic. MuJoCo Warp computes in single
+precision and stops its solver at a tolerance of 1e-6 instead of 1e-8. With the paper's chirp on
+the Mini Cheetah (measured on Warp's CPU device, all 2,500 nodes) the median node's largest
+difference is 3e-7 rad, the best cell is the same and its response agrees within 1e-5 dB. Only a
+stiff knee with little damping, which this chirp makes chaotic, differs visibly: by 0.09 rad and
+0.3 dB at the corner 27 N m/rad, 0.1 N m s/rad, where rounding the command to single precision
+moves the double precision just as far. Tests hold the shorter way.
+
+A step costs a GPU about the same for one simulation as for thousands. So the grid is stepped
+there, and whatever asks fewer than `LEAST` simulations (the refinement, which takes differences
+between neighbouring gains) stays on the processor, in double precision.
+
+Imported only when asked for: it needs the extra `pronk[train]`.
+"""
+
+from __future__ import annotations
+
+import copy
+import gc
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from pronk.errors import PronkError
+from pronk.robots.model import set_drive_gains
+from pronk.robots.robot import Robot
+from pronk.simulators.mujoco import Bench
+
+Array = NDArray[np.float64]
+
+LEAST = 200
+"""Fewer simulations than this run on the processor: a 20 s chirp takes an H200 1.0 s for 10
+simulations as for 500 (measured), and two cores have simulated some 200 by then."""
+MOST = 8192
+"""Simulations in flight at once: 8,192 x 5,000 steps are 160 MB on the device, or twice that when
+each has its own command."""
+_GRAPH_DRIVER = (12, 4)
+"""CUDA driver from which a captured step may hold the solver's loop."""
+
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+
+
+def _before_step(
+    joint: int,
+    actuator: int,
+    target: wp.array2d[float],
+    qpos: wp.array2d[float],
+    clock: wp.array[int],
+    ctrl: wp.array2d[float],
+    position: wp.array2d[float],
+) -> None:
+    """Before a step: note where the asked joint is, and give it the command of this step.
+
+    Every world keeps its own clock, so a captured step needs nothing from the host.
+    """
+    world = wp.tid()
+    step = clock[world]
+    position[step, world] = qpos[world, joint]
+    ctrl[world, actuator] = target[step, world % target.shape[1]]
+    clock[world] = step + 1
+
+
+_READ_AND_COMMAND = wp.kernel(_before_step)
+
+
+class WarpBench(Bench):
+    """A bench whose large runs are stepped by MuJoCo Warp."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        joint: str,
+        *,
+        armature: float | None = None,
+        frictionloss: float | None = None,
+        threads: int = 2,
+        device: str = "cuda",
+        least: int = LEAST,
+    ) -> None:
+        """Compile the model and find the device.
+
+        Args:
+            robot: The robot.
+            joint: The joint to ask; the original of a mirrored family.
+            armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
+            frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+            threads: Threads of the simulator on the processor.
+            device: `cuda`, or `warp-cpu` (slow; to compare the arithmetic without a GPU).
+            least: Fewer simulations than this run on the processor.
+
+        Raises:
+            PronkError: There is no such device.
+        """
+        self._device = find_device(device)
+        super().__init__(
+            robot, joint, armature=armature, frictionloss=frictionloss, threads=threads
+        )
+        self._least = least
+        self._worlds: _Worlds | None = None
+
+    def close(self) -> None:
+        """Stop the threads and give the device's memory back."""
+        super().close()
+        self._worlds = None
+
+    def run(
+        self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
+    ) -> Iterator[tuple[slice, Array]]:
+        """Ask, and yield the asked joint's answers a chunk at a time; see `Bench.run`."""
+        total = len(stiffness)
+        if total < self._least:
+            yield from super().run(commands, poses, stiffness, damping)
+            return
+        for begin in range(0, total, MOST):
+            batch = slice(begin, min(begin + MOST, total))
+            asks = commands if len(commands) == 1 else commands[batch]
+            stands = poses if len(poses) == 1 else poses[batch]
+            before = time.perf_counter()
+            raw = self._step(asks, stands, stiffness[batch], damping[batch])
+            self.count.seconds += time.perf_counter() - before
+            self.count.steps += raw.size
+            centre = np.array([pose[self.index] for pose in stands])
+            for first in range(0, raw.shape[1], self.chunk):
+                part = slice(first, min(first + self.chunk, raw.shape[1]))
+                about = centre if len(centre) == 1 else centre[part]
+                position = raw[:, part].T.astype(np.float64) - about[:, None]
+                yield slice(begin + part.start, begin + part.stop), position
+
+    def _step(
+        self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
+    ) -> NDArray[np.float32]:
+        """Positions of the asked joint [rad], shape (steps, n), all simulated at once."""
+        count, steps = len(stiffness), len(commands[0])
+        shared = len(commands) == 1 and len(poses) == 1
+        ways = 1 if shared else count
+        target = np.empty((steps, ways))
+        control = np.empty((ways, self.model.nu))
+        for i in range(ways):
+            pose = poses[0 if len(poses) == 1 else i]
+            control[i] = self.control(pose)
+            target[:, i] = pose[self.index] + commands[0 if len(commands) == 1 else i]
+        gains = np.empty((count, *self.model.actuator_gainprm.shape))
+        start = np.empty((count, self.model.nq))
+        scratch = self._scratch()
+        rest: dict[float, Array] = {}
+        for i, (kp, kd) in enumerate(zip(stiffness.tolist(), damping.tolist(), strict=True)):
+            set_drive_gains(scratch, self.joint.name, self.joint.drive, kp, kd)
+            gains[i] = scratch.actuator_gainprm
+            if not shared or kp not in rest:
+                first = control[i % ways].copy()
+                first[self.actuator] = target[0, i % ways]
+                rest[kp] = self._equilibrium(first[self._ctrl], kp)
+            start[i] = rest[kp]
+        worlds = self._worlds
+        if worlds is None or not worlds.fits(count, steps, shared):
+            self._worlds = None  # gives the memory back before more is taken
+            worlds = self._worlds = _Worlds(self, self._device, count, steps, shared)
+        return worlds.run(start, gains, control, target)
+
+    def _scratch(self) -> mujoco.MjModel:
+        """A model of which only the gains are used."""
+        if not self._models:
+            self._models.append(copy.copy(self.model))
+        return self._models[0]
+
+
+class _Worlds:
+    """Memory on the device for so many simulations of one bench, and the captured step."""
+
+    def __init__(self, bench: Bench, device: Any, count: int, steps: int, shared: bool) -> None:
+        self._device = device
+        self._count, self._steps, self._shared = count, steps, shared
+        model = copy.copy(bench.model)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+        # Rows of friction, limits and equalities; there are no contacts on the bench.
+        rows = model.nv + 2 * model.njnt + 6 * model.neq
+        with wp.ScopedDevice(device):
+            self._model = mujoco_warp.put_model(model)
+            self._data = mujoco_warp.put_data(
+                model, mujoco.MjData(model), nworld=count, nconmax=0, njmax=rows
+            )
+            self._model.actuator_gainprm = wp.zeros(
+                (count, model.nu), dtype=self._model.actuator_gainprm.dtype
+            )
+            self._clock = wp.zeros(count, dtype=int)
+            self._target = wp.zeros((steps, 1 if shared else count), dtype=float)
+            self._position = wp.zeros((steps, count), dtype=float)
+            self._inputs = (int(model.jnt_qposadr[bench.index]), bench.actuator)
+            # Kernels are compiled and loaded by this step; none of that may be captured.
+            self._step()
+            self._graph = self._capture()
+
+    def fits(self, count: int, steps: int, shared: bool) -> bool:
+        """True if a run of this size needs no more memory and is asked alike."""
+        return self._shared == shared and count <= self._count and steps <= self._steps
+
+    def run(self, start: Array, gains: Array, control: Array, target: Array) -> NDArray[np.float32]:
+        """Step all simulations through their commands.
+
+        Args:
+            start: Positions at rest, shape (n, nq).
+            gains: Parameters of the actuators, shape (n, nu, parameters).
+            control: Commands of the joints that are held, shape (1 or n, nu).
+            target: Commands of the asked joint, shape (steps, 1 or n).
+
+        Returns:
+            Position of the asked joint at the start of each step, shape (steps, n).
+        """
+        steps, count = len(target), len(start)
+        # Worlds to spare repeat the last simulation; commands to spare are never reached.
+        spare = np.minimum(np.arange(self._count), count - 1)
+        ways = slice(None) if self._shared else spare
+        held = np.zeros((self._steps, target.shape[1]))
+        held[:steps] = target
+        with wp.ScopedDevice(self._device):
+            self._data.qpos.assign(start[spare].astype(np.float32))
+            self._data.ctrl.assign(
+                np.broadcast_to(control[ways], (self._count, control.shape[1])).astype(np.float32)
+            )
+            self._data.qvel.zero_()
+            self._data.qacc_warmstart.zero_()
+            self._data.time.zero_()
+            self._model.actuator_gainprm.assign(gains[spare].astype(np.float32))
+            self._target.assign(held[:, ways].astype(np.float32))
+            self._clock.zero_()
+            for _ in range(steps):
+                if self._graph is None:
+                    self._step()
+                else:
+                    wp.capture_launch(self._graph)
+            return np.asarray(self._position.numpy()[:steps, :count])
+
+    def _step(self) -> None:
+        """Read, command, step."""
+        wp.launch(
+            _READ_AND_COMMAND,
+            dim=self._count,
+            inputs=[*self._inputs, self._target, self._data.qpos, self._clock],
+            outputs=[self._data.ctrl, self._position],
+        )
+        mujoco_warp.step(self._model, self._data)
+
+    def _capture(self) -> Any:
+        """The step as a CUDA graph; None where it cannot be captured."""
+        if (
+            not self._device.is_cuda
+            or not wp.is_mempool_enabled(self._device)
+            or (wp.get_cuda_driver_version() or (0, 0)) < _GRAPH_DRIVER
+        ):
+            return None
+        # A graph of old that is collected meanwhile would be captured being destroyed.
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            with wp.ScopedCapture() as capture:
+                self._step()
+        finally:
+            if collecting:
+                gc.enable()
+        return capture.graph
+
+
+def find_device(name: str) -> Any:
+    """The Warp device of a name.
+
+    Args:
+        name: `cuda` or `warp-cpu`.
+
+    Raises:
+        PronkError: There is no CUDA device.
+    """
+    if name == "warp-cpu":
+        return wp.get_device("cpu")
+    if not wp.is_cuda_available():
+        raise PronkError(
+            'device "cuda" needs an NVIDIA GPU and its driver, and no CUDA device was found; use '
+            'device "cpu".'
+        )
+    return wp.get_device("cuda")

@@ -1,0 +1,263 @@
+"""PPO with the estimator beside it.
+
+An iteration is PPO's update, then some supervised steps of the estimator on the same rollout, some
+of the actor where it is shown what to do (`following.py`), then the statistics of the
+normalisation. In this order nothing that the actor's log-probabilities rest on changes before PPO
+has used them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from mjlab.rl import RslRlPpoAlgorithmCfg
+from rsl_rl.algorithms import PPO
+from rsl_rl.extensions import Symmetry
+from rsl_rl.storage import RolloutStorage
+from torch import Tensor, nn
+
+from pronk.errors import PronkError
+from pronk.train.rl import adam
+from pronk.train.rl.actor import EstimatorActor, JumpCritic
+from pronk.train.rl.estimator import estimator_losses
+from pronk.train.rl.following import follow, lesson
+from pronk.train.rl.normalization import average
+
+TARGET_GROUP = "target"
+"""The group of observations that holds the estimator's truth."""
+
+
+@dataclass
+class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
+    """Configuration of PPO and of the estimator's training."""
+
+    estimator_learning_rate: float = 1e-3
+    """Of the estimator's own Adam."""
+    estimator_epochs: int = 2
+    """How often the estimator sees each sample of a rollout."""
+    estimator_mini_batches: int = 12
+    """Steps of the estimator in an epoch."""
+    estimator_contact_coef: float = 1.0
+    """Weight of the contacts' cross entropy [nat]."""
+    estimator_velocity_coef: float = 1.0
+    """Weight of the velocity's mean squared error [m^2/s^2]."""
+    following_steps: int = 8
+    """Steps in an iteration of doing as one is shown, where that is learned."""
+    symmetry_cfg: dict[str, Any] | None = None
+    """Arguments of `rsl_rl.extensions.Symmetry`, but its environment; None for none."""
+    class_name: str = "pronk.train.rl.ppo:EstimatorPPO"
+
+    def __post_init__(self) -> None:
+        """Refuse numbers outside their range."""
+        for name in ("estimator_epochs", "estimator_mini_batches", "following_steps"):
+            if getattr(self, name) < 1:
+                raise PronkError(f"{name} is {getattr(self, name)}; expected 1 or more.")
+        if not self.estimator_learning_rate > 0.0:
+            raise PronkError(
+                f"estimator_learning_rate is {self.estimator_learning_rate:g};"
+                " expected more than 0."
+            )
+
+
+class _Augmentation(Symmetry):
+    """rsl_rl's symmetry without the mirror loss.
+
+    It computes it even where it is only logged: one more pass of the actor over every mini-batch.
+    """
+
+    def compute_loss(self, actor: Any, batch: RolloutStorage.Batch, rows: int) -> Tensor:
+        return batch.advantages.new_zeros(())
+
+
+class EstimatorPPO(PPO):
+    """rsl_rl's PPO; the estimator inside the actor has an optimizer of its own."""
+
+    _raw_actor: EstimatorActor
+    _raw_critic: JumpCritic
+    optimizer: torch.optim.Optimizer
+
+    def __init__(
+        self,
+        actor: EstimatorActor,
+        critic: JumpCritic,
+        storage: RolloutStorage,
+        *,
+        estimator_learning_rate: float = 1e-3,
+        estimator_epochs: int = 1,
+        estimator_mini_batches: int = 8,
+        estimator_contact_coef: float = 1.0,
+        estimator_velocity_coef: float = 1.0,
+        following_steps: int = 8,
+        **cfg: Any,
+    ) -> None:
+        """Called by rsl_rl.
+
+        Args:
+            actor: With the estimator in it.
+            critic: Beside it.
+            storage: Of the rollouts; must hold the group `target`.
+            estimator_learning_rate: As in `EstimatorPpoCfg`, as all that follow.
+            estimator_epochs: See there.
+            estimator_mini_batches: See there.
+            estimator_contact_coef: See there.
+            estimator_velocity_coef: See there.
+            following_steps: See there.
+            cfg: As `rsl_rl.algorithms.PPO` takes it.
+
+        Raises:
+            PronkError: The storage lacks the truth for the estimator.
+        """
+        if TARGET_GROUP not in storage.observations.keys():  # noqa: SIM118 (a TensorDict)
+            raise PronkError(
+                f"the environment gives the groups {', '.join(storage.observations.keys())};"
+                f" the estimator needs {TARGET_GROUP!r} to learn from."
+            )
+        super().__init__(actor, critic, storage, **cfg)
+        symmetry: Mapping[str, Any] = cfg.get("symmetry_cfg") or {}
+        self._augments = bool(symmetry) and not symmetry.get("use_mirror_loss")
+        if self._augments:
+            self.symmetry = _Augmentation(**symmetry)
+        self.estimator_epochs = estimator_epochs
+        self.estimator_mini_batches = estimator_mini_batches
+        self.estimator_contact_coef = estimator_contact_coef
+        self.estimator_velocity_coef = estimator_velocity_coef
+        self.following_steps = following_steps
+        self.following_rate = 0.0
+        """Learning rate of doing as one is shown; 0: not learned."""
+        self.before = deepcopy(actor)
+        """The actor when it began to follow, once it has."""
+        self.follows = False
+        """Whether it has begun."""
+        # PPO has put the whole actor under its optimizer; the estimator is part of the actor.
+        estimator = list(actor.estimator.parameters())
+        mine = {id(parameter) for parameter in estimator}
+        others = [p for p in (*actor.parameters(), *critic.parameters()) if id(p) not in mine]
+        self.optimizer = adam.on_device(type(self.optimizer), others, lr=self.learning_rate)
+        self.estimator_optimizer = adam.on_device(
+            torch.optim.Adam, estimator, lr=estimator_learning_rate
+        )
+        self.following_optimizer = adam.on_device(
+            torch.optim.Adam, list(actor.mlp.parameters()), lr=0.0
+        )
+
+    def update(self) -> dict[str, float]:
+        """One iteration of learning on the stored rollout.
+
+        Returns:
+            Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2],
+            and `following` where it is learned: mean squared distance from the actions shown.
+        """
+        losses: dict[str, float] = super().update()
+        if self._augments:
+            del losses["symmetry"]
+        # The storage is cleared by now, but only its cursor: the rollout is still there.
+        losses.update(self._update_estimator())
+        if self.following_rate > 0.0:
+            losses["following"] = self._follow()
+        observations = self.storage.observations
+        self._raw_actor.learn_normalization(observations, self.gpu_world_size)
+        self._raw_critic.learn_normalization(observations, self.gpu_world_size)
+        return losses
+
+    def _update_estimator(self) -> dict[str, float]:
+        actor, optimizer = self._raw_actor, self.estimator_optimizer
+        parameters = list(actor.estimator.parameters())
+        observations = self.storage.observations
+        with torch.no_grad():
+            inputs = actor.estimator_input(observations).flatten(0, 1)
+        targets = observations[TARGET_GROUP].flatten(0, 1)
+        weights = inputs.new_tensor(
+            [self.estimator_contact_coef, self.estimator_velocity_coef]
+        ).unbind()
+        seen: list[Tensor] = []
+        for _ in range(self.estimator_epochs):
+            order = torch.randperm(len(inputs), device=inputs.device)
+            batches = (
+                whole[order].tensor_split(self.estimator_mini_batches)
+                for whole in (inputs, targets)
+            )
+            for batch, target in zip(*batches, strict=True):
+                losses = estimator_losses(actor.estimator(batch), target)
+                optimizer.zero_grad()
+                torch.autograd.backward(losses, weights)
+                if self.gpu_world_size > 1:
+                    self._average_gradients(parameters)
+                nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+                optimizer.step()
+                seen += [loss.detach() for loss in losses]
+        # PPO clips and reduces what gradients it finds in the actor: leave it none.
+        optimizer.zero_grad()
+        contact, velocity = torch.stack(seen).view(-1, 2).mean(dim=0).tolist()
+        return {"estimator_contact": contact, "estimator_velocity": velocity}
+
+    def _follow(self) -> float:
+        if not self.follows:
+            self.follows = True
+            self.before.load_state_dict(self._raw_actor.state_dict())
+        for group in self.following_optimizer.param_groups:
+            group["lr"] = self.following_rate
+        return follow(
+            self._raw_actor,
+            self.following_optimizer,
+            lesson(self.before, self.storage.observations),
+            steps=self.following_steps,
+            reduce=self._average_gradients if self.gpu_world_size > 1 else None,
+            max_grad_norm=self.max_grad_norm,
+        )
+
+    def _average_gradients(self, parameters: list[nn.Parameter]) -> None:
+        """Over the processes, in one piece."""
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        together = average(nn.utils.parameters_to_vector(gradients), self.gpu_world_size)
+        nn.utils.vector_to_parameters(together, gradients)
+
+    def set_estimator_rate(self, rate: float) -> None:
+        """Let the estimator learn at another rate from now on.
+
+        Args:
+            rate: Learning rate of its Adam.
+        """
+        for group in self.estimator_optimizer.param_groups:
+            group["lr"] = rate
+
+    def get_critic(self) -> JumpCritic:
+        """The critic, uncompiled, as `get_policy` gives the actor."""
+        return self._raw_critic
+
+    def save(self) -> dict[str, Any]:
+        """State of the networks and all optimizers."""
+        state: dict[str, Any] = super().save()
+        state["following_optimizer_state_dict"] = self.following_optimizer.state_dict()
+        if self.follows:
+            state["before_state_dict"] = self.before.state_dict()
+        state["estimator_optimizer_state_dict"] = self.estimator_optimizer.state_dict()
+        return state
+
+    def load(
+        self,
+        loaded_dict: Mapping[str, Any],
+        load_cfg: Mapping[str, bool] | None = None,
+        strict: bool = True,
+    ) -> bool:
+        """Take over what `save` gave.
+
+        Args:
+            loaded_dict: The state.
+            load_cfg: What to take over (`actor`, `critic`, `optimizer`, `iteration`); None for
+                all. `optimizer` means all of them.
+            strict: Refuse missing and unknown weights.
+
+        Returns:
+            Whether the runner should take over the iteration.
+        """
+        if load_cfg is None or load_cfg.get("optimizer"):
+            if "before_state_dict" in loaded_dict:
+                self.follows = True
+                self.before.load_state_dict(loaded_dict["before_state_dict"], strict=strict)
+            for name in ("estimator_optimizer", "following_optimizer"):
+                getattr(self, name).load_state_dict(loaded_dict[f"{name}_state_dict"])
+        return bool(super().load(loaded_dict, load_cfg, strict))

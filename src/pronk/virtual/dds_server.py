@@ -1,0 +1,143 @@
+"""The robot's end of a DDS link: what a Go2 would do with bytes, and stricter.
+
+A message that is not a possible command (above all one with a wrong checksum) is refused and
+counted. Behind the bytes is a virtual robot of whatever kind `dds.codec` has a joint map for.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from pronk.errors import HardwareError
+from pronk.links.dds import idl
+from pronk.links.dds.address import DdsNetwork, Participant, take, write
+from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
+from pronk.links.dds.service import (
+    BAD_PARAMETER,
+    BENCH,
+    CHECK_MODE,
+    CLAMP,
+    DONE,
+    RELEASE_MODE,
+    SELECT_MODE,
+    SWITCHER,
+    UNKNOWN_API,
+    Server,
+)
+from pronk.links.lcm.message import RefusedError
+from pronk.links.machine import Command, State
+from pronk.robots.robot import Robot
+
+Spoil = Callable[[bytes], bytes]
+
+COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
+"""Topics."""
+MODES = ("", "normal", "ai", "advanced", "mcf")
+"""Controllers of a Go2 that can hold its joints; the first is none."""
+_SERVICE_POLLS = 20
+"""Looks for commands to one for requests: 10 ms at the twin's rate."""
+
+
+class DdsWire:
+    """Implements `Wire` in Unitree's messages, on loopback only."""
+
+    def __init__(self, robot: Robot, network: DdsNetwork, *, mode: str = "") -> None:
+        """Join the domain.
+
+        Args:
+            robot: Names of the joints.
+            network: Where; loopback.
+            mode: The robot's own controller that holds the drives at first.
+
+        Raises:
+            HardwareError: Not loopback, an unknown mode, or a robot that does not fit behind these
+                messages.
+        """
+        if not network.loopback:
+            raise HardwareError(
+                f"a virtual robot does not go to {network}, where real ones listen; leave the "
+                "interface out."
+            )
+        if mode not in MODES:
+            raise HardwareError(
+                f"mode {mode!r}; expected one of {', '.join(filter(None, MODES))}, or none for "
+                "released."
+            )
+        self.counts: Counter[str] = Counter()
+        self.mode = mode
+        self.clamps: tuple[str, ...] = ()
+        self.spoil_in: Spoil = lambda data: data
+        self.spoil_out: Spoil = lambda data: data
+        self._joints = joint_map(robot)
+        self._names = robot.joint_names
+        own = Participant(network)
+        self._commands = own.reader(COMMANDS, idl.LowCmd, raw=True)
+        self._states = own.writer(STATES, idl.LowState, raw=True)
+        self._servers = [
+            Server(own, SWITCHER, self._switch, self.counts),
+            Server(own, BENCH, self._bench, self.counts),
+        ]
+        # Another writer is another participant.
+        self._other = Participant(network).writer(COMMANDS, idl.LowCmd, raw=True)
+        self._polls = 0
+
+    def poll(self) -> list[Command]:
+        """Commands that arrived since the last poll, oldest first."""
+        self._polls += 1
+        if self._polls % _SERVICE_POLLS == 1:
+            for server in self._servers:
+                server.poll()
+        met = (self.receive(message.data) for message in take(self._commands, self.counts))
+        return [command for command in met if command is not None]
+
+    def receive(self, data: bytes) -> Command | None:
+        """The command that bytes ask for, whatever they are; None if none. Never raises."""
+        try:
+            command = decode_command(self._joints, self.spoil_in(data))
+        except RefusedError as error:
+            self.counts[f"refused: {error.reason}"] += 1
+            return None
+        self.counts["commands"] += 1
+        return command
+
+    def publish(self, state: State) -> None:
+        """Put a state on the wire."""
+        write(self._states, self.spoil_out(encode_state(self._joints, state)), self.counts)
+        self.counts["states"] += 1
+
+    def contend(self, command: Command) -> None:
+        """Command the joints as another program would."""
+        write(self._other, encode_command(self._joints, command), self.counts)
+
+    def close(self) -> None:
+        """Leave the wire."""
+        del self._commands, self._states, self._servers, self._other
+
+    def _switch(self, api_id: int, parameter: Any) -> tuple[int, Any]:
+        """The service that says and changes which controller holds the joints."""
+        if api_id == CHECK_MODE:
+            return DONE, {"form": "0", "name": self.mode}
+        if api_id == RELEASE_MODE:
+            self.mode = ""
+            self.counts["mode switches"] += 1
+            return DONE, None
+        if api_id == SELECT_MODE:
+            name = parameter.get("name") if isinstance(parameter, dict) else None
+            if name not in MODES[1:]:
+                return BAD_PARAMETER, None
+            self.mode = name
+            self.counts["mode switches"] += 1
+            return DONE, None
+        return UNKNOWN_API, None
+
+    def _bench(self, api_id: int, parameter: Any) -> tuple[int, Any]:
+        """The service that holds joints mechanically."""
+        if api_id != CLAMP:
+            return UNKNOWN_API, None
+        joints = parameter.get("joints") if isinstance(parameter, dict) else None
+        if not isinstance(joints, list) or not all(name in self._names for name in joints):
+            return BAD_PARAMETER, None
+        self.clamps = tuple(name for name in self._names if name in joints)
+        return DONE, {"joints": list(self.clamps)}

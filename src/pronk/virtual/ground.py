@@ -1,0 +1,231 @@
+"""The ground under a virtual robot, and how the robot is set down on it.
+
+Contact of a foot. A foot of rubber on a floor is a spring and a damper, one-sided, with Coulomb
+friction: pressed in by r at a speed v it pushes back with
+
+    f = stiffness r + damping v - added_mass a,    f >= 0,    |friction force| <= friction f.
+
+The last term is what MuJoCo's soft constraints bring along. A constraint there has an inverse
+inertia A, an impedance d between 0 and 1, and a reference acceleration -(b/d) v - (k/d) r, which
+it approaches with the regularization R = A (1 - d) / d. Hence, in newtons,
+
+    stiffness = k / (A (1 - d)),  damping = b / (A (1 - d)),  added_mass = d / (A (1 - d)),
+
+solved here for k and b at d = 1/2: the added mass is then that of the foot itself (0.17 kg), and
+the static spring is exactly the one that was asked for. Training's contact is another one: a
+reference of 20 ms and an impedance of .9 and more, seen through a step of 5 ms.
+
+Two traits of MuJoCo's friction remain. A sticking foot creeps, by 1 / (impratio damping) = 0.02
+mm/s per newton; and a sliding one is pressed more, by some 20 N per m/s of slip, as long as it
+stays pressed in. The friction force is `friction` times the normal force at every instant.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import RobotError
+from pronk.virtual.bounds import Bounds, check_bounds
+
+Array = NDArray[np.float64]
+Point = tuple[float, float, float]
+
+_IMPEDANCE = 0.5
+_IMPRATIO = 1000.0
+# Largest angular frequency of the contact times the step; the symplectic step is stable below 2.
+_STABLE = 0.5
+_COLOUR = (0.55, 0.58, 0.62, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """A block that stands fast, its faces along the axes of the world."""
+
+    center: Point
+    """[m]"""
+    half_size: Point
+    """[m]"""
+
+    def __post_init__(self) -> None:
+        """Refuse a box that is none.
+
+        Raises:
+            RobotError: Not three finite numbers, or a size that is not positive.
+        """
+        for name in ("center", "half_size"):
+            value = getattr(self, name)
+            if np.shape(value) != (3,) or not np.isfinite(value).all():
+                raise RobotError(f"Box.{name} is {value}; expected three finite numbers [m].")
+        if not min(self.half_size) > 0.0:
+            raise RobotError(f"Box.half_size is {self.half_size}; each must be positive.")
+
+    @property
+    def top(self) -> float:
+        """Height of its upper face [m]."""
+        return self.center[2] + self.half_size[2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """A floor, blocks on it, and how feet feel them."""
+
+    friction: float = 0.8
+    """Coulomb coefficient between foot and ground [1]."""
+    stiffness: float = 30e3
+    """Of a foot pressed into the ground [N/m]."""
+    damping: float = 60.0
+    """[N s/m]"""
+    floor: float = 0.0
+    """Height of the endless floor; below the blocks where there are gaps between them [m]."""
+    terrain: tuple[Box, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a ground that cannot exist.
+
+        Raises:
+            RobotError: A value is out of its physical bounds.
+        """
+        check_bounds(self, _BOUNDS)
+
+    def height(self, x: float, y: float) -> float:
+        """Height of the ground at a place [m]."""
+        return max(
+            [self.floor]
+            + [
+                box.top
+                for box in self.terrain
+                if abs(x - box.center[0]) <= box.half_size[0]
+                and abs(y - box.center[1]) <= box.half_size[1]
+            ]
+        )
+
+    def add_to(self, spec: Any) -> None:
+        """Put floor and blocks into a model, to touch all that wants to be touched.
+
+        Args:
+            spec: mujoco.MjSpec.
+        """
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = _IMPRATIO
+        solid = {"contype": 1, "conaffinity": 1, "condim": 3, "rgba": _COLOUR}
+        solid |= {"friction": (self.friction, 0.0, 0.0)}
+        spec.worldbody.add_geom(
+            name="floor",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=(0.0, 0.0, 1.0),
+            pos=(0.0, 0.0, self.floor),
+            **solid,
+        )
+        for index, box in enumerate(self.terrain):
+            spec.worldbody.add_geom(
+                name=f"block_{index}",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=box.half_size,
+                pos=box.center,
+                **solid,
+            )
+
+    def set_down(self, model: Any, data: Any, feet: NDArray[np.intp], start: Start) -> None:
+        """Put a robot on the ground, its lowest foot `start.drop` above it.
+
+        Args:
+            model: mujoco.MjModel of a robot whose first joint is free.
+            data: Its mujoco.MjData, the joints in their places; the trunk is put into its own.
+            feet: Geoms of the feet.
+            start: Where to.
+        """
+        turn = 0.5 * start.yaw
+        data.qpos[:3] = (*start.position, 0.0)
+        data.qpos[3:7] = (math.cos(turn), 0.0, 0.0, math.sin(turn))
+        mujoco.mj_kinematics(model, data)
+        lowest = min(
+            place[2] - radius - self.height(place[0], place[1])
+            for place, radius in zip(data.geom_xpos[feet], model.geom_size[feet, 0], strict=True)
+        )
+        data.qpos[2] = start.drop - lowest
+
+    def set_contact(self, model: Any, geoms: NDArray[np.intp]) -> None:
+        """Give feet their spring, damper and friction.
+
+        Args:
+            model: mujoco.MjModel with this ground in it; its feet have priority over the ground.
+            geoms: The feet's geoms.
+
+        Raises:
+            RobotError: The spring is too stiff for the physics step.
+        """
+        d = _IMPEDANCE
+        for geom in geoms:
+            mobility = float(model.body_invweight0[model.geom_bodyid[geom], 0])
+            k, b = ((1.0 - d) * mobility * value for value in (self.stiffness, self.damping))
+            # The step sees the reference's frequency, sqrt(k / d), and its decay, b / d.
+            fastest = max(math.sqrt(k / d), b / d)
+            if fastest * model.opt.timestep > _STABLE:
+                raise RobotError(
+                    f"ground.stiffness is {self.stiffness:g} and ground.damping "
+                    f"{self.damping:g}; at a physics step of {model.opt.timestep:g} s contacts "
+                    f"may not be faster than {_STABLE / model.opt.timestep:.3g} rad/s, this one "
+                    f"is {fastest:.3g} rad/s; take less of both, or a smaller step."
+                )
+            model.geom_solref[geom] = (-k, -b)
+            model.geom_solimp[geom] = (d, d, 1e-3, 0.5, 2.0)
+            model.geom_friction[geom] = (self.friction, 0.0, 0.0)
+
+
+_BOUNDS: Bounds = {
+    "friction": (1e-3, 10.0),
+    "stiffness": (100.0, 1e7),
+    "damping": (0.0, 1e5),
+    "floor": (-100.0, 100.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """How a robot is set down, its drives holding `default pose + joint_offset`."""
+
+    position: tuple[float, float] = (0.0, 0.0)
+    """Of the trunk over the ground [m]."""
+    yaw: float = 0.0
+    """Heading, positive to the left [rad]."""
+    joint_offset: tuple[float, ...] | None = None
+    """What the drives hold beside the default pose, until the first command, in file order [rad];
+    None is zeros."""
+    drop: float = 0.0
+    """Height of the lowest foot over the ground when the robot is let go [m]."""
+    settle_s: float = 1.5
+    """Time that it is given to come to rest, before the clock starts [s]."""
+
+    def offset(self, joints: int) -> Array:
+        """The joint offset as an array [rad], shape (joints,).
+
+        Raises:
+            RobotError: It is of another number of joints.
+        """
+        offset = np.zeros(joints) if self.joint_offset is None else np.array(self.joint_offset)
+        if offset.shape != (joints,):
+            raise RobotError(
+                f"Start.joint_offset has {len(offset)} numbers; expected {joints}, one per joint."
+            )
+        return offset
+
+    def __post_init__(self) -> None:
+        """Refuse a start that is none.
+
+        Raises:
+            RobotError: A number is not finite, or negative where it cannot be.
+        """
+        numbers = (*self.position, self.yaw, *(self.joint_offset or ()), self.drop, self.settle_s)
+        if len(self.position) != 2 or not all(map(math.isfinite, numbers)):
+            raise RobotError(f"{self}: position has two numbers, and all are finite.")
+        if self.drop < 0.0 or self.settle_s < 0.0:
+            raise RobotError(
+                f"Start.drop is {self.drop:g} and Start.settle_s {self.settle_s:g}; neither may "
+                "be negative."
+            )

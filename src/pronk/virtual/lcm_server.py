@@ -1,0 +1,111 @@
+"""The robot's end of an LCM link: what a Mini Cheetah, or the bridge on a Go1, would do with bytes.
+
+Stricter than they are: a message that is not a possible command is refused and counted, where
+Cheetah-Software would hand it to the motors.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from pronk.errors import HardwareError
+from pronk.links.lcm.address import open_lcm
+from pronk.links.lcm.codec import decode_command, encode_command, encode_state
+from pronk.links.lcm.layout import Layout
+from pronk.links.lcm.message import RefusedError
+from pronk.links.lcm.service import (
+    BEACON_CHANNEL,
+    BENCH_CHANNEL,
+    MODES,
+    REQUEST_CHANNEL,
+    RESPONSE_CHANNEL,
+    clamp_message,
+    read_clamp_message,
+    read_mode_request,
+)
+from pronk.links.machine import Command, State
+from pronk.robots.robot import Robot
+from pronk.virtual.server import Spoil
+
+_BEACON_STATES = 50
+"""States between two beacons: 10 Hz."""
+_QUEUE = 1000
+"""Messages that may wait for one poll; whoever sends more cannot keep the robot from moving on."""
+
+
+class LcmWire:
+    """Implements `Wire` for a layout."""
+
+    def __init__(self, robot: Robot, layout: Layout, url: str, *, mode: str = "") -> None:
+        """Open the robot's end.
+
+        Args:
+            robot: Names of the joints.
+            layout: Messages and channels.
+            url: LCM's address.
+            mode: The robot's own controller that holds the drives at first.
+
+        Raises:
+            HardwareError: The mode is unknown, or the address cannot be opened.
+        """
+        if mode not in MODES.values():
+            raise HardwareError(
+                f"mode {mode!r}; expected one of {', '.join(filter(None, MODES.values()))}, or "
+                "none for released."
+            )
+        self.counts: Counter[str] = Counter()
+        self.mode = mode
+        self.clamps: tuple[str, ...] = ()
+        self.spoil_in: Spoil = bytes
+        self.spoil_out: Spoil = bytes
+        self._layout = layout
+        self._names = robot.joint_names
+        self._lcm = open_lcm(url)
+        # Another writer is another sender.
+        self._other = open_lcm(url)
+        self._arrived: list[Command] = []
+        self._bench_request, self._asked = 0, False
+        for channel in (layout.command_channel, REQUEST_CHANNEL, BENCH_CHANNEL):
+            self._lcm.subscribe(channel, self.receive).set_queue_capacity(_QUEUE)
+
+    def poll(self) -> list[Command]:
+        """Commands that arrived since the last poll, oldest first."""
+        for _ in range(_QUEUE):
+            if self._lcm.handle_timeout(0) == 0:
+                break
+        arrived, self._arrived = self._arrived, []
+        return arrived
+
+    def receive(self, channel: str, data: bytes) -> None:
+        """Take one message, whatever it is. Never raises."""
+        try:
+            if channel == self._layout.command_channel:
+                self._arrived.append(decode_command(self._layout, self.spoil_in(data)))
+                self.counts["commands"] += 1
+            elif channel == REQUEST_CHANNEL:
+                self.mode = read_mode_request(data)
+                self.counts["mode switches"] += 1
+                self._lcm.publish(RESPONSE_CHANNEL, data)
+            elif channel == BENCH_CHANNEL:
+                self._bench_request, self.clamps = read_clamp_message(self._names, data)
+                self._asked = True
+        except RefusedError as error:
+            self.counts[f"refused: {error.reason}"] += 1
+
+    def publish(self, state: State) -> None:
+        """Put a state on the wire, and now and then say that it is a virtual robot's."""
+        for channel, data in encode_state(self._layout, state):
+            self._lcm.publish(channel, self.spoil_out(data))
+        if self._asked or self.counts["states"] % _BEACON_STATES == 0:
+            self._asked = False
+            beacon = clamp_message(self._names, self.clamps, self._bench_request)
+            self._lcm.publish(BEACON_CHANNEL, beacon)
+        self.counts["states"] += 1
+
+    def contend(self, command: Command) -> None:
+        """Command the joints as another program would."""
+        self._other.publish(self._layout.command_channel, encode_command(self._layout, command))
+
+    def close(self) -> None:
+        """Leave the wire."""
+        del self._lcm, self._other

@@ -1,0 +1,175 @@
+"""A plant that runs: commands arrive, the battery sags, samples of the capture are kept.
+
+Time is counted in physics steps from the clock's zero. Steps are taken natively in blocks; Python
+looks in where a state or a sample is due, or a command is heard.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import HardwareError
+from pronk.links.machine import Command
+from pronk.virtual.capture import Capture, Recorder, seen
+from pronk.virtual.plant import Plant
+from pronk.virtual.sim_params_parts import MachineTruth
+from pronk.virtual.transport import Transport
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_LEAST_SHARE = -0.5
+"""No battery here is charged at more than twice its voltage, whatever runs away."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """Raw states of a plant at n instants."""
+
+    qpos: Array
+    """(n, nq)"""
+    qvel: Array
+    """(n, nv)"""
+    torque: Array
+    """Of the motors [N m]. (n, joints of the plant)"""
+    voltage: Array
+    """Of the bus [V]. (n,)"""
+
+
+class Physics:
+    """One run of a plant."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        machine: MachineTruth,
+        *,
+        columns: Indices,
+        offset: Array,
+        first_step: int,
+    ) -> None:
+        """Begin with every joint and drive at zero; `data` is there to be set.
+
+        Args:
+            plant: Built with the physics step in its model.
+            machine: Transport delay and battery.
+            columns: Columns of the plant's joints in a command.
+            offset: Reading of their encoders less the true angle [rad].
+            first_step: Physics step to begin with, negative before the clock's zero.
+        """
+        self.plant = plant
+        self.data = mujoco.MjData(plant.model)
+        self.step = self._first = first_step
+        self.recorder: Recorder | None = None
+        """Keeps the samples of a capture, if there is to be one."""
+        self._machine = machine
+        self._columns, self._offset = columns, offset
+        self._dt = float(plant.model.opt.timestep)
+        self._voltage = machine.bus_voltage
+        self._gains = b""
+        self._qvel, self._act = self.data.qvel, self.data.act  # views
+        plant.set_bus_voltage(self._voltage)
+
+    def place(self, pose: Array) -> None:
+        """Put the joints, links and rotors alike, where a pose of the whole robot has them."""
+        self.data.qpos[self.plant.rotor_qpos] = pose[self._columns]
+        self.data.qpos[self.plant.link_qpos] = pose[self._columns]
+        self.plant.set_clamps((), self.data.qpos, 0.0, 0.0)
+
+    def hear(self, command: Command) -> None:
+        """Let the drives act on a command, through encoders that may be off."""
+        columns = self._columns
+        target = np.asarray(command.position, dtype=float)[columns] - self._offset
+        self.data.ctrl[self.plant.actuator] = target
+        gains = np.asarray([command.stiffness, command.damping], dtype=float)
+        # A policy says the same gains again with every command.
+        if (told := gains.tobytes()) != self._gains:
+            self._gains = told
+            self.plant.set_gains(*gains[:, columns])
+
+    def run(self, steps: list[int], transport: Transport) -> Block:
+        """Go on to each of some physics steps, and look.
+
+        Args:
+            steps: Rising; those already past are looked at late.
+            transport: Whence commands come.
+
+        Raises:
+            HardwareError: The numbers ran away.
+        """
+        plant, data, told = self.plant, self.data, set(steps)
+        due = [] if self.recorder is None else self.recorder.due(steps[-1])
+        # Where a sample and a state are of the same step, one look does for both.
+        stops = sorted(steps + [step for step in due if step not in told])
+        rows, voltages = np.empty((len(stops), plant.state_size)), []
+        heard = transport.soonest
+        for stop, row in zip(stops, rows, strict=True):
+            if heard < stop:
+                heard = self._obey(stop, transport)
+            self._step_to(stop)
+            plant.read(data, row)
+            voltages.append(self._voltage)
+            if stop in told:
+                self._sag()
+        voltage = np.array(voltages)
+        self._check()
+        if self.recorder is not None:
+            sampled = np.searchsorted(stops, due)
+            self.recorder.keep(rows[sampled], voltage[sampled])
+        if len(stops) > len(steps):
+            chosen = [stop in told for stop in stops]
+            rows, voltage = rows[chosen], voltage[chosen]
+        qpos, qvel, act = plant.parts(rows)
+        return Block(qpos=qpos, qvel=qvel, torque=plant.motor_torque(act), voltage=voltage)
+
+    def look(self) -> Capture:
+        """One sample of a capture, of now."""
+        row = np.empty((1, self.plant.state_size))
+        self.plant.read(self.data, row[0])
+        return seen(self.plant, np.array([self.step * self._dt]), row, np.array([self._voltage]))
+
+    def _obey(self, before: int, transport: Transport) -> float:
+        """Step to where commands are heard before a physics step, and put them in.
+
+        Returns:
+            The step at which the next one is heard.
+        """
+        while (heard := transport.take(before)) is not None:
+            self._step_to(heard[0])
+            self.hear(heard[1])
+        return transport.soonest
+
+    def _step_to(self, step: int) -> None:
+        if step > self.step:
+            mujoco.mj_step(self.plant.model, self.data, step - self.step)
+            self.step = step
+
+    def _sag(self) -> None:
+        """Let the bus voltage follow the power P that the motors draw (or give back).
+
+        V = U - R P / V, with P taken as growing with V^2 from what it was at the last V: that of
+        drives at their voltage limit does, and with P held fixed the two would chase each other.
+        Either way it settles on the same V.
+        """
+        plant, machine = self.plant, self._machine
+        torque, speed = plant.motor_torque(self._act), self._qvel.take(plant.rotor)
+        current = torque / plant.constant
+        power = float(torque.dot(speed) + (current * current).dot(plant.resistance))
+        share = machine.bus_resistance * power / self._voltage**2
+        sagged = machine.bus_voltage / (1.0 + max(share, _LEAST_SHARE))
+        # A battery gives most at half its voltage; asked for more, it gives no more.
+        self._voltage = max(sagged, 0.5 * machine.bus_voltage)
+        plant.set_bus_voltage(self._voltage)
+
+    def _check(self) -> None:
+        """MuJoCo starts over, its time at 0, where numbers run away; say so instead."""
+        if self.data.time < (self.step - self._first - 0.5) * self._dt:
+            raise HardwareError(
+                f"the virtual robot's physics ran away by {self.step * self._dt:.3f} s at a step "
+                f"of {self._dt:g} s; look for an extreme number in the truth or in a command's "
+                "gains."
+            )

@@ -1,0 +1,322 @@
+"""The different machine: rotors behind compliant belts, driven by DC motors.
+
+From the robot's own structure (`Robot.build_spec`) comes a plant in which every joint has two
+degrees of freedom: the link, and the rotor with the inertia reflected through the gear. A belt
+(spring and damper) couples them. Motor, encoder and friction sit on the rotor, as on the robot.
+All of it is in joint coordinates.
+
+`rotor.py` has the drive. On the bench the base is fixed to its stand and nothing touches anything;
+on the ground the trunk is free.
+
+Time stepping. MuJoCo's Euler step is symplectic: positions see the new speed, torques the old one.
+With the drive's derivative torque explicit, q_{n+1} - 2 q_n + q_{n-1} = -(h/I) kd (q_n - q_{n-1})
++ ..., in which the backward difference stands for qdot - (h/2) qddot: the joint answers as if its
+inertia were smaller by kd h / 2, an error of first order in the step h (0.13 dB at 0.25 ms). The
+rotor is therefore given that much more inertia, which leaves an error of second order; passive
+damping is implicit in MuJoCo, so its share has the other sign. The same effect, uncorrected and
+at 5 ms, is what makes gains matched in the training simulator differ from those on the drive.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import RobotError
+from pronk.robots.robot import Robot
+from pronk.virtual.ground import Ground
+from pronk.virtual.mounting import STAND_AXES, change_trunk, fix_base, free_base
+from pronk.virtual.rotor import ROTOR_MASS, MotorConstants, add_rotor
+from pronk.virtual.sim_params import Truth
+
+Array = NDArray[np.float64]
+
+# Largest angular frequency of a spring times the step; the symplectic step is stable below 2.
+_STABLE = 1.0
+
+# Places in MuJoCo's parameter vectors of a dcmotor (MuJoCo 3.11).
+_KP, _KD, _VMAX = 4, 6, 7
+_STATE = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A compiled plant and where to find its parts. Arrays are in the order of `joints`."""
+
+    model: Any
+    """mujoco.MjModel"""
+    joints: tuple[str, ...]
+    """Joints that are in the plant, in file order."""
+    rotor: NDArray[np.intp]
+    """Index of each rotor in qvel."""
+    rotor_qpos: NDArray[np.intp]
+    """Index of each rotor in qpos."""
+    link: NDArray[np.intp]
+    """Index of each link in qvel."""
+    link_qpos: NDArray[np.intp]
+    """Index of each link in qpos."""
+    actuator: NDArray[np.intp]
+    """Index of each motor in ctrl."""
+    current: NDArray[np.intp]
+    """Index of each motor's current in act."""
+    stand: NDArray[np.intp]
+    """Indices of the stand's roll, pitch and yaw in qpos and qvel; empty if it is rigid, and on the
+    ground."""
+    feet: NDArray[np.intp]
+    """Geom of each leg's foot, on the ground; empty on the bench."""
+    base: int
+    """Id of the trunk's body."""
+    constant: Array
+    """True motor constants K [V s/rad]."""
+    believed: Array
+    """Motor constants K0 that the drives believe [V s/rad]."""
+    resistance: Array
+    """[ohm]"""
+    effort_limit: Array
+    """Largest torque that the motors give when the drives believe to be at theirs [N m]."""
+    rotor_inertia: Array
+    """True, reflected through the gear [kg m^2]."""
+    viscous: Array
+    """[N m s/rad]"""
+
+    @cached_property
+    def state_size(self) -> int:
+        """Numbers in a raw state: positions, velocities, activations."""
+        return int(self.model.nq + self.model.nv + self.model.na)
+
+    @cached_property
+    def aside(self) -> Any:
+        """A mujoco.MjData to compute in, beside the run's: making one takes longer than a look."""
+        return mujoco.MjData(self.model)
+
+    def read(self, data: Any, row: Array) -> None:
+        """Copy the raw state of a mujoco.MjData into a row, shape (state_size,)."""
+        mujoco.mj_getState(self.model, data, row, _STATE)
+
+    def parts(self, rows: Array) -> tuple[Array, Array, Array]:
+        """Views of positions, velocities and activations in raw states, shape (..., state_size)."""
+        nq, nv = self.model.nq, self.model.nv
+        return rows[..., :nq], rows[..., nq : nq + nv], rows[..., nq + nv :]
+
+    def set_gains(self, stiffness: Array, damping: Array) -> None:
+        """Put gains on the drives, in force from the next physics step.
+
+        Args:
+            stiffness: [N m/rad], shape (joints,).
+            damping: [N m s/rad], shape (joints,).
+        """
+        volts = self.resistance / self.believed
+        self.model.actuator_gainprm[self.actuator, _KP] = volts * stiffness
+        self.model.actuator_gainprm[self.actuator, _KD] = volts * damping - self.constant
+        # Second-order time stepping; see the module's docstring.
+        explicit = self.constant / self.believed * damping - self.viscous
+        half_step = 0.5 * self.model.opt.timestep
+        inertia = self.rotor_inertia + half_step * explicit
+        self.model.dof_armature[self.rotor] = inertia
+        # What MuJoCo reads in its place for a rotor whose parent cannot move.
+        self.model.dof_M0[self.rotor] = inertia + ROTOR_MASS
+
+    def set_bus_voltage(self, voltage: float) -> None:
+        """Set the voltage at which the inverters clip [V]."""
+        # Every actuator of the plant is a motor.
+        self._inverters[:] = voltage
+
+    @cached_property
+    def _inverters(self) -> Array:
+        """View of the voltages at which they clip."""
+        view: Array = self.model.actuator_gainprm[:, _VMAX]
+        return view
+
+    def motor_torque(self, act: Array) -> Array:
+        """Torque of the motors without friction [N m], shape (..., joints).
+
+        Args:
+            act: Activation of the plant; the currents are in it. Shape (..., na).
+        """
+        torque = self.constant * act.take(self.current, axis=-1)
+        np.maximum(torque, self._least_torque, out=torque)
+        limited: Array = np.minimum(torque, self.effort_limit, out=torque)
+        return limited
+
+    @cached_property
+    def _least_torque(self) -> Array:
+        return -self.effort_limit
+
+    def electrical_power(self, torque: Array, speed: Array) -> Array:
+        """What the motors draw from the bus: mechanical power and heat, sum over joints [W].
+
+        Args:
+            torque: Of the motors [N m], shape (..., joints).
+            speed: Of the rotors [rad/s], shape (..., joints).
+        """
+        current = torque / self.constant
+        power: Array = (torque * speed + current * current * self.resistance).sum(axis=-1)
+        return power
+
+    def set_clamps(
+        self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float
+    ) -> None:
+        """Hold links where they are with a fixture; release all others.
+
+        The fixture is a spring and damper between link and body, not a constraint: its
+        stiffness has a unit that can be looked up, and it costs no solver iterations.
+
+        Args:
+            joints: Names of the joints whose links are held; () releases all.
+            q: Generalized positions of the plant [rad].
+            stiffness: [N m/rad]
+            damping: [N m s/rad]
+        """
+        for name, dof, index in zip(self.joints, self.link, self.link_qpos, strict=True):
+            held = name in joints
+            self.model.jnt_stiffness[self.model.dof_jntid[dof]] = stiffness if held else 0.0
+            self.model.dof_damping[dof] = damping if held else 0.0
+            self.model.qpos_spring[index] = q[index] if held else 0.0
+
+
+def legs_of(robot: Robot) -> tuple[str, ...]:
+    """Names of the robot's legs, the first part of its joints' names, in file order."""
+    return tuple(dict.fromkeys(joint.name.split("_")[0] for joint in robot.joints))
+
+
+def _drop_legs(spec: Any, robot: Robot, kept: set[str]) -> None:
+    """Delete every subtree under the base that holds no kept joint."""
+    for child in list(spec.body(robot.base_body).bodies):
+        names = [joint.name for joint in child.find_all("joint")]
+        names += [joint.name for joint in child.joints]
+        if names and not any(name in kept for name in names):
+            spec.delete(child)
+
+
+def _indices(joints: list[Any], of: str) -> NDArray[np.intp]:
+    return np.array([getattr(joint, of)[0] for joint in joints], dtype=np.intp)
+
+
+def _check_springs(plant: Plant, truth: Truth) -> None:
+    """Refuse springs that the physics step cannot follow.
+
+    Raises:
+        RobotError: Names the field and the largest value that would do.
+    """
+    model = plant.model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    mobility = np.diag(np.linalg.inv(inertia))
+    for k, name in enumerate(plant.joints):
+        joint = truth.joints[name]
+        rotor, link = mobility[plant.rotor[k]], mobility[plant.link[k]]
+        for field, value, mobile in (
+            ("belt_stiffness", joint.belt_stiffness, rotor + link),
+            ("presliding_stiffness", joint.presliding_stiffness, rotor),
+        ):
+            most = (_STABLE / model.opt.timestep) ** 2 / mobile
+            if value > most:
+                raise RobotError(
+                    f"joints.{name}.{field} is {value:g}; at a physics step of "
+                    f"{model.opt.timestep:g} s at most {most:.3g} N m/rad can be simulated."
+                )
+
+
+def build_plant(
+    robot: Robot,
+    truth: Truth,
+    legs: tuple[str, ...],
+    timestep_s: float,
+    ground: Ground | None = None,
+) -> Plant:
+    """Build the plant: on the bench, base on the stand and feet in the air, or on the ground.
+
+    Args:
+        robot: Structure, masses and drives to start from.
+        truth: In what the machine differs.
+        legs: Legs to keep in the plant, of `legs_of(robot)`.
+        timestep_s: Physics step [s].
+        ground: What it stands on; None is the bench.
+
+    Raises:
+        RobotError: The truth is of another robot, a joint is missing in the model or in the truth,
+            the trunk is none that could exist, or a spring is too stiff for the step.
+    """
+    if truth.robot != robot.name:
+        raise RobotError(
+            f"the truth is of {truth.robot!r}, the robot is {robot.name!r}; give a truth file "
+            "written for that robot."
+        )
+    truth.check_joints(robot.joint_names)
+    joints = tuple(joint for joint in robot.joints if joint.name.split("_")[0] in legs)
+    spec = robot.build_spec()
+    spec.option.timestep = timestep_s
+    for key in list(spec.keys):
+        spec.delete(key)
+    if ground is None:
+        fix_base(spec, robot, truth)
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    else:
+        free_base(spec, robot, ground)
+    _drop_legs(spec, robot, {joint.name for joint in joints})
+    for joint in joints:
+        add_rotor(
+            spec, joint.name, joint.drive, truth.joints[joint.name], truth.machine.drive_lag_s
+        )
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    model = spec.compile()
+    rotors, links = ([model.joint(f"{j.name}{end}") for j in joints] for end in ("/rotor", ""))
+    if model.nq != model.nv + (ground is not None):
+        raise RobotError(f"{robot.name}: the virtual robot knows hinge joints only.")
+    # Mass and inertia by the same factor: a body that was possible stays possible.
+    for joint in joints:
+        body = int(model.jnt_bodyid[model.joint(joint.name).id])
+        model.body_mass[body] *= truth.joints[joint.name].link_inertia_scale
+        model.body_inertia[body] *= truth.joints[joint.name].link_inertia_scale
+    base = model.body(robot.base_body).id
+    feet = []
+    if ground is not None:
+        change_trunk(model, base, truth)
+        feet = [model.geom(f"{leg}_foot_collision").id for leg in legs]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    if ground is not None:
+        ground.set_contact(model, np.array(feet, dtype=np.intp))
+    scale = np.array([truth.joints[joint.name].torque_scale for joint in joints])
+    motors = [MotorConstants.of(joint.drive) for joint in joints]
+    believed = np.array([motor.constant for motor in motors])
+    rigid = ground is not None or not math.isfinite(truth.machine.stand_stiffness)
+    plant = Plant(
+        model=model,
+        joints=tuple(joint.name for joint in joints),
+        rotor=_indices(rotors, "dofadr"),
+        rotor_qpos=_indices(rotors, "qposadr"),
+        link=_indices(links, "dofadr"),
+        link_qpos=_indices(links, "qposadr"),
+        actuator=np.array([model.actuator(f"{j.name}/motor").id for j in joints], dtype=np.intp),
+        # LuGre's bristle comes first among a motor's states, its current last.
+        current=np.array(
+            [
+                model.actuator_actadr[motor] + model.actuator_actnum[motor] - 1
+                for motor in (model.actuator(f"{joint.name}/motor").id for joint in joints)
+            ],
+            dtype=np.intp,
+        ),
+        stand=np.array(
+            [] if rigid else [model.joint(name).dofadr[0] for name in STAND_AXES], dtype=np.intp
+        ),
+        feet=np.array(feet, dtype=np.intp),
+        base=base,
+        constant=scale * believed,
+        believed=believed,
+        resistance=np.array([motor.resistance for motor in motors]),
+        effort_limit=scale * np.array([joint.drive.effort_limit for joint in joints]),
+        rotor_inertia=np.array(
+            [truth.joints[j.name].rotor_inertia * j.drive.gear_ratio**2 for j in joints]
+        ),
+        viscous=np.array([truth.joints[joint.name].viscous for joint in joints]),
+    )
+    _check_springs(plant, truth)
+    return plant
