@@ -106,7 +106,9 @@ def tick(
     for line in dict.fromkeys(line for row in rows for line in row.granted):
         console.say(line)
     console.write_json(json_file, figures(rows))
-    console.following(f"pronk deploy {policy} --script 1,0,0   # the whole loop, on the twin")
+    console.following(
+        f"pronk deploy {policy} --script 1,0,0   # the whole loop, on the virtual robot"
+    )
 
 
 def train(
@@ -155,7 +157,7 @@ def _numbers(text: str) -> list[int]:
 def trial(
     policy: Annotated[Path, typer.Argument(help="policy.onnx.", metavar="POLICY")],
     repeats: Annotated[int, typer.Option(help="Runs of each loop, taken in turn.")] = 7,
-    truth: Annotated[
+    sim_params: Annotated[
         Path | None,
         typer.Option(help="Body of the virtual robot; the one that ships with pronk if left out."),
     ] = None,
@@ -164,10 +166,16 @@ def trial(
 ) -> None:
     """Simulated seconds per second of the whole trial loop and of bare mj_step, over one run."""
     from benchmarks.trial import run, table
-    from pronk.virtual.sim_params import load_truth
+    from pronk.virtual.sim_params import load_sim_params
 
     with console.progress() as report:
-        result = run(policy, truth=load_truth(truth), repeats=repeats, seed=seed, progress=report)
+        result = run(
+            policy,
+            sim_params=load_sim_params(sim_params),
+            repeats=repeats,
+            seed=seed,
+            progress=report,
+        )
     console.show(table(result))
     console.write_json(json_file, result.figures())
     console.following(f"pronk trial {policy} --out out/trial   # 20 jumps with each command")

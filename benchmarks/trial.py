@@ -34,7 +34,7 @@ from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.run import Plan, jobs_of, versions
 from pronk.evaluation.subjects import load_subjects
 from pronk.robots import load_robot
-from pronk.virtual.sim_params import Truth, load_truth
+from pronk.virtual.sim_params import SimParams, load_sim_params
 
 Array = NDArray[np.float64]
 
@@ -168,7 +168,7 @@ def tape(job: Job) -> Tape:
 def run(
     policy: Path,
     *,
-    truth: Truth | None = None,
+    sim_params: SimParams | None = None,
     case: Case = CASE,
     repeats: int = REPEATS,
     seed: int = 0,
@@ -178,7 +178,7 @@ def run(
 
     Args:
         policy: `policy.onnx`.
-        truth: Body of the virtual robot; the shipped one if None.
+        sim_params: Body of the virtual robot; the shipped one if None.
         case: The command.
         repeats: Runs of each loop.
         seed: Of the jump's start and noise.
@@ -192,7 +192,9 @@ def run(
     robot = load_robot(ROBOT)
     (subject,) = load_subjects([policy], robot)
     plan = Plan(cases=(case,), jumps=1, seed=seed)
-    [(_, job)] = jobs_of([subject], plan, robot=robot, truth=truth or load_truth(), out=Path())
+    [(_, job)] = jobs_of(
+        [subject], plan, robot=robot, sim_params=sim_params or load_sim_params(), out=Path()
+    )
     job = replace(job, keep=None)
     taped = tape(job)  # warms everything up as well
     times: dict[str, list[float]] = {"trial": [], "bare": []}

@@ -29,7 +29,7 @@ def tell(notice: Notice) -> None:
 
 def main() -> int:
     plan = Plan(
-        link=Link(kind="twin", robot="mini_cheetah", base="bench"),
+        link=Link(kind="sim", robot="mini_cheetah", base="bench"),
         policy=Path(sys.argv[1]),
         log=Path(sys.argv[2]),
         timing=QUICK,

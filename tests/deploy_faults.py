@@ -34,7 +34,7 @@ class FaultyLink:
     robot: str = "mini_cheetah"
 
     def __call__(self) -> Faulty:
-        return Faulty(Link(kind="twin", robot=self.robot, base="bench")(), self)
+        return Faulty(Link(kind="sim", robot=self.robot, base="bench")(), self)
 
 
 class Faulty:

@@ -19,13 +19,13 @@ from pronk.virtual.capture import SCHEMA, Capture, load, save
 from pronk.virtual.ground import Start
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.rotor import MotorConstants
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
 Array = NDArray[np.float64]
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
-TRUTH = load_truth()
+SIM_PARAMS = load_sim_params()
 FEET = [f"{leg}_foot" for leg in ("FR", "FL", "HR", "HL")]
 KNEES = [k for k, name in enumerate(ROBOT.joint_names) if name.endswith("knee")]
 
@@ -38,7 +38,7 @@ def _hold(position: Array, stiffness: float, damping: float) -> Command:
 def hopped(**options: Any) -> VirtualRobot:
     """A robot that has stretched its legs at once, left the ground and come back."""
     start = Start(position=(0.3, -0.2), yaw=0.4, settle_s=1.5)
-    machine = VirtualRobot(ROBOT, TRUTH, base="ground", start=start, **options)
+    machine = VirtualRobot(ROBOT, SIM_PARAMS, base="ground", start=start, **options)
     machine.connect()
     stretched = POSE.copy()
     stretched[KNEES] = 1.1
@@ -100,7 +100,7 @@ def test_a_foot_touches_where_its_sphere_is_below_the_floor(seen: Capture) -> No
 def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
     # Momentum of the whole robot, from the capture alone, changes by gravity.
     model = ROBOT.build_spec().compile()
-    plant = VirtualRobot(ROBOT, TRUTH, base="ground")._plant.model
+    plant = VirtualRobot(ROBOT, SIM_PARAMS, base="ground")._plant.model
     for body in range(1, model.nbody):
         name = model.body(body).name
         model.body_mass[body] = plant.body(name).mass[0]
@@ -123,13 +123,13 @@ def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
 def test_power_is_what_the_battery_gives(seen: Capture) -> None:
     # Before anything is asked, current squared times resistance.
     constants = [MotorConstants.of(joint.drive) for joint in ROBOT.joints]
-    scale = np.array([TRUTH.joints[name].torque_scale for name in ROBOT.joint_names])
+    scale = np.array([SIM_PARAMS.joints[name].torque_scale for name in ROBOT.joint_names])
     current = seen.torque[0] / (scale * np.array([c.constant for c in constants]))
     heat = float(current**2 @ np.array([c.resistance for c in constants]))
     assert seen.electrical_power[0] == pytest.approx(heat, rel=0.02)
     assert heat > 1.0
     # The open-circuit voltage less what its resistance takes, a state later.
-    machine = TRUTH.machine
+    machine = SIM_PARAMS.machine
     drop = machine.bus_resistance * seen.electrical_power / seen.bus_voltage
     assert np.corrcoef(drop[1:-3], machine.bus_voltage - seen.bus_voltage[4:])[0, 1] > 0.9
     assert seen.electrical_power.max() > 200.0
@@ -224,13 +224,13 @@ def test_shapes_that_do_not_belong_together(seen: Capture) -> None:
 
 
 def test_nothing_is_captured_on_the_bench_or_unconnected() -> None:
-    bench = VirtualRobot(ROBOT, TRUTH, legs=("FR",))
+    bench = VirtualRobot(ROBOT, SIM_PARAMS, legs=("FR",))
     bench.connect()
     with pytest.raises(HardwareError, match="nothing was captured"):
         bench.capture()
     with pytest.raises(HardwareError, match="on the bench"):
         bench.snapshot()
-    ground = VirtualRobot(ROBOT, TRUTH, base="ground")
+    ground = VirtualRobot(ROBOT, SIM_PARAMS, base="ground")
     with pytest.raises(HardwareError, match="nothing was captured"):
         ground.capture()
     with pytest.raises(HardwareError, match=r"call connect\(\) first"):

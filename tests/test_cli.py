@@ -29,7 +29,7 @@ COMMANDS = (
     "trial",
     "play",
     "deploy",
-    "twin",
+    "simulate",
     "report",
     "bench",
     "demo",
@@ -210,7 +210,7 @@ def test_a_sweep_by_wire_is_refused_with_the_way_out(capsys, tmp_path):
     assert "--port: of --link lcm" in refused(capsys, *asked, "--port", "7801")
     assert "give a domain" in refused(capsys, *asked, "--link", "dds", "--port", "7801")
     assert "give a port" in refused(capsys, *asked, "--link", "lcm", "--domain", "3")
-    assert "pronk twin" in refused(capsys, *asked, "--link", "lcm", "--truth", "t.yaml")
+    assert "pronk simulate" in refused(capsys, *asked, "--link", "lcm", "--sim-params", "t.yaml")
     assert not (tmp_path / "x").exists()
 
 
@@ -224,13 +224,13 @@ def test_a_sweep_that_could_break_the_robot_is_refused_before_it_moves(capsys, t
 
 
 def test_a_broken_truth_is_refused(capsys, tmp_path):
-    truth = tmp_path / "truth.yaml"
-    truth.write_text("schema: pronk/truth/1\nrobot: mini_cheetah\n")
+    truth = tmp_path / "sim_params.yaml"
+    truth.write_text("schema: pronk/sim_params/1\nrobot: mini_cheetah\n")
     said = refused(
         capsys, "sweep", "mini_cheetah", "--out", tmp_path / "x", "--joints", "FR_knee",
-        "--truth", truth,
+        "--sim-params", truth,
     )  # fmt: skip
-    assert "truth.yaml" in said
+    assert "sim_params.yaml" in said
 
 
 # --- The way of the data ------------------------------------------------------------------------

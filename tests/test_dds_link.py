@@ -28,8 +28,8 @@ from pronk.links.preflight import Freshness
 from pronk.robots import load_robot
 from pronk.virtual.dds_server import COMMANDS, STATES, DdsWire
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.server import Twin
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.server import RobotServer
+from pronk.virtual.sim_params import load_sim_params
 
 pytestmark = pytest.mark.live
 
@@ -49,18 +49,18 @@ def own_network(shift: int = 0) -> DdsNetwork:
 
 
 def live(network: DdsNetwork, end: Connection) -> None:
-    """Body of the twin's process, until it is told to stop; it tells what it met."""
-    robot = VirtualRobot(ROBOT, load_truth(), legs=("FR",))
+    """Body of the server's process, until it is told to stop; it tells what it met."""
+    robot = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",))
     robot.connect()
     wire = DdsWire(ROBOT, network, mode="normal")
-    twin = Twin(robot, wire, hold=HOLD)
+    server = RobotServer(robot, wire, hold=HOLD)
     end.send("ready")
-    twin.run(end.poll)
-    end.send(twin.figures())
+    server.run(end.poll)
+    end.send(server.figures())
 
 
 class Double:
-    """A twin in another process, whose own controller holds the joints at first."""
+    """A server in another process, whose own controller holds the joints at first."""
 
     def __init__(self) -> None:
         self.network = own_network()
@@ -173,7 +173,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     figures = double.stop()
     assert 0 < figures["wire"]["refused: checksum"] <= 20
     assert figures["wire"]["mode switches"] == 1
-    assert figures["twin"]["commands of others"] > 0
+    assert figures["server"]["commands of others"] > 0
 
 
 def test_nobody_there() -> None:
@@ -207,7 +207,7 @@ def test_the_mode_switcher_and_the_bench_answer_like_unitrees_services() -> None
 
 
 def asked(wire: DdsWire, client: Client, api_id: int, parameter: Any) -> Any:
-    """Ask while the wire is polled, as the twin does, from this very thread."""
+    """Ask while the wire is polled, as the server does, from this very thread."""
     polling = True
 
     def poll() -> None:
@@ -258,7 +258,7 @@ def test_two_robots_on_one_domain_are_refused() -> None:
     """Both wires speak; no physics is needed to say the same twice over."""
     network = own_network(1)
     wires = [DdsWire(ROBOT, network) for _ in range(2)]
-    robots = [VirtualRobot(ROBOT, load_truth(), legs=("FR",), seed=k) for k in range(2)]
+    robots = [VirtualRobot(ROBOT, load_sim_params(), legs=("FR",), seed=k) for k in range(2)]
     said = []
     for robot in robots:
         robot.connect()

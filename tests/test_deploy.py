@@ -610,7 +610,7 @@ def test_a_gamepad(tmp_path: Path) -> None:
 
 
 def test_a_link_that_there_is_not_is_refused() -> None:
-    with pytest.raises(HardwareError, match="twin, lcm, dds"):
+    with pytest.raises(HardwareError, match="virtual robot, lcm, dds"):
         Link(kind="usb", robot="mini_cheetah")
     assert Link(kind="lcm", robot="mini_cheetah").local
     assert not Link(kind="dds", robot="mini_cheetah", interface="eth0").local

@@ -1,6 +1,6 @@
 """Another program commands the joints: refused before anything moves, damped while a policy runs.
 
-The whole of `pronk deploy` against a real `pronk twin`, over LCM and over DDS. All that could damp
+The whole of `pronk deploy` against a `pronk simulate`, over LCM and over DDS. All that can damp
 the robot but the other writer is given time, so that a slow computer cannot pass for one.
 """
 
@@ -43,7 +43,7 @@ pytest.importorskip("cyclonedds")
 
 ROBOT = load_robot("mini_cheetah")
 OTHER = replace(hold_of(ROBOT), position=hold_of(ROBOT).position + 0.01)
-"""What the other program commands; like the twin's own rival, every 10 ms."""
+"""What the other program commands; like the virtual robot's own rival, every 10 ms."""
 QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
 PATIENT = {"hold_s": 1.0, "damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000}
 DAMPED_S = 0.060
@@ -187,7 +187,7 @@ def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
             sys.executable,
             "-m",
             "pronk.cli.main",
-            "twin",
+            "simulate",
             "--realtime",
             "--link",
             request.param,

@@ -177,7 +177,7 @@ def test_nothing_is_lost_where_nothing_is_kept(
 def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     folder = tmp_path / "file"
     folder.write_text("no folder")
-    link = Link(kind="twin", robot="mini_cheetah", base="ground")
+    link = Link(kind="sim", robot="mini_cheetah", base="ground")
     with flown(link, capture=folder / "seen.npz") as run:
         run.mode(Mode.DAMP)
     (why,) = run.texts("lost")

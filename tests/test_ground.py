@@ -23,15 +23,21 @@ from pronk.virtual.ground import Box, Ground, Start
 from pronk.virtual.imu_motion import moving_force
 from pronk.virtual.plant import build_plant, legs_of
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import SHIPPED, Truth, load_truth, parse_truth, with_changes
-from pronk.virtual.sim_params_parts import AttitudeTruth, TrunkTruth
+from pronk.virtual.sim_params import (
+    SHIPPED,
+    SimParams,
+    load_sim_params,
+    parse_sim_params,
+    with_changes,
+)
+from pronk.virtual.sim_params_parts import AttitudeParams, TrunkParams
 from pronk.virtual.transport import Transport, sinking
 
 Array = NDArray[np.float64]
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
-TRUTH = load_truth()
+SIM_PARAMS = load_sim_params()
 GRAVITY = 9.81
 STEP = 0.25e-3
 NOISES = (
@@ -45,33 +51,33 @@ NOISES = (
 )
 
 
-def quiet(**changes: Any) -> Truth:
-    """The shipped truth with perfect sensors and no delays."""
+def quiet(**changes: Any) -> SimParams:
+    """The shipped sim_params with perfect sensors and no delays."""
     machine = replace(
-        TRUTH.machine,
+        SIM_PARAMS.machine,
         **dict.fromkeys((*NOISES, "command_delay_s", "measurement_delay_s"), 0.0),
         gyro_bias=(0.0, 0.0, 0.0),
         accelerometer_bias=(0.0, 0.0, 0.0),
     )
-    return replace(TRUTH, machine=machine, attitude=AttitudeTruth(), **changes)
+    return replace(SIM_PARAMS, machine=machine, attitude=AttitudeParams(), **changes)
 
 
-def frictionless() -> Truth:
+def frictionless() -> SimParams:
     """Nothing that takes energy away."""
     nothing = dict.fromkeys(("presliding_damping", "viscous", "belt_damping"), 0.0)
     nothing |= dict.fromkeys(("coulomb", "breakaway"), 1e-9) | {"presliding_stiffness": 1e-3}
-    joints = {name: replace(joint, **nothing) for name, joint in TRUTH.joints.items()}
+    joints = {name: replace(joint, **nothing) for name, joint in SIM_PARAMS.joints.items()}
     return quiet(joints=joints)
 
 
-def aligned(truth: Truth) -> Truth:
+def aligned(sim_params: SimParams) -> SimParams:
     """Encoders without offset: in free fall the drives have nothing to correct."""
-    joints = {name: replace(joint, encoder_offset=0.0) for name, joint in truth.joints.items()}
-    return replace(truth, joints=joints)
+    joints = {name: replace(joint, encoder_offset=0.0) for name, joint in sim_params.joints.items()}
+    return replace(sim_params, joints=joints)
 
 
-def standing(truth: Truth = TRUTH, **options: Any) -> VirtualRobot:
-    machine = VirtualRobot(ROBOT, truth, base="ground", **options)
+def standing(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
+    machine = VirtualRobot(ROBOT, sim_params, base="ground", **options)
     machine.connect()
     return machine
 
@@ -82,8 +88,8 @@ def hold(position: Array = POSE, **options: Any) -> Command:
     )
 
 
-def falling(truth: Truth, **options: Any) -> VirtualRobot:
-    return standing(truth, start=Start(drop=2.0, settle_s=0.0), **options)
+def falling(sim_params: SimParams, **options: Any) -> VirtualRobot:
+    return standing(sim_params, start=Start(drop=2.0, settle_s=0.0), **options)
 
 
 def down(state: State) -> Array:
@@ -172,11 +178,11 @@ def test_feet_carry_the_weight_and_sink_in_as_hertz_would_have_it() -> None:
         for part in ("hip", "thigh", "shank")
     )
     nominal = ROBOT.build_spec().compile()
-    trunk = nominal.body("trunk").mass[0] + TRUTH.trunk.mass_offset
+    trunk = nominal.body("trunk").mass[0] + SIM_PARAMS.trunk.mass_offset
     assert weight == pytest.approx((trunk + links) * GRAVITY, rel=1e-6)
     assert total == pytest.approx(weight, rel=0.01)
     sunk = 0.0175 - machine.snapshot().foot_position[0, :, 2]
-    assert sunk.sum() * TRUTH.ground.stiffness == pytest.approx(weight, rel=0.06)
+    assert sunk.sum() * SIM_PARAMS.ground.stiffness == pytest.approx(weight, rel=0.06)
 
 
 def test_it_stands_still_on_four_feet_until_it_is_asked() -> None:
@@ -205,7 +211,7 @@ def test_it_is_set_down_where_and_how_one_says() -> None:
 def test_it_stands_on_blocks_over_a_gap() -> None:
     near = Box(center=(-1.0, 0.0, -0.1), half_size=(1.0, 1.0, 0.1))
     far = Box(center=(1.6, 0.0, -0.05), half_size=(1.0, 1.0, 0.1))
-    ground = replace(TRUTH.ground, floor=-0.5, terrain=(near, far))
+    ground = replace(SIM_PARAMS.ground, floor=-0.5, terrain=(near, far))
     assert ground.height(-0.5, 0.0) == 0.0
     assert ground.height(0.3, 0.0) == -0.5
     assert ground.height(1.0, 0.5) == pytest.approx(0.05)
@@ -236,7 +242,7 @@ def test_the_battery_never_gives_more_than_it_can() -> None:
     gains = {"stiffness": np.full(12, 100.0), "damping": np.full(12, 0.4)}
     machine.send(Command(position=0.3 * POSE, **gains))
     voltage = [state.bus_voltage for state in machine.wait(0.2)]
-    assert min(voltage) == 0.5 * TRUTH.machine.bus_voltage
+    assert min(voltage) == 0.5 * SIM_PARAMS.machine.bus_voltage
 
 
 # --- Free flight --------------------------------------------------------------------------------
@@ -290,29 +296,29 @@ def test_at_rest_it_feels_gravity_along_its_own_vertical() -> None:
     machine = standing(quiet())
     state = machine.wait(2.0)[-1]
     np.testing.assert_allclose(state.accelerometer, -GRAVITY * down(state), atol=0.05)
-    # The truth's trunk leans, so this is no test of (0, 0, g).
+    # the parameters' trunk leans, so this is no test of (0, 0, g).
     assert abs(down(state)[0]) > 1e-4
 
 
 def test_bias_and_noise_are_as_large_as_said() -> None:
-    truth = replace(TRUTH, machine=replace(TRUTH.machine, gyro_bias=(0.1, 0.2, 0.3)))
-    states = falling(aligned(truth)).wait(0.6)
+    sim_params = replace(SIM_PARAMS, machine=replace(SIM_PARAMS.machine, gyro_bias=(0.1, 0.2, 0.3)))
+    states = falling(aligned(sim_params)).wait(0.6)
     gyro = np.array([state.gyro for state in states])
     force = np.array([state.accelerometer for state in states[1:]])  # before, it was at rest
     np.testing.assert_allclose(gyro.mean(axis=0), [0.1, 0.2, 0.3], atol=3e-4)
-    np.testing.assert_allclose(force.mean(axis=0), TRUTH.machine.accelerometer_bias, atol=4e-3)
+    np.testing.assert_allclose(force.mean(axis=0), SIM_PARAMS.machine.accelerometer_bias, atol=4e-3)
     assert gyro.std() == pytest.approx(math.hypot(0.001, np.std([0.1, 0.2, 0.3])), rel=0.1)
     assert force.std(axis=0).mean() == pytest.approx(0.02, rel=0.1)
 
 
 def test_attitude_is_off_by_bias_and_wander_and_its_heading_starts_anywhere() -> None:
-    attitude = AttitudeTruth(bias=(0.05, -0.03, 0.0), noise=0.01, noise_corner_hz=20.0)
-    truth = quiet(trunk=TrunkTruth())
+    attitude = AttitudeParams(bias=(0.05, -0.03, 0.0), noise=0.01, noise_corner_hz=20.0)
+    sim_params = quiet(trunk=TrunkParams())
     headings = []
     for seed in range(3):
-        machine = standing(replace(truth, attitude=attitude), seed=seed)
+        machine = standing(replace(sim_params, attitude=attitude), seed=seed)
         states = machine.wait(1.5)
-        true = standing(truth, seed=seed).wait(1.5)
+        true = standing(sim_params, seed=seed).wait(1.5)
         # To first order, a small rotation e turns gravity (0, 0, -1) by e x (0, 0, 1).
         off = np.array([down(a) - down(b) for a, b in zip(states, true, strict=True)])
         np.testing.assert_allclose(off.mean(axis=0), [-0.03, -0.05, 0.0], atol=0.006)
@@ -323,7 +329,7 @@ def test_attitude_is_off_by_bias_and_wander_and_its_heading_starts_anywhere() ->
 
 
 def test_heading_drifts() -> None:
-    states = falling(replace(aligned(quiet()), attitude=AttitudeTruth(yaw_drift=0.2))).wait(0.5)
+    states = falling(replace(aligned(quiet()), attitude=AttitudeParams(yaw_drift=0.2))).wait(0.5)
     turn = Rotation.from_quat([s.orientation for s in (states[0], states[-1])], scalar_first=True)
     drift = (turn[1] * turn[0].inv()).as_rotvec()
     np.testing.assert_allclose(drift, [0.0, 0.0, 0.2 * 0.498], atol=1e-6)
@@ -457,11 +463,11 @@ def test_an_expired_command_lets_the_robot_sink_and_a_lasting_one_does_not() -> 
 
 
 def test_a_trunk_with_other_mass_centre_and_inertia() -> None:
-    trunk = TrunkTruth(
+    trunk = TrunkParams(
         mass_offset=1.5, com_offset=(0.01, 0.02, -0.03), inertia_scale=(1.1, 0.9, 1.0)
     )
-    truth = replace(TRUTH, trunk=trunk)
-    model = build_plant(ROBOT, truth, legs_of(ROBOT), STEP, Ground()).model
+    sim_params = replace(SIM_PARAMS, trunk=trunk)
+    model = build_plant(ROBOT, sim_params, legs_of(ROBOT), STEP, Ground()).model
     nominal = ROBOT.build_spec().compile()
     was, now = nominal.body("trunk"), model.body("trunk")
     mass = float(was.mass[0])
@@ -478,17 +484,17 @@ def test_a_trunk_with_other_mass_centre_and_inertia() -> None:
 
 def test_changes_one_by_one() -> None:
     changed = with_changes(
-        TRUTH, trunk_mass_offset=1.0, friction=0.5, command_delay_s=0.01, bus_voltage=20.0
+        SIM_PARAMS, trunk_mass_offset=1.0, friction=0.5, command_delay_s=0.01, bus_voltage=20.0
     )
-    assert changed.trunk == replace(TRUTH.trunk, mass_offset=1.0)
-    assert changed.ground == replace(TRUTH.ground, friction=0.5)
-    assert changed.machine == replace(TRUTH.machine, command_delay_s=0.01, bus_voltage=20.0)
-    assert changed.joints is TRUTH.joints
-    assert with_changes(TRUTH) == TRUTH
+    assert changed.trunk == replace(SIM_PARAMS.trunk, mass_offset=1.0)
+    assert changed.ground == replace(SIM_PARAMS.ground, friction=0.5)
+    assert changed.machine == replace(SIM_PARAMS.machine, command_delay_s=0.01, bus_voltage=20.0)
+    assert changed.joints is SIM_PARAMS.joints
+    assert with_changes(SIM_PARAMS) == SIM_PARAMS
     with pytest.raises(RobotError, match="no 'mass' to change; it has trunk_mass_offset, friction"):
-        with_changes(TRUTH, mass=1.0)
+        with_changes(SIM_PARAMS, mass=1.0)
     with pytest.raises(RobotError, match="friction is -1"):
-        with_changes(TRUTH, friction=-1.0)
+        with_changes(SIM_PARAMS, friction=-1.0)
 
 
 def body_of_file(**entries: Any) -> dict[str, Any]:
@@ -498,10 +504,10 @@ def body_of_file(**entries: Any) -> dict[str, Any]:
 def test_parts_for_the_ground_may_be_left_out_of_a_truth() -> None:
     body = body_of_file(trunk={"mass_offset": 1}, ground={"friction": 0.5})
     del body["attitude"]
-    truth = parse_truth(body, "my.yaml")
-    assert truth.trunk == TrunkTruth(mass_offset=1.0)
-    assert truth.ground == Ground(friction=0.5)
-    assert truth.attitude == AttitudeTruth()
+    sim_params = parse_sim_params(body, "my.yaml")
+    assert sim_params.trunk == TrunkParams(mass_offset=1.0)
+    assert sim_params.ground == Ground(friction=0.5)
+    assert sim_params.attitude == AttitudeParams()
 
 
 @pytest.mark.parametrize(
@@ -520,7 +526,7 @@ def test_parts_for_the_ground_may_be_left_out_of_a_truth() -> None:
 )
 def test_impossible_parts_are_refused_by_name(entries: dict[str, Any], words: str) -> None:
     with pytest.raises(RobotError) as caught:
-        parse_truth(body_of_file(**entries), "my.yaml")
+        parse_sim_params(body_of_file(**entries), "my.yaml")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -529,22 +535,27 @@ def test_impossible_parts_are_refused_by_name(entries: dict[str, Any], words: st
 
 
 @pytest.mark.parametrize(
-    ("truth", "words"),
+    ("sim_params", "words"),
     [
-        (replace(TRUTH, trunk=TrunkTruth(mass_offset=-20.0)), r"trunk\.mass_offset is -20 kg"),
         (
-            replace(TRUTH, trunk=TrunkTruth(inertia_scale=(1.0, 1.0, 3.0))),
+            replace(SIM_PARAMS, trunk=TrunkParams(mass_offset=-20.0)),
+            r"trunk\.mass_offset is -20 kg",
+        ),
+        (
+            replace(SIM_PARAMS, trunk=TrunkParams(inertia_scale=(1.0, 1.0, 3.0))),
             r"trunk\.inertia_scale is \[1\.0, 1\.0, 3\.0\]; .* sum of the others",
         ),
         (
-            replace(TRUTH, ground=Ground(stiffness=5e6)),
+            replace(SIM_PARAMS, ground=Ground(stiffness=5e6)),
             r"ground\.stiffness is 5e\+06 .* take less of both",
         ),
     ],
 )
-def test_impossible_bodies_are_refused_before_the_first_step(truth: Truth, words: str) -> None:
+def test_impossible_bodies_are_refused_before_the_first_step(
+    sim_params: SimParams, words: str
+) -> None:
     with pytest.raises(RobotError, match=words) as caught:
-        VirtualRobot(ROBOT, truth, base="ground")
+        VirtualRobot(ROBOT, sim_params, base="ground")
     assert "\n" not in str(caught.value)
 
 
@@ -560,7 +571,7 @@ def test_impossible_bodies_are_refused_before_the_first_step(truth: Truth, words
 )
 def test_what_does_not_go_together_is_refused(options: dict[str, Any], words: str) -> None:
     with pytest.raises(HardwareError, match=words):
-        VirtualRobot(ROBOT, TRUTH, **options)
+        VirtualRobot(ROBOT, SIM_PARAMS, **options)
 
 
 def test_more_refusals() -> None:
@@ -587,10 +598,10 @@ def test_more_refusals() -> None:
 
 def test_an_arm_does_not_stand() -> None:
     arm = load_robot("so101")
-    joint = next(iter(TRUTH.joints.values()))
-    truth = replace(TRUTH, robot="so101", joints=dict.fromkeys(arm.joint_names, joint))
+    joint = next(iter(SIM_PARAMS.joints.values()))
+    sim_params = replace(SIM_PARAMS, robot="so101", joints=dict.fromkeys(arm.joint_names, joint))
     with pytest.raises(RobotError, match="so101 has no legs to stand on"):
-        VirtualRobot(arm, truth, base="ground")
+        VirtualRobot(arm, sim_params, base="ground")
 
 
 def test_physics_that_runs_away_is_told() -> None:

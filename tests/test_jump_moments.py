@@ -13,7 +13,7 @@ from pronk.evaluation.metrics import JumpFigures
 from pronk.evaluation.run import Plan, jobs_of
 from pronk.evaluation.subjects import load_subjects
 from pronk.robots import load_robot
-from pronk.virtual.sim_params import SHIPPED, load_truth
+from pronk.virtual.sim_params import SHIPPED, load_sim_params
 from tools_folder import FOLDER, load_tool
 
 pytest.importorskip("onnxruntime")
@@ -53,7 +53,7 @@ def test_a_table_by_hand(tool: Any) -> None:
 def test_jumps_are_told_at_once_whatever_the_contract_says(tool: Any) -> None:
     robot, plan = load_robot("mini_cheetah"), Plan(jumps=2)
     subjects = load_subjects([POLICY], robot)
-    planned = jobs_of(subjects, plan, robot=robot, truth=load_truth(SHIPPED), out=Path())
+    planned = jobs_of(subjects, plan, robot=robot, sim_params=load_sim_params(SHIPPED), out=Path())
     found = [tool.told_at_once(replace(job, keep=None)) for _, job in planned[:2]]
     assert all(figures.found for _, figures in found)
     # A stride takes ten steps; what is met is drawn, and not the moment that a policy waits for.

@@ -1,4 +1,4 @@
-"""The link against a real `pronk twin` process, on loopback, in real time."""
+"""The link against a real `pronk simulate` process, on loopback, in real time."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def free_port() -> int:
 
 @dataclass
 class Process:
-    """A twin of its own."""
+    """A server of its own."""
 
     layout: str
     folder: Path
     port: int = field(default_factory=free_port)
 
     def __post_init__(self) -> None:
-        code = "import typer; from pronk.cli.simulate import twin; typer.run(twin)"
+        code = "import typer; from pronk.cli.simulate import simulate; typer.run(simulate)"
         words = ["--layout", self.layout, "--port", str(self.port), "--json", self.json]
         self.running = subprocess.Popen(
             [sys.executable, "-c", code, *map(str, words)],
@@ -84,8 +84,8 @@ class Process:
 
 
 @pytest.fixture(scope="module")
-def twins(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Process]]:
-    folder = tmp_path_factory.mktemp("twins")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Process]]:
+    folder = tmp_path_factory.mktemp("servers")
     made = {layout: Process(layout, folder) for layout in ("cheetah", "wtw")}
     try:
         for process in made.values():
@@ -120,9 +120,9 @@ def follow(
 
 @pytest.mark.parametrize("layout", ["cheetah", "wtw"])
 def test_a_joint_moves_as_commanded_and_is_left_damped(
-    twins: dict[str, Process], layout: str
+    servers: dict[str, Process], layout: str
 ) -> None:
-    machine = twins[layout].machine()
+    machine = servers[layout].machine()
     machine.connect()
     try:
         assert machine.virtual
@@ -152,8 +152,8 @@ def test_a_joint_moves_as_commanded_and_is_left_damped(
         machine.clamp(("FR_knee",))
 
 
-def test_a_command_that_expires_is_followed_by_damping(twins: dict[str, Process]) -> None:
-    process = twins["cheetah"]
+def test_a_command_that_expires_is_followed_by_damping(servers: dict[str, Process]) -> None:
+    process = servers["cheetah"]
     machine = process.machine()
     listener = lcm.LCM(url_of(port=process.port))
     heard: list[Command] = []
@@ -179,8 +179,8 @@ def test_a_command_that_expires_is_followed_by_damping(twins: dict[str, Process]
     machine.close()
 
 
-def test_who_else_commands_is_met_before_and_while_pronk_does(twins: dict[str, Process]) -> None:
-    process = twins["cheetah"]
+def test_who_else_commands_is_met_before_and_while_pronk_does(servers: dict[str, Process]) -> None:
+    process = servers["cheetah"]
     machine = process.machine()
     other = lcm.LCM(url_of(port=process.port))
     done = threading.Event()
@@ -210,8 +210,8 @@ def test_who_else_commands_is_met_before_and_while_pronk_does(twins: dict[str, P
     machine.close()
 
 
-def test_the_robots_own_controller_is_asked_to_let_go(twins: dict[str, Process]) -> None:
-    process = twins["cheetah"]
+def test_the_robots_own_controller_is_asked_to_let_go(servers: dict[str, Process]) -> None:
+    process = servers["cheetah"]
     lcm.LCM(url_of(port=process.port)).publish(REQUEST_CHANNEL, mode_request(4, 1))
     with pytest.raises(HardwareError, match="someone else commands the joints"):
         process.machine().connect()
@@ -220,9 +220,9 @@ def test_the_robots_own_controller_is_asked_to_let_go(twins: dict[str, Process])
     machine.close()
 
 
-def test_the_wrong_layout_is_said(twins: dict[str, Process]) -> None:
+def test_the_wrong_layout_is_said(servers: dict[str, Process]) -> None:
     # Both stacks have a channel leg_control_data: what comes there is refused by its fingerprint.
-    machine = LcmMachine(ROBOT, layout="wtw", port=twins["cheetah"].port)
+    machine = LcmMachine(ROBOT, layout="wtw", port=servers["cheetah"].port)
     with pytest.raises(HardwareError, match="sent no state on leg_control_data"):
         machine.connect()
 
@@ -299,8 +299,8 @@ def test_a_wire_that_fails_never_ends_the_damping() -> None:
         writer.stop()
 
 
-def test_a_twin_that_dies_leaves_a_link_that_still_closes(twins: dict[str, Process]) -> None:
-    process = twins["wtw"]
+def test_a_server_that_dies_leaves_a_link_that_still_closes(servers: dict[str, Process]) -> None:
+    process = servers["wtw"]
     machine = process.machine()
     machine.connect()
     machine.send(HOLD)
@@ -316,8 +316,8 @@ def test_a_twin_that_dies_leaves_a_link_that_still_closes(twins: dict[str, Proce
         machine.connect()
 
 
-def test_a_twin_ends_cleanly_when_told_to(twins: dict[str, Process]) -> None:
-    process = twins["cheetah"]
+def test_a_server_ends_cleanly_when_told_to(servers: dict[str, Process]) -> None:
+    process = servers["cheetah"]
     machine = process.machine()
     machine.connect()
     machine.send(HOLD)
@@ -331,4 +331,4 @@ def test_a_twin_ends_cleanly_when_told_to(twins: dict[str, Process]) -> None:
     # The command, and a second of damping after it.
     assert figures["wire"]["commands"] > 10
     assert figures["wire"]["states"] > 100
-    assert figures["twin"]["commands applied"] == figures["wire"]["commands"]
+    assert figures["server"]["commands applied"] == figures["wire"]["commands"]

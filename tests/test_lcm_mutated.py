@@ -17,8 +17,8 @@ from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 from pronk.virtual.faults import flip_bit
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.server import Twin, hold_of
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.server import RobotServer, hold_of
+from pronk.virtual.sim_params import load_sim_params
 
 lcm = pytest.importorskip("lcm")
 
@@ -85,7 +85,7 @@ class Breaker:
 @pytest.fixture(scope="module")
 def undisturbed() -> list[State]:
     """What one leg of the virtual robot does when nobody says anything."""
-    machine = VirtualRobot(ROBOT, load_truth(None), seed=1, legs=("FR",))
+    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
     machine.connect()
     return [machine.latest(), *machine.wait(STEPS * 0.002)]
 
@@ -96,11 +96,11 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
 ) -> None:
     from pronk.virtual.lcm_server import LcmWire
 
-    machine = VirtualRobot(ROBOT, load_truth(None), seed=1, legs=("FR",))
+    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
     machine.connect()
     states = [machine.latest()]
     wire = LcmWire(ROBOT, layout, "memq://")
-    twin = Twin(machine, wire, hold=hold_of(ROBOT))
+    server = RobotServer(machine, wire, hold=hold_of(ROBOT))
     broken = Breaker(layout, seed=2)
     # On the channels of requests, too, none of these may do anything.
     channels = (layout.command_channel,) * 8 + (BENCH_CHANNEL, REQUEST_CHANNEL)
@@ -110,7 +110,7 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
             # A whole message of a service is no broken one.
             channel = channels[0] if len(data) in (28, 146) else channels[k % len(channels)]
             wire.receive(channel, data)
-        twin.step((step + 1) * 0.002)
+        server.step((step + 1) * 0.002)
         states.append(machine.latest())
     assert wire.counts["commands"] == 0
     refused = {name: n for name, n in wire.counts.items() if name.startswith("refused")}
@@ -126,18 +126,18 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
 
 
 @BOTH
-def test_the_same_twin_does_move_when_it_is_told_to(
+def test_the_same_server_does_move_when_it_is_told_to(
     layout: Layout, undisturbed: list[State]
 ) -> None:
     from pronk.virtual.lcm_server import LcmWire
 
-    machine = VirtualRobot(ROBOT, load_truth(None), seed=1, legs=("FR",))
+    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
     machine.connect()
     wire = LcmWire(ROBOT, layout, "memq://")
-    twin = Twin(machine, wire, hold=hold_of(ROBOT))
+    server = RobotServer(machine, wire, hold=hold_of(ROBOT))
     wire.receive(layout.command_channel, good_command(layout))
     for step in range(STEPS):
-        twin.step((step + 1) * 0.002)
+        server.step((step + 1) * 0.002)
     moved = machine.latest().position[:3] - undisturbed[-1].position[:3]
     np.testing.assert_allclose(moved, 0.5, atol=0.15)
 

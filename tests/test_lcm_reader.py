@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.links.lcm.address import TWIN_PORT, multicast_interface, url_of
+from pronk.links.lcm.address import VIRTUAL_PORT, multicast_interface, url_of
 from pronk.links.lcm.codec import encode_state
 from pronk.links.lcm.layout import CHEETAH, WTW, Layout
 from pronk.links.lcm.reader import StateReader
@@ -165,7 +165,7 @@ def test_the_interface_by_which_multicast_leaves() -> None:
 
 
 def test_nothing_leaves_this_computer_unless_an_interface_is_named() -> None:
-    assert url_of() == f"udpm://239.255.76.67:{TWIN_PORT}?ttl=0"
+    assert url_of() == f"udpm://239.255.76.67:{VIRTUAL_PORT}?ttl=0"
     assert url_of(port=9000).endswith(":9000?ttl=0")
     assert url_of(interface="lo") == "udpm://239.255.76.67:7667?ttl=0"
     with pytest.raises(HardwareError, match="LCM port 7667 is the real robots'"):

@@ -15,7 +15,7 @@ from pronk.evaluation.job import Job, jump
 from pronk.evaluation.protocol import STILL, Case, Script
 from pronk.evaluation.run import Plan, jobs_of
 from pronk.evaluation.subjects import load_subjects
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
 SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)
 
@@ -25,7 +25,7 @@ def job(tmp_path: Path) -> Job:
     pytest.importorskip("onnxruntime")
     subjects = load_subjects([write_hopper(tmp_path / "policy.onnx")], ROBOT)
     plan = Plan(cases=(Case(name="spot", command=STILL),), jumps=1, script=SCRIPT, spread_s=0.0)
-    [(_, job)] = jobs_of(subjects, plan, robot=ROBOT, truth=load_truth(), out=tmp_path)
+    [(_, job)] = jobs_of(subjects, plan, robot=ROBOT, sim_params=load_sim_params(), out=tmp_path)
     return replace(job, keep=None)
 
 

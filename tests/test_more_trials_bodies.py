@@ -19,7 +19,7 @@ from pronk.evaluation.run import Plan
 from pronk.evaluation.subjects import load_subjects
 from pronk.evaluation.unseen import bode
 from pronk.evaluation.unseen.bode import bode_errors, gains_of
-from pronk.evaluation.unseen.other_params import GROUP_TORQUE, TOLERANCES, draw, save_truth
+from pronk.evaluation.unseen.other_params import GROUP_TORQUE, TOLERANCES, draw, save_sim_params
 from pronk.evaluation.variation import AS_IT_IS, Parameter, add_variation
 from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
@@ -27,9 +27,9 @@ from pronk.match.settings import MatchSettings
 from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
-TRUTH = load_truth()
+SIM_PARAMS = load_sim_params()
 QUICK = MatchSettings(method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False)
 
 
@@ -39,13 +39,13 @@ QUICK = MatchSettings(method="quick", estimator=Estimator(segment_s=4.0), zero_a
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_draws_stay_within_their_tolerances(seed: int) -> None:
-    drawn = draw(TRUTH, ROBOT, seed=seed)
+    drawn = draw(SIM_PARAMS, ROBOT, seed=seed)
     parts = {
-        "machine": [(TRUTH.machine, drawn.machine)],
-        "trunk": [(TRUTH.trunk, drawn.trunk)],
-        "attitude": [(TRUTH.attitude, drawn.attitude)],
-        "ground": [(TRUTH.ground, drawn.ground)],
-        "joints": [(TRUTH.joints[name], drawn.joints[name]) for name in ROBOT.joint_names],
+        "machine": [(SIM_PARAMS.machine, drawn.machine)],
+        "trunk": [(SIM_PARAMS.trunk, drawn.trunk)],
+        "attitude": [(SIM_PARAMS.attitude, drawn.attitude)],
+        "ground": [(SIM_PARAMS.ground, drawn.ground)],
+        "joints": [(SIM_PARAMS.joints[name], drawn.joints[name]) for name in ROBOT.joint_names],
     }
     for part, tolerances in TOLERANCES.items():
         for field, tolerance in tolerances.items():
@@ -63,37 +63,39 @@ def test_draws_stay_within_their_tolerances(seed: int) -> None:
 
 
 def test_a_body_is_its_seed_and_its_file(tmp_path: Path) -> None:
-    one, again, other = (draw(TRUTH, ROBOT, seed=seed) for seed in (1, 1, 2))
+    one, again, other = (draw(SIM_PARAMS, ROBOT, seed=seed) for seed in (1, 1, 2))
     assert one == again != other
-    assert one.joints["FR_knee"] != TRUTH.joints["FR_knee"]
-    path = tmp_path / "body" / "truth.yaml"
-    save_truth(path, one, says="A body.\nFrom a test.")
-    assert load_truth(path) == one
+    assert one.joints["FR_knee"] != SIM_PARAMS.joints["FR_knee"]
+    path = tmp_path / "body" / "sim_params.yaml"
+    save_sim_params(path, one, says="A body.\nFrom a test.")
+    assert load_sim_params(path) == one
     assert path.read_text().startswith("# A body.\n# From a test.\n")
     # What is not drawn stays.
-    assert one.machine.encoder_bits == TRUTH.machine.encoder_bits
+    assert one.machine.encoder_bits == SIM_PARAMS.machine.encoder_bits
     scene = replace(one, ground=replace(one.ground, floor=-1.0))
     with pytest.raises(PronkError, match="no terrain"):
-        save_truth(path, scene, says="")
-    assert load_truth(path) == one
+        save_sim_params(path, scene, says="")
+    assert load_sim_params(path) == one
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_drawn_bodies_can_exist(seed: int) -> None:
-    VirtualRobot(ROBOT, draw(TRUTH, ROBOT, seed=seed), base="ground")
+    VirtualRobot(ROBOT, draw(SIM_PARAMS, ROBOT, seed=seed), base="ground")
 
 
 # --- The Bode error of gains --------------------------------------------------------------------
 
 
 def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
-    truth = (20.6, 0.492)
-    logs = [rehearse(ROBOT, "FR_hip_roll", [Ask(offsets=Chirp(length_s=8.0).samples())], *truth)]
+    sim_params = (20.6, 0.492)
+    logs = [
+        rehearse(ROBOT, "FR_hip_roll", [Ask(offsets=Chirp(length_s=8.0).samples())], *sim_params)
+    ]
     naive = {"FR_hip_roll": (17.0, 0.4)}
     found = bode_errors(
-        logs, ROBOT, {"naive": naive, "truth": {"FR_hip_roll": truth}}, settings=QUICK
+        logs, ROBOT, {"naive": naive, "sim_params": {"FR_hip_roll": sim_params}}, settings=QUICK
     )
-    (off,), (right,) = found["naive"], found["truth"]
+    (off,), (right,) = found["naive"], found["sim_params"]
     assert right.rms_db < 0.01
     matched = match_logs(logs, ROBOT, settings=QUICK).gains.joints["FR_hip_roll"]
     assert off.rms_db == pytest.approx(matched.naive_error_db, rel=1e-4)
@@ -133,12 +135,12 @@ def test_only_the_varied_number_differs(tmp_path: Path) -> None:
         script=on_the_spot,
         spread_s=0.0,
     )
-    own = TRUTH.machine.bus_voltage
+    own = SIM_PARAMS.machine.bus_voltage
     volts = Parameter(
         name="bus_voltage", says="battery", unit="V", values=(18.0, own), trained="24 V"
     )
     found = add_variation(
-        [policy], plan, robot=ROBOT, truth=TRUTH, out=tmp_path, parameters=(volts,)
+        [policy], plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path, parameters=(volts,)
     )
     as_it_is, low, same = found.rows
     assert as_it_is.parameter == AS_IT_IS
@@ -154,12 +156,12 @@ def test_only_the_varied_number_differs(tmp_path: Path) -> None:
 
 
 def test_parameters_know_their_own_value() -> None:
-    values = {each.name: each.of(TRUTH) for each in variation.PARAMETERS}
+    values = {each.name: each.of(SIM_PARAMS) for each in variation.PARAMETERS}
     assert values == {
-        "trunk_mass_offset": TRUTH.trunk.mass_offset,
-        "friction": TRUTH.ground.friction,
-        "command_delay_s": TRUTH.machine.command_delay_s,
-        "bus_voltage": TRUTH.machine.bus_voltage,
+        "trunk_mass_offset": SIM_PARAMS.trunk.mass_offset,
+        "friction": SIM_PARAMS.ground.friction,
+        "command_delay_s": SIM_PARAMS.machine.command_delay_s,
+        "bus_voltage": SIM_PARAMS.machine.bus_voltage,
     }
     with pytest.raises(PronkError, match="all different"):
         replace(variation.PARAMETERS[0], values=(1.0, 1.0))

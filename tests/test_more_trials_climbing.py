@@ -17,9 +17,9 @@ from pronk.evaluation.terrain import climbing, course, crossing
 from pronk.evaluation.terrain.climbing import Ladder, Plan, add_crossings
 from pronk.evaluation.terrain.course import Verdict
 from pronk.evaluation.terrain.crossing import Crossing, Crossings
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
-TRUTH = load_truth()
+SIM_PARAMS = load_sim_params()
 SUBJECT = Subject(name="matched", path="policy.onnx", sha256="0" * 64, contract={})
 CASE = Case(name="forward 2", command=(2.0, 0.0, 0.0))
 PLAN = Plan(
@@ -34,7 +34,7 @@ PLAN = Plan(
 
 def climb(answer: dict[tuple[float, float], int], plan: Plan = PLAN) -> list[Crossing]:
     """Climb with a robot that crosses so many runs of each size and lead beyond its reach."""
-    search = climbing._Search([SUBJECT], plan, robot=ROBOT, truth=TRUTH)
+    search = climbing._Search([SUBJECT], plan, robot=ROBOT, sim_params=SIM_PARAMS)
     while asked := search.next_round():
         found = []
         for row, task in asked:
@@ -52,7 +52,7 @@ def climb(answer: dict[tuple[float, float], int], plan: Plan = PLAN) -> list[Cro
 
 def result(rows: list[Crossing], plan: Plan = PLAN) -> Crossings:
     origin = sheet.Origin(
-        robot="mini_cheetah", virtual=True, subjects=(SUBJECT,), truth={}, seed=0, versions={}
+        robot="mini_cheetah", virtual=True, subjects=(SUBJECT,), sim_params={}, seed=0, versions={}
     )
     return Crossings(
         origin=origin,
@@ -98,7 +98,7 @@ def test_a_larger_gap_does_not_count_without_the_smaller() -> None:
 
 
 def test_a_robot_that_does_not_jump_crosses_nothing() -> None:
-    search = climbing._Search([SUBJECT], PLAN, robot=ROBOT, truth=TRUTH)
+    search = climbing._Search([SUBJECT], PLAN, robot=ROBOT, sim_params=SIM_PARAMS)
     asked = search.next_round()
     search.take([row for row, _ in asked], [Verdict(why="", reach=math.nan)] * len(asked))
     assert search.next_round() == []
@@ -107,7 +107,7 @@ def test_a_robot_that_does_not_jump_crosses_nothing() -> None:
 
 def test_starts_depend_on_command_and_number_alone() -> None:
     def starts(plan: Plan) -> list[object]:
-        search = climbing._Search([SUBJECT], plan, robot=ROBOT, truth=TRUTH)
+        search = climbing._Search([SUBJECT], plan, robot=ROBOT, sim_params=SIM_PARAMS)
         return [(task.job.start, task.job.seed) for _, task in search.next_round()]
 
     other = Case(name="back 2", command=(-2.0, 0.0, 0.0))
@@ -156,7 +156,7 @@ def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
     plan = replace(
         PLAN, cases=(slow,), practice=1, script=Script(command=slow.command, stand_s=0.1)
     )
-    found = add_crossings([policy], plan, robot=ROBOT, truth=TRUTH, out=tmp_path)
+    found = add_crossings([policy], plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
     assert [row.why for row in found.rows] == [course.NOT_TRIGGERED]
     assert found.climbs[0].largest == 0.0
     assert repr(crossing.load(tmp_path).rows) == repr(found.rows)

@@ -18,7 +18,7 @@ from pronk.evaluation import walk
 from pronk.evaluation.protocol import Case, Script
 from pronk.evaluation.walk_metrics import SETTLE_S, WalkFigures, measure_walk
 from pronk.virtual.capture import Capture
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 from seen_jump import STANDING, changed
 
 DT = 0.002
@@ -153,7 +153,13 @@ def test_a_real_robot_stands(tmp_path: Path) -> None:
         Case(name="slow", command=(0.1, 0.0, 0.0)),
     )
     found = walk.add_walks(
-        [policy], robot=ROBOT, truth=load_truth(), out=tmp_path, cases=cases, runs=1, seconds=2.4
+        [policy],
+        robot=ROBOT,
+        sim_params=load_sim_params(),
+        out=tmp_path,
+        cases=cases,
+        runs=1,
+        seconds=2.4,
     )
     stand, slow = (found.cell("matched", case.name) for case in cases)
     assert (stand.n, stand.fell, stand.touched) == (1, 0, 0)

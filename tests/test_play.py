@@ -31,7 +31,7 @@ from pronk.evaluation.live.readout import Gauge
 from pronk.policy.runtime import load_policy
 from pronk.robots.mini_cheetah.model import standing_height
 from pronk.virtual.capture import Capture
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
 GRAVITY = 9.81
@@ -192,7 +192,7 @@ def test_the_robot_hops_when_told_and_no_faster_than_real_time(hopper: Path) -> 
             stick.jump()
         return simulated >= 1.0
 
-    played = play(ROBOT, load_policy(hopper), load_truth(), stick, album, until=until)
+    played = play(ROBOT, load_policy(hopper), load_sim_params(), stick, album, until=until)
     assert played.simulated_s == pytest.approx(1.0)
     assert played.wall_s >= 0.97
     assert album.heights[0] == pytest.approx(standing_height(), abs=0.06)
@@ -210,7 +210,7 @@ def test_set_down_anew_the_robot_stands_where_it_began(hopper: Path) -> None:
             stick.reset()
         return simulated >= 0.3
 
-    played = play(ROBOT, load_policy(hopper), load_truth(), stick, album, until=until)
+    played = play(ROBOT, load_policy(hopper), load_sim_params(), stick, album, until=until)
     assert played.resets == 1
     # Same seed, same robot: it does again what it did at first.
     again = album.heights[11:]
@@ -232,8 +232,8 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
     import msgspec
 
     stick = Stick(ranges=RANGES)
-    truth = load_truth()
-    with WebPage(ROBOT, truth.ground, stick, title="# virtual", port=18765) as page:
+    sim_params = load_sim_params()
+    with WebPage(ROBOT, sim_params.ground, stick, title="# virtual", port=18765) as page:
         assert page.server.get_host() == "127.0.0.1"
         with urllib.request.urlopen(page.address) as answer:
             assert answer.status == 200
@@ -256,7 +256,7 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
             browse("GuiUpdateMessage", slid)
             wait_for(lambda: stick.asked(0.0)[0] == (1.25, 0.0, 0.0))
             before = page._data.qpos.copy()
-            play(ROBOT, load_policy(hopper), truth, stick, page, until=lambda t: t > 0.2)
+            play(ROBOT, load_policy(hopper), sim_params, stick, page, until=lambda t: t > 0.2)
             assert (page._data.qpos != before).any()
             assert "trunk" in page._readout.content
         page.reset()

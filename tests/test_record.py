@@ -17,10 +17,10 @@ from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import Robot, load_robot
 from pronk.runtime.sweep.record import logged_joints, record
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
-TRUTH = load_truth(None)
+SIM_PARAMS = load_sim_params(None)
 SHORT = Chirp(length_s=2.0, start_hz=0.5, stop_hz=10.0)
 
 
@@ -28,7 +28,7 @@ class Watched(VirtualRobot):
     """The virtual robot, with a note of when it was damped, clamped and closed."""
 
     def __init__(self, **options: object) -> None:
-        super().__init__(ROBOT, TRUTH, legs=("FR",), **options)  # type: ignore[arg-type]
+        super().__init__(ROBOT, SIM_PARAMS, legs=("FR",), **options)  # type: ignore[arg-type]
         self.calls: list[str] = []
         self.silent_after = np.inf
 

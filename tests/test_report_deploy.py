@@ -30,7 +30,7 @@ KP = np.array([joint.stiffness for joint in ROBOT.joints])
 HEADER = {
     "robot": "mini_cheetah",
     "joints": list(ROBOT.joint_names),
-    "link": "twin",
+    "link": "sim",
     "policy": {"file": "policy.onnx", "sha256": "ab" * 32, "delay_range_s": [0.0, 0.01]},
     "limits": {"tilt": 0.8, "hold_s": 0.02, "damp_s": 0.05, "latch_s": 0.1},
     "versions": {"pronk": "0"},

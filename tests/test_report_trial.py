@@ -123,7 +123,7 @@ def made(
         rows=tuple(rows),
         joint_names=ROBOT.joint_names,
         seed=3,
-        truth={"file": "shipped with pronk", "sha256": "ab" * 32},
+        sim_params={"file": "shipped with pronk", "sha256": "ab" * 32},
         script=SCRIPT,
         spread_s=0.0,
         rules=asdict(RULES),
@@ -140,7 +140,7 @@ def origin(*names: str) -> sheet.Origin:
         robot=ROBOT.name,
         virtual=True,
         subjects=tuple(map(subject, names)),
-        truth={"sha256": "cd" * 32},
+        sim_params={"sha256": "cd" * 32},
         seed=1,
         versions={"pronk": "0.1.0"},
     )
@@ -421,7 +421,7 @@ def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     nasty = "<img src=x onerror=alert(1)>"
     trial = made(tmp_path, ("matched",), CASES[:1], keep=False)
     body = json.loads((tmp_path / "summary.json").read_text())
-    body["truth"]["file"] = nasty
+    body["sim_params"]["file"] = nasty
     body["policies"][0]["path"] = nasty
     (tmp_path / "summary.json").write_text(json.dumps(body))
     page, _ = whole.write_report(tmp_path)

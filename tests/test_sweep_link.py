@@ -1,4 +1,4 @@
-"""Sweeps by wire: the whole of it against a real `pronk twin` process, in real time.
+"""Sweeps by wire: the whole of it against a real `pronk simulate` process, in real time.
 
 Patience is great throughout: a slow computer must not pass for a fault.
 """
@@ -74,7 +74,7 @@ def port() -> Iterator[int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         number = int(probe.getsockname()[1])
-    code = "import typer; from pronk.cli.simulate import twin; typer.run(twin)"
+    code = "import typer; from pronk.cli.simulate import simulate; typer.run(simulate)"
     running = subprocess.Popen(
         [sys.executable, "-c", code, "--port", str(number)],
         stdout=subprocess.PIPE,
@@ -179,7 +179,7 @@ def test_a_knee_is_asked_over_lcm(port: int, tmp_path: Path) -> None:
     knee = log.column("FR_knee")
     travel = np.ptp(part.position, axis=0)
     assert 0.15 < travel[knee] < 1.0
-    # The twin's own bench held the others.
+    # The virtual robot's own bench held the others.
     assert np.delete(travel, knee).max() < 0.05
     assert log.segments[0].clamped == ("FR_hip_roll", "FR_hip_pitch")
     assert np.unique(part.command[:, knee]).size > 20

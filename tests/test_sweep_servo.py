@@ -32,7 +32,7 @@ from pronk.runtime.sweep.servo import Servo, Timing
 from pronk.runtime.sweep.servo_process import Owner
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.server import hold_of
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
@@ -49,7 +49,7 @@ class Bench(VirtualRobot):
     """The virtual robot with something wrong from some time on, and a note of what was sent."""
 
     def __init__(self, wrong: str = "", after: float = np.inf) -> None:
-        super().__init__(ROBOT, load_truth(None), legs=("FR",))
+        super().__init__(ROBOT, load_sim_params(None), legs=("FR",))
         self.sent: list[Command] = []
         self._wrong, self._after = wrong, after
         self._kept: State | None = None

@@ -34,7 +34,7 @@ DECIDED = ("observation", "action", "target", "contact", "linear_velocity", "com
 def thinking() -> Iterator[Thinker]:
     shared = Shared()
     try:
-        plan = Plan(link=Link(kind="twin", robot="mini_cheetah"), policy=POLICY)
+        plan = Plan(link=Link(kind="sim", robot="mini_cheetah"), policy=POLICY)
         yield Thinker(plan, shared, load_policy(POLICY))
     finally:
         shared.close()

@@ -25,7 +25,7 @@ from pronk.runtime.rollout import (
 )
 from pronk.virtual.ground import Start
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
 pytest.importorskip("onnxruntime")
 
@@ -50,7 +50,7 @@ class Tapped(VirtualRobot):
 
 
 def standing(seed: int = 0) -> Tapped:
-    machine = Tapped(ROBOT, load_truth(), seed=seed, base="ground", start=Start(yaw=0.5))
+    machine = Tapped(ROBOT, load_sim_params(), seed=seed, base="ground", start=Start(yaw=0.5))
     machine.connect()
     return machine
 

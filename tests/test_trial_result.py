@@ -85,7 +85,7 @@ def trial(
         ),
         joint_names=ROBOT.joint_names,
         seed=3,
-        truth={"file": "shipped with pronk", "sha256": "ab" * 32},
+        sim_params={"file": "shipped with pronk", "sha256": "ab" * 32},
         script=replace(SCRIPT, command=cases[0].command),
         spread_s=0.5,
         rules=asdict(JumpRules()),
@@ -238,7 +238,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     assert repr(loaded.rows) == repr(made.rows)
     assert repr(loaded.cells) == repr(made.cells)
     assert repr(loaded.ratios) == repr(made.ratios)
-    for name in ("subjects", "cases", "script", "seed", "truth", "rules", "mass", "versions"):
+    for name in ("subjects", "cases", "script", "seed", "sim_params", "rules", "mass", "versions"):
         assert getattr(loaded, name) == getattr(made, name), name
 
 

@@ -23,7 +23,7 @@ from pronk.evaluation.run import Plan, draw, jobs_of, run
 from pronk.evaluation.subjects import load_subjects
 from pronk.files import sha256
 from pronk.virtual import capture
-from pronk.virtual.sim_params import SHIPPED, load_truth
+from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
 pytest.importorskip("onnxruntime")
 
@@ -31,7 +31,7 @@ pytest.importorskip("onnxruntime")
 SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=2.4)
 CASE = Case(name="forward 1", command=(1.0, 0.0, 0.0))
 PLAN = Plan(cases=(CASE,), jumps=1, script=SCRIPT, spread_s=0.1)
-TRUTH = load_truth()
+SIM_PARAMS = load_sim_params()
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def go(policies: list[Path], out: Path, **changes: Any) -> result.Trial:
-    kept: dict[str, Any] = {"robot": ROBOT, "truth": TRUTH, "out": out}
+    kept: dict[str, Any] = {"robot": ROBOT, "sim_params": SIM_PARAMS, "out": out}
     return run(policies, PLAN, **(kept | changes))
 
 
@@ -105,7 +105,7 @@ def test_impossible_plans_are_refused(changes: dict[str, Any], what: str) -> Non
 def test_jumps_at_the_speed_of_the_rates_are_few_and_all_kept(hopper: Path, tmp_path: Path) -> None:
     plan = replace(PLAN, jumps=3, rates=2)
     subjects = load_subjects([hopper], ROBOT)
-    planned = jobs_of(subjects, plan, robot=ROBOT, truth=TRUTH, out=tmp_path)
+    planned = jobs_of(subjects, plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
     assert [(row.case, row.number, bool(row.capture)) for row, _ in planned] == [
         ("forward 1", 0, True),
         ("forward 1", 1, False),
@@ -114,7 +114,9 @@ def test_jumps_at_the_speed_of_the_rates_are_few_and_all_kept(hopper: Path, tmp_
         (RATES.name, 1, True),
     ]
     # They stand beside the paper's commands and change nothing of those.
-    alone = jobs_of(subjects, replace(plan, rates=0), robot=ROBOT, truth=TRUTH, out=tmp_path)
+    alone = jobs_of(
+        subjects, replace(plan, rates=0), robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path
+    )
     assert planned[:3] == alone
     with pytest.raises(PronkError, match="all different"):
         replace(plan, cases=(RATES,))
@@ -147,7 +149,7 @@ def test_a_trial_says_what_it_ran(tried: Path, hopper: Path) -> None:
     assert made.subjects[0].contract["gains_sha256"] == "0f" * 32
     assert made.virtual
     assert made.mass == pytest.approx(12.0)
-    assert made.truth == {"sha256": "ab"}
+    assert made.sim_params == {"sha256": "ab"}
     assert made.versions["mujoco"]
     # The hop is real, and half a throw is a lower one.
     strong, half = (made.cell(n, CASE.name).figures["height"].mean for n in ("matched", "naive"))
@@ -277,7 +279,7 @@ def test_the_command_says_what_it_did(
     body = json.loads(figures.read_text())
     assert body["virtual"] is True
     assert [cell["case"] for cell in body["cells"]] == ["side -1"]
-    assert result.load(out).truth["file"] == "shipped with pronk"
+    assert result.load(out).sim_params["file"] == "shipped with pronk"
     assert "Table III" in (out / "report.html").read_text(encoding="utf-8")
     assert not (out / "videos").exists()
 
@@ -285,12 +287,12 @@ def test_the_command_says_what_it_did(
 def test_an_impossible_body_is_refused(hopper: Path, tmp_path: Path) -> None:
     body = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
     body["joints"]["FR_knee"]["rotor_inertia"] = -1.0
-    path = tmp_path / "truth.yaml"
+    path = tmp_path / "sim_params.yaml"
     path.write_text(yaml.safe_dump(body))
-    words = (str(hopper), "--out", str(tmp_path / "out"), "--truth", str(path))
+    words = (str(hopper), "--out", str(tmp_path / "out"), "--sim-params", str(path))
     with pytest.raises(RobotError, match=r"joints\.FR_knee\.rotor_inertia is -1"):
         command(*words)
-    with pytest.raises(RobotError, match="no such truth file"):
+    with pytest.raises(RobotError, match="no such sim_params file"):
         command(*words[:-1], str(tmp_path / "other.yaml"))
     with pytest.raises(PronkError, match="command 'fast'"):
         command(*words[:3], "--commands", "fast")

@@ -32,7 +32,7 @@ from pronk.evaluation.run import Plan as TrialPlan
 from pronk.evaluation.run import run as run_trial
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Box, Ground
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.sim_params import load_sim_params
 
 RATE = 200.0
 GRAVITY = 9.81
@@ -364,7 +364,7 @@ def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> Non
         ],
         TrialPlan(cases=cases, jumps=1, script=script, spread_s=0.0),
         robot=ROBOT,
-        truth=load_truth(),
+        sim_params=load_sim_params(),
         out=tmp_path / "trial",
     )
     (stem, hop), (_, still) = videos.films_of(found, tmp_path / "trial")

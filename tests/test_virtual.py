@@ -17,19 +17,19 @@ from pronk.robots import load_robot
 from pronk.virtual.plant import build_plant
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.rotor import MotorConstants
-from pronk.virtual.sim_params import Truth, load_truth
+from pronk.virtual.sim_params import SimParams, load_sim_params
 
 Array = NDArray[np.float64]
 
 ROBOT = load_robot("mini_cheetah")
 NAMES = ROBOT.joint_names
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
-TRUTH = load_truth()
+SIM_PARAMS = load_sim_params()
 TICK = 0.02
 
 
-def quiet(**machine: Any) -> Truth:
-    """The shipped truth with perfect sensors, no delays and a stiff battery."""
+def quiet(**machine: Any) -> SimParams:
+    """The shipped sim_params with perfect sensors, no delays and a stiff battery."""
     perfect = dict.fromkeys(
         (
             "command_delay_s",
@@ -46,16 +46,19 @@ def quiet(**machine: Any) -> Truth:
         0.0,
     )
     return replace(
-        TRUTH, machine=replace(TRUTH.machine, **{**perfect, "encoder_bits": 32, **machine})
+        SIM_PARAMS,
+        machine=replace(SIM_PARAMS.machine, **{**perfect, "encoder_bits": 32, **machine}),
     )
 
 
-def with_joint(truth: Truth, name: str, **values: float) -> Truth:
-    return replace(truth, joints={**truth.joints, name: replace(truth.joints[name], **values)})
+def with_joint(sim_params: SimParams, name: str, **values: float) -> SimParams:
+    return replace(
+        sim_params, joints={**sim_params.joints, name: replace(sim_params.joints[name], **values)}
+    )
 
 
-def connected(truth: Truth, **options: Any) -> VirtualRobot:
-    machine = VirtualRobot(ROBOT, truth, **{"legs": ("FR",), **options})
+def connected(sim_params: SimParams, **options: Any) -> VirtualRobot:
+    machine = VirtualRobot(ROBOT, sim_params, **{"legs": ("FR",), **options})
     machine.connect()
     return machine
 
@@ -117,7 +120,7 @@ def test_the_step_has_converged_to_40_khz(joint: str) -> None:
 def test_without_imperfections_a_joint_answers_as_its_equation_says() -> None:
     joint = "FR_knee"
     scale, drive = 1.2, ROBOT.joint(joint).drive
-    truth = with_joint(
+    sim_params = with_joint(
         quiet(drive_lag_s=1e-5, clamp_stiffness=9e4),
         joint,
         torque_scale=scale,
@@ -130,7 +133,7 @@ def test_without_imperfections_a_joint_answers_as_its_equation_says() -> None:
         belt_damping=0.0,
         encoder_offset=0.0,
     )
-    machine = connected(truth)
+    machine = connected(sim_params)
     machine.clamp(ROBOT.joint(joint).clamped)
     command = chirp(20.0)
     position = column(ask(machine, joint, command), joint)
@@ -139,10 +142,10 @@ def test_without_imperfections_a_joint_answers_as_its_equation_says() -> None:
     model = ROBOT.build_spec().compile()
     body = model.jnt_bodyid[model.joint(joint).id]
     arm = np.hypot(model.body_ipos[body][0], model.body_ipos[body][2])
-    shank = (model.body_inertia[body].max() + model.body_mass[body] * arm**2) * truth.joints[
+    shank = (model.body_inertia[body].max() + model.body_mass[body] * arm**2) * sim_params.joints[
         joint
     ].link_inertia_scale
-    inertia = truth.joints[joint].rotor_inertia * drive.gear_ratio**2 + shank
+    inertia = sim_params.joints[joint].rotor_inertia * drive.gear_ratio**2 + shank
     s = 2j * np.pi * hz
     stiffness, damping = scale * 17.0, scale * 0.4 + 0.05
     equation = stiffness / (inertia * s**2 + damping * s + stiffness)
@@ -169,8 +172,8 @@ def test_damped_legs_sink_and_come_to_rest() -> None:
 
 
 def test_dry_friction_holds_a_joint_that_is_asked_too_softly() -> None:
-    truth = with_joint(quiet(), "FR_knee", coulomb=0.4, breakaway=0.5)
-    machine = connected(truth)
+    sim_params = with_joint(quiet(), "FR_knee", coulomb=0.4, breakaway=0.5)
+    machine = connected(sim_params)
     before = machine.latest().position[2]
     ask_torque = 0.2  # N m, asked through 17 N m/rad, well below break-away
     step = ask_torque / 17.0
@@ -187,14 +190,16 @@ def test_torque_stays_below_the_torque_speed_line_and_the_effort_limit() -> None
     # A hard step at a low bus voltage: the drive wants far more than the motor can give. A heavy
     # rotor and a prompt drive, so that torque and speed belong to the same instant.
     voltage = 12.0
-    truth = quiet(bus_voltage=voltage, drive_lag_s=1e-5)
-    truth = with_joint(truth, "FR_knee", rotor_inertia=1e-3)
-    machine = connected(truth, log_rate_hz=2000.0)
+    sim_params = quiet(bus_voltage=voltage, drive_lag_s=1e-5)
+    sim_params = with_joint(sim_params, "FR_knee", rotor_inertia=1e-3)
+    machine = connected(sim_params, log_rate_hz=2000.0)
     machine.send(Command(position=offset("FR_knee", -2.0), **gains(300.0, 0.1)))
     states = machine.wait(0.2)
-    torque = np.array([state.torque[2] for state in states]) * truth.joints["FR_knee"].torque_scale
+    torque = (
+        np.array([state.torque[2] for state in states]) * sim_params.joints["FR_knee"].torque_scale
+    )
     speed = np.array([state.velocity[2] for state in states])
-    drive, scale = ROBOT.joint("FR_knee").drive, truth.joints["FR_knee"].torque_scale
+    drive, scale = ROBOT.joint("FR_knee").drive, sim_params.joints["FR_knee"].torque_scale
     motor = MotorConstants.of(drive)
     constant = scale * motor.constant
     line = -constant / motor.resistance * (voltage + constant * speed)
@@ -210,8 +215,10 @@ def test_torque_stays_below_the_torque_speed_line_and_the_effort_limit() -> None
 
 
 def test_reported_torque_is_what_the_drive_believes() -> None:
-    truth = with_joint(quiet(), "FR_hip_pitch", torque_scale=1.25, coulomb=1e-6, breakaway=1e-6)
-    machine = connected(truth)
+    sim_params = with_joint(
+        quiet(), "FR_hip_pitch", torque_scale=1.25, coulomb=1e-6, breakaway=1e-6
+    )
+    machine = connected(sim_params)
     state = machine.wait(0.1)[-1]
     believed = 17.0 * (POSE[1] - state.position[1])
     assert abs(state.torque[1]) > 0.02
@@ -220,10 +227,10 @@ def test_reported_torque_is_what_the_drive_believes() -> None:
 
 def test_battery_sags_with_the_power_drawn() -> None:
     machine = connected(quiet(bus_resistance=0.2))
-    assert machine.latest().bus_voltage == pytest.approx(TRUTH.machine.bus_voltage, abs=0.05)
+    assert machine.latest().bus_voltage == pytest.approx(SIM_PARAMS.machine.bus_voltage, abs=0.05)
     machine.send(Command(position=offset("FR_hip_roll", 1.0), **gains(100.0, 2.0)))
     states = machine.wait(0.1)
-    assert min(state.bus_voltage for state in states) < TRUTH.machine.bus_voltage - 1.0
+    assert min(state.bus_voltage for state in states) < SIM_PARAMS.machine.bus_voltage - 1.0
 
 
 # --- Time ---------------------------------------------------------------------------------------
@@ -240,7 +247,7 @@ def test_delays_shift_the_answer() -> None:
 
 
 def test_timestamps_jitter_increase_and_lose_nothing() -> None:
-    machine = connected(TRUTH)
+    machine = connected(SIM_PARAMS)
     states = [machine.latest(), *machine.wait(4.0)]
     time = np.array([state.time for state in states])
     assert time[0] == 0.0
@@ -252,7 +259,7 @@ def test_timestamps_jitter_increase_and_lose_nothing() -> None:
 
 def test_same_seed_same_numbers_however_time_is_cut() -> None:
     def run(seed: int, cuts: tuple[float, ...]) -> Array:
-        machine = connected(TRUTH, seed=seed)
+        machine = connected(SIM_PARAMS, seed=seed)
         machine.send(Command(position=offset("FR_knee", 0.2), **gains()))
         states = [state for until in cuts for state in machine.wait(until)]
         return np.array([[s.time, *s.position, *s.velocity, *s.torque, *s.gyro] for s in states])
@@ -263,7 +270,7 @@ def test_same_seed_same_numbers_however_time_is_cut() -> None:
 
 
 def test_connecting_again_starts_anew() -> None:
-    machine = connected(TRUTH)
+    machine = connected(SIM_PARAMS)
     first = ask(machine, "FR_knee", np.full(5, 0.1))
     machine.clamp(("FR_knee",))
     machine.close()
@@ -273,7 +280,7 @@ def test_connecting_again_starts_anew() -> None:
 
 
 def test_a_time_already_past_brings_no_states() -> None:
-    machine = connected(TRUTH)
+    machine = connected(SIM_PARAMS)
     assert len(machine.wait(0.1)) == 50
     assert machine.wait(0.1) == []
     assert machine.wait(0.05) == []
@@ -284,7 +291,7 @@ def test_a_time_already_past_brings_no_states() -> None:
 
 
 def test_positions_lie_on_the_grid_of_the_encoder() -> None:
-    machine = connected(replace(TRUTH, machine=replace(TRUTH.machine, encoder_bits=10)))
+    machine = connected(replace(SIM_PARAMS, machine=replace(SIM_PARAMS.machine, encoder_bits=10)))
     states = ask(machine, "FR_knee", chirp(2.0))
     for joint in machine.joints:
         grid = 2.0 * np.pi / 2**10 / ROBOT.joint(joint).drive.gear_ratio
@@ -294,8 +301,8 @@ def test_positions_lie_on_the_grid_of_the_encoder() -> None:
 
 
 def test_position_noise_is_coloured_and_as_large_as_said() -> None:
-    truth = quiet(position_noise=1e-3, position_noise_corner_hz=10.0)
-    noise = column(connected(truth).wait(60.0), "FR_hip_roll")
+    sim_params = quiet(position_noise=1e-3, position_noise_corner_hz=10.0)
+    noise = column(connected(sim_params).wait(60.0), "FR_hip_roll")
     noise = noise - noise.mean()
     assert np.std(noise) == pytest.approx(1e-3, rel=0.1)
     neighbours = float(noise[1:] @ noise[:-1] / (noise @ noise))
@@ -304,15 +311,15 @@ def test_position_noise_is_coloured_and_as_large_as_said() -> None:
 
 def test_inertial_unit_feels_gravity_and_its_bias() -> None:
     state = connected(quiet()).latest()
-    np.testing.assert_allclose(state.gyro, TRUTH.machine.gyro_bias)
+    np.testing.assert_allclose(state.gyro, SIM_PARAMS.machine.gyro_bias)
     np.testing.assert_allclose(
-        state.accelerometer - np.array(TRUTH.machine.accelerometer_bias), [0.0, 0.0, 9.81]
+        state.accelerometer - np.array(SIM_PARAMS.machine.accelerometer_bias), [0.0, 0.0, 9.81]
     )
 
 
 def test_a_compliant_stand_is_felt_by_the_gyro() -> None:
-    truth = quiet(stand_stiffness=500.0, stand_damping=5.0, gyro_bias=(0.0, 0.0, 0.0))
-    machine = connected(truth, legs=None)
+    sim_params = quiet(stand_stiffness=500.0, stand_damping=5.0, gyro_bias=(0.0, 0.0, 0.0))
+    machine = connected(sim_params, legs=None)
     states = ask(machine, "FR_hip_pitch", chirp(3.0))
     rate = np.array([state.gyro for state in states])
     assert np.abs(rate[:, 1]).max() > 0.05
@@ -329,8 +336,11 @@ def test_clamp_holds_a_link_but_no_fixture_is_rigid() -> None:
     rest = machine.latest().position[1]
     held = ask(machine, joint, np.full(25, 0.2))[-1].position[1] - rest
     # Torque through belt and fixture in series, the drive's own stiffness beside them.
-    torque = 17.0 * TRUTH.joints[joint].torque_scale * 0.2
-    give = torque / TRUTH.machine.clamp_stiffness + torque / TRUTH.joints[joint].belt_stiffness
+    torque = 17.0 * SIM_PARAMS.joints[joint].torque_scale * 0.2
+    give = (
+        torque / SIM_PARAMS.machine.clamp_stiffness
+        + torque / SIM_PARAMS.joints[joint].belt_stiffness
+    )
     assert 0.5 * give < held < 1.1 * give
     machine.clamp(())
     free = ask(machine, joint, np.full(50, 0.2))[-1].position[1] - rest
@@ -352,16 +362,16 @@ def test_legs_on_a_rigid_bench_do_not_feel_each_other() -> None:
 
 
 def test_mirrored_legs_mirror_each_other_when_their_truths_agree() -> None:
-    same = replace(TRUTH.joints["FR_hip_roll"], encoder_offset=0.0)
-    truth = replace(quiet(), joints=dict.fromkeys(NAMES, same))
+    same = replace(SIM_PARAMS.joints["FR_hip_roll"], encoder_offset=0.0)
+    sim_params = replace(quiet(), joints=dict.fromkeys(NAMES, same))
     command = chirp(1.0)
-    right = column(ask(connected(truth, legs=None), "FR_hip_roll", command), "FR_hip_roll")
-    left = column(ask(connected(truth, legs=None), "FL_hip_roll", -command), "FL_hip_roll")
+    right = column(ask(connected(sim_params, legs=None), "FR_hip_roll", command), "FR_hip_roll")
+    left = column(ask(connected(sim_params, legs=None), "FL_hip_roll", -command), "FL_hip_roll")
     np.testing.assert_allclose(left, -right, atol=1e-6)
 
 
 def test_plant_is_another_machine_than_the_model_it_came_from() -> None:
-    plant = build_plant(ROBOT, TRUTH, ("FR",), 0.25e-3)
+    plant = build_plant(ROBOT, SIM_PARAMS, ("FR",), 0.25e-3)
     assert plant.joints == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
     assert plant.model.nv == 6
     assert not set(plant.rotor) & set(plant.link)
@@ -370,7 +380,7 @@ def test_plant_is_another_machine_than_the_model_it_came_from() -> None:
     inertia = np.zeros((6, 6))
     mujoco.mj_fullM(plant.model, data, inertia)
     expected = [
-        TRUTH.joints[name].rotor_inertia * ROBOT.joint(name).drive.gear_ratio ** 2
+        SIM_PARAMS.joints[name].rotor_inertia * ROBOT.joint(name).drive.gear_ratio ** 2
         for name in plant.joints
     ]
     np.testing.assert_allclose(inertia[plant.rotor, plant.rotor], expected, rtol=1e-6)
@@ -394,17 +404,17 @@ def test_plant_is_another_machine_than_the_model_it_came_from() -> None:
 )
 def test_refusals(act: Any, words: str) -> None:
     with pytest.raises(HardwareError, match=words):
-        act(connected(TRUTH))
+        act(connected(SIM_PARAMS))
 
 
 def test_refusals_before_anything_runs() -> None:
     with pytest.raises(HardwareError, match=r"not connected; call connect\(\) first"):
-        VirtualRobot(ROBOT, TRUTH).latest()
+        VirtualRobot(ROBOT, SIM_PARAMS).latest()
     with pytest.raises(HardwareError, match="no leg 'XL'; it has FR, FL, HR, HL"):
-        VirtualRobot(ROBOT, TRUTH, legs=("XL",))
+        VirtualRobot(ROBOT, SIM_PARAMS, legs=("XL",))
     with pytest.raises(HardwareError, match="no legs"):
-        VirtualRobot(ROBOT, TRUTH, legs=())
+        VirtualRobot(ROBOT, SIM_PARAMS, legs=())
     with pytest.raises(HardwareError, match="log_rate_hz is 50000"):
-        VirtualRobot(ROBOT, TRUTH, log_rate_hz=50000.0)
-    with pytest.raises(RobotError, match="truth is of 'mini_cheetah', the robot is 'so101'"):
-        VirtualRobot(load_robot("so101"), TRUTH)
+        VirtualRobot(ROBOT, SIM_PARAMS, log_rate_hz=50000.0)
+    with pytest.raises(RobotError, match="parameters are of 'mini_cheetah', the robot is 'so101'"):
+        VirtualRobot(load_robot("so101"), SIM_PARAMS)

@@ -26,7 +26,7 @@ from pronk.policy.runtime import load_policy
 from pronk.policy.stride import apart, changes_over
 from pronk.robots import load_robot
 from pronk.runtime.rollout import fly
-from pronk.virtual.sim_params import SHIPPED, load_truth
+from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
 
 def since_change(position: NDArray[np.float64], step: int) -> int | None:
@@ -81,7 +81,7 @@ def main() -> None:
         load_subjects([asked.policy], robot),
         plan,
         robot=robot,
-        truth=load_truth(SHIPPED),
+        sim_params=load_sim_params(SHIPPED),
         out=Path(),
     )
     jobs = [replace(job, keep=None) for _, job in planned]

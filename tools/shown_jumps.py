@@ -34,7 +34,7 @@ from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
 from pronk.runtime.rollout import fly
 from pronk.train.mdp.demonstration import Demonstration, demonstration, parse
-from pronk.virtual.sim_params import SHIPPED, load_truth
+from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
 PUSH_S = 0.26
 """After the jump command feet leave the ground no sooner [s]."""
@@ -102,7 +102,7 @@ def jump(case_number: tuple[Case, int], *, path: Path, shown: Demonstration) -> 
         policy=path,
         sha256=walks.sha256,
         robot=robot.name,
-        truth=load_truth(SHIPPED),
+        sim_params=load_sim_params(SHIPPED),
         ground=None,
         start=start,
         seed=seed,

@@ -8,7 +8,7 @@ from enum import StrEnum
 class Link(StrEnum):
     """How the machine is reached."""
 
-    TWIN = "twin"
+    SIM = "sim"
     LCM = "lcm"
     DDS = "dds"
 

@@ -11,7 +11,7 @@ import typer
 
 from pronk.cli import console, demo_trial
 from pronk.cli.sweep import AMPLITUDES, SignalName, make
-from pronk.cli.sweep_virtual import record_twin
+from pronk.cli.sweep_virtual import record_virtual
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def demo(
         f"open {found['page']} in a browser",
         f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
         *(f"pronk trial {path} --out out/trial" for path in found["policies"][:1]),
-        f"pronk sweep {ROBOT} --link twin --truth YOUR_TRUTH.yaml --out YOUR_LOGS",
+        f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS",
     )
 
 
@@ -187,10 +187,10 @@ def ask_and_match(
     fresh_plan.check()
     report("plan", 1.0)
     clock.lap("plan")
-    paths = record_twin(
+    paths = record_virtual(
         robot, plan, out / "logs", seed=seed, overwrite=True, progress=report.bar("ask")
     )
-    fresh = record_twin(
+    fresh = record_virtual(
         robot,
         fresh_plan,
         out / "fresh",

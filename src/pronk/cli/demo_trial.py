@@ -167,13 +167,13 @@ def jump(
     from pronk.evaluation.processes import cores
     from pronk.evaluation.run import Plan, run
     from pronk.files import sha256
-    from pronk.virtual.sim_params import SHIPPED, load_truth
+    from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
     return run(
         policies,
         Plan(jumps=jumps, seed=seed),
         robot=robot,
-        truth=load_truth(SHIPPED),
+        sim_params=load_sim_params(SHIPPED),
         out=out,
         about={"file": "shipped with pronk", "sha256": sha256(SHIPPED)},
         overwrite=True,

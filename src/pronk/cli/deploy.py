@@ -30,8 +30,8 @@ _INTERRUPTED = 130
 def deploy(
     policy: Annotated[Path, typer.Argument(help="policy.onnx, as `pronk train` writes it.")],
     link: Annotated[
-        Link, typer.Option(help="twin: the virtual robot in this program; lcm, dds: by wire.")
-    ] = Link.TWIN,
+        Link, typer.Option(help="sim: the virtual robot in this program; lcm, dds: by wire.")
+    ] = Link.SIM,
     interface: Annotated[
         str | None,
         typer.Option(help="Network interface to a real robot; without it nothing leaves here."),
@@ -46,7 +46,8 @@ def deploy(
     ] = None,
     log: Annotated[Path | None, typer.Option(help="Log of everything, MCAP.")] = None,
     capture: Annotated[
-        Path | None, typer.Option(help="What cameras around the twin saw, .npz (--link twin).")
+        Path | None,
+        typer.Option(help="What cameras around the virtual robot saw, .npz (--link sim)."),
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(help="Sit down after this time with the policy in charge.")
@@ -55,11 +56,12 @@ def deploy(
         float, typer.Option(help="Time in which the policy takes over, in s; 0 as in training.")
     ] = 0.4,
     tilt: Annotated[float, typer.Option(help="Largest tilt of the trunk, in rad.")] = 0.8,
-    base: Annotated[Base, typer.Option(help="Of the twin.")] = Base.GROUND,
-    truth: Annotated[
-        Path | None, typer.Option(help="Truth of the twin, instead of the shipped one.")
+    base: Annotated[Base, typer.Option(help="Of the virtual robot.")] = Base.GROUND,
+    sim_params: Annotated[
+        Path | None,
+        typer.Option(help="Parameters of the virtual robot, instead of the shipped one."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the twin's noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,
     layout: Annotated[str, typer.Option(help="Messages on LCM: cheetah or wtw.")] = "cheetah",
     port: Annotated[int | None, typer.Option(help="UDP port of LCM.")] = None,
     domain: Annotated[int | None, typer.Option(help="Domain of DDS.")] = None,
@@ -86,8 +88,8 @@ def deploy(
     from pronk.runtime.trajectories import Timing
 
     contract = load_policy(policy).contract
-    if capture is not None and (link is not Link.TWIN or base is not Base.GROUND):
-        raise HardwareError("--capture needs --link twin --base ground: no camera sees elsewhere.")
+    if capture is not None and (link is not Link.SIM or base is not Base.GROUND):
+        raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
     plan = Plan(
         link=Opener(
             kind=link.value,
@@ -97,7 +99,7 @@ def deploy(
             port=port,
             domain=domain,
             release=release,
-            truth=truth,
+            sim_params=sim_params,
             seed=seed,
             base=base.value,
         ),
@@ -110,7 +112,7 @@ def deploy(
         real_time=real_time,
     )
     scripts = None if script is None else _scripts(script, contract, walk_only)
-    if interface is not None and link is not Link.TWIN and not yes:
+    if interface is not None and link is not Link.SIM and not yes:
         confirm.before_it_moves(contract.robot, f"{link.value} on {interface}")
     with _operator(contract, scripts, gamepad, seconds) as (operator, words):
         console.say(words)

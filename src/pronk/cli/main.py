@@ -25,11 +25,11 @@ from pronk.cli import (
     predict,
     report,
     response,
+    simulate,
     sweep,
     train,
     trial,
 )
-from pronk.cli import simulate as twin
 from pronk.errors import PronkError
 
 app = typer.Typer(
@@ -51,7 +51,7 @@ app.command("export")(export.export)
 app.command("trial")(trial.trial)
 app.command("play")(play.play)
 app.command("deploy")(deploy.deploy)
-app.command("twin")(twin.twin)
+app.command("simulate")(simulate.simulate)
 app.command("report")(report.report)
 app.command("demo")(demo.demo)
 
@@ -76,6 +76,24 @@ def _root(
 _UsageError: type[Exception] = typer.BadParameter.__mro__[2]
 
 
+_RENAMED = {
+    ("twin",): "`pronk twin` is now `pronk simulate`",
+    ("--truth",): "`--truth` is now `--sim-params`",
+    ("--link", "twin"): "`--link twin` is now `--link sim`",
+    ("--link=twin",): "`--link twin` is now `--link sim`",
+}
+"""Words of earlier releases, as they follow each other on the command line, and their hints."""
+
+
+def _hint(arguments: Sequence[str]) -> str:
+    """What replaces the first old word on a command line; empty without one."""
+    for words, hint in _RENAMED.items():
+        places = range(1) if words[0][0] != "-" else range(len(arguments))
+        if any(tuple(arguments[k : k + len(words)]) == words for k in places):
+            return hint
+    return ""
+
+
 def _complain(text: str) -> None:
     typer.echo(f"pronk: {' '.join(text.split())}", err=True)
 
@@ -97,6 +115,9 @@ def run_app(commands: typer.Typer, arguments: Sequence[str], name: str) -> int:
         arguments: The words after the program's name.
         name: Name of the program.
     """
+    if hint := _hint(arguments):
+        _complain(f"{hint}; `{name} --help` lists the commands.")
+        return 2
     try:
         status = commands(list(arguments), prog_name=name, standalone_mode=False)
         return status if isinstance(status, int) else 0

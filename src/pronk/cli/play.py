@@ -12,7 +12,7 @@ from pronk.cli import console
 
 def play(
     policy: Annotated[Path, typer.Argument(help="policy.onnx.", metavar="POLICY")],
-    truth: Annotated[
+    sim_params: Annotated[
         Path | None,
         typer.Option(help="Body of the virtual robot; the one that ships with pronk if left out."),
     ] = None,
@@ -41,11 +41,11 @@ def play(
     from pronk.policy.contract import check
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
-    from pronk.virtual.sim_params import load_truth
+    from pronk.virtual.sim_params import load_sim_params
 
     modules()
     robot = load_robot("mini_cheetah")
-    loaded, body = load_policy(policy), load_truth(truth)
+    loaded, body = load_policy(policy), load_sim_params(sim_params)
     check(loaded.contract, robot)
     stick = Stick(ranges=loaded.contract.command_ranges, jumps=loaded.contract.jump)
     pad = None if gamepad is False else Gamepad()

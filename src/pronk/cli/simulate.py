@@ -1,4 +1,4 @@
-"""`pronk twin`: the virtual robot as a process of its own, behind real bytes."""
+"""`pronk simulate`: the virtual robot as a process of its own, behind real bytes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.robots.robot import Robot
-    from pronk.virtual.server import Twin, Wire
+    from pronk.virtual.server import RobotServer, Wire
 
 
 _PRIORITY = 30
@@ -25,7 +25,7 @@ _LATE_MS = 5.0
 """Lateness of one tick in a hundred above which a virtual robot no longer moves like one [ms]."""
 
 
-class TwinLink(StrEnum):
+class WireLink(StrEnum):
     """The wire that the virtual robot speaks."""
 
     LCM = "lcm"
@@ -40,11 +40,11 @@ class Silence(StrEnum):
     DAMP = "damp"
 
 
-def twin(
+def simulate(
     robot: Annotated[
         str, typer.Argument(help="Robot, for instance mini_cheetah.")
     ] = "mini_cheetah",
-    link: Annotated[TwinLink, typer.Option(help="The wire.")] = TwinLink.LCM,
+    link: Annotated[WireLink, typer.Option(help="The wire.")] = WireLink.LCM,
     layout: Annotated[
         Layout,
         typer.Option(help="Messages on LCM: Cheetah-Software's, or walk-these-ways'."),
@@ -52,8 +52,9 @@ def twin(
     base: Annotated[
         Base, typer.Option(help="bench: the trunk is fixed; ground: it stands and moves freely.")
     ] = Base.BENCH,
-    truth: Annotated[
-        Path | None, typer.Option(help="Truth of the virtual robot, instead of the shipped one.")
+    sim_params: Annotated[
+        Path | None,
+        typer.Option(help="Parameters of the virtual robot, instead of the shipped one."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of all noise and all faults.")] = 0,
     port: Annotated[
@@ -104,9 +105,9 @@ def twin(
     from pronk.virtual.capture import save
     from pronk.virtual.faults import parse_faults
     from pronk.virtual.robot import VirtualRobot
+    from pronk.virtual.server import RobotServer, hold_of
     from pronk.virtual.server import Silence as WhenSilent
-    from pronk.virtual.server import Twin, hold_of
-    from pronk.virtual.sim_params import load_truth
+    from pronk.virtual.sim_params import load_sim_params
 
     if capture is not None and base is not Base.GROUND:
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
@@ -115,7 +116,7 @@ def twin(
     when_silent = WhenSilent(action=silence.value, after_s=silence_after)
     machine = VirtualRobot(
         known,
-        load_truth(truth),
+        load_sim_params(sim_params),
         seed=seed,
         base=base.value,
         capture_rate_hz=1000.0 if capture else None,
@@ -127,7 +128,7 @@ def twin(
     wire, where = _open_wire(link, known, layout, port=port, domain=domain, mode=mode)
     try:
         machine.connect()
-        lives = Twin(
+        lives = RobotServer(
             machine, wire, hold=hold_of(known), faults=wrong, silence=when_silent, seed=seed
         )
         console.say(
@@ -148,11 +149,11 @@ def twin(
     way += f" --layout {layout.value}" if layout is not Layout.CHEETAH else ""
     way += f" --port {port}" if port is not None else ""
     way += f" --domain {domain}" if domain is not None else ""
-    console.following(f"pronk sweep {robot} {way} --out DIR   # while a twin runs")
+    console.following(f"pronk sweep {robot} {way} --out DIR   # while a virtual robot runs")
 
 
 def _open_wire(
-    link: TwinLink,
+    link: WireLink,
     robot: Robot,
     layout: Layout,
     *,
@@ -161,7 +162,7 @@ def _open_wire(
     mode: str,
 ) -> tuple[Wire, str]:
     """The robot's end of the wire, and its address in words."""
-    if link is TwinLink.LCM:
+    if link is WireLink.LCM:
         from pronk.links.lcm.address import url_of
         from pronk.links.lcm.layout import layout_of
         from pronk.virtual.lcm_server import LcmWire
@@ -180,7 +181,7 @@ def _open_wire(
     return DdsWire(robot, network, mode=mode), str(network)
 
 
-def _run(lives: Twin, duration: float | None) -> None:
+def _run(lives: RobotServer, duration: float | None) -> None:
     """Live until Ctrl-C, a SIGTERM, or the end of the time given."""
     asked: list[int] = []
     end = time.monotonic() + duration if duration is not None else float("inf")
@@ -214,5 +215,5 @@ def _tell(figures: dict[str, Any]) -> None:
     if figures["slipped_s"]:
         console.warn(
             f"this computer was too busy for real time: the robot stood still for "
-            f"{figures['slipped_s']:.2f} s in {figures['twin']['slips']} pieces"
+            f"{figures['slipped_s']:.2f} s in {figures['server']['slips']} pieces"
         )

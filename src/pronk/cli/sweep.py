@@ -11,7 +11,7 @@ import typer
 
 from pronk.cli import confirm, console, sweep_wire
 from pronk.cli.choices import Layout, Link
-from pronk.cli.sweep_virtual import record_twin as record_twin
+from pronk.cli.sweep_virtual import record_virtual as record_virtual
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ def sweep(
     robot: Annotated[str, typer.Argument(help="Robot, for instance mini_cheetah.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the logs, one MCAP per joint.")],
     link: Annotated[
-        Link, typer.Option(help="twin: the virtual robot in this program; lcm, dds: by wire.")
-    ] = Link.TWIN,
+        Link, typer.Option(help="sim: the virtual robot in this program; lcm, dds: by wire.")
+    ] = Link.SIM,
     interface: Annotated[
         str | None,
         typer.Option(help="Network interface to a real robot; without it nothing leaves here."),
@@ -56,8 +56,9 @@ def sweep(
         bool,
         typer.Option("--real-time/--no-real-time", help="Ask for real-time scheduling (by wire)."),
     ] = True,
-    truth: Annotated[
-        Path | None, typer.Option(help="Truth of the virtual robot, instead of the shipped one.")
+    sim_params: Annotated[
+        Path | None,
+        typer.Option(help="Parameters of the virtual robot, instead of the shipped one."),
     ] = None,
     joints: Annotated[
         list[str] | None,
@@ -85,15 +86,17 @@ def sweep(
 
     machine = load_robot(robot)
     address = None
-    if link is Link.TWIN:
+    if link is Link.SIM:
         sweep_wire.refuse_without_wire(
             interface=interface, layout=layout, port=port, domain=domain, release=release
         )
     else:
         from pronk.links.open import Address
 
-        if truth is not None:
-            raise HardwareError("--truth is of --link twin; give it to `pronk twin` instead.")
+        if sim_params is not None:
+            raise HardwareError(
+                "--sim-params is of --link sim; give it to `pronk simulate` instead."
+            )
         address = Address(
             kind=link.value,
             interface=interface,
@@ -110,7 +113,7 @@ def sweep(
     plan.check()
     figures: dict[str, Any] = {
         "robot": machine.name,
-        "link": str(address or "twin"),
+        "link": str(address or "sim"),
         "duration_s": plan.duration_s,
         "plan": plan.rows(),
         "logs": [],
@@ -121,11 +124,11 @@ def sweep(
         return
     if address is None:
         with console.progress() as report:
-            paths = record_twin(
+            paths = record_virtual(
                 machine,
                 plan,
                 out,
-                truth=truth,
+                sim_params=sim_params,
                 seed=seed,
                 overwrite=overwrite,
                 progress=report.bar("ask the virtual robot"),

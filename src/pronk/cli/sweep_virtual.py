@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from pronk.robots.robot import Robot
 
 
-def record_twin(
+def record_virtual(
     robot: Robot,
     plan: SweepPlan,
     out_dir: Path,
     *,
-    truth: Path | None = None,
+    sim_params: Path | None = None,
     seed: int = 0,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -35,7 +35,7 @@ def record_twin(
         robot: The robot.
         plan: What to ask; checked by the caller.
         out_dir: Folder for the logs.
-        truth: Truth file; the shipped one if None.
+        sim_params: sim_params file; the shipped one if None.
         seed: Of all noise; each leg takes its own from it.
         overwrite: Replace logs that are already there.
         progress: Told the share done, 0 to 1.
@@ -44,10 +44,10 @@ def record_twin(
         The logs, in the order of the robot's joints.
     """
     from pronk.virtual.plant import legs_of
-    from pronk.virtual.sim_params import load_truth
+    from pronk.virtual.sim_params import load_sim_params
 
     # Read it here once, so that a bad file is one message and not one per process.
-    load_truth(truth).check_joints(robot.joint_names, str(truth or "truth"))
+    load_sim_params(sim_params).check_joints(robot.joint_names, str(sim_params or "sim_params"))
     if len(plan.sets) != len(plan.joints):
         raise PlanError("several joints asked at once: the virtual robot is asked one at a time.")
     jobs = []
@@ -62,7 +62,7 @@ def record_twin(
     ):
         told: queue.Queue[tuple[str, float]] = manager.Queue()
         running = {
-            pool.submit(_record_leg, plan, leg, asked, out_dir, truth, s, overwrite, told)
+            pool.submit(_record_leg, plan, leg, asked, out_dir, sim_params, s, overwrite, told)
             for leg, asked, s in jobs
         }
         shares = {leg: 0.0 for leg, _, _ in jobs}
@@ -88,7 +88,7 @@ def _record_leg(
     leg: str,
     joints: Sequence[str],
     out_dir: Path,
-    truth: Path | None,
+    sim_params: Path | None,
     seed: int,
     overwrite: bool,
     told: queue.Queue[tuple[str, float]],
@@ -96,9 +96,9 @@ def _record_leg(
     """Ask one leg; runs in a process of its own."""
     from pronk.runtime.sweep.record import record
     from pronk.virtual.robot import VirtualRobot
-    from pronk.virtual.sim_params import load_truth
+    from pronk.virtual.sim_params import load_sim_params
 
-    machine = VirtualRobot(plan.robot, load_truth(truth), seed=seed, legs=(leg,))
+    machine = VirtualRobot(plan.robot, load_sim_params(sim_params), seed=seed, legs=(leg,))
     return record(
         machine,
         plan.robot,
@@ -107,5 +107,5 @@ def _record_leg(
         progress=lambda share, _: told.put((leg, share)),
         joints=joints,
         overwrite=overwrite,
-        metadata={"link": "twin, in this program"},
+        metadata={"link": "virtual robot, in this program"},
     )

@@ -102,4 +102,6 @@ def refuse_without_wire(**options: object) -> None:
     """
     given = [f"--{name}" for name, value in options.items() if value]
     if given:
-        raise HardwareError(f"{', '.join(given)}: of --link lcm or dds; the twin has no wire.")
+        raise HardwareError(
+            f"{', '.join(given)}: of --link lcm or dds; the virtual robot has no wire."
+        )

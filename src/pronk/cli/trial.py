@@ -37,7 +37,7 @@ def trial(
         ),
     ] = None,
     jumps: Annotated[int, typer.Option(help="Jumps with each command.")] = 20,
-    truth: Annotated[
+    sim_params: Annotated[
         Path | None,
         typer.Option(help="Body of the virtual robot; the one that ships with pronk if left out."),
     ] = None,
@@ -102,7 +102,7 @@ def trial(
     from pronk.files import sha256
     from pronk.report.whole import write_report
     from pronk.robots import load_robot
-    from pronk.virtual.sim_params import SHIPPED, load_truth
+    from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
     if own and not bodies:
         raise PronkError("--own without --bodies; it names policies that are tried on those.")
@@ -112,14 +112,17 @@ def trial(
         rates=0 if commands else RATES_JUMPS,
         seed=seed,
     )
-    file = truth or SHIPPED
+    file = sim_params or SHIPPED
     # A wrong number of processes is refused by `run`; None is left to the machine.
     count = cores() if processes is None else processes
     policies = [policy, *(also or ())]
     asked: dict[str, Any] = {
         "robot": load_robot(ROBOT),
-        "truth": load_truth(file),
-        "about": {"file": str(truth) if truth else "shipped with pronk", "sha256": sha256(file)},
+        "sim_params": load_sim_params(file),
+        "about": {
+            "file": str(sim_params) if sim_params else "shipped with pronk",
+            "sha256": sha256(file),
+        },
         "processes": count,
     }
     with console.progress() as report:

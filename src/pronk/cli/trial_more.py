@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pronk.evaluation.unseen.bodies import Bodies
     from pronk.evaluation.variation import Variation
     from pronk.robots.robot import Robot
-    from pronk.virtual.sim_params import Truth
+    from pronk.virtual.sim_params import SimParams
 
 
 def more(
@@ -25,7 +25,7 @@ def more(
     out: Path,
     *,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     about: Mapping[str, Any],
     seed: int,
     processes: int,
@@ -43,8 +43,8 @@ def more(
         policies: Of the trial.
         out: Its folder.
         robot: What they are for.
-        truth: Body of the virtual robot.
-        about: Where the truth comes from.
+        sim_params: Body of the virtual robot.
+        about: Where the parameters come from.
         seed: Of all draws.
         processes: How many runs at once.
         report: Told what is done, and the share of it.
@@ -70,7 +70,7 @@ def more(
 
     kept: dict[str, Any] = {
         "robot": robot,
-        "truth": truth,
+        "sim_params": sim_params,
         "out": out,
         "about": about,
         "processes": processes,

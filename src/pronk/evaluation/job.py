@@ -20,7 +20,7 @@ from pronk.runtime.rollout import Flown, check_standing, fly
 from pronk.virtual import capture as captures
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 _OFFSETS = (1.0, 0.5, 0.0)
 """Shares of the drawn joint offsets with which a robot is set down until it stands."""
@@ -33,7 +33,7 @@ class Job:
     policy: Path
     sha256: str
     robot: str
-    truth: Truth
+    sim_params: SimParams
     ground: Ground | None
     start: Start
     seed: int
@@ -80,7 +80,7 @@ def body(job: Job, offset: float = 1.0) -> VirtualRobot:
         start = replace(start, joint_offset=tuple(offset * each for each in start.joint_offset))
     return VirtualRobot(
         load_robot(job.robot),
-        job.truth,
+        job.sim_params,
         seed=job.seed,
         base="ground",
         ground=job.ground,

@@ -1,7 +1,7 @@
 """What a trial found: `trials.csv`, one row a jump, and `summary.json`, where it comes from.
 
 `summary.json` (schema pronk/trial/1) says what was run (policies with their hashes and contracts,
-the truth's hash, script, seed, versions) and sums the rows up. Means and spreads are over the jumps
+the hash of the parameters, script, seed, versions) and sums. Means and spreads are over jumps
 that were found; how many those are of how many, and the success rate, stand beside them.
 """
 
@@ -65,7 +65,7 @@ class Trial:
     """By policy, then command, then number."""
     joint_names: tuple[str, ...]
     seed: int
-    truth: Mapping[str, Any]
+    sim_params: Mapping[str, Any]
     """The virtual robot's body: its file and the hash of it."""
     script: Script
     """Without the spread of the jump input's time."""
@@ -185,7 +185,7 @@ def _body(trial: Trial) -> dict[str, Any]:
         "robot": trial.robot,
         "virtual": trial.virtual,
         "policies": [asdict(subject) for subject in trial.subjects],
-        "truth": trial.truth,
+        "sim_params": trial.sim_params,
         "protocol": {
             "commands": [asdict(case) for case in trial.cases],
             "script": {k: v for k, v in asdict(trial.script).items() if k != "command"},
@@ -277,7 +277,7 @@ def _trial(body: Mapping[str, Any], table: str, folder: Path) -> Trial:
         rows=rows,
         joint_names=joints,
         seed=body["seed"],
-        truth=body["truth"],
+        sim_params=body["sim_params"],
         script=Script(command=cases[0].command, **times),
         spread_s=protocol["spread_s"],
         rules=protocol["rules"],

@@ -1,6 +1,6 @@
 """A sheet: one JSON file of what else was tried, beside a trial's table.
 
-Every sheet says what was run (policies with their hashes, the truth, seed, versions), what its
+Every sheet says what was run (policies with their hashes, the parameters, seed, versions), what its
 figures mean, and has one entry a run; what is summed up in it is for the reader, and is summed up
 anew from the entries when a sheet is read.
 """
@@ -33,7 +33,7 @@ class Origin:
     virtual: bool
     """True: measured on pronk's virtual robot."""
     subjects: tuple[Subject, ...]
-    truth: Mapping[str, Any]
+    sim_params: Mapping[str, Any]
     """The virtual robot's body: its file and the hash of it."""
     seed: int
     versions: Mapping[str, str] = field(default_factory=versions)
@@ -46,7 +46,11 @@ def origin(
 ) -> Origin:
     """Where the numbers of a virtual robot come from."""
     return Origin(
-        robot=robot.name, virtual=True, subjects=tuple(subjects), truth=dict(about or {}), seed=seed
+        robot=robot.name,
+        virtual=True,
+        subjects=tuple(subjects),
+        sim_params=dict(about or {}),
+        seed=seed,
     )
 
 

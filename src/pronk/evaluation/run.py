@@ -1,6 +1,6 @@
 """Many jumps: every policy with every command, each jump from a start of its own.
 
-    trial = run([Path("policy.onnx")], Plan(), robot=robot, truth=truth, out=Path("out/trial"))
+    trial = run([Path("policy.onnx")], Plan(), robot=robot, sim_params=load_sim_params(), out=out)
 
 A jump is one life of a virtual robot: set down with a heading and joint offsets of its own, noise
 of its own, and a jump input that comes up to `spread_s` later, so that it meets every phase of the
@@ -38,7 +38,7 @@ from pronk.evaluation.subjects import load_subjects
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.virtual.ground import Ground, Start
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +120,7 @@ def jobs_of(
     plan: Plan,
     *,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
     ground: Ground | None = None,
     keep_captures: bool = False,
@@ -151,7 +151,7 @@ def jobs_of(
                 policy=Path(subject.path),
                 sha256=subject.sha256,
                 robot=robot.name,
-                truth=truth,
+                sim_params=sim_params,
                 ground=ground,
                 start=start,
                 seed=seed,
@@ -187,7 +187,7 @@ def run(
     plan: Plan,
     *,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
     about: Mapping[str, Any] | None = None,
     ground: Ground | None = None,
@@ -202,17 +202,17 @@ def run(
         policies: `policy.onnx` of each; scatter is compared with that of the first.
         plan: What is tried.
         robot: Which robot they are for.
-        truth: Body of the virtual robot.
+        sim_params: Body of the virtual robot.
         out: Folder for the table, the summary and what was seen.
-        about: Where the truth comes from, kept with the result.
-        ground: Under the robot; None for the truth's.
+        about: Where the parameters come from, kept with the result.
+        ground: Under the robot; None for the parameters'.
         keep_captures: Keep what was seen of every jump, not of the first with each command alone.
         overwrite: Replace a trial in `out`.
         processes: How many jumps at once; the numbers do not depend on it.
         progress: Called with the share done, 0 to 1.
 
     Raises:
-        PronkError: Of policies, truth or folder, before the first step.
+        PronkError: Of policies, sim_params or folder, before the first step.
     """
     begun = time.perf_counter()
     subjects = load_subjects(policies, robot)
@@ -220,7 +220,7 @@ def run(
         subjects,
         plan,
         robot=robot,
-        truth=truth,
+        sim_params=sim_params,
         out=out,
         ground=ground,
         keep_captures=keep_captures,
@@ -240,7 +240,7 @@ def run(
         ),
         joint_names=robot.joint_names,
         seed=plan.seed,
-        truth=dict(about or {}),
+        sim_params=dict(about or {}),
         script=plan.script,
         spread_s=plan.spread_s,
         rules=asdict(plan.rules),

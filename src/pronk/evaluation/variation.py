@@ -1,7 +1,7 @@
 """How each result moves when the virtual robot's body is varied, one number at a time.
 
 Every point is the paper's script with the same starts, noise and times as every other point; only
-one number of the truth is another. `PARAMETERS` has the values, and what training had of them.
+one number of the parameters is another. `PARAMETERS` has the values, and what training had of them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pronk.evaluation.run import Plan, jobs_of
 from pronk.evaluation.subjects import load_subjects
 from pronk.evaluation.summary import Spread, share_interval
 from pronk.robots.robot import Robot
-from pronk.virtual.sim_params import Truth, with_changes
+from pronk.virtual.sim_params import SimParams, with_changes
 
 SCHEMA = "pronk/trial-variation/1"
 FILE = "variation.json"
@@ -48,7 +48,7 @@ VARIED_FIGURES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """A number of the truth, and the values it is given."""
+    """A number of the parameters, and the values it is given."""
 
     name: str
     """As `pronk.virtual.sim_params.with_changes` calls it."""
@@ -69,13 +69,13 @@ class Parameter:
                 f"values {self.values} of {self.name!r}; expected one or more, all different."
             )
 
-    def of(self, truth: Truth) -> float:
-        """The value that a truth has."""
+    def of(self, sim_params: SimParams) -> float:
+        """The value that a set of parameters has."""
         if self.name == "trunk_mass_offset":
-            return truth.trunk.mass_offset
+            return sim_params.trunk.mass_offset
         if self.name == "friction":
-            return truth.ground.friction
-        return float(getattr(truth.machine, self.name))
+            return sim_params.ground.friction
+        return float(getattr(sim_params.machine, self.name))
 
 
 PARAMETERS = (
@@ -219,7 +219,7 @@ def add_variation(
     plan: Plan | None = None,
     *,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
     about: Mapping[str, Any] | None = None,
     parameters: tuple[Parameter, ...] = PARAMETERS,
@@ -232,22 +232,22 @@ def add_variation(
         policies: `policy.onnx` of each.
         plan: What is asked at every point; five jumps with each of the paper's commands if None.
         robot: Which robot they are for.
-        truth: The body that is varied.
+        sim_params: The body that is varied.
         out: Folder of the trial.
-        about: Where the truth comes from, kept with the result.
+        about: Where the parameters come from, kept with the result.
         parameters: What is varied.
         processes: How many jumps at once; the numbers do not depend on it.
         progress: Called with the share done, 0 to 1.
 
     Raises:
-        PronkError: Of policies, truth or plan, before the first step; also where a value makes a
+        PronkError: Of policies, sim_params or plan, before the first step; or a value makes a
             body that cannot exist.
     """
     begun, plan = time.perf_counter(), plan or Plan(jumps=5)
     subjects = load_subjects(policies, robot)
-    bodies = [(AS_IT_IS, math.nan, truth)]
+    bodies = [(AS_IT_IS, math.nan, sim_params)]
     bodies += [
-        (each.name, value, with_changes(truth, **{each.name: value}))
+        (each.name, value, with_changes(sim_params, **{each.name: value}))
         for each in parameters
         for value in each.values
     ]
@@ -257,7 +257,7 @@ def add_variation(
         for planned in _planned(name, value, subjects, plan, robot, varied, out)
     ]
     for _, _, varied in bodies:  # a body that cannot exist is refused here
-        body(replace(planned[0][1], truth=varied))
+        body(replace(planned[0][1], sim_params=varied))
     jumped = in_processes(jump, [job for _, job in planned], processes=processes, progress=progress)
     rows = []
     for (row, _), each in zip(planned, jumped, strict=True):
@@ -278,7 +278,7 @@ def add_variation(
         ),
         cases=plan.cases,
         parameters=parameters,
-        own={each.name: each.of(truth) for each in parameters},
+        own={each.name: each.of(sim_params) for each in parameters},
         rows=tuple(rows),
     )
     save(out, variation)
@@ -291,7 +291,7 @@ def _planned(
     subjects: Sequence[Subject],
     plan: Plan,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
 ) -> list[tuple[Varied, Job]]:
     """Every jump at one point, with its row as far as it is known before."""
@@ -311,7 +311,7 @@ def _planned(
             ),
             replace(job, keep=None),
         )
-        for row, job in jobs_of(subjects, plan, robot=robot, truth=truth, out=out)
+        for row, job in jobs_of(subjects, plan, robot=robot, sim_params=sim_params, out=out)
     ]
 
 

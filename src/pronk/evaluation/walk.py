@@ -21,7 +21,7 @@ from pronk.evaluation.subjects import load_subjects
 from pronk.evaluation.summary import Spread
 from pronk.evaluation.walk_metrics import WALK_FIGURES, WalkFigures, measure_walk
 from pronk.robots.robot import Robot
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 SCHEMA = "pronk/trial-walk/1"
 FILE = "walk.json"
@@ -124,7 +124,7 @@ def add_walks(
     policies: Sequence[Path],
     *,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
     about: Mapping[str, Any] | None = None,
     cases: tuple[Case, ...] = WALKS,
@@ -139,9 +139,9 @@ def add_walks(
     Args:
         policies: `policy.onnx` of each.
         robot: Which robot they are for.
-        truth: Body of the virtual robot.
+        sim_params: Body of the virtual robot.
         out: Folder of the trial.
-        about: Where the truth comes from, kept with the result.
+        about: Where the parameters come from, kept with the result.
         cases: Velocities.
         runs: Walks with each velocity, each with a start and noise of its own.
         seconds: How long each lasts [s].
@@ -150,13 +150,13 @@ def add_walks(
         progress: Called with the share done, 0 to 1.
 
     Raises:
-        PronkError: Of policies, truth or plan, before the first step.
+        PronkError: Of policies, sim_params or plan, before the first step.
     """
     begun = time.perf_counter()
     subjects = load_subjects(policies, robot, jump=False)
     script = walk_script(STILL, seconds=seconds)
     plan = Plan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
-    planned = jobs_of(subjects, plan, robot=robot, truth=truth, out=out)
+    planned = jobs_of(subjects, plan, robot=robot, sim_params=sim_params, out=out)
     jobs = [replace(job, keep=None) for _, job in planned]
     body(jobs[0])  # a body that cannot exist is refused here
     measured = in_processes(walk, jobs, processes=processes, progress=progress)

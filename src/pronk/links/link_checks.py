@@ -134,7 +134,7 @@ def clamp(
         if not hold(joints):
             raise HardwareError(
                 f"the virtual robot did not confirm its clamps within {ANSWER_S:g} s; check that "
-                "`pronk twin` still runs."
+                "`pronk simulate` still runs."
             )
     elif hand is not None:
         hand(joints)

@@ -15,7 +15,7 @@ from pronk.links.realtime import sleep_until
 if TYPE_CHECKING:
     from pronk.virtual.robot import VirtualRobot
 
-LINKS = ("twin", *WIRES)
+LINKS = ("sim", *WIRES)
 
 
 class Opener(Protocol):
@@ -41,12 +41,12 @@ class Link:
     layout: str = "cheetah"
     """Of LCM's messages: `cheetah` or `wtw`."""
     port: int | None = None
-    """Of LCM; None for the twin's on loopback and the robots' on an interface."""
+    """Of LCM; None for the virtual robot's on loopback and the robots' on an interface."""
     domain: int | None = None
-    """Of DDS; None for the twin's on loopback and the robots' on an interface."""
+    """Of DDS; None for the virtual robot's on loopback and the robots' on an interface."""
     release: bool = False
     """Make the robot's own controller let go of the joints first."""
-    truth: Path | None = None
+    sim_params: Path | None = None
     """Of the virtual robot; None for the one that comes with pronk."""
     seed: int = 0
     """Of the virtual robot's noise."""
@@ -68,7 +68,7 @@ class Link:
         Raises:
             HardwareError: The link's library is not installed.
         """
-        if self.kind == "twin":
+        if self.kind == "sim":
             return Paced(self._virtual())
         from pronk.robots import load_robot
 
@@ -85,19 +85,19 @@ class Link:
     @property
     def local(self) -> bool:
         """True where nothing leaves this computer, so that no real robot can move."""
-        return self.kind == "twin" or self.interface is None
+        return self.kind == "sim" or self.interface is None
 
     def __str__(self) -> str:
-        where = "" if self.kind == "twin" else f" on {self.interface or 'loopback'}"
+        where = "" if self.kind == "sim" else f" on {self.interface or 'loopback'}"
         return f"{self.kind}{where}"
 
     def _virtual(self) -> VirtualRobot:
         from pronk.robots import load_robot
         from pronk.virtual.robot import VirtualRobot
-        from pronk.virtual.sim_params import load_truth
+        from pronk.virtual.sim_params import load_sim_params
 
         robot = load_robot(self.robot)
-        return VirtualRobot(robot, load_truth(self.truth), seed=self.seed, base=self.base)
+        return VirtualRobot(robot, load_sim_params(self.sim_params), seed=self.seed, base=self.base)
 
 
 class Paced:

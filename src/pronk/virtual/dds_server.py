@@ -37,7 +37,7 @@ COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
 MODES = ("", "normal", "ai", "advanced", "mcf")
 """Controllers of a Go2 that can hold its joints; the first is none."""
 _SERVICE_POLLS = 20
-"""Looks for commands to one for requests: 10 ms at the twin's rate."""
+"""Looks for commands to one for requests: 10 ms at the virtual robot's rate."""
 
 
 class DdsWire:

@@ -11,7 +11,7 @@ import numpy as np
 from pronk.errors import RobotError
 from pronk.robots.robot import Robot
 from pronk.virtual.ground import Ground
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (0, 0, 1)}
 """Joints of a stand that gives a little, and their axes."""
@@ -39,25 +39,25 @@ def free_base(spec: Any, robot: Robot, ground: Ground) -> None:
     ground.add_to(spec)
 
 
-def change_trunk(model: Any, body: int, truth: Truth) -> None:
+def change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
     """Make the trunk what it truly is.
 
     Args:
         model: mujoco.MjModel to change; constants derived from masses are left to the caller.
         body: Id of the trunk.
-        truth: What it is.
+        sim_params: What it is.
 
     Raises:
         RobotError: No body could be like that.
     """
-    trunk = truth.trunk
+    trunk = sim_params.trunk
     mass = float(model.body_mass[body])
     if not mass + trunk.mass_offset > 0.0:
         raise RobotError(
             f"trunk.mass_offset is {trunk.mass_offset:g} kg; the trunk has {mass:.3g} kg, of which "
             "something must be left."
         )
-    # MuJoCo's principal moments are sorted; those of the truth are about x, y, z.
+    # MuJoCo's principal moments are sorted; those of the parameters are about x, y, z.
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, model.body_iquat[body])
     nearest = np.abs(axes.reshape(3, 3)).argmax(axis=0)
@@ -73,23 +73,23 @@ def change_trunk(model: Any, body: int, truth: Truth) -> None:
     model.body_ipos[body] += trunk.com_offset
 
 
-def fix_base(spec: Any, robot: Robot, truth: Truth) -> None:
+def fix_base(spec: Any, robot: Robot, sim_params: SimParams) -> None:
     """Screw a model's trunk to its stand.
 
     Args:
         spec: mujoco.MjSpec to change.
         robot: Which body is the trunk.
-        truth: How stiff the stand is.
+        sim_params: How stiff the stand is.
     """
     base = spec.body(robot.base_body)
     for joint in list(base.joints):
         spec.delete(joint)
-    if math.isfinite(truth.machine.stand_stiffness):
+    if math.isfinite(sim_params.machine.stand_stiffness):
         for name, axis in STAND_AXES.items():
             base.add_joint(
                 name=name,
                 type=mujoco.mjtJoint.mjJNT_HINGE,
                 axis=axis,
-                stiffness=[truth.machine.stand_stiffness, 0, 0],
-                damping=[truth.machine.stand_damping, 0, 0],
+                stiffness=[sim_params.machine.stand_stiffness, 0, 0],
+                damping=[sim_params.machine.stand_damping, 0, 0],
             )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.virtual.quaternion import about_z, of_vector
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 Array = NDArray[np.float64]
 
@@ -48,16 +48,16 @@ class Noise:
 class NoiseSource:
     """Noise, tick after tick."""
 
-    def __init__(self, truth: Truth, joints: int, *, rate_hz: float, seed: int) -> None:
+    def __init__(self, sim_params: SimParams, joints: int, *, rate_hz: float, seed: int) -> None:
         """Start anew.
 
         Args:
-            truth: How large everything is.
+            sim_params: How large everything is.
             joints: Of the robot.
             rate_hz: Ticks per second.
             seed: Of all noise.
         """
-        self._machine, self._filter = truth.machine, truth.attitude
+        self._machine, self._filter = sim_params.machine, sim_params.attitude
         self._joints = joints
         self._period = 1.0 / rate_hz
         self._rng = np.random.default_rng(seed)
@@ -65,7 +65,7 @@ class NoiseSource:
         self._attitude_rng = np.random.default_rng([seed, 1])
         self._yaw = self._attitude_rng.uniform(-math.pi, math.pi)
         # What is left of the slow noise after a tick, and how large what is added is.
-        machine, off, each = truth.machine, truth.attitude, [joints, 3]
+        machine, off, each = sim_params.machine, sim_params.attitude, [joints, 3]
         corner = np.repeat([machine.position_noise_corner_hz, off.noise_corner_hz], each)
         self._keep = np.exp(-2.0 * math.pi * corner * self._period)
         size = np.repeat([machine.position_noise, off.noise], each)

@@ -16,7 +16,7 @@ from pronk.errors import HardwareError
 from pronk.links.machine import Command
 from pronk.virtual.capture import Capture, Recorder, seen
 from pronk.virtual.plant import Plant
-from pronk.virtual.sim_params_parts import MachineTruth
+from pronk.virtual.sim_params_parts import MachineParams
 from pronk.virtual.transport import Transport
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ class Physics:
     def __init__(
         self,
         plant: Plant,
-        machine: MachineTruth,
+        machine: MachineParams,
         *,
         columns: Indices,
         offset: Array,
@@ -170,6 +170,6 @@ class Physics:
         if self.data.time < (self.step - self._first - 0.5) * self._dt:
             raise HardwareError(
                 f"the virtual robot's physics ran away by {self.step * self._dt:.3f} s at a step "
-                f"of {self._dt:g} s; look for an extreme number in the truth or in a command's "
+                f"of {self._dt:g} s; look for an extreme number in its parameters or a command's "
                 "gains."
             )

@@ -33,7 +33,7 @@ from pronk.robots.robot import Robot
 from pronk.virtual.ground import Ground
 from pronk.virtual.mounting import STAND_AXES, change_trunk, fix_base, free_base
 from pronk.virtual.rotor import ROTOR_MASS, MotorConstants, add_rotor
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 Array = NDArray[np.float64]
 
@@ -198,7 +198,7 @@ def _indices(joints: list[Any], of: str) -> NDArray[np.intp]:
     return np.array([getattr(joint, of)[0] for joint in joints], dtype=np.intp)
 
 
-def _check_springs(plant: Plant, truth: Truth) -> None:
+def _check_springs(plant: Plant, sim_params: SimParams) -> None:
     """Refuse springs that the physics step cannot follow.
 
     Raises:
@@ -211,7 +211,7 @@ def _check_springs(plant: Plant, truth: Truth) -> None:
     mujoco.mj_fullM(model, data, inertia)
     mobility = np.diag(np.linalg.inv(inertia))
     for k, name in enumerate(plant.joints):
-        joint = truth.joints[name]
+        joint = sim_params.joints[name]
         rotor, link = mobility[plant.rotor[k]], mobility[plant.link[k]]
         for field, value, mobile in (
             ("belt_stiffness", joint.belt_stiffness, rotor + link),
@@ -227,7 +227,7 @@ def _check_springs(plant: Plant, truth: Truth) -> None:
 
 def build_plant(
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     legs: tuple[str, ...],
     timestep_s: float,
     ground: Ground | None = None,
@@ -236,35 +236,39 @@ def build_plant(
 
     Args:
         robot: Structure, masses and drives to start from.
-        truth: In what the machine differs.
+        sim_params: In what the machine differs.
         legs: Legs to keep in the plant, of `legs_of(robot)`.
         timestep_s: Physics step [s].
         ground: What it stands on; None is the bench.
 
     Raises:
-        RobotError: The truth is of another robot, a joint is missing in the model or in the truth,
+        RobotError: The parameters are of another robot, a joint is missing in the model or in them,
             the trunk is none that could exist, or a spring is too stiff for the step.
     """
-    if truth.robot != robot.name:
+    if sim_params.robot != robot.name:
         raise RobotError(
-            f"the truth is of {truth.robot!r}, the robot is {robot.name!r}; give a truth file "
+            f"the parameters are of {sim_params.robot!r}, the robot is {robot.name!r}; give a file "
             "written for that robot."
         )
-    truth.check_joints(robot.joint_names)
+    sim_params.check_joints(robot.joint_names)
     joints = tuple(joint for joint in robot.joints if joint.name.split("_")[0] in legs)
     spec = robot.build_spec()
     spec.option.timestep = timestep_s
     for key in list(spec.keys):
         spec.delete(key)
     if ground is None:
-        fix_base(spec, robot, truth)
+        fix_base(spec, robot, sim_params)
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     else:
         free_base(spec, robot, ground)
     _drop_legs(spec, robot, {joint.name for joint in joints})
     for joint in joints:
         add_rotor(
-            spec, joint.name, joint.drive, truth.joints[joint.name], truth.machine.drive_lag_s
+            spec,
+            joint.name,
+            joint.drive,
+            sim_params.joints[joint.name],
+            sim_params.machine.drive_lag_s,
         )
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     model = spec.compile()
@@ -274,20 +278,20 @@ def build_plant(
     # Mass and inertia by the same factor: a body that was possible stays possible.
     for joint in joints:
         body = int(model.jnt_bodyid[model.joint(joint.name).id])
-        model.body_mass[body] *= truth.joints[joint.name].link_inertia_scale
-        model.body_inertia[body] *= truth.joints[joint.name].link_inertia_scale
+        model.body_mass[body] *= sim_params.joints[joint.name].link_inertia_scale
+        model.body_inertia[body] *= sim_params.joints[joint.name].link_inertia_scale
     base = model.body(robot.base_body).id
     feet = []
     if ground is not None:
-        change_trunk(model, base, truth)
+        change_trunk(model, base, sim_params)
         feet = [model.geom(f"{leg}_foot_collision").id for leg in legs]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     if ground is not None:
         ground.set_contact(model, np.array(feet, dtype=np.intp))
-    scale = np.array([truth.joints[joint.name].torque_scale for joint in joints])
+    scale = np.array([sim_params.joints[joint.name].torque_scale for joint in joints])
     motors = [MotorConstants.of(joint.drive) for joint in joints]
     believed = np.array([motor.constant for motor in motors])
-    rigid = ground is not None or not math.isfinite(truth.machine.stand_stiffness)
+    rigid = ground is not None or not math.isfinite(sim_params.machine.stand_stiffness)
     plant = Plant(
         model=model,
         joints=tuple(joint.name for joint in joints),
@@ -314,9 +318,9 @@ def build_plant(
         resistance=np.array([motor.resistance for motor in motors]),
         effort_limit=scale * np.array([joint.drive.effort_limit for joint in joints]),
         rotor_inertia=np.array(
-            [truth.joints[j.name].rotor_inertia * j.drive.gear_ratio**2 for j in joints]
+            [sim_params.joints[j.name].rotor_inertia * j.drive.gear_ratio**2 for j in joints]
         ),
-        viscous=np.array([truth.joints[joint.name].viscous for joint in joints]),
+        viscous=np.array([sim_params.joints[joint.name].viscous for joint in joints]),
     )
-    _check_springs(plant, truth)
+    _check_springs(plant, sim_params)
     return plant

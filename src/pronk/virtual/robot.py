@@ -38,7 +38,7 @@ from pronk.virtual.imu_motion import FreeBody, StandingBody
 from pronk.virtual.physics import Physics
 from pronk.virtual.plant import build_plant, legs_of
 from pronk.virtual.sensors import Raw, Sensors
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 from pronk.virtual.transport import Transport, check_command, sinking
 
 TIMESTEP_S = 0.25e-3
@@ -48,10 +48,10 @@ _SETTLE_S = 2.0
 
 
 class VirtualRobot:
-    """A robot of `robot`'s structure and `truth`'s imperfections. Implements `Machine`.
+    """A robot of `robot`'s structure and `sim_params`'s imperfections. Implements `Machine`.
 
     The clock starts at 0 when connected, with every drive holding the default pose at the robot's
-    own gains. Same truth and seed, same calls: same numbers, however `wait` is cut into pieces.
+    own gains. Same parameters, seed, calls: same numbers, however `wait` is cut into pieces.
     A robot that has fallen goes on being simulated.
     """
 
@@ -61,7 +61,7 @@ class VirtualRobot:
     def __init__(
         self,
         robot: Robot,
-        truth: Truth,
+        sim_params: SimParams,
         *,
         seed: int = 0,
         base: Literal["bench", "ground"] = "bench",
@@ -76,10 +76,10 @@ class VirtualRobot:
 
         Args:
             robot: Structure, masses, drives.
-            truth: In what the machine differs.
+            sim_params: In what the machine differs.
             seed: Of all noise.
             base: `bench`: the body is fixed to its stand; `ground`: it stands and moves freely.
-            ground: What it stands on; None is the truth's own floor. On the ground only.
+            ground: What it stands on; None is the parameters' own floor. On the ground only.
             start: How it is set down on the ground; None is in the default pose at the origin.
             log_rate_hz: States per second.
             capture_rate_hz: Samples per second of `capture`, on the ground; None keeps none, for
@@ -90,7 +90,7 @@ class VirtualRobot:
             timestep_s: Physics step.
 
         Raises:
-            RobotError: The truth is not of this robot, or of a body that cannot exist.
+            RobotError: The parameters are not of this robot, or of a body that cannot exist.
             HardwareError: A leg is unknown, a rate impossible, or something does not go with the
                 base.
         """
@@ -102,18 +102,20 @@ class VirtualRobot:
             _check_rate("capture_rate_hz", capture_rate_hz, timestep_s)
         self.robot = robot.name
         self._robot = robot
-        self._truth = truth
+        self._sim_params = sim_params
         self._seed = seed
-        self._ground = (ground or truth.ground) if base == "ground" else None
+        self._ground = (ground or sim_params.ground) if base == "ground" else None
         self._start = start or Start()
         self._rate = log_rate_hz
         self._capture_rate = capture_rate_hz
         self._dt = timestep_s
-        self._plant = build_plant(robot, truth, legs or known, timestep_s, self._ground)
+        self._plant = build_plant(robot, sim_params, legs or known, timestep_s, self._ground)
         # Columns of the present joints in file order, and their encoders' error.
         names = robot.joint_names
         self._columns = np.array([names.index(name) for name in self._plant.joints], dtype=np.intp)
-        self._offset = np.array([truth.joints[name].encoder_offset for name in self._plant.joints])
+        self._offset = np.array(
+            [sim_params.joints[name].encoder_offset for name in self._plant.joints]
+        )
         self._recorder: Recorder | None = None
         self._open = False
 
@@ -124,7 +126,7 @@ class VirtualRobot:
 
     def connect(self) -> None:
         """Set the robot down, let it settle, start the clock; the drives hold its pose."""
-        robot, plant, machine = self._robot, self._plant, self._truth.machine
+        robot, plant, machine = self._robot, self._plant, self._sim_params.machine
         pose = np.array([joint.default_position for joint in robot.joints])
         settle = _SETTLE_S
         self._body: StandingBody | FreeBody = StandingBody(plant)
@@ -132,7 +134,7 @@ class VirtualRobot:
             pose, settle = pose + self._start.offset(len(pose)), self._start.settle_s
             self._body = FreeBody(1.0 / self._rate)
         self._sensors = Sensors(
-            robot, self._truth, plant.joints, rate_hz=self._rate, seed=self._seed
+            robot, self._sim_params, plant.joints, rate_hz=self._rate, seed=self._seed
         )
         self._transport = Transport(len(pose), machine.command_delay_s, self._dt)
         self._physics = Physics(
@@ -221,7 +223,7 @@ class VirtualRobot:
                     f"{self.robot} has no joint {name!r} to clamp; "
                     f"it has {', '.join(self._robot.joint_names)}."
                 )
-        machine = self._truth.machine
+        machine = self._sim_params.machine
         self._plant.set_clamps(
             joints, self._physics.data.qpos, machine.clamp_stiffness, machine.clamp_damping
         )
@@ -275,7 +277,7 @@ class VirtualRobot:
         plant, first = self._plant, self._sensors.sequence
         ticks = np.arange(first, first + count) / self._rate
         # What a state says was measured some time before its timestamp.
-        delay = self._truth.machine.measurement_delay_s
+        delay = self._sim_params.machine.measurement_delay_s
         steps = np.rint((ticks - delay) / self._dt).astype(int)
         block = self._physics.run(steps.tolist(), self._transport)
         return self._sensors.read(

@@ -23,7 +23,7 @@ import mujoco
 
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive
-from pronk.virtual.sim_params_parts import JointTruth
+from pronk.virtual.sim_params_parts import JointParams
 
 ROTOR_MASS = 1e-9
 """The rotor's inertia lives in the armature of its hinge; MuJoCo still wants a body with mass, and
@@ -62,7 +62,7 @@ def _discrete_lag(lag_s: float, timestep_s: float) -> float:
     return timestep_s / math.log1p(timestep_s / lag_s)
 
 
-def add_rotor(spec: Any, name: str, drive: Drive, true: JointTruth, lag_s: float) -> None:
+def add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: float) -> None:
     """Give a joint of a model its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`.
 
     Args:

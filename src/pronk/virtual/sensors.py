@@ -22,7 +22,7 @@ from pronk.robots.robot import Robot
 from pronk.virtual.imu_motion import Motion
 from pronk.virtual.noise import NoiseSource
 from pronk.virtual.quaternion import product
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class Sensors:
     def __init__(
         self,
         robot: Robot,
-        truth: Truth,
+        sim_params: SimParams,
         joints: tuple[str, ...],
         *,
         rate_hz: float,
@@ -63,20 +63,20 @@ class Sensors:
 
         Args:
             robot: Names, gears and default pose.
-            truth: Noise, delays, encoders, attitude filter.
+            sim_params: Noise, delays, encoders, attitude filter.
             joints: The joints that are present, in file order.
             rate_hz: States per second.
             seed: Of all noise.
         """
-        self._machine = machine = truth.machine
+        self._machine = machine = sim_params.machine
         names = robot.joint_names
         self._columns = np.array([names.index(name) for name in joints], dtype=np.intp)
         self._default = np.array([joint.default_position for joint in robot.joints])
-        self._offset = np.array([truth.joints[name].encoder_offset for name in joints])
-        self._scale = np.array([truth.joints[name].torque_scale for name in joints])
+        self._offset = np.array([sim_params.joints[name].encoder_offset for name in joints])
+        self._scale = np.array([sim_params.joints[name].torque_scale for name in joints])
         gears = np.array([robot.joint(name).drive.gear_ratio for name in joints])
         self._count = 2.0 * math.pi / 2.0**machine.encoder_bits / gears
-        self._noise = NoiseSource(truth, len(names), rate_hz=rate_hz, seed=seed)
+        self._noise = NoiseSource(sim_params, len(names), rate_hz=rate_hz, seed=seed)
         self._sequence = 0
 
     @property

@@ -1,6 +1,6 @@
 """The virtual robot as a machine of its own: real time, real bytes, and what goes wrong with them.
 
-A `Wire` is the robot's end of a link. `Twin` holds a virtual robot to the wall clock, passes it
+A `Wire` is the robot end of a link. `RobotServer` holds a virtual robot to the clock, passes it
 what the wire brings, and puts its states on the wire. The drives' PD runs inside physics at 4 kHz;
 nothing in here computes a torque.
 """
@@ -52,7 +52,7 @@ class Wire(Protocol):
     mode: str
     """Name of the robot's own controller that holds the drives; empty when it is released."""
     clamps: tuple[str, ...]
-    """Joints that whoever is at the bench wants held mechanically; the twin holds them."""
+    """Joints that whoever is at the bench wants held mechanically; the virtual robot holds them."""
     spoil_in: Spoil
     """Applied to the bytes of every command that comes in, before anything is checked."""
     spoil_out: Spoil
@@ -102,7 +102,7 @@ def hold_of(robot: Robot) -> Command:
     )
 
 
-class Twin:
+class RobotServer:
     """A virtual robot behind a wire."""
 
     def __init__(
@@ -126,7 +126,7 @@ class Twin:
             seed: Of the faults.
         """
         self.counts: Counter[str] = Counter()
-        """What the twin itself met: `commands applied`, `silences`, `slips`."""
+        """What the virtual robot itself met: `commands applied`, `silences`, `slips`."""
         self._machine = machine
         self._wire = wire
         self._hold = hold
@@ -183,7 +183,7 @@ class Twin:
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Live in real time until `stop()` is true, at most one tick after that."""
-        # What was built until now lives as long as the twin; the collector need not walk it.
+        # What was built until now lives as long as the server; the collector need not walk it.
         gc.freeze()
         start = time.monotonic() - self._machine.now()
         worked = time.process_time()
@@ -208,7 +208,7 @@ class Twin:
         self._cpu += time.process_time() - worked
 
     def figures(self) -> dict[str, object]:
-        """What happened: counts of the twin, the wire and the faults, and what real time cost.
+        """What happened: counts of server, wire and faults, and what real time cost.
 
         Lateness is from a tick's instant to its beginning [ms]; the share of the processor is of
         one core, all threads of the process counted. `zero_s` is when the machine's clock was at
@@ -219,7 +219,7 @@ class Twin:
         return {
             "virtual": True,
             "duration_s": self._now,
-            "twin": dict(self.counts),
+            "server": dict(self.counts),
             "wire": dict(self._wire.counts),
             "command_faults": dict(self._commands.counts),
             "state_faults": dict(self._states.counts),
@@ -244,7 +244,7 @@ class Twin:
             self._wire.contend(self._hold)
 
     def _told(self, state: State) -> State:
-        """What the machine says of a state: the truth, unless a fault is due."""
+        """What the machine says of a state: the parameters, unless a fault is due."""
         now, faults = self._now, self._faults
         stamp = state.time if state.robot_time is None else state.robot_time
         if faults.clock is not None and now >= faults.clock[0]:

@@ -1,11 +1,11 @@
 """What is true of a virtual robot, and of nothing else that pronk may look at.
 
-The truth is a file (`pronk/truth/1`) that can be replaced by any other. It says in which ways
+The file (`pronk/sim_params/1`) can be replaced by any other. It says in which ways
 the virtual machine differs from the model that is matched and trained in. `pronk.match` and
 `pronk.train` must not import this module; a test holds that.
 
 The entries `trunk`, `attitude` and `ground` matter off the bench only. A file may leave them out,
-or some of their fields: then they are as in `truth_parts.py` and `ground.py`.
+or some of their fields: then they are as in `sim_params.py` and `ground.py`.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ import yaml
 
 from pronk.errors import RobotError
 from pronk.virtual.ground import Ground
-from pronk.virtual.sim_params_parts import AttitudeTruth, JointTruth, MachineTruth, TrunkTruth
+from pronk.virtual.sim_params_parts import AttitudeParams, JointParams, MachineParams, TrunkParams
 
-SCHEMA = "pronk/truth/1"
-SHIPPED = Path(__file__).with_name("mini_cheetah_truth.yaml")
+SCHEMA = "pronk/sim_params/1"
+SHIPPED = Path(__file__).with_name("mini_cheetah_sim_params.yaml")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Truth:
-    """The whole truth of a virtual robot."""
+class SimParams:
+    """The whole sim_params of a virtual robot."""
 
     robot: str
     """Name of the robot whose structure it has."""
-    machine: MachineTruth
-    joints: Mapping[str, JointTruth]
-    trunk: TrunkTruth = field(default_factory=TrunkTruth)
-    attitude: AttitudeTruth = field(default_factory=AttitudeTruth)
+    machine: MachineParams
+    joints: Mapping[str, JointParams]
+    trunk: TrunkParams = field(default_factory=TrunkParams)
+    attitude: AttitudeParams = field(default_factory=AttitudeParams)
     ground: Ground = field(default_factory=Ground)
 
-    def check_joints(self, names: Iterable[str], source: str = "truth") -> None:
-        """See that the truth tells of exactly these joints.
+    def check_joints(self, names: Iterable[str], source: str = "sim_params") -> None:
+        """See that the parameters tells of exactly these joints.
 
         Raises:
             RobotError: A joint is missing or unknown.
@@ -53,40 +53,44 @@ class Truth:
             )
 
 
-T = TypeVar("T", JointTruth, MachineTruth, TrunkTruth, AttitudeTruth, Ground)
+T = TypeVar("T", JointParams, MachineParams, TrunkParams, AttitudeParams, Ground)
 
 _REQUIRED = ("schema", "robot", "machine", "joints")
-_OPTIONAL: dict[str, Any] = {"trunk": TrunkTruth, "attitude": AttitudeTruth, "ground": Ground}
+_OPTIONAL: dict[str, Any] = {"trunk": TrunkParams, "attitude": AttitudeParams, "ground": Ground}
 # Written by who sets a scene up, not by who describes a machine.
 _NOT_IN_FILES = ("terrain", "floor")
 _VECTORS = ("bias", "gyro_bias", "accelerometer_bias", "com_offset", "inertia_scale")
 
 
-def with_changes(truth: Truth, **changes: float) -> Truth:
+def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
     """The same machine with a few numbers changed.
 
     Args:
-        truth: To start from; it stays as it is.
+        sim_params: To start from; it stays as it is.
         changes: `trunk_mass_offset` [kg], `friction` (of the ground), or any number of
-            `MachineTruth`, as `command_delay_s` or `bus_voltage`; the values replace the old ones.
+            `MachineParams`, as `command_delay_s` or `bus_voltage`; the values replace the old ones.
 
     Raises:
         RobotError: A name is unknown, or a value impossible.
     """
-    numbers = [f.name for f in fields(MachineTruth) if f.name not in _VECTORS]
+    numbers = [f.name for f in fields(MachineParams) if f.name not in _VECTORS]
     known = ["trunk_mass_offset", "friction", *numbers]
     for name in changes:
         if name not in known:
-            raise RobotError(f"a truth has no {name!r} to change; it has {', '.join(known)}.")
+            raise RobotError(
+                f"a set of parameters has no {name!r} to change; it has {', '.join(known)}."
+            )
     machine: dict[str, Any] = {name: changes[name] for name in changes if name in numbers}
     if machine:
-        truth = replace(truth, machine=replace(truth.machine, **machine))
+        sim_params = replace(sim_params, machine=replace(sim_params.machine, **machine))
     if "trunk_mass_offset" in changes:
         mass = changes["trunk_mass_offset"]
-        truth = replace(truth, trunk=replace(truth.trunk, mass_offset=mass))
+        sim_params = replace(sim_params, trunk=replace(sim_params.trunk, mass_offset=mass))
     if "friction" in changes:
-        truth = replace(truth, ground=replace(truth.ground, friction=changes["friction"]))
-    return truth
+        sim_params = replace(
+            sim_params, ground=replace(sim_params.ground, friction=changes["friction"])
+        )
+    return sim_params
 
 
 def _number(where: str, value: Any) -> float:
@@ -124,8 +128,8 @@ def _read(kind: type[T], where: str, entry: Any) -> T:
         raise RobotError(f"{where}.{error}") from None
 
 
-def parse_truth(body: Any, source: str) -> Truth:
-    """Read a truth from what a YAML file holds.
+def parse_sim_params(body: Any, source: str) -> SimParams:
+    """Read a set of parameters from what a YAML file holds.
 
     Args:
         body: The parsed document.
@@ -137,7 +141,8 @@ def parse_truth(body: Any, source: str) -> Truth:
     """
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         got = body.get("schema") if isinstance(body, dict) else type(body).__name__
-        raise RobotError(f"{source}: schema {got!r}; this pronk reads {SCHEMA!r}.")
+        hint = " The fields of pronk/truth/1 are the same." if got == "pronk/truth/1" else ""
+        raise RobotError(f"{source}: schema {got!r}; this pronk reads {SCHEMA!r}.{hint}")
     known = (*_REQUIRED, *_OPTIONAL)
     for name in body:
         if name not in known:
@@ -149,11 +154,11 @@ def parse_truth(body: Any, source: str) -> Truth:
         raise RobotError(f"{source}: robot is {body['robot']!r}; expected a name.")
     if not isinstance(body["joints"], dict) or not body["joints"]:
         raise RobotError(f"{source}: joints is {body['joints']!r}; expected a mapping by name.")
-    return Truth(
+    return SimParams(
         robot=body["robot"],
-        machine=_read(MachineTruth, f"{source}: machine", body["machine"]),
+        machine=_read(MachineParams, f"{source}: machine", body["machine"]),
         joints={
-            str(name): _read(JointTruth, f"{source}: joints.{name}", entry)
+            str(name): _read(JointParams, f"{source}: joints.{name}", entry)
             for name, entry in body["joints"].items()
         },
         **{
@@ -164,20 +169,20 @@ def parse_truth(body: Any, source: str) -> Truth:
     )
 
 
-def load_truth(path: Path | str | None = None) -> Truth:
-    """Read a truth file.
+def load_sim_params(path: Path | str | None = None) -> SimParams:
+    """Read a sim_params file.
 
     Args:
         path: The file; None for the one that ships with pronk, whose match is the paper's Table I.
 
     Raises:
-        RobotError: The file is missing, not YAML, or `parse_truth` refuses it.
+        RobotError: The file is missing, not YAML, or `parse_sim_params` refuses it.
     """
     path = SHIPPED if path is None else Path(path)
     try:
         body = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise RobotError(f"{path}: no such truth file; copy {SHIPPED} and edit it.") from None
+        raise RobotError(f"{path}: no such sim_params file; copy {SHIPPED} and edit it.") from None
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise RobotError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from error
-    return parse_truth(body, str(path))
+    return parse_sim_params(body, str(path))

@@ -1,4 +1,4 @@
-"""The parts of a truth: a joint, what the joints share, the trunk, the attitude filter.
+"""The parts of a set of parameters: a joint, what the joints share, the trunk, the attitude filter.
 
 Everything of a joint is in joint coordinates (through the gear) unless its name says motor.
 Vectors are in the trunk's frame: x forward, y left, z up.
@@ -16,7 +16,7 @@ _INF = math.inf
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointTruth:
+class JointParams:
     """One joint of the virtual robot."""
 
     torque_scale: float
@@ -59,7 +59,7 @@ class JointTruth:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MachineTruth:
+class MachineParams:
     """What the joints share: timing, supply, sensors, the stand."""
 
     command_delay_s: float
@@ -116,7 +116,7 @@ class MachineTruth:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrunkTruth:
+class TrunkParams:
     """How the trunk differs from the model's; of no effect on the bench."""
 
     mass_offset: float = 0.0
@@ -137,7 +137,7 @@ class TrunkTruth:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AttitudeTruth:
+class AttitudeParams:
     """How far the machine's own attitude filter is off."""
 
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -21,7 +21,7 @@ from pronk.robots.robot import Robot
 from pronk.runtime.rollout import ticks
 from pronk.virtual.capture import Capture
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 _SEE_S = 0.004
 """From look to look at the robot; a lift-off speed is off by less than 4 cm/s for it."""
@@ -74,7 +74,7 @@ class Played:
 def play(
     robot: Robot,
     policy: Policy,
-    truth: Truth,
+    sim_params: SimParams,
     stick: Stick,
     page: Page,
     *,
@@ -89,7 +89,7 @@ def play(
     Args:
         robot: Structure.
         policy: Whose contract fits the robot.
-        truth: Body of the virtual robot.
+        sim_params: Body of the virtual robot.
         stick: What is asked.
         page: Where it is shown.
         gamepad: Read once a policy step.
@@ -99,10 +99,10 @@ def play(
     Raises:
         ArtefactError: The contract does not fit.
         HardwareError: The robot cannot stand.
-        RobotError: The truth is not of this robot.
+        RobotError: The parameters are not of this robot.
     """
     gauge, pace = Gauge(), Pace()
-    machine = Watched(robot, truth, base="ground", seed=seed, capture_rate_hz=None)
+    machine = Watched(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
     began, simulated, resets, over = time.perf_counter(), 0.0, 0, False
     try:
         while not over:

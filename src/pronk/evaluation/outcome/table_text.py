@@ -65,4 +65,6 @@ def virtual_note(trial: Trial) -> str:
     where = (
         "ours: pronk's virtual robot, not a real one" if trial.virtual else "ours: the real robot"
     )
-    return f"{where}; seed {trial.seed}, truth {str(trial.truth.get('sha256', '-'))[:12]}."
+    return (
+        f"{where}; seed {trial.seed}, sim_params {str(trial.sim_params.get('sha256', '-'))[:12]}."
+    )

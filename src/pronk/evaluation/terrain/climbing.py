@@ -46,7 +46,7 @@ from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.runtime.rollout import ticks
 from pronk.virtual.ground import Start
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 CROSSED_BY = (
     Case(name="forward 2", command=(2.0, 0.0, 0.0)),
@@ -186,7 +186,7 @@ def add_crossings(
     plan: Plan | None = None,
     *,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
     about: Mapping[str, Any] | None = None,
     processes: int = 1,
@@ -198,18 +198,18 @@ def add_crossings(
         policies: `policy.onnx` of each.
         plan: What is tried.
         robot: Which robot they are for.
-        truth: Body of the virtual robot.
+        sim_params: Body of the virtual robot.
         out: Folder of the trial.
-        about: Where the truth comes from, kept with the result.
+        about: Where the parameters come from, kept with the result.
         processes: How many runs at once; the numbers do not depend on it.
         progress: Called with the share done, 0 to 1; how much there is to do is a guess.
 
     Raises:
-        PronkError: Of policies, truth or plan, before the first step.
+        PronkError: Of policies, sim_params or plan, before the first step.
     """
     begun, plan = time.perf_counter(), plan or Plan()
     subjects = load_subjects(policies, robot)
-    search = _Search(subjects, plan, robot=robot, truth=truth)
+    search = _Search(subjects, plan, robot=robot, sim_params=sim_params)
     while planned := search.next_round():
         tasks = [task for _, task in planned]
         body(tasks[0].job)  # a body that cannot exist is refused here
@@ -239,10 +239,15 @@ class _Search:
     """Climbs all ladders at once, a rung of each in every round."""
 
     def __init__(
-        self, subjects: Sequence[Subject], plan: Plan, *, robot: Robot, truth: Truth
+        self, subjects: Sequence[Subject], plan: Plan, *, robot: Robot, sim_params: SimParams
     ) -> None:
         self.rows: list[Crossing] = []
-        self._subjects, self._plan, self._robot, self._truth = subjects, plan, robot, truth
+        self._subjects, self._plan, self._robot, self._sim_params = (
+            subjects,
+            plan,
+            robot,
+            sim_params,
+        )
         self._reach: dict[tuple[str, str], float] = {}
         self._rung: dict[tuple[str, str, Kind], int | None] = {
             (subject.name, case.name, kind): 0
@@ -303,8 +308,8 @@ class _Search:
                 policy=Path(subject.path),
                 sha256=subject.sha256,
                 robot=self._robot.name,
-                truth=self._truth,
-                ground=obstacle.on(self._truth.ground, case.command, edge),
+                sim_params=self._sim_params,
+                ground=obstacle.on(self._sim_params.ground, case.command, edge),
                 start=start,
                 seed=seed,
                 script=replace(plan.script, command=case.command),

@@ -1,9 +1,9 @@
 """Bodies never seen: other virtual robots, each matched anew by its own sweep, and the same table.
 
-Every body is drawn around a truth (`pronk.evaluation.unseen.other_params`), asked by its own sweep,
+Every body is drawn around given parameters (`other_params.py`), swept by itself,
 matched, and tried with the same script as everything else. Its folder holds all of it:
 
-    truth.yaml    the body, for a person and for `--truth`
+    sim_params.yaml    the body, for a person and for `--sim-params`
     logs/         its sweep
     gains.yaml    its matched gains: `pronk train all --gains` trains a policy of its own with them
     match.npz
@@ -33,7 +33,7 @@ from pronk.evaluation.result import Subject, Trial
 from pronk.evaluation.run import Plan, run
 from pronk.evaluation.subjects import load_subjects
 from pronk.evaluation.unseen.bode import bode_errors, gains_of, overall_rms_db
-from pronk.evaluation.unseen.other_params import GROUP_TORQUE, TOLERANCES, draw, save_truth
+from pronk.evaluation.unseen.other_params import GROUP_TORQUE, TOLERANCES, draw, save_sim_params
 from pronk.evaluation.unseen.own_sweep import GAINS, LOGS, SETTINGS, ask, match_own
 from pronk.files import sha256
 from pronk.logs.joint_log import SweepLog
@@ -41,13 +41,13 @@ from pronk.logs.readers import read_logs
 from pronk.match import gains as gains_file
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.robots.robot import Robot
-from pronk.virtual.sim_params import Truth, load_truth
+from pronk.virtual.sim_params import SimParams, load_sim_params
 
 SCHEMA = "pronk/trial-bodies/1"
 FILE = "bodies.json"
 FOLDER = "bodies"
 WRITER = "pronk trial POLICY --bodies"
-TRUTH, TRIAL = "truth.yaml", "trial"
+SIM_PARAMS, TRIAL = "sim_params.yaml", "trial"
 NAIVE = "drive's own"
 MATCHED = "matched anew"
 TRAINABLE = "matched anew, by group"
@@ -78,7 +78,7 @@ class Body:
     seed: int
     """Of its draw and of its sweep's noise."""
     sha256: str
-    """Of its truth file."""
+    """Of its sim_params file."""
     joints: Mapping[str, JointGains]
     """Matched anew."""
     groups: Mapping[str, GroupGains]
@@ -92,7 +92,7 @@ class Bodies:
     """All of them."""
 
     origin: sheet.Origin
-    """Its truth is the one they are drawn around, its policies those that every body is given."""
+    """Its sim_params are drawn around, its policies given to every body."""
     bodies: tuple[Body, ...]
     tolerances: Mapping[str, Any] = field(default_factory=dict)
     """How far they are drawn."""
@@ -103,7 +103,7 @@ def add_bodies(
     plan: Plan | None = None,
     *,
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
     about: Mapping[str, Any] | None = None,
     count: int = 3,
@@ -122,9 +122,9 @@ def add_bodies(
         policies: `policy.onnx` of each; all of them are tried on every body.
         plan: What is tried; the paper's script, 20 jumps with each command, if None.
         robot: Which robot they are for.
-        truth: What is drawn around.
+        sim_params: What is drawn around.
         out: Folder of the trial; the bodies' folders are made in `bodies` in it.
-        about: Where the truth comes from, kept with the result.
+        about: Where the parameters come from, kept with the result.
         count: Bodies.
         own: For each body, in order, policies that were trained with its own gains; they are tried
             on it beside the others.
@@ -134,7 +134,7 @@ def add_bodies(
         progress: Called with what is done and the share of it.
 
     Raises:
-        PronkError: Of policies, truth or plan, before the first step.
+        PronkError: Of policies, sim_params or plan, before the first step.
     """
     begun, plan = time.perf_counter(), plan or Plan()
     if count < 1 or len(own) > count:
@@ -147,7 +147,7 @@ def add_bodies(
     given = [[*policies, *(own[i] if i < len(own) else ())] for i in range(count)]
     for paths in given:
         load_subjects(paths, robot)
-    drawn = [draw(truth, robot, seed=1000 * seed + number) for number in range(1, count + 1)]
+    drawn = [draw(sim_params, robot, seed=1000 * seed + number) for number in range(1, count + 1)]
     bodies = []
     for i, (body, paths) in enumerate(zip(drawn, given, strict=True)):
         name = f"body {i + 1}"
@@ -167,9 +167,9 @@ def add_bodies(
             paths,
             plan,
             robot=robot,
-            truth=body,
+            sim_params=body,
             out=folder / TRIAL,
-            about={"file": str(folder / TRUTH), "sha256": sha256(folder / TRUTH)},
+            about={"file": str(folder / SIM_PARAMS), "sha256": sha256(folder / SIM_PARAMS)},
             overwrite=True,
             processes=processes,
             progress=lambda share, name=name: tell(f"{name}: jump", share),  # type: ignore[misc]
@@ -179,7 +179,7 @@ def add_bodies(
                 name=name,
                 folder=str(folder.relative_to(out)),
                 seed=1000 * seed + i + 1,
-                sha256=sha256(folder / TRUTH),
+                sha256=sha256(folder / SIM_PARAMS),
                 joints=matched.joints,
                 groups=matched.groups,
                 errors=_errors(robot, logs, matched, found.subjects),
@@ -200,7 +200,7 @@ def add_bodies(
 
 def _matched(
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     folder: Path,
     *,
     name: str,
@@ -210,14 +210,14 @@ def _matched(
     tell: Callable[[str, float], None],
 ) -> tuple[MatchedGains, list[SweepLog]]:
     """The gains of a body and its sweep; asked and matched unless its folder has them."""
-    if _known(folder, truth):
+    if _known(folder, sim_params):
         files = [folder / LOGS / f"{joint}.mcap" for joint in robot.joint_names]
         return gains_file.load(folder / GAINS), read_logs(files, processes=processes, robot=robot)
     (folder / GAINS).unlink(missing_ok=True)
-    save_truth(folder / TRUTH, truth, says=_says(name, seed))
+    save_sim_params(folder / SIM_PARAMS, sim_params, says=_says(name, seed))
     logs = ask(
         robot,
-        truth,
+        sim_params,
         folder / LOGS,
         seed=seed,
         repeats=repeats,
@@ -231,12 +231,12 @@ def _matched(
     return gains_file.load(folder / GAINS), logs
 
 
-def _known(folder: Path, truth: Truth) -> bool:
+def _known(folder: Path, sim_params: SimParams) -> bool:
     """Whether a folder holds this very body with its gains, which are written last."""
-    if not (folder / TRUTH).exists() or not (folder / GAINS).exists():
+    if not (folder / SIM_PARAMS).exists() or not (folder / GAINS).exists():
         return False
     try:
-        return load_truth(folder / TRUTH) == truth
+        return load_sim_params(folder / SIM_PARAMS) == sim_params
     except PronkError:
         return False
 
@@ -246,7 +246,7 @@ def _says(name: str, seed: int) -> str:
         f"What is true of {name}, a virtual robot that nobody has seen.\n"
         f"Drawn by `{WRITER}`, seed {seed}. How far each number may be from that of\n"
         "the body it is drawn around, and why, is in bodies.json.\n"
-        "Fields and units: pronk/hardware/truth_parts.py and ground.py."
+        "Fields and units: pronk/virtual/sim_params.py and ground.py."
     )
 
 

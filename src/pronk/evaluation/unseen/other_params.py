@@ -1,8 +1,8 @@
-"""Virtual robots that nobody has seen: seeded draws around a truth, within stated tolerances.
+"""Virtual robots that nobody has seen: seeded draws around given ones, within stated tolerances.
 
 `TOLERANCES` says how far each number of a body may lie from the one it is drawn around, and why
-that far. Everything that is not named there stays. A drawn body is written as a truth file
-(`pronk/truth/1`), so that a person can open it and `--truth FILE` can use it.
+that far. Everything that is not named there stays. A drawn body is written as a sim_params file
+(`pronk/sim_params/1`), so that a person can open it and `--sim-params FILE` can use it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pronk.errors import PronkError
 from pronk.files import write_text
 from pronk.robots.robot import Robot
 from pronk.virtual.ground import Ground
-from pronk.virtual.sim_params import SCHEMA, Truth
-from pronk.virtual.sim_params_parts import AttitudeTruth, JointTruth, MachineTruth, TrunkTruth
+from pronk.virtual.sim_params import SCHEMA, SimParams
+from pronk.virtual.sim_params_parts import AttitudeParams, JointParams, MachineParams, TrunkParams
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,31 +91,31 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         "damping": _relative(0.4, "the same"),
     },
 }
-"""By part of the truth and name of the number."""
+"""By part of the parameters and name of the number."""
 
 _DIGITS = 5
 _NOT_IN_FILES = ("terrain", "floor")
 
 
-def draw(truth: Truth, robot: Robot, *, seed: int) -> Truth:
-    """Another body: every number of `TOLERANCES` drawn anew about a truth.
+def draw(sim_params: SimParams, robot: Robot, *, seed: int) -> SimParams:
+    """Another body: every number of `TOLERANCES` drawn anew about a set of parameters.
 
     The numbers are rounded to five digits, so that the file that is written holds the very body.
 
     Args:
-        truth: To draw around.
+        sim_params: To draw around.
         robot: Whose joints it has; says which of them form a group.
         seed: Of the draw. Same seed, same body.
 
     Raises:
-        RobotError: The truth is not of this robot, or a drawn body cannot exist.
+        RobotError: The parameters are not of this robot, or a drawn body cannot exist.
     """
-    truth.check_joints(robot.joint_names)
+    sim_params.check_joints(robot.joint_names)
     rng = np.random.default_rng([seed, 0x707])
     batch = {group: 1.0 + GROUP_TORQUE * rng.uniform(-1.0, 1.0) for group in robot.groups}
-    joints: dict[str, JointTruth] = {}
+    joints: dict[str, JointParams] = {}
     for joint in robot.joints:
-        true = truth.joints[joint.name]
+        true = sim_params.joints[joint.name]
         drawn = _drawn(true, "joints", rng)
         drawn["torque_scale"] = _rounded(drawn["torque_scale"] * batch[joint.group])
         # Break-away is friction's peak: it moves with the friction, and is never below it.
@@ -123,12 +123,12 @@ def draw(truth: Truth, robot: Robot, *, seed: int) -> Truth:
         drawn["breakaway"] = max(_rounded(drawn["coulomb"] * ratio), drawn["coulomb"])
         joints[joint.name] = replace(true, **drawn)
     return replace(
-        truth,
-        machine=replace(truth.machine, **_drawn(truth.machine, "machine", rng)),
+        sim_params,
+        machine=replace(sim_params.machine, **_drawn(sim_params.machine, "machine", rng)),
         joints=joints,
-        trunk=replace(truth.trunk, **_drawn(truth.trunk, "trunk", rng)),
-        attitude=replace(truth.attitude, **_drawn(truth.attitude, "attitude", rng)),
-        ground=replace(truth.ground, **_drawn(truth.ground, "ground", rng)),
+        trunk=replace(sim_params.trunk, **_drawn(sim_params.trunk, "trunk", rng)),
+        attitude=replace(sim_params.attitude, **_drawn(sim_params.attitude, "attitude", rng)),
+        ground=replace(sim_params.ground, **_drawn(sim_params.ground, "ground", rng)),
     )
 
 
@@ -173,34 +173,34 @@ _Dumper.add_representer(_Flow, _represent_flow)
 _Dumper.add_representer(_Vector, _represent_vector)
 
 
-def save_truth(path: Path, truth: Truth, *, says: str) -> None:
-    """Write a truth file, whole or not at all.
+def save_sim_params(path: Path, sim_params: SimParams, *, says: str) -> None:
+    """Write a sim_params file, whole or not at all.
 
     Args:
         path: Where to.
-        truth: On an empty floor.
+        sim_params: On an empty floor.
         says: What it is and where it comes from, as the comment at its head.
 
     Raises:
-        PronkError: There are blocks or a lowered floor; a truth file describes a machine.
+        PronkError: There are blocks or a lowered floor; a sim_params file describes a machine.
     """
-    if truth.ground != replace(truth.ground, terrain=(), floor=0.0):
-        raise PronkError(f"{path}: a truth file holds no terrain; take the blocks away first.")
+    if sim_params.ground != replace(sim_params.ground, terrain=(), floor=0.0):
+        raise PronkError(f"{path}: a sim_params file holds no terrain; take the blocks away first.")
     body = {
         "schema": SCHEMA,
-        "robot": truth.robot,
-        "machine": _plain(truth.machine),
-        "trunk": _plain(truth.trunk),
-        "attitude": _plain(truth.attitude),
-        "ground": _plain(truth.ground),
-        "joints": {name: _Flow(_plain(joint)) for name, joint in truth.joints.items()},
+        "robot": sim_params.robot,
+        "machine": _plain(sim_params.machine),
+        "trunk": _plain(sim_params.trunk),
+        "attitude": _plain(sim_params.attitude),
+        "ground": _plain(sim_params.ground),
+        "joints": {name: _Flow(_plain(joint)) for name, joint in sim_params.joints.items()},
     }
     head = "".join(f"# {line}".rstrip() + "\n" for line in says.splitlines())
     write_text(path, head + "\n" + yaml.dump(body, Dumper=_Dumper, sort_keys=False, width=100))
 
 
 def _plain(
-    part: JointTruth | MachineTruth | TrunkTruth | AttitudeTruth | Ground,
+    part: JointParams | MachineParams | TrunkParams | AttitudeParams | Ground,
 ) -> dict[str, Any]:
     values = {
         field.name: getattr(part, field.name)

@@ -1,6 +1,6 @@
 """A virtual robot's own sweep and match: what a person does first with a robot never seen.
 
-The body is asked as `pronk sweep --link twin` asks it, and matched as `pronk match --quick` does:
+The body is asked as `pronk sweep --link sim` asks it, and matched as `pronk match --quick` does:
 the match reads the logs and nothing else of the body.
 """
 
@@ -23,7 +23,7 @@ from pronk.robots.robot import Robot
 from pronk.runtime.sweep.record import record
 from pronk.virtual.plant import legs_of
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import Truth
+from pronk.virtual.sim_params import SimParams
 
 AMPLITUDE = 0.25
 """Of the paper's chirp (F3) [rad]."""
@@ -38,7 +38,7 @@ class _Leg:
     """The questions to one leg; on a rigid bench legs do not feel each other."""
 
     plan: SweepPlan
-    truth: Truth
+    sim_params: SimParams
     leg: str
     out: Path
     seed: int
@@ -46,14 +46,14 @@ class _Leg:
 
 def _ask(leg: _Leg) -> list[Path]:
     robot = leg.plan.robot
-    machine = VirtualRobot(robot, leg.truth, seed=leg.seed, legs=(leg.leg,))
+    machine = VirtualRobot(robot, leg.sim_params, seed=leg.seed, legs=(leg.leg,))
     asked = [name for name in leg.plan.joints if name.split("_")[0] == leg.leg]
     return record(machine, robot, leg.plan, leg.out, joints=asked, overwrite=True)
 
 
 def ask(
     robot: Robot,
-    truth: Truth,
+    sim_params: SimParams,
     out: Path,
     *,
     seed: int = 0,
@@ -65,7 +65,7 @@ def ask(
 
     Args:
         robot: What the body is of.
-        truth: The body.
+        sim_params: The body.
         out: Folder for the logs, one MCAP a joint; logs that are there are replaced.
         seed: Of all noise.
         repeats: Times that every joint is asked; three or more give honest intervals.
@@ -82,7 +82,7 @@ def ask(
     plan = make_plan(robot, amplitudes=(AMPLITUDE,), repeats=repeats)
     plan.check()
     legs = [
-        _Leg(plan=plan, truth=truth, leg=leg, out=out, seed=1000 * seed + index)
+        _Leg(plan=plan, sim_params=sim_params, leg=leg, out=out, seed=1000 * seed + index)
         for index, leg in enumerate(legs_of(robot))
     ]
     written = in_processes(_ask, legs, processes=processes, progress=progress)

@@ -18,7 +18,7 @@ GROUP = "239.255.76.67"
 """LCM's multicast group, that of every robot too."""
 ROBOT_PORT = 7667
 """LCM's port, that of every robot too."""
-TWIN_PORT = 7768
+VIRTUAL_PORT = 7768
 """The virtual robot's: private, so that nothing here ever meets a real one."""
 _ROUTES = Path("/proc/net/route")
 
@@ -27,19 +27,21 @@ def url_of(*, port: int | None = None, interface: str | None = None) -> str:
     """The address of a link.
 
     Args:
-        port: UDP port; `TWIN_PORT` on loopback and `ROBOT_PORT` on an interface if None.
+        port: UDP port; `VIRTUAL_PORT` on loopback and `ROBOT_PORT` on an interface if None.
         interface: Network interface of the real robot, by the system's name; `lo` if pronk runs
             on the robot itself. None stays on this computer.
 
     Raises:
         HardwareError: The port is impossible, or multicast does not leave by that interface.
     """
-    number = port if port is not None else (ROBOT_PORT if interface else TWIN_PORT)
+    number = port if port is not None else (ROBOT_PORT if interface else VIRTUAL_PORT)
     if not 1024 <= number <= 65535:
-        raise HardwareError(f"LCM port {number}; expected 1024 to 65535, for instance {TWIN_PORT}.")
+        raise HardwareError(
+            f"LCM port {number}; expected 1024 to 65535, for instance {VIRTUAL_PORT}."
+        )
     if interface is None and number == ROBOT_PORT:
         raise HardwareError(
-            f"LCM port {ROBOT_PORT} is the real robots'; take another, for instance {TWIN_PORT}, "
+            f"LCM port {ROBOT_PORT} is the real robots'; take another, as {VIRTUAL_PORT}, "
             "or name the robot's network interface (lo on the robot itself)."
         )
     if interface in (None, "lo"):

@@ -1,4 +1,4 @@
-"""A robot behind LCM: the Mini Cheetah, a Go1 behind the bridge of walk-these-ways, or the twin.
+"""A robot behind LCM: the Mini Cheetah, a Go1 by the bridge of walk-these-ways, or a virtual robot.
 
 One handle receives, in a thread of its own, because polling one message per tick from LCM's queue
 yields data hundreds of milliseconds old; the other publishes. Times are the local monotonic
@@ -59,7 +59,7 @@ class LcmMachine(NetworkLink):
         Args:
             robot: Names, order and limits of the joints.
             layout: `cheetah` or `wtw`.
-            port: UDP port; None for the twin's on loopback, the robots' on an interface.
+            port: UDP port; None for the virtual robot's on loopback, the robots' on an interface.
             interface: Network interface of a real robot, `lo` on the robot itself; None never
                 leaves this computer and meets no real robot.
             hand: Who fixes joints on a real bench; None if nobody.

@@ -14,7 +14,7 @@ from pronk.links.lcm.message import RefusedError
 
 REQUEST_CHANNEL, RESPONSE_CHANNEL = "interface_request", "interface_response"
 """Where parameters are set and confirmed (`HardwareBridge.cpp`)."""
-BENCH_CHANNEL, BEACON_CHANNEL = "pronk_bench", "pronk_twin"
+BENCH_CHANNEL, BEACON_CHANNEL = "pronk_bench", "pronk_virtual"
 """Where the virtual robot is asked for clamps, and where it says what it is."""
 
 MODES = {0: "", 1: "stand_up", 3: "balance_stand", 4: "locomotion", 6: "recovery_stand"}
@@ -69,7 +69,7 @@ def clamp_message(names: tuple[str, ...], held: tuple[str, ...], number: int) ->
         held: Of those to be held, or held.
         number: Of the request.
     """
-    return types.PRONK_TWIN.encode(request=number, clamped=[int(name in held) for name in names])
+    return types.VIRTUAL_ROBOT.encode(request=number, clamped=[int(name in held) for name in names])
 
 
 def read_clamp_message(names: tuple[str, ...], data: bytes) -> tuple[int, tuple[str, ...]]:
@@ -78,6 +78,6 @@ def read_clamp_message(names: tuple[str, ...], data: bytes) -> tuple[int, tuple[
     Raises:
         RefusedError: `fingerprint` or `length`.
     """
-    fields = types.PRONK_TWIN.decode(data)
+    fields = types.VIRTUAL_ROBOT.decode(data)
     flags = zip(names, fields["clamped"].tolist(), strict=True)
     return int(fields["request"]), tuple(name for name, held in flags if held)

@@ -117,8 +117,10 @@ WTW_STATE_ESTIMATOR = Message(
 
 # --- pronk's own, of the virtual robot alone ----------------------------------------------------
 
-PRONK_TWIN = Message("pronk.twin_lcmt", 0x23FC8EF4C8F343CB, "int64_t request; int8_t clamped[12]")
-"""From the bench: joints to hold. From the twin: joints held, and the request that asked."""
+VIRTUAL_ROBOT = Message(
+    "pronk.virtual_robot_lcmt", 0x23FC8EF4C8F343CB, "int64_t request; int8_t clamped[12]"
+)
+"""From the bench: joints to hold. From the virtual robot: joints held, and the request answered."""
 
 MESSAGES = {
     message.fingerprint: message
@@ -138,7 +140,7 @@ MESSAGES = {
         WTW_PD_TAU_TARGETS,
         WTW_RC_COMMAND,
         WTW_STATE_ESTIMATOR,
-        PRONK_TWIN,
+        VIRTUAL_ROBOT,
     )
 }
 """Every message, by fingerprint."""

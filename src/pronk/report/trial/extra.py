@@ -55,7 +55,7 @@ def part(
     """
     versions = ", ".join(f"{name} {version}" for name, version in origin.versions.items())
     hashes = ", ".join(f"{subject.name} {subject.sha256[:12]}" for subject in origin.subjects)
-    body = str(origin.truth.get("sha256", "unknown"))[:12]
+    body = str(origin.sim_params.get("sha256", "unknown"))[:12]
     html = shell.fill(
         "extra.html.j2",
         at=f"{anchor}-" if anchor else "",

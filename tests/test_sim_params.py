@@ -1,4 +1,4 @@
-"""The truth of the virtual robot: what is refused, and with which words."""
+"""The parameters of the virtual robot: what is refused, and with which words."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import yaml
 from pronk.errors import RobotError
 from pronk.robots import load_robot
 from pronk.virtual.plant import build_plant
-from pronk.virtual.sim_params import SHIPPED, load_truth, parse_truth
+from pronk.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params
 
 BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
 ROBOT = load_robot("mini_cheetah")
@@ -29,10 +29,10 @@ def changed(*path: str, value: Any) -> dict[str, Any]:
 
 
 def test_shipped_truth_is_of_the_mini_cheetah_and_plausible() -> None:
-    truth = load_truth()
-    truth.check_joints(ROBOT.joint_names)
-    assert truth.robot == ROBOT.name
-    for name, joint in truth.joints.items():
+    sim_params = load_sim_params()
+    sim_params.check_joints(ROBOT.joint_names)
+    assert sim_params.robot == ROBOT.name
+    for name, joint in sim_params.joints.items():
         assert 0.8 <= joint.link_inertia_scale <= 1.3, name
         assert 0.8 <= joint.torque_scale <= 1.45, name
         assert 0.0 <= joint.viscous <= 0.15, name
@@ -42,7 +42,7 @@ def test_shipped_truth_is_of_the_mini_cheetah_and_plausible() -> None:
 
 
 def test_no_two_joints_are_alike() -> None:
-    joints = list(load_truth().joints.values())
+    joints = list(load_sim_params().joints.values())
     for name in ("coulomb", "link_inertia_scale", "belt_stiffness", "encoder_offset"):
         values = [getattr(joint, name) for joint in joints]
         assert len(set(values)) > len(joints) // 2, name
@@ -66,14 +66,14 @@ def test_no_two_joints_are_alike() -> None:
         (("machine", "command_delay"), 0.002, "machine.command_delay is unknown; the fields are"),
         (("robot",), 7, "robot is 7; expected a name"),
         (("colour",), "red", "colour is unknown; the entries are schema, robot"),
-        (("schema",), "pronk/gains/1", "this pronk reads 'pronk/truth/1'"),
+        (("schema",), "pronk/gains/1", "this pronk reads 'pronk/sim_params/1'"),
     ],
 )
 def test_impossible_is_refused_in_one_sentence_naming_the_field(
     path: tuple[str, ...], value: Any, words: str
 ) -> None:
     with pytest.raises(RobotError) as caught:
-        parse_truth(changed(*path, value=value), "my.yaml")
+        parse_sim_params(changed(*path, value=value), "my.yaml")
     message = str(caught.value)
     assert words in message
     assert message.startswith("my.yaml: ")
@@ -88,43 +88,47 @@ def test_missing_field_is_named(path: tuple[str, ...]) -> None:
         entry = entry[key]
     del entry[path[-1]]
     with pytest.raises(RobotError, match=rf"{'.'.join(path)} is missing"):
-        parse_truth(body, "my.yaml")
+        parse_sim_params(body, "my.yaml")
 
 
 def test_missing_and_foreign_joints_are_named() -> None:
-    truth = load_truth()
-    short = replace(truth, joints={k: v for k, v in truth.joints.items() if k != "HR_knee"})
+    sim_params = load_sim_params()
+    short = replace(
+        sim_params, joints={k: v for k, v in sim_params.joints.items() if k != "HR_knee"}
+    )
     with pytest.raises(RobotError, match=r"joints\.HR_knee is missing"):
         build_plant(ROBOT, short, ("FR",), 0.25e-3)
-    foreign = replace(truth, joints={**truth.joints, "tail": truth.joints["HR_knee"]})
+    foreign = replace(
+        sim_params, joints={**sim_params.joints, "tail": sim_params.joints["HR_knee"]}
+    )
     with pytest.raises(RobotError, match=r"joints\.tail is not a joint of mini_cheetah"):
         build_plant(ROBOT, foreign, ("FR",), 0.25e-3)
 
 
 def test_belt_too_stiff_for_the_step_is_refused_with_the_stiffest_that_fits() -> None:
-    truth = load_truth()
-    stiff = replace(truth.joints["FR_hip_roll"], belt_stiffness=9e4)
-    broken = replace(truth, joints={**truth.joints, "FR_hip_roll": stiff})
+    sim_params = load_sim_params()
+    stiff = replace(sim_params.joints["FR_hip_roll"], belt_stiffness=9e4)
+    broken = replace(sim_params, joints={**sim_params.joints, "FR_hip_roll": stiff})
     with pytest.raises(RobotError, match=r"FR_hip_roll\.belt_stiffness is 90000; .* at most"):
         build_plant(ROBOT, broken, ("FR",), 0.25e-3)
     build_plant(ROBOT, broken, ("FR",), 0.025e-3)
 
 
 def test_files_that_are_no_truth(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match="no such truth file"):
-        load_truth(tmp_path / "none.yaml")
+    with pytest.raises(RobotError, match="no such sim_params file"):
+        load_sim_params(tmp_path / "none.yaml")
     bad = tmp_path / "bad.yaml"
     bad.write_text("joints: [unclosed")
     with pytest.raises(RobotError, match="cannot be read as YAML"):
-        load_truth(bad)
+        load_sim_params(bad)
     bad.write_text("")
     with pytest.raises(RobotError, match="schema 'NoneType'"):
-        load_truth(str(bad))
+        load_sim_params(str(bad))
 
 
 def test_a_file_of_ones_own_replaces_the_shipped_one(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(changed("machine", "bus_voltage", value=22.0)))
-    assert load_truth(path) == replace(
-        load_truth(), machine=replace(load_truth().machine, bus_voltage=22.0)
+    assert load_sim_params(path) == replace(
+        load_sim_params(), machine=replace(load_sim_params().machine, bus_voltage=22.0)
     )

@@ -12,18 +12,18 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from pronk.cli.simulate import twin as twin_command
+from pronk.cli.simulate import simulate as simulate_command
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 from pronk.virtual.capture import load
 from pronk.virtual.faults import Faults, parse_faults
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.server import TICK_S, Silence, Spoil, Twin, hold_of
-from pronk.virtual.sim_params import load_truth
+from pronk.virtual.server import TICK_S, RobotServer, Silence, Spoil, hold_of
+from pronk.virtual.sim_params import load_sim_params
 
 APP = typer.Typer()
-APP.command()(twin_command)
+APP.command()(simulate_command)
 ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
 RAISED = replace(HOLD, position=HOLD.position + np.tile([0.0, 0.0, 0.3], 4))
@@ -57,25 +57,25 @@ class Desk:
 
 def made(
     faults: str = "", silence: Silence | None = None, legs: tuple[str, ...] = ("FR",)
-) -> tuple[Twin, Desk, VirtualRobot]:
-    machine = VirtualRobot(ROBOT, load_truth(None), seed=3, legs=legs)
+) -> tuple[RobotServer, Desk, VirtualRobot]:
+    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=3, legs=legs)
     machine.connect()
     desk = Desk()
-    twin = Twin(
+    server = RobotServer(
         machine, desk, hold=HOLD, faults=parse_faults(faults), silence=silence, seed=1
     )  # fmt: skip
-    return twin, desk, machine
+    return server, desk, machine
 
 
-def live(twin: Twin, start: float, end: float) -> None:
+def live(server: RobotServer, start: float, end: float) -> None:
     for k in range(round(start / TICK_S) + 1, round(end / TICK_S) + 1):
-        twin.step(k * TICK_S)
+        server.step(k * TICK_S)
 
 
 def test_states_are_those_of_the_machine_at_its_rate() -> None:
-    twin, desk, _ = made()
-    live(twin, 0.0, 0.2)
-    alone = VirtualRobot(ROBOT, load_truth(None), seed=3, legs=("FR",))
+    server, desk, _ = made()
+    live(server, 0.0, 0.2)
+    alone = VirtualRobot(ROBOT, load_sim_params(None), seed=3, legs=("FR",))
     alone.connect()
     expected = alone.wait(0.2)
     assert len(desk.heard) == len(expected) == 100
@@ -86,38 +86,38 @@ def test_states_are_those_of_the_machine_at_its_rate() -> None:
 
 
 def test_a_command_moves_the_machine() -> None:
-    twin, desk, _ = made()
-    live(twin, 0.0, 0.1)
+    server, desk, _ = made()
+    live(server, 0.0, 0.1)
     before = desk.heard[-1].position[2]
     desk.inbox.append(RAISED)
-    live(twin, 0.1, 0.6)
+    live(server, 0.1, 0.6)
     assert desk.heard[-1].position[2] - before == pytest.approx(0.3, abs=0.1)
-    assert twin.figures()["twin"] == {"commands applied": 1}
+    assert server.figures()["server"] == {"commands applied": 1}
 
 
 @pytest.mark.parametrize("action", ["hold", "zero", "damp"])
 def test_what_the_drives_do_when_commands_stop(action: str) -> None:
-    twin, desk, _ = made(silence=Silence(action=action, after_s=0.1))  # type: ignore[arg-type]
-    live(twin, 0.0, 0.5)
+    server, desk, _ = made(silence=Silence(action=action, after_s=0.1))  # type: ignore[arg-type]
+    live(server, 0.0, 0.5)
     # Nobody has commanded yet: the drives hold what they held.
-    assert "silences" not in twin.counts
+    assert "silences" not in server.counts
     for k in range(20):
         desk.inbox.append(RAISED)
-        live(twin, 0.5 + 0.02 * k, 0.52 + 0.02 * k)
-    live(twin, 0.9, 1.9)
+        live(server, 0.5 + 0.02 * k, 0.52 + 0.02 * k)
+    live(server, 0.9, 1.9)
     sunk = np.abs(desk.heard[-1].position[:3] - RAISED.position[:3]).max()
     torque = np.abs(desk.heard[-1].torque[:3]).max()
     if action == "hold":
-        assert "silences" not in twin.counts
+        assert "silences" not in server.counts
         assert sunk < 0.15
     else:
-        assert twin.counts["silences"] == 1
+        assert server.counts["silences"] == 1
         assert sunk > 0.3
         # Nothing but noise is left of the torque, save for damping.
         assert torque < (0.3 if action == "zero" else 3.0)
         for k in range(20):
             desk.inbox.append(RAISED)
-            live(twin, 1.9 + 0.05 * k, 1.95 + 0.05 * k)
+            live(server, 1.9 + 0.05 * k, 1.95 + 0.05 * k)
         assert np.abs(desk.heard[-1].position[:3] - RAISED.position[:3]).max() < 0.15
     with pytest.raises(HardwareError, match="expected hold, zero or damp"):
         Silence(action="sleep")  # type: ignore[arg-type]
@@ -126,23 +126,23 @@ def test_what_the_drives_do_when_commands_stop(action: str) -> None:
 
 
 def test_a_rival_comes_when_asked_and_the_robots_own_controller_until_released() -> None:
-    twin, desk, _ = made("rival=0.2")
-    live(twin, 0.0, 0.19)
-    assert twin.counts["commands applied"] == 0
-    live(twin, 0.19, 0.4)
-    assert 19 <= twin.counts["commands applied"] <= 21
-    twin, desk, _ = made()
+    server, desk, _ = made("rival=0.2")
+    live(server, 0.0, 0.19)
+    assert server.counts["commands applied"] == 0
+    live(server, 0.19, 0.4)
+    assert 19 <= server.counts["commands applied"] <= 21
+    server, desk, _ = made()
     desk.mode = "locomotion"
-    live(twin, 0.0, 0.2)
-    assert 19 <= twin.counts["commands applied"] <= 21
+    live(server, 0.0, 0.2)
+    assert 19 <= server.counts["commands applied"] <= 21
     desk.mode = ""
-    live(twin, 0.2, 0.4)
-    assert 19 <= twin.counts["commands applied"] <= 21
+    live(server, 0.2, 0.4)
+    assert 19 <= server.counts["commands applied"] <= 21
 
 
 def test_frozen_values_with_a_live_count() -> None:
-    twin, desk, _ = made("freeze=0.1:0.1")
-    live(twin, 0.0, 0.3)
+    server, desk, _ = made("freeze=0.1:0.1")
+    live(server, 0.0, 0.3)
     assert [state.sequence for state in desk.heard] == list(range(1, 151))
     times = np.diff([state.time for state in desk.heard])
     assert times.min() > 0.0
@@ -153,37 +153,37 @@ def test_frozen_values_with_a_live_count() -> None:
 
 
 def test_the_robots_clock_jumps() -> None:
-    twin, desk, _ = made("clock=0.1:-5")
-    live(twin, 0.0, 0.2)
+    server, desk, _ = made("clock=0.1:-5")
+    live(server, 0.0, 0.2)
     offsets = np.array([s.robot_time - s.time for s in desk.heard])  # type: ignore[operator]
     np.testing.assert_allclose(offsets[:48], 0.0)
     np.testing.assert_allclose(offsets[50:], -5.0)
 
 
 def test_some_states_hold_no_number() -> None:
-    twin, desk, _ = made("state.nan=0.2")
-    live(twin, 0.0, 1.0)
+    server, desk, _ = made("state.nan=0.2")
+    live(server, 0.0, 1.0)
     names = ("position", "velocity", "gyro", "accelerometer", "orientation")
     broken = [sum(int(np.isnan(getattr(s, n)).sum()) for n in names) for s in desk.heard]
     assert set(broken) == {0, 1}
     assert 60 < sum(broken) < 140
-    assert twin.figures()["state_faults"] == {"nan": sum(broken)}
+    assert server.figures()["state_faults"] == {"nan": sum(broken)}
 
 
 def test_lost_commands_are_not_heard_and_lost_states_not_told() -> None:
-    twin, desk, _ = made("loss=1,after=0.1")
-    live(twin, 0.0, 0.1)
+    server, desk, _ = made("loss=1,after=0.1")
+    live(server, 0.0, 0.1)
     desk.inbox.append(RAISED)
-    live(twin, 0.1, 0.3)
+    live(server, 0.1, 0.3)
     # The tick at 0.1 s itself has lost its state.
     assert len(desk.heard) == 49
-    assert twin.counts["commands applied"] == 0
-    assert twin.figures()["command_faults"] == {"lost": 1}
+    assert server.counts["commands applied"] == 0
+    assert server.figures()["command_faults"] == {"lost": 1}
 
 
 def test_bits_are_flipped_where_the_wire_lets_them() -> None:
-    twin, desk, _ = made("command.flip=1")
-    live(twin, 0.0, 0.01)
+    server, desk, _ = made("command.flip=1")
+    live(server, 0.0, 0.01)
     assert desk.spoil_out is bytes
     data = bytes(100)
     changed = desk.spoil_in(data)
@@ -192,11 +192,11 @@ def test_bits_are_flipped_where_the_wire_lets_them() -> None:
 
 
 def test_clamps_of_the_bench() -> None:
-    twin, desk, _ = made(legs=("FR",))
+    server, desk, _ = made(legs=("FR",))
     desk.clamps = ("FR_hip_roll", "FR_hip_pitch")
-    live(twin, 0.0, 0.1)
+    live(server, 0.0, 0.1)
     desk.inbox.append(replace(HOLD, position=HOLD.position + 0.3))
-    live(twin, 0.1, 0.6)
+    live(server, 0.1, 0.6)
     moved = desk.heard[-1].position[:3] - desk.heard[0].position[:3]
     # The clamp is on the link, the encoder on the rotor behind the belt.
     assert np.abs(moved[:2]).max() < 0.02
@@ -204,27 +204,27 @@ def test_clamps_of_the_bench() -> None:
 
 
 def test_on_the_ground_nothing_is_clamped_and_nothing_falls_over_it() -> None:
-    machine = VirtualRobot(ROBOT, load_truth(None), base="ground")
+    machine = VirtualRobot(ROBOT, load_sim_params(None), base="ground")
     machine.connect()
     desk = Desk()
-    twin = Twin(machine, desk, hold=HOLD)
+    server = RobotServer(machine, desk, hold=HOLD)
     desk.clamps = ("FR_knee",)
-    live(twin, 0.0, 0.05)
+    live(server, 0.0, 0.05)
     assert desk.clamps == ()
-    assert twin.counts["clamps refused"] == 1
+    assert server.counts["clamps refused"] == 1
     assert len(desk.heard) == 25
 
 
 def test_real_time_goes_on_and_ends_when_asked() -> None:
-    twin, desk, machine = made()
+    server, desk, machine = made()
     asked: list[int] = []
 
     def stop() -> bool:
         asked.append(1)
         return len(asked) > 400
 
-    twin.run(stop)
-    figures = twin.figures()
+    server.run(stop)
+    figures = server.figures()
     assert figures["ticks"] == 400
     assert machine.now() == pytest.approx(400 * TICK_S)
     assert len(desk.heard) == 100
@@ -242,13 +242,13 @@ def test_real_time_goes_on_and_ends_when_asked() -> None:
         (["--port", "7667"], "is the real robots'"),
     ],
 )
-def test_a_twin_that_cannot_be_is_one_sentence(words: list[str], complaint: str) -> None:
+def test_a_server_that_cannot_be_is_one_sentence(words: list[str], complaint: str) -> None:
     done = CliRunner().invoke(APP, words)
     assert isinstance(done.exception, HardwareError)
     assert complaint in str(done.exception)
 
 
-def test_a_twin_ends_by_itself_and_says_what_happened(tmp_path: Path) -> None:
+def test_a_server_ends_by_itself_and_says_what_happened(tmp_path: Path) -> None:
     pytest.importorskip("lcm")
     seen, figures = tmp_path / "seen.npz", tmp_path / "figures.json"
     done = CliRunner().invoke(

@@ -1,7 +1,7 @@
-"""Set the truth of the virtual Mini Cheetah so that an honest match lands on the paper's Table I.
+"""Set the parameters of the virtual Mini Cheetah so that a match lands on the paper's Table I.
 
-    python tools/calibrate_truth.py            # calibrate and write the shipped file
-    python tools/calibrate_truth.py --check    # only match the shipped file and print the table
+    python tools/calibrate_sim_params.py            # calibrate and write the shipped file
+    python tools/calibrate_sim_params.py --check    # only match the shipped file, print the table
 
 Two knobs a joint are turned by Newton's method, `torque_scale` and `viscous`; each evaluation is
 the paper's protocol: a chirp (0.1 to 25 Hz, 0.25 rad, 20 s) to the virtual robot with 17 / 0.4 on
@@ -26,8 +26,8 @@ from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.runtime.sweep.record import record
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import SCHEMA, SHIPPED, Truth, load_truth, parse_truth
-from pronk.virtual.sim_params_parts import JointTruth
+from pronk.virtual.sim_params import SCHEMA, SHIPPED, SimParams, load_sim_params, parse_sim_params
+from pronk.virtual.sim_params_parts import JointParams
 
 LEGS = ("FR", "FL", "HR", "HL")
 # Paper, Table I: stiffness and damping by leg.
@@ -90,7 +90,7 @@ ground:
 """
 
 HEADER = f"""\
-# What is true of the virtual Mini Cheetah. Written by: python tools/calibrate_truth.py
+# What is true of the virtual Mini Cheetah. Written by: python tools/calibrate_sim_params.py
 #
 # Sources and reasons of the numbers of the joints (joint side unless said otherwise):
 #   torque_scale, viscous  turned until an honest match lands on the paper's Table I; the knees
@@ -112,8 +112,8 @@ HEADER = f"""\
 """
 
 
-def designed() -> Truth:
-    """The truth before the two knobs are turned."""
+def designed() -> SimParams:
+    """The parameters before the two knobs are turned."""
     import yaml
 
     rng = np.random.default_rng(SEED)
@@ -136,7 +136,7 @@ def designed() -> Truth:
                 "viscous": centre["start"][1],
                 "encoder_offset": round(0.002 * spread[8], 5),
             }
-    return parse_truth(
+    return parse_sim_params(
         {
             "schema": SCHEMA,
             "robot": "mini_cheetah",
@@ -144,7 +144,7 @@ def designed() -> Truth:
             **yaml.safe_load(BODY),
             "joints": joints,
         },
-        "designed truth",
+        "designed sim_params",
     )
 
 
@@ -154,11 +154,13 @@ def target(name: str) -> np.ndarray:
     return np.array([stiffness[LEGS.index(leg)], damping[LEGS.index(leg)]])
 
 
-def asked(truth: Truth, name: str, method: str = "quick") -> tuple[np.ndarray, float, float]:
+def asked(
+    sim_params: SimParams, name: str, method: str = "quick"
+) -> tuple[np.ndarray, float, float]:
     """Matched (stiffness, damping) of one joint, its error and the naive error [dB RMS]."""
     robot = load_robot("mini_cheetah")
     plan = make_plan(robot, [name], amplitudes=(0.25,), repeats=1)
-    machine = VirtualRobot(robot, truth, legs=(name.split("_")[0],))
+    machine = VirtualRobot(robot, sim_params, legs=(name.split("_")[0],))
     with tempfile.TemporaryDirectory() as folder:
         logs = [read_mcap(path) for path in record(machine, robot, plan, Path(folder))]
     settings = MatchSettings(method=method, zero_armature=False)  # type: ignore[arg-type]
@@ -166,14 +168,14 @@ def asked(truth: Truth, name: str, method: str = "quick") -> tuple[np.ndarray, f
     return np.array([found.stiffness, found.damping]), found.error_db, found.naive_error_db
 
 
-def calibrated(truth: Truth, name: str) -> JointTruth:
+def calibrated(sim_params: SimParams, name: str) -> JointParams:
     """Turn the two knobs of a joint until its match lands on Table I."""
     robot = load_robot("mini_cheetah")
     drive_damping = robot.joint(name).damping
     wanted = target(name)
     for turn in range(ROUNDS):
-        joint = truth.joints[name]
-        got, error, naive = asked(truth, name)
+        joint = sim_params.joints[name]
+        got, error, naive = asked(sim_params, name)
         cells = (got - wanted) / CELL
         print(
             f"{name:14s} round {turn}: torque {joint.torque_scale:.4f} viscous {joint.viscous:.4f}"
@@ -195,15 +197,15 @@ def calibrated(truth: Truth, name: str) -> JointTruth:
             torque_scale=round(joint.torque_scale * ratio, 4),
             viscous=round(viscous, 4),
         )
-        truth = replace(truth, joints={**truth.joints, name: joint})
+        sim_params = replace(sim_params, joints={**sim_params.joints, name: joint})
     raise SystemExit(f"{name} did not settle in {ROUNDS} rounds.")
 
 
-def text(truth: Truth) -> str:
-    """The truth file, laid out for reading."""
-    lines = [HEADER, f"schema: {SCHEMA}", f"robot: {truth.robot}", "machine:"]
+def text(sim_params: SimParams) -> str:
+    """The sim_params file, laid out for reading."""
+    lines = [HEADER, f"schema: {SCHEMA}", f"robot: {sim_params.robot}", "machine:"]
     lines.append(MACHINE + BODY + "joints:")
-    for name, joint in truth.joints.items():
+    for name, joint in sim_params.joints.items():
         entries = [f"{key}: {_decimal(value)}" for key, value in vars(joint).items()]
         lines.append(f"  {name}:")
         lines += [
@@ -226,9 +228,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=SHIPPED)
     arguments = parser.parse_args()
     if arguments.check:
-        truth = load_truth(arguments.out)
-        for name in truth.joints:
-            got, error, naive = asked(truth, name, "grid")
+        sim_params = load_sim_params(arguments.out)
+        for name in sim_params.joints:
+            got, error, naive = asked(sim_params, name, "grid")
             cells = (got - target(name)) / CELL
             print(
                 f"{name:14s} {got[0]:6.2f} {got[1]:.4f}  {cells[0]:+.2f} {cells[1]:+.2f} cells off"
@@ -236,10 +238,12 @@ def main() -> None:
                 flush=True,
             )
         return
-    truth = designed()
-    truth = replace(truth, joints={name: calibrated(truth, name) for name in truth.joints})
-    write_text(arguments.out, text(truth))
-    load_truth(arguments.out).check_joints(load_robot("mini_cheetah").joint_names)
+    sim_params = designed()
+    sim_params = replace(
+        sim_params, joints={name: calibrated(sim_params, name) for name in sim_params.joints}
+    )
+    write_text(arguments.out, text(sim_params))
+    load_sim_params(arguments.out).check_joints(load_robot("mini_cheetah").joint_names)
     print(f"wrote {arguments.out}; --check matches it with the paper's grid.")
 
 
