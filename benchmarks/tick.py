@@ -30,13 +30,13 @@ from rich.text import Text
 
 from pronk.errors import PronkError
 from pronk.evaluation.criteria import Check
-from pronk.evaluation.protocol import STILL
 from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace, Wanted, enter, sleep_until
 from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.runtime.policy_process import WARM_UP, standing
 from pronk.runtime.rollout import Pilot
+from pronk.runtime.script import STILL
 from pronk.runtime.warmup import rehearse_until
 
 RATE_HZ = 50.0

@@ -9,12 +9,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pronk.evaluation.protocol import Script
 from pronk.runtime.events import Notice
 from pronk.runtime.link import Link
 from pronk.runtime.operators import Scripted
 from pronk.runtime.plan import Plan
 from pronk.runtime.run import fly
+from pronk.runtime.script import Script
 from pronk.runtime.trajectories import Timing
 
 QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from pronk.evaluation.protocol import Script
 from pronk.robots.mini_cheetah.constants import FOOT_RADIUS
+from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 
 DT = 1e-3

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 
 import pronk.runtime.log
 from pronk.errors import HardwareError, LogError, RobotError
-from pronk.evaluation.protocol import Script
 from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace
 from pronk.logs.mcap_stream import MOST_BYTES, DamagedError, records
@@ -33,6 +32,7 @@ from pronk.runtime.preflight import delay_objection, refusals
 from pronk.runtime.reasons import Level, Reason
 from pronk.runtime.records import EVENT, STEP, TICK, Mode, Wish, event, get_state, put_state
 from pronk.runtime.safety import Memory, fault
+from pronk.runtime.script import Script
 from pronk.runtime.shared import Mailbox, Ring
 from pronk.runtime.states import FIRST_ORDER_S, Director, Order
 from pronk.runtime.teleop import Gamepad, Keyboard

@@ -15,12 +15,11 @@ from scipy.spatial.transform import Rotation
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.criteria import Check
 from pronk.evaluation.jumps import Jump, JumpRules, Series, answer, measure, unasked_height
-from pronk.policy.stride import MOST_S
-from pronk.train.evaluate import bars as evaluate_bars
-from pronk.train.evaluate import result as evaluate_result
-from pronk.train.evaluate.bars import checks, cost_of_jumping
-from pronk.train.evaluate.plan import JUMPS, NEVER, WALKS, Case, Plan
-from pronk.train.evaluate.result import (
+from pronk.evaluation.training_sim import bars as evaluate_bars
+from pronk.evaluation.training_sim import result as evaluate_result
+from pronk.evaluation.training_sim.bars import checks, cost_of_jumping
+from pronk.evaluation.training_sim.plan import JUMPS, NEVER, WALKS, Case, Plan
+from pronk.evaluation.training_sim.result import (
     EstimatorResult,
     Evaluation,
     JumpResult,
@@ -28,6 +27,7 @@ from pronk.train.evaluate.result import (
     Unasked,
     WalkResult,
 )
+from pronk.policy.stride import MOST_S
 
 DT = 0.005
 
@@ -287,7 +287,7 @@ def random_turns(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def test_jumps_on_the_device_are_those_of_the_definitions() -> None:
     """Three hundred robots that do what they like, against `measure` on the series of each."""
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate.flight import FlightRecorder
+    from pronk.evaluation.training_sim.flight import FlightRecorder
 
     rng = np.random.default_rng(8)
     count, length = 300, 360
@@ -402,9 +402,9 @@ def test_what_touches_is_counted_as_a_trial_counts_it() -> None:
     """Each life by hand, on the device, and as a capture of the virtual robot."""
     torch = pytest.importorskip("torch")
     from pronk.evaluation.metrics import measure as measure_capture
-    from pronk.evaluation.protocol import Script
+    from pronk.evaluation.training_sim.flight import FlightRecorder
     from pronk.robots import load_robot
-    from pronk.train.evaluate.flight import FlightRecorder
+    from pronk.runtime.script import Script
     from pronk.virtual.capture import Capture
 
     rules = JumpRules(search_s=0.3, tail_s=0.1, upright_s=0.3)
@@ -462,7 +462,7 @@ def test_what_touches_is_counted_as_a_trial_counts_it() -> None:
 def test_a_stride_is_in_the_raw_error_and_not_in_the_averaged() -> None:
     """Velocity = command + (.1, 0) + .3 sin: averaged .1, raw the mean of |.1 + .3 sin|."""
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate.walk import SpeedRecorder
+    from pronk.evaluation.training_sim.walk import SpeedRecorder
 
     count, settle, end, average = 3, 150, 550, 100
     command = torch.tensor([[2.0, 0.0, 0.0]] * count)
@@ -499,7 +499,7 @@ def test_a_stride_is_in_the_raw_error_and_not_in_the_averaged() -> None:
 @pytest.mark.train
 def test_a_robot_that_never_settled_has_no_error() -> None:
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate.walk import SpeedRecorder
+    from pronk.evaluation.training_sim.walk import SpeedRecorder
 
     recorder = SpeedRecorder(torch.zeros(1, 3), settle=2, end=5, average=2)
     for _ in range(5):
@@ -510,7 +510,7 @@ def test_a_robot_that_never_settled_has_no_error() -> None:
 @pytest.mark.train
 def test_the_estimator_is_judged_on_robots_that_stand() -> None:
     torch = pytest.importorskip("torch")
-    from pronk.train.evaluate.walk import EstimatorRecorder
+    from pronk.evaluation.training_sim.walk import EstimatorRecorder
 
     recorder = EstimatorRecorder(2, "cpu")
     target = torch.tensor([[1.0, 0.0, 1.0, 0.0, 2.0, 0.0, 0.1]] * 2)
@@ -572,8 +572,8 @@ def seen() -> Seen:
     pytest.importorskip("mjlab")
     from mjlab.envs import ManagerBasedRlEnv
 
-    from pronk.train.evaluate.evaluate import evaluate_policy, evaluation_cfg
-    from pronk.train.evaluate.run import TERM
+    from pronk.evaluation.training_sim.evaluate import evaluate_policy, evaluation_cfg
+    from pronk.evaluation.training_sim.run import TERM
     from pronk.train.mdp.randomization import Randomization
     from pronk.train.tasks import env_cfg
 
@@ -731,7 +731,7 @@ def test_a_run_is_written_and_shown(
     seen: Seen, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from pronk.cli.evaluate import show
-    from pronk.train.evaluate.evaluate import write
+    from pronk.evaluation.training_sim.evaluate import write
 
     path = tmp_path / "evaluation.json"
     write(path, seen.evaluation)
@@ -751,7 +751,7 @@ def test_an_environment_of_training_is_refused() -> None:
     pytest.importorskip("mjlab")
     from types import SimpleNamespace
 
-    from pronk.train.evaluate.evaluate import evaluate_policy
+    from pronk.evaluation.training_sim.evaluate import evaluate_policy
 
     plain = SimpleNamespace(metrics_manager=SimpleNamespace(cfg=None), num_envs=6)
     with pytest.raises(PronkError, match="6 robots and no evaluation term; this plan needs one"):
@@ -766,7 +766,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     """The folder of a run with one checkpoint of random weights, and its actor."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("mjlab")
-    from pronk.train.evaluate.subject import blank_actor
+    from pronk.evaluation.training_sim.subject import blank_actor
     from pronk.train.runner import checkpoint
     from pronk.train.runner.run_folder import RunFolder
 
@@ -785,8 +785,8 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
     torch = pytest.importorskip("torch")
     from tensordict import TensorDict
 
+    from pronk.evaluation.training_sim.subject import load_subject
     from pronk.robots import load_robot
-    from pronk.train.evaluate.subject import load_subject
     from pronk.train.gains import training_gains
 
     folder, actor = trained
@@ -808,7 +808,7 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
 @pytest.mark.train
 def test_what_is_no_policy_is_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
     pytest.importorskip("mjlab")
-    from pronk.train.evaluate.subject import load_subject
+    from pronk.evaluation.training_sim.subject import load_subject
     from pronk.train.runner import checkpoint
 
     with pytest.raises(ArtefactError, match="no checkpoints in it; expected the folder of a run"):
@@ -833,8 +833,8 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
     pytest.importorskip("onnxruntime")
     from tensordict import TensorDict
 
+    from pronk.evaluation.training_sim.subject import load_subject
     from pronk.robots import load_robot
-    from pronk.train.evaluate.subject import load_subject
     from pronk.train.gains import training_gains
     from pronk.train.rl.export import contract_for, export_policy
 
@@ -876,8 +876,8 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
 def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> None:
     pytest.importorskip("mjlab")
     from pronk.cli.evaluate import run
+    from pronk.evaluation.training_sim.subject import load_subject
     from pronk.robots import load_robot
-    from pronk.train.evaluate.subject import load_subject
     from pronk.train.gains import training_gains
 
     plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
@@ -898,8 +898,8 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
 def test_one_robot_is_measured_many_times_with_noise_alone() -> None:
     pytest.importorskip("mjlab")
     from pronk.cli.evaluate import Drawn
+    from pronk.evaluation.training_sim.run import RANDOMIZATIONS
     from pronk.robots import load_robot
-    from pronk.train.evaluate.run import RANDOMIZATIONS
     from pronk.train.gains import training_gains
     from pronk.train.mdp.randomization import delay_steps, events, noise
 
@@ -920,7 +920,7 @@ def test_a_policy_that_cannot_jump_is_not_asked_to(
 ) -> None:
     pytest.importorskip("mjlab")
     from pronk.cli.evaluate import What, evaluate
-    from pronk.train.evaluate.subject import blank_actor
+    from pronk.evaluation.training_sim.subject import blank_actor
     from pronk.train.runner import checkpoint
 
     path = tmp_path / "model_1.pt"

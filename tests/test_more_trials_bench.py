@@ -12,9 +12,10 @@ from benchmarks import trial as bench
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
 from pronk.evaluation.job import Job, jump
-from pronk.evaluation.protocol import STILL, Case, Script
+from pronk.evaluation.protocol import Case
 from pronk.evaluation.run import Plan, jobs_of
 from pronk.evaluation.subjects import load_subjects
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.sim_params import load_sim_params
 
 SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)

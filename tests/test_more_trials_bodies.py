@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
 from pronk.evaluation import variation
-from pronk.evaluation.protocol import Case, Script
+from pronk.evaluation.protocol import Case
 from pronk.evaluation.run import Plan
 from pronk.evaluation.subjects import load_subjects
 from pronk.evaluation.unseen import bode
@@ -26,6 +26,7 @@ from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
+from pronk.runtime.script import Script
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params
 

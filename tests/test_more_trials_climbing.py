@@ -11,12 +11,13 @@ import pytest
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import result_io as sheet
-from pronk.evaluation.protocol import Case, Script
+from pronk.evaluation.protocol import Case
 from pronk.evaluation.result import Subject
 from pronk.evaluation.terrain import climbing, course, crossing
 from pronk.evaluation.terrain.climbing import Ladder, Plan, add_crossings
 from pronk.evaluation.terrain.course import Verdict
 from pronk.evaluation.terrain.crossing import Crossing, Crossings
+from pronk.runtime.script import Script
 from pronk.virtual.sim_params import load_sim_params
 
 SIM_PARAMS = load_sim_params()

@@ -10,9 +10,9 @@ import pytest
 
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpRules
-from pronk.evaluation.protocol import STILL, Script
 from pronk.evaluation.terrain import course
 from pronk.evaluation.terrain.course import Obstacle, Operator, Verdict, direction, judge, lost
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Ground
 from seen_jump import DELAY, SCRIPT, changed, seen_jump

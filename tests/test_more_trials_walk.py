@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError
 from pronk.evaluation import walk
-from pronk.evaluation.protocol import Case, Script
+from pronk.evaluation.protocol import Case
 from pronk.evaluation.walk_metrics import SETTLE_S, WalkFigures, measure_walk
+from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 from pronk.virtual.sim_params import load_sim_params
 from seen_jump import STANDING, changed

@@ -54,15 +54,15 @@ def test_a_gamepad_has_a_dead_middle_and_reaches_its_ends(deflection: float) -> 
 def test_page_and_gamepad_add_up_within_the_ranges() -> None:
     stick = Stick(ranges=RANGES)
     stick.set_velocity((0.5, 0.2, -1.0))
-    assert stick.asked(0.0) == ((0.5, 0.2, -1.0), False)
+    assert stick.commanded(0.0) == ((0.5, 0.2, -1.0), False)
     stick.feel(Pad(forward=1.0, left=-1.0, yaw=0.05))
-    assert stick.asked(0.02) == ((3.0, -0.8, -1.0), False)
+    assert stick.commanded(0.02) == ((3.0, -0.8, -1.0), False)
     stick.feel(Pad(forward=-1.0))
-    assert stick.asked(0.04)[0] == (-1.5, 0.2, -1.0)
+    assert stick.commanded(0.04)[0] == (-1.5, 0.2, -1.0)
 
 
 def asked_jump(stick: Stick, start: float, ticks: int) -> list[bool]:
-    return [stick.asked(start + k / 50.0)[1] for k in range(ticks)]
+    return [stick.commanded(start + k / 50.0)[1] for k in range(ticks)]
 
 
 def test_a_jump_lasts_as_long_as_in_the_trial_however_often_one_presses() -> None:
@@ -79,13 +79,13 @@ def test_a_button_counts_when_it_goes_down() -> None:
     stick = Stick(ranges=RANGES)
     for k in range(100):
         stick.feel(Pad(jump=True))
-        assert stick.asked(k / 50.0)[1] == (k < JUMP_S * 50)
+        assert stick.commanded(k / 50.0)[1] == (k < JUMP_S * 50)
     stick.feel(Pad())
     stick.feel(Pad(jump=True, reset=True))
     assert stick.take_reset()
     assert not stick.take_reset()
     # Set down anew, the clock begins at zero and nobody jumps.
-    assert not stick.asked(0.0)[1]
+    assert not stick.commanded(0.0)[1]
 
 
 def test_who_cannot_jump_is_never_told_to() -> None:
@@ -254,13 +254,13 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
             forward = page._sliders[0]
             slid = {"uuid": forward._impl.uuid, "updates": {"value": 1.25}}
             browse("GuiUpdateMessage", slid)
-            wait_for(lambda: stick.asked(0.0)[0] == (1.25, 0.0, 0.0))
+            wait_for(lambda: stick.commanded(0.0)[0] == (1.25, 0.0, 0.0))
             before = page._data.qpos.copy()
             play(ROBOT, load_policy(hopper), sim_params, stick, page, until=lambda t: t > 0.2)
             assert (page._data.qpos != before).any()
             assert "trunk" in page._readout.content
         page.reset()
-        assert stick.asked(0.0)[0] == (0.0, 0.0, 0.0)
+        assert stick.commanded(0.0)[0] == (0.0, 0.0, 0.0)
         assert stick.take_reset()
 
 

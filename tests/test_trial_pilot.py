@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from hopper import DEFAULT, ROBOT, STRAIGHT, write_hopper
 from pronk.errors import ArtefactError, HardwareError
-from pronk.evaluation.protocol import STILL, Script
 from pronk.links.machine import Command, State
 from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.rollout import (
@@ -23,6 +22,7 @@ from pronk.runtime.rollout import (
     projected_gravity,
     ticks,
 )
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.ground import Start
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params

@@ -10,15 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pronk.errors import PronkError
-from pronk.evaluation.protocol import (
-    PAPER_COMMANDS,
-    RATES,
-    STILL,
-    Case,
-    Script,
-    parse_case,
-    parse_cases,
-)
+from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case, parse_case, parse_cases
+from pronk.runtime.script import STILL, Script
 
 COMMAND = (2.0, 0.0, 0.5)
 
@@ -53,13 +46,13 @@ def test_the_whole_script_by_hand() -> None:
         (4.5, STILL, False),
         (7.4, STILL, False),
     ]
-    assert [(t, *made.asked(t)) for t, _, _ in expected] == expected
+    assert [(t, *made.commanded(t)) for t, _, _ in expected] == expected
 
 
 def test_times_are_met_whatever_binary_fractions_they_have() -> None:
     for ticks in range(26):
         made = script(run_s=2.5 + ticks / 50)
-        asked = [made.asked(k / 50) for k in range(round(made.seconds * 50))]
+        asked = [made.commanded(k / 50) for k in range(round(made.seconds * 50))]
         jumps = [k for k, (_, jump) in enumerate(asked) if jump]
         assert jumps == list(range(175 + ticks, 200 + ticks))
         assert [k for k, (command, _) in enumerate(asked) if command != STILL] == list(
@@ -71,7 +64,7 @@ def test_a_ramp_by_hand() -> None:
     made = script(acceleration=4.0)
     shares = {1.0: 0.0, 1.25: 0.5, 1.5: 1.0, 3.0: 1.0, 4.5: 1.0, 4.75: 0.5, 5.0: 0.0, 6.0: 0.0}
     for t, share in shares.items():
-        assert made.asked(t)[0] == pytest.approx([share * axis for axis in COMMAND], abs=1e-6)
+        assert made.commanded(t)[0] == pytest.approx([share * axis for axis in COMMAND], abs=1e-6)
     # A command that does not move the robot has nothing to ramp.
     assert script(command=(0.0, 0.0, 1.0), acceleration=1.0).asked(1.1)[0] == (0.0, 0.0, 1.0)
 
@@ -79,7 +72,7 @@ def test_a_ramp_by_hand() -> None:
 @given(st.floats(0.1, 10.0), st.floats(-1.0, 10.0), st.floats(0.0, 0.1))
 def test_a_ramp_is_never_steeper_than_said(acceleration: float, t: float, later: float) -> None:
     made = script(acceleration=acceleration)
-    speeds = [math.hypot(*made.asked(s)[0][:2]) for s in (t, t + later)]
+    speeds = [math.hypot(*made.commanded(s)[0][:2]) for s in (t, t + later)]
     inside = t + later < made.seconds  # where the script ends, so does its command
     assert not inside or abs(speeds[1] - speeds[0]) <= acceleration * later + 1e-6
     assert max(speeds) <= 2.0

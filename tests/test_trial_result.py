@@ -22,11 +22,12 @@ from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.metrics import FIGURES, JumpFigures
 from pronk.evaluation.outcome import comparison, published, tables
 from pronk.evaluation.outcome import criteria as bars
-from pronk.evaluation.protocol import PAPER_COMMANDS, Case, Script
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.result import Subject, Trial
 from pronk.evaluation.rows import Row
 from pronk.evaluation.summary import Spread, ratio_of_scatter, share_interval
 from pronk.robots import load_robot
+from pronk.runtime.script import Script
 
 ROBOT = load_robot("mini_cheetah")
 SCRIPT = Script(command=(0.0, 0.0, 0.0))

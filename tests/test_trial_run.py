@@ -18,10 +18,11 @@ from pronk.evaluation import result
 from pronk.evaluation.folder import prepare
 from pronk.evaluation.metrics import measure
 from pronk.evaluation.processes import in_processes
-from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, STILL, Case, Script
+from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.run import Plan, draw, jobs_of, run
 from pronk.evaluation.subjects import load_subjects
 from pronk.files import sha256
+from pronk.runtime.script import STILL, Script
 from pronk.virtual import capture
 from pronk.virtual.sim_params import SHIPPED, load_sim_params
 

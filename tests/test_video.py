@@ -27,9 +27,10 @@ from pronk.evaluation.pictures.frames import HEIGHT, WIDTH
 from pronk.evaluation.pictures.render import in_gif
 from pronk.evaluation.pictures.stage import FOV_DEG, TAPE_M, Tape
 from pronk.evaluation.pictures.view import View
-from pronk.evaluation.protocol import STILL, Case, Script
+from pronk.evaluation.protocol import Case
 from pronk.evaluation.run import Plan as TrialPlan
 from pronk.evaluation.run import run as run_trial
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Box, Ground
 from pronk.virtual.sim_params import load_sim_params

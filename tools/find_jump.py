@@ -40,11 +40,11 @@ import torch
 import yaml
 from tensordict import TensorDict
 
+from pronk.evaluation.training_sim.subject import Subject, load_subject
 from pronk.files import sha256
 from pronk.robots import load_robot
 from pronk.robots.mini_cheetah.constants import LEG_JOINTS as PARTS
 from pronk.robots.robot import Joint
-from pronk.train.evaluate.subject import Subject, load_subject
 from pronk.train.gains import TrainingGains, training_gains
 from pronk.train.mdp.commands import MotionCommandCfg, motion_command
 from pronk.train.mdp.demonstration import JOINTS, SCHEMA_VERSION

@@ -46,7 +46,7 @@ def told_at_once(job: Job) -> tuple[int | None, JumpFigures]:
     policy, robot = load_policy(job.policy), load_robot(job.robot)
     policy.contract = replace(policy.contract, waits_for_stride=False)
     machine = set_down(job)
-    flown = fly(machine, policy, robot, job.script.asked, seconds=job.script.seconds)
+    flown = fly(machine, policy, robot, job.script.commanded, seconds=job.script.seconds)
     figures = measure(
         machine.capture(), job.script, robot, began=flown.began, mass=job.mass, rules=job.rules
     )

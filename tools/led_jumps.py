@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from pronk.evaluation.training_sim.subject import load_subject
 from pronk.policy import paper
 from pronk.robots import load_robot
-from pronk.train.evaluate.subject import load_subject
 from pronk.train.gains import training_gains
 from pronk.train.mdp.commands import motion_command
 from pronk.train.phases import enter_phase, phase

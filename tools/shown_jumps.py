@@ -112,7 +112,7 @@ def jump(case_number: tuple[Case, int], *, path: Path, shown: Demonstration) -> 
         keep=None,
     )
     machine = set_down(job)
-    flown = fly(machine, policy, robot, script.asked, seconds=script.seconds)
+    flown = fly(machine, policy, robot, script.commanded, seconds=script.seconds)
     seen = machine.capture()
     return measure(seen, script, robot, began=flown.began, mass=job.mass, rules=job.rules)
 

@@ -14,10 +14,10 @@ from pronk.cli.choices import Base, Link
 from pronk.errors import HardwareError, PronkError
 
 if TYPE_CHECKING:
-    from pronk.evaluation.protocol import Script
     from pronk.policy.contract import Contract
     from pronk.runtime.events import Notice
     from pronk.runtime.operators import Operator
+    from pronk.runtime.script import Script
     from pronk.runtime.summary import Outcome
 
 
@@ -168,7 +168,8 @@ def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
     Raises:
         PronkError: It is no command, or none that the policy was trained for.
     """
-    from pronk.evaluation.protocol import Script, parse_cases
+    from pronk.evaluation.protocol import parse_cases
+    from pronk.runtime.script import Script
 
     cases = parse_cases([text])
     ranges = contract.command_ranges

@@ -16,9 +16,9 @@ from pronk.cli import console
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.train.evaluate.plan import Plan
-    from pronk.train.evaluate.result import Evaluation, Spread
-    from pronk.train.evaluate.subject import Subject
+    from pronk.evaluation.training_sim.plan import Plan
+    from pronk.evaluation.training_sim.result import Evaluation, Spread
+    from pronk.evaluation.training_sim.subject import Subject
     from pronk.train.gains import TrainingGains
 
 
@@ -86,8 +86,8 @@ def evaluate(
     ] = Device.AUTO,
 ) -> None:
     """Walk and jump with many robots at once; errors, heights and falls beside the bars."""
+    from pronk.evaluation.training_sim.plan import JUMPS, WALKS, Plan
     from pronk.robots import load_robot
-    from pronk.train.evaluate.plan import JUMPS, WALKS, Plan
     from pronk.train.gains import training_gains
     from pronk.train.runner.devices import find_devices, require_extra
     from pronk.train.runner.request import ROBOT
@@ -104,9 +104,9 @@ def evaluate(
     drives = training_gains(gains, load_robot(ROBOT), like=like)
     where = "cuda:0" if find_devices(device.value).device == "cuda" else "cpu"
 
-    from pronk.train.evaluate import result as evaluate_result
-    from pronk.train.evaluate.evaluate import write
-    from pronk.train.evaluate.subject import load_subject
+    from pronk.evaluation.training_sim import result as evaluate_result
+    from pronk.evaluation.training_sim.evaluate import write
+    from pronk.evaluation.training_sim.subject import load_subject
 
     errors = {} if before is None else evaluate_result.load(before).speed_errors()
     subject = load_subject(policy, where)
@@ -145,8 +145,8 @@ def run(
     """
     from mjlab.envs import ManagerBasedRlEnv
 
-    from pronk.train.evaluate.evaluate import evaluate_policy, evaluation_cfg
-    from pronk.train.evaluate.run import RANDOMIZATIONS
+    from pronk.evaluation.training_sim.evaluate import evaluate_policy, evaluation_cfg
+    from pronk.evaluation.training_sim.run import RANDOMIZATIONS
     from pronk.train.runner.provenance import device_facts, versions
     from pronk.train.tasks import env_cfg
 
@@ -181,7 +181,7 @@ def run(
 
 def show(evaluation: Evaluation) -> None:
     """Print what was measured, and every bar beside its figure."""
-    from pronk.train.evaluate.bars import checks
+    from pronk.evaluation.training_sim.bars import checks
 
     if evaluation.walks:
         show_walks(evaluation)

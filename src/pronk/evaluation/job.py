@@ -13,10 +13,10 @@ from pathlib import Path
 from pronk.errors import ArtefactError, HardwareError
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.metrics import JumpFigures, measure
-from pronk.evaluation.protocol import Script
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
 from pronk.runtime.rollout import Flown, check_standing, fly
+from pronk.runtime.script import Script
 from pronk.virtual import capture as captures
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.robot import VirtualRobot
@@ -113,7 +113,7 @@ def flight(job: Job) -> tuple[captures.Capture, Flown]:
     machine = set_down(job)
     policy = _policy(job.policy, job.sha256)
     script = job.script
-    flown = fly(machine, policy, load_robot(job.robot), script.asked, seconds=script.seconds)
+    flown = fly(machine, policy, load_robot(job.robot), script.commanded, seconds=script.seconds)
     return machine.capture(), flown
 
 

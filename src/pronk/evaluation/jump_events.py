@@ -9,7 +9,7 @@ import numpy as np
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpRules, answer
 from pronk.evaluation.metrics import series_of
-from pronk.evaluation.protocol import Script
+from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 
 

@@ -1,7 +1,7 @@
 """What a jump was: flight phases and the figures of one jump, from the series of one robot.
 
-The definitions stand here, once; `pronk.train.evaluate.flight` computes the same for thousands of
-robots while they run, and a test holds the two together. Samples k = 0, 1, ... are taken at every
+The definitions stand here, once; `pronk.evaluation.training_sim.flight` computes the same for
+thousands of robots while they run. Samples k = 0, 1, ... are taken at every
 physics step, at times k dt; foot contacts of a sample belong to its position. The trunk is
 followed at the origin of its frame, z up, the world's frame.
 

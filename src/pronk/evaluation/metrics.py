@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 from pronk.actuator import model as drive
 from pronk.evaluation.jumps import Flight, JumpRules, Series, answer, heading
 from pronk.evaluation.jumps import measure as measure_jump
-from pronk.evaluation.protocol import Script
 from pronk.robots.mini_cheetah.constants import FOOT_RADIUS
 from pronk.robots.robot import Robot
+from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 
 Array = NDArray[np.float64]

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError
 from pronk.evaluation.metrics import FIGURES
-from pronk.evaluation.protocol import PAPER_COMMANDS, Case, Script
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.rows import Row, of_csv, to_csv
 from pronk.evaluation.summary import Cell, Ratio, Spread, ratio_of_scatter, share_interval
 from pronk.files import write_text
+from pronk.runtime.script import Script
 
 SCHEMA = "pronk/trial/1"
 TABLE = "trials.csv"

@@ -12,7 +12,8 @@ from typing import Any
 
 from pronk.errors import ArtefactError
 from pronk.evaluation.metrics import FIGURES, FLAGS, JumpFigures
-from pronk.evaluation.protocol import Case, Script
+from pronk.evaluation.protocol import Case
+from pronk.runtime.script import Script
 
 _OWN = ("policy", "command", "number", "seed", "capture", "success")
 """Columns before the figures."""

@@ -31,12 +31,13 @@ from pronk.evaluation.job import Job, Jumped, body, jump
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.metrics import JumpFigures
 from pronk.evaluation.processes import in_processes
-from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, STILL, Case, Script
+from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.result import Subject, Trial
 from pronk.evaluation.rows import Row
 from pronk.evaluation.subjects import load_subjects
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.sim_params import SimParams
 

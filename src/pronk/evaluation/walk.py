@@ -15,12 +15,13 @@ from typing import Any
 from pronk.evaluation import result_io as sheet
 from pronk.evaluation.job import Job, body, flight
 from pronk.evaluation.processes import in_processes
-from pronk.evaluation.protocol import STILL, Case, Script
+from pronk.evaluation.protocol import Case
 from pronk.evaluation.run import Plan, jobs_of
 from pronk.evaluation.subjects import load_subjects
 from pronk.evaluation.summary import Spread
 from pronk.evaluation.walk_metrics import WALK_FIGURES, WalkFigures, measure_walk
 from pronk.robots.robot import Robot
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.sim_params import SimParams
 
 SCHEMA = "pronk/trial-walk/1"

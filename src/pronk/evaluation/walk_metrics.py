@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pronk.evaluation.jumps import JumpRules, unasked_height
 from pronk.evaluation.metrics import GRAVITY, Figure, fallen_at, series_of
-from pronk.evaluation.protocol import Script
+from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 
 Array = NDArray[np.float64]

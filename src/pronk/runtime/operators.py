@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pronk.evaluation.protocol import STILL, Script, Velocity
 from pronk.runtime.records import Mode, Wish
+from pronk.runtime.script import STILL, Script, Velocity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,7 @@ class Scripted:
         t = now - self._began
         for script in self.scripts:
             if t < script.seconds:
-                command, jump = script.asked(t)
+                command, jump = script.commanded(t)
                 return Stick(command=command, jump=jump, held=True)
             t -= script.seconds
             if t < self.pause_s:

@@ -22,7 +22,6 @@ import numpy as np
 import orjson
 
 from pronk.errors import PronkError
-from pronk.evaluation.protocol import STILL, Asked
 from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace, enter
 from pronk.links.terminal import leave
@@ -32,6 +31,7 @@ from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.plan import POLICY_PRIORITY, Names, Plan, Shared
 from pronk.runtime.records import ORDERS, STEP, Mode, event, get_state
 from pronk.runtime.rollout import Pilot, measurement
+from pronk.runtime.script import STILL, Commanded
 from pronk.runtime.warmup import rehearse_until
 
 WARM_UP = 20
@@ -202,7 +202,7 @@ class Thinker:
         self.shared.steps.put(step)
         self._complaint = ""
 
-    def _asked(self) -> Asked:
+    def _asked(self) -> Commanded:
         """What the operator wants now: to stand still unless the policy is in charge.
 
         Never more than the policy was trained for.

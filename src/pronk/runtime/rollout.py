@@ -1,6 +1,6 @@
 """The pilot: runs a policy on a machine, real or virtual, by whatever says what is asked.
 
-    flown = fly(machine, policy, robot, script.asked, seconds=script.seconds)
+    flown = fly(machine, policy, robot, script.commanded, seconds=script.seconds)
 
 On every tick of the policy's clock it reads the machine's newest state, makes the measurement of
 it, asks the source what is wanted, and sends the policy's joint targets with the gains that are
@@ -23,16 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.evaluation.protocol import Asked, Velocity
 from pronk.links.machine import Command, Machine, State
 from pronk.policy.contract import check
 from pronk.policy.observation import Measurement
 from pronk.policy.runtime import Policy
 from pronk.robots.robot import Robot
+from pronk.runtime.script import Commanded, Velocity
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Source = Callable[[float], Asked]
+Source = Callable[[float], Commanded]
 """What is asked at a time since the policy took over [s]."""
 
 NEAR = 0.5
@@ -141,7 +141,7 @@ class Pilot:
         self._sequence = 0
         self._began: float | None = None
 
-    def decide(self, state: State, asked: Asked, now: float) -> tuple[Command, Tick]:
+    def decide(self, state: State, asked: Commanded, now: float) -> tuple[Command, Tick]:
         """One policy step; call it at `policy.contract.policy_rate_hz`.
 
         Args:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from threading import Lock
 
-from pronk.evaluation.protocol import STILL, Asked, Script, Velocity
 from pronk.policy.contract import COMMANDS
+from pronk.runtime.script import STILL, Commanded, Script, Velocity
 
 JUMP_S = Script(command=STILL).jump_s
 """How long the jump input lasts, as in the trial [s]."""
@@ -83,7 +83,7 @@ class Stick:
                 self._reset = True
             self._pad = pad
 
-    def asked(self, t: float) -> Asked:
+    def commanded(self, t: float) -> Commanded:
         """What is asked at a time since the policy took over [s]. Implements `pilot.Source`.
 
         Page and gamepad add up, within the ranges; full deflection is the end of a range.

@@ -17,9 +17,9 @@ import numpy as np
 from pronk.errors import PronkError
 from pronk.evaluation.live.joystick import Stick
 from pronk.evaluation.live.readout import Gauge
-from pronk.evaluation.protocol import STILL, Velocity
 from pronk.policy.contract import COMMANDS
 from pronk.robots.robot import Robot
+from pronk.runtime.script import STILL, Velocity
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Ground
 

@@ -112,7 +112,7 @@ def play(
             gauge.forget()
             pace.start()
             before = simulated
-            for tick in ticks(machine, policy, robot, stick.asked):
+            for tick in ticks(machine, policy, robot, stick.commanded):
                 simulated = before + tick.since
                 if gamepad is not None:
                     stick.feel(gamepad.read())

@@ -27,7 +27,7 @@ from pronk.evaluation import result_io as sheet
 from pronk.evaluation.job import Job, body, set_down
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.processes import in_processes
-from pronk.evaluation.protocol import STILL, Case, Script
+from pronk.evaluation.protocol import Case
 from pronk.evaluation.result import Subject
 from pronk.evaluation.run import mass_of
 from pronk.evaluation.subjects import load_subjects
@@ -45,6 +45,7 @@ from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.runtime.rollout import ticks
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.ground import Start
 from pronk.virtual.sim_params import SimParams
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpRules, flights
 from pronk.evaluation.metrics import FALLEN_COSINE
-from pronk.evaluation.protocol import STILL, Asked, Script, Velocity
+from pronk.runtime.script import STILL, Commanded, Script, Velocity
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Box, Ground
 
@@ -139,7 +139,7 @@ class Operator:
         self.triggered: float | None = None
         """When the jump input rose, since the policy took over [s]."""
 
-    def __call__(self, t: float) -> Asked:
+    def __call__(self, t: float) -> Commanded:
         """What is asked at a time since the policy took over [s]."""
         script = self._script
         if t < script.stand_s:

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import steps
-from pronk.train.evaluate.flight import FlightRecorder
-from pronk.train.evaluate.plan import NEVER, Plan
-from pronk.train.evaluate.walk import EstimatorRecorder, SpeedRecorder
+from pronk.evaluation.training_sim.flight import FlightRecorder
+from pronk.evaluation.training_sim.plan import NEVER, Plan
+from pronk.evaluation.training_sim.walk import EstimatorRecorder, SpeedRecorder
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.randomization import Randomization
 

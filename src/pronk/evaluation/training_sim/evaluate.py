@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.evaluation.jumps import steps
-from pronk.train.evaluate import result
-from pronk.train.evaluate.bars import UNASKED_HEIGHT, checks
-from pronk.train.evaluate.plan import Plan
-from pronk.train.evaluate.result import (
+from pronk.evaluation.training_sim import result
+from pronk.evaluation.training_sim.bars import UNASKED_HEIGHT, checks
+from pronk.evaluation.training_sim.plan import Plan
+from pronk.evaluation.training_sim.result import (
     EstimatorResult,
     Evaluation,
     JumpResult,
@@ -34,8 +34,8 @@ from pronk.train.evaluate.result import (
     Unasked,
     WalkResult,
 )
-from pronk.train.evaluate.run import Estimate, Policy, Run, evaluation_cfg
-from pronk.train.evaluate.walk import FIGURES
+from pronk.evaluation.training_sim.run import Estimate, Policy, Run, evaluation_cfg
+from pronk.evaluation.training_sim.walk import FIGURES
 
 __all__ = ["evaluate_policy", "evaluation_cfg", "write"]
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from pronk.evaluation.criteria import Check
 from pronk.evaluation.jumps import RISE
-from pronk.train.evaluate.result import Evaluation, JumpResult, WalkResult
+from pronk.evaluation.training_sim.result import Evaluation, JumpResult, WalkResult
 
 SPEED_ERROR = 0.15
 """[m/s]"""

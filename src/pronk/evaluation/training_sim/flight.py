@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pronk.evaluation.jumps import JumpRules, along, steps
-from pronk.train.evaluate.plan import NEVER
+from pronk.evaluation.training_sim.plan import NEVER
 
 STATE = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 3}
 """The trunk: position [m], quaternion w x y z and velocity [m/s] in the world's frame, angular

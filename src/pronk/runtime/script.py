@@ -1,0 +1,104 @@
+"""The script of one run (paper E1): stand, accelerate, jump, stop.
+
+Times count from the moment at which the policy takes over a standing robot:
+
+    0 ... stand_s       zero command
+    ... + run_s         the velocity command
+    ... + jump_s        the same with the jump input
+    ... + keep_s        the same without it: the robot may still be in the air
+    ... + stop_s        zero command
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pronk.errors import PronkError
+from pronk.policy.contract import COMMANDS
+
+Velocity = tuple[float, float, float]
+"""Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
+Commanded = tuple[Velocity, bool]
+"""Velocity command and jump input."""
+STILL: Velocity = (0.0, 0.0, 0.0)
+
+_SLACK = 1e-9
+"""Tolerance for rounding in sums of times [s]."""
+
+
+def check_velocity(command: Velocity, of: str) -> None:
+    """Refuse a command that is not three finite numbers.
+
+    Raises:
+        PronkError: The command and what was expected.
+    """
+    if len(command) != 3 or not all(map(math.isfinite, command)):
+        raise PronkError(
+            f"command {command} of {of}; expected three finite numbers: {', '.join(COMMANDS)}."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Script:
+    """What is commanded over the time of one run."""
+
+    command: Velocity
+    """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
+    stand_s: float = 1.0
+    """Before the velocity command [s]."""
+    run_s: float = 2.5
+    """From there to the jump input [s]."""
+    jump_s: float = 0.5
+    """Length of the jump input [s]; 0 for no jump."""
+    keep_s: float = 0.5
+    """From its end to the zero command [s]."""
+    stop_s: float = 3.0
+    """From there to the end [s]: long enough to see whether the robot stays upright."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible times.
+
+        Raises:
+            PronkError: One sentence that names the field.
+        """
+        check_velocity(self.command, "the script")
+        for name in ("stand_s", "run_s", "jump_s", "keep_s", "stop_s"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise PronkError(f"Script.{name} is {value}; it must be finite, not negative.")
+
+    @property
+    def start(self) -> float:
+        """Begin of the velocity command [s]."""
+        return self.stand_s
+
+    @property
+    def on(self) -> float:
+        """Rise of the jump input [s]."""
+        return self.start + self.run_s
+
+    @property
+    def off(self) -> float:
+        """Fall of the jump input [s]."""
+        return self.on + self.jump_s
+
+    @property
+    def stop(self) -> float:
+        """End of the velocity command [s]."""
+        return self.off + self.keep_s
+
+    @property
+    def seconds(self) -> float:
+        """Length of the whole [s]."""
+        return self.stop + self.stop_s
+
+    def commanded(self, t: float) -> Commanded:
+        """Return the velocity command and the jump input at a time.
+
+        Args:
+            t: Since the policy took over [s].
+        """
+        now = t + _SLACK
+        moving = self.start <= now < self.stop
+        return (self.command if moving else STILL), self.on <= now < self.off
