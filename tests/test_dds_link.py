@@ -19,14 +19,14 @@ pytest.importorskip("cyclonedds")
 from broken_message import mutated
 from pronk.errors import HardwareError, RobotError
 from pronk.links.dds import idl
-from pronk.links.dds.address import DdsNetwork, Message, Participant, take
+from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Message, Participant, take
 from pronk.links.dds.codec import encode_command, joint_map
 from pronk.links.dds.link import DdsMachine
 from pronk.links.dds.service import SWITCHER, Client
 from pronk.links.machine import Command
 from pronk.links.preflight import Freshness
 from pronk.robots import load_robot
-from pronk.virtual.dds_server import COMMANDS, STATES, DdsWire
+from pronk.virtual.dds_server import DdsWire
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.server import RobotServer
 from pronk.virtual.sim_params import load_sim_params

@@ -149,9 +149,8 @@ def over_lcm(port: int) -> Wire:
 
 def over_dds(domain: int) -> Wire:
     from pronk.links.dds import idl
-    from pronk.links.dds.address import DdsNetwork, Participant, take, write
+    from pronk.links.dds.address import COMMANDS, DdsNetwork, Participant, take, write
     from pronk.links.dds.codec import decode_command, encode_command, joint_map
-    from pronk.virtual.dds_server import COMMANDS
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
     mouth = own.writer(COMMANDS, idl.LowCmd, raw=True)

@@ -26,8 +26,14 @@ from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.runtime.sweep.record import record
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import SCHEMA, SHIPPED, SimParams, load_sim_params, parse_sim_params
-from pronk.virtual.sim_params_parts import JointParams
+from pronk.virtual.sim_params import (
+    SCHEMA,
+    SHIPPED,
+    JointParams,
+    SimParams,
+    load_sim_params,
+    parse_sim_params,
+)
 
 LEGS = ("FR", "FL", "HR", "HL")
 # Paper, Table I: stiffness and damping by leg.

@@ -13,6 +13,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.errors import HardwareError
+
 Array = NDArray[np.float64]
 TorqueKind = Literal["measured", "computed", "absent"]
 
@@ -64,6 +66,39 @@ class Command:
     """When it was decided, on the machine's clock [s]."""
     valid_for: float = math.inf
     """Time after `made` at which whoever writes the wire damps instead of repeating it [s]."""
+
+
+def damping_command(joints: int, damping: float = 1.0) -> Command:
+    """Make a command without stiffness.
+
+    Args:
+        joints: How many.
+        damping: [N m s/rad]; with 1 a Mini Cheetah's leg sinks from its pose in about a second.
+    """
+    zeros = np.zeros(joints)
+    return Command(position=zeros, stiffness=zeros, damping=zeros + damping)
+
+
+def check_command(command: Command, joints: int) -> None:
+    """See that drives can follow a command.
+
+    Raises:
+        HardwareError: Wrong shape, not finite, a negative gain, or a time that is none.
+    """
+    for name in ("position", "stiffness", "damping"):
+        values = np.asarray(getattr(command, name))
+        if values.shape != (joints,) or not np.isfinite(values).all():
+            raise HardwareError(
+                f"command.{name} has shape {values.shape} or is not finite; "
+                f"expected {(joints,)} finite numbers, one per joint."
+            )
+        if name != "position" and values.min() < 0.0:
+            raise HardwareError(f"command.{name} is negative; the drives accept 0 or more.")
+    if not math.isfinite(command.made) or not command.valid_for > 0.0:
+        raise HardwareError(
+            f"command.made is {command.made} and command.valid_for {command.valid_for}; expected a "
+            "finite time [s] and a positive one, which may be infinite."
+        )
 
 
 class Machine(Protocol):

@@ -1,23 +1,90 @@
-"""Bounds of what can exist, and the one sentence that refuses the rest."""
+"""Parameter classes whose annotations hold bounds, and their reader.
+
+A field is `Annotated[float, Meta(ge=LOW, le=HIGH)]`, or a tuple of those.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import msgspec
 
 from pronk.errors import RobotError
 
-Bounds = Mapping[str, tuple[float, float]]
-"""Lowest and highest possible value by field; of a tuple, of each part."""
+T = TypeVar("T", bound="Bounded")
 
 
-def check_bounds(values: object, bounds: Bounds) -> None:
-    """See that fields lie within their bounds.
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _bounds(kind: type) -> dict[str, tuple[float, float]]:
+    """Lowest and highest value by field; of a tuple, of each part."""
+    found = {}
+    for name, hint in _hints(kind).items():
+        first, *rest = get_args(hint) or (hint,)
+        for meta in (*get_args(first), *rest):
+            if isinstance(meta, msgspec.Meta) and meta.ge is not None:
+                found[name] = (meta.ge, math.inf if meta.le is None else meta.le)
+    return found
+
+
+class Bounded:
+    """Base of a parameter dataclass."""
+
+    def __post_init__(self) -> None:
+        """Refuse values out of their bounds, and NaN.
+
+        Raises:
+            RobotError: Names the field.
+        """
+        for name, (low, high) in _bounds(type(self)).items():
+            value = getattr(self, name)
+            for part in value if isinstance(value, tuple) else (value,):
+                if not low <= part <= high:
+                    raise RobotError(f"{name} is {part:g}; expected {low:g} to {high:g}.")
+
+
+def plain(error: msgspec.ValidationError) -> str:
+    """Put msgspec's message into plain words."""
+    text = str(error)[0].lower() + str(error)[1:]
+    names = {"float": "a number", "int": "a whole number", "array": "a list", "str": "a text"}
+    for kind, words in {**names, "object": "a mapping"}.items():
+        text = text.replace(f"`{kind}`", words)
+    return text
+
+
+def read(kind: type[T], where: str, entry: Any, without: tuple[str, ...] = ()) -> T:
+    """Build a parameter class from a mapping of its fields.
+
+    Args:
+        kind: The class, a dataclass.
+        where: What to call the mapping in errors.
+        entry: From a file.
+        without: Fields that files do not have.
 
     Raises:
-        RobotError: One does not, or is not a number; the sentence names it.
+        RobotError: A field is missing, unknown, of another type or out of its bounds.
     """
-    for name, (low, high) in bounds.items():
-        value = getattr(values, name)
-        for part in value if isinstance(value, tuple) else (value,):
-            if not low <= part <= high:  # refuses NaN as well
-                raise RobotError(f"{name} is {part:g}; expected {low:g} to {high:g}.")
+    if not isinstance(entry, Mapping):
+        raise RobotError(f"{where} is {entry!r}; expected a mapping of its fields.")
+    known = {part.name: part for part in fields(kind) if part.name not in without}  # type: ignore[arg-type]
+    for name in entry:
+        if name not in known:
+            raise RobotError(f"{where}.{name} is unknown; the fields are {', '.join(known)}.")
+    values: dict[str, Any] = {}
+    for name, part in known.items():
+        if name in entry:
+            try:
+                values[name] = msgspec.convert(entry[name], _hints(kind)[name])
+            except msgspec.ValidationError as error:
+                raise RobotError(f"{where}.{name} is {entry[name]!r}; {plain(error)}.") from None
+        elif part.default is MISSING:
+            raise RobotError(f"{where}.{name} is missing.")
+    try:
+        return kind(**values)
+    except RobotError as error:
+        raise RobotError(f"{where}.{error}") from None

@@ -12,7 +12,7 @@ from typing import Any
 
 from pronk.errors import HardwareError
 from pronk.links.dds import idl
-from pronk.links.dds.address import DdsNetwork, Participant, take, write
+from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take, write
 from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
 from pronk.links.dds.service import (
     BAD_PARAMETER,
@@ -32,8 +32,6 @@ from pronk.robots.robot import Robot
 
 Spoil = Callable[[bytes], bytes]
 
-COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
-"""Topics."""
 MODES = ("", "normal", "ai", "advanced", "mcf")
 """Controllers of a Go2 that can hold its joints; the first is none."""
 _SERVICE_POLLS = 20

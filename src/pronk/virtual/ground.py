@@ -24,14 +24,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from pronk.errors import RobotError
-from pronk.virtual.bounds import Bounds, check_bounds
+from pronk.virtual.bounds import Bounded
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -72,26 +73,18 @@ class Box:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ground:
+class Ground(Bounded):
     """A floor, blocks on it, and how feet feel them."""
 
-    friction: float = 0.8
+    friction: Annotated[float, Meta(ge=1e-3, le=10.0)] = 0.8
     """Coulomb coefficient between foot and ground [1]."""
-    stiffness: float = 30e3
+    stiffness: Annotated[float, Meta(ge=100.0, le=1e7)] = 30e3
     """Of a foot pressed into the ground [N/m]."""
-    damping: float = 60.0
+    damping: Annotated[float, Meta(ge=0.0, le=1e5)] = 60.0
     """[N s/m]"""
-    floor: float = 0.0
+    floor: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
     """Height of the endless floor; below the blocks where there are gaps between them [m]."""
     terrain: tuple[Box, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Refuse a ground that cannot exist.
-
-        Raises:
-            RobotError: A value is out of its physical bounds.
-        """
-        check_bounds(self, _BOUNDS)
 
     def height(self, x: float, y: float) -> float:
         """Height of the ground at a place [m]."""
@@ -176,14 +169,6 @@ class Ground:
             model.geom_solref[geom] = (-k, -b)
             model.geom_solimp[geom] = (d, d, 1e-3, 0.5, 2.0)
             model.geom_friction[geom] = (self.friction, 0.0, 0.0)
-
-
-_BOUNDS: Bounds = {
-    "friction": (1e-3, 10.0),
-    "stiffness": (100.0, 1e7),
-    "damping": (0.0, 1e5),
-    "floor": (-100.0, 100.0),
-}
 
 
 @dataclass(frozen=True, kw_only=True)

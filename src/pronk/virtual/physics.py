@@ -6,6 +6,8 @@ looks in where a state or a sample is due, or a command is heard.
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass
 
 import mujoco
@@ -13,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.links.machine import Command
+from pronk.links.machine import Command, damping_command
 from pronk.virtual.capture import Capture, Recorder, seen
 from pronk.virtual.plant import Plant
-from pronk.virtual.sim_params_parts import MachineParams
-from pronk.virtual.transport import Transport
+from pronk.virtual.sim_params import MachineParams
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -38,6 +39,50 @@ class Block:
     """Of the motors [N m]. (n, joints of the plant)"""
     voltage: Array
     """Of the bus [V]. (n,)"""
+
+
+class Transport:
+    """Commands under way, in order of arrival. Time is counted in physics steps.
+
+    A command that expires, at `made + valid_for` and later by the delay, is followed by damping. A
+    newer command replaces an older one together with its expiry.
+    """
+
+    def __init__(self, joints: int, delay_s: float, step_s: float) -> None:
+        """Nothing is under way yet.
+
+        Args:
+            joints: How many the commands are for.
+            delay_s: From sending to being heard [s].
+            step_s: Physics step [s].
+        """
+        self._sinking = damping_command(joints)
+        self._delay, self._step = delay_s, step_s
+        self._under_way: deque[tuple[int, Command]] = deque()
+        self._expiry = math.inf
+
+    def put(self, command: Command, now: float) -> None:
+        """Send a command at a time on the machine's clock [s]."""
+        self._under_way.append((round((now + self._delay) / self._step), command))
+
+    @property
+    def soonest(self) -> float:
+        """Physics step at which the next command is heard, of those on the way; may be infinite."""
+        return min(self._under_way[0][0], self._expiry) if self._under_way else self._expiry
+
+    def take(self, before: int) -> tuple[int, Command] | None:
+        """The next command that is heard before a physics step, and the step; None without one."""
+        step = self._under_way[0][0] if self._under_way else before
+        # At the same step the newer command wins: it is taken after the expiry.
+        if self._expiry <= step and self._expiry < before:
+            expired, self._expiry = int(self._expiry), math.inf
+            return expired, self._sinking
+        if step >= before:
+            return None
+        _, command = self._under_way.popleft()
+        end = command.made + command.valid_for
+        self._expiry = round((end + self._delay) / self._step) if math.isfinite(end) else math.inf
+        return step, command
 
 
 class Physics:

@@ -30,16 +30,14 @@ from typing import Literal
 import numpy as np
 
 from pronk.errors import HardwareError
-from pronk.links.machine import Command, State, TorqueKind
+from pronk.links.machine import Command, State, TorqueKind, check_command, damping_command
 from pronk.robots.robot import Robot
 from pronk.virtual.capture import Capture, Recorder
 from pronk.virtual.ground import Ground, Start
-from pronk.virtual.imu_motion import FreeBody, StandingBody
-from pronk.virtual.physics import Physics
+from pronk.virtual.physics import Physics, Transport
 from pronk.virtual.plant import build_plant, legs_of
-from pronk.virtual.sensors import Raw, Sensors
+from pronk.virtual.sensors import FreeBody, Raw, Sensors, StandingBody
 from pronk.virtual.sim_params import SimParams
-from pronk.virtual.transport import Transport, check_command, sinking
 
 TIMESTEP_S = 0.25e-3
 """Physics step; see the module's docstring for why it suffices."""
@@ -231,7 +229,7 @@ class VirtualRobot:
     def damp(self) -> None:
         """Let the joints sink softly: no stiffness, some damping."""
         self._check_open()
-        self._transport.put(sinking(len(self._robot.joints)), self._now)
+        self._transport.put(damping_command(len(self._robot.joints)), self._now)
 
     def capture(self, since: float = 0.0) -> Capture:
         """What a motion-capture rig has seen so far; also after `close`.

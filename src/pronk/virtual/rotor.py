@@ -23,7 +23,7 @@ import mujoco
 
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive
-from pronk.virtual.sim_params_parts import JointParams
+from pronk.virtual.sim_params import JointParams
 
 ROTOR_MASS = 1e-9
 """The rotor's inertia lives in the armature of its hinge; MuJoCo still wants a body with mass, and

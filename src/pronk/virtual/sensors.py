@@ -19,12 +19,227 @@ from numpy.typing import NDArray
 
 from pronk.links.machine import State
 from pronk.robots.robot import Robot
-from pronk.virtual.imu_motion import Motion
-from pronk.virtual.noise import NoiseSource
-from pronk.virtual.quaternion import product
+from pronk.virtual.plant import Plant
+from pronk.virtual.quaternion import about_z, of_vector, product, turned_back
 from pronk.virtual.sim_params import SimParams
 
 Array = NDArray[np.float64]
+
+
+_GRAVITY = 9.81
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Of the trunk, at n instants."""
+
+    orientation: Array
+    """Trunk to world, quaternions w, x, y, z. (n, 4)"""
+    rate: Array
+    """Angular velocity in the trunk's frame [rad/s]. (n, 3)"""
+    force: Array
+    """Specific force in the trunk's frame, its mean since the instant before [m/s^2]. (n, 3)"""
+
+
+class StandingBody:
+    """A body on the bench, still or on a stand that gives a little."""
+
+    def __init__(self, plant: Plant) -> None:
+        """Of a plant on the bench."""
+        self._stand = plant.stand
+        self._still: Motion | None = None
+        """Of a rigid stand, as many instants as were last asked for."""
+
+    def motion(self, qpos: Array, qvel: Array) -> Motion:
+        """The motion at instants, from the plant's positions (n, nq) and velocities (n, nv)."""
+        if len(self._stand):
+            tilt = qpos[:, self._stand]
+            rate = qvel[:, self._stand]
+            return Motion(orientation=of_vector(tilt), rate=rate, force=resting_force(tilt))
+        if self._still is None or len(self._still.rate) != len(qpos):
+            tilt = np.zeros((len(qpos), 3))
+            self._still = Motion(orientation=of_vector(tilt), rate=tilt, force=resting_force(tilt))
+        return self._still
+
+
+class FreeBody:
+    """A body that moves freely. Keeps the last instant between blocks."""
+
+    def __init__(self, period_s: float) -> None:
+        """Begin at rest.
+
+        Args:
+            period_s: Between instants [s].
+        """
+        self._period = period_s
+        self._last: Array | None = None
+
+    def motion(self, qpos: Array, qvel: Array) -> Motion:
+        """The motion at instants, from positions (n, nq) and velocities (n, nv), trunk first."""
+        orientation, velocity = qpos[:, 3:7], qvel[:, :3]
+        now = np.concatenate([orientation, velocity], axis=1)
+        path = np.concatenate([now[:1] if self._last is None else self._last, now])
+        self._last = now[-1:]
+        force = moving_force(path[:, 4:], path[:, :4], self._period)
+        return Motion(orientation=orientation, rate=qvel[:, 3:6], force=force)
+
+
+def resting_force(tilt: Array) -> Array:
+    """What an accelerometer at rest reads in the frame of a body with a small tilt [m/s^2].
+
+    Args:
+        tilt: Roll, pitch and yaw of the body [rad], shape (n, 3).
+    """
+    roll, pitch = tilt[:, 0], tilt[:, 1]
+    return _GRAVITY * np.stack([-pitch, roll, np.ones_like(roll)], axis=1)
+
+
+def moving_force(velocity: Array, orientation: Array, period_s: float) -> Array:
+    """What an accelerometer reads on average between instants, in the body's frame [m/s^2].
+
+    The change of velocity and what gravity would have made of it, turned into the frame halfway;
+    a unit that integrates inside, as good ones do, gives this mean.
+
+    Args:
+        velocity: World frame [m/s], shape (n + 1, 3).
+        orientation: Body to world, unit quaternions w, x, y, z, shape (n + 1, 4).
+        period_s: Between instants [s].
+
+    Returns:
+        Shape (n, 3).
+    """
+    force = (velocity[1:] - velocity[:-1]) / period_s
+    force[:, 2] += _GRAVITY
+    # Not normalized: the mean of two orientations 0.02 rad apart is short of 1 by 1e-5.
+    return turned_back(0.5 * (orientation[1:] + orientation[:-1]), force)
+
+
+_AHEAD = 512
+"""Ticks that are computed at once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Errors of the sensors at n ticks; joints are all of the robot's."""
+
+    jitter: Array
+    """Of the instant of sampling about its tick [s]. (n,)"""
+    stamp: Array
+    """Of the timestamp beyond that [s]. (n,)"""
+    position: Array
+    """[rad]. (n, joints)"""
+    velocity: Array
+    """[rad/s]. (n, joints)"""
+    torque: Array
+    """[N m]. (n, joints)"""
+    gyro: Array
+    """With its bias [rad/s]. (n, 3)"""
+    force: Array
+    """With its bias [m/s^2]. (n, 3)"""
+    tilt: Array
+    """Rotation of the attitude in the trunk's frame, w, x, y, z. (n, 4)"""
+    heading: Array
+    """Rotation of the attitude about the vertical. (n, 4)"""
+
+
+class NoiseSource:
+    """Noise, tick after tick."""
+
+    def __init__(self, sim_params: SimParams, joints: int, *, rate_hz: float, seed: int) -> None:
+        """Start anew.
+
+        Args:
+            sim_params: How large everything is.
+            joints: Of the robot.
+            rate_hz: Ticks per second.
+            seed: Of all noise.
+        """
+        self._machine, self._filter = sim_params.machine, sim_params.attitude
+        self._joints = joints
+        self._period = 1.0 / rate_hz
+        self._rng = np.random.default_rng(seed)
+        # A stream of its own: what the joints say does not depend on the attitude.
+        self._attitude_rng = np.random.default_rng([seed, 1])
+        self._yaw = self._attitude_rng.uniform(-math.pi, math.pi)
+        # What is left of the slow noise after a tick, and how large what is added is.
+        machine, off, each = sim_params.machine, sim_params.attitude, [joints, 3]
+        corner = np.repeat([machine.position_noise_corner_hz, off.noise_corner_hz], each)
+        self._keep = np.exp(-2.0 * math.pi * corner * self._period)
+        size = np.repeat([machine.position_noise, off.noise], each)
+        self._fresh = size * np.sqrt(1.0 - self._keep**2)
+        self._last = np.zeros(joints + 3)
+        self._drawn = 0
+        # Columns side by side, so that a slice of rows is a slice of everything.
+        widths = (1, 1, joints, joints, joints, 3, 3, 4, 4)
+        ends = np.cumsum(widths).tolist()
+        self._parts = [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
+        self._table = np.empty((0, ends[-1]))
+        self._next = 0
+
+    def take(self, count: int) -> Noise:
+        """The noise of the next `count` ticks."""
+        if self._next + count > len(self._table):
+            left = self._table[self._next :]
+            self._table = np.concatenate([left, self._draw(max(count - len(left), _AHEAD))])
+            self._next = 0
+        rows = self._table[self._next : self._next + count]
+        self._next += count
+        jitter, stamp, position, velocity, torque, gyro, force, tilt, heading = (
+            rows[:, part] for part in self._parts
+        )
+        return Noise(
+            jitter=jitter[:, 0],
+            stamp=stamp[:, 0],
+            position=position,
+            velocity=velocity,
+            torque=torque,
+            gyro=gyro,
+            force=force,
+            tilt=tilt,
+            heading=heading,
+        )
+
+    def _draw(self, n: int) -> Array:
+        """Rows of the table for the next n ticks."""
+        machine, off, joints = self._machine, self._filter, self._joints
+        draws = self._rng.standard_normal((n, 3 * joints + 8))
+        if self._drawn == 0:
+            draws[0, -2:] = 0.0  # the clock starts with the first state
+        mount, fast, current = (draws[:, k * joints : (k + 1) * joints] for k in range(3))
+        # Clipped so that neither may ever put two states out of order.
+        most = 0.4 * self._period
+        jitter = np.clip(machine.sampling_jitter_s * draws[:, -1], -most, most)
+        stamp = np.clip(machine.timestamp_error_s * draws[:, -2], -most / 8, most / 8)
+        normals = self._attitude_rng.standard_normal((n, 3))
+        slow = self._low_passed(np.concatenate([mount, normals], axis=1))
+        shake, wander = slow[:, :joints], slow[:, joints:]
+        ticks = np.arange(self._drawn, self._drawn + n) * self._period
+        self._drawn += n
+        return np.concatenate(
+            [
+                jitter[:, None],
+                stamp[:, None],
+                shake,
+                machine.velocity_noise * fast,
+                machine.torque_noise * current,
+                machine.gyro_noise * draws[:, -8:-5] + np.array(machine.gyro_bias),
+                machine.accelerometer_noise * draws[:, -5:-2]
+                + np.array(machine.accelerometer_bias),
+                of_vector(wander + np.array(off.bias)),
+                about_z(np.asarray(self._yaw + off.yaw_drift * ticks, dtype=np.float64)),
+            ],
+            axis=1,
+        )
+
+    def _low_passed(self, normals: Array) -> Array:
+        """First-order low-passed noise, of the mounts and of the attitude, that goes on."""
+        slow: Array = self._fresh * normals
+        last = self._last
+        for row in slow:
+            row += self._keep * last
+            last = row
+        self._last = last.copy()
+        return slow
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,33 +1,158 @@
-"""What is true of a virtual robot, and of nothing else that pronk may look at.
+"""The hidden parameters of a virtual robot.
 
-The file (`pronk/sim_params/1`) can be replaced by any other. It says in which ways
-the virtual machine differs from the model that is matched and trained in. `pronk.match` and
-`pronk.train` must not import this module; a test holds that.
+The file (schema `pronk/sim_params/1`) holds how the virtual robot differs from the model that is
+matched and trained in; `pronk.match` and `pronk.train` cannot import this module. The entries
+`trunk`, `attitude` and `ground` matter off the bench only; a file may leave them, or some of their
+fields, at their defaults.
 
-The entries `trunk`, `attitude` and `ground` matter off the bench only. A file may leave them out,
-or some of their fields: then they are as in `sim_params.py` and `ground.py`.
+Joint quantities are in joint coordinates (through the gear) unless the name says motor. Vectors are
+in the trunk's frame: x forward, y left, z up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any
 
+import msgspec
 import yaml
+from msgspec import Meta
 
 from pronk.errors import RobotError
+from pronk.virtual.bounds import Bounded, plain, read
 from pronk.virtual.ground import Ground
-from pronk.virtual.sim_params_parts import AttitudeParams, JointParams, MachineParams, TrunkParams
 
 SCHEMA = "pronk/sim_params/1"
 SHIPPED = Path(__file__).with_name("mini_cheetah_sim_params.yaml")
 
+# Parts of vectors.
+_Rate = Annotated[float, Meta(ge=-1.0, le=1.0)]
+_Force = Annotated[float, Meta(ge=-5.0, le=5.0)]
+_Offset = Annotated[float, Meta(ge=-0.2, le=0.2)]
+_Scale = Annotated[float, Meta(ge=0.1, le=10.0)]
+_Angle = Annotated[float, Meta(ge=-0.5, le=0.5)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointParams(Bounded):
+    """One joint of the virtual robot. Bounds exclude slips of the pen (a factor of ten)."""
+
+    torque_scale: Annotated[float, Meta(ge=0.1, le=10.0)]
+    """Torque that the motor gives per torque that its drive believes to give [1]."""
+    link_inertia_scale: Annotated[float, Meta(ge=0.1, le=10.0)]
+    """Mass and inertia of the link this joint moves, relative to the model's [1]."""
+    rotor_inertia: Annotated[float, Meta(ge=1e-9, le=1.0)]
+    """Inertia of the rotor about its own axis, motor side [kg m^2]."""
+    belt_stiffness: Annotated[float, Meta(ge=1.0, le=1e5)]
+    """Between rotor (reflected) and link [N m/rad]."""
+    belt_damping: Annotated[float, Meta(ge=0.0, le=100.0)]
+    """Between rotor (reflected) and link [N m s/rad]."""
+    coulomb: Annotated[float, Meta(ge=0.0, le=100.0)]
+    """Dry friction of the rotor while it slips [N m]."""
+    breakaway: Annotated[float, Meta(ge=0.0, le=100.0)]
+    """Dry friction at the onset of slip; the Stribeck peak, not below `coulomb` [N m]."""
+    stribeck_speed: Annotated[float, Meta(ge=1e-6, le=100.0)]
+    """Speed at which the peak has fallen to 1/e of its height over `coulomb` [rad/s]."""
+    presliding_stiffness: Annotated[float, Meta(ge=1e-3, le=1e6)]
+    """Of the bristles before slip, LuGre sigma_0 [N m/rad]."""
+    presliding_damping: Annotated[float, Meta(ge=0.0, le=100.0)]
+    """Of the bristles, LuGre sigma_1 [N m s/rad]."""
+    viscous: Annotated[float, Meta(ge=0.0, le=100.0)]
+    """Viscous friction of the rotor [N m s/rad]."""
+    encoder_offset: Annotated[float, Meta(ge=-0.1, le=0.1)]
+    """Reading minus true angle; the drive closes its loop on the reading [rad]."""
+
+    def __post_init__(self) -> None:
+        """Refuse a joint that cannot exist."""
+        super().__post_init__()
+        if self.breakaway < self.coulomb:
+            raise RobotError(
+                f"breakaway is {self.breakaway:g}, below coulomb = {self.coulomb:g}; "
+                "friction at the onset of slip is never below that while slipping."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineParams(Bounded):
+    """What the joints share: timing, supply, sensors, the stand."""
+
+    command_delay_s: Annotated[float, Meta(ge=0.0, le=0.5)]
+    """From sending a command to the drives acting on it [s]."""
+    measurement_delay_s: Annotated[float, Meta(ge=0.0, le=0.5)]
+    """From the instant a state was measured to its timestamp [s]."""
+    sampling_jitter_s: Annotated[float, Meta(ge=0.0, le=1e-3)]
+    """Standard deviation of the sampling instant about its tick, contained in timestamps [s]."""
+    timestamp_error_s: Annotated[float, Meta(ge=0.0, le=1e-3)]
+    """Standard deviation of the timestamp about the sampling instant plus delay [s]."""
+    drive_lag_s: Annotated[float, Meta(ge=1e-6, le=0.1)]
+    """Time constant from a drive's torque command to its motor's torque: sampling, averaging of
+    the speed, current loop [s]."""
+    bus_voltage: Annotated[float, Meta(ge=1.0, le=1e3)]
+    """Open-circuit voltage of the battery [V]."""
+    bus_resistance: Annotated[float, Meta(ge=0.0, le=10.0)]
+    """Of battery and wiring [ohm]."""
+    encoder_bits: Annotated[int, Meta(ge=4, le=32)]
+    """Of the absolute encoder on each rotor, motor side [bit per revolution]."""
+    velocity_window_s: Annotated[float, Meta(ge=1e-6, le=0.1)]
+    """Span over which a drive differentiates its encoder [s]."""
+    velocity_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    """White, standard deviation [rad/s]."""
+    position_noise: Annotated[float, Meta(ge=0.0, le=0.1)]
+    """Coloured (vibration of the encoder mount), standard deviation [rad]."""
+    position_noise_corner_hz: Annotated[float, Meta(ge=0.1, le=1e5)]
+    """Corner of the first-order low-pass that colours it [Hz]."""
+    torque_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    """White, of the current measurement as torque, standard deviation [N m]."""
+    gyro_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    """White, standard deviation per sample [rad/s]."""
+    gyro_bias: tuple[_Rate, _Rate, _Rate]
+    """[rad/s]"""
+    accelerometer_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    """White, standard deviation per sample [m/s^2]."""
+    accelerometer_bias: tuple[_Force, _Force, _Force]
+    """[m/s^2]"""
+    clamp_stiffness: Annotated[float, Meta(ge=1.0, le=1e5)]
+    """Of the fixture that holds a clamped link [N m/rad]."""
+    clamp_damping: Annotated[float, Meta(ge=0.0, le=1e3)]
+    """[N m s/rad]"""
+    stand_stiffness: Annotated[float, Meta(ge=100.0)]
+    """Of the stand under the body, about each axis; .inf is rigid [N m/rad]."""
+    stand_damping: Annotated[float, Meta(ge=0.0, le=1e3)]
+    """[N m s/rad]; of no effect with a rigid stand."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrunkParams(Bounded):
+    """How the trunk differs from the model's; of no effect on the bench."""
+
+    mass_offset: Annotated[float, Meta(ge=-50.0, le=50.0)] = 0.0
+    """Added to the trunk's mass; its inertia grows alike [kg]."""
+    com_offset: tuple[_Offset, _Offset, _Offset] = (0.0, 0.0, 0.0)
+    """Added to its centre of mass [m]."""
+    inertia_scale: tuple[_Scale, _Scale, _Scale] = (1.0, 1.0, 1.0)
+    """Its principal moments (about x, y, z) relative to the model's, beyond `mass_offset` [1].
+    Together they must still be those of a body: the largest not above the sum of the others."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeParams(Bounded):
+    """Errors of the machine's own attitude filter."""
+
+    bias: tuple[_Angle, _Angle, _Angle] = (0.0, 0.0, 0.0)
+    """Constant part, as a small rotation about the trunk's axes [rad]."""
+    noise: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.0
+    """Slowly varying part about each axis, standard deviation [rad]."""
+    noise_corner_hz: Annotated[float, Meta(ge=1e-3, le=1e3)] = 0.3
+    """Corner of the first-order low-pass that colours it [Hz]."""
+    yaw_drift: Annotated[float, Meta(ge=-1.0, le=1.0)] = 0.0
+    """Drift of the heading, which no sensor corrects [rad/s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SimParams:
-    """The whole sim_params of a virtual robot."""
+    """All hidden parameters of a virtual robot."""
 
     robot: str
     """Name of the robot whose structure it has."""
@@ -38,7 +163,7 @@ class SimParams:
     ground: Ground = field(default_factory=Ground)
 
     def check_joints(self, names: Iterable[str], source: str = "sim_params") -> None:
-        """See that the parameters tells of exactly these joints.
+        """Check that the parameters hold exactly these joints.
 
         Raises:
             RobotError: A joint is missing or unknown.
@@ -53,127 +178,83 @@ class SimParams:
             )
 
 
-T = TypeVar("T", JointParams, MachineParams, TrunkParams, AttitudeParams, Ground)
-
-_REQUIRED = ("schema", "robot", "machine", "joints")
-_OPTIONAL: dict[str, Any] = {"trunk": TrunkParams, "attitude": AttitudeParams, "ground": Ground}
-# Written by who sets a scene up, not by who describes a machine.
-_NOT_IN_FILES = ("terrain", "floor")
-_VECTORS = ("bias", "gyro_bias", "accelerometer_bias", "com_offset", "inertia_scale")
-
-
 def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
-    """The same machine with a few numbers changed.
+    """Copy parameters with a few numbers changed.
 
     Args:
-        sim_params: To start from; it stays as it is.
+        sim_params: To start from.
         changes: `trunk_mass_offset` [kg], `friction` (of the ground), or any number of
-            `MachineParams`, as `command_delay_s` or `bus_voltage`; the values replace the old ones.
+            `MachineParams`, as `command_delay_s` or `bus_voltage`.
 
     Raises:
-        RobotError: A name is unknown, or a value impossible.
+        RobotError: A name is unknown, or a value is out of its bounds.
     """
-    numbers = [f.name for f in fields(MachineParams) if f.name not in _VECTORS]
-    known = ["trunk_mass_offset", "friction", *numbers]
-    for name in changes:
-        if name not in known:
-            raise RobotError(
-                f"a set of parameters has no {name!r} to change; it has {', '.join(known)}."
-            )
-    machine: dict[str, Any] = {name: changes[name] for name in changes if name in numbers}
-    if machine:
-        sim_params = replace(sim_params, machine=replace(sim_params.machine, **machine))
-    if "trunk_mass_offset" in changes:
-        mass = changes["trunk_mass_offset"]
-        sim_params = replace(sim_params, trunk=replace(sim_params.trunk, mass_offset=mass))
-    if "friction" in changes:
-        sim_params = replace(
-            sim_params, ground=replace(sim_params.ground, friction=changes["friction"])
-        )
+    numbers = [f.name for f in fields(MachineParams) if not f.name.endswith("_bias")]
+    places = {"trunk_mass_offset": ("trunk", "mass_offset"), "friction": ("ground", "friction")}
+    places |= {name: ("machine", name) for name in numbers}
+    for name, value in changes.items():
+        if name not in places:
+            raise RobotError(f"no parameter {name!r} to change; there are {', '.join(places)}.")
+        part, entry = places[name]
+        changed: Any = replace(getattr(sim_params, part), **{entry: value})
+        sim_params = replace(sim_params, **{part: changed})
     return sim_params
 
 
-def _number(where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise RobotError(f"{where} is {value!r}; expected a number.")
-    return float(value)
+class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Entries of a file; their fields are read by `read`."""
 
-
-def _read(kind: type[T], where: str, entry: Any) -> T:
-    """Build one of the dataclasses from a mapping, each field without a default exactly once."""
-    if not isinstance(entry, dict):
-        raise RobotError(f"{where} is {entry!r}; expected a mapping of its fields.")
-    known = {part.name: part for part in fields(kind) if part.name not in _NOT_IN_FILES}
-    for name in entry:
-        if name not in known:
-            raise RobotError(f"{where}.{name} is unknown; the fields are {', '.join(known)}.")
-    for name, part in known.items():
-        if name not in entry and part.default is MISSING:
-            raise RobotError(f"{where}.{name} is missing.")
-    values: dict[str, Any] = {}
-    for name, value in entry.items():
-        if name in _VECTORS:
-            if not isinstance(value, list) or len(value) != 3:
-                raise RobotError(f"{where}.{name} is {value!r}; expected three numbers.")
-            values[name] = tuple(_number(f"{where}.{name}", number) for number in value)
-        elif name == "encoder_bits":
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise RobotError(f"{where}.{name} is {value!r}; expected a whole number.")
-            values[name] = value
-        else:
-            values[name] = _number(f"{where}.{name}", value)
-    try:
-        return kind(**values)
-    except RobotError as error:
-        raise RobotError(f"{where}.{error}") from None
+    schema: str
+    robot: str
+    machine: Any
+    joints: Annotated[dict[str, Any], Meta(min_length=1)]
+    trunk: Any = {}
+    attitude: Any = {}
+    ground: Any = {}
 
 
 def parse_sim_params(body: Any, source: str) -> SimParams:
-    """Read a set of parameters from what a YAML file holds.
+    """Read parameters from the content of a YAML file.
 
     Args:
         body: The parsed document.
         source: What to call it in errors, usually its path.
 
     Raises:
-        RobotError: Another schema, a field missing, unknown or of another type, or a machine that
-            cannot exist. The sentence names the field.
+        RobotError: Another schema; a field missing, unknown, of another type or out of its bounds.
     """
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         got = body.get("schema") if isinstance(body, dict) else type(body).__name__
         hint = " The fields of pronk/truth/1 are the same." if got == "pronk/truth/1" else ""
         raise RobotError(f"{source}: schema {got!r}; this pronk reads {SCHEMA!r}.{hint}")
-    known = (*_REQUIRED, *_OPTIONAL)
-    for name in body:
-        if name not in known:
-            raise RobotError(f"{source}: {name} is unknown; the entries are {', '.join(known)}.")
-    for name in _REQUIRED:
-        if name not in body:
-            raise RobotError(f"{source}: {name} is missing.")
-    if not isinstance(body["robot"], str):
-        raise RobotError(f"{source}: robot is {body['robot']!r}; expected a name.")
-    if not isinstance(body["joints"], dict) or not body["joints"]:
-        raise RobotError(f"{source}: joints is {body['joints']!r}; expected a mapping by name.")
+    try:
+        file = msgspec.convert(body, _File)
+    except msgspec.ValidationError as error:
+        raise RobotError(
+            f"{source}: {plain(error)}; the entries are {', '.join(_FIELDS)}."
+        ) from None
     return SimParams(
-        robot=body["robot"],
-        machine=_read(MachineParams, f"{source}: machine", body["machine"]),
+        robot=file.robot,
+        machine=read(MachineParams, f"{source}: machine", file.machine),
         joints={
-            str(name): _read(JointParams, f"{source}: joints.{name}", entry)
-            for name, entry in body["joints"].items()
+            name: read(JointParams, f"{source}: joints.{name}", entry)
+            for name, entry in file.joints.items()
         },
-        **{
-            name: _read(kind, f"{source}: {name}", body[name])
-            for name, kind in _OPTIONAL.items()
-            if name in body
-        },
+        trunk=read(TrunkParams, f"{source}: trunk", file.trunk),
+        attitude=read(AttitudeParams, f"{source}: attitude", file.attitude),
+        # Terrain belongs to a scene, not to a machine.
+        ground=read(Ground, f"{source}: ground", file.ground, without=("terrain", "floor")),
     )
 
 
+_FIELDS = [entry.name for entry in msgspec.structs.fields(_File)]
+
+
 def load_sim_params(path: Path | str | None = None) -> SimParams:
-    """Read a sim_params file.
+    """Read a parameter file.
 
     Args:
-        path: The file; None for the one that ships with pronk, whose match is the paper's Table I.
+        path: The file; None for the shipped one, whose match is the paper's Table I.
 
     Raises:
         RobotError: The file is missing, not YAML, or `parse_sim_params` refuses it.

@@ -19,8 +19,14 @@ from pronk.errors import PronkError
 from pronk.files import write_text
 from pronk.robots.robot import Robot
 from pronk.virtual.ground import Ground
-from pronk.virtual.sim_params import SCHEMA, SimParams
-from pronk.virtual.sim_params_parts import AttitudeParams, JointParams, MachineParams, TrunkParams
+from pronk.virtual.sim_params import (
+    SCHEMA,
+    AttitudeParams,
+    JointParams,
+    MachineParams,
+    SimParams,
+    TrunkParams,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,6 +34,8 @@ except ImportError:
         "install it with: pip install 'pronk[hardware]'."
     ) from None
 
+COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
+"""Topics."""
 LOOPBACK_DOMAIN = 77
 """pronk's own; Unitree's robots use 0, unitree_mujoco 1."""
 ROBOT_DOMAIN = 0

@@ -26,9 +26,8 @@ from pronk.errors import HardwareError
 from pronk.links.dds import idl
 from pronk.links.dds.layout import pack, record, unpack
 from pronk.links.lcm.message import RefusedError
-from pronk.links.machine import Command, State
+from pronk.links.machine import Command, State, check_command
 from pronk.robots.robot import Robot
-from pronk.virtual.transport import check_command
 
 Array = NDArray[np.float64]
 

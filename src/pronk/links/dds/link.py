@@ -19,7 +19,7 @@ from collections import Counter, deque
 
 from pronk.errors import HardwareError
 from pronk.links.dds import idl
-from pronk.links.dds.address import DdsNetwork, Participant, take
+from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take
 from pronk.links.dds.codec import joint_map
 from pronk.links.dds.service import BENCH, CLAMP, Client, own_controller
 from pronk.links.dds.state_decoder import STATE_RATE_HZ, Intake
@@ -29,7 +29,6 @@ from pronk.links.machine import State, TorqueKind
 from pronk.links.network_link import NetworkLink
 from pronk.links.preflight import Freshness, check_rest
 from pronk.robots.robot import Robot
-from pronk.virtual.dds_server import COMMANDS, STATES
 
 _LONGEST_BURST_S = 0.1
 _LONGEST_PAUSE_S = 0.05
