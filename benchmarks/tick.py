@@ -35,9 +35,9 @@ from pronk.links.realtime import Histogram, Pace, Wanted, enter, sleep_until
 from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.runtime.policy_process import WARM_UP, standing
-from pronk.runtime.rollout import Pilot
+from pronk.runtime.rollout import PolicyRunner
 from pronk.runtime.script import STILL
-from pronk.runtime.warmup import rehearse_until
+from pronk.runtime.warmup import warm_up_until
 
 RATE_HZ = 50.0
 HOGS = 2
@@ -159,11 +159,11 @@ class _Counts:
 def _loop(case: Case, path: Path, seconds: float, end: Connection) -> None:
     policy = load_policy(path)
     robot = load_robot(policy.contract.robot)
-    pilot, stand_in = Pilot(policy, robot), Pilot(policy.sibling(), robot)
+    pilot, stand_in = PolicyRunner(policy, robot), PolicyRunner(policy.sibling(), robot)
     states = _states(standing(policy.contract))
     counts = {way: _Counts() for way in WAYS}
 
-    def rehearse() -> None:
+    def warm_up() -> None:
         stand_in.reset()
         stand_in.decide(states[0], (STILL, False), 0.0)
 
@@ -179,7 +179,7 @@ def _loop(case: Case, path: Path, seconds: float, end: Connection) -> None:
     )
     once, ticked, rehearsed = WAYS
     for _ in range(WARM_UP):
-        rehearse()
+        warm_up()
     for number in range(BACK_TO_BACK):
         decide(number, once)
     pace = Pace(RATE_HZ, time.monotonic() + 0.1)
@@ -187,7 +187,7 @@ def _loop(case: Case, path: Path, seconds: float, end: Connection) -> None:
     while pace.tick < last:
         way = rehearsed if pace.tick % 2 else ticked
         if way is rehearsed:
-            rehearse_until(pace.deadline, rehearse)
+            warm_up_until(pace.deadline, warm_up)
         else:
             sleep_until(pace.deadline)
         counts[way].lateness.add(time.monotonic() - pace.deadline)

@@ -9,12 +9,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pronk.runtime.events import Notice
+from pronk.runtime.ipc import Event
 from pronk.runtime.link import Link
-from pronk.runtime.operators import Scripted
 from pronk.runtime.plan import Plan
-from pronk.runtime.run import fly
+from pronk.runtime.run import run
 from pronk.runtime.script import Script
+from pronk.runtime.teleop import ScriptedOperator
 from pronk.runtime.trajectories import Timing
 
 QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
@@ -22,7 +22,7 @@ PATIENT = {"damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}
 """A busy computer must not look like a fault."""
 
 
-def tell(notice: Notice) -> None:
+def tell(notice: Event) -> None:
     sys.stdout.write((notice.text if notice.kind == "mode" else notice.kind) + "\n")
     sys.stdout.flush()
 
@@ -34,11 +34,11 @@ def main() -> int:
         log=Path(sys.argv[2]),
         timing=QUICK,
         limits=PATIENT,
-        order_valid_s=2.0,
-        any_delay=True,
+        action_valid_s=2.0,
+        ignore_latency=True,
     )
-    outcome = fly(plan, Scripted([Script(command=(0.5, 0.0, 0.0), run_s=60.0)]), tell)
-    return 130 if outcome.interrupted else 0
+    summary = run(plan, ScriptedOperator([Script(command=(0.5, 0.0, 0.0), run_s=60.0)]), tell)
+    return 130 if summary.interrupted else 0
 
 
 if __name__ == "__main__":

@@ -23,19 +23,25 @@ from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace
 from pronk.logs.mcap_stream import MOST_BYTES, DamagedError, records
 from pronk.robots import load_robot
-from pronk.runtime.limits import Limits
+from pronk.runtime.ipc import (
+    EVENT,
+    STEP,
+    TICK,
+    Mailbox,
+    Mode,
+    OperatorRequest,
+    Ring,
+    event,
+    get_state,
+    put_state,
+)
 from pronk.runtime.link import Link
-from pronk.runtime.log import is_deploy_log, read_deploy_log
-from pronk.runtime.log_writer import DeployLogWriter
-from pronk.runtime.operators import Scripted, Stick, Timed
+from pronk.runtime.log import DeployLogWriter, is_deploy_log, read_deploy_log
 from pronk.runtime.preflight import delay_objection, refusals
-from pronk.runtime.reasons import Level, Reason
-from pronk.runtime.records import EVENT, STEP, TICK, Mode, Wish, event, get_state, put_state
-from pronk.runtime.safety import Memory, fault
+from pronk.runtime.safety import FilterAction, FilterState, Limits, Reason, fault
 from pronk.runtime.script import Script
-from pronk.runtime.shared import Mailbox, Ring
-from pronk.runtime.states import FIRST_ORDER_S, Director, Order
-from pronk.runtime.teleop import Gamepad, Keyboard
+from pronk.runtime.state_machine import FIRST_ACTION_S, PolicyAction, StateMachine
+from pronk.runtime.teleop import Gamepad, Keyboard, OperatorCommand, ScriptedOperator, TimeLimit
 from pronk.runtime.trajectories import Timing, folded_pose, minimum_jerk, sit_down, stand_up
 
 ROBOT = load_robot("mini_cheetah")
@@ -231,76 +237,81 @@ def test_a_time_that_is_none_is_refused() -> None:
 
 
 class Run:
-    """A director on a clock of its own."""
+    """A machine_state on a clock of its own."""
 
     def __init__(self, **times: float) -> None:
-        self.director = Director(ROBOT, Timing(**times))
-        self.memory = Memory()
+        self.machine_state = StateMachine(ROBOT, Timing(**times))
+        self.memory = FilterState()
         self.t = 0.0
-        self.order: Order | None = None
+        self.action: PolicyAction | None = None
         self.objection = ""
 
-    def tick(self, seconds: float = 0.0, wish: Wish = Wish.NONE, q: np.ndarray = LYING) -> Any:
+    def tick(
+        self,
+        seconds: float = 0.0,
+        request: OperatorRequest = OperatorRequest.NONE,
+        q: np.ndarray = LYING,
+    ) -> Any:
         self.t += seconds
-        if wish is not Wish.NONE:
-            self.director.wish(wish)
-        intent, self.memory = self.director.step(
-            self.t, state(position=q), self.memory, self.order, objection=self.objection
+        if request is not OperatorRequest.NONE:
+            self.machine_state.request(request)
+        intent, self.memory = self.machine_state.step(
+            self.t, state(position=q), self.memory, self.action, objection=self.objection
         )
         if self.memory.faulted:
-            self.director.faulted(self.t)
+            self.machine_state.faulted(self.t)
         return intent
 
     def give(self, target: np.ndarray, entry: int | None = None) -> None:
-        self.order = Order(
-            sequence=0 if self.order is None else self.order.sequence + 1,
+        self.action = PolicyAction(
+            sequence=0 if self.action is None else self.action.sequence + 1,
             state_sequence=3,
             state_time=self.t,
             made=self.t,
             valid_for=0.05,
-            entry=self.director.entry if entry is None else entry,
+            entry=self.machine_state.entry if entry is None else entry,
             position=target,
         )
 
     def standing(self) -> Run:
-        self.director.preflighted((), self.t)
-        self.tick(0.0, Wish.STAND)
+        self.machine_state.preflighted((), self.t)
+        self.tick(0.0, OperatorRequest.STAND)
         self.tick(1.0)
         self.tick(2.5)
-        assert self.director.mode is Mode.STAND
+        assert self.machine_state.mode is Mode.STAND
         return self
 
 
 def test_nothing_is_sent_before_and_without_the_checks() -> None:
     run = Run()
     assert run.tick().silent
-    run.director.enter(Mode.PREFLIGHT, run.t)
-    assert run.tick(wish=Wish.STAND).silent
-    run.director.preflighted(("the battery is empty.",), run.t)
-    assert run.director.mode is Mode.IDLE
-    assert run.tick(5.0, Wish.STAND).silent
-    assert run.director.refusals == ("the battery is empty.",)
+    run.machine_state.enter(Mode.PREFLIGHT, run.t)
+    assert run.tick(request=OperatorRequest.STAND).silent
+    run.machine_state.preflighted(("the battery is empty.",), run.t)
+    assert run.machine_state.mode is Mode.IDLE
+    assert run.tick(5.0, OperatorRequest.STAND).silent
+    assert run.machine_state.refusals == ("the battery is empty.",)
 
 
 def test_the_whole_way() -> None:
     run = Run(blend_s=0.4, halt_s=1.0, sit_s=1.5)
-    run.director.preflighted((), 0.0)
+    run.machine_state.preflighted((), 0.0)
     intent = run.tick()
     assert not intent.silent
     assert intent.command is None
-    run.tick(0.5, Wish.STAND)
-    assert run.director.mode is Mode.DAMP, "it has not sunk yet"
+    run.tick(0.5, OperatorRequest.STAND)
+    assert run.machine_state.mode is Mode.DAMP, "it has not sunk yet"
     intent = run.tick(0.5)
-    assert run.director.mode is Mode.STAND
+    assert run.machine_state.mode is Mode.STAND
     np.testing.assert_array_equal(intent.command.position, LYING)
     assert (intent.command.stiffness == 0.0).all()
-    run.tick(2.0, Wish.WALK)
-    assert run.director.mode is Mode.STAND, "it is not up yet"
+    run.tick(2.0, OperatorRequest.WALK)
+    assert run.machine_state.mode is Mode.STAND, "it is not up yet"
     intent = run.tick(0.5)
-    assert run.director.mode is Mode.POLICY
+    assert run.machine_state.mode is Mode.POLICY
     np.testing.assert_allclose(intent.command.position, POSE)
-    # An order for another mode is not followed; the first for this one is blended in.
-    run.give(POSE + 0.4, entry=run.director.entry - 1)
+    # An action for another mode is not followed; the first for this one is blended in.
+    run.give(POSE + 0.4, entry=run.machine_state.entry - 1)
     np.testing.assert_allclose(run.tick(0.02).command.position, POSE)
     run.give(POSE + 0.4)
     assert run.tick(0.02).blend == 0.0
@@ -308,45 +319,45 @@ def test_the_whole_way() -> None:
     intent = run.tick(0.2)
     assert intent.blend == pytest.approx(0.5)
     np.testing.assert_allclose(intent.command.position, POSE + 0.2)
-    assert (intent.command.made, intent.command.state_sequence) == (run.order.made, 3)
+    assert (intent.command.made, intent.command.state_sequence) == (run.action.made, 3)
     np.testing.assert_allclose(run.tick(0.2).command.position, POSE + 0.4)
     # Down: the policy first comes to a halt.
-    intent = run.tick(0.0, Wish.SIT)
-    assert run.director.mode is Mode.HALT
+    intent = run.tick(0.0, OperatorRequest.SIT)
+    assert run.machine_state.mode is Mode.HALT
     assert intent.blend == 1.0
     run.tick(1.0, q=POSE)
     intent = run.tick(0.0, q=POSE)
-    assert run.director.mode is Mode.SIT
+    assert run.machine_state.mode is Mode.SIT
     np.testing.assert_array_equal(intent.command.position, POSE)
     intent = run.tick(1.5, q=POSE)
-    assert run.director.mode is Mode.DAMP
+    assert run.machine_state.mode is Mode.DAMP
     assert intent.command is None
 
 
-@pytest.mark.parametrize("wish", [Wish.DAMP, Wish.QUIT])
-def test_damping_comes_at_once(wish: Wish) -> None:
+@pytest.mark.parametrize("wanted", [OperatorRequest.DAMP, OperatorRequest.QUIT])
+def test_damping_comes_at_once(wanted: OperatorRequest) -> None:
     run = Run().standing()
-    assert run.tick(0.0, wish).command is None
-    assert run.director.mode is Mode.DAMP
-    assert run.director.quitting() is (wish is Wish.QUIT)
+    assert run.tick(0.0, wanted).command is None
+    assert run.machine_state.mode is Mode.DAMP
+    assert run.machine_state.quitting() is (wanted is OperatorRequest.QUIT)
 
 
 def test_a_policy_that_never_answers_is_a_fault() -> None:
     run = Run().standing()
-    run.tick(0.0, Wish.WALK)
-    assert run.tick(FIRST_ORDER_S - 0.01).command is not None
+    run.tick(0.0, OperatorRequest.WALK)
+    assert run.tick(FIRST_ACTION_S - 0.01).command is not None
     assert run.tick(0.02).command is None
-    assert (run.memory.reason, run.director.mode) == (Reason.EXPIRED, Mode.FAULT)
+    assert (run.memory.reason, run.machine_state.mode) == (Reason.EXPIRED, Mode.FAULT)
 
 
 @pytest.mark.parametrize("answers", [0, 1])
 def test_told_to_sit_at_once_the_policy_is_still_heard(answers: int) -> None:
     run = Run(halt_s=1.0).standing()
-    run.tick(0.0, Wish.WALK)
-    walking = run.director.entry
+    run.tick(0.0, OperatorRequest.WALK)
+    walking = run.machine_state.entry
     run.give(POSE + 0.4, entry=walking - 1)
-    run.tick(0.002, Wish.SIT)
-    assert (run.director.mode, run.director.entry) == (Mode.HALT, walking + 1)
+    run.tick(0.002, OperatorRequest.SIT)
+    assert (run.machine_state.mode, run.machine_state.entry) == (Mode.HALT, walking + 1)
     # It knows nothing of the halt yet, or nothing of the walk before it.
     run.give(POSE + 0.4, entry=walking + answers)
     assert run.tick(0.02).blend == 0.0
@@ -357,41 +368,41 @@ def test_told_to_sit_at_once_the_policy_is_still_heard(answers: int) -> None:
     assert intent.blend == pytest.approx(1.0)
     np.testing.assert_allclose(intent.command.position, POSE + 0.4)
     run.tick(1.0)
-    assert (run.director.mode, run.memory.faulted) == (Mode.SIT, False)
+    assert (run.machine_state.mode, run.memory.faulted) == (Mode.SIT, False)
 
 
 def test_an_objection_keeps_the_policy_out_and_is_told() -> None:
     run = Run().standing()
     run.objection = "too slow."
-    run.tick(0.0, Wish.WALK)
-    assert run.director.mode is Mode.STAND
-    assert run.director.notice == "too slow."
+    run.tick(0.0, OperatorRequest.WALK)
+    assert run.machine_state.mode is Mode.STAND
+    assert run.machine_state.notice == "too slow."
     run.objection = ""
-    run.tick(0.1, Wish.WALK)
-    assert run.director.mode is Mode.POLICY
+    run.tick(0.1, OperatorRequest.WALK)
+    assert run.machine_state.mode is Mode.POLICY
 
 
 def test_the_way_back_from_a_fault() -> None:
     run = Run().standing()
-    run.memory = fault(Memory(), Level.LATCH, Reason.TILT, run.t)
+    run.memory = fault(FilterState(), FilterAction.LATCH, Reason.TILT, run.t)
     run.tick()
-    run.director.faulted(run.t)
-    assert run.director.mode is Mode.FAULT
-    run.tick(2.0, Wish.STAND)
-    assert run.director.mode is Mode.FAULT
-    assert "reset" in run.director.notice
-    run.tick(0.0, Wish.RESET)
-    assert run.director.mode is Mode.DAMP
+    run.machine_state.faulted(run.t)
+    assert run.machine_state.mode is Mode.FAULT
+    run.tick(2.0, OperatorRequest.STAND)
+    assert run.machine_state.mode is Mode.FAULT
+    assert "reset" in run.machine_state.notice
+    run.tick(0.0, OperatorRequest.RESET)
+    assert run.machine_state.mode is Mode.DAMP
     assert not run.memory.faulted
     # One that is not latched needs no reset, but its second.
     run = Run(damp_s=0.0).standing()
-    run.memory = fault(Memory(), Level.DAMP, Reason.DEAD_MAN, run.t)
-    run.director.faulted(run.t)
-    run.tick(0.5, Wish.STAND)
-    assert run.director.mode is Mode.FAULT
+    run.memory = fault(FilterState(), FilterAction.DAMP, Reason.DEAD_MAN, run.t)
+    run.machine_state.faulted(run.t)
+    run.tick(0.5, OperatorRequest.STAND)
+    assert run.machine_state.mode is Mode.FAULT
     run.tick(0.6)
     run.tick(0.01)
-    assert run.director.mode is Mode.STAND
+    assert run.machine_state.mode is Mode.STAND
 
 
 # --- Pre-flight ---------------------------------------------------------------------------------
@@ -471,12 +482,15 @@ def test_a_script_stands_walks_sits_and_leaves() -> None:
     script = Script(
         command=(1.0, 0.0, 0.0), stand_s=1.0, run_s=1.0, jump_s=0.5, keep_s=0.5, stop_s=1.0
     )
-    operator = Scripted([script, replace(script, command=(0.0, -1.0, 0.0))], pause_s=1.0)
+    operator = ScriptedOperator([script, replace(script, command=(0.0, -1.0, 0.0))], pause_s=1.0)
     assert operator.seconds == 10.0
-    assert operator.stick(0.0, Mode.PREFLIGHT).wish is Wish.NONE
-    assert [operator.stick(0.1 * k, Mode.DAMP).wish for k in range(2)] == [Wish.STAND, Wish.NONE]
-    assert operator.stick(1.0, Mode.STAND).wish is Wish.WALK
-    told = {t: operator.stick(10.0 + t, Mode.POLICY) for t in (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)}
+    assert operator.command(0.0, Mode.PREFLIGHT).request is OperatorRequest.NONE
+    assert [operator.command(0.1 * k, Mode.DAMP).request for k in range(2)] == [
+        OperatorRequest.STAND,
+        OperatorRequest.NONE,
+    ]
+    assert operator.command(1.0, Mode.STAND).request is OperatorRequest.WALK
+    told = {t: operator.command(10.0 + t, Mode.POLICY) for t in (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)}
     assert all(stick.held for stick in told.values())
     assert [stick.jump for stick in told.values()] == [
         False,
@@ -495,29 +509,29 @@ def test_a_script_stands_walks_sits_and_leaves() -> None:
     ]
     assert told[6.5].command == (0.0, -1.0, 0.0)
     assert not operator.finished
-    assert operator.stick(20.1, Mode.POLICY).wish is Wish.SIT
+    assert operator.command(20.1, Mode.POLICY).request is OperatorRequest.SIT
     assert operator.finished
-    assert operator.stick(22.0, Mode.SIT).wish is Wish.NONE
-    assert operator.stick(23.0, Mode.DAMP).wish is Wish.QUIT
+    assert operator.command(22.0, Mode.SIT).request is OperatorRequest.NONE
+    assert operator.command(23.0, Mode.DAMP).request is OperatorRequest.QUIT
 
 
 @pytest.mark.parametrize("kind", ["fault", "refused", "notice"])
 def test_a_script_ends_at_the_first_trouble(kind: str) -> None:
-    operator = Scripted([Script(command=(1.0, 0.0, 0.0))])
-    operator.told("mode", "STAND")
-    assert operator.stick(0.0, Mode.STAND).wish is Wish.WALK
-    operator.told(kind, "no.")
-    assert operator.stick(0.1, Mode.STAND).wish is Wish.QUIT
+    operator = ScriptedOperator([Script(command=(1.0, 0.0, 0.0))])
+    operator.notified("mode", "STAND")
+    assert operator.command(0.0, Mode.STAND).request is OperatorRequest.WALK
+    operator.notified(kind, "no.")
+    assert operator.command(0.1, Mode.STAND).request is OperatorRequest.QUIT
 
 
 def test_time_runs_out() -> None:
-    operator = Timed(Scripted([Script(command=(1.0, 0.0, 0.0), stand_s=0.0)]), 0.5)
-    assert operator.stick(0.0, Mode.STAND).wish is Wish.WALK
-    assert operator.stick(5.0, Mode.POLICY).command == (1.0, 0.0, 0.0)
-    late = operator.stick(5.6, Mode.POLICY)
-    assert (late.wish, late.held) == (Wish.SIT, True)
-    assert operator.stick(5.7, Mode.HALT).wish is Wish.NONE
-    assert operator.stick(6.7, Mode.DAMP).wish is Wish.QUIT
+    operator = TimeLimit(ScriptedOperator([Script(command=(1.0, 0.0, 0.0), stand_s=0.0)]), 0.5)
+    assert operator.command(0.0, Mode.STAND).request is OperatorRequest.WALK
+    assert operator.command(5.0, Mode.POLICY).command == (1.0, 0.0, 0.0)
+    late = operator.command(5.6, Mode.POLICY)
+    assert (late.request, late.held) == (OperatorRequest.SIT, True)
+    assert operator.command(5.7, Mode.HALT).request is OperatorRequest.NONE
+    assert operator.command(6.7, Mode.DAMP).request is OperatorRequest.QUIT
 
 
 @pytest.fixture
@@ -532,33 +546,33 @@ def terminal() -> Iterator[tuple[int, Keyboard]]:
 
 def test_keys_of_a_terminal(terminal: tuple[int, Keyboard]) -> None:
     master, keyboard = terminal
-    assert not keyboard.stick(0.0, Mode.DAMP).held
+    assert not keyboard.command(0.0, Mode.DAMP).held
     os.write(master, b" wwwad")
-    stick = keyboard.stick(1.0, Mode.POLICY)
+    stick = keyboard.command(1.0, Mode.POLICY)
     assert stick.held
     assert stick.command == (0.75, 0.0, 0.0)
     os.write(master, b"\n2jj")
-    stick = keyboard.stick(1.1, Mode.POLICY)
-    assert (stick.jump, stick.wish) == (True, Wish.WALK)
+    stick = keyboard.command(1.1, Mode.POLICY)
+    assert (stick.jump, stick.request) == (True, OperatorRequest.WALK)
     assert stick.command[2] == pytest.approx(0.4)
     # The jump's press lasts half a second, the dead-man key four fifths.
-    assert keyboard.stick(1.61, Mode.POLICY).jump is False
-    assert keyboard.stick(1.79, Mode.POLICY).held
-    assert not keyboard.stick(1.81, Mode.POLICY).held
+    assert keyboard.command(1.61, Mode.POLICY).jump is False
+    assert keyboard.command(1.79, Mode.POLICY).held
+    assert not keyboard.command(1.81, Mode.POLICY).held
     os.write(master, b"s" * 40)
-    assert keyboard.stick(2.0, Mode.POLICY).command[0] == RANGES["vx"][0], "as far as was trained"
-    keyboard.told("mode", "DAMP")
-    assert keyboard.stick(2.1, Mode.DAMP).command == (0.0, 0.0, 0.0)
+    assert keyboard.command(2.0, Mode.POLICY).command[0] == RANGES["vx"][0], "as far as was trained"
+    keyboard.notified("mode", "DAMP")
+    assert keyboard.command(2.1, Mode.DAMP).command == (0.0, 0.0, 0.0)
 
 
 def test_a_terminal_that_is_gone_leaves() -> None:
     master, slave = pty.openpty()
     keyboard = Keyboard(RANGES, slave)
     os.write(master, b" w")
-    assert keyboard.stick(0.0, Mode.POLICY).held
+    assert keyboard.command(0.0, Mode.POLICY).held
     os.close(master)
     for _ in range(2):
-        assert keyboard.stick(0.1, Mode.POLICY) == Stick(wish=Wish.QUIT)
+        assert keyboard.command(0.1, Mode.POLICY) == OperatorCommand(request=OperatorRequest.QUIT)
     keyboard.close()
     os.close(slave)
 
@@ -582,26 +596,26 @@ def test_a_gamepad(tmp_path: Path) -> None:
 
     say(0, 0x81, 4)  # what was held when it was opened is told first, and is no press
     say(1, 0x81, 3)
-    stick = pad.stick(0.0, Mode.STAND)
-    assert (stick.held, stick.wish) == (False, Wish.NONE)
+    stick = pad.command(0.0, Mode.STAND)
+    assert (stick.held, stick.request) == (False, OperatorRequest.NONE)
     say(1, 1, 4)
     say(1, 1, 3)
     say(-32767, 2, 1)
     say(16384, 2, 0)
     say(2000, 2, 3)  # within the dead zone
-    stick = pad.stick(0.1, Mode.STAND)
-    assert (stick.held, stick.wish) == (True, Wish.WALK)
+    stick = pad.command(0.1, Mode.STAND)
+    assert (stick.held, stick.request) == (True, OperatorRequest.WALK)
     assert stick.command == pytest.approx((3.0, -0.5, 0.0), abs=1e-3)
     say(1, 1, 5)
-    assert pad.stick(0.2, Mode.POLICY).jump
+    assert pad.command(0.2, Mode.POLICY).jump
     say(0, 1, 5)  # a tap asks for as long as training did, and so does a button that is held
-    assert pad.stick(0.68, Mode.POLICY).jump
-    assert not pad.stick(0.72, Mode.POLICY).jump
+    assert pad.command(0.68, Mode.POLICY).jump
+    assert not pad.command(0.72, Mode.POLICY).jump
     say(1, 1, 5)
-    assert pad.stick(0.8, Mode.POLICY).jump
-    assert not pad.stick(1.4, Mode.POLICY).jump
+    assert pad.command(0.8, Mode.POLICY).jump
+    assert not pad.command(1.4, Mode.POLICY).jump
     os.close(wire)
-    stick = pad.stick(1.5, Mode.POLICY)
+    stick = pad.command(1.5, Mode.POLICY)
     assert not stick.held, "unplugged is let go"
     assert stick.command == (0.0, 0.0, 0.0)
     pad.close()
@@ -610,7 +624,7 @@ def test_a_gamepad(tmp_path: Path) -> None:
 
 
 def test_a_link_that_there_is_not_is_refused() -> None:
-    with pytest.raises(HardwareError, match="virtual robot, lcm, dds"):
+    with pytest.raises(HardwareError, match="sim, lcm, dds"):
         Link(kind="usb", robot="mini_cheetah")
     assert Link(kind="lcm", robot="mini_cheetah").local
     assert not Link(kind="dds", robot="mini_cheetah", interface="eth0").local
@@ -619,7 +633,7 @@ def test_a_link_that_there_is_not_is_refused() -> None:
 # --- The log ------------------------------------------------------------------------------------
 
 HEADER = {"robot": "mini_cheetah", "joints": list(ROBOT.joint_names)}
-PER_TICK = {f"/deploy/{topic}" for topic in ("state", "asked", "sent", "timing")}
+PER_TICK = {f"/deploy/{topic}" for topic in ("state", "desired", "sent", "timing")}
 
 
 def record(number: int, **changes: Any) -> np.void:
@@ -627,7 +641,7 @@ def record(number: int, **changes: Any) -> np.void:
     put_state(one, state(time=number / 500, sequence=number), 0.0)
     one["tick"], one["begun"], one["deadline"] = number, number / 500 + 1e-4, number / 500
     one["done"], one["latency"] = number / 500 + 4e-4, np.nan
-    one["asked"] = one["sent"] = POSE
+    one["desired"] = one["sent"] = POSE
     for name, value in changes.items():
         one[name] = value
     return np.frombuffer(one.tobytes(), dtype=TICK)[0]
@@ -635,7 +649,7 @@ def record(number: int, **changes: Any) -> np.void:
 
 def written(path: Path) -> DeployLogWriter:
     writer = DeployLogWriter(path, HEADER)
-    text = event(0.5, "fault", "tilted", reason=Reason.TILT, level=Level.LATCH)
+    text = event(0.5, "fault", "tilted", reason=Reason.TILT, level=FilterAction.LATCH)
     writer.event(np.frombuffer(text.tobytes(), dtype=EVENT)[0])
     for k in range(100):
         damped = {"sent": np.nan, "damped": 1} if k >= 90 else {}
@@ -698,11 +712,11 @@ def test_a_log_cut_anywhere_is_read_up_to_there_or_refused(
     assert log.complete or share < 1.0
 
 
-def test_a_long_log_is_read_chunk_by_chunk_and_only_what_is_asked_for(tmp_path: Path) -> None:
+def test_a_long_log_is_read_chunk_by_chunk_and_only_the_requested_arrays(tmp_path: Path) -> None:
     path, count = tmp_path / "long.mcap", 2600
     writer = DeployLogWriter(path, HEADER)
     for k in range(count):
-        writer.tick(record(k, asked=POSE + k, latency=np.nan if k % 10 else k / 1e4))
+        writer.tick(record(k, desired=POSE + k, latency=np.nan if k % 10 else k / 1e4))
         if k % 10 == 0:
             step = np.zeros((), dtype=STEP)
             step["sequence"], step["action"], step["live"] = k // 10, k, 1
@@ -711,7 +725,7 @@ def test_a_long_log_is_read_chunk_by_chunk_and_only_what_is_asked_for(tmp_path: 
             writer.flush()
     writer.end(complete=True, figures={})
     log = read_deploy_log(path)
-    np.testing.assert_array_equal(log.asked, POSE + np.arange(count)[:, None])
+    np.testing.assert_array_equal(log.desired, POSE + np.arange(count)[:, None])
     np.testing.assert_array_equal(log.latency[::10], np.arange(0, count, 10) / 1e4)
     assert np.isnan(log.latency).sum() == count * 9 // 10
     np.testing.assert_array_equal(log.action, np.tile(np.arange(0, count, 10)[:, None], 12))
@@ -725,7 +739,7 @@ def test_a_long_log_is_read_chunk_by_chunk_and_only_what_is_asked_for(tmp_path: 
             assert (found.shape, found.dtype) == ((0, *value.shape[1:]), value.dtype), name
         else:
             assert found == value
-    with pytest.raises(LogError, match=r"asked for speed; the arrays of a log are time, tick"):
+    with pytest.raises(LogError, match=r"speed; the arrays of a log are time, tick"):
         read_deploy_log(path, only=("latency", "speed"))
 
 
@@ -734,7 +748,7 @@ def test_a_log_of_an_hour_may_be_read(tmp_path: Path, monkeypatch: pytest.Monkey
     rng, writer = np.random.default_rng(0), DeployLogWriter(path, HEADER)
     for k in range(100):
         # Numbers of full length, as sensors give them.
-        names = ("position", "velocity", "torque", "asked", "sent", "gyro", "accelerometer")
+        names = ("position", "velocity", "torque", "desired", "sent", "gyro", "accelerometer")
         shapes = {name: TICK[name].shape for name in names}
         writer.tick(record(k, **{name: rng.standard_normal(of) for name, of in shapes.items()}))
     writer.end(complete=True, figures={})

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pronk.runtime.events import Notice
-from pronk.runtime.reasons import Level
-from pronk.runtime.records import EVENT, TEXT, event
-from pronk.runtime.summary import Outcome
+from pronk.runtime.ipc import EVENT, TEXT, Event, event
+from pronk.runtime.run import RunSummary
+from pronk.runtime.safety import FilterAction
 
 
-def notice(kind: str, text: str) -> Notice:
-    return Notice(time=1.0, kind=kind, text=text, level=int(Level.PASS))
+def notice(kind: str, text: str) -> Event:
+    return Event(time=1.0, kind=kind, text=text, level=int(FilterAction.PASS))
 
 
 def delays(**changes: Any) -> dict[str, Any]:
@@ -23,26 +22,26 @@ def delays(**changes: Any) -> dict[str, Any]:
 
 
 def test_a_notice_is_what_the_servo_said() -> None:
-    said = event(2.5, "fault", "the robot is tilted", level=Level.DAMP)
+    said = event(2.5, "fault", "the robot is tilted", level=FilterAction.DAMP)
     # As it comes out of a ring.
     [record] = np.frombuffer(said.tobytes(), dtype=EVENT)
-    assert Notice.of(record) == Notice(
-        time=2.5, kind="fault", text="the robot is tilted", level=int(Level.DAMP)
+    assert Event.of(record) == Event(
+        time=2.5, kind="fault", text="the robot is tilted", level=int(FilterAction.DAMP)
     )
     [long] = np.frombuffer(event(0.0, "notice", "ä" * 2 * TEXT).tobytes(), dtype=EVENT)
-    assert Notice.of(long).text == "?" * TEXT
+    assert Event.of(long).text == "?" * TEXT
 
 
 def test_faults_and_refusals_are_told_apart() -> None:
-    outcome = Outcome(
-        notices=[notice("mode", "DAMP"), notice("refused", "lying"), notice("fault", "tilted")]
+    summary = RunSummary(
+        events_seen=[notice("mode", "DAMP"), notice("refused", "lying"), notice("fault", "tilted")]
     )
-    assert (outcome.faults, outcome.refusals) == (["tilted"], ["lying"])
-    figures = json.loads(json.dumps(outcome.figures()))
+    assert (summary.faults, summary.refusals) == (["tilted"], ["lying"])
+    figures = json.loads(json.dumps(summary.figures()))
     assert (figures["faults"], figures["refusals"]) == (["tilted"], ["lying"])
     assert figures["interrupted"] is False
     assert figures["trained_delay_s"] == [0.0, 0.0]
-    assert Outcome().figures()["servo"] == {}
+    assert RunSummary().figures()["servo"] == {}
 
 
 @pytest.mark.parametrize(
@@ -56,4 +55,4 @@ def test_faults_and_refusals_are_told_apart() -> None:
     ],
 )
 def test_the_delay_stands_beside_what_was_trained(servo: dict[str, Any], says: str) -> None:
-    assert says in Outcome(servo=servo, trained_delay_s=(0.0, 0.01)).delay_words()
+    assert says in RunSummary(servo=servo, trained_delay_s=(0.0, 0.01)).delay_words()

@@ -21,14 +21,14 @@ from deploy_faults import FaultyLink, writes
 from hopper import write_hopper
 from pronk.cli.deploy import deploy
 from pronk.errors import ArtefactError, HardwareError, PronkError
+from pronk.runtime.ipc import Mode, OperatorRequest
 
 # Reading a log for the first time would keep this process from holding the stick.
 from pronk.runtime.log import is_deploy_log, read_deploy_log
-from pronk.runtime.operators import Stick
 from pronk.runtime.plan import Plan
-from pronk.runtime.reasons import Reason
-from pronk.runtime.records import Mode, Wish
 from pronk.runtime.run import Deployment
+from pronk.runtime.safety import Reason
+from pronk.runtime.teleop import OperatorCommand
 from pronk.runtime.trajectories import Timing
 from pronk.virtual.capture import load as load_capture
 
@@ -53,32 +53,42 @@ def events() -> dict[str, Any]:
 
 
 def hold(
-    deployment: Deployment, seconds: float, mode: Mode | None = None, *wishes: Wish, **more: Any
+    deployment: Deployment,
+    seconds: float,
+    mode: Mode | None = None,
+    *requests: OperatorRequest,
+    **more: Any,
 ) -> float:
     """Hold the dead-man button until a mode comes, or for a time; when that was."""
-    found = met(deployment, seconds, () if mode is None else (mode,), *wishes, **more)
-    assert mode is None or found, f"{mode.name} did not come: {told(deployment)}"
+    found = met(deployment, seconds, () if mode is None else (mode,), *requests, **more)
+    assert mode is None or found, f"{mode.name} did not come: {notified(deployment)}"
     return time.monotonic()
 
 
 def met(
-    deployment: Deployment, seconds: float, modes: tuple[Mode, ...], *wishes: Wish, **more: Any
+    deployment: Deployment,
+    seconds: float,
+    modes: tuple[Mode, ...],
+    *requests: OperatorRequest,
+    **more: Any,
 ) -> bool:
     """Hold the dead-man button until one of some modes comes, or for a time; whether it came."""
-    said = list(wishes)
+    said = list(requests)
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         stick = {"held": True, "command": (0.5, 0.0, 0.0)} | more
-        deployment.write(Stick(wish=said.pop(0) if said else Wish.NONE, **stick))
+        deployment.write(
+            OperatorCommand(request=said.pop(0) if said else OperatorRequest.NONE, **stick)
+        )
         if deployment.mode in modes:
             return True
         time.sleep(0.01)
     return False
 
 
-def told(deployment: Deployment) -> str:
-    deployment.notices()
-    return f"{deployment.mode.name}, {[notice.text for notice in deployment.outcome.notices]}"
+def notified(deployment: Deployment) -> str:
+    deployment.events_seen()
+    return f"{deployment.mode.name}, {[notice.text for notice in deployment.summary.events_seen]}"
 
 
 def walk(deployment: Deployment, seconds: float = 0.3, **more: Any) -> None:
@@ -90,14 +100,17 @@ def walk(deployment: Deployment, seconds: float = 0.3, **more: Any) -> None:
     for _ in range(5):
         if deployment.mode is Mode.FAULT:
             hold(deployment, 1.1)
-            hold(deployment, 5.0, Mode.DAMP, Wish.RESET)
-        for mode, wish in ((Mode.STAND, Wish.STAND), (Mode.POLICY, Wish.WALK)):
+            hold(deployment, 5.0, Mode.DAMP, OperatorRequest.RESET)
+        for mode, request in (
+            (Mode.STAND, OperatorRequest.STAND),
+            (Mode.POLICY, OperatorRequest.WALK),
+        ):
             if deployment.mode not in (Mode.POLICY, Mode.FAULT):
-                assert met(deployment, 10.0, (mode, Mode.FAULT), wish), told(deployment)
+                assert met(deployment, 10.0, (mode, Mode.FAULT), request), notified(deployment)
         met(deployment, seconds, (Mode.FAULT,), **more)
         if deployment.mode is Mode.POLICY:
             return
-    pytest.fail(f"it never walked for {seconds:g} s: {told(deployment)}")
+    pytest.fail(f"it never walked for {seconds:g} s: {notified(deployment)}")
 
 
 def first_damping(wire: Path, after: float) -> float:
@@ -119,8 +132,8 @@ def running(
         policy=policy,
         log=log,
         timing=QUICK,
-        any_delay=True,
-        stick_valid_s=5.0,
+        ignore_latency=True,
+        operator_timeout_s=5.0,
     )
     with Deployment(plan) as deployment:
         yield deployment, wire, log
@@ -153,14 +166,14 @@ def test_loss_and_killed_processes(running: tuple[Deployment, Path, Path]) -> No
     hold(deployment, 0.2)
     assert first_damping(wire, killed) <= DAMPED_S
     # It does not come back by itself, nor by asking to stand: the fault is latched.
-    hold(deployment, 1.2, None, Wish.STAND)
+    hold(deployment, 1.2, None, OperatorRequest.STAND)
     assert deployment.mode is Mode.FAULT
     deployment.close()
     # Its last command is too old, by the clock or by the states that have come since.
     old = (Reason.EXPIRED.text, Reason.LAG.text)
-    assert any(fault.startswith(old) for fault in deployment.outcome.faults), told(deployment)
-    assert deployment.outcome.servo["states_lost"] > 100
-    assert deployment.outcome.policy == {}
+    assert any(fault.startswith(old) for fault in deployment.summary.faults), notified(deployment)
+    assert deployment.summary.servo["states_lost"] > 100
+    assert deployment.summary.policy == {}
 
 
 @pytest.mark.parametrize("running", [0.0], indirect=True)
@@ -169,7 +182,11 @@ def test_states_that_cannot_be_believed(
 ) -> None:
     deployment, wire, log = running
     strikes: dict[str, float] = {}
-    for name, reset in (("nan", Wish.RESET), ("stuck", Wish.RESET), ("freeze", Wish.NONE)):
+    for name, reset in (
+        ("nan", OperatorRequest.RESET),
+        ("stuck", OperatorRequest.RESET),
+        ("freeze", OperatorRequest.NONE),
+    ):
         walk(deployment)
         strikes[name] = struck = time.monotonic()
         events[name].set()
@@ -179,14 +196,14 @@ def test_states_that_cannot_be_believed(
         events[name].clear()
         hold(deployment, 1.1)
         assert deployment.mode is Mode.FAULT, "a fault damps for a second at least"
-        if reset is not Wish.NONE:
+        if reset is not OperatorRequest.NONE:
             hold(deployment, 5.0, Mode.DAMP, reset)
     deployment.close()
     # The log of a run that ended badly is whole.
     found = read_deploy_log(log)
     assert found.complete, (found.damage, found.figures["servo"]["dropped"], len(found.time))
     faults = [event for event in found.events if event.kind == "fault"]
-    assert [event.text for event in faults] == deployment.outcome.faults
+    assert [event.text for event in faults] == deployment.summary.faults
     for name, struck in strikes.items():
         first = next(event for event in faults if event.time > struck)
         old = {"NO_STATE", "STATE_LOST"}
@@ -197,14 +214,14 @@ def test_states_that_cannot_be_believed(
     when, damped = writes(wire)
     assert abs(int(damped.sum()) - int(found.damped.sum())) <= 1
     assert abs(len(when) - int(driven.sum())) <= 1
-    # The policy's orders were followed, once blended in.
+    # The policy's actions were followed, once blended in.
     followed = (found.mode == Mode.POLICY) & (found.blend == 1.0) & (found.level == 0)
     assert followed.any()
     target = {
         int(k): row for k, row in zip(np.arange(len(found.target)), found.target, strict=True)
     }
     k = int(np.flatnonzero(followed)[0])
-    np.testing.assert_allclose(found.sent[k], target[int(found.order[k])])
+    np.testing.assert_allclose(found.sent[k], target[int(found.action[k])])
     # What the network read is what pronk's observation of the logged state is.
     assert found.observation.shape[1] == 105
     assert np.isfinite(found.latency[found.mode == Mode.POLICY]).sum() > 10
@@ -224,8 +241,8 @@ def test_a_policy_for_another_robot_is_refused_before_anything_starts(tmp_path: 
 
 def test_a_plan_without_time_is_refused(policy: Path, tmp_path: Path) -> None:
     link = FaultyLink(wire=tmp_path / "w", nan=None, freeze=None, stuck=None)
-    with pytest.raises(HardwareError, match="order_valid_s"):
-        Plan(link=link, policy=policy, order_valid_s=0.0)
+    with pytest.raises(HardwareError, match="action_valid_s"):
+        Plan(link=link, policy=policy, action_valid_s=0.0)
 
 
 # --- From the command line ----------------------------------------------------------------------
@@ -254,9 +271,9 @@ def test_the_command_on_the_virtual_robot_on_the_ground(tmp_path: Path, policy: 
     found = read_deploy_log(log)
     assert found.complete
     assert found.virtual
-    # It lay down damped, stood up, ran the policy, sat down and was damped, in this order.
-    order = [Mode(mode) for mode, _ in itertools.groupby(found.mode.tolist())]
-    assert order == [
+    # It lay down damped, stood up, ran the policy, sat down and was damped, in this action.
+    action = [Mode(mode) for mode, _ in itertools.groupby(found.mode.tolist())]
+    assert action == [
         *(Mode.PREFLIGHT, Mode.DAMP, Mode.STAND, Mode.POLICY, Mode.HALT, Mode.SIT, Mode.DAMP)
     ]
     seen = load_capture(capture)

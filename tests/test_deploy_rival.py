@@ -27,11 +27,11 @@ from pronk.links.machine import Command, Machine
 from pronk.links.open import Address
 from pronk.links.preflight import Freshness
 from pronk.robots import load_robot
+from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.log import read_deploy_log
-from pronk.runtime.operators import Stick
 from pronk.runtime.plan import Plan
-from pronk.runtime.records import Mode, Wish
 from pronk.runtime.run import Deployment
+from pronk.runtime.teleop import OperatorCommand
 from pronk.runtime.trajectories import Timing
 from pronk.virtual.server import hold_of
 
@@ -206,13 +206,15 @@ def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
         running.communicate()
 
 
-def hold(deployment: Deployment, mode: Mode, wish: Wish = Wish.NONE) -> None:
+def hold(
+    deployment: Deployment, mode: Mode, request: OperatorRequest = OperatorRequest.NONE
+) -> None:
     """Hold the dead-man button until a mode comes."""
     until = time.monotonic() + 20.0
     while deployment.mode is not mode:
-        assert time.monotonic() < until, f"{mode.name} did not come: {deployment.notices()}"
-        deployment.write(Stick(wish=wish, held=True))
-        wish = Wish.NONE
+        assert time.monotonic() < until, f"{mode.name} did not come: {deployment.events_seen()}"
+        deployment.write(OperatorCommand(request=request, held=True))
+        request = OperatorRequest.NONE
         time.sleep(0.01)
 
 
@@ -226,9 +228,9 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
         log=tmp_path / "run.mcap",
         timing=QUICK,
         limits=PATIENT,
-        order_valid_s=2.0,
-        stick_valid_s=2.0,
-        any_delay=True,
+        action_valid_s=2.0,
+        operator_timeout_s=2.0,
+        ignore_latency=True,
     )
     # It is there before: nothing is written, and one line says why.
     wire.speak()
@@ -237,22 +239,22 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
         refused.__enter__()
     wire.hush()
     assert len(wire.heard()[0]) == 0
-    assert len(refused.outcome.refusals) == 1
+    assert len(refused.summary.refusals) == 1
 
     # It comes up while the policy runs.
     with Deployment(plan) as deployment:
-        hold(deployment, Mode.STAND, Wish.STAND)
-        hold(deployment, Mode.POLICY, Wish.WALK)
+        hold(deployment, Mode.STAND, OperatorRequest.STAND)
+        hold(deployment, Mode.POLICY, OperatorRequest.WALK)
         until = time.monotonic() + 0.3
         while time.monotonic() < until:
-            deployment.write(Stick(held=True))
+            deployment.write(OperatorCommand(held=True))
             time.sleep(0.01)
         wire.speak()
         hold(deployment, Mode.FAULT)
         until = time.monotonic() + 0.3
         while time.monotonic() < until:
             # It does not come back by itself, nor by asking to stand.
-            deployment.write(Stick(wish=Wish.STAND, held=True))
+            deployment.write(OperatorCommand(request=OperatorRequest.STAND, held=True))
             time.sleep(0.01)
         assert deployment.mode is Mode.FAULT
     wire.hush()
@@ -263,7 +265,7 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
     # From there on nothing but damping, to the end.
     assert damps[when >= first].all()
     assert when[-1] - first > 1.0
-    [why] = deployment.outcome.faults
+    [why] = deployment.summary.faults
     assert why.startswith("another program commands the joints")
     assert "\n" not in why
     found = read_deploy_log(tmp_path / "run.mcap")

@@ -18,9 +18,9 @@ import pytest
 from deploy_faults import FaultyLink
 from pronk.errors import HardwareError
 from pronk.links.machine import Machine
+from pronk.runtime.ipc import OPERATOR, Mode, OperatorRequest, Shared
 from pronk.runtime.link import Link
-from pronk.runtime.plan import Plan, Shared
-from pronk.runtime.records import STICK, Mode, Wish
+from pronk.runtime.plan import Plan
 from pronk.runtime.servo import Servo
 from pronk.runtime.trajectories import Timing
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.live
 
 QUICK = Timing(damp_s=0.05, fold_s=0.1, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
 NOWHERE = Path("policy.onnx")
-"""The servo knows nothing of the policy but its orders."""
+"""The servo knows nothing of the policy but its actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class Run:
         self.servo = Servo(plan, shared, (0.0, 1.0))
         self.shared = shared
         self.said: list[tuple[str, str]] = []
-        self._stick = np.zeros((), dtype=STICK)
+        self._stick = np.zeros((), dtype=OPERATOR)
         self._thread = threading.Thread(target=self.servo.run)
         self.begun = time.monotonic()
         self._thread.start()
@@ -64,33 +64,37 @@ class Run:
         return not self._thread.is_alive()
 
     def until(
-        self, there: Callable[[], bool], wish: Wish = Wish.NONE, seconds: float = 20.0
+        self,
+        there: Callable[[], bool],
+        request: OperatorRequest = OperatorRequest.NONE,
+        seconds: float = 20.0,
     ) -> None:
         """Hold the dead-man button until something is so."""
         stick, end = self._stick, time.monotonic() + seconds
-        stick["wish"] = wish
-        stick["wishes"] += wish is not Wish.NONE
+        stick["request"] = request
+        stick["requests"] += request is not OperatorRequest.NONE
         while not there():
-            assert time.monotonic() < end, (self.servo.director.mode, self.said)
+            assert time.monotonic() < end, (self.servo.machine_state.mode, self.said)
             stick["time"], stick["held"] = time.monotonic(), 1
-            self.shared.stick.write(stick)
+            self.shared.operator.write(stick)
             self.hear()
             time.sleep(0.005)
         self.hear()
 
-    def mode(self, mode: Mode, wish: Wish = Wish.NONE) -> None:
-        self.until(lambda: self.servo.director.mode is mode, wish)
+    def mode(self, mode: Mode, request: OperatorRequest = OperatorRequest.NONE) -> None:
+        self.until(lambda: self.servo.machine_state.mode is mode, request)
 
     def hear(self) -> None:
         self.said += [
-            (each["kind"].decode(), each["text"].decode()) for each in self.shared.notices.take()
+            (each["kind"].decode(), each["text"].decode())
+            for each in self.shared.events_seen.take()
         ]
 
     def texts(self, kind: str) -> list[str]:
         return [text for which, text in self.said if which == kind]
 
     def leave(self) -> None:
-        self.until(lambda: self.over, Wish.QUIT)
+        self.until(lambda: self.over, OperatorRequest.QUIT)
         self._thread.join()
 
 
@@ -98,7 +102,7 @@ class Run:
 def flown(link: Any, **more: Any) -> Iterator[Run]:
     shared, before = Shared(), sys.getswitchinterval()
     plan = Plan(
-        link=link, policy=NOWHERE, timing=QUICK, real_time=False, stick_valid_s=10.0, **more
+        link=link, policy=NOWHERE, timing=QUICK, real_time=False, operator_timeout_s=10.0, **more
     )
     run = Run(plan, shared)
     try:
@@ -124,14 +128,14 @@ def test_without_any_state_the_operator_is_told_and_heard(faults: FaultyLink) ->
     faults.freeze.set()
     with flown(faults) as run:
         # Whoever waits for the servo's first word gets it, and a sentence with it.
-        run.until(lambda: run.shared.news.written > 0)
+        run.until(lambda: run.shared.state.written > 0)
         run.until(lambda: bool(run.texts("refused")))
         run.mode(Mode.IDLE)
-        news = run.shared.news.read()
-        assert news is not None
-        assert Mode(int(news["mode"])) in (Mode.PREFLIGHT, Mode.IDLE)
+        record = run.shared.state.read()
+        assert record is not None
+        assert Mode(int(record["mode"])) in (Mode.PREFLIGHT, Mode.IDLE)
         # No robot moves, whatever is wished; leaving is granted at once.
-        run.until(lambda: len(run.texts("mode")) == 1, Wish.STAND)
+        run.until(lambda: len(run.texts("mode")) == 1, OperatorRequest.STAND)
         asked = time.monotonic()
         run.leave()
         assert time.monotonic() - asked < 5.0
@@ -142,7 +146,7 @@ def test_without_any_state_the_operator_is_told_and_heard(faults: FaultyLink) ->
 def test_a_link_that_breaks_does_not_make_time_run_ahead(faults: FaultyLink) -> None:
     with flown(faults) as run:
         run.mode(Mode.DAMP)
-        run.mode(Mode.STAND, Wish.STAND)
+        run.mode(Mode.STAND, OperatorRequest.STAND)
         faults.broken.set()
         run.mode(Mode.FAULT)
         end = time.monotonic() + 0.5
@@ -166,7 +170,7 @@ def test_nothing_is_lost_where_nothing_is_kept(
     faults: FaultyLink, log: Path | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Nobody empties the queue here: it is full at once.
-    monkeypatch.setattr("pronk.runtime.plan._TICKS", 4)
+    monkeypatch.setattr("pronk.runtime.ipc._TICKS", 4)
     with flown(faults, log=log) as run:
         run.mode(Mode.DAMP)
         run.until(lambda: run.shared.ticks.dropped > 0)

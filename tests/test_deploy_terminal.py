@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from hopper import write_hopper
+from pronk.runtime.ipc import Mode
 from pronk.runtime.log import DeployLog, read_deploy_log
-from pronk.runtime.records import Mode
 
 pytestmark = pytest.mark.live
 

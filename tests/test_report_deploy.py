@@ -19,10 +19,9 @@ from pronk.report.deploy import part as deploy_part
 from pronk.report.deploy import words as deploy_words
 from pronk.report.deploy.delay import delay, shift
 from pronk.robots import load_robot
-from pronk.runtime.log import DeployLog, read_deploy_log
-from pronk.runtime.log_writer import DeployLogWriter
-from pronk.runtime.reasons import Level, Reason
-from pronk.runtime.records import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
+from pronk.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
+from pronk.runtime.log import DeployLog, DeployLogWriter, read_deploy_log
+from pronk.runtime.safety import FilterAction, Reason
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
@@ -57,7 +56,7 @@ def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
     one["tick"], one["deadline"] = number, number * TICK_S
     one["begun"], one["done"] = number * TICK_S + 1e-4, number * TICK_S + 4e-4
     one["mode"], one["latency"] = Mode.POLICY, np.nan
-    one["asked"] = one["sent"] = target
+    one["desired"] = one["sent"] = target
     for name, value in changes.items():
         one[name] = value
     return np.frombuffer(one.tobytes(), dtype=TICK)[0]
@@ -97,12 +96,12 @@ def faulted(path: Path, *, end: bool = True) -> Path:
     writer = DeployLogWriter(path, HEADER)
     say(writer, 0.0, "robot", REAL)
     moved = POSE + np.eye(12)[5] * 0.25
-    limited = {"level": Level.LIMIT, "reason": Reason.POSITION, "sent": POSE}
+    limited = {"level": FilterAction.LIMIT, "reason": Reason.POSITION, "sent": POSE}
     damped = {
         "sent": np.nan,
-        "asked": np.nan,
+        "desired": np.nan,
         "damped": 1,
-        "level": Level.LATCH,
+        "level": FilterAction.LATCH,
         "reason": Reason.TILT,
         "mode": Mode.FAULT,
         "orientation": np.array([math.cos(0.5), math.sin(0.5), 0.0, 0.0]),
@@ -111,7 +110,7 @@ def faulted(path: Path, *, end: bool = True) -> Path:
         writer.tick(record(k, POSE + 0.01, mode=Mode.STAND))
     for k in range(100, 200):
         writer.tick(record(k, moved, **limited))
-    say(writer, 0.4, "fault", "tilted", reason=Reason.TILT, level=Level.LATCH)
+    say(writer, 0.4, "fault", "tilted", reason=Reason.TILT, level=FilterAction.LATCH)
     for k in range(200, 300):
         writer.tick(record(k, POSE, **damped))
     if end:
@@ -171,7 +170,7 @@ def test_what_a_fault_leaves(tmp_path: Path) -> None:
     assert [one.mode for one in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
     np.testing.assert_allclose([one.seconds for one in found], 0.2, atol=1e-9)
     moved, latched = deploy_data.interventions(log)
-    assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, Level.LIMIT, 100)
+    assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, FilterAction.LIMIT, 100)
     assert (moved.largest, moved.joint) == (pytest.approx(0.25), ROBOT.joint_names[5])
     assert (latched.reason, latched.ticks, latched.joint) == (Reason.TILT, 100, "")
     np.testing.assert_allclose(deploy_data.tilt(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
@@ -221,7 +220,7 @@ def test_the_page_of_a_cut_log_says_so(tmp_path: Path) -> None:
 def test_the_page_of_a_refusal(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     writer = DeployLogWriter(path, HEADER | {"robot": "unheard_of"})
-    nothing = {"asked": np.nan, "sent": np.nan, "bus_voltage": np.nan, "orientation": np.zeros(4)}
+    nothing = {"desired": np.nan, "sent": np.nan, "bus_voltage": np.nan, "orientation": np.zeros(4)}
     for k in range(3):
         writer.tick(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
     say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")

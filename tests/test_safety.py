@@ -14,10 +14,20 @@ from hypothesis import strategies as st
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
-from pronk.runtime.limits import Limits
-from pronk.runtime.reasons import TEXTS, Level, Reason
-from pronk.runtime.rules import Asked, judge
-from pronk.runtime.safety import LEAST_DAMPING_S, Memory, fault, filtered, released, tilt
+from pronk.runtime.safety import (
+    LEAST_DAMPING_S,
+    TEXTS,
+    FilterAction,
+    FilterState,
+    Limits,
+    Reason,
+    SafetyInput,
+    apply_rules,
+    fault,
+    filtered,
+    released,
+    tilt,
+)
 
 ROBOT = load_robot("mini_cheetah")
 LIMITS = Limits.of(ROBOT)
@@ -53,18 +63,18 @@ def command(**changes: Any) -> Command:
     return Command(**(whole | changes))
 
 
-def verdict(
-    s: State, c: Command, t: float = 0.0, memory: Memory | None = None, **more: Any
-) -> tuple[Level, Reason]:
-    found = filtered(s, c, memory or Memory(), LIMITS, t, **more)[1]
+def decision(
+    s: State, c: Command, t: float = 0.0, memory: FilterState | None = None, **more: Any
+) -> tuple[FilterAction, Reason]:
+    found = filtered(s, c, memory or FilterState(), LIMITS, t, **more)[1]
     return found.level, found.reason
 
 
 def test_what_is_fine_goes_through_untouched() -> None:
     target = POSE + 0.1
-    sent, found, memory = filtered(state(), command(position=target), Memory(), LIMITS, 0.001)
+    sent, found, memory = filtered(state(), command(position=target), FilterState(), LIMITS, 0.001)
     assert sent is not None
-    assert (found.level, found.reason) == (Level.PASS, Reason.NONE)
+    assert (found.level, found.reason) == (FilterAction.PASS, Reason.NONE)
     np.testing.assert_array_equal(sent.position, target)
     assert sent.stiffness is KP
     assert sent.damping is KD
@@ -75,24 +85,24 @@ def test_what_is_fine_goes_through_untouched() -> None:
 @pytest.mark.parametrize(
     ("age_s", "level", "reason"),
     [
-        (0.019, Level.PASS, Reason.NONE),
-        (0.021, Level.HOLD, Reason.OLD_STATE),
-        (0.049, Level.HOLD, Reason.OLD_STATE),
-        (0.051, Level.DAMP, Reason.NO_STATE),
-        (0.099, Level.DAMP, Reason.NO_STATE),
-        (0.101, Level.LATCH, Reason.STATE_LOST),
+        (0.019, FilterAction.PASS, Reason.NONE),
+        (0.021, FilterAction.HOLD, Reason.OLD_STATE),
+        (0.049, FilterAction.HOLD, Reason.OLD_STATE),
+        (0.051, FilterAction.DAMP, Reason.NO_STATE),
+        (0.099, FilterAction.DAMP, Reason.NO_STATE),
+        (0.101, FilterAction.LATCH, Reason.STATE_LOST),
     ],
 )
 def test_an_old_state_holds_then_damps_then_latches(
-    age_s: float, level: Level, reason: Reason
+    age_s: float, level: FilterAction, reason: Reason
 ) -> None:
-    assert verdict(state(), command(made=age_s), age_s) == (level, reason)
+    assert decision(state(), command(made=age_s), age_s) == (level, reason)
 
 
 def test_hold_sends_the_last_target() -> None:
     last = POSE + 0.2
     asked = command(position=POSE + 0.4, made=0.03)
-    sent, _, memory = filtered(state(), asked, Memory(last=last), LIMITS, 0.03)
+    sent, _, memory = filtered(state(), asked, FilterState(last=last), LIMITS, 0.03)
     assert sent is not None
     np.testing.assert_array_equal(sent.position, last)
     assert memory.last is not None
@@ -109,20 +119,20 @@ def spoilt(values: Any, wrong: float) -> np.ndarray:
 @pytest.mark.parametrize("part", ["position", "velocity", "gyro", "orientation"])
 def test_a_state_that_is_no_number_latches(part: str, wrong: float) -> None:
     s = state(**{part: spoilt(getattr(state(), part), wrong)})
-    assert verdict(s, command()) == (Level.LATCH, Reason.STATE_NOT_FINITE)
+    assert decision(s, command()) == (FilterAction.LATCH, Reason.STATE_NOT_FINITE)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
 @pytest.mark.parametrize("part", ["position", "stiffness", "damping"])
 def test_a_command_that_is_no_number_latches(part: str, wrong: float) -> None:
     c = command(**{part: spoilt(getattr(command(), part), wrong)})
-    assert verdict(state(), c) == (Level.LATCH, Reason.COMMAND_NOT_FINITE)
+    assert decision(state(), c) == (FilterAction.LATCH, Reason.COMMAND_NOT_FINITE)
 
 
 @pytest.mark.parametrize("shape", [np.zeros(N + 1), np.zeros((2, N)), None, "legs"])
 def test_a_command_of_another_shape_latches(shape: Any) -> None:
     c = command(position=shape)
-    assert verdict(state(), c) == (Level.LATCH, Reason.COMMAND_NOT_FINITE)
+    assert decision(state(), c) == (FilterAction.LATCH, Reason.COMMAND_NOT_FINITE)
 
 
 def turned(angle: float) -> np.ndarray:
@@ -150,9 +160,9 @@ def turned(angle: float) -> np.ndarray:
     ],
 )
 def test_faults_latch_and_say_why(s: State, c: Command, reason: Reason) -> None:
-    sent, found, memory = filtered(s, c, Memory(), LIMITS, 0.0)
+    sent, found, memory = filtered(s, c, FilterState(), LIMITS, 0.0)
     assert sent is None
-    assert (found.level, found.reason) == (Level.LATCH, reason)
+    assert (found.level, found.reason) == (FilterAction.LATCH, reason)
     assert memory.faulted
     assert memory.last is None
     assert TEXTS[reason] in found.text
@@ -168,15 +178,18 @@ def test_what_is_just_within_does_not_fault() -> None:
         sequence=130,
     )
     last = np.minimum(s.position, 2.5)
-    assert verdict(s, command(position=last), 0.0, Memory(last=last))[0] <= Level.LIMIT
+    assert decision(s, command(position=last), 0.0, FilterState(last=last))[0] <= FilterAction.LIMIT
 
 
 def test_letting_go_of_the_dead_man_damps() -> None:
-    assert verdict(state(), command(), held=False) == (Level.DAMP, Reason.DEAD_MAN)
+    assert decision(state(), command(), held=False) == (FilterAction.DAMP, Reason.DEAD_MAN)
 
 
 def test_a_fault_lasts_a_second_and_a_latched_one_until_somebody_says_so() -> None:
-    soft, hard = (fault(Memory(), level, Reason.TILT, 10.0) for level in (Level.DAMP, Level.LATCH))
+    soft, hard = (
+        fault(FilterState(), level, Reason.TILT, 10.0)
+        for level in (FilterAction.DAMP, FilterAction.LATCH)
+    )
     for memory in (soft, hard):
         sent, found, after = filtered(state(time=10.0), command(made=10.0), memory, LIMITS, 10.0)
         assert sent is None
@@ -189,13 +202,13 @@ def test_a_fault_lasts_a_second_and_a_latched_one_until_somebody_says_so() -> No
 
 
 def test_a_fault_can_only_become_worse() -> None:
-    _, _, memory = filtered(state(), command(made=0.06), Memory(), LIMITS, 0.06)
-    assert (memory.level, memory.reason) == (Level.DAMP, Reason.NO_STATE)
+    _, _, memory = filtered(state(), command(made=0.06), FilterState(), LIMITS, 0.06)
+    assert (memory.level, memory.reason) == (FilterAction.DAMP, Reason.NO_STATE)
     _, found, memory = filtered(state(), command(made=0.11), memory, LIMITS, 0.11)
-    assert (memory.level, memory.reason) == (Level.LATCH, Reason.STATE_LOST)
+    assert (memory.level, memory.reason) == (FilterAction.LATCH, Reason.STATE_LOST)
     assert memory.since == 0.06
-    assert found.level is Level.LATCH
-    same = fault(memory, Level.DAMP, Reason.DEAD_MAN, 0.2)
+    assert found.level is FilterAction.LATCH
+    same = fault(memory, FilterAction.DAMP, Reason.DEAD_MAN, 0.2)
     assert same is memory
 
 
@@ -206,17 +219,17 @@ def test_torque_is_limited_by_moving_the_target() -> None:
     target = POSE.copy()
     target[0] = 1.4
     s = state(velocity=v)
-    memory = Memory(last=np.concatenate([[0.9], POSE[1:]]))
+    memory = FilterState(last=np.concatenate([[0.9], POSE[1:]]))
     sent, found, _ = filtered(s, command(position=target), memory, LIMITS, 0.0)
     assert sent is not None
-    assert (found.level, found.reason) == (Level.LIMIT, Reason.TORQUE)
+    assert (found.level, found.reason) == (FilterAction.LIMIT, Reason.TORQUE)
     assert sent.position[0] == pytest.approx(1.0 + 1.0 / 17.0)
     np.testing.assert_array_equal(sent.position[1:], POSE[1:])
 
 
 def test_a_target_changes_by_so_much_in_a_tick() -> None:
     sent, found, _ = filtered(
-        state(), command(position=POSE - 0.9), Memory(last=POSE + 0.5), LIMITS, 0.0
+        state(), command(position=POSE - 0.9), FilterState(last=POSE + 0.5), LIMITS, 0.0
     )
     assert sent is not None
     assert found.reason is Reason.CHANGE
@@ -228,7 +241,11 @@ def test_a_joint_on_its_way_out_is_not_driven_further() -> None:
     q, v = POSE.copy(), np.zeros(N)
     q[2], v[2] = 2.4, 10.0
     sent, found, _ = filtered(
-        state(position=q, velocity=v), command(position=spoilt_at(q, 2, 2.5)), Memory(), LIMITS, 0.0
+        state(position=q, velocity=v),
+        command(position=spoilt_at(q, 2, 2.5)),
+        FilterState(),
+        LIMITS,
+        0.0,
     )
     assert sent is not None
     assert found.reason is Reason.POSITION
@@ -244,7 +261,7 @@ def spoilt_at(values: np.ndarray, index: int, value: float) -> np.ndarray:
 def test_power_is_limited_by_scaling_all_torques() -> None:
     limits = Limits.of(ROBOT, power_w=1000.0)
     target = POSE + 0.8
-    sent, found, _ = filtered(state(), command(position=target), Memory(), limits, 0.0)
+    sent, found, _ = filtered(state(), command(position=target), FilterState(), limits, 0.0)
     assert sent is not None
     assert found.reason is Reason.POWER
     torque = KP * (sent.position - POSE)
@@ -271,7 +288,7 @@ def test_tilt_is_the_angle_of_the_z_axis() -> None:
     assert tilt(np.array([math.cos(1.0), 0.0, 0.0, math.sin(1.0)])) == pytest.approx(0.0)
 
 
-def wild(rng: np.random.Generator, count: int) -> Asked:
+def wild(rng: np.random.Generator, count: int) -> SafetyInput:
     """States and commands from harmless to impossible, every limit met on both sides."""
 
     def spread(shape: tuple[int, ...], centre: Any, scale: Any) -> np.ndarray:
@@ -285,7 +302,7 @@ def wild(rng: np.random.Generator, count: int) -> Asked:
     )
     orientation /= np.linalg.norm(orientation, axis=-1, keepdims=True)
     position = spread(many, POSE, 0.5)
-    asked = Asked(
+    asked = SafetyInput(
         position=position,
         velocity=spread(many, 0.0, 5.0),
         orientation=orientation,
@@ -307,7 +324,7 @@ def wild(rng: np.random.Generator, count: int) -> Asked:
     return asked
 
 
-def broken(asked: Asked, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
+def broken(asked: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
     """Which rows that were sent break which limit; written anew, not the filter's own code."""
     slack = 1e-6
     q, v, kp, kd = asked.position, asked.velocity, asked.stiffness, asked.damping
@@ -350,17 +367,17 @@ def test_a_million_states_and_commands_break_no_limit() -> None:
     limits = Limits.of(ROBOT, power_w=2000.0)
     for _ in range(200):
         asked = wild(rng, chunk)
-        found = judge(asked, limits)
+        found = apply_rules(asked, limits)
         met += np.bincount(found.reason, minlength=len(Reason))
         passed += np.bincount(found.level, minlength=5)
-        sent = found.level < Level.DAMP
+        sent = found.level < FilterAction.DAMP
         with np.errstate(invalid="ignore", over="ignore"):
             for name, wrong in broken(asked, found.target, limits).items():
                 assert not (wrong & sent).any(), name
         # A command that is passed is the one that was asked for, to the last bit.
-        same = found.level == Level.PASS
+        same = found.level == FilterAction.PASS
         np.testing.assert_array_equal(found.target[same], asked.target[same])
-        held = found.level == Level.HOLD
+        held = found.level == FilterAction.HOLD
         assert (asked.state_age[held] > limits.hold_s).all()
     # Every rule had its say, and enough went through for the test to mean something.
     silent = {Reason(i) for i in np.flatnonzero(met == 0)}
@@ -399,8 +416,8 @@ def test_whatever_comes_the_filter_answers_and_damping_is_allowed(
         valid_for=ages[2],
         state_sequence=sequences[1],
     )
-    sent, found, memory = filtered(s, c, Memory(), LIMITS, 0.0, held=held)
-    assert (sent is None) == (found.level >= Level.DAMP) == memory.faulted
+    sent, found, memory = filtered(s, c, FilterState(), LIMITS, 0.0, held=held)
+    assert (sent is None) == (found.level >= FilterAction.DAMP) == memory.faulted
     if sent is not None:
         assert np.isfinite(sent.position).all()
         assert (sent.position >= LIMITS.low).all()
@@ -411,4 +428,4 @@ def test_whatever_comes_the_filter_answers_and_damping_is_allowed(
 def test_every_reason_has_a_line() -> None:
     assert set(TEXTS) == set(Reason)
     assert len(set(TEXTS.values())) == len(Reason)
-    assert replace(Memory(), last=POSE).faulted is False
+    assert replace(FilterState(), last=POSE).faulted is False

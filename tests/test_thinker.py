@@ -16,11 +16,11 @@ from pronk.errors import PronkError
 from pronk.links.machine import State
 from pronk.links.realtime import Pace
 from pronk.policy.runtime import load_policy
+from pronk.runtime.ipc import OPERATOR, STATE, Mode, Shared, put_state
 from pronk.runtime.link import Link
-from pronk.runtime.plan import Plan, Shared
-from pronk.runtime.policy_process import Thinker, standing
-from pronk.runtime.records import NEWS, STICK, Mode, put_state
-from pronk.runtime.warmup import LEAD_S, rehearse_until
+from pronk.runtime.plan import Plan
+from pronk.runtime.policy_process import PolicyProcess, standing
+from pronk.runtime.warmup import LEAD_S, warm_up_until
 
 pytest.importorskip("onnxruntime")
 
@@ -31,11 +31,11 @@ DECIDED = ("observation", "action", "target", "contact", "linear_velocity", "com
 
 
 @contextmanager
-def thinking() -> Iterator[Thinker]:
+def thinking() -> Iterator[PolicyProcess]:
     shared = Shared()
     try:
         plan = Plan(link=Link(kind="sim", robot="mini_cheetah"), policy=POLICY)
-        yield Thinker(plan, shared, load_policy(POLICY))
+        yield PolicyProcess(plan, shared, load_policy(POLICY))
     finally:
         shared.close()
 
@@ -58,30 +58,30 @@ def states(count: int) -> list[State]:
     ]
 
 
-def tell(thinker: Thinker, state: State, mode: Mode, entry: int) -> None:
+def tell(thinker: PolicyProcess, state: State, mode: Mode, entry: int) -> None:
     """What servo and operator say before a step."""
-    news, stick = np.zeros((), dtype=NEWS), np.zeros((), dtype=STICK)
-    put_state(news, state, 0.0)
-    news["mode"], news["entry"] = mode, entry
-    thinker.shared.news.write(news)
+    record, stick = np.zeros((), dtype=STATE), np.zeros((), dtype=OPERATOR)
+    put_state(record, state, 0.0)
+    record["mode"], record["entry"] = mode, entry
+    thinker.shared.state.write(record)
     stick["command"], stick["jump"] = (1.0, -0.3, 99.0), state.sequence % 3 == 0
-    thinker.shared.stick.write(stick)
+    thinker.shared.operator.write(stick)
 
 
-def decided(thinker: Thinker, rehearsals: int, seen: list[State]) -> list[bytes]:
+def decided(thinker: PolicyProcess, rehearsals: int, seen: list[State]) -> list[bytes]:
     """Every bit that the steps of `WAY` wrote, with so many rehearsals before each."""
     pace, entry, found = Pace(50.0), 0, []
     for k, (state, mode) in enumerate(zip(seen, WAY, strict=True)):
         entry += k > 0 and mode is not WAY[k - 1]
         tell(thinker, state, mode, entry)
         for _ in range(rehearsals + k if rehearsals else 0):
-            thinker.rehearse()
+            thinker.warm_up()
         thinker.step(pace)
-        order = thinker.shared.orders.read()
+        action = thinker.shared.actions.read()
         (step,) = thinker.shared.steps.take()
-        assert order is not None
-        assert (order["sequence"], order["state_sequence"]) == (k, k)
-        found.append(order["position"].tobytes() + b"".join(step[n].tobytes() for n in DECIDED))
+        assert action is not None
+        assert (action["sequence"], action["state_sequence"]) == (k, k)
+        found.append(action["position"].tobytes() + b"".join(step[n].tobytes() for n in DECIDED))
     assert thinker.figures()["network"]["n"] == len(WAY)
     return found
 
@@ -94,7 +94,7 @@ def test_rehearsals_change_no_bit_of_what_is_decided() -> None:
     assert len(set(expected)) == len(expected)
     # That would have been seen: with the policy itself instead of its sibling it is another.
     with thinking() as wrong:
-        wrong.rehearse = lambda: wrong.pilot.decide(seen[0], ((0.0, 0.0, 0.0), False), 0.0)  # type: ignore[assignment,method-assign]
+        wrong.warm_up = lambda: wrong.runner.decide(seen[0], ((0.0, 0.0, 0.0), False), 0.0)  # type: ignore[assignment,method-assign]
         assert decided(wrong, 1, seen) != expected
 
 
@@ -113,7 +113,7 @@ def test_the_policy_is_never_asked_for_more_than_it_was_trained_for() -> None:
         tell(thinker, states(1)[0], Mode.POLICY, 1)
         thinker.step(Pace(50.0))
         (step,) = thinker.shared.steps.take()
-        most = list(thinker.pilot.policy.contract.command_ranges.values())[2][1]
+        most = list(thinker.runner.policy.contract.command_ranges.values())[2][1]
         np.testing.assert_allclose(step["command"], (1.0, -0.3, most))
 
 
@@ -123,13 +123,13 @@ def test_a_state_that_is_none_gives_no_order_and_one_complaint() -> None:
         for _ in range(3):
             tell(thinker, spoilt, Mode.POLICY, 1)
             thinker.step(Pace(50.0))
-        assert thinker.shared.orders.read() is None
-        (complaint,) = thinker.shared.troubles.take()
-        assert b"velocity" in bytes(complaint["text"])
+        assert thinker.shared.actions.read() is None
+        (last_error,) = thinker.shared.policy_events.take()
+        assert b"velocity" in bytes(last_error["text"])
         # The next good state is answered.
         tell(thinker, states(1)[0], Mode.POLICY, 1)
         thinker.step(Pace(50.0))
-        assert thinker.shared.orders.read() is not None
+        assert thinker.shared.actions.read() is not None
 
 
 @pytest.mark.parametrize("took", [0.0, 3e-4, 3e-3])
@@ -144,7 +144,7 @@ def test_rehearsals_lie_in_the_last_two_milliseconds(took: float) -> None:
     for _ in range(50):
         begun.clear()
         deadline = time.monotonic() + 5e-3
-        count = rehearse_until(deadline, act)
+        count = warm_up_until(deadline, act)
         assert time.monotonic() >= deadline
         assert count == len(begun)
         assert all(deadline - LEAD_S <= when < deadline for when in begun)
@@ -156,9 +156,9 @@ def test_rehearsals_lie_in_the_last_two_milliseconds(took: float) -> None:
 
 
 def test_nothing_is_rehearsed_for_a_deadline_that_has_passed() -> None:
-    assert rehearse_until(time.monotonic() - 1.0, pytest.fail) == 0  # type: ignore[arg-type]
+    assert warm_up_until(time.monotonic() - 1.0, pytest.fail) == 0  # type: ignore[arg-type]
     # Nor where there is less room than the first one needs.
-    assert rehearse_until(time.monotonic() + 5e-4, pytest.fail) == 0  # type: ignore[arg-type]
+    assert warm_up_until(time.monotonic() + 5e-4, pytest.fail) == 0  # type: ignore[arg-type]
 
 
 # --- The bench ----------------------------------------------------------------------------------

@@ -16,10 +16,10 @@ from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.rollout import (
     Tick,
     check_standing,
-    fly,
     hold,
     measurement,
     projected_gravity,
+    run_policy,
     ticks,
 )
 from pronk.runtime.script import STILL, Script
@@ -88,7 +88,7 @@ def test_a_nose_up_trunk_feels_gravity_behind() -> None:
 
 def test_commands_are_sent_on_time_with_the_drives_own_gains(policy: Policy) -> None:
     machine = standing()
-    flown = fly(machine, policy, ROBOT, HOP.asked, seconds=HOP.seconds)
+    flown = run_policy(machine, policy, ROBOT, HOP.commanded, seconds=HOP.seconds)
     count = round(HOP.seconds * 50)
     assert len(machine.sent) == len(flown.time) == count == 20
     for k, (now, command) in enumerate(machine.sent):
@@ -102,7 +102,7 @@ def test_commands_are_sent_on_time_with_the_drives_own_gains(policy: Policy) -> 
 
 
 def test_the_record_is_what_happened(policy: Policy) -> None:
-    flown = fly(standing(), policy, ROBOT, HOP.asked, seconds=HOP.seconds)
+    flown = run_policy(standing(), policy, ROBOT, HOP.commanded, seconds=HOP.seconds)
     assert flown.began == 0.0
     assert flown.time == pytest.approx(np.arange(20) / 50)
     assert np.flatnonzero(flown.jump).tolist() == [10, 11, 12, 13, 14]
@@ -119,15 +119,19 @@ def test_the_record_is_what_happened(policy: Policy) -> None:
 
 
 def test_a_repeat_is_the_same_to_the_last_digit(policy: Policy) -> None:
-    one, two = (fly(standing(7), policy, ROBOT, HOP.asked, seconds=0.3) for _ in range(2))
-    other = fly(standing(8), policy, ROBOT, HOP.asked, seconds=0.3)
+    one, two = (
+        run_policy(standing(7), policy, ROBOT, HOP.commanded, seconds=0.3) for _ in range(2)
+    )
+    other = run_policy(standing(8), policy, ROBOT, HOP.commanded, seconds=0.3)
     assert np.array_equal(one.position, two.position)
     assert not np.array_equal(one.position, other.position)
 
 
 def test_whoever_watches_sees_every_tick_and_can_stop(policy: Policy) -> None:
     seen: list[Tick] = []
-    flown = fly(standing(), policy, ROBOT, lambda t: (STILL, False), seconds=0.1, watch=seen.append)
+    flown = run_policy(
+        standing(), policy, ROBOT, lambda t: (STILL, False), seconds=0.1, watch=seen.append
+    )
     assert [tick.since for tick in seen] == pytest.approx(flown.time)
     machine = standing()
     for tick in ticks(machine, policy, ROBOT, lambda t: (STILL, False)):
@@ -147,7 +151,7 @@ def test_a_clock_that_runs_ahead_loses_ticks_and_no_time(policy: Policy) -> None
             machine.wait(machine.now() + 0.05)  # whoever decides takes 2.5 ticks once
         return STILL, False
 
-    fly(machine, policy, ROBOT, slow, seconds=0.2)
+    run_policy(machine, policy, ROBOT, slow, seconds=0.2)
     assert asked == pytest.approx([0.0, 0.02, 0.08, 0.1, 0.12, 0.14, 0.16, 0.18])
 
 
@@ -156,7 +160,7 @@ def test_a_policy_of_another_robot_sends_nothing(tmp_path: Path) -> None:
     other = load_policy(write_hopper(tmp_path / "other.onnx", joint_names=names))
     machine = standing()
     with pytest.raises(ArtefactError, match="joint_names"):
-        fly(machine, other, ROBOT, HOP.asked, seconds=1.0)
+        run_policy(machine, other, ROBOT, HOP.commanded, seconds=1.0)
     assert machine.sent == []
 
 
@@ -181,4 +185,4 @@ def test_hold_is_the_default_pose() -> None:
 
 def test_no_time_makes_no_record(policy: Policy) -> None:
     with pytest.raises(HardwareError, match="no decision"):
-        fly(standing(), policy, ROBOT, HOP.asked, seconds=0.0)
+        run_policy(standing(), policy, ROBOT, HOP.commanded, seconds=0.0)

@@ -25,7 +25,7 @@ from pronk.evaluation.subjects import load_subjects
 from pronk.policy.runtime import load_policy
 from pronk.policy.stride import apart, changes_over
 from pronk.robots import load_robot
-from pronk.runtime.rollout import fly
+from pronk.runtime.rollout import run_policy
 from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
 
@@ -46,7 +46,7 @@ def told_at_once(job: Job) -> tuple[int | None, JumpFigures]:
     policy, robot = load_policy(job.policy), load_robot(job.robot)
     policy.contract = replace(policy.contract, waits_for_stride=False)
     machine = set_down(job)
-    flown = fly(machine, policy, robot, job.script.commanded, seconds=job.script.seconds)
+    flown = run_policy(machine, policy, robot, job.script.commanded, seconds=job.script.seconds)
     figures = measure(
         machine.capture(), job.script, robot, began=flown.began, mass=job.mass, rules=job.rules
     )

@@ -32,7 +32,7 @@ from pronk.evaluation.run import Plan, draw, mass_of
 from pronk.policy.observation import Measurement
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
-from pronk.runtime.rollout import fly
+from pronk.runtime.rollout import run_policy
 from pronk.train.mdp.demonstration import Demonstration, demonstration, parse
 from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
@@ -112,7 +112,7 @@ def jump(case_number: tuple[Case, int], *, path: Path, shown: Demonstration) -> 
         keep=None,
     )
     machine = set_down(job)
-    flown = fly(machine, policy, robot, script.commanded, seconds=script.seconds)
+    flown = run_policy(machine, policy, robot, script.commanded, seconds=script.seconds)
     seen = machine.capture()
     return measure(seen, script, robot, began=flown.began, mass=job.mass, rules=job.rules)
 

@@ -15,10 +15,10 @@ from pronk.errors import HardwareError, PronkError
 
 if TYPE_CHECKING:
     from pronk.policy.contract import Contract
-    from pronk.runtime.events import Notice
-    from pronk.runtime.operators import Operator
+    from pronk.runtime.ipc import Event
+    from pronk.runtime.run import RunSummary
     from pronk.runtime.script import Script
-    from pronk.runtime.summary import Outcome
+    from pronk.runtime.teleop import Operator
 
 
 _FAILED = 1
@@ -69,7 +69,7 @@ def deploy(
         bool,
         typer.Option("--release", help="Make the robot's own controller let go of the joints."),
     ] = False,
-    any_delay: Annotated[
+    ignore_latency: Annotated[
         bool, typer.Option("--any-delay", help="Walk whatever delay is measured.")
     ] = False,
     real_time: Annotated[
@@ -84,7 +84,7 @@ def deploy(
     from pronk.policy.runtime import load_policy
     from pronk.runtime.link import Link as Opener
     from pronk.runtime.plan import Plan
-    from pronk.runtime.run import fly
+    from pronk.runtime.run import run
     from pronk.runtime.trajectories import Timing
 
     contract = load_policy(policy).contract
@@ -108,7 +108,7 @@ def deploy(
         capture=capture,
         limits={"tilt": tilt},
         timing=Timing(blend_s=blend),
-        any_delay=any_delay,
+        ignore_latency=ignore_latency,
         real_time=real_time,
     )
     scripts = None if script is None else _scripts(script, contract, walk_only)
@@ -116,19 +116,19 @@ def deploy(
         confirm.before_it_moves(contract.robot, f"{link.value} on {interface}")
     with _operator(contract, scripts, gamepad, seconds) as (operator, words):
         console.say(words)
-        outcome = fly(plan, operator, _tell)
-    _report(outcome)
-    lost = [notice.text for notice in outcome.notices if notice.kind == "lost"]
+        summary = run(plan, operator, _tell)
+    _report(summary)
+    lost = [notice.text for notice in summary.events_seen if notice.kind == "lost"]
     console.wrote(*(path for path in (log, None if lost else capture) if path is not None))
-    console.write_json(json_file, outcome.figures())
+    console.write_json(json_file, summary.figures())
     console.following(
         f"pronk report {log}"
         if log is not None
         else f"pronk deploy {policy} --link {link.value} --log run.mcap   # keeps everything"
     )
-    if outcome.faults or outcome.refusals or lost:
+    if summary.faults or summary.refusals or lost:
         raise typer.Exit(_FAILED)
-    if outcome.interrupted:
+    if summary.interrupted:
         raise typer.Exit(_INTERRUPTED)
 
 
@@ -140,13 +140,12 @@ def _operator(
     seconds: float | None,
 ) -> Iterator[tuple[Operator, str]]:
     """Who holds the stick, and what to tell them."""
-    from pronk.runtime.operators import Scripted, Timed
-    from pronk.runtime.teleop import HELP, PAD_HELP, Gamepad, Keyboard
+    from pronk.runtime.teleop import HELP, PAD_HELP, Gamepad, Keyboard, ScriptedOperator, TimeLimit
 
     if scripts is not None:
-        unattended = Scripted(scripts)
+        unattended = ScriptedOperator(scripts)
         what = f"unattended: {len(unattended.scripts)} scripts, {unattended.seconds:.0f} s."
-        yield (unattended if seconds is None else Timed(unattended, seconds)), what
+        yield (unattended if seconds is None else TimeLimit(unattended, seconds)), what
         return
     held = (
         Keyboard(contract.command_ranges)
@@ -155,7 +154,7 @@ def _operator(
     )
     try:
         yield (
-            (held if seconds is None else Timed(held, seconds)),
+            (held if seconds is None else TimeLimit(held, seconds)),
             (HELP if gamepad is None else PAD_HELP),
         )
     finally:
@@ -184,7 +183,7 @@ def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
     return [Script(command=case.command, jump_s=jump_s) for case in cases]
 
 
-def _tell(notice: Notice) -> None:
+def _tell(notice: Event) -> None:
     """One line for each thing that happened."""
     line = f"{notice.kind}: {notice.text}"
     if notice.kind in ("fault", "refused", "notice", "lost"):
@@ -193,11 +192,11 @@ def _tell(notice: Notice) -> None:
         console.err().print(line, markup=False)
 
 
-def _report(outcome: Outcome) -> None:
+def _report(summary: RunSummary) -> None:
     """The figures of the run."""
-    from pronk.runtime.records import REAL, VIRTUAL
+    from pronk.runtime.ipc import REAL, VIRTUAL
 
-    servo, policy = outcome.servo, outcome.policy
+    servo, policy = summary.servo, summary.policy
     robot = VIRTUAL if servo.get("virtual") else REAL
     made = console.table(
         f"Deployment on {robot}", "what [ms]", "n", "median", "95 %", "99 %", "99.9 %", "largest"
@@ -223,4 +222,4 @@ def _report(outcome: Outcome) -> None:
     dropped = sum(servo.get("dropped", {}).values())
     if dropped:
         console.warn(f"{dropped} records found no room on their way to the log")
-    console.say(outcome.delay_words())
+    console.say(summary.delay_words())

@@ -15,7 +15,7 @@ from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.metrics import JumpFigures, measure
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
-from pronk.runtime.rollout import Flown, check_standing, fly
+from pronk.runtime.rollout import Rollout, check_standing, run_policy
 from pronk.runtime.script import Script
 from pronk.virtual import capture as captures
 from pronk.virtual.ground import Ground, Start
@@ -108,12 +108,14 @@ def set_down(job: Job) -> VirtualRobot:
     return machine
 
 
-def flight(job: Job) -> tuple[captures.Capture, Flown]:
+def flight(job: Job) -> tuple[captures.Capture, Rollout]:
     """Run one job: what was seen, and what the policy decided."""
     machine = set_down(job)
     policy = _policy(job.policy, job.sha256)
     script = job.script
-    flown = fly(machine, policy, load_robot(job.robot), script.commanded, seconds=script.seconds)
+    flown = run_policy(
+        machine, policy, load_robot(job.robot), script.commanded, seconds=script.seconds
+    )
     return machine.capture(), flown
 
 

@@ -1,4 +1,4 @@
-"""The policy's process: at 50 Hz from the newest state to an order for the servo.
+"""The policy's process: at 50 Hz from the newest state to an action for the servo.
 
 It decides from the moment the robot is damped, heard or not: so the network is warm, and the
 latency is known, before the policy's turn comes. Every change of mode begins a new past for it,
@@ -28,20 +28,20 @@ from pronk.links.terminal import leave
 from pronk.policy.contract import Contract
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy
-from pronk.runtime.plan import POLICY_PRIORITY, Names, Plan, Shared
-from pronk.runtime.records import ORDERS, STEP, Mode, event, get_state
-from pronk.runtime.rollout import Pilot, measurement
+from pronk.runtime.ipc import ACTIONS, STEP, Mode, Names, Shared, event, get_state
+from pronk.runtime.plan import POLICY_PRIORITY, Plan
+from pronk.runtime.rollout import PolicyRunner, measurement
 from pronk.runtime.script import STILL, Commanded
-from pronk.runtime.warmup import rehearse_until
+from pronk.runtime.warmup import warm_up_until
 
 WARM_UP = 20
 """Rehearsals before the first step."""
 _PHASE_S = 0.4e-3
-"""After the servo's tick, when its news are there: nothing waits for the next tick [s]."""
+"""After the servo's tick, when its record are there: nothing waits for the next tick [s]."""
 _LIVE = (Mode.POLICY, Mode.HALT)
 
 
-def think(plan: Plan, names: Names, end: Connection) -> None:
+def serve_policy(plan: Plan, names: Names, end: Connection) -> None:
     """Body of the policy process.
 
     Args:
@@ -51,10 +51,10 @@ def think(plan: Plan, names: Names, end: Connection) -> None:
     """
     leave()
     shared = Shared(names)
-    thinker = Thinker(plan, shared, load_policy(plan.policy))
+    thinker = PolicyProcess(plan, shared, load_policy(plan.policy))
     signal.signal(signal.SIGTERM, lambda *_: thinker.stop())
     for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
-        shared.troubles.put(event(time.monotonic(), "system", f"policy: {line}"))
+        shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))
     try:
         thinker.run()
     finally:
@@ -78,7 +78,7 @@ def standing(contract: Contract) -> State:
     )
 
 
-class Thinker:
+class PolicyProcess:
     """The loop and what it counts."""
 
     def __init__(self, plan: Plan, shared: Shared, policy: Policy) -> None:
@@ -89,14 +89,14 @@ class Thinker:
         """
         self.plan = plan
         self.shared = shared
-        self.pilot = Pilot(policy, plan.robot)
+        self.runner = PolicyRunner(policy, plan.robot)
         self.rate_hz = policy.contract.policy_rate_hz
         self.lateness = Histogram()
         self.decision = Histogram()
         """Observation built and network run."""
         self.network = Histogram()
         """The network alone."""
-        self._stand_in = Pilot(policy.sibling(), plan.robot)
+        self._stand_in = PolicyRunner(policy.sibling(), plan.robot)
         self._standing = standing(policy.contract)
         self._history = History(policy.contract.default_position)
         self._jumps = policy.contract.jump
@@ -106,12 +106,12 @@ class Thinker:
         self._mode = Mode.IDLE
         self._stopping = False
         self._parent = os.getppid()
-        self._complaint = ""
-        self._order = np.zeros((), dtype=ORDERS)
+        self._last_error = ""
+        self._order = np.zeros((), dtype=ACTIONS)
         self._step = np.zeros((), dtype=STEP)
         self._count = 0
         for _ in range(WARM_UP):
-            self.rehearse()
+            self.warm_up()
 
     def stop(self) -> None:
         """End at the next step."""
@@ -120,21 +120,21 @@ class Thinker:
     def run(self) -> None:
         """Step until the servo has ended."""
         while not self._stopping and os.getppid() == self._parent:
-            news = self.shared.news.read()
-            if news is None:
+            record = self.shared.state.read()
+            if record is None:
                 time.sleep(1.0 / self.rate_hz)
                 continue
-            mode = Mode(int(news["mode"]))
+            mode = Mode(int(record["mode"]))
             if mode is Mode.ENDED:
                 return
             if self._pace is None:
-                # On the servo's own grid, so that news are always as young.
-                self._pace = Pace(self.rate_hz, float(news["start"]) + _PHASE_S)
+                # On the servo's own grid, so that record are always as young.
+                self._pace = Pace(self.rate_hz, float(record["start"]) + _PHASE_S)
                 self._pace.advance(time.monotonic())
-            rehearse_until(self._pace.deadline, self.rehearse)
+            warm_up_until(self._pace.deadline, self.warm_up)
             self.step(self._pace)
 
-    def rehearse(self) -> None:
+    def warm_up(self) -> None:
         """Decide for nothing: always the first step of a robot that stands."""
         self._stand_in.reset()
         self._stand_in.decide(self._standing, (STILL, False), 0.0)
@@ -151,48 +151,48 @@ class Thinker:
         }
 
     def step(self, pace: Pace) -> None:
-        """The step whose deadline has come: from the newest news to an order."""
+        """The step whose deadline has come: from the newest record to an action."""
         begun = time.monotonic()
         self.lateness.add(begun - pace.deadline)
         deadline = pace.deadline
-        news = self.shared.news.read()
-        if news is not None and Mode(int(news["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
-            mode, entry = Mode(int(news["mode"])), int(news["entry"])
+        record = self.shared.state.read()
+        if record is not None and Mode(int(record["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
+            mode, entry = Mode(int(record["mode"])), int(record["entry"])
             if entry != self._entry and not (mode is Mode.HALT and self._mode is Mode.POLICY):
-                self.pilot.reset()
+                self.runner.reset()
                 self._history.reset()
                 self._entry = entry
             self._mode = mode
             try:
-                self._answer(news, deadline, begun)
+                self._answer(record, deadline, begun)
             except PronkError as error:
-                # No order: the servo's filter says what is wrong and lets the last one expire.
-                self._complain(str(error))
+                # No action: the servo's filter says what is wrong and lets the last one expire.
+                self._report_error(str(error))
         pace.advance(time.monotonic())
 
-    def _answer(self, news: np.void, deadline: float, begun: float) -> None:
-        state = get_state(news)
+    def _answer(self, record: np.void, deadline: float, begun: float) -> None:
+        state = get_state(record)
         velocity, jump = self._asked()
         now = time.monotonic()
-        command, tick = self.pilot.decide(state, (velocity, jump), now)
+        command, tick = self.runner.decide(state, (velocity, jump), now)
         inferred = time.monotonic()
         self.decision.add(inferred - now)
-        self.network.add(self.pilot.policy.network_s)
-        order = self._order
-        order["sequence"] = self._count
-        order["state_sequence"], order["state_time"] = state.sequence, state.time
-        order["made"], order["valid_for"] = begun, self.plan.order_valid_s
-        order["entry"] = self._entry
-        order["position"] = command.position
-        self.shared.orders.write(order)
+        self.network.add(self.runner.policy.network_s)
+        action = self._order
+        action["sequence"] = self._count
+        action["state_sequence"], action["state_time"] = state.sequence, state.time
+        action["made"], action["valid_for"] = begun, self.plan.action_valid_s
+        action["entry"] = self._entry
+        action["position"] = command.position
+        self.shared.actions.write(action)
         done = time.monotonic()
         self._count += 1
-        # What the network read, built once more beside it: after the order, where it costs nothing.
+        # The observation for the log, built again after the action is out.
         observation = self._history.observe(measurement(state), velocity)
         self._history.acted(tick.action.astype(np.float32))
         step = self._step
         step["observation"] = observation
-        step["sequence"], step["deadline"], step["begun"] = order["sequence"], deadline, begun
+        step["sequence"], step["deadline"], step["begun"] = action["sequence"], deadline, begun
         step["observed"], step["inferred"], step["done"] = now, inferred, done
         step["state_sequence"], step["state_time"] = state.sequence, state.time
         step["live"] = self._mode in _LIVE
@@ -200,21 +200,21 @@ class Thinker:
         step["action"], step["target"] = tick.action, tick.target
         step["contact"], step["linear_velocity"] = tick.contact, tick.linear_velocity
         self.shared.steps.put(step)
-        self._complaint = ""
+        self._last_error = ""
 
     def _asked(self) -> Commanded:
         """What the operator wants now: to stand still unless the policy is in charge.
 
         Never more than the policy was trained for.
         """
-        stick = self.shared.stick.read()
+        stick = self.shared.operator.read()
         if stick is None or self._mode is not Mode.POLICY:
             return STILL, False
         forward, left, yaw = np.clip(stick["command"], self._least, self._most).tolist()
         return (forward, left, yaw), bool(stick["jump"]) and self._jumps
 
-    def _complain(self, text: str) -> None:
-        """Once for each new complaint."""
-        if text != self._complaint:
-            self._complaint = text
-            self.shared.troubles.put(event(time.monotonic(), "policy", text))
+    def _report_error(self, text: str) -> None:
+        """Once for each new last_error."""
+        if text != self._last_error:
+            self._last_error = text
+            self.shared.policy_events.put(event(time.monotonic(), "policy", text))

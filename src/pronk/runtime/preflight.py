@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from pronk.links.machine import State
 from pronk.robots.robot import Robot
-from pronk.runtime.limits import Limits
-from pronk.runtime.safety import tilt
+from pronk.runtime.safety import Limits, tilt
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
-"""The pilot: runs a policy on a machine, real or virtual, by whatever says what is asked.
+"""The runner: runs a policy on a machine, real or virtual, by whatever says what is asked.
 
-    flown = fly(machine, policy, robot, script.commanded, seconds=script.seconds)
+    flown = run_policy(machine, policy, robot, script.commanded, seconds=script.seconds)
 
 On every tick of the policy's clock it reads the machine's newest state, makes the measurement of
 it, asks the source what is wanted, and sends the policy's joint targets with the gains that are
@@ -120,7 +120,7 @@ class Tick:
     """Estimated, of the trunk in its frame [m/s]. (3,)"""
 
 
-class Pilot:
+class PolicyRunner:
     """A policy at the stick of one robot: a state in, a command out."""
 
     def __init__(self, policy: Policy, robot: Robot) -> None:
@@ -205,13 +205,13 @@ def ticks(
             finite.
         HardwareError: The robot does not stand.
     """
-    pilot = Pilot(policy, robot)
+    runner = PolicyRunner(policy, robot)
     rate = policy.contract.policy_rate_hz
     check_standing(robot, machine.latest())
     began, count = machine.now(), 0
     while count < seconds * rate - 1e-9:
         now = machine.now()
-        command, tick = pilot.decide(machine.latest(), source(count / rate), now)
+        command, tick = runner.decide(machine.latest(), source(count / rate), now)
         machine.send(command)
         yield tick
         count = max(count + 1, math.ceil((machine.now() - began) * rate - 1e-6))
@@ -219,7 +219,7 @@ def ticks(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flown:
+class Rollout:
     """What a policy decided in one run: one row for each tick, T of them."""
 
     began: float
@@ -284,7 +284,7 @@ class Flown:
         )
 
 
-def fly(
+def run_policy(
     machine: Machine,
     policy: Policy,
     robot: Robot,
@@ -292,7 +292,7 @@ def fly(
     *,
     seconds: float,
     watch: Callable[[Tick], None] | None = None,
-) -> Flown:
+) -> Rollout:
     """Run a policy on a connected, standing machine and return what it decided.
 
     Args:
@@ -312,4 +312,4 @@ def fly(
         if watch is not None:
             watch(tick)
         taken.append(tick)
-    return Flown.of(taken)
+    return Rollout.of(taken)

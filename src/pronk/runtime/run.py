@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -18,14 +19,12 @@ from pronk.errors import HardwareError, LogError, PronkError
 from pronk.links.terminal import Interrupts, unheard
 from pronk.policy.contract import check
 from pronk.policy.runtime import load_policy
-from pronk.runtime.events import Notice
-from pronk.runtime.logger import READY, write_log
-from pronk.runtime.operators import Operator, Stick
-from pronk.runtime.plan import Plan, Shared
-from pronk.runtime.policy_process import think
-from pronk.runtime.records import STICK, Mode, Wish
+from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared
+from pronk.runtime.log import READY, write_log
+from pronk.runtime.plan import Plan
+from pronk.runtime.policy_process import serve_policy
 from pronk.runtime.servo import serve
-from pronk.runtime.summary import Outcome
+from pronk.runtime.teleop import Operator, OperatorCommand
 
 _RATE_HZ = 50.0
 """Of the operator's program."""
@@ -33,6 +32,55 @@ _START_S = 30.0
 """In which the servo must have opened the link."""
 _END_S = 10.0
 """In which each process must have ended."""
+
+
+@dataclass(kw_only=True)
+class RunSummary:
+    """How a deployment went."""
+
+    servo: dict[str, Any] = field(default_factory=dict)
+    """Figures of the servo; empty if it was killed."""
+    policy: dict[str, Any] = field(default_factory=dict)
+    """Figures of the policy's process; empty if it was killed."""
+    events_seen: list[Event] = field(default_factory=list)
+    interrupted: bool = False
+    """Whether somebody ended it by a signal: the interrupt key, or the end of the terminal."""
+    trained_delay_s: tuple[float, float] = (0.0, 0.0)
+    """Command delays that the policy was trained for [s]."""
+
+    @property
+    def faults(self) -> list[str]:
+        """What damped the robot."""
+        return [notice.text for notice in self.events_seen if notice.kind == "fault"]
+
+    @property
+    def refusals(self) -> list[str]:
+        """Why the robot was not moved."""
+        return [notice.text for notice in self.events_seen if notice.kind == "refused"]
+
+    def delay_words(self) -> str:
+        """The measured delay beside the range that the policy was trained for, in one line."""
+        low, high = (1e3 * edge for edge in self.trained_delay_s)
+        measured = self.servo.get("state_to_command", {})
+        if not measured.get("n"):
+            return f"no delay was measured; the policy was trained for {low:g} to {high:g} ms."
+        p50, p95 = measured["p50_ms"], measured["p95_ms"]
+        where = "within" if p95 <= high else "BEYOND"
+        return (
+            f"state to command {p50:.1f} ms (median), {p95:.1f} ms (95 %), n = {measured['n']}: "
+            f"{where} the {low:g} to {high:g} ms trained for; the drives' own delay comes on top."
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """For JSON and the end of the log."""
+        return {
+            "servo": self.servo,
+            "policy": self.policy,
+            "trained_delay_s": list(self.trained_delay_s),
+            "faults": self.faults,
+            "refusals": self.refusals,
+            "interrupted": self.interrupted,
+        }
 
 
 class Deployment:
@@ -57,11 +105,11 @@ class Deployment:
         self.plan = plan
         self.contract = policy.contract
         self.policy_sha256 = policy.sha256
-        self.outcome = Outcome(trained_delay_s=policy.contract.delay_range_s)
+        self.summary = RunSummary(trained_delay_s=policy.contract.delay_range_s)
         self.servo: BaseProcess
         self.policy: BaseProcess
         self.logger: BaseProcess | None = None
-        self._stick = np.zeros((), dtype=STICK)
+        self._stick = np.zeros((), dtype=OPERATOR)
         self._open = False
         self._interrupts = Interrupts()
 
@@ -76,14 +124,14 @@ class Deployment:
             self.shared = Shared()
         names = self.shared.names
         trained = self.contract.delay_range_s
-        self.write(Stick())
+        self.write(OperatorCommand())
         self._servo_end, servo_end = context.Pipe(duplex=False)
         self._policy_end, policy_end = context.Pipe(duplex=False)
         self.servo = context.Process(
             target=serve, args=(plan, names, trained, servo_end), name="pronk servo"
         )
         self.policy = context.Process(
-            target=think, args=(plan, names, policy_end), name="pronk policy"
+            target=serve_policy, args=(plan, names, policy_end), name="pronk policy"
         )
         if plan.log is not None:
             talk, self._logger_end = context.Pipe()
@@ -124,16 +172,16 @@ class Deployment:
         """What the servo is doing; `ENDED` too if its process is gone."""
         if not self.servo.is_alive():
             return Mode.ENDED
-        news = self.shared.news.read()
-        return Mode.IDLE if news is None else Mode(int(news["mode"]))
+        record = self.shared.state.read()
+        return Mode.IDLE if record is None else Mode(int(record["mode"]))
 
-    def notices(self) -> list[Notice]:
-        """What the servo has told since the last call; all of it is kept in the outcome too."""
-        found = [Notice.of(record) for record in self.shared.notices.take()]
-        self.outcome.notices += found
+    def events_seen(self) -> list[Event]:
+        """What the servo has told since the last call; all of it is kept in the summary too."""
+        found = [Event.of(record) for record in self.shared.events_seen.take()]
+        self.summary.events_seen += found
         return found
 
-    def write(self, stick: Stick) -> None:
+    def write(self, stick: OperatorCommand) -> None:
         """Tell servo and policy what the operator wants. To be called at 50 Hz or so.
 
         Raises:
@@ -142,17 +190,17 @@ class Deployment:
         if self._open:
             self._interrupts.check()
         record = self._stick
-        if stick.wish is not Wish.NONE:
-            record["wish"] = stick.wish
-            record["wishes"] += 1
+        if stick.request is not OperatorRequest.NONE:
+            record["request"] = stick.request
+            record["requests"] += 1
         record["time"] = time.monotonic()
         record["held"], record["jump"] = stick.held, stick.jump
         record["command"] = stick.command
-        self.shared.stick.write(record)
+        self.shared.operator.write(record)
 
-    def fly(
-        self, operator: Operator, tell: Callable[[Notice], None] = lambda notice: None
-    ) -> Outcome:
+    def run(
+        self, operator: Operator, tell: Callable[[Event], None] = lambda notice: None
+    ) -> RunSummary:
         """Let an operator have the stick until they leave or the servo ends.
 
         Args:
@@ -161,23 +209,23 @@ class Deployment:
         """
         wake = time.monotonic()
         while True:
-            for notice in self.notices():
-                operator.told(notice.kind, notice.text)
+            for notice in self.events_seen():
+                operator.notified(notice.kind, notice.text)
                 tell(notice)
             mode = self.mode
             if mode is Mode.ENDED:
                 break
             try:
-                self.write(operator.stick(time.monotonic(), mode))
+                self.write(operator.command(time.monotonic(), mode))
             except KeyboardInterrupt:
-                self.outcome.interrupted = True
-                self.write(Stick(wish=Wish.QUIT))
+                self.summary.interrupted = True
+                self.write(OperatorCommand(request=OperatorRequest.QUIT))
                 operator.leave()
             wake = max(wake + 1.0 / _RATE_HZ, time.monotonic())
             time.sleep(max(0.0, wake - time.monotonic()))
-        for notice in self.notices():
+        for notice in self.events_seen():
             tell(notice)
-        return self.outcome
+        return self.summary
 
     def close(self) -> None:
         """Damp, end all processes, finish the log; twice does no harm."""
@@ -187,12 +235,12 @@ class Deployment:
         try:
             if self.servo.pid is not None:
                 self._stop_servo()
-            self.outcome.servo = _received(self._servo_end)
+            self.summary.servo = _received(self._servo_end)
             if self.policy.pid is not None:
                 self.policy.terminate()
                 self.policy.join(_END_S)
-            self.outcome.policy = _received(self._policy_end)
-            self.notices()
+            self.summary.policy = _received(self._policy_end)
+            self.events_seen()
             if self.logger is not None and self.logger.pid is not None:
                 self._stop_logger(self.logger)
         finally:
@@ -206,17 +254,17 @@ class Deployment:
     def _stop_servo(self) -> None:
         """Ask it to damp and end, and keep asking: an operator who falls silent is a fault too."""
         until = time.monotonic() + _END_S
-        self.write(Stick(wish=Wish.QUIT))
+        self.write(OperatorCommand(request=OperatorRequest.QUIT))
         while self.servo.is_alive() and time.monotonic() < until:
             self.servo.join(1.0 / _RATE_HZ)
-            self.write(Stick())
+            self.write(OperatorCommand())
         if self.servo.is_alive():
             self.servo.terminate()
             self.servo.join(_END_S)
 
     def _stop_logger(self, logger: BaseProcess) -> None:
         try:
-            self._logger_end.send_bytes(orjson.dumps(self.outcome.figures()))
+            self._logger_end.send_bytes(orjson.dumps(self.summary.figures()))
         except OSError:
             return  # it was killed; what it flushed is there
         logger.join(_END_S)
@@ -224,7 +272,7 @@ class Deployment:
     def _await_logger(self, logger: BaseProcess) -> None:
         until = time.monotonic() + _START_S
         while not self._logger_end.poll(0.05):
-            self.write(Stick())
+            self.write(OperatorCommand())
             if logger.exitcode is not None or time.monotonic() > until:
                 raise LogError(f"{self.plan.log}: the process that writes the log did not start.")
         answer = self._logger_end.recv_bytes()
@@ -233,12 +281,12 @@ class Deployment:
 
     def _await_servo(self) -> None:
         until = time.monotonic() + _START_S
-        while self.shared.news.written == 0:
-            self.write(Stick())
+        while self.shared.state.written == 0:
+            self.write(OperatorCommand())
             self.servo.join(0.05)
-            self.notices()
+            self.events_seen()
             if self.servo.exitcode is not None:
-                why = " ".join(self.outcome.refusals) or "its process ended without a word"
+                why = " ".join(self.summary.refusals) or "its process ended without a word"
                 raise HardwareError(f"the link {self.plan.link.robot} was not opened: {why}")
             if time.monotonic() > until:
                 raise HardwareError(
@@ -283,14 +331,14 @@ def _received(end: Connection) -> dict[str, Any]:
     return {}
 
 
-def fly(plan: Plan, operator: Operator, tell: Callable[[Notice], None]) -> Outcome:
+def run(plan: Plan, operator: Operator, tell: Callable[[Event], None]) -> RunSummary:
     """Run a deployment from beginning to end.
 
     Raises:
         PronkError: It could not start.
     """
     with Deployment(plan) as deployment:
-        outcome = deployment.fly(operator, tell)
-    if not outcome.servo:
+        summary = deployment.run(operator, tell)
+    if not summary.servo:
         raise PronkError("the servo's process was killed; the robot's own watchdog had to stop it.")
-    return outcome
+    return summary

@@ -23,14 +23,31 @@ from pronk.errors import PronkError
 from pronk.links.machine import Command, Machine, State
 from pronk.links.realtime import Histogram, Pace, enter, sleep_until
 from pronk.links.terminal import leave
-from pronk.runtime.inputs import Hearing
-from pronk.runtime.outputs import Telling
-from pronk.runtime.plan import SERVO_PRIORITY, Names, Plan, Shared
+from pronk.runtime.ipc import (
+    REAL,
+    STATE,
+    TICK,
+    VIRTUAL,
+    Mode,
+    Names,
+    OperatorRequest,
+    PolicyAction,
+    Shared,
+    event,
+    put_state,
+)
+from pronk.runtime.plan import SERVO_PRIORITY, Plan
 from pronk.runtime.preflight import delay_objection, refusals
-from pronk.runtime.reasons import Level, Reason
-from pronk.runtime.records import REAL, VIRTUAL, Mode, Wish
-from pronk.runtime.safety import LEAST_DAMPING_S, Memory, Verdict, fault, filtered
-from pronk.runtime.states import PREFLIGHT_S, Director, Intent
+from pronk.runtime.safety import (
+    LEAST_DAMPING_S,
+    FilterAction,
+    FilterDecision,
+    FilterState,
+    Reason,
+    fault,
+    filtered,
+)
+from pronk.runtime.state_machine import PREFLIGHT_S, DesiredCommand, StateMachine
 
 _SWITCH_S = 0.5e-3
 """Longest that a thread of the link keeps the loop waiting [s]."""
@@ -70,10 +87,13 @@ class Servo:
         self.trained = trained
         self.robot = plan.robot
         self.limits = plan.safety()
-        self.director = Director(self.robot, plan.timing)
-        self.telling = Telling(shared, self.director)
-        self.hearing = Hearing(shared, self.director, plan.stick_valid_s)
-        self.memory = Memory()
+        self.machine_state = StateMachine(self.robot, plan.timing)
+        self.action: PolicyAction | None = None
+        """The policy's newest."""
+        self._requests = 0
+        self._state_record = np.zeros((), dtype=STATE)
+        self._tick_record = np.zeros((), dtype=TICK)
+        self.memory = FilterState()
         self.lateness = Histogram()
         self.latency = Histogram()
         """From a state to the command that answers it."""
@@ -105,7 +125,7 @@ class Servo:
             while not self._over():
                 self._one(machine)
         except PronkError as error:
-            self.telling.say("refused", str(error), level=Level.LATCH)
+            self._report("refused", str(error), level=FilterAction.LATCH)
         finally:
             if self._machine is not None:
                 self._close(self._machine)
@@ -126,102 +146,193 @@ class Servo:
             "state_age": self.age.figures(),
             "interventions": self.interventions,
             "faults": self.faults,
-            "refusals": list(self.director.refusals),
+            "refusals": list(self.machine_state.refusals),
             # Without a log nobody empties the queues to it, and nothing is lost.
             "dropped": {} if self.plan.log is None else self.shared.dropped(),
         }
+
+    def _operator(self, now: float) -> tuple[bool, bool]:
+        """Read the operator's mailbox: dead-man button held, operator's program gone."""
+        record = self.shared.operator.read()
+        timeout = self.plan.operator_timeout_s
+        if record is None:
+            return False, now - self.machine_state.since > 10.0 * timeout
+        if int(record["requests"]) != self._requests:
+            self._requests = int(record["requests"])
+            self.machine_state.request(OperatorRequest(int(record["request"])))
+        gone = now - float(record["time"]) > timeout
+        return bool(record["held"]) and not gone, gone
+
+    def _new_action(self) -> bool:
+        """Take the policy's newest action; whether there is a new one."""
+        record = self.shared.actions.read()
+        if record is None or (
+            self.action is not None and int(record["sequence"]) == self.action.sequence
+        ):
+            return False
+        self.action = PolicyAction(
+            sequence=int(record["sequence"]),
+            state_sequence=int(record["state_sequence"]),
+            state_time=float(record["state_time"]),
+            made=float(record["made"]),
+            valid_for=float(record["valid_for"]),
+            entry=int(record["entry"]),
+            position=np.array(record["position"]),
+        )
+        return True
+
+    def _report(
+        self,
+        kind: str,
+        text: str,
+        *,
+        reason: Reason = Reason.NONE,
+        level: FilterAction = FilterAction.PASS,
+    ) -> None:
+        """Send an event to logger and operator."""
+        record = event(time.monotonic(), kind, text, reason=reason, level=level)
+        self.shared.events.put(record)
+        self.shared.events_seen.put(record)
+
+    def _report_mode(self) -> None:
+        self._report("mode", self.machine_state.mode.name)
+
+    def _publish(self, state: State | None, now: float, pace: Pace) -> None:
+        """Write the newest state and the mode for the other processes; zeros without a state."""
+        record = self._state_record
+        if state is not None:
+            put_state(record, state, 0.0)
+        record["now"], record["start"] = now, pace.start
+        record["mode"], record["entry"] = self.machine_state.mode, self.machine_state.entry
+        self.shared.state.write(record)
+
+    def _log_tick(
+        self,
+        number: int,
+        state: State,
+        times: tuple[float, float, float],
+        desired: DesiredCommand,
+        sent: Command | None,
+        decision: FilterDecision,
+        latency: float,
+    ) -> None:
+        """Put a tick into the logger's queue.
+
+        Args:
+            number: Of the tick.
+            state: The newest, on CLOCK_MONOTONIC.
+            times: Deadline, begin and end of the tick, on the same clock [s].
+            desired: Requested of the filter.
+            sent: What the filter passed on; None for damping.
+            decision: The filter's.
+            latency: From a state to the command that uses it [s]; NaN without a new action.
+        """
+        tick, action = self._tick_record, self.action
+        put_state(tick, state, 0.0)
+        tick["tick"] = number
+        tick["deadline"], tick["begun"], tick["done"] = times
+        tick["mode"], tick["blend"] = self.machine_state.mode, desired.blend
+        tick["desired"] = np.nan if desired.command is None else desired.command.position
+        tick["sent"] = np.nan if sent is None else sent.position
+        tick["stiffness"] = 0.0 if sent is None else desired.stiffness
+        tick["damped"] = sent is None and not desired.silent
+        tick["level"], tick["reason"] = decision.level, decision.reason
+        tick["action"] = -1 if action is None else action.sequence
+        tick["action_state"] = -1 if action is None else action.state_sequence
+        tick["latency"] = latency
+        self.shared.ticks.put(tick)
 
     def _open(self, machine: Machine) -> None:
         # Before the link starts threads: they inherit what is granted, and so can never hold the
         # interpreter's lock while something less urgent runs.
         for line in enter(self.plan.wanted(SERVO_PRIORITY, 0)):
-            self.telling.say("system", line)
+            self._report("system", line)
         sys.setswitchinterval(_SWITCH_S)
         machine.connect()
         self._machine = machine
-        self.telling.say("robot", VIRTUAL if machine.virtual else REAL)
+        self._report("robot", VIRTUAL if machine.virtual else REAL)
         # The states' clock may be another; everything here is on CLOCK_MONOTONIC.
         self._offset = time.monotonic() - machine.now()
         machine.wait(machine.now())
         self._pace = Pace(self.plan.servo_rate_hz, time.monotonic() + 0.01)
-        self.director.enter(Mode.PREFLIGHT, self._pace.start)
+        self.machine_state.enter(Mode.PREFLIGHT, self._pace.start)
 
     def _over(self) -> bool:
         """Whether the loop may end: quit, and damped long enough."""
         assert self._pace is not None
-        mode, now = self.director.mode, time.monotonic()
+        mode, now = self.machine_state.mode, time.monotonic()
         if not self._alone and os.getppid() != self._parent:
             self._alone = True
-            self.telling.say("notice", "the operator's program has ended")
+            self._report("notice", "the operator's program has ended")
         if self._stopping or self._alone:
-            self.director.wish(Wish.QUIT)
-        if not self.director.quitting():
+            self.machine_state.request(OperatorRequest.QUIT)
+        if not self.machine_state.quitting():
             return False
         if mode in (Mode.IDLE, Mode.PREFLIGHT):
             return True
-        return mode in (Mode.DAMP, Mode.FAULT) and now - self.director.since >= LEAST_DAMPING_S
+        return mode in (Mode.DAMP, Mode.FAULT) and now - self.machine_state.since >= LEAST_DAMPING_S
 
     def _one(self, machine: Machine) -> None:
         """One tick."""
         pace = self._pace
         assert pace is not None
         deadline = pace.deadline
-        trouble = ""
+        link_error = ""
         try:
             met = machine.wait(deadline - self._offset)
         except PronkError as error:
-            met, trouble = [], str(error)
+            met, link_error = [], str(error)
             sleep_until(deadline)
         begun = time.monotonic()
         self.lateness.add(begun - deadline)
         self._take(met)
-        if self.director.mode is Mode.PREFLIGHT:
+        if self.machine_state.mode is Mode.PREFLIGHT:
             self._preflight(begun)
         if self._state is not None:
-            self._decide(machine, self._state, begun, trouble)
+            self._decide(machine, self._state, begun, link_error)
         else:
             # Nothing to decide on, but the operator is heard, and told.
-            self.hearing.stick(begun)
-            self.telling.publish(None, begun, pace)
+            self._operator(begun)
+            self._publish(None, begun, pace)
         pace.advance(time.monotonic())
 
-    def _decide(self, machine: Machine, state: State, begun: float, trouble: str) -> None:
+    def _decide(self, machine: Machine, state: State, begun: float, link_error: str) -> None:
         """From a state to what is written to the machine."""
         pace = self._pace
         assert pace is not None
         self.age.add(max(0.0, begun - state.time))
-        mode, memory, why = self.director.mode, self.memory, ""
-        held, gone = self.hearing.stick(begun)
-        fresh = self.hearing.orders()
-        if trouble:
-            memory, why = fault(memory, Level.LATCH, Reason.LINK, begun), trouble
+        mode, memory, why = self.machine_state.mode, self.memory, ""
+        held, gone = self._operator(begun)
+        fresh = self._new_action()
+        if link_error:
+            memory, why = fault(memory, FilterAction.LATCH, Reason.LINK, begun), link_error
         if gone and mode not in (Mode.IDLE, Mode.PREFLIGHT):
-            memory = fault(memory, Level.DAMP, Reason.ENDED, begun)
-        intent, memory = self.director.step(
-            begun, state, memory, self.hearing.order, objection=self._objection()
+            memory = fault(memory, FilterAction.DAMP, Reason.ENDED, begun)
+        desired, memory = self.machine_state.step(
+            begun, state, memory, self.action, objection=self._objection()
         )
-        if self.director.notice:
-            self.telling.say("notice", self.director.notice)
-        self.telling.publish(state, begun, pace)
-        sent, verdict, memory = self._filter(intent, state, memory, begun, held)
-        trouble = self._act(machine, intent, sent)
+        if self.machine_state.notice:
+            self._report("notice", self.machine_state.notice)
+        self._publish(state, begun, pace)
+        sent, decision, memory = self._filter(desired, state, memory, begun, held)
+        link_error = self._act(machine, desired, sent)
         done = time.monotonic()
-        if trouble:
-            memory, why = fault(memory, Level.LATCH, Reason.LINK, done), trouble
+        if link_error:
+            memory, why = fault(memory, FilterAction.LATCH, Reason.LINK, done), link_error
         if memory.level > self.memory.level and memory.faulted:
-            self._fault(memory, why or (verdict.text if verdict.detail else memory.reason.text))
+            self._fault(memory, why or (decision.text if decision.detail else memory.reason.text))
         self.memory = memory
         if memory.faulted:
-            self.director.faulted(begun)
-        if self.director.mode is not mode:
-            self.telling.mode()
-        order = self.hearing.order
+            self.machine_state.faulted(begun)
+        if self.machine_state.mode is not mode:
+            self._report_mode()
+        action = self.action
         latency = np.nan
-        if fresh and order is not None and self.director.mode in _THINKING:
-            latency = done - order.state_time
+        if fresh and action is not None and self.machine_state.mode in _THINKING:
+            latency = done - action.state_time
             self.latency.add(max(0.0, latency))
         times = (pace.deadline, begun, done)
-        self.telling.tick(pace.tick, state, times, intent, sent, verdict, order, latency)
+        self._log_tick(pace.tick, state, times, desired, sent, decision, latency)
 
     def _take(self, met: list[State]) -> None:
         for state in met:
@@ -235,45 +346,45 @@ class Servo:
                 self.lost += max(0, state.sequence - self._state.sequence - 1)
             self._state = state
             self.states += 1
-            if self.director.mode is Mode.PREFLIGHT:
+            if self.machine_state.mode is Mode.PREFLIGHT:
                 self._seen.append(state)
 
     def _preflight(self, now: float) -> None:
-        looked = now - self.director.since
+        looked = now - self.machine_state.since
         if looked < PREFLIGHT_S:
             return
         found = refusals(self._seen, self.robot, self.limits, now=now, seconds=looked)
         self._seen.clear()
         for sentence in found:
-            self.telling.say("refused", sentence)
-        self.director.preflighted(found, now)
-        self.telling.mode()
+            self._report("refused", sentence)
+        self.machine_state.preflighted(found, now)
+        self._report_mode()
 
     def _objection(self) -> str:
-        if self.plan.any_delay or self.director.mode is not Mode.STAND:
+        if self.plan.ignore_latency or self.machine_state.mode is not Mode.STAND:
             return ""
         return delay_objection(self.latency.quantile(0.95), self.latency.count, self.trained)
 
     def _filter(
-        self, intent: Intent, state: State, memory: Memory, now: float, held: bool
-    ) -> tuple[Command | None, Verdict, Memory]:
+        self, desired: DesiredCommand, state: State, memory: FilterState, now: float, held: bool
+    ) -> tuple[Command | None, FilterDecision, FilterState]:
         """The filter's word on what is asked."""
-        if intent.command is None:
-            quiet = Verdict(level=memory.level, reason=memory.reason)
+        if desired.command is None:
+            quiet = FilterDecision(level=memory.level, reason=memory.reason)
             # Damping is always allowed; the next target is measured against where the joints are.
             return None, quiet, replace(memory, last=None)
-        needed = self.director.mode is Mode.POLICY
-        sent, verdict, memory = filtered(
-            state, intent.command, memory, self.limits, now, held=held or not needed
+        needed = self.machine_state.mode is Mode.POLICY
+        sent, decision, memory = filtered(
+            state, desired.command, memory, self.limits, now, held=held or not needed
         )
-        if Level.PASS < verdict.level < Level.DAMP:
-            name = verdict.reason.name.lower()
+        if FilterAction.PASS < decision.level < FilterAction.DAMP:
+            name = decision.reason.name.lower()
             self.interventions[name] = self.interventions.get(name, 0) + 1
-        return sent, verdict, memory
+        return sent, decision, memory
 
-    def _act(self, machine: Machine, intent: Intent, sent: Command | None) -> str:
+    def _act(self, machine: Machine, desired: DesiredCommand, sent: Command | None) -> str:
         """Write to the machine; what the link objects to, or ""."""
-        if intent.silent:
+        if desired.silent:
             return ""
         try:
             if sent is None:
@@ -284,15 +395,15 @@ class Servo:
             return str(error)
         return ""
 
-    def _fault(self, memory: Memory, text: str) -> None:
+    def _fault(self, memory: FilterState, text: str) -> None:
         self.faults.append(text)
-        self.telling.say("fault", text, reason=memory.reason, level=memory.level)
+        self._report("fault", text, reason=memory.reason, level=memory.level)
 
     def _close(self, machine: Machine) -> None:
         """Leave the joints damped, whatever happened before, and keep what the cameras saw."""
-        quiet = self.director.mode in (Mode.IDLE, Mode.PREFLIGHT)
+        quiet = self.machine_state.mode in (Mode.IDLE, Mode.PREFLIGHT)
         try:
-            if not quiet and self.director.mode not in (Mode.DAMP, Mode.FAULT):
+            if not quiet and self.machine_state.mode not in (Mode.DAMP, Mode.FAULT):
                 # An error of pronk itself: damp for as long as a fault would.
                 until = time.monotonic() + LEAST_DAMPING_S
                 while time.monotonic() < until:
@@ -303,10 +414,10 @@ class Servo:
                 self._keep(machine)
             finally:
                 machine.close()
-                self.director.enter(Mode.ENDED, time.monotonic())
-                self.telling.mode()
+                self.machine_state.enter(Mode.ENDED, time.monotonic())
+                self._report_mode()
                 if self._pace is not None:
-                    self.telling.publish(self._state, time.monotonic(), self._pace)
+                    self._publish(self._state, time.monotonic(), self._pace)
 
     def _keep(self, machine: Machine) -> None:
         """Save what the cameras saw; a disk that is full harms nothing else."""
@@ -318,7 +429,7 @@ class Servo:
         try:
             save(self.plan.capture, inner.capture())
         except (OSError, PronkError) as error:
-            self.telling.say("lost", f"what the cameras saw was not kept: {error}")
+            self._report("lost", f"what the cameras saw was not kept: {error}")
 
 
 def _same(one: State, other: State) -> bool:

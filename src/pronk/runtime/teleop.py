@@ -1,4 +1,4 @@
-"""A person's hands: a keyboard, a gamepad."""
+"""Operators: keyboard, gamepad, and scripted ones that need nobody."""
 
 from __future__ import annotations
 
@@ -8,13 +8,155 @@ import struct
 import sys
 import termios
 import tty
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from pronk.errors import HardwareError
-from pronk.runtime.operators import Stick
-from pronk.runtime.records import Mode, Wish
+from pronk.runtime.ipc import Mode, OperatorRequest
+from pronk.runtime.script import STILL, Script, Velocity
+
+
+@dataclass(frozen=True, kw_only=True)
+class OperatorCommand:
+    """What the operator wants at a moment."""
+
+    command: Velocity = STILL
+    """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
+    jump: bool = False
+    held: bool = False
+    """Whether the dead-man button is held: without it the policy's robot is damped."""
+    request: OperatorRequest = OperatorRequest.NONE
+    """Something new that is asked for."""
+
+
+class Operator(Protocol):
+    """Gives the stick's position, 50 times a second."""
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """What is wanted now.
+
+        Args:
+            now: CLOCK_MONOTONIC [s].
+            mode: What the servo is doing.
+        """
+
+    def notified(self, kind: str, text: str) -> None:
+        """Hear what the servo has to say."""
+
+    def leave(self) -> None:
+        """The program was interrupted."""
+
+
+class ScriptedOperator:
+    """Stands up, runs one script after another, sits down, leaves; needs nobody.
+
+    It ends at the first fault or refusal.
+    """
+
+    def __init__(self, scripts: Sequence[Script], *, pause_s: float = 1.0) -> None:
+        """Take the scripts.
+
+        Args:
+            scripts: What is asked while the policy is in charge, one after the other.
+            pause_s: Of standing still between two [s].
+        """
+        self.scripts = tuple(scripts)
+        self.pause_s = pause_s
+        self._began: float | None = None
+        self._asked = Mode.ENDED
+        self._over = False
+        self.finished = False
+        """True once all scripts have been run to their ends."""
+
+    @property
+    def seconds(self) -> float:
+        """While the policy is in charge [s]."""
+        return sum(script.seconds + self.pause_s for script in self.scripts)
+
+    def notified(self, kind: str, text: str) -> None:
+        """A fault or a refusal ends it."""
+        if kind in ("fault", "refused") or (kind == "notice" and self._began is None):
+            self._over = True
+
+    def leave(self) -> None:
+        """End it."""
+        self._over = True
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """What the scripts say."""
+        if self._over or (self.finished and mode is Mode.DAMP):
+            return OperatorCommand(request=self._once(OperatorRequest.QUIT, Mode.ENDED))
+        if mode is Mode.DAMP:
+            return OperatorCommand(request=self._once(OperatorRequest.STAND, mode))
+        if mode is Mode.STAND:
+            return OperatorCommand(held=True, request=self._once(OperatorRequest.WALK, mode))
+        if mode is not Mode.POLICY:
+            return OperatorCommand(held=True)
+        if self._began is None:
+            self._began = now
+        t = now - self._began
+        for script in self.scripts:
+            if t < script.seconds:
+                command, jump = script.commanded(t)
+                return OperatorCommand(command=command, jump=jump, held=True)
+            t -= script.seconds
+            if t < self.pause_s:
+                return OperatorCommand(held=True)
+            t -= self.pause_s
+        self.finished = True
+        return OperatorCommand(held=True, request=self._once(OperatorRequest.SIT, mode))
+
+    def _once(self, request: OperatorRequest, mode: Mode) -> OperatorRequest:
+        """A request, said once for each mode."""
+        if self._asked is mode and request is not OperatorRequest.QUIT:
+            return OperatorRequest.NONE
+        self._asked = mode
+        return request
+
+
+class TimeLimit:
+    """Another operator, who sits down when the time is over."""
+
+    def __init__(self, operator: Operator, seconds: float) -> None:
+        """Begin to count when the policy takes over.
+
+        Args:
+            operator: Who else decides.
+            seconds: With the policy in charge [s].
+        """
+        self._operator = operator
+        self._seconds = seconds
+        self._began: float | None = None
+        self._sat = False
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """What the other wants, until the time is over."""
+        wanted = self._operator.command(now, mode)
+        if mode is Mode.POLICY and self._began is None:
+            self._began = now
+        if self._began is None or now - self._began < self._seconds:
+            return wanted
+        if mode is Mode.POLICY:
+            request = OperatorRequest.NONE if self._sat else OperatorRequest.SIT
+            self._sat = True
+            return OperatorCommand(held=wanted.held, request=request)
+        return (
+            OperatorCommand(request=OperatorRequest.QUIT)
+            if mode is Mode.DAMP
+            else OperatorCommand(held=wanted.held)
+        )
+
+    def notified(self, kind: str, text: str) -> None:
+        """Tell the other."""
+        self._operator.notified(kind, text)
+
+    def leave(self) -> None:
+        """Tell the other."""
+        self._operator.leave()
+
 
 HELP = """\
   hold SPACE   dead-man: let go and the joints are damped
@@ -25,13 +167,13 @@ HELP = """\
 _STEP = {"w": (0, 0.25), "s": (0, -0.25), "a": (1, 0.1), "d": (1, -0.1), "j": (2, 0.2)} | {
     "l": (2, -0.2)
 }
-_WISHES = {
-    "1": Wish.STAND,
-    "2": Wish.WALK,
-    "3": Wish.SIT,
-    "0": Wish.DAMP,
-    "r": Wish.RESET,
-    "q": Wish.QUIT,
+_REQUESTS = {
+    "1": OperatorRequest.STAND,
+    "2": OperatorRequest.WALK,
+    "3": OperatorRequest.SIT,
+    "0": OperatorRequest.DAMP,
+    "r": OperatorRequest.RESET,
+    "q": OperatorRequest.QUIT,
 }
 _JUMP_S = 0.5
 """How long one press asks for a jump, as in training [s]: in less, the stride might not come to
@@ -78,7 +220,7 @@ class Keyboard:
         with suppress(termios.error):
             termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
-    def told(self, kind: str, text: str) -> None:
+    def notified(self, kind: str, text: str) -> None:
         """After a change of mode nothing of the old command is left."""
         if kind == "mode":
             self._command = [0.0, 0.0, 0.0]
@@ -86,13 +228,13 @@ class Keyboard:
     def leave(self) -> None:
         """Nothing to do."""
 
-    def stick(self, now: float, mode: Mode) -> Stick:
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
         """What the keys say."""
         del mode
-        wish = Wish.NONE
+        request = OperatorRequest.NONE
         keys = self._keys()
         if not self._there:
-            return Stick(wish=Wish.QUIT)
+            return OperatorCommand(request=OperatorRequest.QUIT)
         for key in keys:
             if key == " ":
                 self._held = now
@@ -104,14 +246,14 @@ class Keyboard:
                 self._command = [0.0, 0.0, 0.0]
             elif key in "\r\n":
                 self._jump = now
-            elif key in _WISHES:
-                wish = _WISHES[key]
+            elif key in _REQUESTS:
+                request = _REQUESTS[key]
         forward, left, yaw = self._command
-        return Stick(
+        return OperatorCommand(
             command=(forward, left, yaw),
             jump=now - self._jump < _JUMP_S,
             held=now - self._held < _REPEAT_S,
-            wish=wish,
+            request=request,
         )
 
     def _keys(self) -> str:
@@ -134,7 +276,14 @@ _BUTTON, _AXIS, _INITIAL = 1, 2, 0x80
 _FULL = 32767.0
 _DEAD_ZONE = 0.1
 # Numbers as the kernel's xpad driver gives them, to which other gamepads are mapped.
-_PAD_WISHES = {0: Wish.STAND, 1: Wish.DAMP, 2: Wish.SIT, 3: Wish.WALK, 6: Wish.QUIT, 7: Wish.RESET}
+_PAD_REQUESTS = {
+    0: OperatorRequest.STAND,
+    1: OperatorRequest.DAMP,
+    2: OperatorRequest.SIT,
+    3: OperatorRequest.WALK,
+    6: OperatorRequest.QUIT,
+    7: OperatorRequest.RESET,
+}
 _LEFT_BUMPER, _RIGHT_BUMPER = 4, 5
 _FORWARD_AXIS, _LEFT_AXIS, _TURN_AXIS = 1, 0, 3
 
@@ -176,18 +325,18 @@ class Gamepad:
         """Let go of the device."""
         os.close(self._fd)
 
-    def told(self, kind: str, text: str) -> None:
+    def notified(self, kind: str, text: str) -> None:
         """A gamepad has no ears."""
 
     def leave(self) -> None:
         """Nothing to do."""
 
-    def stick(self, now: float, mode: Mode) -> Stick:
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
         """What sticks and buttons say."""
         del mode
-        wish = self._read()
+        request = self._read()
         if not self._there:
-            return Stick(wish=wish)
+            return OperatorCommand(request=request)
         pushed = [-self._axis(_FORWARD_AXIS), -self._axis(_LEFT_AXIS), -self._axis(_TURN_AXIS)]
         forward, left, yaw = (
             push * (high if push > 0.0 else -low)
@@ -197,34 +346,34 @@ class Gamepad:
         if pressed and not self._pressed:
             self._jump = now
         self._pressed = pressed
-        return Stick(
+        return OperatorCommand(
             command=(forward, left, yaw),
             jump=now - self._jump < _JUMP_S,
             held=self._buttons.get(_LEFT_BUMPER, False),
-            wish=wish,
+            request=request,
         )
 
     def _axis(self, number: int) -> float:
         value = self._axes.get(number, 0.0)
         return value if abs(value) > _DEAD_ZONE else 0.0
 
-    def _read(self) -> Wish:
-        wish = Wish.NONE
+    def _read(self) -> OperatorRequest:
+        request = OperatorRequest.NONE
         while True:
             try:
                 data = os.read(self._fd, _EVENT.size)
             except BlockingIOError:
-                return wish
+                return request
             except OSError:
                 self._there = False
-                return wish
+                return request
             if len(data) < _EVENT.size:
                 self._there = False
-                return wish
+                return request
             _, value, kind, number = _EVENT.unpack(data)
             if kind & ~_INITIAL == _AXIS:
                 self._axes[number] = value / _FULL
             elif kind & ~_INITIAL == _BUTTON:
                 self._buttons[number] = bool(value)
                 if value and not kind & _INITIAL:
-                    wish = _PAD_WISHES.get(number, wish)
+                    request = _PAD_REQUESTS.get(number, request)

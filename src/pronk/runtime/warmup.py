@@ -28,7 +28,7 @@ _SPIN_S = 0.2e-3
 """Shorter waits are spun away: a sleep ends up to so much late [s]."""
 
 
-def rehearse_until(deadline: float, act: Callable[[], object]) -> int:
+def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
     """Wait for a deadline, and do something over and over in the last 2 ms before it.
 
     Nothing is begun without room for half of what it took the last time, for each is quicker than

@@ -160,7 +160,7 @@ def attempt(task: Attempt) -> Verdict:
         lead=task.lead,
         where=lambda: float(machine.snapshot().position[0, :2] @ along),
     )
-    # Time to lift off, to fly and land on all feet, and to stand.
+    # Time to lift off, to run_policy and land on all feet, and to stand.
     after = rules.search_s + 1.0 + rules.upright_s
     late = script.stand_s + LATE * (RUN_UP_S + PHASE_S)
     began = machine.now()

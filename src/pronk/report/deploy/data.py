@@ -14,9 +14,9 @@ import orjson
 from numpy.typing import NDArray
 
 from pronk.logs.mcap_stream import DamagedError, records
+from pronk.runtime.ipc import Mode
 from pronk.runtime.log import DeployLog
-from pronk.runtime.reasons import Level, Reason
-from pronk.runtime.records import Mode
+from pronk.runtime.safety import FilterAction, Reason
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -55,7 +55,7 @@ class Intervention:
     """What the filter did for one reason."""
 
     reason: Reason
-    level: Level
+    level: FilterAction
     ticks: int
     largest: float
     """Farthest that it moved a target [rad]; NaN while damped."""
@@ -100,7 +100,7 @@ def flying(log: DeployLog) -> Mask:
 
 def until_fault(log: DeployLog) -> int:
     """Number of ticks up to the first that damped for a fault, that one included."""
-    bad = log.level >= Level.DAMP
+    bad = log.level >= FilterAction.DAMP
     return int(bad.argmax()) + 1 if bad.any() else len(bad)
 
 
@@ -158,14 +158,14 @@ def interventions(log: DeployLog) -> tuple[Intervention, ...]:
     """What the filter did, by level and reason; the mildest first."""
     found = []
     with np.errstate(invalid="ignore"):
-        moved = np.abs(log.sent - log.asked)
-    for level in list(Level)[1:]:
+        moved = np.abs(log.sent - log.desired)
+    for level in list(FilterAction)[1:]:
         for reason in Reason:
             there = (log.level == level) & (log.reason == reason)
             if not there.any():
                 continue
             of = moved[there]
-            known = bool(np.isfinite(of).any()) and level < Level.DAMP
+            known = bool(np.isfinite(of).any()) and level < FilterAction.DAMP
             often = (of > _MOVED).sum(axis=0)
             found.append(
                 Intervention(

@@ -14,13 +14,13 @@ from pronk.report.deploy.delay import Delay
 from pronk.report.shell import number
 from pronk.robots.robot import Robot
 from pronk.runtime.log import DeployLog
-from pronk.runtime.reasons import Level
+from pronk.runtime.safety import FilterAction
 
 _LEVEL_WORDS = {
-    Level.LIMIT: "target moved",
-    Level.HOLD: "last one held",
-    Level.DAMP: "damped",
-    Level.LATCH: "damped, latched",
+    FilterAction.LIMIT: "target moved",
+    FilterAction.HOLD: "last one held",
+    FilterAction.DAMP: "damped",
+    FilterAction.LATCH: "damped, latched",
 }
 
 

@@ -25,7 +25,7 @@ _LIMITS = (("hold_s", "held"), ("damp_s", "damped"), ("latch_s", "latched"))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Timed:
+class TimeLimit:
     """One kind of time."""
 
     name: str
@@ -35,37 +35,37 @@ class Timed:
     """What it is, in one line."""
 
 
-def times(log: DeployLog) -> tuple[Timed, ...]:
+def times(log: DeployLog) -> tuple[TimeLimit, ...]:
     """Everything that was timed and happened at all."""
     live = flying(log)
     found = (
-        Timed(
+        TimeLimit(
             name="servo tick late",
             values=log.lateness,
             says="from a tick's deadline to its begin, every tick of the run",
         ),
-        Timed(
+        TimeLimit(
             name="age of the state at a tick",
             values=log.state_age[: until_fault(log)],
             says="from the newest state to the tick's begin, every tick until a fault",
         ),
-        Timed(
+        TimeLimit(
             name="state to command",
             values=log.latency[live],
             says="from the state that the policy read to the first command on the wire that "
             "answers it, while the policy decided",
         ),
-        Timed(
+        TimeLimit(
             name="servo's work",
             values=log.work,
             says="from a tick's begin until its command was on the wire, every tick",
         ),
-        Timed(
+        TimeLimit(
             name="policy step late",
             values=log.step_lateness[log.step_live],
             says="from a step's deadline to its begin, while the policy decided",
         ),
-        Timed(
+        TimeLimit(
             name="policy's decision",
             values=log.decision[log.step_live],
             says="observation built and network run, while the policy decided",
@@ -110,7 +110,7 @@ def histograms(log: DeployLog, trained: tuple[float, float] | None) -> Figure:
     return drawn
 
 
-def _histogram(axes: Axes, one: Timed) -> None:
+def _histogram(axes: Axes, one: TimeLimit) -> None:
     values = np.maximum(1e3 * one.values[np.isfinite(one.values)], _LEAST_MS)
     decades = int(np.ceil(np.log10(max(values.max() / _LEAST_MS, 10.0)))) + 1
     edges = _LEAST_MS * 10.0 ** (np.arange(decades * _PER_DECADE + 1) / _PER_DECADE)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pronk.report import style
 from pronk.report.deploy.data import flying, in_force, seconds, stretches, tilt
+from pronk.runtime.ipc import Mode
 from pronk.runtime.log import DeployLog
-from pronk.runtime.records import Mode
 
 Array = NDArray[np.float64]
 
@@ -204,7 +204,7 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure | None:
         return None
     rows = style.grid_of_joints(log.joints)
     with np.errstate(invalid="ignore"):
-        moved = bool((np.abs(log.asked - log.sent)[there] > _MOVED).any())
+        moved = bool((np.abs(log.desired - log.sent)[there] > _MOVED).any())
     shown = [(max(a, begin), min(b, end)) for a, b in jumps(log) if a < end and b > begin]
     with style.styled():
         drawn, panels = style.small_multiples(rows, height=1.55, sharey="row")
@@ -248,7 +248,7 @@ def _joint(axes: Axes, log: DeployLog, i: int, there: NDArray[np.bool_]) -> None
         color=style.MEASURED_WIDE,
         linewidth=2.6,
     )
-    asked, sent = log.asked[there, i], in_force(log)[there, i]
+    asked, sent = log.desired[there, i], in_force(log)[there, i]
     now = log.sent[there, i]
     with np.errstate(invalid="ignore"):
         axes.step(t, np.where(np.abs(asked - now) > _MOVED, asked, np.nan), where="post", **_ASKED)

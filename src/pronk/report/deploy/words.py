@@ -9,9 +9,9 @@ import numpy as np
 from pronk.report.deploy.data import FLYING, missed, seconds, stretches
 from pronk.report.deploy.delay import Delay
 from pronk.report.deploy.traces import MODE_WORDS, jumps
+from pronk.runtime.ipc import REAL, VIRTUAL
 from pronk.runtime.log import DeployLog
-from pronk.runtime.reasons import Level
-from pronk.runtime.records import REAL, VIRTUAL
+from pronk.runtime.safety import FilterAction
 
 
 def machine(log: DeployLog) -> str:
@@ -80,7 +80,7 @@ def lines(log: DeployLog, delay: Delay) -> Iterator[str]:
 
 def damping(log: DeployLog) -> str:
     """What the servo did after the first fault."""
-    bad = log.level >= Level.DAMP
+    bad = log.level >= FilterAction.DAMP
     if not bad.any():
         return "The log ends before a tick that was damped."
     first = int(bad.argmax())
@@ -96,8 +96,8 @@ def damping(log: DeployLog) -> str:
 
 def filtering(log: DeployLog) -> str:
     """How much the filter had to do."""
-    wanted = np.isfinite(log.asked).any(axis=1)
-    moved = int((wanted & np.isin(log.level, (Level.LIMIT, Level.HOLD))).sum())
+    wanted = np.isfinite(log.desired).any(axis=1)
+    moved = int((wanted & np.isin(log.level, (FilterAction.LIMIT, FilterAction.HOLD))).sum())
     if not wanted.any():
         return "No target was asked of the safety filter."
     if not moved:

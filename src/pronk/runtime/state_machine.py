@@ -4,7 +4,7 @@
                                    any fault -> Fault (damped) -> Damp -> ...
 
 The machine decides what is *asked*; the safety filter decides what is sent. It takes time, states
-and wishes as arguments and has no clock of its own.
+and requests as arguments and has no clock of its own.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from pronk.links.machine import Command, State
 from pronk.robots.robot import Robot
-from pronk.runtime.reasons import Level, Reason
-from pronk.runtime.records import Mode, Wish
-from pronk.runtime.safety import Memory, released
+from pronk.runtime.ipc import Mode, OperatorRequest, PolicyAction
+from pronk.runtime.safety import FilterAction, FilterState, Reason, released
 from pronk.runtime.trajectories import Path, Timing, minimum_jerk, sit_down, stand_up
 
 Array = NDArray[np.float64]
@@ -28,28 +27,14 @@ PREFLIGHT_S = 0.5
 """How long states are looked at before anything is sent [s]."""
 VALID_S = 0.05
 """How long a target on the way up or down may be repeated [s]; there is a new one every tick."""
-FIRST_ORDER_S = 0.2
-"""In which the policy must give its first order once it is its turn [s]."""
+FIRST_ACTION_S = 0.2
+"""In which the policy must give its first action once it is its turn [s]."""
 
 _SILENT = (Mode.IDLE, Mode.PREFLIGHT, Mode.ENDED)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
-    """Joint targets of the policy, on the servo's clock."""
-
-    sequence: int
-    state_sequence: int
-    state_time: float
-    made: float
-    valid_for: float
-    entry: int
-    """Of the mode that it was made for."""
-    position: Array
-
-
-@dataclass(frozen=True, kw_only=True)
-class Intent:
+class DesiredCommand:
     """What a tick asks for."""
 
     command: Command | None
@@ -61,7 +46,7 @@ class Intent:
     """Share of the drives' own stiffness."""
 
 
-class Director:
+class StateMachine:
     """One robot's way through the modes."""
 
     def __init__(self, robot: Robot, timing: Timing) -> None:
@@ -76,14 +61,14 @@ class Director:
         self.refusals: tuple[str, ...] = ()
         """Why nothing may move, from the pre-flight checks."""
         self.notice = ""
-        """Why the last wish was not granted; empty if it was."""
+        """Why the last request was not granted; empty if it was."""
         self._kp = np.array([joint.stiffness for joint in robot.joints])
         self._kd = np.array([joint.damping for joint in robot.joints])
         self._path: Path | None = None
         self._blending: float | None = None
         self._took_over = 0
         """Entry with which the policy took over."""
-        self._wish = Wish.NONE
+        self._request = OperatorRequest.NONE
 
     def enter(self, mode: Mode, t: float) -> None:
         """Change the mode."""
@@ -95,36 +80,40 @@ class Director:
         self.refusals = tuple(refusals)
         self.enter(Mode.IDLE if refusals else Mode.DAMP, t)
 
-    def wish(self, wish: Wish) -> None:
-        """Take a wish; it waits until it can be granted or another comes."""
-        self._wish = wish
+    def request(self, request: OperatorRequest) -> None:
+        """Take a request; it waits until it can be granted or another comes."""
+        self._request = request
 
     def quitting(self) -> bool:
         """Whether the operator wants to leave."""
-        return self._wish is Wish.QUIT
+        return self._request is OperatorRequest.QUIT
 
     def faulted(self, t: float) -> None:
         """The filter damps: so does the mode."""
         if self.mode is not Mode.FAULT and self.mode not in _SILENT:
-            self._wish = Wish.QUIT if self._wish is Wish.QUIT else Wish.NONE
+            self._request = (
+                OperatorRequest.QUIT
+                if self._request is OperatorRequest.QUIT
+                else OperatorRequest.NONE
+            )
             self.enter(Mode.FAULT, t)
 
     def step(
         self,
         t: float,
         state: State,
-        memory: Memory,
-        order: Order | None,
+        memory: FilterState,
+        action: PolicyAction | None,
         *,
         objection: str = "",
-    ) -> tuple[Intent, Memory]:
+    ) -> tuple[DesiredCommand, FilterState]:
         """One tick.
 
         Args:
             t: Now [s].
             state: The newest.
-            memory: The filter's; a fault in it is released where a wish and the time allow it.
-            order: The policy's newest.
+            memory: The filter's; a fault in it is released where a request and the time allow it.
+            action: The policy's newest.
             objection: Why the policy may not take over, from what was measured while standing;
                 empty if it may.
 
@@ -133,7 +122,7 @@ class Director:
         """
         memory = self._grant(t, state, memory, objection)
         if self.mode in _SILENT:
-            return Intent(command=None, silent=True), memory
+            return DesiredCommand(command=None, silent=True), memory
         if self.mode is Mode.STAND and self._path is not None:
             share = self._path.stiffness(t)
             return self._pose(t, self._path.target(t), share), memory
@@ -141,45 +130,49 @@ class Director:
             if self.mode is Mode.HALT and t - self.since >= self.timing.halt_s:
                 self._sit(t, state)
             else:
-                return self._follow(t, order, memory)
+                return self._follow(t, action, memory)
         if self.mode is Mode.SIT and self._path is not None:
             if not self._path.done(t):
                 return self._pose(t, self._path.target(t), 1.0), memory
             self.enter(Mode.DAMP, t)
-        return Intent(command=None), memory
+        return DesiredCommand(command=None), memory
 
-    def _grant(self, t: float, state: State, memory: Memory, objection: str) -> Memory:
-        """Let the wish have its way as far as it may."""
-        wish, mode = self._wish, self.mode
+    def _grant(self, t: float, state: State, memory: FilterState, objection: str) -> FilterState:
+        """Let the request have its way as far as it may."""
+        request, mode = self._request, self.mode
         self.notice = ""
-        if wish in (Wish.DAMP, Wish.QUIT) and mode not in (*_SILENT, Mode.FAULT, Mode.DAMP):
+        if request in (OperatorRequest.DAMP, OperatorRequest.QUIT) and mode not in (
+            *_SILENT,
+            Mode.FAULT,
+            Mode.DAMP,
+        ):
             self.enter(Mode.DAMP, t)
-        elif wish is Wish.SIT and mode is Mode.POLICY:
+        elif request is OperatorRequest.SIT and mode is Mode.POLICY:
             self.enter(Mode.HALT, t)
-        elif wish is Wish.SIT and mode is Mode.STAND:
+        elif request is OperatorRequest.SIT and mode is Mode.STAND:
             self._sit(t, state)
-        elif wish in (Wish.STAND, Wish.RESET) and mode is Mode.FAULT:
-            memory = released(memory, t, mended=wish is Wish.RESET)
+        elif request in (OperatorRequest.STAND, OperatorRequest.RESET) and mode is Mode.FAULT:
+            memory = released(memory, t, mended=request is OperatorRequest.RESET)
             if not memory.faulted:
                 self.enter(Mode.DAMP, t)
-            elif memory.level is Level.LATCH and wish is Wish.STAND:
+            elif memory.level is FilterAction.LATCH and request is OperatorRequest.STAND:
                 self.notice = "the fault is latched; say that it is mended (reset) first"
-                self._wish = Wish.NONE
-        elif wish is Wish.STAND and mode is Mode.DAMP:
+                self._request = OperatorRequest.NONE
+        elif request is OperatorRequest.STAND and mode is Mode.DAMP:
             if t - self.since >= self.timing.damp_s:
                 self._path = stand_up(self.robot, state.position, t, self.timing)
-                self._wish = Wish.NONE
+                self._request = OperatorRequest.NONE
                 self.enter(Mode.STAND, t)
-        elif wish is Wish.WALK and mode is Mode.STAND and self._stands(t):
-            self._wish = Wish.NONE
+        elif request is OperatorRequest.WALK and mode is Mode.STAND and self._stands(t):
+            self._request = OperatorRequest.NONE
             if objection:
                 self.notice = objection
             else:
                 self._blending = None
                 self.enter(Mode.POLICY, t)
                 self._took_over = self.entry
-        if self.mode is not mode and wish not in (Wish.QUIT, Wish.STAND):
-            self._wish = Wish.NONE
+        if self.mode is not mode and request not in (OperatorRequest.QUIT, OperatorRequest.STAND):
+            self._request = OperatorRequest.NONE
         return memory
 
     def _stands(self, t: float) -> bool:
@@ -189,34 +182,36 @@ class Director:
         self._path = sit_down(self.robot, state.position, t, self.timing)
         self.enter(Mode.SIT, t)
 
-    def _pose(self, t: float, target: Array, share: float) -> Intent:
+    def _pose(self, t: float, target: Array, share: float) -> DesiredCommand:
         command = Command(
             position=target, stiffness=share * self._kp, damping=self._kd, made=t, valid_for=VALID_S
         )
-        return Intent(command=command, stiffness=share)
+        return DesiredCommand(command=command, stiffness=share)
 
-    def _follow(self, t: float, order: Order | None, memory: Memory) -> tuple[Intent, Memory]:
+    def _follow(
+        self, t: float, action: PolicyAction | None, memory: FilterState
+    ) -> tuple[DesiredCommand, FilterState]:
         """The policy's targets, blended in; the standing pose until the first of them."""
         assert self._path is not None
         pose = self._path.target(t)
         if self._blending is None:
             # Told to halt before it has answered, it may answer as before or as told.
-            if order is None or order.entry < self._took_over:
-                if t - self.since > FIRST_ORDER_S:
-                    late = Memory(level=Level.LATCH, reason=Reason.EXPIRED, since=t)
-                    return Intent(command=None), late
+            if action is None or action.entry < self._took_over:
+                if t - self.since > FIRST_ACTION_S:
+                    late = FilterState(level=FilterAction.LATCH, reason=Reason.EXPIRED, since=t)
+                    return DesiredCommand(command=None), late
                 return self._pose(t, pose, 1.0), memory
             self._blending = t
-        assert order is not None
+        assert action is not None
         length = self.timing.blend_s
         share = minimum_jerk((t - self._blending) / length) if length > 0.0 else 1.0
         command = Command(
-            position=pose + share * (order.position - pose),
+            position=pose + share * (action.position - pose),
             stiffness=self._kp,
             damping=self._kd,
-            sequence=order.sequence,
-            state_sequence=order.state_sequence,
-            made=order.made,
-            valid_for=order.valid_for,
+            sequence=action.sequence,
+            state_sequence=action.state_sequence,
+            made=action.made,
+            valid_for=action.valid_for,
         )
-        return Intent(command=command, blend=share, stiffness=1.0), memory
+        return DesiredCommand(command=command, blend=share, stiffness=1.0), memory
