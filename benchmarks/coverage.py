@@ -17,17 +17,17 @@ from rich.text import Text
 from scipy.signal import lfilter
 from scipy.stats import binom
 
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
 from pronk.match.interval import interval
-from pronk.match.measured_joint import targets
+from pronk.match.measured_joint import measured_joints
 from pronk.match.refine import refine
 from pronk.match.settings import MatchSettings
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.report.paper import published
 from pronk.response.estimate import operators
 from pronk.robots import load_robot
-from pronk.simulators.batch import Simulator
+from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = "mini_cheetah"
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
@@ -115,15 +115,17 @@ def _joint(
     paper = published(ROBOT)
     assert paper is not None
     truth = paper.joints[name]
-    chirp = Ask(offsets=Chirp(length_s=length_s).samples(), repeats=repeats, settle_s=_REST_S)
+    chirp = Excitation(
+        offsets=Chirp(length_s=length_s).samples(), repeats=repeats, settle_s=_REST_S
+    )
     samples = round((length_s + 2.0 * _REST_S + 1.0) * LOG_RATE_HZ)
-    log = rehearse(robot, name, [chirp], *truth, noise=list(coloured(rng, (repeats, samples))))
-    noisy = targets(log, name, robot, settings)[0]
-    quiet = rehearse(robot, name, [replace(chirp, repeats=1)], *truth)
-    clean = targets(quiet, name, robot, settings)[0].measured.response
+    log = synthetic_log(robot, name, [chirp], *truth, noise=list(coloured(rng, (repeats, samples))))
+    noisy = measured_joints(log, name, robot, settings)[0]
+    quiet = synthetic_log(robot, name, [replace(chirp, repeats=1)], *truth)
+    clean = measured_joints(quiet, name, robot, settings)[0].measured.response
     operator = operators(log, name, settings.estimator)[0][0]
     gains, low, high = (np.empty((trials, 2)) for _ in range(3))
-    with Simulator(robot, threads=threads) as simulator:
+    with MujocoSimulator(robot, threads=threads) as simulator:
         for begin in range(0, trials, _BATCH):
             count = min(_BATCH, trials - begin)
             shaken = operator.apply(coloured(rng, (count, repeats, len(operator.time))))

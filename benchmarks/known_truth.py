@@ -18,7 +18,7 @@ from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import Segment, SweepLog
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import Question
+from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
 
 Array = NDArray[np.float64]
@@ -139,7 +139,7 @@ class KnownTruth:
         joint = robot.joint(JOINT)
         rest = np.zeros(round(HOLD_S * robot.policy_rate_hz))
         ticks = np.concatenate([rest, self._signal.samples(robot.policy_rate_hz), rest])
-        self._question = Question(
+        self._question = CommandTrace(
             joint=JOINT,
             start=0.0,
             timestep=robot.timestep_s,

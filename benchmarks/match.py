@@ -84,16 +84,16 @@ def run(
     truth = Truth()
     start = (joint.stiffness, joint.damping)
     bounds = (machine.grid_stiffness, machine.grid_damping)
-    jobs = [
+    requests = [
         (scenario, tools(machine, scenario, bounds=bounds, start=start, seed=seed, threads=threads))
         for scenario in scenarios
     ]
     # The quick way and the full grid end in the same refinement, so that one grid shows its time.
     grid = partial(fit_pronk, robot=machine, method="grid", threads=threads)
-    total = trials * sum(len(chosen) for _, chosen in jobs) + full_grid
+    total = trials * sum(len(chosen) for _, chosen in requests) + full_grid
     done = 0
     rows: list[Row] = []
-    for index, (scenario, chosen) in enumerate(jobs):
+    for index, (scenario, chosen) in enumerate(requests):
         source = KnownTruth(
             machine, scenario, truth=truth, repeats=repeats, length_s=length_s, threads=threads
         )

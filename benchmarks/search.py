@@ -22,18 +22,17 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.excitation.signals import Chirp
 from pronk.match.grid import GridSearch, alike, axes, search
-from pronk.match.measured_joint import Target, targets
+from pronk.match.measured_joint import MeasuredJoint, measured_joints
 from pronk.match.quick import quick_search
 from pronk.match.refine import Fit, refine
 from pronk.match.settings import MatchSettings
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.report.paper import published
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.simulators.batch import Simulator
-from pronk.simulators.mujoco import Bench
+from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -101,16 +100,16 @@ class SearchBench:
         return self.steps_per_second / self.bare_steps_per_second
 
 
-def bare_rollout(bench: Bench, goal: Target, pairs: int, threads: int) -> float:
+def bare_rollout(rig: JointTestRig, goal: MeasuredJoint, pairs: int, threads: int) -> float:
     """Steps per second of `mujoco.rollout` alone over a bench's model and a target's command."""
-    command = goal.question.mirrored(bench.robot)[2][: goal.steps]
-    control = np.tile(bench.control(bench.pose(goal.question)), (pairs, goal.steps, 1))
-    control[:, :, bench.actuator] += command
-    models = [copy.copy(bench.model) for _ in range(pairs)]
-    data = [mujoco.MjData(bench.model) for _ in range(threads)]
-    width = mujoco.mj_stateSize(bench.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    command = goal.trace.mirrored(rig.robot)[2][: goal.steps]
+    control = np.tile(rig.control(rig.pose(goal.trace)), (pairs, goal.steps, 1))
+    control[:, :, rig.actuator] += command
+    models = [copy.copy(rig.model) for _ in range(pairs)]
+    data = [mujoco.MjData(rig.model) for _ in range(threads)]
+    width = mujoco.mj_stateSize(rig.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     initial = np.zeros((pairs, width))
-    initial[:, 1 : 1 + bench.model.nq] = bench.pose(goal.question)
+    initial[:, 1 : 1 + rig.model.nq] = rig.pose(goal.trace)
     with mujoco.rollout.Rollout(nthread=threads) as pool:
         begin = time.perf_counter()
         pool.rollout(models, data, initial, control)
@@ -149,22 +148,22 @@ def run(
     groups = alike(goals, robot)
     grids: dict[str, GridSearch] = {}
     grid_s = bare_s = 0.0
-    with Simulator(robot, threads=threads) as simulator:
+    with MujocoSimulator(robot, threads=threads) as simulator:
         for k, group in enumerate(groups):
-            bench = simulator.bench(group[0].joint)
+            rig = simulator.rig(group[0].joint)
             before = simulator.count.steps
             pairs = min(BARE_PAIRS, points**2)
-            speeds = [bare_rollout(bench, group[0], pairs, threads)]
+            speeds = [bare_rollout(rig, group[0], pairs, threads)]
             begin = time.perf_counter()
             found = search(
-                bench,
+                rig,
                 group,
                 stiffness,
                 damping,
                 progress=lambda share, k=k: told("grid", (k + share) / len(groups)),  # type: ignore[misc]
             )
             grid_s += time.perf_counter() - begin
-            speeds.append(bare_rollout(bench, group[0], pairs, threads))
+            speeds.append(bare_rollout(rig, group[0], pairs, threads))
             bare_s += (simulator.count.steps - before) / float(np.mean(speeds))
             grids |= {goal.joint: grid for goal, grid in zip(group, found, strict=True)}
         steps = simulator.count.steps
@@ -172,7 +171,7 @@ def run(
         fits = refine(simulator, goals, [grids[goal.joint].gains for goal in goals])
         refine_s = time.perf_counter() - begin
     begin = time.perf_counter()
-    with Simulator(robot, threads=threads) as simulator:
+    with MujocoSimulator(robot, threads=threads) as simulator:
         quick = quick_search(simulator, goals, stiffness, damping)
     quick_s = time.perf_counter() - begin
     return SearchBench(
@@ -193,16 +192,16 @@ def run(
 
 def _known(
     robot: Robot, name: str, gains: tuple[float, float], length_s: float, settings: MatchSettings
-) -> Target:
+) -> MeasuredJoint:
     """A joint's chirp in the training simulator; mirrored joints are asked mirrored."""
     sign = robot.joint(name).original[1]
-    ask = Ask(offsets=sign * Chirp(length_s=length_s).samples(robot.policy_rate_hz))
-    log = rehearse(robot, name, [ask], *gains, threads=settings.threads)
-    return targets(log, name, robot, settings)[0]
+    ask = Excitation(offsets=sign * Chirp(length_s=length_s).samples(robot.policy_rate_hz))
+    log = synthetic_log(robot, name, [ask], *gains, threads=settings.threads)
+    return measured_joints(log, name, robot, settings)[0]
 
 
 def _found(
-    goal: Target,
+    goal: MeasuredJoint,
     truth: tuple[float, float],
     grid: GridSearch,
     fit: Fit,

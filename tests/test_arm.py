@@ -17,7 +17,7 @@ from pronk.match.arm.match import ArmMatch, drives_of, match_arm
 from pronk.match.arm.sample_mask import trusted_frequency, trusted_samples
 from pronk.match.predict import predict
 from pronk.robots import load_robot
-from pronk.simulators.chain import ArmBench, JointDrive, held_mean, moves_together
+from pronk.simulators.chain import ChainSimulation, JointDrive, held_mean, moves_together
 
 SO101 = Path(__file__).resolve().parents[2] / "shared" / "data" / "so101"
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the SO-101 recordings are not here")
@@ -61,7 +61,7 @@ def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) ->
 
 def answered(log: SweepLog, truth: dict[str, JointDrive]) -> SweepLog:
     """What an arm with these drives and 12-bit encoders would have recorded."""
-    with ArmBench(ARM, [log]) as bench:
+    with ChainSimulation(ARM, [log]) as bench:
         position = bench.run([truth])[0][0]
     return replace(log, position=np.round(position / COUNT) * COUNT)
 
@@ -102,7 +102,7 @@ def test_too_short_and_misspelled_are_refused() -> None:
 def test_still_arm_is_refused() -> None:
     log = commands(30.0, (0.2, 3.0), 0.0)
     with pytest.raises(LogError, match="asked to move in radians"):
-        ArmBench(ARM, [log])
+        ChainSimulation(ARM, [log])
 
 
 def test_held_mean_is_the_command_on_the_grid_and_its_share_off_it() -> None:
@@ -194,6 +194,6 @@ def test_matched_response_is_nearer_in_the_frequency_domain_too(matched: ArmMatc
 @recorded
 def test_jaw_is_included_once_its_travel_is_given() -> None:
     log = read_log(SO101 / "step_response", robot=ARM, scale={"gripper": 1.5})
-    with ArmBench(ARM, [log]) as bench:
+    with ChainSimulation(ARM, [log]) as bench:
         assert bench.joints == ARM.joint_names
         assert bench.excluded == {}

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import SweepLog
 from pronk.match.drive import match_drives
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
@@ -22,9 +22,12 @@ LATE_S = 0.004
 def sweep(joint: str, amplitudes: tuple[float, ...] = (0.25, 0.125)) -> SweepLog:
     """Known drive, two amplitudes of three repeats, 0.2 mrad of noise, answers 4 ms late."""
     rng = np.random.default_rng(3)
-    asks = [Ask(offsets=Chirp(length_s=12.0, amplitude=a).samples(), repeats=3) for a in amplitudes]
+    asks = [
+        Excitation(offsets=Chirp(length_s=12.0, amplitude=a).samples(), repeats=3)
+        for a in amplitudes
+    ]
     noise = [2e-4 * rng.standard_normal(8000) for _ in range(3 * len(asks))]
-    log = rehearse(
+    log = synthetic_log(
         ROBOT,
         joint,
         asks,

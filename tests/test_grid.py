@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError
 from pronk.excitation.signals import Chirp
 from pronk.match.grid import (
@@ -20,13 +21,12 @@ from pronk.match.grid import (
     search_all,
     weights,
 )
-from pronk.match.measured_joint import Target, merged, targets
+from pronk.match.measured_joint import MeasuredJoint, SimRequest, measured_joints, merged, responses
 from pronk.match.quick import quick_search
 from pronk.match.settings import MatchSettings
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot
-from pronk.simulators.batch import Job, Simulator
+from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = load_robot("mini_cheetah")
 SETTINGS = MatchSettings()
@@ -44,9 +44,13 @@ def truth(joint: str) -> tuple[float, float]:
     return TABLE_1[group][("FR", "FL", "HR", "HL").index(leg)]
 
 
-def known(joint: str, *, length_s: float = 20.0, settings: MatchSettings = SETTINGS) -> Target:
-    ask = Ask(offsets=Chirp(length_s=length_s).samples())
-    return targets(rehearse(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, settings)[0]
+def known(
+    joint: str, *, length_s: float = 20.0, settings: MatchSettings = SETTINGS
+) -> MeasuredJoint:
+    ask = Excitation(offsets=Chirp(length_s=length_s).samples())
+    return measured_joints(
+        synthetic_log(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, settings
+    )[0]
 
 
 def nearest(grid: GridSearch, gains: tuple[float, float]) -> tuple[int, int]:
@@ -67,7 +71,7 @@ def test_the_axes_are_those_of_the_paper() -> None:
 def test_table_1_is_found_again_by_every_joint() -> None:
     """12 of 12: the paper's gains as truth, a log without noise (the bars of the match)."""
     goals = [known(joint.name) for joint in ROBOT.joints]
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         found = quick_search(simulator, goals, *axes(ROBOT))
     for goal, one in zip(goals, found, strict=True):
         stiffness, damping = truth(goal.joint)
@@ -81,14 +85,14 @@ def test_table_1_is_found_again_by_every_joint() -> None:
 def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
     """All 2,500 pairs simulated, two mirror-image knees at once (a short chirp to 18 Hz)."""
     quick = MatchSettings(estimator=Estimator(segment_s=2.0))
-    ask = Ask(offsets=Chirp(length_s=4.0, stop_hz=18.0).samples(), settle_s=0.2)
+    ask = Excitation(offsets=Chirp(length_s=4.0, stop_hz=18.0).samples(), settle_s=0.2)
     goals = [
-        targets(rehearse(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, quick)[0]
+        measured_joints(synthetic_log(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, quick)[0]
         for joint in ("FR_knee", "HL_knee")
     ]
     assert len(alike(goals, ROBOT)) == 1
-    with Simulator(ROBOT) as simulator:
-        found = search(simulator.bench("FR_knee"), goals, *axes(ROBOT))
+    with MujocoSimulator(ROBOT) as simulator:
+        found = search(simulator.rig("FR_knee"), goals, *axes(ROBOT))
         assert simulator.count.steps == 2500 * max(goal.steps for goal in goals)
     for goal, one in zip(goals, found, strict=True):
         assert one.error.shape == (50, 50)
@@ -115,10 +119,10 @@ def test_rolls_asked_to_the_same_side_cost_one_simulation_and_a_look() -> None:
     goals = [known(joint, length_s=8.0) for joint in ("FR_hip_roll", "FL_hip_roll", "FR_knee")]
     grid = axes(ROBOT, 12)
     shares: list[float] = []
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         found = search_all(simulator, goals, *grid, progress=shares.append)
         steps = simulator.count.steps
-        whole = [search(simulator.bench(goal.joint), [goal], *grid)[0] for goal in goals]
+        whole = [search(simulator.rig(goal.joint), [goal], *grid)[0] for goal in goals]
     for fast, slow in zip(found, whole, strict=True):
         assert fast.cell == slow.cell
         assert fast.error_db == pytest.approx(slow.error_db, rel=1e-9)
@@ -129,11 +133,11 @@ def test_rolls_asked_to_the_same_side_cost_one_simulation_and_a_look() -> None:
 
 
 def test_the_edge_of_the_grid_is_noticed() -> None:
-    ask = Ask(offsets=Chirp(length_s=8.0).samples())
-    log = rehearse(ROBOT, "FR_knee", [ask], 32.0, 0.6)
-    goal = targets(log, "FR_knee", ROBOT, SETTINGS)[0]
-    with Simulator(ROBOT) as simulator:
-        found = search(simulator.bench("FR_knee"), [goal], *axes(ROBOT, 8))[0]
+    ask = Excitation(offsets=Chirp(length_s=8.0).samples())
+    log = synthetic_log(ROBOT, "FR_knee", [ask], 32.0, 0.6)
+    goal = measured_joints(log, "FR_knee", ROBOT, SETTINGS)[0]
+    with MujocoSimulator(ROBOT) as simulator:
+        found = search(simulator.rig("FR_knee"), [goal], *axes(ROBOT, 8))[0]
     assert found.at_edge
     assert found.gains[0] == 27.0
 
@@ -141,10 +145,10 @@ def test_the_edge_of_the_grid_is_noticed() -> None:
 def test_the_coarse_search_finds_the_best_of_the_whole_grid() -> None:
     goal = known("FR_knee", length_s=8.0)
     stiffness, damping = axes(ROBOT, 22)
-    with Simulator(ROBOT) as simulator:
-        bench = simulator.bench("FR_knee")
-        whole = search(bench, [goal], stiffness, damping)[0]
-        coarse = coarse_search(bench, [goal], stiffness, damping)[0]
+    with MujocoSimulator(ROBOT) as simulator:
+        rig = simulator.rig("FR_knee")
+        whole = search(rig, [goal], stiffness, damping)[0]
+        coarse = coarse_search(rig, [goal], stiffness, damping)[0]
     assert coarse.cell == whole.cell
     looked = np.isfinite(coarse.error)
     assert looked.mean() < 0.3
@@ -155,19 +159,19 @@ def test_without_rotor_inertia_no_pair_fits_a_knee() -> None:
     """Paper F13: the best error is at least five times the matched one."""
     goal = known("FR_knee", length_s=10.0)
     grid = axes(ROBOT)
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         matched = quick_search(simulator, [goal], *grid)[0]
-    with Simulator(ROBOT, armature=0.0) as simulator:
-        bench = simulator.bench("FR_knee")
-        assert bench.model.dof_armature[bench.index] == 0.0
-        zero = coarse_search(bench, [goal], *grid)[0]
+    with MujocoSimulator(ROBOT, armature=0.0) as simulator:
+        rig = simulator.rig("FR_knee")
+        assert rig.model.dof_armature[rig.index] == 0.0
+        zero = coarse_search(rig, [goal], *grid)[0]
     assert zero.error_db > 5.0 * matched.grid.error_db
     assert zero.error_db > 5.0
 
 
 def test_the_error_is_the_mean_square_in_decibels() -> None:
     goal = known("FR_hip_pitch", length_s=8.0)
-    measured = goal.measured.response[goal.inside]
+    measured = goal.measured.response[goal.fit_mask]
     flat = weights(goal, "none")
     assert flat.sum() == pytest.approx(1.0)
     assert mean_square(goal, measured * 10 ** (0.5 / 20), flat) == pytest.approx(0.25)
@@ -183,7 +187,7 @@ def test_the_error_is_the_mean_square_in_decibels() -> None:
 def test_coherence_weighs_doubtful_frequencies_down() -> None:
     goal = known("FR_hip_pitch", length_s=8.0)
     coherence = goal.measured.coherence.copy()
-    doubtful = np.nonzero(goal.inside)[0][:5]
+    doubtful = np.nonzero(goal.fit_mask)[0][:5]
     coherence[doubtful] = 0.85
     worse = replace(goal, measured=replace(goal.measured, coherence=coherence))
     weight = weights(worse, "coherence")
@@ -203,10 +207,12 @@ def test_the_band_is_that_of_the_joint() -> None:
 
 def test_an_incoherent_band_is_refused() -> None:
     rng = np.random.default_rng(0)
-    ask = Ask(offsets=Chirp(length_s=10.0, amplitude=0.02).samples())
-    log = rehearse(ROBOT, "FR_knee", [ask], 20.0, 0.5, noise=[0.1 * rng.standard_normal(20_000)])
+    ask = Excitation(offsets=Chirp(length_s=10.0, amplitude=0.02).samples())
+    log = synthetic_log(
+        ROBOT, "FR_knee", [ask], 20.0, 0.5, noise=[0.1 * rng.standard_normal(20_000)]
+    )
     with pytest.raises(IdentifiabilityError, match=r"FR_knee is coherent .* larger amplitude"):
-        targets(log, "FR_knee", ROBOT, SETTINGS)
+        measured_joints(log, "FR_knee", ROBOT, SETTINGS)
 
 
 def test_repeats_in_several_logs_are_put_together() -> None:
@@ -228,9 +234,9 @@ def test_repeats_in_several_logs_are_put_together() -> None:
 
 def test_whole_and_banded_answers_agree() -> None:
     goal = known("FL_hip_roll", length_s=8.0)
-    with Simulator(ROBOT) as simulator:
-        job = Job(goal, *truth("FL_hip_roll"))
-        whole = simulator.responses([job], whole=True)[0]
-        banded = simulator.responses([job])[0]
+    with MujocoSimulator(ROBOT) as simulator:
+        request = SimRequest(goal, *truth("FL_hip_roll"))
+        whole = responses(simulator, [request], whole=True)[0]
+        banded = responses(simulator, [request])[0]
     np.testing.assert_allclose(whole, goal.measured.response, rtol=1e-6)
-    np.testing.assert_allclose(banded, whole[goal.inside], rtol=1e-3)
+    np.testing.assert_allclose(banded, whole[goal.fit_mask], rtol=1e-3)

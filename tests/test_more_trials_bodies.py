@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
 from pronk.evaluation import variation
@@ -24,7 +25,6 @@ from pronk.evaluation.variation import AS_IT_IS, Parameter, add_variation
 from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
 from pronk.runtime.script import Script
 from pronk.virtual.robot import VirtualRobot
@@ -90,7 +90,9 @@ def test_drawn_bodies_can_exist(seed: int) -> None:
 def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
     sim_params = (20.6, 0.492)
     logs = [
-        rehearse(ROBOT, "FR_hip_roll", [Ask(offsets=Chirp(length_s=8.0).samples())], *sim_params)
+        synthetic_log(
+            ROBOT, "FR_hip_roll", [Excitation(offsets=Chirp(length_s=8.0).samples())], *sim_params
+        )
     ]
     naive = {"FR_hip_roll": (17.0, 0.4)}
     found = bode_errors(

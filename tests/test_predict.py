@@ -14,7 +14,7 @@ from pronk.match.gains import JointGains, MatchedGains, Simulator
 from pronk.match.predict import predict
 from pronk.match.prediction import r2, rmse
 from pronk.robots import load_robot
-from pronk.simulators.command_trace import question
+from pronk.simulators.command_trace import command_trace
 from pronk.simulators.mujoco import simulate
 
 ROBOT = load_robot("mini_cheetah")
@@ -82,7 +82,7 @@ def chirp_log(late_ticks: int = 0) -> SweepLog:
     )
     for segment in segments:
         name = segment.joints[0]
-        asked = question(log, segment, name, ROBOT)
+        asked = command_trace(log, segment, name, ROBOT)
         steps = late_ticks * ROBOT.decimation
         if steps:
             held = np.concatenate([np.full(steps, asked.command[0]), asked.command[:-steps]])

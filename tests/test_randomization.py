@@ -22,7 +22,7 @@ from pronk.match.gains import GroupGains
 from pronk.robots import load_robot
 from pronk.robots.mini_cheetah import constants as c
 from pronk.robots.model import bench_spec
-from pronk.simulators.command_trace import Question
+from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
 from pronk.train.gains import TrainingGains, training_gains
 
@@ -182,7 +182,7 @@ def test_training_answers_the_chirp_that_was_matched(joint: str, delay: int) -> 
     offset = 0.25 * chirp(ticks, 0.1, ticks[-1], 15.0, phi=-90)
     default = CHEETAH.joint(joint).default_position
     held = np.repeat(offset, CHEETAH.decimation)
-    question = Question(
+    question = CommandTrace(
         joint=joint,
         start=0.0,
         timestep=CHEETAH.timestep_s,

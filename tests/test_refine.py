@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from benchmarks.engine import engine_gap
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError
 from pronk.excitation.signals import Chirp
 from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
-from pronk.match.engine import engine_gap
 from pronk.match.interval import interval, measurement_error_db
-from pronk.match.measured_joint import Target, targets
+from pronk.match.measured_joint import MeasuredJoint, measured_joints
 from pronk.match.refine import refine
 from pronk.match.settings import MatchSettings
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimate import operators
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot
-from pronk.simulators.batch import Simulator
+from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = load_robot("mini_cheetah")
 SETTINGS = MatchSettings()
@@ -45,16 +45,16 @@ def known(
     length_s: float = 8.0,
     settings: MatchSettings = SHORT,
     **more: object,
-) -> Target:
-    ask = Ask(offsets=Chirp(length_s=length_s).samples())
-    log = rehearse(ROBOT, joint, [ask], *truth, **more)  # type: ignore[arg-type]
-    return targets(log, joint, ROBOT, settings)[0]
+) -> MeasuredJoint:
+    ask = Excitation(offsets=Chirp(length_s=length_s).samples())
+    log = synthetic_log(ROBOT, joint, [ask], *truth, **more)  # type: ignore[arg-type]
+    return measured_joints(log, joint, ROBOT, settings)[0]
 
 
 def test_it_comes_back_to_the_truth_from_anywhere_on_the_grid() -> None:
     goals = [known(), known("FR_knee", (22.0, 0.523))]
     truths = [TRUTH, (22.0, 0.523)]
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         for start in ((13.0, 0.1), (27.0, 0.7), (13.0, 0.7), (27.0, 0.1)):
             for fit, truth in zip(refine(simulator, goals, [start, start]), truths, strict=True):
                 assert fit.settled
@@ -70,11 +70,11 @@ def test_intervals_cover_the_truth_under_coloured_noise() -> None:
     """
     rng = np.random.default_rng(2)
     trials, repeats, deviation = 200, 3, 0.003
-    ask = Ask(offsets=Chirp(length_s=8.0).samples(), repeats=repeats)
+    ask = Excitation(offsets=Chirp(length_s=8.0).samples(), repeats=repeats)
     clean = known()
     noise = list(coloured(rng, (repeats, 6000), deviation))
-    log = rehearse(ROBOT, JOINT, [ask], *TRUTH, noise=noise)
-    measured = targets(log, JOINT, ROBOT, SHORT)[0]
+    log = synthetic_log(ROBOT, JOINT, [ask], *TRUTH, noise=noise)
+    measured = measured_joints(log, JOINT, ROBOT, SHORT)[0]
     operator = operators(log, JOINT, SHORT.estimator)[0][0]
     shaken = operator.apply(coloured(rng, (trials, repeats, len(operator.time)), deviation))
     answers = clean.measured.response + shaken
@@ -85,7 +85,7 @@ def test_intervals_cover_the_truth_under_coloured_noise() -> None:
         )
         for answer in answers
     ]
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         fits = refine(simulator, goals, [TRUTH] * trials)
     covered = np.zeros(2)
     gains = np.empty((trials, 2))
@@ -112,7 +112,7 @@ def test_each_repeat_is_fitted_by_itself() -> None:
         each[0],
         measured=replace(each[0].measured, response=responses.mean(axis=0), repeats=responses),
     )
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         fit = refine(simulator, [both], [(17.0, 0.4)])[0]
     bounds = interval(fit)
     np.testing.assert_allclose(bounds.repeat_gains, others, rtol=1e-3)
@@ -129,12 +129,12 @@ def test_the_bootstrap_agrees_with_student_and_refuses_few_repeats() -> None:
     scale = 1.0 + 0.02 * rng.standard_normal(18)
     answers = base.measured.response * scale[:, None]
 
-    def repeated(count: int) -> Target:
+    def repeated(count: int) -> MeasuredJoint:
         some = answers[:count]
         measured = replace(base.measured, response=some.mean(axis=0), repeats=some)
         return replace(base, measured=measured)
 
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         many, few = refine(simulator, [repeated(18), repeated(3)], [TRUTH, TRUTH])
     student, bootstrap = interval(many), interval(many, method="bootstrap")
     for i in range(2):
@@ -148,11 +148,13 @@ def test_the_bootstrap_agrees_with_student_and_refuses_few_repeats() -> None:
 
 def test_few_repeats_say_so() -> None:
     rng = np.random.default_rng(3)
-    ask = Ask(offsets=Chirp(length_s=8.0).samples(), repeats=2)
-    log = rehearse(ROBOT, JOINT, [ask], *TRUTH, noise=list(0.002 * rng.standard_normal((2, 6000))))
-    two = targets(log, JOINT, ROBOT, SHORT)[0]
+    ask = Excitation(offsets=Chirp(length_s=8.0).samples(), repeats=2)
+    log = synthetic_log(
+        ROBOT, JOINT, [ask], *TRUTH, noise=list(0.002 * rng.standard_normal((2, 6000)))
+    )
+    two = measured_joints(log, JOINT, ROBOT, SHORT)[0]
     one = replace(two, measured=replace(two.measured, repeats=two.measured.repeats[:1]))
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         fits = refine(simulator, [two, one], [TRUTH, TRUTH])
     assert interval(fits[0]).flags[0].startswith("two repeats")
     bounds = interval(fits[1])
@@ -173,7 +175,7 @@ def test_a_delay_is_found_in_the_phase_and_disregarded_in_the_gain() -> None:
             response=goal.measured.response * np.exp(-1j * goal.measured.omega * 0.004),
         ),
     )
-    with Simulator(ROBOT) as simulator:
+    with MujocoSimulator(ROBOT) as simulator:
         gain_only = refine(simulator, [late], [(18.0, 0.45)])[0]
         with_phase = refine(simulator, [late], [(18.0, 0.45)], use_phase=True)[0]
     for fit in (gain_only, with_phase):
@@ -183,12 +185,12 @@ def test_a_delay_is_found_in_the_phase_and_disregarded_in_the_gain() -> None:
 
 
 def test_friction_that_the_simulator_lacks_shows_between_amplitudes() -> None:
-    asks = [Ask(offsets=Chirp(length_s=8.0, amplitude=a).samples()) for a in (0.25, 0.1)]
+    asks = [Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples()) for a in (0.25, 0.1)]
     for friction, flagged in ((0.2, False), (0.8, True)):
-        log = rehearse(ROBOT, "FR_knee", asks, 20.0, 0.5, frictionloss=friction)
-        goals = targets(log, "FR_knee", ROBOT, SHORT)
+        log = synthetic_log(ROBOT, "FR_knee", asks, 20.0, 0.5, frictionloss=friction)
+        goals = measured_joints(log, "FR_knee", ROBOT, SHORT)
         assert [round(goal.measured.amplitude, 3) for goal in goals] == [0.25, 0.1]
-        with Simulator(ROBOT) as simulator:
+        with MujocoSimulator(ROBOT) as simulator:
             gains = amplitude_gains(refine(simulator, goals, [(20.0, 0.5)] * 2))
         assert gains[:, 0] == pytest.approx([0.25, 0.1], rel=1e-3)
         flags = amplitude_flags(gains)

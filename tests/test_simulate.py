@@ -11,23 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import LogError
 from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import Segment, SweepLog
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import Question, policy_clock, question
-from pronk.simulators.mujoco import Bench, simulate
+from pronk.simulators.command_trace import CommandTrace, command_trace, policy_clock
+from pronk.simulators.mujoco import JointTestRig, simulate
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
 
 
-def ask(joint: str, offsets: np.ndarray, robot: Robot = ROBOT) -> Question:
+def ask(joint: str, offsets: np.ndarray, robot: Robot = ROBOT) -> CommandTrace:
     centre = robot.joint(joint).default_position
-    return Question(
+    return CommandTrace(
         joint=joint,
         start=0.0,
         timestep=robot.timestep_s,
@@ -100,10 +100,10 @@ def test_a_mirrored_joint_is_simulated_by_its_original() -> None:
 def test_chunks_and_company_change_nothing() -> None:
     asked = ask("FR_hip_pitch", short_chirp())
     stiffness, damping = np.linspace(14, 26, 7), np.linspace(0.2, 0.6, 7)
-    with Bench(ROBOT, "FR_hip_pitch", chunk=3) as bench:
+    with JointTestRig(ROBOT, "FR_hip_pitch", chunk=3) as rig:
         command = asked.mirrored(ROBOT)[2]
         found = np.empty((7, len(command)))
-        for part, position in bench.run([command], [bench.pose(asked)], stiffness, damping):
+        for part, position in rig.run([command], [rig.pose(asked)], stiffness, damping):
             found[part] = position
     one = simulate(ROBOT, asked, stiffness[4], damping[4], threads=1)[0]
     centre = ROBOT.joint("FR_hip_pitch").default_position
@@ -150,7 +150,7 @@ def test_jitter_does_not_move_a_tick(seed: int, offset: float, rate: float) -> N
     exact = offset + np.arange(int(2.0 * rate)) / rate
     command = ticks[np.minimum(((exact - offset) / 0.02 + 1e-6).astype(int), 99)]
     log = log_of(exact + 50e-6 * rng.uniform(-1, 1, len(exact)), command)
-    asked = question(log, log.segments[0], "FR_knee", ROBOT)
+    asked = command_trace(log, log.segments[0], "FR_knee", ROBOT)
     assert asked.policy_held
     assert len(asked.command) >= 395
     np.testing.assert_array_equal(asked.command, np.repeat(ticks, 4)[: len(asked.command)])
@@ -163,7 +163,7 @@ def test_questions_are_alike_whatever_tick_the_log_caught_first() -> None:
     asked = []
     for caught in (0, 7, 13):
         log = log_of(0.002 * np.arange(len(held))[caught:], held[caught:])
-        asked.append(question(log, log.segments[0], "FR_knee", ROBOT))
+        asked.append(command_trace(log, log.segments[0], "FR_knee", ROBOT))
     assert asked[0].same_as(asked[1], ROBOT)
     assert asked[0].same_as(asked[2], ROBOT)
     longer = replace(asked[0], command=np.append(asked[0].command, np.full(8, 1.6)))
@@ -187,7 +187,7 @@ def test_a_command_off_the_policy_clock_is_held_step_by_step() -> None:
     time_ = np.arange(0.0, 4.0, 0.002)
     command = 1.6 + 0.2 * np.sin(2 * np.pi * np.floor(time_ / 0.033) * 0.033)
     log = log_of(time_, command)
-    asked = question(log, log.segments[0], "FR_knee", ROBOT)
+    asked = command_trace(log, log.segments[0], "FR_knee", ROBOT)
     assert not asked.policy_held
     middle = asked.time + 0.0025
     inside = middle < time_[-1]
@@ -208,9 +208,9 @@ def test_a_question_that_cannot_be_asked_is_refused() -> None:
     command = 1.6 + 0.2 * np.sin(time_)
     log = log_of(time_, command)
     with pytest.raises(LogError, match=r"FR_hip_roll is not asked .* FR_knee are"):
-        question(log, log.segments[0], "FR_hip_roll", ROBOT)
+        command_trace(log, log.segments[0], "FR_hip_roll", ROBOT)
     with pytest.raises(LogError, match="unit 'unknown'; the simulator needs radians"):
-        question(log_of(time_, command, units=("unknown",)), log.segments[0], "FR_knee", ROBOT)
+        command_trace(log_of(time_, command, units=("unknown",)), log.segments[0], "FR_knee", ROBOT)
     wide = replace(
         log,
         joints=("FR_knee", "FR_hip_pitch"),
@@ -219,14 +219,14 @@ def test_a_question_that_cannot_be_asked_is_refused() -> None:
         pose=np.array([1.6, 0.0]),
     )
     with pytest.raises(LogError, match=r"FR_hip_pitch was clamped at 0\.000 rad .* clamps it at"):
-        question(wide, wide.segments[0], "FR_knee", ROBOT)
+        command_trace(wide, wide.segments[0], "FR_knee", ROBOT)
 
 
 def test_a_rehearsal_is_the_simulation_with_the_truth() -> None:
-    log = rehearse(ROBOT, "FR_knee", [Ask(offsets=short_chirp(), repeats=2)], 21.0, 0.5)
+    log = synthetic_log(ROBOT, "FR_knee", [Excitation(offsets=short_chirp(), repeats=2)], 21.0, 0.5)
     first, second = log.segments
     assert (first.repeat, second.repeat) == (0, 1)
-    asked = question(log, second, "FR_knee", ROBOT)
+    asked = command_trace(log, second, "FR_knee", ROBOT)
     position = simulate(ROBOT, asked, 21.0, 0.5)[0]
     # Steps of 5 ms and samples of 2 ms meet every 10 ms; between them the log is interpolated.
     both = slice(20, -10, 2)

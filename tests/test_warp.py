@@ -1,4 +1,4 @@
-"""The bench in MuJoCo Warp: the same positions, the same cell, on Warp's CPU device."""
+"""The rig in MuJoCo Warp: the same positions, the same cell, on Warp's CPU device."""
 
 from __future__ import annotations
 
@@ -11,17 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
 from pronk.match.grid import search
-from pronk.match.measured_joint import targets
+from pronk.match.measured_joint import measured_joints
 from pronk.match.settings import MatchSettings
-from pronk.match.synthetic_log import Ask, rehearse
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot
-from pronk.simulators.batch import Simulator
-from pronk.simulators.device import DEVICES, bench_on
-from pronk.simulators.mujoco import Bench
+from pronk.simulators.mujoco import DEVICES, JointTestRig, MujocoSimulator, rig_on
 
 Array = NDArray[np.float64]
 
@@ -36,17 +34,17 @@ ROUNDING = 2e-5
 @contextmanager
 def both(
     joint: str, *, least: int = 1, frictionloss: float | None = None
-) -> Iterator[tuple[Bench, Bench]]:
-    make = bench_on("warp-cpu")
+) -> Iterator[tuple[JointTestRig, JointTestRig]]:
+    make = rig_on("warp-cpu")
     with (
-        Bench(ROBOT, joint, frictionloss=frictionloss) as known,
+        JointTestRig(ROBOT, joint, frictionloss=frictionloss) as known,
         make(ROBOT, joint, frictionloss=frictionloss, least=least) as warped,
     ):
         yield known, warped
 
 
-def default_pose(bench: Bench) -> Array:
-    return np.array([ROBOT.joint(name).default_position for name in bench.chain])
+def default_pose(rig: JointTestRig) -> Array:
+    return np.array([ROBOT.joint(name).default_position for name in rig.chain])
 
 
 def command(length_s: float, amplitude: float = 0.25) -> Array:
@@ -54,9 +52,9 @@ def command(length_s: float, amplitude: float = 0.25) -> Array:
     return np.repeat(np.concatenate([np.zeros(5), ticks]), 4)
 
 
-def positions(bench: Bench, commands: list[Array], poses: list[Array], rows: int = 5) -> Array:
+def positions(rig: JointTestRig, commands: list[Array], poses: list[Array], rows: int = 5) -> Array:
     out = np.full((rows, len(commands[0])), np.nan)
-    for part, position in bench.run(commands, poses, STIFFNESS[:rows], DAMPING[:rows]):
+    for part, position in rig.run(commands, poses, STIFFNESS[:rows], DAMPING[:rows]):
         out[part] = position
     return out
 
@@ -104,16 +102,16 @@ def test_few_simulations_stay_in_double_precision() -> None:
 def test_the_grid_finds_the_same_cell(joint: str) -> None:
     """225 nodes, a step of the paper's grid apart, the truth between them."""
     pytest.importorskip("mujoco_warp")
-    asked = Ask(offsets=Chirp(length_s=4.0).samples())
-    log = rehearse(ROBOT, joint, [asked], 20.6, 0.492)
+    asked = Excitation(offsets=Chirp(length_s=4.0).samples())
+    log = synthetic_log(ROBOT, joint, [asked], 20.6, 0.492)
     settings = MatchSettings(estimator=Estimator(segment_s=2.0))
-    goal = targets(log, joint, ROBOT, settings)[0]
+    goal = measured_joints(log, joint, ROBOT, settings)[0]
     stiffness = 20.6 + 14.0 / 49.0 * (np.arange(15) - 6.3)
     damping = 0.492 + 0.6 / 49.0 * (np.arange(15) - 7.4)
     grids = []
     for device in ("cpu", "warp-cpu"):
-        with Simulator(ROBOT, device=device) as simulator:
-            grids.append(search(simulator.bench(joint), [goal], stiffness, damping)[0])
+        with MujocoSimulator(ROBOT, device=device) as simulator:
+            grids.append(search(simulator.rig(joint), [goal], stiffness, damping)[0])
     known, warped = (np.sqrt(grid.error) for grid in grids)
     assert grids[0].cell == grids[1].cell
     assert not grids[0].at_edge
@@ -128,15 +126,15 @@ def test_a_missing_gpu_is_refused_in_one_sentence() -> None:
     if wp.is_cuda_available():
         pytest.skip("this machine has a GPU")
     with pytest.raises(PronkError, match="no CUDA device was found"):
-        Simulator(ROBOT, device="cuda")
+        MujocoSimulator(ROBOT, device="cuda")
 
 
 def test_a_missing_extra_is_refused_in_one_sentence() -> None:
     code = (
         "import sys; sys.modules['mujoco_warp'] = None\n"
         "from pronk.errors import PronkError\n"
-        "from pronk.simulators.device import bench_on\n"
-        "try: bench_on('cuda')\n"
+        "from pronk.simulators.mujoco import rig_on\n"
+        "try: rig_on('cuda')\n"
         "except PronkError as error: print(error)"
     )
     said = subprocess.run(
@@ -148,7 +146,7 @@ def test_a_missing_extra_is_refused_in_one_sentence() -> None:
 
 def test_an_unknown_device_is_refused() -> None:
     with pytest.raises(PronkError, match="expected one of cpu, cuda, warp-cpu"):
-        bench_on("tpu")
+        rig_on("tpu")
     with pytest.raises(PronkError, match="expected one of cpu, cuda, warp-cpu"):
         MatchSettings(device="tpu")
     assert MatchSettings().device == DEVICES[0]

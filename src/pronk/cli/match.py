@@ -80,7 +80,7 @@ def match(
 ) -> None:
     """Find the gains that make the simulator answer like the robot."""
     from pronk.match.drive import match_drives
-    from pronk.match.drive_parameters import DRIVE_MODE
+    from pronk.match.parameters import DRIVE_MODE
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.robots import load_robot

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pronk.match.grid import GridSearch
 from pronk.match.interval import measurement_error_db
-from pronk.match.measured_joint import Target
+from pronk.match.measured_joint import MeasuredJoint
 from pronk.match.refine import Fit
 from pronk.match.settings import MatchSettings
 
@@ -22,7 +22,9 @@ NO_ARMATURE_RATIO = 5.0
 """Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
 
 
-def doubts(goal: Target, fit: Fit, grid: GridSearch, settings: MatchSettings) -> Iterator[str]:
+def doubts(
+    goal: MeasuredJoint, fit: Fit, grid: GridSearch, settings: MatchSettings
+) -> Iterator[str]:
     """What speaks against the optimum."""
     limit = no_match_db(fit, settings)
     if not fit.error_db <= limit:
@@ -36,7 +38,7 @@ def doubts(goal: Target, fit: Fit, grid: GridSearch, settings: MatchSettings) ->
         )
     if not fit.settled:
         yield "the refinement did not settle; take the gains of the grid"
-    if not goal.question.policy_held:
+    if not goal.trace.policy_held:
         yield "the command does not change at the policy's rate; each physics step holds its own"
 
 
@@ -45,9 +47,9 @@ def no_match_db(fit: Fit, settings: MatchSettings) -> float:
     return max(NO_MATCH_DB, NO_MATCH_INTERVALS * measurement_error_db(fit, level=settings.level))
 
 
-def missing(goal: Target, band: NDArray[np.bool_]) -> Iterator[str]:
+def missing(goal: MeasuredJoint, band: NDArray[np.bool_]) -> Iterator[str]:
     """Frequencies of the band that the fit did not look at."""
-    left, whole = int(band.sum()) - int(goal.inside.sum()), int(band.sum())
+    left, whole = int(band.sum()) - int(goal.fit_mask.sum()), int(band.sum())
     if left:
         yield f"{left} of {whole} frequencies left out for low coherence"
 

@@ -19,17 +19,24 @@ from scipy.optimize import least_squares
 
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.logs.joint_log import SweepLog
-from pronk.match.drive_parameters import DRIVE_MODE, KINDS, gains_covariance
 from pronk.match.gains import JointGains
 from pronk.match.identifiability import EXPERIMENTS, bench_experiment, require_identifiable
-from pronk.match.measured_joint import DB, Target, gains_on_drive, logs_by_joint, merged, targets
+from pronk.match.measured_joint import (
+    DB,
+    MeasuredJoint,
+    gains_on_drive,
+    logs_by_joint,
+    measured_joints,
+    merged,
+)
+from pronk.match.parameters import DRIVE_MODE, KINDS, gains_covariance
 from pronk.match.ranges import matched_gains
 from pronk.match.refine import residual_db
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
 from pronk.robots.model import set_passive
 from pronk.robots.robot import Robot
-from pronk.simulators.mujoco import Bench
+from pronk.simulators.mujoco import JointTestRig
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -57,10 +64,10 @@ class DriveFit:
     flags: tuple[str, ...] = ()
 
 
-class _DriveBench(Bench):
-    """A bench whose simulations differ in armature and friction too."""
+class _DriveRig(JointTestRig):
+    """A rig whose simulations differ in armature and friction too."""
 
-    def answer(self, goal: Target, drives: Sequence[Mapping[str, float]]) -> ComplexArray:
+    def answer(self, goal: MeasuredJoint, drives: Sequence[Mapping[str, float]]) -> ComplexArray:
         """Whole responses of a target, the delay included, shape (drives, f)."""
         while len(self._models) < len(drives):
             self._models.append(copy.copy(self.model))
@@ -71,13 +78,13 @@ class _DriveBench(Bench):
                 armature=drive["armature"],
                 frictionloss=drive["frictionloss"],
             )
-        command = goal.question.mirrored(self.robot)[2]
+        command = goal.trace.mirrored(self.robot)[2]
         stiffness = np.array([drive["stiffness"] for drive in drives])
         damping = np.array([drive["damping"] for drive in drives])
         late = np.array([drive["delay"] for drive in drives])
-        ((_, position),) = self.run([command], [self.pose(goal.question)], stiffness, damping)
+        ((_, position),) = self.run([command], [self.pose(goal.trace)], stiffness, damping)
         turned = np.exp(-1j * late[:, None] * goal.measured.omega)
-        return np.asarray(goal.whole_answer(position) * turned)
+        return np.asarray(goal.full_response(position) * turned)
 
 
 def match_drives(
@@ -111,7 +118,7 @@ def match_drives(
     told = progress or (lambda _stage, _share: None)
     where = logs_by_joint(logs, robot)
     asked = {
-        name: merged([targets(log, name, robot, chosen) for log in sources])
+        name: merged([measured_joints(log, name, robot, chosen) for log in sources])
         for name, sources in where.items()
     }
     names = tuple(name for name in FREE if name in free)
@@ -131,7 +138,9 @@ def match_drives(
     )
 
 
-def _require(robot: Robot, joint: str, goals: Sequence[Target], free: tuple[str, ...]) -> None:
+def _require(
+    robot: Robot, joint: str, goals: Sequence[MeasuredJoint], free: tuple[str, ...]
+) -> None:
     """Refuse what these sweeps cannot tell apart, before anything is fitted."""
     first, nominal = bench_experiment(robot, joint)
     experiments = [
@@ -152,7 +161,7 @@ def _require(robot: Robot, joint: str, goals: Sequence[Target], free: tuple[str,
 
 def fit_drive(
     robot: Robot,
-    goals: Sequence[Target],
+    goals: Sequence[MeasuredJoint],
     on_drive: tuple[float, float],
     free: tuple[str, ...],
     settings: MatchSettings,
@@ -186,15 +195,15 @@ def fit_drive(
         }
         return {**known, **found}
 
-    with _DriveBench(robot, joint.original[0], threads=settings.threads) as bench:
+    with _DriveRig(robot, joint.original[0], threads=settings.threads) as rig:
 
         def rows(x: Array) -> tuple[Array, Array]:
             """Weighted residuals and their Jacobian by forward differences."""
             points = [x, *(x + np.diag(steps))]
             parts = []
             for goal in goals:
-                answers = bench.answer(goal, [drive(point) for point in points])[:, goal.inside]
-                measured = goal.measured.response[goal.inside]
+                answers = rig.answer(goal, [drive(point) for point in points])[:, goal.fit_mask]
+                measured = goal.measured.response[goal.fit_mask]
                 parts.append(residual_db(goal, answers, measured, True) * _weight(goal))
             every = np.concatenate(parts, axis=1)
             return every[0], ((every[1:] - every[0]) / steps[:, None]).T
@@ -231,7 +240,7 @@ def fit_drive(
             ftol=1e-8,
         )
         best = drive(found.x)
-        matched, naive = bench.answer(goals[0], [best, known])
+        matched, naive = rig.answer(goals[0], [best, known])
     scale = np.array([kind.slope(float(v)) for kind, v in zip(kinds, found.x, strict=True)])
     covariance, freedom = _covariance(goals, np.asarray(found.jac))
     deviation = np.sqrt(np.diag(covariance))
@@ -264,12 +273,12 @@ def fit_drive(
     )
 
 
-def _weight(goal: Target) -> Array:
+def _weight(goal: MeasuredJoint) -> Array:
     """Weight of gain and of phase at each frequency [1/dB], shape (2 inside,)."""
     return np.tile(1.0 / goal.deviation_db(), 2)
 
 
-def _covariance(goals: Sequence[Target], jacobian: Array) -> tuple[Array, int]:
+def _covariance(goals: Sequence[MeasuredJoint], jacobian: Array) -> tuple[Array, int]:
     """Covariance of the searched numbers from the scatter over repeats, and its freedom.
 
     Every repeat of every amplitude moves the optimum by `(J^T J)^-1 J^T` times what it differs
@@ -280,13 +289,13 @@ def _covariance(goals: Sequence[Target], jacobian: Array) -> tuple[Array, int]:
     freedom = 0
     begin = 0
     for goal in goals:
-        count, width = len(goal.measured.repeats), 2 * int(goal.inside.sum())
+        count, width = len(goal.measured.repeats), 2 * int(goal.fit_mask.sum())
         part = influence[:, begin : begin + width]
         begin += width
         if count < 2:
             continue
-        mean = goal.measured.response[goal.inside]
-        change = residual_db(goal, goal.measured.repeats[:, goal.inside], mean, True)
+        mean = goal.measured.response[goal.fit_mask]
+        change = residual_db(goal, goal.measured.repeats[:, goal.fit_mask], mean, True)
         moved = (change * _weight(goal)) @ part.T
         covariance += np.atleast_2d(np.cov(moved.T, ddof=1)) / count
         freedom += count - 1
@@ -294,13 +303,13 @@ def _covariance(goals: Sequence[Target], jacobian: Array) -> tuple[Array, int]:
 
 
 def _artefacts(
-    robot: Robot, goal: Target, goals: Sequence[Target], fit: DriveFit
+    robot: Robot, goal: MeasuredJoint, goals: Sequence[MeasuredJoint], fit: DriveFit
 ) -> tuple[JointMatch, JointGains]:
     """One joint's fit as the artefacts have it; there is no grid."""
     joint, values = robot.joint(goal.joint), fit.values
     covariance = gains_covariance(fit.fitted, fit.covariance)
     errors = [
-        float(np.sqrt(np.mean(goal.error_db(answer[goal.inside]) ** 2)))
+        float(np.sqrt(np.mean(goal.error_db(answer[goal.fit_mask]) ** 2)))
         for answer in (fit.matched, fit.naive)
     ]
     band = goal.measured.band(*joint.band_hz)

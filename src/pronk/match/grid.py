@@ -17,10 +17,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.measured_joint import Target
+from pronk.match.measured_joint import MeasuredJoint
 from pronk.robots.robot import Robot
-from pronk.simulators.batch import Simulator
-from pronk.simulators.mujoco import Bench
+from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
 
 Array = NDArray[np.float64]
 
@@ -72,26 +71,26 @@ def axes(robot: Robot, points: int = 50) -> tuple[Array, Array]:
     return np.linspace(*robot.grid_stiffness, points), np.linspace(*robot.grid_damping, points)
 
 
-def weights(goal: Target, weighting: Literal["none", "coherence"]) -> Array:
+def weights(goal: MeasuredJoint, weighting: Literal["none", "coherence"]) -> Array:
     """Weights of the frequencies inside the band, summing to one, shape (inside,)."""
-    count = int(goal.inside.sum())
+    count = int(goal.fit_mask.sum())
     raw = np.ones(count) if weighting == "none" else goal.deviation_db() ** -2.0
     return np.asarray(raw / raw.sum())
 
 
-def mean_square(goal: Target, simulated: NDArray[np.complex128], weight: Array) -> Array:
+def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128], weight: Array) -> Array:
     """Weighted mean square of the gain error [dB^2], shape (...), for (..., inside)."""
     error = goal.error_db(simulated)
     error = np.where(np.isfinite(error), np.clip(error, -DIVERGED_DB, DIVERGED_DB), DIVERGED_DB)
     return np.asarray(error**2 @ weight)
 
 
-def alike(targets: Sequence[Target], robot: Robot) -> list[list[Target]]:
+def alike(targets: Sequence[MeasuredJoint], robot: Robot) -> list[list[MeasuredJoint]]:
     """Targets gathered by simulation: mirror-image joints asked alike share one."""
-    groups: list[list[Target]] = []
+    groups: list[list[MeasuredJoint]] = []
     for goal in targets:
         for group in groups:
-            if group[0].question.same_as(goal.question, robot):
+            if group[0].trace.same_as(goal.trace, robot):
                 group.append(goal)
                 break
         else:
@@ -100,8 +99,8 @@ def alike(targets: Sequence[Target], robot: Robot) -> list[list[Target]]:
 
 
 def errors(
-    bench: Bench,
-    group: Sequence[Target],
+    rig: JointTestRig,
+    group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
     weighting: Literal["none", "coherence"] = "none",
@@ -110,7 +109,7 @@ def errors(
     """Mean squared errors of several targets that share one simulation.
 
     Args:
-        bench: The bench of the group's original joint.
+        rig: The rig of the group's original joint.
         group: Targets whose questions are the same after mirroring.
         stiffness: [N m/rad], shape (b,).
         damping: [N m s/rad], shape (b,).
@@ -122,25 +121,25 @@ def errors(
     """
     # One may rest longer than the others at the end.
     question = max(
-        (g.question for g in group if g.question.same_as(group[0].question, bench.robot)),
+        (g.trace for g in group if g.trace.same_as(group[0].trace, rig.robot)),
         key=lambda one: len(one.command),
     )
-    command = question.mirrored(bench.robot)[2]
+    command = question.mirrored(rig.robot)[2]
     steps = max(goal.steps for goal in group)
     command = np.pad(command, (0, max(0, steps - len(command))), mode="edge")
     weight = [weights(goal, weighting) for goal in group]
     out = np.empty((len(group), len(stiffness)))
-    for part, position in bench.run([command[:steps]], [bench.pose(question)], stiffness, damping):
+    for part, position in rig.run([command[:steps]], [rig.pose(question)], stiffness, damping):
         for k, goal in enumerate(group):
-            out[k, part] = mean_square(goal, goal.answer(position), weight[k])
+            out[k, part] = mean_square(goal, goal.fit_response(position), weight[k])
         if progress is not None:
             progress(part.stop / len(stiffness))
     return out
 
 
 def search(
-    bench: Bench,
-    group: Sequence[Target],
+    rig: JointTestRig,
+    group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
     weighting: Literal["none", "coherence"] = "none",
@@ -149,7 +148,7 @@ def search(
     """Simulate the whole grid for targets that share one simulation.
 
     Args:
-        bench: The bench of the group's original joint.
+        rig: The rig of the group's original joint.
         group: Targets whose questions are the same after mirroring.
         stiffness: Axis [N m/rad], shape (a,).
         damping: Axis [N m s/rad], shape (b,).
@@ -158,15 +157,15 @@ def search(
     """
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
     shape = (len(stiffness), len(damping))
-    found = errors(bench, group, kp, kd, weighting, progress)
+    found = errors(rig, group, kp, kd, weighting, progress)
     return [
         GridSearch(stiffness=stiffness, damping=damping, error=row.reshape(shape)) for row in found
     ]
 
 
 def search_all(
-    simulator: Simulator,
-    targets: Sequence[Target],
+    simulator: MujocoSimulator,
+    targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
     weighting: Literal["none", "coherence"] = "none",
@@ -192,34 +191,34 @@ def search_all(
         One search a target, in their order.
     """
     robot = simulator.robot
-    families: list[list[list[Target]]] = []
+    families: list[list[list[MeasuredJoint]]] = []
     for group in alike(targets, robot):
         for family in families:
-            if family[0][0].question.same_as(group[0].question, robot, sign=-1.0):
+            if family[0][0].trace.same_as(group[0].trace, robot, sign=-1.0):
                 family.append(group)
                 break
         else:
             families.append([group])
     found: dict[int, GridSearch] = {}
     for k, family in enumerate(families):
-        bench = simulator.bench(family[0][0].joint)
+        rig = simulator.rig(family[0][0].joint)
 
         def tell(share: float, k: int = k) -> None:
             if progress is not None:
                 progress((k + share) / len(families))
 
         members = [goal for group in family for goal in group]
-        maps = search(bench, members, stiffness, damping, weighting, tell)
+        maps = search(rig, members, stiffness, damping, weighting, tell)
         found |= {id(goal): one for goal, one in zip(members, maps, strict=True)}
         for group in family[1:]:
-            looked = _look_again(bench, group, [found[id(goal)] for goal in group], weighting)
+            looked = _look_again(rig, group, [found[id(goal)] for goal in group], weighting)
             found |= {id(goal): one for goal, one in zip(group, looked, strict=True)}
     return [found[id(goal)] for goal in targets]
 
 
 def _look_again(
-    bench: Bench,
-    group: Sequence[Target],
+    rig: JointTestRig,
+    group: Sequence[MeasuredJoint],
     shared: Sequence[GridSearch],
     weighting: Literal["none", "coherence"],
 ) -> list[GridSearch]:
@@ -231,7 +230,7 @@ def _look_again(
 
     def look(nodes: NDArray[np.bool_]) -> None:
         i, j = np.nonzero(nodes)
-        maps[:, i, j] = errors(bench, group, first.stiffness[i], first.damping[j], weighting)
+        maps[:, i, j] = errors(rig, group, first.stiffness[i], first.damping[j], weighting)
 
     look(near)
     if np.abs(np.sqrt(maps) - levels).max() > 0.5 * _NEAR_DB:
@@ -240,8 +239,8 @@ def _look_again(
 
 
 def coarse_search(
-    bench: Bench,
-    group: Sequence[Target],
+    rig: JointTestRig,
+    group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
     weighting: Literal["none", "coherence"] = "none",
@@ -259,7 +258,7 @@ def coarse_search(
     def look(nodes: NDArray[np.bool_]) -> bool:
         i, j = np.nonzero(nodes & ~looked)
         if len(i):
-            maps[:, i, j] = errors(bench, group, stiffness[i], damping[j], weighting)
+            maps[:, i, j] = errors(rig, group, stiffness[i], damping[j], weighting)
         looked[i, j] = True
         return len(i) > 0
 

@@ -81,9 +81,9 @@ def interval(
         )
     if count < 2:
         return _from_coherence(fit, optimum, level)
-    use_phase = len(fit.residual) > int(goal.inside.sum())
-    measured = goal.measured.repeats[:, goal.inside]
-    change = residual_db(goal, measured, goal.measured.response[goal.inside], use_phase)
+    use_phase = len(fit.residual) > int(goal.fit_mask.sum())
+    measured = goal.measured.repeats[:, goal.fit_mask]
+    change = residual_db(goal, measured, goal.measured.response[goal.fit_mask], use_phase)
     # The residual is simulated less measured: a larger answer asks for a larger simulated one.
     gains = optimum * np.exp(change @ fit.influence().T)
     spread = np.atleast_2d(np.cov(gains.T, ddof=1))
@@ -144,4 +144,4 @@ def _from_coherence(fit: Fit, optimum: Array, level: float) -> Interval:
 def measurement_error_db(fit: Fit, *, level: float = 0.95) -> float:
     """Root mean square half-width of the measured gain's own interval in the band [dB]."""
     goal = fit.target
-    return float(DB * np.sqrt(np.mean(goal.measured.relative_error(level)[goal.inside] ** 2)))
+    return float(DB * np.sqrt(np.mean(goal.measured.relative_error(level)[goal.fit_mask] ** 2)))

@@ -22,7 +22,8 @@ from pronk.response.operator import H1Operator
 from pronk.response.periodic import multisine_operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import Question, question
+from pronk.simulators.command_trace import CommandTrace, command_trace
+from pronk.simulators.mujoco import MujocoSimulator
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -38,41 +39,41 @@ its command: 0.002 dB at gain 1. Over the paper's grid it was 0.001 dB; nodes di
 
 
 @dataclass(frozen=True, kw_only=True)
-class Target:
+class MeasuredJoint:
     """A joint's measured response at one amplitude, ready to be compared with simulations."""
 
-    question: Question
+    trace: CommandTrace
     sign: float
     """Between this joint's coordinate and that of the joint simulated in its place."""
     measured: FrequencyResponse
     matrix: ComplexArray
     """From position about the pose at the start of each step to response, shape (steps, f)."""
-    inside: NDArray[np.bool_]
+    fit_mask: NDArray[np.bool_]
     """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
-    heard: Array
+    fit_matrix: Array
     """The part of `matrix` that the fit needs, real and imaginary columns side by side (one real
     product is faster than one of complex numbers), shape (steps heard, 2 inside). The estimator
     hears nothing of the frequencies inside after these steps, so they need not be simulated."""
 
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     """What could not be used beside it."""
 
     @property
     def joint(self) -> str:
         """The joint asked."""
-        return self.question.joint
+        return self.trace.joint
 
     @property
     def omega(self) -> Array:
         """Angular frequencies of the fit [rad/s], shape (inside,)."""
-        return self.measured.omega[self.inside]
+        return self.measured.omega[self.fit_mask]
 
     @property
     def steps(self) -> int:
         """Steps that the fit needs."""
-        return len(self.heard)
+        return len(self.fit_matrix)
 
-    def answer(self, position: Array) -> ComplexArray:
+    def fit_response(self, position: Array) -> ComplexArray:
         """Response at the frequencies inside, in this joint's coordinate.
 
         Args:
@@ -83,11 +84,11 @@ class Target:
         """
         # A constant is no answer; without it nothing is cut off where the steps end at rest.
         moved = position[..., : self.steps] - position[..., :1]
-        pair = moved @ self.heard
+        pair = moved @ self.fit_matrix
         half = pair.shape[-1] // 2
         return np.asarray(self.sign * (pair[..., :half] + 1j * pair[..., half:]))
 
-    def whole_answer(self, position: Array) -> ComplexArray:
+    def full_response(self, position: Array) -> ComplexArray:
         """Response at all frequencies, shape (..., f), for positions of shape (..., all steps)."""
         position = position[..., : len(self.matrix)]
         # Two real products: a mixed one would first turn the positions complex.
@@ -101,8 +102,8 @@ class Target:
         `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
         eq. 9.90), in dB, not below `FLOOR_DB`.
         """
-        coherence = np.clip(self.measured.coherence[self.inside], 1e-9, 1.0)
-        averages = np.maximum(self.measured.averages[self.inside], 1.0)
+        coherence = np.clip(self.measured.coherence[self.fit_mask], 1e-9, 1.0)
+        averages = np.maximum(self.measured.averages[self.fit_mask], 1.0)
         relative = np.sqrt((1.0 - coherence) / (2.0 * averages * coherence))
         return np.asarray(np.hypot(DB * relative, FLOOR_DB))
 
@@ -112,7 +113,7 @@ class Target:
         Args:
             simulated: Response, shape (..., inside).
         """
-        measured = np.abs(self.measured.response[self.inside])
+        measured = np.abs(self.measured.response[self.fit_mask])
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(DB * (np.log(np.abs(simulated)) - np.log(measured)))
 
@@ -150,14 +151,14 @@ def gains_on_drive(log: SweepLog, joint: str, robot: Robot) -> tuple[float, floa
     )
 
 
-def targets(
+def measured_joints(
     log: SweepLog,
     joint: str,
     robot: Robot,
     settings: MatchSettings,
     *,
     band_hz: tuple[float, float] | None = None,
-) -> list[Target]:
+) -> list[MeasuredJoint]:
     """Estimate a joint's responses and prepare each for comparison, largest amplitude first.
 
     Sine steps are left out: they are read step by step and have no single matrix.
@@ -184,8 +185,8 @@ def targets(
     measured = estimate(log, joint, settings.estimator)
     parts = questions(log, joint)
     rate_hz = log_rate([part for repeats in parts for part in repeats])
-    found: list[Target] = []
-    doubts: list[str] = []
+    found: list[MeasuredJoint] = []
+    warnings: list[str] = []
     for repeats, response in zip(parts, measured, strict=True):
         operator = _operator(repeats[0], joint, settings.estimator, rate_hz)
         try:
@@ -194,8 +195,8 @@ def targets(
             # The largest amplitude must be usable; a smaller one only checks it.
             if not found:
                 raise
-            doubts.append(f"the answer at {response.amplitude:.3g} rad is left out: {error}")
-    found[0] = replace(found[0], doubts=tuple(doubts))
+            warnings.append(f"the answer at {response.amplitude:.3g} rad is left out: {error}")
+    found[0] = replace(found[0], warnings=tuple(warnings))
     return found
 
 
@@ -215,7 +216,7 @@ def target(
     settings: MatchSettings,
     *,
     band_hz: tuple[float, float] | None = None,
-) -> Target:
+) -> MeasuredJoint:
     """Prepare the comparison of one measured response.
 
     Args:
@@ -231,21 +232,21 @@ def target(
         IdentifiabilityError: Too little of the band is coherent, or the joint did not move.
     """
     joint = measured.joint
-    asked = question(part, part.segments[0], joint, robot)
+    asked = command_trace(part, part.segments[0], joint, robot)
     matrix = operator.matrix(asked.time)
     low, high = band_hz or robot.joint(joint).band_hz
     inside = _inside(measured, low, high, settings, part.source or "log")
-    return Target(
-        question=asked,
+    return MeasuredJoint(
+        trace=asked,
         sign=robot.joint(joint).original[1],
         measured=measured,
         matrix=matrix,
-        inside=inside,
-        heard=_heard(matrix, inside, asked.mirrored(robot)[2]),
+        fit_mask=inside,
+        fit_matrix=_heard(matrix, inside, asked.mirrored(robot)[2]),
     )
 
 
-def merged(found: Sequence[Sequence[Target]]) -> list[Target]:
+def merged(found: Sequence[Sequence[MeasuredJoint]]) -> list[MeasuredJoint]:
     """Targets of one joint from several logs, repeats of the same question put together.
 
     Args:
@@ -254,7 +255,7 @@ def merged(found: Sequence[Sequence[Target]]) -> list[Target]:
     Returns:
         One target an amplitude, largest first.
     """
-    groups: dict[tuple[object, ...], list[Target]] = {}
+    groups: dict[tuple[object, ...], list[MeasuredJoint]] = {}
     for goal in (goal for row in found for goal in row):
         measured = goal.measured
         key = (round(measured.amplitude, 4), measured.estimator, len(measured.omega))
@@ -272,7 +273,7 @@ def merged(found: Sequence[Sequence[Target]]) -> list[Target]:
     return sorted(out, key=lambda goal: -goal.measured.amplitude)
 
 
-def _together(goals: Sequence[Target]) -> Target:
+def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
     """One target from repeats in several logs, each log counting by its repeats."""
     share = np.array([len(goal.measured.repeats) for goal in goals], dtype=np.float64)
     share /= share.sum()
@@ -286,12 +287,12 @@ def _together(goals: Sequence[Target]) -> Target:
         source=", ".join(dict.fromkeys(r.source for r in each)),
     )
     # Frequencies that any of the logs cannot be believed at are left out.
-    inside = np.logical_and.reduce([goal.inside for goal in goals])
+    inside = np.logical_and.reduce([goal.fit_mask for goal in goals])
     first = goals[0]
-    kept = inside[first.inside]
-    heard = first.heard[:, np.concatenate([kept, kept])]
-    doubts = tuple(dict.fromkeys(doubt for goal in goals for doubt in goal.doubts))
-    return replace(first, measured=measured, inside=inside, heard=heard, doubts=doubts)
+    kept = inside[first.fit_mask]
+    heard = first.fit_matrix[:, np.concatenate([kept, kept])]
+    warnings = tuple(dict.fromkeys(doubt for goal in goals for doubt in goal.warnings))
+    return replace(first, measured=measured, fit_mask=inside, fit_matrix=heard, warnings=warnings)
 
 
 def _inside(
@@ -321,7 +322,7 @@ def _inside(
 
 
 def _heard(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array) -> Array:
-    """Rows and columns of the matrix that the fit needs (`Target.heard`).
+    """Rows and columns of the matrix that the fit needs (`MeasuredJoint.fit_matrix`).
 
     A chirp leaves the band long before it ends; the windows of the segments after that hold next
     to nothing of the band's frequencies. The rows end where all remaining positions together move
@@ -337,3 +338,63 @@ def _heard(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array) -> A
     loud = np.nonzero(tail > _TAIL)[0]
     steps = min(int(loud[-1]) + 2, len(matrix)) if len(loud) else len(matrix)
     return np.hstack([chosen[:steps].real, chosen[:steps].imag])
+
+
+@dataclass(frozen=True)
+class SimRequest:
+    """One simulation: a target's question with one pair of gains."""
+
+    target: MeasuredJoint
+    stiffness: float
+    damping: float
+
+
+def responses(
+    simulator: MujocoSimulator, requests: Sequence[SimRequest], *, whole: bool = False
+) -> list[ComplexArray]:
+    """Simulated responses, one a request.
+
+    Args:
+        simulator: The training simulator.
+        requests: What to simulate.
+        whole: All frequencies of the target instead of those inside its band.
+
+    Returns:
+        Each of shape (inside,), or (f,) if `whole`. NaN where a simulation diverged.
+    """
+    out: list[ComplexArray] = [np.empty(0, dtype=np.complex128)] * len(requests)
+    by_original: dict[str, list[int]] = {}
+    for i, request in enumerate(requests):
+        original = simulator.robot.joint(request.target.joint).original[0]
+        by_original.setdefault(original, []).append(i)
+    for indices in by_original.values():
+        _simulate_family(simulator, [requests[i] for i in indices], indices, out, whole)
+    return out
+
+
+def _simulate_family(
+    simulator: MujocoSimulator,
+    requests: Sequence[SimRequest],
+    indices: Sequence[int],
+    out: list[ComplexArray],
+    whole: bool,
+) -> None:
+    """Simulate requests whose joints mirror one original joint, in one rollout."""
+    rig = simulator.rig(requests[0].target.joint)
+    lengths = [
+        len(request.target.matrix) if whole else request.target.steps for request in requests
+    ]
+    longest = max(lengths)
+    commands, poses = [], []
+    for request in requests:
+        command = request.target.trace.mirrored(simulator.robot)[2][:longest]
+        # Shorter questions rest at the pose until the longest has ended.
+        commands.append(np.pad(command, (0, longest - len(command))))
+        poses.append(rig.pose(request.target.trace))
+    stiffness = np.array([request.stiffness for request in requests])
+    damping = np.array([request.damping for request in requests])
+    for part, position in rig.run(commands, poses, stiffness, damping):
+        for row, i in enumerate(range(part.start, part.stop)):
+            goal = requests[i].target
+            read = goal.full_response if whole else goal.fit_response
+            out[indices[i]] = read(position[row])

@@ -17,14 +17,22 @@ from pronk.match.diagnostics import armature_flags, doubts, missing
 from pronk.match.gains import JointGains
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
 from pronk.match.interval import interval
-from pronk.match.measured_joint import Target, gains_on_drive, logs_by_joint, merged, targets
+from pronk.match.measured_joint import (
+    MeasuredJoint,
+    SimRequest,
+    gains_on_drive,
+    logs_by_joint,
+    measured_joints,
+    merged,
+    responses,
+)
 from pronk.match.quick import quick_search
 from pronk.match.ranges import matched_gains
 from pronk.match.refine import Fit, refine
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
 from pronk.robots.robot import Robot
-from pronk.simulators.batch import Job, Simulator
+from pronk.simulators.mujoco import MujocoSimulator
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -34,12 +42,12 @@ Progress = Callable[[str, float], None]
 class _Asked:
     """One joint and all that was measured of it."""
 
-    targets: list[Target]
+    targets: list[MeasuredJoint]
     naive: tuple[float, float]
     """Gains on the real drive while the log was made."""
 
     @property
-    def main(self) -> Target:
+    def main(self) -> MeasuredJoint:
         """The response that is matched: that of the largest amplitude."""
         return self.targets[0]
 
@@ -78,7 +86,7 @@ def match_logs(
     chosen = settings or MatchSettings()
     clock = _Clock(progress)
     # The simulator first: a device that is missing must not cost the user an estimate.
-    with Simulator(robot, threads=chosen.threads, device=chosen.device) as simulator:
+    with MujocoSimulator(robot, threads=chosen.threads, device=chosen.device) as simulator:
         with clock.stage("estimate"):
             asked = _collect(logs, robot, chosen, clock)
         found, rate = _search(simulator, asked, chosen, clock)
@@ -137,7 +145,7 @@ def _collect(
     asked: dict[str, _Asked] = {}
     for i, (name, sources) in enumerate(where.items()):
         asked[name] = _Asked(
-            targets=merged([targets(log, name, robot, settings) for log in sources]),
+            targets=merged([measured_joints(log, name, robot, settings) for log in sources]),
             naive=gains_on_drive(sources[0], name, robot),
         )
         clock.tell((i + 1) / len(where))
@@ -145,7 +153,7 @@ def _collect(
 
 
 def _search(
-    simulator: Simulator, asked: dict[str, _Asked], settings: MatchSettings, clock: _Clock
+    simulator: MujocoSimulator, asked: dict[str, _Asked], settings: MatchSettings, clock: _Clock
 ) -> tuple[dict[str, _Found], float]:
     """Best node and optimum off the grid of every joint; physics steps per second of the grid."""
     main = [item.main for item in asked.values()]
@@ -183,7 +191,7 @@ def _search(
 
 
 def _fit_amplitudes(
-    simulator: Simulator,
+    simulator: MujocoSimulator,
     asked: dict[str, _Asked],
     found: dict[str, _Found],
     settings: MatchSettings,
@@ -196,15 +204,16 @@ def _fit_amplitudes(
 
 
 def _answers(
-    simulator: Simulator, asked: dict[str, _Asked], found: dict[str, _Found]
+    simulator: MujocoSimulator, asked: dict[str, _Asked], found: dict[str, _Found]
 ) -> tuple[dict[str, NDArray[np.complex128]], dict[str, NDArray[np.complex128]]]:
     """Whole responses with the matched and with the naive gains."""
     main = [item.main for item in asked.values()]
-    jobs = [
-        Job(goal, found[goal.joint].fit.stiffness, found[goal.joint].fit.damping) for goal in main
+    requests = [
+        SimRequest(goal, found[goal.joint].fit.stiffness, found[goal.joint].fit.damping)
+        for goal in main
     ]
-    jobs += [Job(item.main, *item.naive) for item in asked.values()]
-    answers = simulator.responses(jobs, whole=True)
+    requests += [SimRequest(item.main, *item.naive) for item in asked.values()]
+    answers = responses(simulator, requests, whole=True)
     names = list(asked)
     return (
         dict(zip(names, answers[: len(names)], strict=True)),
@@ -222,22 +231,22 @@ def _without_armature(
     """The search without rotor inertia (F13); whole responses at its best nodes."""
     stiffness, damping = axes(robot, settings.grid_points)
     groups = alike([item.main for item in asked.values()], robot)
-    jobs = []
-    with Simulator(
+    requests = []
+    with MujocoSimulator(
         robot, armature=0.0, threads=settings.threads, device=settings.device
     ) as simulator:
         for k, group in enumerate(groups):
-            bench = simulator.bench(group[0].joint)
+            rig = simulator.rig(group[0].joint)
             for goal, grid in zip(
                 group,
-                coarse_search(bench, group, stiffness, damping, settings.grid_weighting),
+                coarse_search(rig, group, stiffness, damping, settings.grid_weighting),
                 strict=True,
             ):
                 found[goal.joint].zero = grid
-                jobs.append(Job(goal, *grid.gains))
+                requests.append(SimRequest(goal, *grid.gains))
             clock.tell((k + 1) / len(groups))
-        answers = simulator.responses(jobs, whole=True)
-    return {job.target.joint: answer for job, answer in zip(jobs, answers, strict=True)}
+        answers = responses(simulator, requests, whole=True)
+    return {request.target.joint: answer for request, answer in zip(requests, answers, strict=True)}
 
 
 def _report(
@@ -254,7 +263,7 @@ def _report(
     joint = robot.joint(goal.joint)
     bounds = interval(fit, level=settings.level, method=settings.interval)
     per_amplitude = amplitude_gains([fit, *found.others])
-    naive_db = float(np.sqrt(np.mean(goal.error_db(naive[goal.inside]) ** 2)))
+    naive_db = float(np.sqrt(np.mean(goal.error_db(naive[goal.fit_mask]) ** 2)))
     zero_db = float("nan") if found.zero is None else found.zero.error_db
     band = goal.measured.band(*joint.band_hz)
     flags = (
@@ -262,7 +271,7 @@ def _report(
         *bounds.flags,
         *amplitude_flags(per_amplitude),
         *missing(goal, band),
-        *goal.doubts,
+        *goal.warnings,
     )
     covariance = bounds.covariance
     gains = JointGains(

@@ -22,8 +22,8 @@ from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.measured_joint import gains_on_drive
 from pronk.match.prediction import JointPrediction, Prediction
 from pronk.robots.robot import Robot
-from pronk.simulators.chain import ArmBench, JointDrive, held_mean, moves_together
-from pronk.simulators.command_trace import Question, question
+from pronk.simulators.chain import ChainSimulation, JointDrive, held_mean, moves_together
+from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.mujoco import simulate
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ def predict(log: SweepLog, robot: Robot, gains: MatchedGains, *, threads: int = 
     """Simulate a log with naive and with matched gains.
 
     Where several joints move at once the whole arm is simulated; otherwise each question to each
-    joint by itself, the rest held as on the bench.
+    joint by itself, the rest held as on the rig.
 
     Args:
         log: What to replay; any signal.
@@ -52,15 +52,15 @@ def predict(log: SweepLog, robot: Robot, gains: MatchedGains, *, threads: int = 
 def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
     """The whole arm at once."""
     matched = drives_of(robot, gains)
-    with ArmBench(robot, [log], threads=threads) as bench:
-        naive = {name: _on_drive(log, robot, name) for name in bench.joints}
+    with ChainSimulation(robot, [log], threads=threads) as rig:
+        naive = {name: _on_drive(log, robot, name) for name in rig.joints}
         late = {
             name: replace(drive, delay=matched[name].delay) if name in matched else drive
             for name, drive in naive.items()
         }
-        (answer,), (plain,), (delayed,) = bench.run([matched, naive, late])
-        excluded = dict(bench.excluded)
-        names = bench.joints
+        (answer,), (plain,), (delayed,) = rig.run([matched, naive, late])
+        excluded = dict(rig.excluded)
+        names = rig.joints
     kinds = {name: s.kind for s in log.segments for name in s.joints}
     out = []
     for i, name in enumerate(names):
@@ -124,7 +124,7 @@ def _replay(
     threads: int,
 ) -> tuple[Array, ...]:
     """Time, command, measured, naive, naive with the delay and matched position of a question."""
-    asked = question(part, segment, name, robot)
+    asked = command_trace(part, segment, name, robot)
     late = _delayed(asked, gains.delay_s)
     plain = _on_drive(part, robot, name)
     naive, naive_delayed = (
@@ -149,12 +149,12 @@ def _replay(
     return time, part.command[inside, column], part.position[inside, column], *answers
 
 
-def _delayed(asked: Question, delay: float) -> Question:
+def _delayed(asked: CommandTrace, delay: float) -> CommandTrace:
     """The question with its command delayed."""
     if delay == 0.0:
         return asked
     edges = np.append(asked.time, asked.time[-1] + asked.timestep) - delay
-    return Question(**{**vars(asked), "command": held_mean(asked.time, asked.command, edges)})
+    return CommandTrace(**{**vars(asked), "command": held_mean(asked.time, asked.command, edges)})
 
 
 def _on_drive(log: SweepLog, robot: Robot, name: str) -> JointDrive:

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.match.grid import GridSearch, mean_square, weights
-from pronk.match.measured_joint import DB, Target
+from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
 from pronk.match.refine import Fit, refine
-from pronk.simulators.batch import Job, Simulator
 from pronk.simulators.linear import Plant, plant
+from pronk.simulators.mujoco import MujocoSimulator
 
 Array = NDArray[np.float64]
 
@@ -42,8 +42,8 @@ class QuickSearch:
 
 
 def quick_search(
-    simulator: Simulator,
-    targets: Sequence[Target],
+    simulator: MujocoSimulator,
+    targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
     *,
@@ -65,7 +65,7 @@ def quick_search(
     plants = [_plant(simulator, goal) for goal in targets]
     weight = [weights(goal, weighting) for goal in targets]
     logs = [
-        np.log(np.abs(p.response(kp, kd, amplitude=goal.question.amplitude)))
+        np.log(np.abs(p.response(kp, kd, amplitude=goal.trace.amplitude)))
         for p, goal in zip(plants, targets, strict=True)
     ]
     first = [
@@ -74,12 +74,12 @@ def quick_search(
     ]
     start = [(float(kp[k]), float(kd[k])) for k in first]
     fits = refine(simulator, targets, start, use_phase=use_phase)
-    maps, jobs = [], []
+    maps, requests = [], []
     for goal, p, log, w, fit in zip(targets, plants, logs, weight, fits, strict=True):
         corrected = log + _correction(p, fit, kp, kd)
         maps.append(mean_square(goal, np.exp(corrected).astype(np.complex128), w))
-        jobs += [Job(goal, kp[k], kd[k]) for k in np.argsort(maps[-1])[:_VERIFIED]]
-    answers = simulator.responses(jobs)
+        requests += [SimRequest(goal, kp[k], kd[k]) for k in np.argsort(maps[-1])[:_VERIFIED]]
+    answers = responses(simulator, requests)
     found = []
     for i, (goal, w, fit) in enumerate(zip(targets, weight, fits, strict=True)):
         best = np.argsort(maps[i])[:_VERIFIED]
@@ -94,14 +94,14 @@ def quick_search(
     return found
 
 
-def _plant(simulator: Simulator, goal: Target) -> Plant:
-    bench = simulator.bench(goal.joint)
-    return plant(bench, bench.pose(goal.question), goal.omega)
+def _plant(simulator: MujocoSimulator, goal: MeasuredJoint) -> Plant:
+    rig = simulator.rig(goal.joint)
+    return plant(rig, rig.pose(goal.trace), goal.omega)
 
 
 def _correction(linear: Plant, fit: Fit, stiffness: Array, damping: Array) -> Array:
     """Log gain of the simulator over that of the closed form, to first order, shape (b, f)."""
-    amplitude = fit.target.question.amplitude
+    amplitude = fit.target.trace.amplitude
     at = np.array([fit.stiffness, fit.damping])
     near = at * np.exp(_STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     closed = np.log(np.abs(linear.response(near[:, 0], near[:, 1], amplitude=amplitude)))

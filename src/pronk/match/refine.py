@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.measured_joint import DB, Target
-from pronk.simulators.batch import Job, Simulator
+from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
+from pronk.simulators.mujoco import MujocoSimulator
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -35,7 +35,7 @@ _ROUNDS = 12
 class Fit:
     """One joint's gains off the grid, and what the interval needs to know of them."""
 
-    target: Target
+    target: MeasuredJoint
     stiffness: float
     damping: float
     delay_s: float
@@ -66,7 +66,7 @@ class Fit:
 
 
 def residual_db(
-    goal: Target, simulated: ComplexArray, measured: ComplexArray, use_phase: bool
+    goal: MeasuredJoint, simulated: ComplexArray, measured: ComplexArray, use_phase: bool
 ) -> Array:
     """Simulated over measured response in dB, gain and then (if asked) phase.
 
@@ -100,8 +100,8 @@ class _State:
 
 
 def refine(
-    simulator: Simulator,
-    targets: Sequence[Target],
+    simulator: MujocoSimulator,
+    targets: Sequence[MeasuredJoint],
     start: Sequence[tuple[float, float]],
     *,
     use_phase: bool = False,
@@ -120,19 +120,21 @@ def refine(
         active = [i for i, state in enumerate(states) if not state.done]
         if not active:
             break
-        jobs = [
-            Job(targets[i], *np.exp(states[i].x + offset)) for i in active for offset in offsets
+        requests = [
+            SimRequest(targets[i], *np.exp(states[i].x + offset))
+            for i in active
+            for offset in offsets
         ]
-        answers = simulator.responses(jobs)
+        answers = responses(simulator, requests)
         for k, i in enumerate(active):
             _round(states[i], targets[i], np.array(answers[3 * k : 3 * k + 3]), use_phase)
     fits = [state.fit for state in states]
     return [fit for fit in fits if fit is not None]
 
 
-def _round(state: _State, goal: Target, answers: ComplexArray, use_phase: bool) -> None:
+def _round(state: _State, goal: MeasuredJoint, answers: ComplexArray, use_phase: bool) -> None:
     """Judge the last step by its simulation and take the next."""
-    measured = goal.measured.response[goal.inside]
+    measured = goal.measured.response[goal.fit_mask]
     rows = residual_db(goal, answers, measured, use_phase)
     weight = goal.deviation_db() ** -2.0
     if use_phase:

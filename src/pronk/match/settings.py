@@ -7,7 +7,7 @@ from typing import Literal
 
 from pronk.errors import PronkError
 from pronk.response.estimator import Estimator
-from pronk.simulators.device import DEVICES
+from pronk.simulators.mujoco import DEVICES
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -109,7 +109,7 @@ def moves_together(log: SweepLog) -> bool:
     return int(moving.sum()) > 1
 
 
-class ArmBench:
+class ChainSimulation:
     """The chain, ready to be asked what one or more logs asked, with many sets of drives."""
 
     def __init__(self, robot: Robot, logs: Sequence[SweepLog], *, threads: int = 2) -> None:
@@ -144,7 +144,7 @@ class ArmBench:
         self._data = [mujoco.MjData(self.model) for _ in range(max(threads, 1))]
         self._questions = [self._question(log) for log in self.logs]
 
-    def __enter__(self) -> ArmBench:
+    def __enter__(self) -> ChainSimulation:
         return self
 
     def __exit__(self, *error: object) -> None:

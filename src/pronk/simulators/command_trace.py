@@ -30,7 +30,7 @@ _POSE_SLACK = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class Question:
+class CommandTrace:
     """One command to one joint, at every physics step of the training simulator."""
 
     joint: str
@@ -40,7 +40,7 @@ class Question:
     timestep: float
     """Physics step [s]."""
     command: Array
-    """Target position in force during each step [rad], shape (steps,)."""
+    """MeasuredJoint position in force during each step [rad], shape (steps,)."""
     pose: Array
     """Position that every joint of the robot is held at, robot's order [rad], shape (joints,)."""
     amplitude: float = float("nan")
@@ -63,7 +63,7 @@ class Question:
         centre = self.pose[robot.joint_names.index(self.joint)]
         return name, sign, np.asarray(sign * (self.command - centre))
 
-    def same_as(self, other: Question, robot: Robot, *, sign: float = 1.0) -> bool:
+    def same_as(self, other: CommandTrace, robot: Robot, *, sign: float = 1.0) -> bool:
         """True if both lead to the same simulation of the same original joint.
 
         One may rest longer than the other at the end. The pose of the joints of the chain must
@@ -85,16 +85,16 @@ class Question:
         )
 
 
-def original_pose(question: Question, robot: Robot) -> Array:
+def original_pose(trace: CommandTrace, robot: Robot) -> Array:
     """Pose of the original joint's chain that mirrors the question's pose [rad], shape (chain,)."""
-    asked = robot.joint(question.joint)
+    asked = robot.joint(trace.joint)
     original = robot.joint(asked.original[0])
     index = {name: i for i, name in enumerate(robot.joint_names)}
     pose = []
     # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
     for own, first in zip(asked.chain, original.chain, strict=True):
         sign = robot.joint(own).original[1] * robot.joint(first).original[1]
-        pose.append(sign * question.pose[index[own]])
+        pose.append(sign * trace.pose[index[own]])
     return np.array(pose)
 
 
@@ -129,9 +129,9 @@ def held(time: Array, command: Array, instants: Array) -> Array:
     return np.asarray(command[np.clip(index, 0, len(time) - 1)])
 
 
-def question(
+def command_trace(
     log: SweepLog, segment: Segment, joint: str, robot: Robot, *, until: float | None = None
-) -> Question:
+) -> CommandTrace:
     """What the simulator must be asked to repeat one segment of a log.
 
     Args:
@@ -177,7 +177,7 @@ def question(
         count = int(np.ceil((end - start) / robot.timestep_s))
         middle = start + (np.arange(count) + 0.5) * robot.timestep_s
         steps = held(part.time, command, middle)
-    return Question(
+    return CommandTrace(
         joint=joint,
         start=float(start),
         timestep=robot.timestep_s,

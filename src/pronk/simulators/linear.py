@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pronk.simulators.mujoco import Bench
+from pronk.simulators.mujoco import JointTestRig
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -80,33 +80,33 @@ class Plant:
         return np.asarray(closed / hold)
 
 
-def plant(bench: Bench, pose: Array, omega: Array) -> Plant:
+def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
     """Linearize a bench model about a pose.
 
     Args:
-        bench: The asked joint's bench.
+        rig: The asked joint's rig.
         pose: Pose of its chain [rad], shape (chain,).
         omega: Frequencies to evaluate [rad/s], shape (f,).
     """
-    model = bench.torque_model()
+    model = rig.torque_model()
     data = mujoco.MjData(model)
     data.qpos[:] = pose
-    data.ctrl[:] = bench.control(pose)
+    data.ctrl[:] = rig.control(pose)
     mujoco.mj_forward(model, data)
     # Hold the asked joint against gravity, so that the linearization is about rest.
-    data.ctrl[bench.actuator] = data.qfrc_bias[bench.index]
+    data.ctrl[rig.actuator] = data.qfrc_bias[rig.index]
     nx, nu = 2 * model.nv + model.na, model.nu
     a, b = np.zeros((nx, nx)), np.zeros((nx, nu))
     mujoco.mjd_transitionFD(model, data, _EPS, True, a, b, None, None)
     z = np.exp(1j * omega * model.opt.timestep)
     states = np.linalg.solve(
         z[:, None, None] * np.eye(nx) - a,
-        np.broadcast_to(b[:, bench.actuator, None], (len(z), nx, 1)).astype(np.complex128),
+        np.broadcast_to(b[:, rig.actuator, None], (len(z), nx, 1)).astype(np.complex128),
     )[..., 0]
     return Plant(
         omega=omega,
-        position=states[:, bench.index],
-        speed=states[:, model.nv + bench.index],
+        position=states[:, rig.index],
+        speed=states[:, model.nv + rig.index],
         timestep=float(model.opt.timestep),
-        frictionloss=float(bench.model.dof_frictionloss[bench.index]),
+        frictionloss=float(rig.model.dof_frictionloss[rig.index]),
     )

@@ -1,4 +1,4 @@
-"""The training simulator, asked the way a joint was asked on the bench.
+"""The training simulator, asked the way a joint was asked on the rig.
 
 The model is `pronk.robots.model.bench_spec`: fixed base, the joint's own chain, explicit PD at the
 start of each 5 ms step, clipped by the torque-speed curve. One native MuJoCo model holds all of
@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import mujoco
@@ -23,10 +24,10 @@ import mujoco.rollout
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pronk.errors import RobotError
+from pronk.errors import PronkError, RobotError
 from pronk.robots.model import bench_spec, set_drive_gains
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import Question, original_pose
+from pronk.simulators.command_trace import CommandTrace, original_pose
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,11 @@ CHUNK = 100
 """Simulations in flight at once: 100 x 5,000 steps x 3 commands are 12 MB."""
 _SAG_ROUNDS = 4
 """Rounds of `q = target - gravity(q) / stiffness`; each gains two digits at 17 N m/rad."""
+
+
+DEVICES = ("cpu", "cuda", "warp-cpu")
+"""`cpu`: `mujoco.rollout` on its threads, in double precision. `cuda`: MuJoCo Warp on the GPU, in
+single precision. `warp-cpu`: MuJoCo Warp on the processor, slow, to see what precision does."""
 
 
 @dataclass
@@ -49,8 +55,8 @@ class Count:
         return self.steps / self.seconds if self.seconds > 0.0 else float("nan")
 
 
-class Bench:
-    """One joint on the bench, ready to be asked with many gain pairs.
+class JointTestRig:
+    """One joint on the rig, ready to be asked with many gain pairs.
 
     Built for the original of a mirrored family; positions and commands are about the pose, in
     the original's own sign.
@@ -127,10 +133,10 @@ class Bench:
         """Stop the threads."""
         self._pool.close()
 
-    def pose(self, question: Question) -> Array:
+    def pose(self, trace: CommandTrace) -> Array:
         """Where the chain of this model is held for a question [rad], shape (chain,)."""
         chain = self.robot.joint(self.joint.name).chain or (self.joint.name,)
-        by_name = dict(zip(chain, original_pose(question, self.robot), strict=True))
+        by_name = dict(zip(chain, original_pose(trace, self.robot), strict=True))
         return np.array(
             [by_name.get(name, self.robot.joint(name).default_position) for name in self.chain]
         )
@@ -178,7 +184,7 @@ class Bench:
     def run(
         self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
     ) -> Iterator[tuple[slice, Array]]:
-        """Ask, and yield the asked joint's answers a chunk at a time.
+        """Excitation, and yield the asked joint's answers a chunk at a time.
 
         Args:
             commands: Command about the pose during each step [rad], each of shape (steps,); one
@@ -234,9 +240,99 @@ class Bench:
             yield part, sensor[:n, :, self._sensor] - centre[:n, None]
 
 
+def rig_on(device: str) -> Callable[..., JointTestRig]:
+    """What builds a rig on a device; call it as `JointTestRig`.
+
+    Args:
+        device: One of `DEVICES`.
+
+    Raises:
+        PronkError: The device is unknown, MuJoCo Warp is not installed, or there is no GPU.
+    """
+    if device not in DEVICES:
+        raise PronkError(f"device {device!r}; expected one of {', '.join(DEVICES)}.")
+    if device == "cpu":
+        return JointTestRig
+    try:
+        from pronk.simulators.warp import WarpTestRig, find_device
+    except ModuleNotFoundError as error:
+        raise PronkError(
+            f'device "{device}" needs MuJoCo Warp, and {error.name} is not installed; '
+            'pip install "pronk[train]", or use device "cpu".'
+        ) from error
+    find_device(device)
+    return partial(WarpTestRig, device=device)
+
+
+class MujocoSimulator:
+    """Test rigs of a robot's joints in MuJoCo, compiled when first needed and kept."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        armature: float | None = None,
+        frictionloss: float | None = None,
+        threads: int = 2,
+        device: str = "cpu",
+    ) -> None:
+        """Take note of the robot.
+
+        Args:
+            robot: The robot.
+            armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
+            frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+            threads: Threads of the simulator.
+            device: Where large runs are simulated; see `pronk.simulators.device.DEVICES`.
+
+        Raises:
+            PronkError: The device is unknown or cannot be used here.
+        """
+        self.robot = robot
+        self._new_bench = rig_on(device)
+        self._armature = armature
+        self._frictionloss = frictionloss
+        self._threads = threads
+        self._benches: dict[str, JointTestRig] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the threads of every rig."""
+        for rig in self._benches.values():
+            rig.close()
+        self._benches.clear()
+
+    def rig(self, joint: str) -> JointTestRig:
+        """The rig that is simulated for a joint: that of its mirrored original."""
+        original = self.robot.joint(joint).original[0]
+        if original not in self._benches:
+            self._benches[original] = self._new_bench(
+                self.robot,
+                original,
+                armature=self._armature,
+                frictionloss=self._frictionloss,
+                threads=self._threads,
+            )
+        return self._benches[original]
+
+    @property
+    def count(self) -> Count:
+        """Steps and seconds of all benches together."""
+        counts = [rig.count for rig in self._benches.values()]
+        return Count(
+            steps=sum(count.steps for count in counts),
+            seconds=sum(count.seconds for count in counts),
+        )
+
+
 def simulate(
     robot: Robot,
-    question: Question,
+    trace: CommandTrace,
     stiffness: ArrayLike,
     damping: ArrayLike,
     *,
@@ -252,7 +348,7 @@ def simulate(
 
     Args:
         robot: The robot.
-        question: What was asked.
+        trace: The command to repeat.
         stiffness: Gains of the asked joint [N m/rad], shape (b,) or a scalar.
         damping: Gains of the asked joint [N m s/rad], shape (b,) or a scalar.
         armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
@@ -262,16 +358,16 @@ def simulate(
         threads: Threads of the simulator.
 
     Returns:
-        Position at the start of each step [rad], shape (b, steps), at `question.time`.
+        Position at the start of each step [rad], shape (b, steps), at `trace.time`.
     """
     kp, kd = np.broadcast_arrays(
         np.atleast_1d(np.asarray(stiffness, dtype=np.float64)),
         np.atleast_1d(np.asarray(damping, dtype=np.float64)),
     )
-    name, sign, command = question.mirrored(robot)
-    centre = question.pose[robot.joint_names.index(question.joint)]
+    name, sign, command = trace.mirrored(robot)
+    centre = trace.pose[robot.joint_names.index(trace.joint)]
     out = np.empty((len(kp), len(command)))
-    with Bench(
+    with JointTestRig(
         robot,
         name,
         armature=armature,
@@ -279,7 +375,7 @@ def simulate(
         held_stiffness=held_stiffness,
         held_damping=held_damping,
         threads=threads,
-    ) as bench:
-        for part, position in bench.run([command], [bench.pose(question)], kp, kd):
+    ) as rig:
+        for part, position in rig.run([command], [rig.pose(trace)], kp, kd):
             out[part] = centre + sign * position
     return out

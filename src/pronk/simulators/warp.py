@@ -1,7 +1,7 @@
-"""The bench on a GPU: thousands of gain pairs at once in MuJoCo Warp.
+"""The test rig on a GPU: thousands of gain pairs at once in MuJoCo Warp.
 
-The model is the one that `pronk.simulators.mujoco.Bench` rolls out on the processor, and every
-simulation is asked the same; what differs is the arithmetic. MuJoCo Warp computes in single
+The model and the commands are those that `pronk.simulators.mujoco.JointTestRig` rolls out on the
+processor; what differs is the arithmetic. MuJoCo Warp computes in single
 precision and stops its solver at a tolerance of 1e-6 instead of 1e-8. With the paper's chirp on
 the Mini Cheetah (measured on Warp's CPU device, all 2,500 nodes) the median node's largest
 difference is 3e-7 rad, the best cell is the same and its response agrees within 1e-5 dB. Only a
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pronk.errors import PronkError
 from pronk.robots.model import set_drive_gains
 from pronk.robots.robot import Robot
-from pronk.simulators.mujoco import Bench
+from pronk.simulators.mujoco import JointTestRig
 
 Array = NDArray[np.float64]
 
@@ -72,8 +72,8 @@ def _before_step(
 _READ_AND_COMMAND = wp.kernel(_before_step)
 
 
-class WarpBench(Bench):
-    """A bench whose large runs are stepped by MuJoCo Warp."""
+class WarpTestRig(JointTestRig):
+    """A rig whose large runs are stepped by MuJoCo Warp."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class WarpBench(Bench):
     def run(
         self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
     ) -> Iterator[tuple[slice, Array]]:
-        """Ask, and yield the asked joint's answers a chunk at a time; see `Bench.run`."""
+        """Yield the excited joint's positions a chunk at a time; see `JointTestRig.run`."""
         total = len(stiffness)
         if total < self._least:
             yield from super().run(commands, poses, stiffness, damping)
@@ -174,14 +174,16 @@ class WarpBench(Bench):
 
 
 class _Worlds:
-    """Memory on the device for so many simulations of one bench, and the captured step."""
+    """Memory on the device for so many simulations of one rig, and the captured step."""
 
-    def __init__(self, bench: Bench, device: Any, count: int, steps: int, shared: bool) -> None:
+    def __init__(
+        self, rig: JointTestRig, device: Any, count: int, steps: int, shared: bool
+    ) -> None:
         self._device = device
         self._count, self._steps, self._shared = count, steps, shared
-        model = copy.copy(bench.model)
+        model = copy.copy(rig.model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-        # Rows of friction, limits and equalities; there are no contacts on the bench.
+        # Rows of friction, limits and equalities; there are no contacts on the rig.
         rows = model.nv + 2 * model.njnt + 6 * model.neq
         with wp.ScopedDevice(device):
             self._model = mujoco_warp.put_model(model)
@@ -194,7 +196,7 @@ class _Worlds:
             self._clock = wp.zeros(count, dtype=int)
             self._target = wp.zeros((steps, 1 if shared else count), dtype=float)
             self._position = wp.zeros((steps, count), dtype=float)
-            self._inputs = (int(model.jnt_qposadr[bench.index]), bench.actuator)
+            self._inputs = (int(model.jnt_qposadr[rig.index]), rig.actuator)
             # Kernels are compiled and loaded by this step; none of that may be captured.
             self._step()
             self._graph = self._capture()

@@ -22,10 +22,16 @@ from numpy.typing import NDArray
 from pronk.errors import PronkError
 from pronk.evaluation.result import Subject
 from pronk.logs.joint_log import SweepLog
-from pronk.match.measured_joint import Target, logs_by_joint, targets
+from pronk.match.measured_joint import (
+    MeasuredJoint,
+    SimRequest,
+    logs_by_joint,
+    measured_joints,
+    responses,
+)
 from pronk.match.settings import MatchSettings
 from pronk.robots.robot import Robot
-from pronk.simulators.batch import Job, Simulator
+from pronk.simulators.mujoco import MujocoSimulator
 
 Array = NDArray[np.float64]
 Gains = Mapping[str, tuple[float, float]]
@@ -90,7 +96,7 @@ def bode_errors(
     chosen = settings or MatchSettings()
     goals = [
         max(
-            (goal for log in sources for goal in targets(log, joint, robot, chosen)),
+            (goal for log in sources for goal in measured_joints(log, joint, robot, chosen)),
             key=lambda goal: goal.measured.amplitude,
         )
         for joint, sources in logs_by_joint(logs, robot).items()
@@ -102,10 +108,10 @@ def bode_errors(
                     f"the gains {name!r} have none for {goal.joint}, which the sweep asked; give "
                     "a pair for every joint asked."
                 )
-    jobs = [Job(goal, *pairs[goal.joint]) for pairs in gains.values() for goal in goals]
-    with Simulator(robot, threads=chosen.threads, device=chosen.device) as simulator:
-        answers = simulator.responses(jobs)
-    errors = [_error(job, answer) for job, answer in zip(jobs, answers, strict=True)]
+    requests = [SimRequest(goal, *pairs[goal.joint]) for pairs in gains.values() for goal in goals]
+    with MujocoSimulator(robot, threads=chosen.threads, device=chosen.device) as simulator:
+        answers = responses(simulator, requests)
+    errors = [_error(request, answer) for request, answer in zip(requests, answers, strict=True)]
     count = len(goals)
     return {name: tuple(errors[i * count : (i + 1) * count]) for i, name in enumerate(gains)}
 
@@ -115,12 +121,12 @@ def overall_rms_db(errors: Sequence[BodeError]) -> float:
     return float(np.sqrt(np.mean([one.rms_db**2 for one in errors])))
 
 
-def _error(job: Job, answer: NDArray[np.complex128]) -> BodeError:
-    goal: Target = job.target
+def _error(request: SimRequest, answer: NDArray[np.complex128]) -> BodeError:
+    goal: MeasuredJoint = request.target
     return BodeError(
         joint=goal.joint,
-        stiffness=job.stiffness,
-        damping=job.damping,
+        stiffness=request.stiffness,
+        damping=request.damping,
         omega=goal.omega,
         error_db=goal.error_db(answer),
     )

@@ -21,10 +21,10 @@ from scipy.optimize import least_squares
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import SweepLog
 from pronk.match.arm.problem import DriveProblem, stacked
-from pronk.match.drive_parameters import DRIVE_MODE, KINDS, PARAMETERS, asked_of
 from pronk.match.identifiability import EXPERIMENTS
+from pronk.match.parameters import DRIVE_MODE, KINDS, PARAMETERS, asked_of
 from pronk.robots.robot import Robot
-from pronk.simulators.chain import ArmBench, Drives, JointDrive
+from pronk.simulators.chain import ChainSimulation, Drives, JointDrive
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -115,8 +115,8 @@ def fit_drive(
     """
     if not logs:
         raise LogError("no recordings; fit_drive needs at least one.")
-    with ArmBench(robot, logs, threads=threads) as bench:
-        asked = asked_of(parameters, bench.joints)
+    with ChainSimulation(robot, logs, threads=threads) as rig:
+        asked = asked_of(parameters, rig.joints)
         kinds = len({name for names in asked.values() for name in names})
         most = _ROUNDS * (1 + kinds)
 
@@ -124,7 +124,7 @@ def fit_drive(
             if progress is not None:
                 progress("fit", min(evaluations / most, 0.99))
 
-        problem = DriveProblem(bench, asked, start or {}, told)
+        problem = DriveProblem(rig, asked, start or {}, told)
         blocks = _blocks(logs)
         if (count := len(np.unique(blocks))) < MIN_BLOCKS:
             raise LogError(
@@ -145,7 +145,7 @@ def fit_drive(
         fit = DriveFit(
             robot=robot.name,
             joints=_joints(problem, x, blocks),
-            excluded=bench.excluded,
+            excluded=rig.excluded,
             evaluations=problem.evaluations,
         )
     if progress is not None:
@@ -158,7 +158,7 @@ def fit_drive(
 def _joints(problem: DriveProblem, x: Array, blocks: NDArray[np.int64]) -> dict[str, DriveJoint]:
     """Values, intervals and doubts of every joint at the optimum."""
     published = {
-        joint: JointDrive.published(problem.bench.robot, joint) for joint in problem.bench.joints
+        joint: JointDrive.published(problem.rig.robot, joint) for joint in problem.rig.joints
     }
     naive = stacked(problem.differences([published])[0])
     error, jacobian = problem.residual(x), problem.jacobian(x)
@@ -168,7 +168,7 @@ def _joints(problem: DriveProblem, x: Array, blocks: NDArray[np.int64]) -> dict[
     )
     drives = problem.drives(x)
     out = {}
-    for column, joint in enumerate(problem.bench.joints):
+    for column, joint in enumerate(problem.rig.joints):
         block, mask = problem.block(joint), believed[column]
         mine = [i for i, (name, _) in enumerate(problem.slots) if name == joint]
         kinds = [KINDS[name] for name in problem.asked[joint]]
@@ -208,7 +208,7 @@ def _joints(problem: DriveProblem, x: Array, blocks: NDArray[np.int64]) -> dict[
 
 def _asked_samples(problem: DriveProblem, joint: str) -> int:
     """Samples of the recordings in which a joint was asked at all."""
-    column = problem.bench.joints.index(joint)
+    column = problem.rig.joints.index(joint)
     return sum(len(part) for part in problem.measured if np.isfinite(part[0, column]))
 
 

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from pronk.errors import LogError, PronkError
 from pronk.logs.joint_log import SweepLog
 from pronk.match.arm.fit import DriveFit, DriveJoint, fit_drive
-from pronk.match.drive_parameters import DRIVE_MODE, GAINS_MODE, PARAMETERS, gains_covariance
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.identifiability import EXPERIMENTS
+from pronk.match.parameters import DRIVE_MODE, GAINS_MODE, PARAMETERS, gains_covariance
 from pronk.match.ranges import matched_gains
 from pronk.match.result import JointMatch
 from pronk.response.estimate import estimate
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
-from pronk.simulators.chain import ArmBench, Drives, JointDrive
+from pronk.simulators.chain import ChainSimulation, Drives, JointDrive
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -189,9 +189,9 @@ def _responses(
     logs: Sequence[SweepLog], robot: Robot, fit: DriveFit, threads: int
 ) -> dict[str, JointMatch]:
     """Responses of the recording that says most about each joint, and of its simulations."""
-    with ArmBench(robot, logs, threads=threads) as bench:
-        matched, naive = bench.run([fit.drives, {}])
-        joints = bench.joints
+    with ChainSimulation(robot, logs, threads=threads) as rig:
+        matched, naive = rig.run([fit.drives, {}])
+        joints = rig.joints
     out = {}
     for i, name in enumerate(joints):
         best = None

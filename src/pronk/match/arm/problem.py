@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.match.arm.sample_mask import trusted_samples
-from pronk.match.drive_parameters import KINDS, PARAMETERS
-from pronk.simulators.chain import ArmBench, Drives, JointDrive, asked_joints
+from pronk.match.parameters import KINDS, PARAMETERS
+from pronk.simulators.chain import ChainSimulation, Drives, JointDrive, asked_joints
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,7 +27,7 @@ class DriveProblem:
 
     def __init__(
         self,
-        bench: ArmBench,
+        rig: ChainSimulation,
         asked: Mapping[str, tuple[str, ...]],
         start: Drives,
         told: Callable[[int], None] | None = None,
@@ -35,22 +35,22 @@ class DriveProblem:
         """Take in the recordings.
 
         Args:
-            bench: The arm and its recordings.
+            rig: The arm and its recordings.
             asked: Names of the parameters to fit, by joint.
             start: Drives to begin with; the robot's published ones if not given.
             told: Told the number of simulations so far.
         """
-        self.bench = bench
+        self.rig = rig
         self.asked = asked
         self.start = {
-            joint: start.get(joint) or JointDrive.published(bench.robot, joint)
-            for joint in bench.joints
+            joint: start.get(joint) or JointDrive.published(rig.robot, joint)
+            for joint in rig.joints
         }
         self._given = frozenset(start)
-        self.slots = [(joint, name) for joint in bench.joints for name in asked[joint]]
+        self.slots = [(joint, name) for joint in rig.joints for name in asked[joint]]
         """Joint and name of every scaled parameter."""
-        self.measured = bench.measured()
-        self.believed, self.limit_hz = believed(bench)
+        self.measured = rig.measured()
+        self.believed, self.limit_hz = believed(rig)
         self.evaluations = 0
         self._kinds = [name for name in PARAMETERS if any(name in n for n in asked.values())]
         self._told = told
@@ -122,13 +122,13 @@ class DriveProblem:
 
     def block(self, joint: str) -> slice:
         """Rows of the residual that are a joint's."""
-        first = self.bench.joints.index(joint) * self.rows
+        first = self.rig.joints.index(joint) * self.rows
         return slice(first, first + self.rows)
 
     def differences(self, sets: Sequence[Drives]) -> list[list[Array]]:
         """Simulated less measured of several sets of drives, one list of recordings a set."""
         out = []
-        for answers in self.bench.run(sets):
+        for answers in self.rig.run(sets):
             row = []
             for answer, measured, mask in zip(answers, self.measured, self.believed, strict=True):
                 # What diverged is as wrong as a joint can be, not undefined.
@@ -146,16 +146,16 @@ def stacked(parts: Sequence[Array]) -> Array:
     return np.asarray(np.concatenate(parts).T.ravel())
 
 
-def believed(bench: ArmBench) -> tuple[list[Mask], dict[str, float]]:
+def believed(rig: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
     """Samples to believe, shape (n, joints) a recording, and each joint's trusted frequency [Hz].
 
     The frequency is infinite where no recording ran out of coherence.
     """
-    masks, limit = [], dict.fromkeys(bench.joints, float("inf"))
-    for log in bench.logs:
-        asked, _ = asked_joints(log, bench.robot)
-        mask = np.zeros((len(log.time), len(bench.joints)), dtype=bool)
-        for i, joint in enumerate(bench.joints):
+    masks, limit = [], dict.fromkeys(rig.joints, float("inf"))
+    for log in rig.logs:
+        asked, _ = asked_joints(log, rig.robot)
+        mask = np.zeros((len(log.time), len(rig.joints)), dtype=bool)
+        for i, joint in enumerate(rig.joints):
             if joint in asked:
                 mask[:, i], highest = trusted_samples(log, joint)
                 if not mask[:, i].all():

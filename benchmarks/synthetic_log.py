@@ -15,14 +15,14 @@ from scipy.interpolate import make_interp_spline
 
 from pronk.logs.joint_log import Segment, SweepLog
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import Question
+from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ask:
+class Excitation:
     """One signal to one joint."""
 
     offsets: Array
@@ -34,10 +34,10 @@ class Ask:
     """Rest before and after the signal [s]."""
 
 
-def rehearse(
+def synthetic_log(
     robot: Robot,
     joint: str,
-    asks: Sequence[Ask],
+    asks: Sequence[Excitation],
     stiffness: float,
     damping: float,
     *,
@@ -82,7 +82,7 @@ def rehearse(
     for ask in asks:
         rest = np.zeros(round(ask.settle_s / tick))
         ticks = centre + np.concatenate([rest, ask.offsets, rest])
-        question = Question(
+        question = CommandTrace(
             joint=joint,
             start=0.0,
             timestep=robot.timestep_s,
