@@ -19,7 +19,7 @@ from rich.text import Text
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.excitation.signals import Chirp
 from pronk.match.grid import axes
-from pronk.match.measured_joint import DB, SimRequest, measured_joints
+from pronk.match.measured_joint import DB, SimRequest, measured_joints, responses
 from pronk.match.quick import quick_search
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
