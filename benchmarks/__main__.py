@@ -5,21 +5,26 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
 
-import typer
+import tyro
 
 from pronk.cli import console
-from pronk.cli.main import run_app
+from pronk.cli.main import run_commands
 from pronk.errors import PronkError
 
 
 def match(
-    trials: Annotated[int, typer.Option(help="Logs of each scenario.")] = 5,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
-    json_file: console.JsonOption = None,
+    trials: int = 5,
+    seed: int = 0,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Match logs of known truth with pronk, mujoco.sysid and CMA-ES; bias, coverage, time."""
+    """Match logs of known truth with pronk, mujoco.sysid and CMA-ES; bias, coverage, time.
+
+    Args:
+        trials: Logs of each scenario.
+        seed: Of the noise.
+        json_file: Also write the figures to this file.
+    """
     import orjson
 
     from benchmarks.match import run, table
@@ -35,10 +40,15 @@ def match(
 
 
 def grid(
-    points: Annotated[int, typer.Option(help="Points of each axis; the paper has 50.")] = 50,
-    json_file: console.JsonOption = None,
+    points: int = 50,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """The paper's grid on twelve joints of known truth, beside a bare mujoco.rollout loop."""
+    """The paper's grid on twelve joints of known truth, beside a bare mujoco.rollout loop.
+
+    Args:
+        points: Points of each axis; the paper has 50.
+        json_file: Also write the figures to this file.
+    """
     from dataclasses import asdict
 
     from benchmarks.search import run, table
@@ -51,8 +61,14 @@ def grid(
     console.following("pronk bench engine   # what the simulator's step does to a joint")
 
 
-def engine(json_file: console.JsonOption = None) -> None:
-    """The same drive at a 0.25 ms step and in the 5 ms training simulator, before and after."""
+def engine(
+    json_file: console.JsonFile = None,
+) -> None:
+    """The same drive at a 0.25 ms step and in the 5 ms training simulator, before and after.
+
+    Args:
+        json_file: Also write the figures to this file.
+    """
     from benchmarks.engine import run, table
 
     with console.progress() as report:
@@ -75,11 +91,17 @@ def engine(json_file: console.JsonOption = None) -> None:
 
 
 def coverage(
-    trials: Annotated[int, typer.Option(help="Logs of each joint.")] = 200,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
-    json_file: console.JsonOption = None,
+    trials: int = 200,
+    seed: int = 0,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """How often the 95 % intervals hold the truth under coloured noise."""
+    """How often the 95 % intervals hold the truth under coloured noise.
+
+    Args:
+        trials: Logs of each joint.
+        seed: Of the noise.
+        json_file: Also write the figures to this file.
+    """
     from dataclasses import asdict
 
     from benchmarks.coverage import run, table
@@ -92,11 +114,17 @@ def coverage(
 
 
 def tick(
-    policy: Annotated[Path, typer.Argument(help="policy.onnx, which decides at each tick.")],
-    seconds: Annotated[float, typer.Option(help="Of each of the four cases.")] = 40.0,
-    json_file: console.JsonOption = None,
+    policy: tyro.conf.Positional[Path],
+    seconds: float = 40.0,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Lateness and the policy's answer at 50 Hz: idle, beside CPU hogs, with real time, without."""
+    """Lateness and the policy's answer at 50 Hz: idle, beside CPU hogs, with real time, without.
+
+    Args:
+        policy: policy.onnx, which decides at each tick.
+        seconds: Of each of the four cases.
+        json_file: Also write the figures to this file.
+    """
     from benchmarks.tick import bars, figures, run, table
 
     with console.progress() as report:
@@ -112,18 +140,25 @@ def tick(
 
 
 def train(
-    envs: Annotated[str, typer.Option(help="Numbers of environments.")] = "4096,16384",
-    steps: Annotated[int, typer.Option(help="Steps in a block of stepping.")] = 50,
-    iterations: Annotated[int, typer.Option(help="Iterations in a block of training.")] = 1,
-    repeats: Annotated[int, typer.Option(help="Blocks of each task, taken in turn.")] = 4,
-    device: Annotated[str, typer.Option(help="auto, cuda or cpu (to try it out).")] = "auto",
-    gpu_ids: Annotated[
-        str | None,
-        typer.Option(help="GPUs, such as 0,1: training on one and on all of them as well."),
-    ] = None,
-    json_file: console.JsonOption = None,
+    envs: str = "4096,16384",
+    steps: int = 50,
+    iterations: int = 1,
+    repeats: int = 4,
+    device: str = "auto",
+    gpu_ids: str | None = None,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Steps per second of the jump task and of mjlab's own Go1 task, stage by stage."""
+    """Steps per second of the jump task and of mjlab's own Go1 task, stage by stage.
+
+    Args:
+        envs: Numbers of environments.
+        steps: Steps in a block of stepping.
+        iterations: Iterations in a block of training.
+        repeats: Blocks of each task, taken in turn.
+        device: auto, cuda or cpu (to try it out).
+        gpu_ids: GPUs, such as 0,1: training on one and on all of them as well.
+        json_file: Also write the figures to this file.
+    """
     from benchmarks.train import run, stage_table, table
 
     begin = time.perf_counter()
@@ -155,16 +190,22 @@ def _numbers(text: str) -> list[int]:
 
 
 def trial(
-    policy: Annotated[Path, typer.Argument(help="policy.onnx.", metavar="POLICY")],
-    repeats: Annotated[int, typer.Option(help="Runs of each loop, taken in turn.")] = 7,
-    sim_params: Annotated[
-        Path | None,
-        typer.Option(help="Body of the virtual robot; the one that ships with pronk if left out."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of the jump's start and noise.")] = 0,
-    json_file: console.JsonOption = None,
+    policy: tyro.conf.Positional[Path],
+    repeats: int = 7,
+    sim_params: Path | None = None,
+    seed: int = 0,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Simulated seconds per second of the whole trial loop and of bare mj_step, over one run."""
+    """Simulated seconds per second of the whole trial loop and of bare mj_step, over one run.
+
+    Args:
+        policy: policy.onnx.
+        repeats: Runs of each loop, taken in turn.
+        sim_params: Body of the virtual robot; the one that ships with pronk if left
+            out.
+        seed: Of the jump's start and noise.
+        json_file: Also write the figures to this file.
+    """
     from benchmarks.trial import run, table
     from pronk.virtual.sim_params import load_sim_params
 
@@ -181,11 +222,15 @@ def trial(
     console.following(f"pronk trial {policy} --out out/trial   # 20 jumps with each command")
 
 
-app = typer.Typer(
-    help="pronk beside its peers, on the same data, in one run.", add_completion=False
-)
-for _command in (match, grid, engine, coverage, tick, train, trial):
-    app.command(_command.__name__)(_command)
+COMMANDS = {
+    "match": ("benchmarks.__main__:match", "pronk, mujoco.sysid and CMA-ES on the same logs."),
+    "grid": ("benchmarks.__main__:grid", "The paper's grid beside a bare mujoco.rollout loop."),
+    "engine": ("benchmarks.__main__:engine", "The same drive at 0.25 ms and at 5 ms."),
+    "coverage": ("benchmarks.__main__:coverage", "How often the 95 % intervals hold."),
+    "latency": ("benchmarks.__main__:tick", "Lateness of the control loop, and policy latency."),
+    "train": ("benchmarks.__main__:train", "Steps per second beside mjlab's Go1 task."),
+    "trial": ("benchmarks.__main__:trial", "The trial loop beside a bare MuJoCo loop."),
+}
 
 if __name__ == "__main__":
-    sys.exit(run_app(app, sys.argv[1:], "python -m benchmarks"))
+    sys.exit(run_commands(COMMANDS, sys.argv[1:], "python -m benchmarks"))

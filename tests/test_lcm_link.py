@@ -53,7 +53,9 @@ class Process:
     port: int = field(default_factory=free_port)
 
     def __post_init__(self) -> None:
-        code = "import typer; from pronk.cli.simulate import simulate; typer.run(simulate)"
+        code = (
+            "import sys; from pronk.cli.main import run; sys.exit(run(['simulate', *sys.argv[1:]]))"
+        )
         words = ["--layout", self.layout, "--port", str(self.port), "--json", self.json]
         self.running = subprocess.Popen(
             [sys.executable, "-c", code, *map(str, words)],

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from pronk.cli.main import app
+from command_line import invoke
 from pronk.errors import LogError
 from pronk.links.machine import State
 from pronk.report import whole
@@ -233,10 +232,7 @@ def test_the_page_of_a_refusal(tmp_path: Path) -> None:
 
 def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
     faulted(tmp_path / "a.mcap")
-    runner = CliRunner()
-    one = runner.invoke(
-        app, ["report", str(tmp_path / "a.mcap"), "--json", str(tmp_path / "a.json")]
-    )
+    one = invoke(["report", str(tmp_path / "a.mcap"), "--json", str(tmp_path / "a.json")])
     assert one.exit_code == 0, one.output
     written = (tmp_path / "a.html").read_text()
     assert "virtual robot</span>" not in written

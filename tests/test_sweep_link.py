@@ -74,7 +74,7 @@ def port() -> Iterator[int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         number = int(probe.getsockname()[1])
-    code = "import typer; from pronk.cli.simulate import simulate; typer.run(simulate)"
+    code = "import sys; from pronk.cli.main import run; sys.exit(run(['simulate', *sys.argv[1:]]))"
     running = subprocess.Popen(
         [sys.executable, "-c", code, "--port", str(number)],
         stdout=subprocess.PIPE,

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from typing import Literal
+
+Link = Literal["sim", "lcm", "dds"]
+"""How the machine is reached."""
 
 
-class Link(StrEnum):
-    """How the machine is reached."""
-
-    SIM = "sim"
-    LCM = "lcm"
-    DDS = "dds"
+Layout = Literal["cheetah", "wtw"]
+"""The messages on LCM."""
 
 
-class Layout(StrEnum):
-    """The messages on LCM."""
-
-    CHEETAH = "cheetah"
-    WTW = "wtw"
-
-
-class Base(StrEnum):
-    """What the virtual robot's trunk stands on."""
-
-    BENCH = "bench"
-    GROUND = "ground"
+Base = Literal["bench", "ground"]
+"""What the virtual robot's trunk stands on."""

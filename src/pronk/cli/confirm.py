@@ -5,8 +5,6 @@ from __future__ import annotations
 import select
 import sys
 
-import typer
-
 from pronk.cli import console
 from pronk.errors import HardwareError
 
@@ -23,7 +21,7 @@ def before_it_moves(robot: str, where: str) -> None:
         f"A real {robot} at {where} is about to move. Everybody out of its reach; the first time, "
         "hang it up."
     )
-    if typer.prompt(f"Type the robot's name ({robot}) to go on").strip() != robot:
+    if input(f"Type the robot's name ({robot}) to go on: ").strip() != robot:
         raise HardwareError(f"that was not {robot!r}; nothing was moved.")
 
 

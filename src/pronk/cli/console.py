@@ -13,15 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-JsonOption = Annotated[
-    Path | None, typer.Option("--json", help="Also write the figures to this file.")
-]
+JsonFile = Annotated[Path | None, tyro.conf.arg(name="json")]
 
 
 def out() -> Console:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from pronk.cli import console, demo_trial
-from pronk.cli.sweep import AMPLITUDES, SignalName, make
+from pronk.cli.sweep import AMPLITUDES, make
 from pronk.cli.sweep_virtual import record_virtual
 from pronk.errors import PronkError
 
@@ -51,20 +49,25 @@ class Clock:
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Folder for everything.")] = Path("out/demo"),
-    policies: Annotated[
-        Path | None,
-        typer.Option(help="Folder of policies to try; those that come with pronk if left out."),
-    ] = None,
-    jumps: Annotated[int, typer.Option(help="Jumps with each of the paper's commands.")] = 2,
-    repeats: Annotated[int, typer.Option(help="Times the matched amplitude is asked.")] = 3,
-    seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Search the linearized model instead of the grid.")
-    ] = False,
-    json_file: console.JsonOption = None,
+    out: Path = Path("out/demo"),
+    policies: Path | None = None,
+    jumps: int = 2,
+    repeats: int = 3,
+    seed: int = 0,
+    quick: bool = False,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Ask and match all joints of the virtual robot, let trained policies jump on it, report."""
+    """Ask and match all joints of the virtual robot, let trained policies jump on it, report.
+
+    Args:
+        out: Folder for everything.
+        policies: Folder of policies to try; those that come with pronk if left out.
+        jumps: Jumps with each of the paper's commands.
+        repeats: Times the matched amplitude is asked.
+        seed: Of the virtual robot's noise.
+        quick: Search the linearized model instead of the grid.
+        json_file: Also write the figures to this file.
+    """
     if jumps < 1:
         raise PronkError(f"--jumps {jumps}; expected 1 or more.")
     console.say(
@@ -180,10 +183,10 @@ def ask_and_match(
     from pronk.response import save as save_responses
 
     report("plan", 0.0)
-    plan = make(robot, None, SignalName.CHIRP, AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])))
+    plan = make(robot, None, "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])))
     plan.check()
     report("plan", 0.5)
-    fresh_plan = make(robot, None, SignalName.LOG_CHIRP, AMPLITUDES[:1], 1)
+    fresh_plan = make(robot, None, "log-chirp", AMPLITUDES[:1], 1)
     fresh_plan.check()
     report("plan", 1.0)
     clock.lap("plan")

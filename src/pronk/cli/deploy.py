@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import tyro
 
 from pronk.cli import confirm, console
 from pronk.cli.choices import Base, Link
@@ -28,59 +28,55 @@ _INTERRUPTED = 130
 
 
 def deploy(
-    policy: Annotated[Path, typer.Argument(help="policy.onnx, as `pronk train` writes it.")],
-    link: Annotated[
-        Link, typer.Option(help="sim: the virtual robot in this program; lcm, dds: by wire.")
-    ] = Link.SIM,
-    interface: Annotated[
-        str | None,
-        typer.Option(help="Network interface to a real robot; without it nothing leaves here."),
-    ] = None,
-    script: Annotated[
-        str | None,
-        typer.Option(help="Fly this unattended: paper, or a command such as 1,0,0."),
-    ] = None,
-    walk_only: Annotated[bool, typer.Option("--walk-only", help="A script without jumps.")] = False,
-    gamepad: Annotated[
-        Path | None, typer.Option(help="Gamepad, such as /dev/input/js0; a keyboard if left out.")
-    ] = None,
-    log: Annotated[Path | None, typer.Option(help="Log of everything, MCAP.")] = None,
-    capture: Annotated[
-        Path | None,
-        typer.Option(help="What cameras around the virtual robot saw, .npz (--link sim)."),
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="Sit down after this time with the policy in charge.")
-    ] = None,
-    blend: Annotated[
-        float, typer.Option(help="Time in which the policy takes over, in s; 0 as in training.")
-    ] = 0.4,
-    tilt: Annotated[float, typer.Option(help="Largest tilt of the trunk, in rad.")] = 0.8,
-    base: Annotated[Base, typer.Option(help="Of the virtual robot.")] = Base.GROUND,
-    sim_params: Annotated[
-        Path | None,
-        typer.Option(help="Parameters of the virtual robot, instead of the shipped one."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,
-    layout: Annotated[str, typer.Option(help="Messages on LCM: cheetah or wtw.")] = "cheetah",
-    port: Annotated[int | None, typer.Option(help="UDP port of LCM.")] = None,
-    domain: Annotated[int | None, typer.Option(help="Domain of DDS.")] = None,
-    release: Annotated[
-        bool,
-        typer.Option("--release", help="Make the robot's own controller let go of the joints."),
-    ] = False,
-    ignore_latency: Annotated[
-        bool, typer.Option("--any-delay", help="Walk whatever delay is measured.")
-    ] = False,
-    real_time: Annotated[
-        bool, typer.Option("--real-time/--no-real-time", help="Ask for real-time scheduling.")
-    ] = True,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Do not ask before real hardware moves.")
-    ] = False,
-    json_file: console.JsonOption = None,
-) -> None:
-    """Stand up, let the policy walk and jump, sit down; every command through the safety filter."""
+    policy: tyro.conf.Positional[Path],
+    link: Link = "sim",
+    interface: str | None = None,
+    script: str | None = None,
+    walk_only: bool = False,
+    gamepad: Path | None = None,
+    log: Path | None = None,
+    capture: Path | None = None,
+    seconds: float | None = None,
+    blend: float = 0.4,
+    tilt: float = 0.8,
+    base: Base = "ground",
+    sim_params: Path | None = None,
+    seed: int = 0,
+    layout: str = "cheetah",
+    port: int | None = None,
+    domain: int | None = None,
+    release: bool = False,
+    ignore_latency: Annotated[bool, tyro.conf.arg(name="any-delay")] = False,
+    real_time: bool = True,
+    yes: bool = False,
+    json_file: console.JsonFile = None,
+) -> int:
+    """Stand up, let the policy walk and jump, sit down; every command through the safety filter.
+
+    Args:
+        policy: policy.onnx, as `pronk train` writes it.
+        link: sim: the virtual robot in this program; lcm, dds: by wire.
+        interface: Network interface to a real robot; without it nothing leaves here.
+        script: Fly this unattended: paper, or a command such as 1,0,0.
+        walk_only: A script without jumps.
+        gamepad: Gamepad, such as /dev/input/js0; a keyboard if left out.
+        log: Log of everything, MCAP.
+        capture: What cameras around the virtual robot saw, .npz (--link sim).
+        seconds: Sit down after this time with the policy in charge.
+        blend: Time in which the policy takes over, in s; 0 as in training.
+        tilt: Largest tilt of the trunk, in rad.
+        base: Of the virtual robot.
+        sim_params: Parameters of the virtual robot, instead of the shipped one.
+        seed: Of the virtual robot's noise.
+        layout: Messages on LCM: cheetah or wtw.
+        port: UDP port of LCM.
+        domain: Domain of DDS.
+        release: Make the robot's own controller let go of the joints.
+        ignore_latency: Walk whatever delay is measured.
+        real_time: Ask for real-time scheduling.
+        yes: Do not ask before real hardware moves.
+        json_file: Also write the figures to this file.
+    """
     from pronk.policy.runtime import load_policy
     from pronk.runtime.link import Link as Opener
     from pronk.runtime.plan import Plan
@@ -88,11 +84,11 @@ def deploy(
     from pronk.runtime.trajectories import Timing
 
     contract = load_policy(policy).contract
-    if capture is not None and (link is not Link.SIM or base is not Base.GROUND):
+    if capture is not None and (link != "sim" or base != "ground"):
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
     plan = Plan(
         link=Opener(
-            kind=link.value,
+            kind=link,
             robot=contract.robot,
             interface=interface,
             layout=layout,
@@ -101,7 +97,7 @@ def deploy(
             release=release,
             sim_params=sim_params,
             seed=seed,
-            base=base.value,
+            base=base,
         ),
         policy=policy,
         log=log,
@@ -112,8 +108,8 @@ def deploy(
         real_time=real_time,
     )
     scripts = None if script is None else _scripts(script, contract, walk_only)
-    if interface is not None and link is not Link.SIM and not yes:
-        confirm.before_it_moves(contract.robot, f"{link.value} on {interface}")
+    if interface is not None and link != "sim" and not yes:
+        confirm.before_it_moves(contract.robot, f"{link} on {interface}")
     with _operator(contract, scripts, gamepad, seconds) as (operator, words):
         console.say(words)
         summary = run(plan, operator, _tell)
@@ -124,12 +120,13 @@ def deploy(
     console.following(
         f"pronk report {log}"
         if log is not None
-        else f"pronk deploy {policy} --link {link.value} --log run.mcap   # keeps everything"
+        else f"pronk deploy {policy} --link {link} --log run.mcap   # keeps everything"
     )
     if summary.faults or summary.refusals or lost:
-        raise typer.Exit(_FAILED)
+        return _FAILED
     if summary.interrupted:
-        raise typer.Exit(_INTERRUPTED)
+        return _INTERRUPTED
+    return 0
 
 
 @contextmanager

@@ -6,11 +6,10 @@ import io
 import math
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+import tyro
 
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -22,70 +21,46 @@ if TYPE_CHECKING:
     from pronk.train.gains import TrainingGains
 
 
-class What(StrEnum):
-    """What is asked."""
-
-    ALL = "all"
-    WALK = "walk"
-    JUMP = "jump"
+What = Literal["all", "walk", "jump"]
+"""What is asked."""
 
 
-class Drawn(StrEnum):
-    """What differs from robot to robot."""
-
-    FULL = "full"
-    NOISE = "noise"
-    NONE = "none"
+Drawn = Literal["full", "noise", "none"]
+"""What differs from robot to robot."""
 
 
-class Device(StrEnum):
-    """What computes."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    CUDA = "cuda"
+Device = Literal["auto", "cpu", "cuda"]
+"""What computes."""
 
 
 def evaluate(
-    policy: Annotated[
-        Path,
-        typer.Argument(
-            help="policy.onnx, a checkpoint, or the folder of a run (its last checkpoint).",
-            metavar="POLICY",
-        ),
-    ],
-    gains: Annotated[
-        str,
-        typer.Option(help="Gains of the simulated drives: gains.yaml, or naive."),
-    ],
-    out: Annotated[Path, typer.Option("--out", "--json", help="The evaluation, as JSON.")] = Path(
-        "evaluation.json"
-    ),
-    like: Annotated[
-        Path | None,
-        typer.Option(help="With naive gains: the gains.yaml whose ranges and delay are used."),
-    ] = None,
-    what: Annotated[
-        What, typer.Option(help="walk: velocities. jump: the paper's jumps. all: both.")
-    ] = What.ALL,
-    robots: Annotated[int, typer.Option(help="Robots for each command.")] = 1000,
-    randomization: Annotated[
-        Drawn,
-        typer.Option(
-            help="full: as in training. noise: one nominal robot many times, with noise, timing "
-            "and delay as in training. none: the nominal robot, undisturbed."
-        ),
-    ] = Drawn.FULL,
-    before: Annotated[
-        Path | None,
-        typer.Option(help="Evaluation of the policy before the jump phases, to compare the walk."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of all draws.")] = 0,
-    device: Annotated[
-        Device, typer.Option(help="auto: a GPU if there is one. On the CPU take a few robots.")
-    ] = Device.AUTO,
+    policy: tyro.conf.Positional[Path],
+    gains: str,
+    out: Annotated[Path, tyro.conf.arg(aliases=("--json",))] = Path("evaluation.json"),
+    like: Path | None = None,
+    what: What = "all",
+    robots: int = 1000,
+    randomization: Drawn = "full",
+    before: Path | None = None,
+    seed: int = 0,
+    device: Device = "auto",
 ) -> None:
-    """Walk and jump with many robots at once; errors, heights and falls beside the bars."""
+    """Walk and jump with many robots at once; errors, heights and falls beside the bars.
+
+    Args:
+        policy: policy.onnx, a checkpoint, or the folder of a run (its last checkpoint).
+        gains: Gains of the simulated drives: gains.yaml, or naive.
+        out: The evaluation, as JSON.
+        like: With naive gains: the gains.yaml whose ranges and delay are used.
+        what: walk: velocities. jump: the paper's jumps. all: both.
+        robots: Robots for each command.
+        randomization: full: as in training. noise: one nominal robot many times, with
+            noise, timing and delay as in training. none: the nominal robot,
+            undisturbed.
+        before: Evaluation of the policy before the jump phases, to compare the walk.
+        seed: Of all draws.
+        device: auto: a GPU if there is one. On the CPU take a few robots.
+    """
     from pronk.evaluation.training_sim.plan import JUMPS, WALKS, Plan
     from pronk.robots import load_robot
     from pronk.train.gains import training_gains
@@ -98,11 +73,11 @@ def evaluate(
     plan = Plan(
         robots=robots,
         seed=seed,
-        walks=() if what is What.JUMP else WALKS,
-        jumps=() if what is What.WALK else JUMPS,
+        walks=() if what == "jump" else WALKS,
+        jumps=() if what == "walk" else JUMPS,
     )
     drives = training_gains(gains, load_robot(ROBOT), like=like)
-    where = "cuda:0" if find_devices(device.value).device == "cuda" else "cpu"
+    where = "cuda:0" if find_devices(device).device == "cuda" else "cpu"
 
     from pronk.evaluation.training_sim import result as evaluate_result
     from pronk.evaluation.training_sim.evaluate import write
@@ -119,7 +94,7 @@ def evaluate(
             f"{policy} was not trained with these gains; what follows is how it does with "
             f"{drives.name} ones"
         )
-    found = run(subject, drives, plan, where, randomization.value, errors)
+    found = run(subject, drives, plan, where, randomization, errors)
     write(out, found)
     show(found)
     console.wrote(out)

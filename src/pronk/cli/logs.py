@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import tyro
 
 from pronk.errors import LogError, PronkError
 
@@ -18,42 +16,25 @@ if TYPE_CHECKING:
     from pronk.logs.joint_log import SweepLog
     from pronk.robots.robot import Robot
 
-LogsArgument = Annotated[
-    list[Path], typer.Argument(help="Logs; a folder means all logs in it.", metavar="LOG...")
-]
-RobotOption = Annotated[str, typer.Option("--robot", help="Robot, for instance mini_cheetah.")]
-
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
-    """How logs are to be read. A field is an option of every command that reads logs."""
+class ReadingOptions:
+    """How logs are read. Each field is an option of every command that reads logs."""
 
-    unit: Annotated[
-        str | None, typer.Option(help="Unit of all angles, rad or deg; must be said for CSV.")
-    ] = None
-    time_unit: Annotated[
-        str | None, typer.Option(help="Unit of the timestamps: s, ms, us or ns.")
-    ] = None
-    columns: Annotated[
-        list[str] | None,
-        typer.Option(help="CSV: OURS=THEIRS, as in position.FR_knee=q3; repeat it."),
-    ] = None
-    joint_names: Annotated[
-        list[str] | None, typer.Option(help="THEIRS=OURS for joints of other names; repeat it.")
-    ] = None
-    scale: Annotated[
-        list[str] | None,
-        typer.Option(help="JOINT=RADIANS per unit, for a joint that is not in radians; repeat it."),
-    ] = None
-    rate_hz: Annotated[
-        float | None, typer.Option(help="Rate the log is said to have; an error if it has not.")
-    ] = None
-    log_format: Annotated[
-        str | None,
-        typer.Option(
-            "--format", help="mcap, csv, sage, pace or npz; told from the name if left out."
-        ),
-    ] = None
+    unit: str | None = None
+    """Unit of all angles, rad or deg; required for CSV."""
+    time_unit: str | None = None
+    """Unit of the timestamps: s, ms, us or ns."""
+    columns: tuple[str, ...] = ()
+    """CSV: OURS=THEIRS, as in position.FR_knee=q3; repeat it."""
+    joint_names: tuple[str, ...] = ()
+    """THEIRS=OURS for joints of other names; repeat it."""
+    scale: tuple[str, ...] = ()
+    """JOINT=RADIANS per unit, for a joint that is not in radians; repeat it."""
+    rate_hz: float | None = None
+    """Rate that the log is expected to have; another one is an error."""
+    log_format: Annotated[str | None, tyro.conf.arg(name="format")] = None
+    """mcap, csv, sage, pace or npz; from the name if left out."""
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `pronk.logs.readers.read_log`."""
@@ -86,30 +67,7 @@ def _float(option: str, text: str) -> float:
         raise PronkError(f"{option}: {text!r} is not a number.") from None
 
 
-def reads_logs(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `Reading`; it takes them together as its argument `reading`."""
-    own = inspect.signature(command, eval_str=True)
-    hints = inspect.get_annotations(Reading, eval_str=True)
-    added = [
-        inspect.Parameter(
-            field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hints[field.name]
-        )
-        for field in fields(Reading)
-    ]
-    kept = [p for p in own.parameters.values() if p.name != "reading"]
-
-    @functools.wraps(command)
-    def wrapped(**given: Any) -> None:
-        reading = Reading(**{field.name: given.pop(field.name) for field in fields(Reading)})
-        command(**given, reading=reading)
-
-    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept] + added
-    wrapped.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
-    wrapped.__annotations__ = {p.name: p.annotation for p in parameters}
-    return wrapped
-
-
-def read(paths: Sequence[Path], reading: Reading, robot: Robot | None) -> list[SweepLog]:
+def read(paths: Sequence[Path], reading: ReadingOptions, robot: Robot | None) -> list[SweepLog]:
     """Read every log that some paths stand for, on all cores.
 
     Raises:

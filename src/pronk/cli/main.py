@@ -1,101 +1,55 @@
-"""The command line: one command per arrow of the way of the data, and nothing else.
+"""The command line: each command is a function whose parameters tyro makes into options.
 
-A bad input ends with one sentence and exit status 2; anything else that escapes is a defect of
-pronk, is called so, and ends with 1 (`PRONK_DEBUG=1` shows where it came from).
+Bad input ends with one sentence on standard error and exit status 2. Any other exception is a
+defect of pronk, is named so, and ends with 1 (`PRONK_DEBUG=1` prints the traceback).
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import inspect
+import io
 import os
+import re
 import sys
 import traceback
-from collections.abc import Sequence
-from typing import Annotated
-
-import typer
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from pronk import __version__, opengl
-from pronk.cli import (
-    demo,
-    deploy,
-    evaluate,
-    export,
-    match,
-    play,
-    predict,
-    report,
-    response,
-    simulate,
-    sweep,
-    train,
-    trial,
-)
 from pronk.errors import PronkError
 
-app = typer.Typer(
-    name="pronk",
-    help="From a chirp to matched gains to a policy that jumps: ask every joint, write down its "
-    "answer, make the simulator answer alike, train in it.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command("sweep")(sweep.sweep)
-app.command("response")(response.response)
-app.command("match")(match.match)
-app.command("predict")(predict.predict)
-app.command("train")(train.train)
-app.command("evaluate")(evaluate.evaluate)
-app.command("export")(export.export)
-app.command("trial")(trial.trial)
-app.command("play")(play.play)
-app.command("deploy")(deploy.deploy)
-app.command("simulate")(simulate.simulate)
-app.command("report")(report.report)
-app.command("demo")(demo.demo)
-
-
-def _show_version(asked: bool) -> None:
-    if asked:
-        typer.echo(f"pronk {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: Annotated[
-        bool,
-        typer.Option("--version", callback=_show_version, is_eager=True, help="Show and leave."),
-    ] = False,
-) -> None:
-    """Options of pronk itself."""
-
-
-# Misspelled options and the like: the base of BadParameter's base, wherever typer keeps it.
-_UsageError: type[Exception] = typer.BadParameter.__mro__[2]
-
-
-_RENAMED = {
-    ("twin",): "`pronk twin` is now `pronk simulate`",
-    ("--truth",): "`--truth` is now `--sim-params`",
-    ("--link", "twin"): "`--link twin` is now `--link sim`",
-    ("--link=twin",): "`--link twin` is now `--link sim`",
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "sweep": ("pronk.cli.sweep:sweep", "Plan a sweep, check it against the limits, record it."),
+    "response": ("pronk.cli.response:response", "Estimate frequency responses; Bode plots."),
+    "match": ("pronk.cli.match:match", "Find the gains with which the simulator responds alike."),
+    "predict": ("pronk.cli.predict:predict", "Replay logs that the fit has not used."),
+    "export": ("pronk.cli.export:export", "Write gains as configuration of a simulator."),
+    "train": ("pronk.cli.train:train", "Train a policy that walks and jumps."),
+    "evaluate": ("pronk.cli.evaluate:evaluate", "Evaluate a policy in the training simulator."),
+    "trial": ("pronk.cli.trial:trial", "Measure the paper's jumps on the virtual robot."),
+    "play": ("pronk.cli.play:play", "Steer the virtual robot in a browser."),
+    "deploy": ("pronk.cli.deploy:deploy", "Run a policy on a robot or the virtual robot."),
+    "simulate": ("pronk.cli.simulate:simulate", "Run the virtual robot as a process of its own."),
+    "report": ("pronk.cli.report:report", "Write one HTML page of matches, trials, deployments."),
+    "demo": ("pronk.cli.demo:demo", "Sweep, match and jump on the virtual robot."),
 }
-"""Words of earlier releases, as they follow each other on the command line, and their hints."""
+"""Name of a command: where its function is, and what it does."""
 
-
-def _hint(arguments: Sequence[str]) -> str:
-    """What replaces the first old word on a command line; empty without one."""
-    for words, hint in _RENAMED.items():
-        places = range(1) if words[0][0] != "-" else range(len(arguments))
-        if any(tuple(arguments[k : k + len(words)]) == words for k in places):
-            return hint
-    return ""
-
-
-def _complain(text: str) -> None:
-    typer.echo(f"pronk: {' '.join(text.split())}", err=True)
+RENAMED = {
+    "twin": "`pronk twin` is now `pronk simulate`.",
+    "bench": "`pronk bench NAME` is now `python -m benchmarks NAME`, run in a checkout.",
+    "--link twin": "`--link twin` is now `--link sim`.",
+    "--truth": "`--truth` is now `--sim-params`.",
+    "--free": "`--free` is now `--fit`.",
+    "--release": "`--release` is now `--disable-onboard-controller`.",
+    "--any-delay": "`--any-delay` is now `--ignore-latency-check`.",
+    "--blend": "`--blend` is now `--blend-time-s`.",
+    "--like": "`--like` is now `--ranges-from`.",
+    "--from": "`--from` is now `--init-checkpoint`.",
+}
+"""Names of the release before, each with the hint that replaces it."""
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -104,53 +58,111 @@ def run(arguments: Sequence[str]) -> int:
     Args:
         arguments: The words after `pronk`.
     """
-    return run_app(app, arguments, "pronk")
+    return run_commands(COMMANDS, arguments, "pronk")
 
 
-def run_app(commands: typer.Typer, arguments: Sequence[str], name: str) -> int:
-    """Run a command line with pronk's error messages and return its exit status.
+def run_commands(
+    commands: Mapping[str, tuple[str, str]], arguments: Sequence[str], program: str
+) -> int:
+    """Run one of `commands` and return its exit status.
 
     Args:
         commands: The commands to choose from.
         arguments: The words after the program's name.
-        name: Name of the program.
+        program: Name of the program.
     """
-    if hint := _hint(arguments):
-        _complain(f"{hint}; `{name} --help` lists the commands.")
-        return 2
     try:
-        status = commands(list(arguments), prog_name=name, standalone_mode=False)
-        return status if isinstance(status, int) else 0
+        return _dispatch(commands, list(arguments), program)
     except PronkError as error:
-        _complain(str(error))
+        _print_error(str(error))
         return 2
-    except (KeyboardInterrupt, typer.Abort):
-        _complain("interrupted.")
+    except KeyboardInterrupt:
+        _print_error("interrupted.")
         return 130
-    except _UsageError as error:
-        message = str(getattr(error, "message", error))
-        # Without arguments the message is the help itself.
-        if not message.strip() or not arguments:
-            return 0 if not arguments else 2
-        context = getattr(error, "ctx", None)
-        command = context.command_path if context is not None else "pronk"
-        _complain(f"{message.rstrip('.')}; `{command} --help` lists what there is.")
-        return 2
     except BrokenPipeError:
-        # Whoever read the output has seen enough.
-        sys.stderr.close()
+        sys.stderr.close()  # The reader of a pipe has closed it.
         return 0
     except MemoryError:
-        _complain("out of memory; give fewer logs or joints at a time.")
+        _print_error("out of memory; give fewer logs or joints at a time.")
         return 1
     except Exception as error:
         if os.environ.get("PRONK_DEBUG"):
             traceback.print_exc()
-        _complain(
+        _print_error(
             f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
             "PRONK_DEBUG=1 shows where it happened."
         )
         return 1
+
+
+def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], program: str) -> int:
+    name = arguments[0] if arguments else "--help"
+    if name in ("--help", "-h"):
+        width = max(map(len, commands))
+        lines = [f"  {name:{width}}  {text}" for name, (_, text) in commands.items()]
+        print(  # noqa: T201
+            f"usage: {program} [--version] COMMAND ...\n\ncommands:\n"
+            + "\n".join(lines)
+            + f"\n\n`{program} COMMAND --help` lists the options of a command."
+        )
+        return 0
+    if name == "--version":
+        print(f"pronk {__version__}")  # noqa: T201
+        return 0
+    if name not in commands:
+        hint = RENAMED.get(name) or f"the commands are {', '.join(commands)}."
+        raise PronkError(f"there is no command {name!r}; {hint}")
+    module, _, function = commands[name][0].partition(":")
+    command = getattr(importlib.import_module(module), function)
+    status = _parse(command, arguments[1:], f"{program} {name}")()
+    return status if isinstance(status, int) else 0
+
+
+def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> Callable[[], Any]:
+    """Return the call that a command line means.
+
+    Raises:
+        PronkError: The options do not fit; one sentence.
+    """
+    import tyro
+
+    given: dict[str, Any] = {}
+
+    def call(**values: Any) -> None:
+        given.update(values)
+
+    call.__signature__ = inspect.signature(command, eval_str=True)  # type: ignore[attr-defined]
+    call.__doc__ = command.__doc__
+    call.__annotations__ = inspect.get_annotations(command, eval_str=True)
+    config = (tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes)
+    messages = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(messages):
+            tyro.cli(call, prog=program, args=arguments, config=config)
+    except SystemExit as stop:
+        if not stop.code:
+            return lambda: 0
+        raise PronkError(_sentence(messages.getvalue(), arguments, program)) from None
+    return lambda: command(**given)
+
+
+def _sentence(box: str, arguments: list[str], program: str) -> str:
+    """Make one sentence of the message that tyro prints in a box."""
+    words = " ".join(arguments)
+    for old, hint in RENAMED.items():
+        if re.search(rf"(?:^| ){re.escape(old)}(?:[ =]|$)", words):
+            return hint
+    lines = [re.sub(r"[│╭╮╰╯─]", " ", line).strip() for line in box.splitlines()]
+    text = " ".join(line for line in lines if line)
+    text = text.split("For full helptext")[0].strip().rstrip(".")
+    text = re.sub(
+        r"^(Parsing error|Required options|Unrecognized options|Value error)\s+", "", text
+    )
+    return f"{text}; `{program} --help` lists the options."
+
+
+def _print_error(text: str) -> None:
+    print(f"pronk: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
 
 
 def main() -> None:

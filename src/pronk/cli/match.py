@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import typer
+import tyro
 
 from pronk.cli import console, logs
 from pronk.errors import PronkError
@@ -20,65 +19,47 @@ if TYPE_CHECKING:
     from pronk.robots.robot import Robot
 
 
-class Mode(StrEnum):
-    """What is looked for."""
-
-    GAINS = "gains"
-    DRIVE = "drive"
+Mode = Literal["gains", "drive"]
+"""What is looked for."""
 
 
-class Interval(StrEnum):
-    """How intervals are made from repeats."""
-
-    STUDENT = "student"
-    BOOTSTRAP = "bootstrap"
+Interval = Literal["student", "bootstrap"]
+"""How intervals are made from repeats."""
 
 
-@logs.reads_logs
 def match(
-    paths: logs.LogsArgument,
-    robot: logs.RobotOption,
-    out: Annotated[Path, typer.Option("--out", help="The gains file.")] = Path("gains.yaml"),
-    mode: Annotated[
-        Mode,
-        typer.Option(
-            help="gains: stiffness and damping (the paper's), the default. drive: stiffness is "
-            "known; damping, armature, friction and delay are looked for."
-        ),
-    ] = Mode.GAINS,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Search the linearized model, verify by simulation.")
-    ] = False,
-    zero_armature: Annotated[
-        bool,
-        typer.Option(
-            "--zero-armature/--no-zero-armature", help="Repeat the search without rotor inertia."
-        ),
-    ] = True,
-    free: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="drive: look for this instead; repeat it. What the sweeps cannot tell is refused."
-        ),
-    ] = None,
-    interval: Annotated[
-        Interval, typer.Option(help="95 % intervals over repeats; the bootstrap needs eight.")
-    ] = Interval.STUDENT,
-    phase: Annotated[
-        bool, typer.Option("--phase", help="Let the refinement see the phase and a free delay.")
-    ] = False,
-    device: Annotated[
-        str,
-        typer.Option(
-            help="Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs "
-            "pronk\\[train])."
-        ),
-    ] = "cpu",
-    json_file: console.JsonOption = None,
-    *,
-    reading: logs.Reading,
+    paths: tyro.conf.Positional[tuple[Path, ...]],
+    robot: str,
+    out: Path = Path("gains.yaml"),
+    mode: Mode = "gains",
+    quick: bool = False,
+    zero_armature: bool = True,
+    free: tuple[str, ...] = (),
+    interval: Interval = "student",
+    phase: bool = False,
+    device: str = "cpu",
+    reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Find the gains that make the simulator answer like the robot."""
+    """Find the gains that make the simulator answer like the robot.
+
+    Args:
+        paths: Logs, or folders of logs.
+        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF.
+        out: The gains file.
+        mode: gains: stiffness and damping (the paper's), the default. drive: stiffness
+            is known; damping, armature, friction and delay are looked for.
+        quick: Search the linearized model, verify by simulation.
+        zero_armature: Repeat the search without rotor inertia.
+        free: drive: look for this instead; repeat it. What the sweeps cannot tell is
+            refused.
+        interval: 95 % intervals over repeats; the bootstrap needs eight.
+        phase: Let the refinement see the phase and a free delay.
+        device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
+            pronk[train]).
+        json_file: Also write the figures to this file.
+        reading: How logs are read.
+    """
     from pronk.match.drive import match_drives
     from pronk.match.parameters import DRIVE_MODE
     from pronk.match.pipeline import match_logs
@@ -96,16 +77,16 @@ def match(
         method="quick" if quick else "grid",
         zero_armature=zero_armature,
         use_phase=phase,
-        interval=interval.value,
+        interval=interval,
         device=device,
     )
-    if free and mode is not Mode.DRIVE:
+    if free and mode != "drive":
         raise PronkError("--free names what --mode drive looks for; say --mode drive as well.")
     arm: ArmMatch | None = None
     with console.progress() as report:
         if any(moves_together(log) for log in read):
-            arm, result = together(read, machine, mode.value, report)
-        elif mode is Mode.DRIVE:
+            arm, result = together(read, machine, mode, report)
+        elif mode == "drive":
             result = match_drives(
                 read, machine, free=free or DRIVE_MODE, settings=settings, progress=report
             )

@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
+import tyro
 
 from pronk.cli import console
 
 
 def play(
-    policy: Annotated[Path, typer.Argument(help="policy.onnx.", metavar="POLICY")],
-    sim_params: Annotated[
-        Path | None,
-        typer.Option(help="Body of the virtual robot; the one that ships with pronk if left out."),
-    ] = None,
-    port: Annotated[int, typer.Option(help="Of the page; the next one that is free.")] = 8080,
-    host: Annotated[
-        str,
-        typer.Option(help="Address to bind to. 0.0.0.0 lets everybody on your networks play."),
-    ] = "127.0.0.1",
-    gamepad: Annotated[
-        bool | None,
-        typer.Option(
-            help="Use a gamepad that is plugged into this machine; if there is one, if left out."
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,
-    json: console.JsonOption = None,
+    policy: tyro.conf.Positional[Path],
+    sim_params: Path | None = None,
+    port: int = 8080,
+    host: str = "127.0.0.1",
+    gamepad: bool | None = None,
+    seed: int = 0,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Walk and jump the virtual robot from a browser: sliders, keys or gamepad."""
+    """Walk and jump the virtual robot from a browser: sliders, keys or gamepad.
+
+    Args:
+        policy: policy.onnx.
+        sim_params: Body of the virtual robot; the one that ships with pronk if left
+            out.
+        port: Of the page; the next one that is free.
+        host: Address to bind to. 0.0.0.0 lets everybody on your networks play.
+        gamepad: Use a gamepad that is plugged into this machine; if there is one, if
+            left out.
+        seed: Of the virtual robot's noise.
+        json_file: Also write the figures to this file.
+    """
     from dataclasses import asdict
 
     from pronk.errors import PronkError
@@ -76,4 +76,4 @@ def play(
         f"{played.simulated_s:.0f} s of the virtual robot in {played.wall_s:.0f} s "
         f"({played.factor:.2f} x real time), {len(played.hops)} jumps"
     )
-    console.write_json(json, asdict(played))
+    console.write_json(json_file, asdict(played))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
+import tyro
 
 from pronk.cli import console, logs
 
@@ -14,19 +14,24 @@ if TYPE_CHECKING:
     from pronk.match.prediction import JointPrediction
 
 
-@logs.reads_logs
 def predict(
-    paths: logs.LogsArgument,
-    robot: logs.RobotOption,
-    gains: Annotated[Path, typer.Option("--gains", help="gains.yaml of `pronk match`.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for replays and figure; beside the gains.")
-    ] = None,
-    json_file: console.JsonOption = None,
-    *,
-    reading: logs.Reading,
+    paths: tyro.conf.Positional[tuple[Path, ...]],
+    robot: str,
+    gains: Path,
+    out: Path | None = None,
+    reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Replay logs in the simulator with naive and with matched gains; RMSE and R2 per joint."""
+    """Replay logs in the simulator with naive and with matched gains; RMSE and R2 per joint.
+
+    Args:
+        paths: Logs, or folders of logs.
+        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF.
+        gains: gains.yaml of `pronk match`.
+        out: Folder for replays and figure; beside the gains.
+        json_file: Also write the figures to this file.
+        reading: How logs are read.
+    """
     from pronk.match import gains as gains_file
     from pronk.match import prediction as prediction_file
     from pronk.match.predict import predict as predict_log

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
+import tyro
 
 from pronk.cli import console
 
 
 def report(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder that matches and trials were written to, or one above; or the log of a "
-            "deployment, .mcap."
-        ),
-    ],
-    json_file: console.JsonOption = None,
+    folder: tyro.conf.Positional[Path],
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Write one HTML page of all matches, trials and deployments in a folder, or of one log."""
+    """Write one HTML page of all matches, trials and deployments in a folder, or of one log.
+
+    Args:
+        folder: Folder that matches and trials were written to, or one above; or the log
+            of a deployment, .mcap.
+        json_file: Also write the figures to this file.
+    """
     from pronk.report import whole
 
     with console.progress() as shown:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import typer
+import tyro
 
 from pronk.cli import console, logs
 
@@ -14,41 +13,40 @@ if TYPE_CHECKING:
     from pronk.response.response import FrequencyResponse
 
 
-class Method(StrEnum):
-    """Estimator."""
-
-    H1 = "H1"
-    H2 = "H2"
-    HV = "Hv"
+Method = Literal["H1", "H2", "Hv"]
+"""Estimator."""
 
 
 COHERENT = 0.95
 """Coherence from which on a frequency counts as answered."""
 
 
-@logs.reads_logs
 def response(
-    paths: logs.LogsArgument,
-    robot: Annotated[
-        str | None, typer.Option("--robot", help="Robot, where the log does not say.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for what is written; beside the log if left out."),
-    ] = None,
-    method: Annotated[Method, typer.Option(help="H1: noise on the position alone.")] = Method.H1,
-    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw Bode plots.")] = True,
-    json_file: console.JsonOption = None,
-    *,
-    reading: logs.Reading,
+    paths: tyro.conf.Positional[tuple[Path, ...]],
+    robot: str | None = None,
+    out: Path | None = None,
+    method: Method = "H1",
+    plots: bool = True,
+    reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Estimate the frequency response of every joint that was asked."""
+    """Estimate the frequency response of every joint that was asked.
+
+    Args:
+        paths: Logs, or folders of logs.
+        robot: Robot, where the log does not say.
+        out: Folder for what is written; beside the log if left out.
+        method: H1: noise on the position alone.
+        plots: Draw Bode plots.
+        json_file: Also write the figures to this file.
+        reading: How logs are read.
+    """
     from pronk.report import figures, style
     from pronk.response import Estimator, estimate, save
     from pronk.robots import load_robot
 
     read = logs.read(paths, reading, load_robot(robot) if robot else None)
-    settings = Estimator(method=method.value)
+    settings = Estimator(method=method)
     rows: list[dict[str, Any]] = []
     written: list[Path] = []
     with console.progress() as report:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import signal
 import time
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import typer
+import tyro
 
 from pronk.cli import console
 from pronk.cli.choices import Base, Layout
@@ -25,80 +24,57 @@ _LATE_MS = 5.0
 """Lateness of one tick in a hundred above which a virtual robot no longer moves like one [ms]."""
 
 
-class WireLink(StrEnum):
-    """The wire that the virtual robot speaks."""
-
-    LCM = "lcm"
-    DDS = "dds"
+WireLink = Literal["lcm", "dds"]
+"""The wire that the virtual robot speaks."""
 
 
-class Silence(StrEnum):
-    """What the drives do when commands stop."""
-
-    HOLD = "hold"
-    ZERO = "zero"
-    DAMP = "damp"
+Silence = Literal["hold", "zero", "damp"]
+"""What the drives do when commands stop."""
 
 
 def simulate(
-    robot: Annotated[
-        str, typer.Argument(help="Robot, for instance mini_cheetah.")
-    ] = "mini_cheetah",
-    link: Annotated[WireLink, typer.Option(help="The wire.")] = WireLink.LCM,
-    layout: Annotated[
-        Layout,
-        typer.Option(help="Messages on LCM: Cheetah-Software's, or walk-these-ways'."),
-    ] = Layout.CHEETAH,
-    base: Annotated[
-        Base, typer.Option(help="bench: the trunk is fixed; ground: it stands and moves freely.")
-    ] = Base.BENCH,
-    sim_params: Annotated[
-        Path | None,
-        typer.Option(help="Parameters of the virtual robot, instead of the shipped one."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of all noise and all faults.")] = 0,
-    port: Annotated[
-        int | None, typer.Option(help="UDP port on this computer (LCM); 7768 if left out.")
-    ] = None,
-    domain: Annotated[
-        int | None, typer.Option(help="Domain on this computer (DDS); 77 if left out, never 0.")
-    ] = None,
-    faults: Annotated[
-        str,
-        typer.Option(
-            help="What goes wrong, for instance 'loss=0.3,state.delay=5ms,jitter=2ms,nan=0.01,"
-            "flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=4s,after=2s'."
-        ),
-    ] = "",
-    silence: Annotated[
-        Silence, typer.Option(help="What the drives do when commands stop.")
-    ] = Silence.HOLD,
-    silence_after: Annotated[
-        float, typer.Option(help="Time without a command after which they do it, in s.")
-    ] = 0.1,
-    mode: Annotated[
-        str,
-        typer.Option(
-            help="The robot's own controller that holds the joints at first; released if left out. "
-            "LCM: stand_up, balance_stand, locomotion, recovery_stand; DDS: normal, ai, advanced, "
-            "mcf."
-        ),
-    ] = "",
-    duration: Annotated[
-        float | None, typer.Option(help="End after this time, in s; Ctrl-C ends it too.")
-    ] = None,
-    capture: Annotated[
-        Path | None,
-        typer.Option(help="Write what a motion-capture rig saw to this .npz (--base ground)."),
-    ] = None,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="Ask the system for real-time scheduling.")
-    ] = False,
-    json_file: console.JsonOption = None,
+    robot: tyro.conf.Positional[str] = "mini_cheetah",
+    link: WireLink = "lcm",
+    layout: Layout = "cheetah",
+    base: Base = "bench",
+    sim_params: Path | None = None,
+    seed: int = 0,
+    port: int | None = None,
+    domain: int | None = None,
+    faults: str = "",
+    silence: Silence = "hold",
+    silence_after: float = 0.1,
+    mode: str = "",
+    duration: float | None = None,
+    capture: Path | None = None,
+    realtime: bool = False,
+    json_file: console.JsonFile = None,
 ) -> None:
     """Run the virtual robot in real time, behind the very bytes of a real one.
 
     Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
+
+    Args:
+        robot: Robot, for instance mini_cheetah.
+        link: The wire.
+        layout: Messages on LCM: Cheetah-Software's, or walk-these-ways'.
+        base: bench: the trunk is fixed; ground: it stands and moves freely.
+        sim_params: Parameters of the virtual robot, instead of the shipped one.
+        seed: Of all noise and all faults.
+        port: UDP port on this computer (LCM); 7768 if left out.
+        domain: Domain on this computer (DDS); 77 if left out, never 0.
+        faults: What goes wrong, for instance 'loss=0.3,state.delay=5ms,jitter=2ms,nan=0
+            .01,flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=
+            4s,after=2s'.
+        silence: What the drives do when commands stop.
+        silence_after: Time without a command after which they do it, in s.
+        mode: The robot's own controller that holds the joints at first; released if
+            left out. LCM: stand_up, balance_stand, locomotion, recovery_stand; DDS:
+            normal, ai, advanced, mcf.
+        duration: End after this time, in s; Ctrl-C ends it too.
+        capture: Write what a motion-capture rig saw to this .npz (--base ground).
+        realtime: Ask the system for real-time scheduling.
+        json_file: Also write the figures to this file.
     """
     from pronk.links.realtime import Wanted, enter
     from pronk.robots import load_robot
@@ -109,16 +85,16 @@ def simulate(
     from pronk.virtual.server import Silence as WhenSilent
     from pronk.virtual.sim_params import load_sim_params
 
-    if capture is not None and base is not Base.GROUND:
+    if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
     known = load_robot(robot)
     wrong = parse_faults(faults)
-    when_silent = WhenSilent(action=silence.value, after_s=silence_after)
+    when_silent = WhenSilent(action=silence, after_s=silence_after)
     machine = VirtualRobot(
         known,
         load_sim_params(sim_params),
         seed=seed,
-        base=base.value,
+        base=base,
         capture_rate_hz=1000.0 if capture else None,
     )
     if realtime:
@@ -132,7 +108,7 @@ def simulate(
             machine, wire, hold=hold_of(known), faults=wrong, silence=when_silent, seed=seed
         )
         console.say(
-            f"ready: the virtual {known.name} on the {base.value}, seed {seed}, on {where}; "
+            f"ready: the virtual {known.name} on the {base}, seed {seed}, on {where}; "
             "Ctrl-C ends it"
         )
         _run(lives, duration)
@@ -145,8 +121,8 @@ def simulate(
         machine.close()
     _tell(figures)
     console.write_json(json_file, figures)
-    way = f"--link {link.value}"
-    way += f" --layout {layout.value}" if layout is not Layout.CHEETAH else ""
+    way = f"--link {link}"
+    way += f" --layout {layout}" if layout != "cheetah" else ""
     way += f" --port {port}" if port is not None else ""
     way += f" --domain {domain}" if domain is not None else ""
     console.following(f"pronk sweep {robot} {way} --out DIR   # while a virtual robot runs")
@@ -162,7 +138,7 @@ def _open_wire(
     mode: str,
 ) -> tuple[Wire, str]:
     """The robot's end of the wire, and its address in words."""
-    if link is WireLink.LCM:
+    if link == "lcm":
         from pronk.links.lcm.address import url_of
         from pronk.links.lcm.layout import layout_of
         from pronk.virtual.lcm_server import LcmWire
@@ -170,8 +146,8 @@ def _open_wire(
         if domain is not None:
             raise HardwareError("--domain is of DDS; with --link lcm give --port.")
         url = url_of(port=port)
-        wire = LcmWire(robot, layout_of(layout.value), url, mode=mode)
-        return wire, f"LCM, messages of {layout.value}, {url}"
+        wire = LcmWire(robot, layout_of(layout), url, mode=mode)
+        return wire, f"LCM, messages of {layout}, {url}"
     from pronk.links.dds.address import DdsNetwork
     from pronk.virtual.dds_server import DdsWire
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import typer
+import tyro
 
 from pronk.cli import confirm, console, sweep_wire
 from pronk.cli.choices import Layout, Link
@@ -20,13 +19,8 @@ if TYPE_CHECKING:
     from pronk.robots.robot import Robot
 
 
-class SignalName(StrEnum):
-    """What can be asked."""
-
-    CHIRP = "chirp"
-    LOG_CHIRP = "log-chirp"
-    MULTISINE = "multisine"
-    SINE_STEPS = "sine-steps"
+SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
+"""What can be asked."""
 
 
 AMPLITUDES = (0.25, 0.125)
@@ -34,59 +28,54 @@ AMPLITUDES = (0.25, 0.125)
 
 
 def sweep(
-    robot: Annotated[str, typer.Argument(help="Robot, for instance mini_cheetah.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for the logs, one MCAP per joint.")],
-    link: Annotated[
-        Link, typer.Option(help="sim: the virtual robot in this program; lcm, dds: by wire.")
-    ] = Link.SIM,
-    interface: Annotated[
-        str | None,
-        typer.Option(help="Network interface to a real robot; without it nothing leaves here."),
-    ] = None,
-    layout: Annotated[
-        Layout | None, typer.Option(help="Messages on LCM; cheetah if left out.")
-    ] = None,
-    port: Annotated[int | None, typer.Option(help="UDP port of LCM.")] = None,
-    domain: Annotated[int | None, typer.Option(help="Domain of DDS.")] = None,
-    release: Annotated[
-        bool,
-        typer.Option("--release", help="Make the robot's own controller let go of the joints."),
-    ] = False,
-    real_time: Annotated[
-        bool,
-        typer.Option("--real-time/--no-real-time", help="Ask for real-time scheduling (by wire)."),
-    ] = True,
-    sim_params: Annotated[
-        Path | None,
-        typer.Option(help="Parameters of the virtual robot, instead of the shipped one."),
-    ] = None,
-    joints: Annotated[
-        list[str] | None,
-        typer.Option("--joints", help="Joints to ask; repeat it. All if left out."),
-    ] = None,
-    signal: Annotated[SignalName, typer.Option(help="What to ask.")] = SignalName.CHIRP,
-    amplitude: Annotated[
-        list[float] | None, typer.Option(help="Peak of the command in rad; repeat it for several.")
-    ] = None,
-    repeats: Annotated[int, typer.Option(help="Times each amplitude is asked.")] = 3,
-    seed: Annotated[int, typer.Option(help="Of the virtual robot's noise.")] = 0,
-    plan_only: Annotated[
-        bool, typer.Option("--plan-only", help="Show what it would do to the robot and leave.")
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace logs that are already there.")
-    ] = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Do not ask before real hardware moves.")
-    ] = False,
-    json_file: console.JsonOption = None,
+    robot: tyro.conf.Positional[str],
+    out: Path,
+    link: Link = "sim",
+    interface: str | None = None,
+    layout: Layout | None = None,
+    port: int | None = None,
+    domain: int | None = None,
+    release: bool = False,
+    real_time: bool = True,
+    sim_params: Path | None = None,
+    joints: tuple[str, ...] = (),
+    signal: SignalName = "chirp",
+    amplitude: tuple[float, ...] = (),
+    repeats: int = 3,
+    seed: int = 0,
+    plan_only: bool = False,
+    overwrite: bool = False,
+    yes: bool = False,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Ask every joint: plan, check against the limits, ask, record."""
+    """Ask every joint: plan, check against the limits, ask, record.
+
+    Args:
+        robot: Robot, for instance mini_cheetah.
+        out: Folder for the logs, one MCAP per joint.
+        link: sim: the virtual robot in this program; lcm, dds: by wire.
+        interface: Network interface to a real robot; without it nothing leaves here.
+        layout: Messages on LCM; cheetah if left out.
+        port: UDP port of LCM.
+        domain: Domain of DDS.
+        release: Make the robot's own controller let go of the joints.
+        real_time: Ask for real-time scheduling (by wire).
+        sim_params: Parameters of the virtual robot, instead of the shipped one.
+        joints: Joints to ask; repeat it. All if left out.
+        signal: What to ask.
+        amplitude: Peak of the command in rad; repeat it for several.
+        repeats: Times each amplitude is asked.
+        seed: Of the virtual robot's noise.
+        plan_only: Show what it would do to the robot and leave.
+        overwrite: Replace logs that are already there.
+        yes: Do not ask before real hardware moves.
+        json_file: Also write the figures to this file.
+    """
     from pronk.robots import load_robot
 
     machine = load_robot(robot)
     address = None
-    if link is Link.SIM:
+    if link == "sim":
         sweep_wire.refuse_without_wire(
             interface=interface, layout=layout, port=port, domain=domain, release=release
         )
@@ -98,9 +87,9 @@ def sweep(
                 "--sim-params is of --link sim; give it to `pronk simulate` instead."
             )
         address = Address(
-            kind=link.value,
+            kind=link,
             interface=interface,
-            layout=layout and layout.value,
+            layout=layout and layout,
             port=port,
             domain=domain,
         )
@@ -147,7 +136,7 @@ def sweep(
                 release=release,
                 overwrite=overwrite,
                 real_time=real_time,
-                progress=report.bar(f"ask over {link.value}"),
+                progress=report.bar(f"ask over {link}"),
             )
         figures |= {
             "virtual": recorded.virtual,
@@ -167,10 +156,10 @@ def make_signal(name: SignalName) -> Signal:
     from pronk.excitation import signals
 
     kinds = {
-        SignalName.CHIRP: signals.Chirp,
-        SignalName.LOG_CHIRP: signals.LogChirp,
-        SignalName.MULTISINE: signals.Multisine,
-        SignalName.SINE_STEPS: signals.SineSteps,
+        "chirp": signals.Chirp,
+        "log-chirp": signals.LogChirp,
+        "multisine": signals.Multisine,
+        "sine-steps": signals.SineSteps,
     }
     made: Signal = kinds[name]()
     return made

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+import tyro
 
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -22,98 +21,68 @@ CPU_RATE = 300.0
 """Environment steps a second that two cores were seen to train with."""
 
 
-class Task(StrEnum):
-    """What is trained."""
-
-    WALK = "walk"
-    JUMP = "jump"
-    ALL = "all"
-    TOGETHER = "together"
+Task = Literal["walk", "jump", "all", "together"]
+"""What is trained."""
 
 
-class Device(StrEnum):
-    """What computes."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    CUDA = "cuda"
+Device = Literal["auto", "cpu", "cuda"]
+"""What computes."""
 
 
-class Logger(StrEnum):
-    """Where the curves go."""
-
-    TENSORBOARD = "tensorboard"
-    WANDB = "wandb"
-    NONE = "none"
+Logger = Literal["tensorboard", "wandb", "none"]
+"""Where the curves go."""
 
 
 def train(
-    task: Annotated[
-        Task,
-        typer.Argument(
-            help="walk: phase 1. jump: widen a walking policy, then phases 2a and 2b. all: both. "
-            "together: walk and jump at once from random weights, the paper's ablation."
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the run, new or empty.")],
-    gains: Annotated[
-        str | None,
-        typer.Option(
-            help="gains.yaml of `pronk match`, or naive: the gains of the real drives as they are."
-        ),
-    ] = None,
-    like: Annotated[
-        Path | None,
-        typer.Option(help="With naive gains: the gains.yaml whose ranges and delay are used."),
-    ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option("--from", help="jump: folder of a walking run, or one of its checkpoints."),
-    ] = None,
-    envs: Annotated[int | None, typer.Option(help="Robots on each device; 4096.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all draws; 1.")] = None,
-    phase: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="PHASE=ITERATIONS, as in walk=300, for walk, jump_a or jump_b; repeat it."
-        ),
-    ] = None,
-    ellipsoid: Annotated[
-        bool | None,
-        typer.Option(
-            "--ellipsoid/--box", help="Draw gains from each group's ellipsoid, or its box; box."
-        ),
-    ] = None,
-    device: Annotated[
-        Device | None, typer.Option(help="auto: a GPU if there is one; the CPU is for tests.")
-    ] = None,
-    gpu_ids: Annotated[
-        str | None, typer.Option("--gpu-ids", help="GPUs of this host, as in 0,1, or all; 0.")
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume", help="Continue the run in --out; options left out are those of the run."
-        ),
-    ] = False,
-    save_interval: Annotated[int, typer.Option(help="Iterations between checkpoints.")] = 50,
-    minutes: Annotated[
-        float | None,
-        typer.Option(help="Stop at a checkpoint after so long; --resume goes on from there."),
-    ] = None,
-    logger: Annotated[Logger, typer.Option(help="Where the curves go.")] = Logger.TENSORBOARD,
-    json_file: console.JsonOption = None,
+    task: tyro.conf.Positional[Task],
+    out: Path,
+    gains: str | None = None,
+    like: Path | None = None,
+    start: Annotated[Path | None, tyro.conf.arg(name="from")] = None,
+    envs: int | None = None,
+    seed: int | None = None,
+    phase: tuple[str, ...] = (),
+    ellipsoid: bool | None = None,
+    device: Device | None = None,
+    gpu_ids: str | None = None,
+    resume: bool = False,
+    save_interval: int = 50,
+    minutes: float | None = None,
+    logger: Logger = "tensorboard",
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Train a policy that walks, runs and jumps on command."""
+    """Train a policy that walks, runs and jumps on command.
+
+    Args:
+        task: walk: phase 1. jump: widen a walking policy, then phases 2a and 2b. all:
+            both. together: walk and jump at once from random weights, the paper's
+            ablation.
+        out: Folder of the run, new or empty.
+        gains: gains.yaml of `pronk match`, or naive: the gains of the real drives as
+            they are.
+        like: With naive gains: the gains.yaml whose ranges and delay are used.
+        start: jump: folder of a walking run, or one of its checkpoints.
+        envs: Robots on each device; 4096.
+        seed: Of all draws; 1.
+        phase: PHASE=ITERATIONS, as in walk=300, for walk, jump_a or jump_b; repeat it.
+        ellipsoid: Draw gains from each group's ellipsoid, or its box; box.
+        device: auto: a GPU if there is one; the CPU is for tests.
+        gpu_ids: GPUs of this host, as in 0,1, or all; 0.
+        resume: Continue the run in --out; options left out are those of the run.
+        save_interval: Iterations between checkpoints.
+        minutes: Stop at a checkpoint after so long; --resume goes on from there.
+        logger: Where the curves go.
+        json_file: Also write the figures to this file.
+    """
     from pronk.train.runner import provenance
     from pronk.train.runner.launch import begin_run, launch
     from pronk.train.runner.request import Request, new_settings, resumed_settings
     from pronk.train.runner.run_folder import RunFolder
     from pronk.train.runner.settings import WatchSettings
 
-    watch = WatchSettings(logger=logger.value, save_interval=save_interval, minutes=minutes)
+    watch = WatchSettings(logger=logger, save_interval=save_interval, minutes=minutes)
     request = Request(
-        task=task.value,
+        task=task,
         gains=gains,
         like=like,
         start=start,
@@ -121,7 +90,7 @@ def train(
         envs=envs,
         seed=seed,
         ellipsoid=ellipsoid,
-        device=None if device is None else device.value,
+        device=None if device is None else device,
         gpu_ids=gpu_ids,
     )
     folder = RunFolder(out)
@@ -147,7 +116,7 @@ def train(
     if not found["finished"]:
         console.following(again(settings, folder))
         if found["sessions"][-1]["stopped"].startswith("SIG"):
-            raise typer.Abort
+            raise KeyboardInterrupt
         return
     console.following(*next_steps(settings, folder, logger))
 
@@ -246,6 +215,6 @@ def next_steps(settings: TrainSettings, folder: RunFolder, logger: Logger) -> li
     if settings.task == "walk":
         words = ["pronk", "train", "jump", "--from", str(folder.path), *gains]
         steps.append(shlex.join([*words, "--out", f"{folder.path}_jump"]))
-    if logger is not Logger.NONE:
+    if logger != "none":
         steps.append(shlex.join(["tensorboard", "--logdir", str(folder.path)]))
     return steps

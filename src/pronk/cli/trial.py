@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
+import tyro
 
 from pronk.cli import console
 
@@ -20,77 +20,52 @@ RATES_JUMPS = 3
 
 
 def trial(
-    policy: Annotated[Path, typer.Argument(help="policy.onnx.", metavar="POLICY")],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for tables, captures, videos and the page.")
-    ],
-    also: Annotated[
-        list[Path] | None,
-        typer.Option(help="Another policy to compare with, as the naive one. Give it repeatedly."),
-    ] = None,
-    commands: Annotated[
-        list[str] | None,
-        typer.Option(
-            help='Forward and left velocity in m/s, as "2.25,0"; a yaw rate in rad/s may follow. '
-            'Give it repeatedly; "paper" is the paper\'s five. If left out, those, and a few jumps '
-            "at 2.25 m/s for the figure of roll and pitch rates."
-        ),
-    ] = None,
-    jumps: Annotated[int, typer.Option(help="Jumps with each command.")] = 20,
-    sim_params: Annotated[
-        Path | None,
-        typer.Option(help="Body of the virtual robot; the one that ships with pronk if left out."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of all draws.")] = 0,
-    processes: Annotated[
-        int | None, typer.Option(help="Jumps at once; as many as there are cores if left out.")
-    ] = None,
-    walk: Annotated[
-        bool, typer.Option("--walk", help="Also walk 20 s with each velocity, 20 times.")
-    ] = False,
-    crossing: Annotated[
-        bool, typer.Option("--crossing", help="Also cross gaps and steps of growing size.")
-    ] = False,
-    variation: Annotated[
-        bool,
-        typer.Option(
-            "--variation", help="Also vary mass, friction, delay and bus voltage, one by one."
-        ),
-    ] = False,
-    bodies: Annotated[
-        bool,
-        typer.Option("--bodies", help="Also try three bodies never seen, each matched anew."),
-    ] = False,
-    own: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="A policy trained with the gains of the first body of --bodies; give it again "
-            "for the second and the third."
-        ),
-    ] = None,
-    video: Annotated[
-        bool,
-        typer.Option(
-            "--video/--no-video",
-            help="MP4, GIF and strip of each command, where this machine can paint.",
-        ),
-    ] = True,
-    keep_captures: Annotated[
-        bool,
-        typer.Option(
-            "--keep-captures",
-            help="Keep what was seen of every jump (4 MB each), not of the first of each command.",
-        ),
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the trial in that folder.")
-    ] = False,
-    definitions: Annotated[
-        bool, typer.Option("--definitions", help="Also print the equation of every figure.")
-    ] = False,
-    json: console.JsonOption = None,
+    policy: tyro.conf.Positional[Path],
+    out: Path,
+    also: tuple[Path, ...] = (),
+    commands: tuple[str, ...] = (),
+    jumps: int = 20,
+    sim_params: Path | None = None,
+    seed: int = 0,
+    processes: int | None = None,
+    walk: bool = False,
+    crossing: bool = False,
+    variation: bool = False,
+    bodies: bool = False,
+    own: tuple[Path, ...] = (),
+    video: bool = True,
+    keep_captures: bool = False,
+    overwrite: bool = False,
+    definitions: bool = False,
+    json_file: console.JsonFile = None,
 ) -> None:
-    """Stand, run, jump, stop: 20 times with each command; the paper's table beside ours."""
+    """Stand, run, jump, stop: 20 times with each command; the paper's table beside ours.
+
+    Args:
+        policy: policy.onnx.
+        out: Folder for tables, captures, videos and the page.
+        also: Another policy to compare with, as the naive one. Give it repeatedly.
+        commands: Forward and left velocity in m/s, as "2.25,0"; a yaw rate in rad/s may
+            follow. Give it repeatedly; "paper" is the paper's five. If left out, those,
+            and a few jumps at 2.25 m/s for the figure of roll and pitch rates.
+        jumps: Jumps with each command.
+        sim_params: Body of the virtual robot; the one that ships with pronk if left
+            out.
+        seed: Of all draws.
+        processes: Jumps at once; as many as there are cores if left out.
+        walk: Also walk 20 s with each velocity, 20 times.
+        crossing: Also cross gaps and steps of growing size.
+        variation: Also vary mass, friction, delay and bus voltage, one by one.
+        bodies: Also try three bodies never seen, each matched anew.
+        own: A policy trained with the gains of the first body of --bodies; give it
+            again for the second and the third.
+        video: MP4, GIF and strip of each command, where this machine can paint.
+        keep_captures: Keep what was seen of every jump (4 MB each), not of the first of
+            each command.
+        overwrite: Replace the trial in that folder.
+        definitions: Also print the equation of every figure.
+        json_file: Also write the figures to this file.
+    """
     from pronk.cli.trial_more import more
     from pronk.errors import PronkError
     from pronk.evaluation.folder import CAPTURES, VIDEOS
@@ -160,7 +135,7 @@ def trial(
     for sheet in sheets:
         show(sheet)
     console.wrote(*([out / VIDEOS] if films else []), *files, page)
-    console.write_json(json, figures(found, sheets) | {"page": page, "videos": films})
+    console.write_json(json_file, figures(found, sheets) | {"page": page, "videos": films})
     console.following(f"open {page} in a browser", f"pronk play {policy}")
 
 
