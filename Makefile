@@ -1,10 +1,10 @@
-# Two commands do everything: `make demo` runs the main job, `make test` passes the tests.
+# `make demo` runs the whole method on the virtual robot; `make test` checks the code.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test lint types clean
+.PHONY: demo test test-slow lint clean
 
 demo: $(VENV)/.core
 	$(BIN)/pronk demo --out out/demo
@@ -12,8 +12,13 @@ demo: $(VENV)/.core
 test: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "not live"
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "not live and not slow"
+
+# Trainings, whole trials and processes in real time.
+test-slow: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "slow and not live"
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m live
 
 lint: $(VENV)/.dev

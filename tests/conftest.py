@@ -1,14 +1,16 @@
-"""What all tests share."""
+"""Settings of all tests; the folders `slow` and `live` give their tests the marker."""
 
 import signal
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
-# Machines that run tests are slow at times; a slow example is no defect.
+# A slow example on a busy machine is not a defect.
 settings.register_profile("pronk", deadline=None)
 settings.load_profile("pronk")
 
-# What is started in the background, or by nohup, ignores these, and so would all it starts.
+# A process started in the background ignores these signals, and so would its children.
 for number, usual in (
     (signal.SIGINT, signal.default_int_handler),
     (signal.SIGQUIT, signal.SIG_DFL),
@@ -16,3 +18,10 @@ for number, usual in (
 ):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, usual)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        for folder in ("slow", "live"):
+            if folder in Path(item.path).parts[-3:-1]:
+                item.add_marker(folder)

@@ -258,8 +258,7 @@ def test_the_command_on_the_virtual_robot_on_the_ground(tmp_path: Path, policy: 
         *(str(policy), "--script", "0,0", "--seconds", "0.6", "--any-delay", "--log", str(log)),
         *("--capture", str(capture), "--json", str(figures)),
     )
-    assert error is None, error
-    assert status == 0, output
+    assert status == 0, output + error
     assert "the virtual robot" in output
     assert "the network alone" in output
     assert f"wrote {log}" in output
@@ -289,7 +288,7 @@ def test_nobody_at_the_keyboard_and_nobody_who_confirms(policy: Path) -> None:
     )
     assert status != 0
     assert "is about to move" in output
-    assert isinstance(error, (HardwareError, SystemExit)) or error is None
+    assert "nothing was moved" in error
 
 
 def test_a_script_beyond_what_was_trained_for_is_refused(policy: Path) -> None:

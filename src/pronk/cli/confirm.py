@@ -21,7 +21,11 @@ def before_it_moves(robot: str, where: str) -> None:
         f"A real {robot} at {where} is about to move. Everybody out of its reach; the first time, "
         "hang it up."
     )
-    if input(f"Type the robot's name ({robot}) to go on: ").strip() != robot:
+    try:
+        typed = input(f"Type the robot's name ({robot}) to go on: ").strip()
+    except EOFError:
+        typed = ""
+    if typed != robot:
         raise HardwareError(f"that was not {robot!r}; nothing was moved.")
 
 
