@@ -9,9 +9,26 @@ compared), `grid` (the paper's search), `quick` (the same optimum by the lineari
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+from pronk.logs.joint_log import SweepLog
 from pronk.match.pipeline import match_logs
 from pronk.match.predict import predict
 from pronk.match.result import MatchResult
 from pronk.match.settings import MatchSettings
+from pronk.robots import Robot
 
 __all__ = ["MatchResult", "MatchSettings", "match_logs", "predict"]
+
+
+class _Package(ModuleType):
+    """Make `pronk.match(logs, robot)` call `match_logs`."""
+
+    def __call__(self, logs: Sequence[SweepLog], robot: Robot, **options: Any) -> MatchResult:
+        return match_logs(logs, robot, **options)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,5 +1,9 @@
-"""The answer: from a log to the frequency response of each joint."""
+"""Estimate the frequency response of each joint from a log."""
 
+import sys
+from types import ModuleType
+
+from pronk.logs.joint_log import SweepLog
 from pronk.response.delay import DelayFit, fit_delay
 from pronk.response.distortion import Distortion, distortion, third_harmonic
 from pronk.response.estimate import estimate, operators
@@ -21,3 +25,15 @@ __all__ = [
     "save",
     "third_harmonic",
 ]
+
+
+class _Package(ModuleType):
+    """Make `pronk.response(log, joint)` call `estimate`."""
+
+    def __call__(
+        self, log: SweepLog, joint: str, estimator: Estimator | None = None
+    ) -> list[FrequencyResponse]:
+        return estimate(log, joint, estimator)
+
+
+sys.modules[__name__].__class__ = _Package
