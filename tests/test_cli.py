@@ -354,12 +354,12 @@ def test_export(capsys, matched, tmp_path, target):
 def test_drive_mode_finds_what_it_can_and_refuses_the_rest(capsys, matched, tmp_path):
     log = matched / "FR_knee.mcap"
     common = ("match", log, "--robot", "mini_cheetah", "--out", tmp_path / "gains.yaml")
-    said = refused(capsys, *common, "--free", "armature")
+    said = refused(capsys, *common, "--fit", "armature")
     assert "--mode drive" in said
-    said = refused(capsys, *common, "--mode", "drive", "--free", "stiffness", "--free", "armature",
-                   "--free", "damping", "--free", "frictionloss")  # fmt: skip
+    said = refused(capsys, *common, "--mode", "drive", "--fit", "stiffness", "--fit", "armature",
+                   "--fit", "damping", "--fit", "frictionloss")  # fmt: skip
     assert "FR_knee: these data" in said
     assert "payload" in said
     assert not (tmp_path / "gains.yaml").exists()
-    shown = accepted(capsys, *common, "--mode", "drive", "--free", "damping", "--free", "delay")
+    shown = accepted(capsys, *common, "--mode", "drive", "--fit", "damping", "--fit", "delay")
     assert "held" in shown

@@ -74,11 +74,20 @@ def walking_policy(path: Path, phase: str = "walk") -> Path:
             ("walk", "--gains", "naive", "--phase", "walk=3", "--phase", "walk=4"),
             "--phase walk|twice",
         ),
-        (("walk", "--gains", "a.yaml", "--like", "b.yaml"), "--like b.yaml|--gains naive"),
-        (("walk", "--gains", "naive", "--like", "b.yaml"), "b.yaml|no such file"),
+        (
+            ("walk", "--gains", "a.yaml", "--ranges-from", "b.yaml"),
+            "--ranges-from b.yaml|--gains naive",
+        ),
+        (("walk", "--gains", "naive", "--ranges-from", "b.yaml"), "b.yaml|no such file"),
         (("jump", "--gains", "naive"), "--from|pronk train all"),
-        (("walk", "--gains", "naive", "--from", "x"), "--from x|jump|random weights"),
-        (("jump", "--gains", "naive", "--from", "nowhere"), "--from nowhere|phase walk is over"),
+        (
+            ("walk", "--gains", "naive", "--init-checkpoint", "x"),
+            "--init-checkpoint x|jump|random weights",
+        ),
+        (
+            ("jump", "--gains", "naive", "--init-checkpoint", "nowhere"),
+            "--init-checkpoint nowhere|phase walk is over",
+        ),
         (("walk", "--gains", "naive", "--gpu-ids", "one"), "--gpu-ids 'one'|0,1|all"),
         (("walk", "--gains", "naive", "--gpu-ids", "0,0"), "--gpu-ids '0,0'|different"),
         (("walk", "--gains", "naive", "--gpu-ids", "0", "--device", "cpu"), "--gpu-ids 0|cpu"),
@@ -117,7 +126,7 @@ def test_gains_of_another_robot_are_refused(capsys, tmp_path):
 
 
 def test_only_a_walking_policy_is_widened(capsys, tmp_path):
-    arguments = ("jump", "--gains", "naive", "--out", tmp_path / "run", "--from")
+    arguments = ("jump", "--gains", "naive", "--out", tmp_path / "run", "--init-checkpoint")
     said = refused(capsys, *arguments, walking_policy(tmp_path / "a.pt", "jump_b"))
     assert "phase jump_b" in said
     damaged = tmp_path / "b.pt"
@@ -175,7 +184,7 @@ def test_a_gpu_that_is_not_there_is_refused(capsys, tmp_path):
         (("all", "--envs", "32"), "envs is 32|16"),
         (("all", "--ellipsoid"), "--ellipsoid is True|False"),
         (("all", "--phase", "jump_b=9"), "iterations of jump_b is 9|has 2"),
-        (("jump", "--from", "walk.pt"), "the task is jump|all"),
+        (("jump", "--init-checkpoint", "walk.pt"), "the task is jump|all"),
     ],
 )
 def test_resuming_with_another_setting_names_it(capsys, tmp_path, monkeypatch, arguments, words):
@@ -196,7 +205,7 @@ def test_resuming_with_other_gains_or_another_walk_is_refused(capsys, tmp_path):
     jump = {"jump_a": 1, "jump_b": 1}
     other = settings(task="jump", iterations=jump, start=str(start), start_sha256="1" * 64)
     folder.write_config(other, {})
-    said = refused(capsys, "jump", "--from", start, "--out", folder.path, "--resume")
+    said = refused(capsys, "jump", "--init-checkpoint", start, "--out", folder.path, "--resume")
     assert "--from is" in said
 
 

@@ -185,7 +185,7 @@ def test_the_libraries_talk_to_the_log(uninterrupted, capsys, tmp_path):
     assert "walk 1/1" in shown.err
     assert "for tests only" in shown.err
     assert f"wrote {tmp_path / 'run' / 'policy.onnx'}" in shown.out
-    assert "pronk train jump --from" in shown.out
+    assert "pronk train jump --init-checkpoint" in shown.out
 
 
 def test_the_last_policy_reads_the_jump_input_and_the_first_does_not(uninterrupted):
@@ -348,7 +348,7 @@ def test_jumping_begins_where_walking_ended(walked, tmp_path, capsys):
     found = checkpoint.load(last)
     grown(found.tree["ranks"][0]["environment"]).fill_(2500.0)
     checkpoint.save(last, found)
-    words = ("jump", "--from", begun, "--gains", walked.gains, *SMALL)
+    words = ("jump", "--init-checkpoint", begun, "--gains", walked.gains, *SMALL)
     words += ("--phase", "jump_a=1", "--phase", "jump_b=1")
     assert train(*words, "--out", folder.path) == 0
     start, end = (checkpoint.load(path).tree for path in (last, folder.last_of("jump_a")))

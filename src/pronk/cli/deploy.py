@@ -37,7 +37,7 @@ def deploy(
     log: Path | None = None,
     capture: Path | None = None,
     seconds: float | None = None,
-    blend: float = 0.4,
+    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = 0.4,
     tilt: float = 0.8,
     base: Base = "ground",
     sim_params: Path | None = None,
@@ -45,8 +45,8 @@ def deploy(
     layout: str = "cheetah",
     port: int | None = None,
     domain: int | None = None,
-    release: bool = False,
-    ignore_latency: Annotated[bool, tyro.conf.arg(name="any-delay")] = False,
+    release: Annotated[bool, tyro.conf.arg(name="disable-onboard-controller")] = False,
+    ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False,
     real_time: bool = True,
     yes: bool = False,
     json_file: console.JsonFile = None,
@@ -72,7 +72,7 @@ def deploy(
         port: UDP port of LCM.
         domain: Domain of DDS.
         release: Make the robot's own controller let go of the joints.
-        ignore_latency: Walk whatever delay is measured.
+        ignore_latency: Start the policy even if the measured latency exceeds its training range.
         real_time: Ask for real-time scheduling.
         yes: Do not ask before real hardware moves.
         json_file: Also write the figures to this file.

@@ -37,7 +37,7 @@ def evaluate(
     policy: tyro.conf.Positional[Path],
     gains: str,
     out: Annotated[Path, tyro.conf.arg(aliases=("--json",))] = Path("evaluation.json"),
-    like: Path | None = None,
+    like: Annotated[Path | None, tyro.conf.arg(name="ranges-from")] = None,
     what: What = "all",
     robots: int = 1000,
     randomization: Drawn = "full",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -34,7 +34,7 @@ def match(
     mode: Mode = "gains",
     quick: bool = False,
     zero_armature: bool = True,
-    free: tuple[str, ...] = (),
+    free: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
     interval: Interval = "student",
     phase: bool = False,
     device: str = "cpu",
@@ -81,7 +81,7 @@ def match(
         device=device,
     )
     if free and mode != "drive":
-        raise PronkError("--free names what --mode drive looks for; say --mode drive as well.")
+        raise PronkError("--fit names what --mode drive looks for; say --mode drive as well.")
     arm: ArmMatch | None = None
     with console.progress() as report:
         if any(moves_together(log) for log in read):

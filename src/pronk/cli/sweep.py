@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -35,7 +35,7 @@ def sweep(
     layout: Layout | None = None,
     port: int | None = None,
     domain: int | None = None,
-    release: bool = False,
+    release: Annotated[bool, tyro.conf.arg(name="disable-onboard-controller")] = False,
     real_time: bool = True,
     sim_params: Path | None = None,
     joints: tuple[str, ...] = (),

@@ -37,8 +37,8 @@ def train(
     task: tyro.conf.Positional[Task],
     out: Path,
     gains: str | None = None,
-    like: Path | None = None,
-    start: Annotated[Path | None, tyro.conf.arg(name="from")] = None,
+    like: Annotated[Path | None, tyro.conf.arg(name="ranges-from")] = None,
+    start: Annotated[Path | None, tyro.conf.arg(name="init-checkpoint")] = None,
     envs: int | None = None,
     seed: int | None = None,
     phase: tuple[str, ...] = (),
@@ -209,11 +209,11 @@ def next_steps(settings: TrainSettings, folder: RunFolder, logger: Logger) -> li
     """What to do with a finished run."""
     gains = ["--gains", str(folder.gains) if settings.gains == "matched" else "naive"]
     if settings.gains == "naive" and settings.gains_sha256:
-        gains += ["--like", str(folder.gains)]
+        gains += ["--ranges-from", str(folder.gains)]
     judged = str(folder.path / "evaluation.json")
     steps = [shlex.join(["pronk", "evaluate", str(folder.policy), *gains, "--out", judged])]
     if settings.task == "walk":
-        words = ["pronk", "train", "jump", "--from", str(folder.path), *gains]
+        words = ["pronk", "train", "jump", "--init-checkpoint", str(folder.path), *gains]
         steps.append(shlex.join([*words, "--out", f"{folder.path}_jump"]))
     if logger != "none":
         steps.append(shlex.join(["tensorboard", "--logdir", str(folder.path)]))

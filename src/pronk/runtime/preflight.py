@@ -186,6 +186,6 @@ def delay_objection(latency_s: float, count: int, trained: tuple[float, float]) 
         return (
             f"state to command takes {1e3 * latency_s:.1f} ms (95 % of {count} steps), more than "
             f"the {1e3 * trained[1]:.0f} ms that the policy was trained for; free the processor, "
-            "grant real-time scheduling, or insist with --any-delay."
+            "grant real-time scheduling, or insist with --ignore-latency-check."
         )
     return ""

@@ -168,7 +168,7 @@ def own_controller(participant: Participant, *, release: bool, timeout_s: float 
     if name:
         raise HardwareError(
             f"the robot's own controller {name!r} holds the joints; lay the robot down or hang it "
-            "up, and have the controller released (--release)."
+            "up, and have the controller released (--disable-onboard-controller)."
         )
     return held
 

@@ -22,8 +22,8 @@ ROBOT = "mini_cheetah"
 _OPTIONS = {
     "task": "the task",
     "gains": "--gains",
-    "gains_sha256": "--gains (or --like)",
-    "start_sha256": "--from",
+    "gains_sha256": "--gains (or --ranges-from)",
+    "start_sha256": "--init-checkpoint",
     "ellipsoid": "--ellipsoid",
     "gpus": "--gpu-ids",
 }
@@ -59,11 +59,11 @@ class Request:
         check_iterations(self.task, self.iterations)
         if self.like is not None and self.gains not in (None, NAIVE):
             raise PronkError(
-                f"--like {self.like} goes with --gains naive; {self.gains} has its own ranges."
+                f"--ranges-from {self.like} goes with --gains naive; {self.gains} has its own ranges."  # noqa: E501
             )
         if self.start is not None and self.task != "jump":
             raise PronkError(
-                f"--from {self.start} goes with jump; {self.task} begins with random weights."
+                f"--init-checkpoint {self.start} goes with jump; {self.task} begins with random weights."  # noqa: E501
             )
         if self.gpu_ids is not None:
             parse_gpu_ids(self.gpu_ids)
@@ -115,7 +115,7 @@ def new_settings(request: Request) -> tuple[TrainSettings, Devices]:
         )
     if request.task == "jump" and request.start is None:
         raise PronkError(
-            "jump needs --from: the folder of a walking run, or one of its checkpoints; "
+            "jump needs --init-checkpoint: the folder of a walking run, or one of its checkpoints; "
             "`pronk train all` does both."
         )
     asked = request.named()
@@ -188,13 +188,13 @@ def walking_checkpoint(path: Path) -> Path:
     found = RunFolder(path).last_of("walk") if path.is_dir() else path
     if not found.is_file():
         raise ArtefactError(
-            f"--from {path}: no {found.name if path.is_dir() else 'such file'}; expected the "
+            f"--init-checkpoint {path}: no {found.name if path.is_dir() else 'such file'}; expected the "  # noqa: E501
             "folder of a run whose phase walk is over, or one of its checkpoints."
         )
     phase = about(found).get("phase")
     if phase != "walk":
         raise ArtefactError(
-            f"--from {found}: a checkpoint of phase {phase}; expected one of phase walk, whose "
+            f"--init-checkpoint {found}: a checkpoint of phase {phase}; expected one of phase walk, whose "  # noqa: E501
             "networks have no jump input yet."
         )
     return found
