@@ -17,6 +17,7 @@ from pronk.logs.joint_log import Segment, SweepLog
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
+from pronk.simulators.simulator import JointRigs, play
 
 Array = NDArray[np.float64]
 
@@ -47,6 +48,7 @@ def synthetic_log(
     frictionloss: float | None = None,
     held_stiffness: Mapping[str, float] | None = None,
     held_damping: Mapping[str, float] | None = None,
+    simulator: JointRigs | None = None,
     threads: int = 2,
 ) -> SweepLog:
     """Sweep one joint of the training simulator with known gains.
@@ -64,12 +66,15 @@ def synthetic_log(
         frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
         held_stiffness: Gains of the joints that are held; the robot's if not given.
         held_damping: Gains of the joints that are held; the robot's if not given.
+        simulator: Rigs of another simulator, which then also gives the timestep.
         threads: Threads of the simulator.
 
     Returns:
         A log of this joint alone, `stiffness` and `damping` being those of the robot's drive (what
         a match would be told), not those simulated.
     """
+    if simulator is not None:
+        robot = simulator.robot
     asked = robot.joint(joint)
     pose = np.array([j.default_position for j in robot.joints])
     centre = asked.default_position
@@ -90,17 +95,21 @@ def synthetic_log(
             pose=pose,
             amplitude=float(np.abs(ask.offsets).max()),
         )
-        answer = simulate(
-            robot,
-            question,
-            stiffness,
-            damping,
-            armature=armature,
-            frictionloss=frictionloss,
-            held_stiffness=held_stiffness,
-            held_damping=held_damping,
-            threads=threads,
-        )[0]
+        if simulator is not None:
+            rig = simulator.rig(joint)
+            answer = play(rig, question, np.array([stiffness]), np.array([damping]))[0]
+        else:
+            answer = simulate(
+                robot,
+                question,
+                stiffness,
+                damping,
+                armature=armature,
+                frictionloss=frictionloss,
+                held_stiffness=held_stiffness,
+                held_damping=held_damping,
+                threads=threads,
+            )[0]
         count = len(ticks) * per_tick
         times = np.minimum(np.arange(count) / rate, question.time[-1])
         position = make_interp_spline(question.time, answer, k=3)(times)

@@ -10,9 +10,10 @@ import yaml
 from pronk.actuator.model import clip_torque
 from pronk.errors import PronkError
 from pronk.match.export import EXPORTS, export_text, group_drives
-from pronk.match.gains import JointGains, MatchedGains, Simulator
+from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.ranges import group_gains
 from pronk.robots import load_robot
+from pronk.simulators.simulator import SimulatorInfo
 
 ROBOT = load_robot("mini_cheetah")
 
@@ -39,7 +40,7 @@ def matched(robot_name: str = "mini_cheetah", **extra: float) -> MatchedGains:
         )
     return MatchedGains(
         robot=robot.name,
-        simulator=Simulator(version=mujoco.__version__),
+        simulator=SimulatorInfo(version=mujoco.__version__),
         joints=joints,
         groups=group_gains(robot, joints),
         logs={"FR_knee.mcap": "ab" * 32},

@@ -10,12 +10,13 @@ from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import Segment, SweepLog
-from pronk.match.gains import JointGains, MatchedGains, Simulator
+from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.predict import predict
 from pronk.match.prediction import r2, rmse
 from pronk.robots import load_robot
 from pronk.simulators.command_trace import command_trace
 from pronk.simulators.mujoco import simulate
+from pronk.simulators.simulator import SimulatorInfo
 
 ROBOT = load_robot("mini_cheetah")
 MADE_WITH = {"FL_hip_roll": (20.0, 0.5), "HR_knee": (22.0, 0.55)}
@@ -25,7 +26,7 @@ def gains(names: tuple[str, ...], **extra: float) -> MatchedGains:
     nan = float("nan")
     return MatchedGains(
         robot=ROBOT.name,
-        simulator=Simulator(),
+        simulator=SimulatorInfo(),
         joints={
             name: JointGains(
                 stiffness=MADE_WITH[name][0],

@@ -15,11 +15,12 @@ from pronk.match import gains as gains_file
 from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
 from pronk.match.command_delay import command_delay
-from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator
+from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.match.result import JointMatch, MatchResult
 from pronk.report import figures, page, replay, style
 from pronk.report.paper import published
 from pronk.response.response import FrequencyResponse
+from pronk.simulators.simulator import SimulatorInfo
 
 LEGS = ("FR", "FL", "HR", "HL")
 # Inertia of leg and rotor about the joint [kg m^2] and the gains that a match finds.
@@ -149,7 +150,7 @@ def synthetic(*, virtual: bool = True, robot: str = "mini_cheetah", legs: int = 
     }
     gains = MatchedGains(
         robot=robot,
-        simulator=Simulator(version="3.11.0"),
+        simulator=SimulatorInfo(version="3.11.0"),
         joints=per_joint,
         groups=groups,
         logs={f"{name}.mcap": f"{i:064x}" for i, name in enumerate(joints)},

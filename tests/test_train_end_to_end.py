@@ -22,7 +22,8 @@ import pytest
 import yaml
 
 from pronk.cli import main as cli
-from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator, save
+from pronk.match.gains import GroupGains, JointGains, MatchedGains, save
+from pronk.simulators.simulator import SimulatorInfo
 from pronk.train.runner import checkpoint
 from pronk.train.runner.run_folder import RunFolder
 
@@ -68,7 +69,7 @@ def save_gains(path: Path) -> None:
         name: GroupGains(stiffness=k, damping=d, stiffness_range=2.0, damping_range=0.05)
         for name, k, d in (("hip_roll", 20.0, 0.45), ("hip_pitch", 17.5, 0.4), ("knee", 21.5, 0.55))
     }
-    simulator = Simulator(version=mujoco.__version__)
+    simulator = SimulatorInfo(version=mujoco.__version__)
     gains = MatchedGains(
         robot="mini_cheetah",
         simulator=simulator,

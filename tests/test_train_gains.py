@@ -11,8 +11,9 @@ import mujoco
 import pytest
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator, save
+from pronk.match.gains import GroupGains, JointGains, MatchedGains, save
 from pronk.robots import load_robot
+from pronk.simulators.simulator import SimulatorInfo
 from pronk.train.gains import TrainingGains, training_gains
 
 CHEETAH = load_robot("mini_cheetah")
@@ -47,7 +48,7 @@ JOINT = JointGains(
 def written(tmp_path: Path, **changes: Any) -> Path:
     gains = MatchedGains(
         robot="mini_cheetah",
-        simulator=Simulator(version=mujoco.__version__),
+        simulator=SimulatorInfo(version=mujoco.__version__),
         joints={
             "FR_knee": replace(JOINT, delay_s=0.004),
             "FL_knee": replace(JOINT, delay_s=0.007),
@@ -132,7 +133,7 @@ def test_files_that_do_not_fit_are_refused(
 def test_gains_of_another_simulator_are_refused(
     tmp_path: Path, field: str, value: Any, expected: str
 ) -> None:
-    simulator = replace(Simulator(version=mujoco.__version__), **{field: value})
+    simulator = replace(SimulatorInfo(version=mujoco.__version__), **{field: value})
     path = written(tmp_path, simulator=simulator)
     shown = "4.0" if field == "version" else str(value)
     with pytest.raises(ArtefactError, match=f"{field} {shown}; training uses {field} {expected}"):
@@ -141,7 +142,7 @@ def test_gains_of_another_simulator_are_refused(
 
 def test_a_patch_of_mujoco_is_the_same_simulator(tmp_path: Path) -> None:
     minor = ".".join(mujoco.__version__.split(".")[:2])
-    path = written(tmp_path, simulator=Simulator(version=f"{minor}.99"))
+    path = written(tmp_path, simulator=SimulatorInfo(version=f"{minor}.99"))
     assert training_gains(path, CHEETAH).name == "matched"
 
 

@@ -37,6 +37,7 @@ def match(
     free: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
     interval: Interval = "student",
     phase: bool = False,
+    simulator: str = "mujoco",
     device: str = "cpu",
     reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
     json_file: console.JsonFile = None,
@@ -55,6 +56,7 @@ def match(
             refused.
         interval: 95 % intervals over repeats; the bootstrap needs eight.
         phase: Let the refinement see the phase and a free delay.
+        simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
             pronk[train]).
         json_file: Also write the figures to this file.
@@ -79,12 +81,18 @@ def match(
         use_phase=phase,
         interval=interval,
         device=device,
+        simulator=simulator,
     )
     if free and mode != "drive":
         raise PronkError("--fit names what --mode drive looks for; say --mode drive as well.")
     arm: ArmMatch | None = None
     with console.progress() as report:
         if any(moves_together(log) for log in read):
+            if simulator != "mujoco":
+                raise PronkError(
+                    f"--simulator {simulator}: several joints of these logs move at once, which "
+                    "only simulator mujoco matches; record one joint at a time."
+                )
             arm, result = together(read, machine, mode, report)
         elif mode == "drive":
             result = match_drives(

@@ -19,6 +19,7 @@ def predict(
     robot: str,
     gains: Path,
     out: Path | None = None,
+    simulator: str = "mujoco",
     reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
     json_file: console.JsonFile = None,
 ) -> None:
@@ -29,6 +30,7 @@ def predict(
         robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF.
         gains: gains.yaml of `pronk match`.
         out: Folder for replays and figure; beside the gains.
+        simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         json_file: Also write the figures to this file.
         reading: How logs are read.
     """
@@ -49,7 +51,7 @@ def predict(
     with console.progress() as report:
         done = report.bar("predict")
         for i, log in enumerate(read):
-            found = predict_log(log, machine, matched)
+            found = predict_log(log, machine, matched, simulator=simulator)
             excluded |= found.excluded
             stem = Path(log.source or "log").stem
             path = folder / f"{stem}.prediction.npz"

@@ -8,7 +8,6 @@ they cannot, and names the experiment that would.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,9 +33,8 @@ from pronk.match.ranges import matched_gains
 from pronk.match.refine import residual_db
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
-from pronk.robots.model import set_passive
 from pronk.robots.robot import Robot
-from pronk.simulators.mujoco import JointTestRig
+from pronk.simulators.simulator import JointRig, joint_rigs
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -64,27 +62,17 @@ class DriveFit:
     flags: tuple[str, ...] = ()
 
 
-class _DriveRig(JointTestRig):
-    """A rig whose simulations differ in armature and friction too."""
-
-    def answer(self, goal: MeasuredJoint, drives: Sequence[Mapping[str, float]]) -> ComplexArray:
-        """Whole responses of a target, the delay included, shape (drives, f)."""
-        while len(self._models) < len(drives):
-            self._models.append(copy.copy(self.model))
-        for model, drive in zip(self._models, drives, strict=False):
-            set_passive(
-                model,
-                self.joint.name,
-                armature=drive["armature"],
-                frictionloss=drive["frictionloss"],
-            )
-        command = goal.trace.mirrored(self.robot)[2]
-        stiffness = np.array([drive["stiffness"] for drive in drives])
-        damping = np.array([drive["damping"] for drive in drives])
-        late = np.array([drive["delay"] for drive in drives])
-        ((_, position),) = self.run([command], [self.pose(goal.trace)], stiffness, damping)
-        turned = np.exp(-1j * late[:, None] * goal.measured.omega)
-        return np.asarray(goal.full_response(position) * turned)
+def _drive_responses(
+    rig: JointRig, goal: MeasuredJoint, drives: Sequence[Mapping[str, float]]
+) -> ComplexArray:
+    """Full responses of a joint with several drives, the delay included, shape (drives, f)."""
+    values = {name: np.array([drive[name] for drive in drives]) for name in FREE}
+    command = goal.trace.mirrored(rig.robot)[2]
+    late = values.pop("delay")
+    ((_, position),) = rig.run([command], [rig.pose(goal.trace)], **values)
+    return np.asarray(
+        goal.full_response(position) * np.exp(-1j * late[:, None] * goal.measured.omega)
+    )
 
 
 def match_drives(
@@ -116,6 +104,8 @@ def match_drives(
         )
     chosen = settings or MatchSettings()
     told = progress or (lambda _stage, _share: None)
+    with joint_rigs(chosen.simulator, robot) as rigs:
+        robot, info = rigs.robot, rigs.info
     where = logs_by_joint(logs, robot)
     asked = {
         name: merged([measured_joints(log, name, robot, chosen) for log in sources])
@@ -133,7 +123,7 @@ def match_drives(
         joints[name], gains[name] = _artefacts(robot, goals[0], goals, fit)
     told("fit", 1.0)
     return MatchResult(
-        gains=matched_gains(robot, gains, logs),
+        gains=matched_gains(robot, gains, logs, info),
         joints=joints,
     )
 
@@ -195,14 +185,17 @@ def fit_drive(
         }
         return {**known, **found}
 
-    with _DriveRig(robot, joint.original[0], threads=settings.threads) as rig:
+    with joint_rigs(settings.simulator, robot, threads=settings.threads) as rigs:
+        rig = rigs.rig(joint.name)
 
         def rows(x: Array) -> tuple[Array, Array]:
             """Weighted residuals and their Jacobian by forward differences."""
             points = [x, *(x + np.diag(steps))]
             parts = []
             for goal in goals:
-                answers = rig.answer(goal, [drive(point) for point in points])[:, goal.fit_mask]
+                answers = _drive_responses(rig, goal, [drive(point) for point in points])[
+                    :, goal.fit_mask
+                ]
                 measured = goal.measured.response[goal.fit_mask]
                 parts.append(residual_db(goal, answers, measured, True) * _weight(goal))
             every = np.concatenate(parts, axis=1)
@@ -240,7 +233,7 @@ def fit_drive(
             ftol=1e-8,
         )
         best = drive(found.x)
-        matched, naive = rig.answer(goals[0], [best, known])
+        matched, naive = _drive_responses(rig, goals[0], [best, known])
     scale = np.array([kind.slope(float(v)) for kind, v in zip(kinds, found.x, strict=True)])
     covariance, freedom = _covariance(goals, np.asarray(found.jac))
     deviation = np.sqrt(np.diag(covariance))

@@ -16,22 +16,9 @@ import yaml
 
 from pronk.errors import ArtefactError
 from pronk.files import write_text
+from pronk.simulators.simulator import SimulatorInfo
 
 SCHEMA = "pronk/gains/1"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Simulator:
-    """The simulator that gains hold for. In another one the same numbers mean another joint."""
-
-    engine: str = "mujoco"
-    version: str = ""
-    timestep_s: float = 0.005
-    decimation: int = 4
-    integrator: str = "implicitfast"
-    actuator: str = "dc_motor_pd"
-    """Explicit PD on position and velocity at the start of each physics step, clipped by the
-    torque-speed curve (mjlab's DcMotorActuator)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +75,7 @@ class MatchedGains:
     """Matched gains of a robot, and what they rest on."""
 
     robot: str
-    simulator: Simulator
+    simulator: SimulatorInfo
     joints: Mapping[str, JointGains]
     groups: Mapping[str, GroupGains]
     logs: Mapping[str, str] = field(default_factory=dict)
@@ -180,7 +167,7 @@ def load(path: Path) -> MatchedGains:
         return MatchedGains(
             robot=body["robot"],
             virtual=bool(body.get("virtual", False)),
-            simulator=_read(Simulator, "simulator", body["simulator"], path),
+            simulator=_read(SimulatorInfo, "simulator", body["simulator"], path),
             joints={k: _read(JointGains, k, v, path) for k, v in body["joints"].items()},
             groups={k: _read(GroupGains, k, v, path) for k, v in body["groups"].items()},
             logs=dict(body.get("logs") or {}),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pronk.match.measured_joint import MeasuredJoint
 from pronk.robots.robot import Robot
-from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
+from pronk.simulators.simulator import JointRig, JointRigs
 
 Array = NDArray[np.float64]
 
@@ -99,7 +99,7 @@ def alike(targets: Sequence[MeasuredJoint], robot: Robot) -> list[list[MeasuredJ
 
 
 def errors(
-    rig: JointTestRig,
+    rig: JointRig,
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
@@ -138,7 +138,7 @@ def errors(
 
 
 def search(
-    rig: JointTestRig,
+    rig: JointRig,
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
@@ -164,7 +164,7 @@ def search(
 
 
 def search_all(
-    simulator: MujocoSimulator,
+    simulator: JointRigs,
     targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
@@ -217,7 +217,7 @@ def search_all(
 
 
 def _look_again(
-    rig: JointTestRig,
+    rig: JointRig,
     group: Sequence[MeasuredJoint],
     shared: Sequence[GridSearch],
     weighting: Literal["none", "coherence"],
@@ -239,7 +239,7 @@ def _look_again(
 
 
 def coarse_search(
-    rig: JointTestRig,
+    rig: JointRig,
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,

@@ -23,7 +23,7 @@ from pronk.response.periodic import multisine_operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import CommandTrace, command_trace
-from pronk.simulators.mujoco import MujocoSimulator
+from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -350,7 +350,7 @@ class SimRequest:
 
 
 def responses(
-    simulator: MujocoSimulator, requests: Sequence[SimRequest], *, whole: bool = False
+    simulator: JointRigs, requests: Sequence[SimRequest], *, whole: bool = False
 ) -> list[ComplexArray]:
     """Simulated responses, one a request.
 
@@ -373,7 +373,7 @@ def responses(
 
 
 def _simulate_family(
-    simulator: MujocoSimulator,
+    simulator: JointRigs,
     requests: Sequence[SimRequest],
     indices: Sequence[int],
     out: list[ComplexArray],

@@ -32,7 +32,7 @@ from pronk.match.refine import Fit, refine
 from pronk.match.result import JointMatch, MatchResult
 from pronk.match.settings import MatchSettings
 from pronk.robots.robot import Robot
-from pronk.simulators.mujoco import MujocoSimulator
+from pronk.simulators.simulator import JointRigs, joint_rigs
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -86,7 +86,10 @@ def match_logs(
     chosen = settings or MatchSettings()
     clock = _Clock(progress)
     # The simulator first: a device that is missing must not cost the user an estimate.
-    with MujocoSimulator(robot, threads=chosen.threads, device=chosen.device) as simulator:
+    with joint_rigs(
+        chosen.simulator, robot, threads=chosen.threads, device=chosen.device
+    ) as simulator:
+        robot = simulator.robot
         with clock.stage("estimate"):
             asked = _collect(logs, robot, chosen, clock)
         found, rate = _search(simulator, asked, chosen, clock)
@@ -94,10 +97,10 @@ def match_logs(
             _fit_amplitudes(simulator, asked, found, chosen)
         with clock.stage("answers"):
             matched, naive = _answers(simulator, asked, found)
-    zero: dict[str, NDArray[np.complex128]] = {}
-    if chosen.zero_armature:
-        with clock.stage("zero armature"):
-            zero = _without_armature(robot, asked, found, chosen, clock)
+        zero: dict[str, NDArray[np.complex128]] = {}
+        if chosen.zero_armature and "armature" in simulator.parameters:
+            with clock.stage("zero armature"):
+                zero = _without_armature(simulator, asked, found, chosen, clock)
     joints: dict[str, JointMatch] = {}
     gains: dict[str, JointGains] = {}
     for name, item in asked.items():
@@ -106,7 +109,7 @@ def match_logs(
         )
         gains[name] = replace(gains[name], delay_s=command_delay(joints[name]))
     return MatchResult(
-        gains=matched_gains(robot, gains, logs),
+        gains=matched_gains(robot, gains, logs, simulator.info),
         joints=joints,
         seconds=clock.seconds,
         grid_steps_per_second=rate,
@@ -153,7 +156,7 @@ def _collect(
 
 
 def _search(
-    simulator: MujocoSimulator, asked: dict[str, _Asked], settings: MatchSettings, clock: _Clock
+    simulator: JointRigs, asked: dict[str, _Asked], settings: MatchSettings, clock: _Clock
 ) -> tuple[dict[str, _Found], float]:
     """Best node and optimum off the grid of every joint; physics steps per second of the grid."""
     main = [item.main for item in asked.values()]
@@ -191,7 +194,7 @@ def _search(
 
 
 def _fit_amplitudes(
-    simulator: MujocoSimulator,
+    simulator: JointRigs,
     asked: dict[str, _Asked],
     found: dict[str, _Found],
     settings: MatchSettings,
@@ -204,7 +207,7 @@ def _fit_amplitudes(
 
 
 def _answers(
-    simulator: MujocoSimulator, asked: dict[str, _Asked], found: dict[str, _Found]
+    simulator: JointRigs, asked: dict[str, _Asked], found: dict[str, _Found]
 ) -> tuple[dict[str, NDArray[np.complex128]], dict[str, NDArray[np.complex128]]]:
     """Whole responses with the matched and with the naive gains."""
     main = [item.main for item in asked.values()]
@@ -222,21 +225,19 @@ def _answers(
 
 
 def _without_armature(
-    robot: Robot,
+    simulator: JointRigs,
     asked: dict[str, _Asked],
     found: dict[str, _Found],
     settings: MatchSettings,
     clock: _Clock,
 ) -> dict[str, NDArray[np.complex128]]:
     """The search without rotor inertia (F13); whole responses at its best nodes."""
-    stiffness, damping = axes(robot, settings.grid_points)
-    groups = alike([item.main for item in asked.values()], robot)
+    stiffness, damping = axes(simulator.robot, settings.grid_points)
+    groups = alike([item.main for item in asked.values()], simulator.robot)
     requests = []
-    with MujocoSimulator(
-        robot, armature=0.0, threads=settings.threads, device=settings.device
-    ) as simulator:
+    with simulator.without_armature() as rigs:
         for k, group in enumerate(groups):
-            rig = simulator.rig(group[0].joint)
+            rig = rigs.rig(group[0].joint)
             for goal, grid in zip(
                 group,
                 coarse_search(rig, group, stiffness, damping, settings.grid_weighting),
@@ -245,7 +246,7 @@ def _without_armature(
                 found[goal.joint].zero = grid
                 requests.append(SimRequest(goal, *grid.gains))
             clock.tell((k + 1) / len(groups))
-        answers = responses(simulator, requests, whole=True)
+        answers = responses(rigs, requests, whole=True)
     return {request.target.joint: answer for request, answer in zip(requests, answers, strict=True)}
 
 

@@ -15,21 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from pronk.errors import LogError
+from pronk.errors import LogError, PronkError
 from pronk.logs.joint_log import Segment, SweepLog
 from pronk.match.arm.match import drives_of
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.measured_joint import gains_on_drive
 from pronk.match.prediction import JointPrediction, Prediction
 from pronk.robots.robot import Robot
-from pronk.simulators.chain import ChainSimulation, JointDrive, held_mean, moves_together
-from pronk.simulators.command_trace import CommandTrace, command_trace
-from pronk.simulators.mujoco import simulate
+from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together
+from pronk.simulators.command_trace import CommandTrace, command_trace, held_mean
+from pronk.simulators.simulator import JointRigs, joint_rigs, play
 
 Array = NDArray[np.float64]
 
 
-def predict(log: SweepLog, robot: Robot, gains: MatchedGains, *, threads: int = 2) -> Prediction:
+def predict(
+    log: SweepLog,
+    robot: Robot,
+    gains: MatchedGains,
+    *,
+    threads: int = 2,
+    simulator: str = "mujoco",
+) -> Prediction:
     """Simulate a log with naive and with matched gains.
 
     Where several joints move at once the whole arm is simulated; otherwise each question to each
@@ -40,13 +47,23 @@ def predict(log: SweepLog, robot: Robot, gains: MatchedGains, *, threads: int = 
         robot: The robot.
         gains: Matched gains of the joints to replay.
         threads: Threads of the simulator.
+        simulator: What to replay in; see `pronk.simulators.simulator.load_simulator`.
 
     Raises:
-        LogError: The log asks no joint that has matched gains, or the robots differ.
+        LogError: The log excites no joint that has matched gains, or the robots differ.
+        PronkError: The simulator is unknown, or cannot replay joints that move together.
     """
     if gains.robot != robot.name:
         raise LogError(f"the gains are those of {gains.robot}, not of {robot.name}.")
-    return (_arm if moves_together(log) else _bench)(log, robot, gains, threads)
+    if moves_together(log):
+        if simulator != "mujoco":
+            raise PronkError(
+                f"{log.source or 'log'}: several joints move at once, which only simulator mujoco "
+                f"replays, not {simulator}."
+            )
+        return _arm(log, robot, gains, threads)
+    with joint_rigs(simulator, robot, threads=threads) as rigs:
+        return _joint_by_joint(log, rigs, gains)
 
 
 def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
@@ -83,8 +100,9 @@ def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pred
     return _prediction(log, out, excluded)
 
 
-def _bench(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
+def _joint_by_joint(log: SweepLog, rigs: JointRigs, gains: MatchedGains) -> Prediction:
     """One joint after the other, question by question."""
+    robot = rigs.robot
     out, excluded = [], {}
     segments = log.segments or _single(log)
     asked = {name for segment in segments for name in segment.joints}
@@ -96,7 +114,7 @@ def _bench(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pr
             continue
         mine = [segment for segment in segments if name in segment.joints]
         parts = [
-            _replay(log.cut(one), one, name, robot, gains.joints[name], threads)
+            _replay(log.cut(one), one, name, rigs, gains.joints[name])
             for one in sorted(mine, key=lambda segment: segment.start)
         ]
         joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
@@ -119,42 +137,48 @@ def _replay(
     part: SweepLog,
     segment: Segment,
     name: str,
-    robot: Robot,
+    rigs: JointRigs,
     gains: JointGains,
-    threads: int,
 ) -> tuple[Array, ...]:
     """Time, command, measured, naive, naive with the delay and matched position of a question."""
-    asked = command_trace(part, segment, name, robot)
-    late = _delayed(asked, gains.delay_s)
-    plain = _on_drive(part, robot, name)
-    naive, naive_delayed = (
-        simulate(robot, one, plain.stiffness, plain.damping, threads=threads)[0]
-        for one in (asked, late)
-    )
-    matched = simulate(
-        robot,
+    robot, rig = rigs.robot, rigs.rig(name)
+    trace = command_trace(part, segment, name, robot)
+    late = _delayed(trace, gains.delay_s)
+    real = _on_drive(part, robot, name)
+    gains_of_drive = np.array([real.stiffness]), np.array([real.damping])
+    own = {
+        "armature": np.array([gains.armature]),
+        "frictionloss": np.array(
+            [
+                robot.joint(name).drive.frictionloss
+                if np.isnan(gains.frictionloss)
+                else gains.frictionloss
+            ]
+        ),
+    }
+    naive, naive_delayed = (play(rig, one, *gains_of_drive)[0] for one in (trace, late))
+    matched = play(
+        rig,
         late,
-        gains.stiffness,
-        gains.damping,
-        armature=gains.armature,
-        frictionloss=None if np.isnan(gains.frictionloss) else gains.frictionloss,
-        threads=threads,
+        np.array([gains.stiffness]),
+        np.array([gains.damping]),
+        **{k: v for k, v in own.items() if k in rigs.parameters},
     )[0]
     # The last state is that at the start of the last step: no sample may lie beyond it.
-    inside = (part.time >= asked.time[0]) & (part.time <= asked.time[-1])
+    inside = (part.time >= trace.time[0]) & (part.time <= trace.time[-1])
     time, column = part.time[inside], part.column(name)
     answers = (
-        np.asarray(CubicSpline(asked.time, one)(time)) for one in (naive, naive_delayed, matched)
+        np.asarray(CubicSpline(trace.time, one)(time)) for one in (naive, naive_delayed, matched)
     )
     return time, part.command[inside, column], part.position[inside, column], *answers
 
 
-def _delayed(asked: CommandTrace, delay: float) -> CommandTrace:
-    """The question with its command delayed."""
+def _delayed(trace: CommandTrace, delay: float) -> CommandTrace:
+    """The trace with its command delayed [s]."""
     if delay == 0.0:
-        return asked
-    edges = np.append(asked.time, asked.time[-1] + asked.timestep) - delay
-    return CommandTrace(**{**vars(asked), "command": held_mean(asked.time, asked.command, edges)})
+        return trace
+    edges = np.append(trace.time, trace.time[-1] + trace.timestep) - delay
+    return replace(trace, command=held_mean(trace.time, trace.command, edges))
 
 
 def _on_drive(log: SweepLog, robot: Robot, name: str) -> JointDrive:

@@ -17,11 +17,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.errors import PronkError
 from pronk.match.grid import GridSearch, mean_square, weights
 from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
 from pronk.match.refine import Fit, refine
 from pronk.simulators.linear import Plant, plant
-from pronk.simulators.mujoco import MujocoSimulator
+from pronk.simulators.mujoco import JointTestRig
+from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
 
@@ -42,7 +44,7 @@ class QuickSearch:
 
 
 def quick_search(
-    simulator: MujocoSimulator,
+    simulator: JointRigs,
     targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
@@ -94,8 +96,13 @@ def quick_search(
     return found
 
 
-def _plant(simulator: MujocoSimulator, goal: MeasuredJoint) -> Plant:
+def _plant(simulator: JointRigs, goal: MeasuredJoint) -> Plant:
     rig = simulator.rig(goal.joint)
+    if not isinstance(rig, JointTestRig):
+        raise PronkError(
+            f"the quick search linearizes MuJoCo; with simulator {simulator.info.engine} search "
+            "the grid."
+        )
     return plant(rig, rig.pose(goal.trace), goal.omega)
 
 

@@ -32,9 +32,10 @@ from numpy.typing import NDArray
 from pronk.errors import RobotError
 from pronk.logs.joint_log import SweepLog
 from pronk.match.ellipsoid import enclosing, interval_points
-from pronk.match.gains import GroupGains, JointGains, MatchedGains, Simulator
+from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Robot
+from pronk.simulators.simulator import SimulatorInfo
 
 Array = NDArray[np.float64]
 Rule = Literal["cover", "paper"]
@@ -93,20 +94,22 @@ def group_gains(
 
 
 def matched_gains(
-    robot: Robot, joints: Mapping[str, JointGains], logs: Sequence[SweepLog]
+    robot: Robot,
+    joints: Mapping[str, JointGains],
+    logs: Sequence[SweepLog],
+    info: SimulatorInfo,
 ) -> MatchedGains:
     """The artefact: gains of the joints, what training draws from, and what they rest on.
 
     Args:
-        robot: The robot, whose training simulator the gains hold for.
+        robot: The robot.
         joints: Matched gains.
         logs: The logs that went in.
+        info: The simulator that the gains hold for.
     """
     return MatchedGains(
         robot=robot.name,
-        simulator=Simulator(
-            version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
-        ),
+        simulator=info,
         joints=joints,
         groups=group_gains(robot, joints),
         logs={Path(log.source or "log").name: log.sha256 for log in logs},

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
-from pronk.simulators.mujoco import MujocoSimulator
+from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -100,7 +100,7 @@ class _State:
 
 
 def refine(
-    simulator: MujocoSimulator,
+    simulator: JointRigs,
     targets: Sequence[MeasuredJoint],
     start: Sequence[tuple[float, float]],
     *,

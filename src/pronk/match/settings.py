@@ -36,6 +36,8 @@ class MatchSettings:
     device: str = "cpu"
     """Where the grid is simulated: `cpu` (all of it in double precision), `cuda` (MuJoCo Warp on a
     GPU; needs `pronk[train]`), or `warp-cpu` (the same arithmetic on the processor, slow)."""
+    simulator: str = "mujoco"
+    """`mujoco`, `FILE.py:NAME` or an entry point in `pronk.simulators` (see `load_simulator`)."""
     estimator: Estimator = field(default_factory=Estimator)
     """Estimator, the same for the log and the simulation."""
 

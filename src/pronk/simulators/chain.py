@@ -21,6 +21,7 @@ from pronk.errors import LogError
 from pronk.logs.joint_log import SweepLog
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import Robot
+from pronk.simulators.command_trace import held_mean
 
 Array = NDArray[np.float64]
 
@@ -253,34 +254,6 @@ class _ArmQuestion:
     command: Array
     """Recorded commands of the chain [rad], shape (n, chain)."""
     steps: int
-
-
-def held_mean(time: Array, command: Array, edges: Array) -> Array:
-    """Mean over each interval of a command that is held from each timestamp to the next.
-
-    The mean, not the value at the start: so the answer depends smoothly on a delay that is no
-    multiple of the step, and a fit can find it.
-
-    Args:
-        time: Timestamps [s], shape (n,).
-        command: Command in force from each of them [rad], shape (n,).
-        edges: Ends of the intervals [s], shape (m + 1,).
-
-    Returns:
-        Means [rad], shape (m,).
-    """
-    area = np.concatenate([[0.0], np.cumsum(command[:-1] * np.diff(time))])
-    # Before the first timestamp the first command holds, after the last one the last.
-    before, after = min(edges[0], time[0]) - 1.0, max(edges[-1], time[-1]) + 1.0
-    times = np.concatenate([[before], time, [after]])
-    areas = np.concatenate(
-        [
-            [command[0] * (before - time[0])],
-            area,
-            [area[-1] + command[-1] * (after - time[-1])],
-        ]
-    )
-    return np.asarray(np.diff(np.interp(edges, times, areas)) / np.diff(edges))
 
 
 def _sampled(positions: Array, time: Array, timestep: float) -> Array:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Self
 
@@ -25,14 +24,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import PronkError, RobotError
-from pronk.robots.model import bench_spec, set_drive_gains
+from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import CommandTrace, original_pose
+from pronk.simulators.command_trace import CommandTrace, held_mean, original_pose
+from pronk.simulators.simulator import CHUNK, PARAMETERS, Count, SimulatorInfo, play
 
 Array = NDArray[np.float64]
 
-CHUNK = 100
-"""Simulations in flight at once: 100 x 5,000 steps x 3 commands are 12 MB."""
 _SAG_ROUNDS = 4
 """Rounds of `q = target - gravity(q) / stiffness`; each gains two digits at 17 N m/rad."""
 
@@ -42,17 +40,19 @@ DEVICES = ("cpu", "cuda", "warp-cpu")
 single precision. `warp-cpu`: MuJoCo Warp on the processor, slow, to see what precision does."""
 
 
-@dataclass
-class Count:
-    """Physics steps done and the wall time they took, to report steps per second."""
-
-    steps: int = 0
-    seconds: float = 0.0
-
-    @property
-    def rate(self) -> float:
-        """Physics steps per second; NaN before the first."""
-        return self.steps / self.seconds if self.seconds > 0.0 else float("nan")
+def rest_position(
+    model: mujoco.MjModel, data: mujoco.MjData, target: Array, stiffness: Array
+) -> Array:
+    """Positions at rest with the drives at a target: what gravity leaves [rad], shape (nq,)."""
+    mujoco.mj_resetData(model, data)
+    data.qpos[:] = target
+    for _ in range(_SAG_ROUNDS):
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_rne(model, data, 0, data.qfrc_bias)
+        data.qpos[:] = target - data.qfrc_bias / stiffness
+    return np.array(data.qpos)
 
 
 class JointTestRig:
@@ -120,6 +120,7 @@ class JointTestRig:
         # One actuator a joint; map joint order to the columns of ctrl.
         self._ctrl = np.array([self.model.actuator(name).id for name in self.chain])
         self._models: list[mujoco.MjModel] = []
+        self._passive_set = False
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
 
@@ -168,35 +169,21 @@ class JointTestRig:
 
     def _equilibrium(self, target: Array, stiffness: float) -> Array:
         """Positions at rest with the drives at a target: what gravity leaves, shape (chain,)."""
-        data = self._data[0]
         gains = self._stiffness.copy()
         gains[self.index] = stiffness
-        mujoco.mj_resetData(self.model, data)
-        data.qpos[:] = target
-        for _ in range(_SAG_ROUNDS):
-            mujoco.mj_kinematics(self.model, data)
-            mujoco.mj_comPos(self.model, data)
-            mujoco.mj_comVel(self.model, data)
-            mujoco.mj_rne(self.model, data, 0, data.qfrc_bias)
-            data.qpos[:] = target - data.qfrc_bias / gains
-        return np.array(data.qpos)
+        return rest_position(self.model, self._data[0], target, gains)
 
     def run(
-        self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
+        self,
+        commands: Sequence[Array],
+        poses: Sequence[Array],
+        stiffness: Array,
+        damping: Array,
+        *,
+        armature: Array | None = None,
+        frictionloss: Array | None = None,
     ) -> Iterator[tuple[slice, Array]]:
-        """Excitation, and yield the asked joint's answers a chunk at a time.
-
-        Args:
-            commands: Command about the pose during each step [rad], each of shape (steps,); one
-                for all simulations, or one each.
-            poses: Pose of the chain [rad], each of shape (chain,); one for all or one each.
-            stiffness: Gains of the asked joint [N m/rad], shape (b,).
-            damping: Gains of the asked joint [N m s/rad], shape (b,).
-
-        Yields:
-            Which simulations, and the position about the pose at the start of each step [rad],
-            shape (chunk, steps). The array is reused: take what is needed before going on.
-        """
+        """Yield the excited joint's positions a chunk at a time; see `JointRig.run`."""
         total, steps = len(stiffness), len(commands[0])
         size = min(self.chunk, total)
         while len(self._models) < size:
@@ -216,6 +203,8 @@ class JointTestRig:
                 set_drive_gains(
                     self._models[row], self.joint.name, self.joint.drive, kp, float(damping[i])
                 )
+                if self._passive_set or armature is not None or frictionloss is not None:
+                    self._set_passive(self._models[row], i, armature, frictionloss)
                 if not shared or begin == 0:
                     pose = poses[0 if len(poses) == 1 else i]
                     centre[row] = pose[self.index]
@@ -238,6 +227,21 @@ class JointTestRig:
             self.count.seconds += time.perf_counter() - before
             self.count.steps += n * steps
             yield part, sensor[:n, :, self._sensor] - centre[:n, None]
+        self._passive_set = armature is not None or frictionloss is not None
+
+    def _set_passive(
+        self, model: mujoco.MjModel, i: int, armature: Array | None, frictionloss: Array | None
+    ) -> None:
+        """Give a model the armature and friction of simulation i, or the rig's own."""
+        dof = self.index
+        set_passive(
+            model,
+            self.joint.name,
+            armature=float(self.model.dof_armature[dof] if armature is None else armature[i]),
+            frictionloss=float(
+                self.model.dof_frictionloss[dof] if frictionloss is None else frictionloss[i]
+            ),
+        )
 
 
 def rig_on(device: str) -> Callable[..., JointTestRig]:
@@ -264,8 +268,18 @@ def rig_on(device: str) -> Callable[..., JointTestRig]:
     return partial(WarpTestRig, device=device)
 
 
+def mujoco_info(robot: Robot) -> SimulatorInfo:
+    """Describe the training simulator of a robot."""
+    return SimulatorInfo(
+        version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
+    )
+
+
 class MujocoSimulator:
-    """Test rigs of a robot's joints in MuJoCo, compiled when first needed and kept."""
+    """A robot's joints in MuJoCo, each branch on a fixed base; models are compiled once.
+
+    `rig` is the fast path: one joint, many gain pairs, on CPU threads or (MuJoCo Warp) a GPU.
+    """
 
     def __init__(
         self,
@@ -283,17 +297,21 @@ class MujocoSimulator:
             armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
             frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
             threads: Threads of the simulator.
-            device: Where large runs are simulated; see `pronk.simulators.device.DEVICES`.
+            device: Where large runs are simulated; see `DEVICES`.
 
         Raises:
             PronkError: The device is unknown or cannot be used here.
         """
         self.robot = robot
-        self._new_bench = rig_on(device)
+        self.info = mujoco_info(robot)
+        self.joints = robot.joint_names
+        self.parameters = frozenset(PARAMETERS)
+        self._new_rig = rig_on(device)
+        self._device = device
         self._armature = armature
         self._frictionloss = frictionloss
         self._threads = threads
-        self._benches: dict[str, JointTestRig] = {}
+        self._rigs: dict[str, JointTestRig] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -303,27 +321,99 @@ class MujocoSimulator:
 
     def close(self) -> None:
         """Stop the threads of every rig."""
-        for rig in self._benches.values():
+        for rig in self._rigs.values():
             rig.close()
-        self._benches.clear()
+        self._rigs.clear()
 
     def rig(self, joint: str) -> JointTestRig:
         """The rig that is simulated for a joint: that of its mirrored original."""
         original = self.robot.joint(joint).original[0]
-        if original not in self._benches:
-            self._benches[original] = self._new_bench(
+        if original not in self._rigs:
+            self._rigs[original] = self._new_rig(
                 self.robot,
                 original,
                 armature=self._armature,
                 frictionloss=self._frictionloss,
                 threads=self._threads,
             )
-        return self._benches[original]
+        return self._rigs[original]
+
+    def without_armature(self) -> MujocoSimulator:
+        """The same with no rotor inertia at the excited joint."""
+        return MujocoSimulator(self.robot, armature=0.0, threads=self._threads, device=self._device)
+
+    def rollout(
+        self, command: Array, values: Mapping[str, Array], *, locked: Sequence[str] = ()
+    ) -> Array:
+        """Simulate B runs from rest at the first command; see `Simulator.rollout`."""
+        if unknown := set(values) - self.parameters:
+            raise PronkError(
+                f"MuJoCo sets {', '.join(PARAMETERS)}, not {', '.join(sorted(unknown))}."
+            )
+        out = np.repeat(command[:, :1], command.shape[1], axis=1)
+        left = [name for name in self.joints if name not in locked]
+        while left:
+            # Branches do not feel each other: take the shortest chain with most of the joints.
+            root = max(
+                (j for j in self.robot.joints if left[0] in (j.chain or (j.name,))),
+                key=lambda joint: (len(set(joint.chain) & set(left)), -len(joint.chain)),
+            )
+            columns = [self.joints.index(name) for name in root.chain or (root.name,)]
+            chosen = {name: array[:, columns] for name, array in values.items()}
+            out[..., columns] = self._chain(root.name, columns, command[..., columns], chosen)
+            left = [name for name in left if self.joints.index(name) not in columns]
+        return out
+
+    def _chain(
+        self, root: str, columns: list[int], command: Array, values: Mapping[str, Array]
+    ) -> Array:
+        """Simulate one chain whose joints all have commands, shape (B, T, chain)."""
+        model = bench_spec(self.robot, root).compile()
+        names = [self.joints[k] for k in columns]
+        runs, steps = command.shape[:2]
+        control = np.zeros((runs, steps, model.nu))
+        state = np.zeros((runs, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        models = [copy.copy(model) for _ in range(runs)]
+        data = mujoco.MjData(model)
+        edges = self.robot.timestep_s * np.arange(steps + 1)
+        address = [int(model.joint(name).qposadr[0]) for name in names]
+        for b, one in enumerate(models):
+            stiffness = np.empty(model.nv)
+            for k, name in enumerate(names):
+                joint = self.robot.joint(name)
+                own = {parameter: float(array[b, k]) for parameter, array in values.items()}
+                kp = own.get("stiffness", joint.stiffness)
+                stiffness[address[k]] = kp
+                set_drive_gains(one, name, joint.drive, kp, own.get("damping", joint.damping))
+                set_passive(
+                    one,
+                    name,
+                    armature=own.get("armature"),
+                    frictionloss=own.get("frictionloss"),
+                )
+                track = command[b, :, k]
+                if delay := own.get("delay", 0.0):
+                    track = held_mean(edges[:-1], track, edges - delay)
+                control[b, :, model.actuator(name).id] = track
+            target = np.empty(model.nq)
+            target[address] = command[b, 0]
+            state[b, 1 : 1 + model.nq] = rest_position(one, data, target, stiffness)
+        trace, _ = mujoco.rollout.rollout(
+            models,
+            data,
+            state,
+            control,
+            nstep=steps,
+            skip_checks=False,
+            control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
+        )
+        before = np.concatenate([state[:, None], trace[:, :-1]], axis=1)
+        return np.asarray(before[..., 1 : 1 + model.nq][..., address])
 
     @property
     def count(self) -> Count:
-        """Steps and seconds of all benches together."""
-        counts = [rig.count for rig in self._benches.values()]
+        """Steps and seconds of all rigs together."""
+        counts = [rig.count for rig in self._rigs.values()]
         return Count(
             steps=sum(count.steps for count in counts),
             seconds=sum(count.seconds for count in counts),
@@ -364,18 +454,13 @@ def simulate(
         np.atleast_1d(np.asarray(stiffness, dtype=np.float64)),
         np.atleast_1d(np.asarray(damping, dtype=np.float64)),
     )
-    name, sign, command = trace.mirrored(robot)
-    centre = trace.pose[robot.joint_names.index(trace.joint)]
-    out = np.empty((len(kp), len(command)))
     with JointTestRig(
         robot,
-        name,
+        robot.joint(trace.joint).original[0],
         armature=armature,
         frictionloss=frictionloss,
         held_stiffness=held_stiffness,
         held_damping=held_damping,
         threads=threads,
     ) as rig:
-        for part, position in rig.run([command], [rig.pose(trace)], kp, kd):
-            out[part] = centre + sign * position
-    return out
+        return play(rig, trace, kp, kd)

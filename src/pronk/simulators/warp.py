@@ -113,12 +113,21 @@ class WarpTestRig(JointTestRig):
         self._worlds = None
 
     def run(
-        self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
+        self,
+        commands: Sequence[Array],
+        poses: Sequence[Array],
+        stiffness: Array,
+        damping: Array,
+        *,
+        armature: Array | None = None,
+        frictionloss: Array | None = None,
     ) -> Iterator[tuple[slice, Array]]:
-        """Yield the excited joint's positions a chunk at a time; see `JointTestRig.run`."""
+        """Yield the excited joint's positions a chunk at a time; see `JointRig.run`."""
         total = len(stiffness)
-        if total < self._least:
-            yield from super().run(commands, poses, stiffness, damping)
+        if total < self._least or armature is not None or frictionloss is not None:
+            yield from super().run(
+                commands, poses, stiffness, damping, armature=armature, frictionloss=frictionloss
+            )
             return
         for begin in range(0, total, MOST):
             batch = slice(begin, min(begin + MOST, total))

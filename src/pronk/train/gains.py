@@ -17,8 +17,9 @@ import mujoco
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
-from pronk.match.gains import GroupGains, MatchedGains, Simulator, load
+from pronk.match.gains import GroupGains, MatchedGains, load
 from pronk.robots.robot import Robot
+from pronk.simulators.simulator import SimulatorInfo
 
 NAIVE = "naive"
 """The choice of gains that needs no file."""
@@ -158,9 +159,9 @@ def _matched(path: Path, robot: Robot) -> MatchedGains:
     return gains
 
 
-def _check_simulator(simulator: Simulator, robot: Robot, path: Path) -> None:
+def _check_simulator(simulator: SimulatorInfo, robot: Robot, path: Path) -> None:
     """Gains hold for the simulator that they were matched in, and for no other."""
-    used = Simulator(
+    used = SimulatorInfo(
         version=_minor(mujoco.__version__),
         timestep_s=robot.timestep_s,
         decimation=robot.decimation,

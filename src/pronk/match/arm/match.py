@@ -26,6 +26,7 @@ from pronk.response.estimate import estimate
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
 from pronk.simulators.chain import ChainSimulation, Drives, JointDrive
+from pronk.simulators.mujoco import mujoco_info
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -86,7 +87,11 @@ def match_arm(
         for name, joint in fit.joints.items()
     }
     return ArmMatch(
-        gains=matched_gains(robot, gains, logs), fit=fit, mode=mode, held=held, joints=joints
+        gains=matched_gains(robot, gains, logs, mujoco_info(robot)),
+        fit=fit,
+        mode=mode,
+        held=held,
+        joints=joints,
     )
 
 

@@ -1,0 +1,408 @@
+"""The Simulator protocol: what an engine must offer so that its joints can be matched.
+
+An engine implements `Simulator`; MuJoCo is one of them (`pronk.simulators.mujoco`). The match works
+on `JointRigs`, which excite one joint at a time with many gain pairs: MuJoCo has a fast path of its
+own for that, every other simulator gets one by `RolloutRigs`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import PronkError
+from pronk.robots.robot import Robot
+from pronk.simulators.command_trace import CommandTrace, original_pose
+
+Array = NDArray[np.float64]
+
+PARAMETERS = ("stiffness", "damping", "armature", "frictionloss", "delay")
+"""Parameters of a joint [N m/rad, N m s/rad, kg m^2, N m, s]; the gains must be settable."""
+ENTRY_POINTS = "pronk.simulators"
+"""Group of entry points that installed packages offer simulators in."""
+CHUNK = 100
+"""Simulations in flight at once: 100 x 5,000 steps x 3 commands are 12 MB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorInfo:
+    """The simulator that gains hold for. In another one the same numbers give another joint."""
+
+    engine: str = "mujoco"
+    version: str = ""
+    timestep_s: float = 0.005
+    decimation: int = 4
+    integrator: str = "implicitfast"
+    actuator: str = "dc_motor_pd"
+    """Explicit PD on position and velocity at the start of each physics step, clipped by the
+    torque-speed curve (mjlab's DcMotorActuator)."""
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """Joints of a robot in some engine."""
+
+    info: SimulatorInfo
+    joints: tuple[str, ...]
+    """Names of the J joints, in the order of the columns."""
+    parameters: frozenset[str]
+    """Which of `PARAMETERS` it can set."""
+
+    def rollout(
+        self, command: Array, values: Mapping[str, Array], *, locked: Sequence[str] = ()
+    ) -> Array:
+        """Simulate B runs from rest at the first command.
+
+        Args:
+            command: Target position during each physics step [rad], shape (B, T, J).
+            values: Parameter name to values, each of shape (B, J), in the units of `PARAMETERS`;
+                the robot's own where a name is missing.
+            locked: Joints that are held at their first command; their motion is not needed.
+
+        Returns:
+            Position at the start of each step [rad], shape (B, T, J); NaN where a run diverged.
+        """
+
+
+@dataclass
+class Count:
+    """Physics steps done and the wall time they took."""
+
+    steps: int = 0
+    seconds: float = 0.0
+
+    @property
+    def rate(self) -> float:
+        """Physics steps per second; NaN before the first."""
+        return self.steps / self.seconds if self.seconds > 0.0 else float("nan")
+
+
+class JointRig(Protocol):
+    """One joint excited with many parameter sets, the other joints held."""
+
+    robot: Robot
+
+    def pose(self, trace: CommandTrace) -> Array:
+        """Pose at which the joint's chain is held for a trace [rad], shape (chain,)."""
+
+    def run(
+        self,
+        commands: Sequence[Array],
+        poses: Sequence[Array],
+        stiffness: Array,
+        damping: Array,
+        *,
+        armature: Array | None = None,
+        frictionloss: Array | None = None,
+    ) -> Iterator[tuple[slice, Array]]:
+        """Yield the excited joint's positions a chunk at a time.
+
+        Args:
+            commands: Command about the pose during each step [rad], each of shape (steps,); one
+                for all simulations, or one each.
+            poses: Pose of the chain [rad], each of shape (chain,); one for all or one each.
+            stiffness: Of the excited joint [N m/rad], shape (b,).
+            damping: Of the excited joint [N m s/rad], shape (b,).
+            armature: Of the excited joint [kg m^2], shape (b,); the rig's own if not given.
+            frictionloss: Of the excited joint [N m], shape (b,); the rig's own if not given.
+
+        Yields:
+            Which simulations, and the position about the pose at the start of each step [rad],
+            shape (chunk, steps). The array is reused: take what is needed before going on.
+        """
+
+
+class JointRigs(Protocol):
+    """The rigs of all joints of a robot in one simulator."""
+
+    robot: Robot
+    info: SimulatorInfo
+    parameters: frozenset[str]
+
+    @property
+    def count(self) -> Count:
+        """Steps and seconds of all rigs together."""
+
+    def rig(self, joint: str) -> JointRig:
+        """The rig that is simulated for a joint: that of its mirrored original."""
+
+    def without_armature(self) -> JointRigs:
+        """The same rigs with no rotor inertia at the excited joint."""
+
+    def close(self) -> None:
+        """Release threads and memory."""
+
+    def __enter__(self) -> Self:
+        """Use the rigs in a with statement."""
+
+    def __exit__(self, *error: object) -> None:
+        """Close."""
+
+
+class RolloutRigs:
+    """Rigs of any simulator, made from its `rollout`."""
+
+    def __init__(
+        self, simulator: Simulator, robot: Robot, *, armature: float | None = None
+    ) -> None:
+        """Take a simulator.
+
+        Args:
+            simulator: The simulator.
+            robot: The robot; timestep and decimation become those of the simulator.
+            armature: Rotor inertia of the excited joint [kg m^2]; the simulator's if not given.
+        """
+        info = simulator.info
+        self.robot = replace(robot, timestep_s=info.timestep_s, decimation=info.decimation)
+        self.info = info
+        self.parameters = simulator.parameters
+        self.count = Count()
+        self._simulator = simulator
+        self._armature = armature
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """No-op: the simulator belongs to the caller."""
+
+    def without_armature(self) -> RolloutRigs:
+        """The same with no rotor inertia at the excited joint.
+
+        Raises:
+            PronkError: The simulator cannot set the armature.
+        """
+        return RolloutRigs(self._simulator, self.robot, armature=0.0)
+
+    def rig(self, joint: str) -> RolloutRig:
+        """The rig of a joint's mirrored original.
+
+        Raises:
+            PronkError: The simulator lacks the joint, or a parameter that is set.
+        """
+        original = self.robot.joint(joint).original[0]
+        if original not in self._simulator.joints:
+            raise PronkError(
+                f"simulator {self.info.engine} has no joint {original!r}; its joints are "
+                f"{', '.join(self._simulator.joints)}."
+            )
+        return RolloutRig(self._simulator, self.robot, original, self.count, self._armature)
+
+
+class RolloutRig:
+    """One joint of any simulator, the others held at the pose."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        robot: Robot,
+        joint: str,
+        count: Count,
+        armature: float | None = None,
+    ) -> None:
+        """Take a simulator and one of its joints.
+
+        Args:
+            simulator: The simulator.
+            robot: The robot, with the simulator's timestep.
+            joint: The joint to excite; the original of a mirrored family.
+            count: Where to count steps.
+            armature: Rotor inertia of the joint [kg m^2]; the simulator's if not given.
+        """
+        self.robot = robot
+        self._simulator = simulator
+        self._joint = joint
+        self._count = count
+        self._armature = armature
+        self._chain = robot.joint(joint).chain or (joint,)
+
+    def pose(self, trace: CommandTrace) -> Array:
+        """Pose of the joint's chain [rad], shape (chain,)."""
+        return original_pose(trace, self.robot)
+
+    def run(
+        self,
+        commands: Sequence[Array],
+        poses: Sequence[Array],
+        stiffness: Array,
+        damping: Array,
+        *,
+        armature: Array | None = None,
+        frictionloss: Array | None = None,
+    ) -> Iterator[tuple[slice, Array]]:
+        """Yield the excited joint's positions a chunk at a time; see `JointRig.run`."""
+        names = self._simulator.joints
+        column = names.index(self._joint)
+        rest = np.array([self.robot.joint(name).default_position for name in names])
+        if armature is None and self._armature is not None:
+            armature = np.full(len(stiffness), self._armature)
+        joints = [self.robot.joint(name) for name in names]
+        own = {
+            "stiffness": [joint.stiffness for joint in joints],
+            "damping": [joint.damping for joint in joints],
+            "armature": [joint.drive.armature for joint in joints],
+            "frictionloss": [joint.drive.frictionloss for joint in joints],
+        }
+        excited = {"stiffness": stiffness, "damping": damping}
+        excited |= {"armature": armature} if armature is not None else {}
+        excited |= {"frictionloss": frictionloss} if frictionloss is not None else {}
+        can = self._simulator.parameters
+        if lacking := set(excited) - can:
+            raise PronkError(
+                f"simulator {self._simulator.info.engine} cannot set "
+                f"{', '.join(sorted(lacking))}; it sets {', '.join(sorted(can))}."
+            )
+        locked = tuple(name for name in names if name != self._joint)
+        for begin in range(0, len(stiffness), CHUNK):
+            part = slice(begin, min(begin + CHUNK, len(stiffness)))
+            size = part.stop - part.start
+            command = np.empty((size, len(commands[0]), len(names)))
+            centre = np.empty((size, 1))
+            for row, i in enumerate(range(part.start, part.stop)):
+                pose = dict(zip(self._chain, poses[0 if len(poses) == 1 else i], strict=True))
+                command[row] = [pose.get(n, r) for n, r in zip(names, rest, strict=True)]
+                command[row, :, column] += commands[0 if len(commands) == 1 else i]
+                centre[row] = pose[self._joint]
+            values = {name: np.tile(own[name], (size, 1)) for name in own if name in can}
+            for name, array in excited.items():
+                values[name][:, column] = array[part]
+            before = time.perf_counter()
+            position = checked(self._simulator.rollout(command, values, locked=locked), command)
+            self._count.seconds += time.perf_counter() - before
+            self._count.steps += size * command.shape[1]
+            yield part, position[:, :, column] - centre
+
+
+def checked(position: Any, command: Array) -> Array:
+    """What a rollout returned, as an array.
+
+    Raises:
+        PronkError: It has another shape than the command.
+    """
+    out = np.asarray(position, dtype=np.float64)
+    if out.shape != command.shape:
+        raise PronkError(
+            f"the simulator's rollout returned shape {out.shape}; expected that of the command, "
+            f"{command.shape} (runs, steps, joints)."
+        )
+    return out
+
+
+def play(
+    rig: JointRig,
+    trace: CommandTrace,
+    stiffness: Array,
+    damping: Array,
+    *,
+    armature: Array | None = None,
+    frictionloss: Array | None = None,
+) -> Array:
+    """Position of the joint of a trace, for many parameter sets.
+
+    Returns:
+        Position at the start of each step [rad], shape (b, steps), at `trace.time`.
+    """
+    sign, command = trace.mirrored(rig.robot)[1:]
+    centre = trace.pose[rig.robot.joint_names.index(trace.joint)]
+    out = np.empty((len(stiffness), len(command)))
+    for part, position in rig.run(
+        [command],
+        [rig.pose(trace)],
+        stiffness,
+        damping,
+        armature=armature,
+        frictionloss=frictionloss,
+    ):
+        out[part] = centre + sign * position
+    return out
+
+
+def load_simulator(
+    choice: str, robot: Robot, *, threads: int = 2, device: str = "cpu"
+) -> Simulator:
+    """Make a simulator of a robot.
+
+    Args:
+        choice: `mujoco`, `FILE.py:NAME`, or the name of an entry point in `pronk.simulators`. What
+            it names is called with the robot and returns a `Simulator`.
+        robot: The robot.
+        threads: Threads of MuJoCo.
+        device: Where MuJoCo simulates large runs; see `pronk.simulators.mujoco.DEVICES`.
+
+    Raises:
+        PronkError: There is no such simulator, or it lacks what the protocol needs.
+    """
+    if choice == "mujoco":
+        from pronk.simulators.mujoco import MujocoSimulator
+
+        return MujocoSimulator(robot, threads=threads, device=device)
+    if device != "cpu":
+        raise PronkError(f"device {device!r} is for simulator mujoco; {choice} has its own.")
+    simulator = _factory(choice)(robot)
+    lacking = [
+        name for name in ("info", "joints", "parameters", "rollout") if not hasattr(simulator, name)
+    ]
+    if lacking:
+        raise PronkError(f"simulator {choice} has no {', '.join(lacking)}; see Simulator.")
+    if not {"stiffness", "damping"} <= set(simulator.parameters):
+        raise PronkError(
+            f"simulator {choice} sets {', '.join(sorted(simulator.parameters)) or 'nothing'}; "
+            "expected at least stiffness and damping."
+        )
+    found: Simulator = simulator
+    return found
+
+
+def joint_rigs(choice: str, robot: Robot, *, threads: int = 2, device: str = "cpu") -> JointRigs:
+    """Rigs of a robot's joints in a simulator; arguments and errors are `load_simulator`'s."""
+    from pronk.simulators.mujoco import MujocoSimulator
+
+    simulator = load_simulator(choice, robot, threads=threads, device=device)
+    if isinstance(simulator, MujocoSimulator):
+        return simulator
+    return RolloutRigs(simulator, robot)
+
+
+def _factory(choice: str) -> Any:
+    """The callable that a path or entry point names."""
+    file, colon, name = choice.rpartition(":")
+    if colon and file.endswith(".py"):
+        path = Path(file)
+        if not path.is_file():
+            raise PronkError(f"simulator {choice}: there is no file {path}.")
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        try:
+            spec.loader.exec_module(module)
+        except Exception as error:
+            raise PronkError(
+                f"simulator {choice}: {path} cannot be loaded ({type(error).__name__}: {error})."
+            ) from error
+        found = getattr(module, name, None)
+        if not callable(found):
+            offers = [n for n, v in vars(module).items() if isinstance(v, type) and n[0] != "_"]
+            raise PronkError(
+                f"simulator {choice}: {path} has no {name!r} that can be called; its classes are "
+                f"{', '.join(offers) or 'none'}."
+            )
+        return found
+    known = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+    if choice not in known:
+        raise PronkError(
+            f"simulator {choice!r}; expected FILE.py:NAME or one of "
+            f"{', '.join(['mujoco', *sorted(known)])}."
+        )
+    return known[choice].load()

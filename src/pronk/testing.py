@@ -1,0 +1,78 @@
+"""Conformance checks of extensions; each raises PronkError and names the rule that is broken."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pronk.errors import PronkError
+from pronk.simulators.simulator import PARAMETERS, Simulator
+
+
+def check_simulator(simulator: Simulator) -> None:
+    """Check that a simulator keeps the `Simulator` protocol.
+
+    Two runs of 0.2 s are simulated several times: shapes, rest at the first command,
+    causality, independent runs, repeatability, locked joints, and an effect of every
+    parameter that it claims to set.
+
+    Args:
+        simulator: The simulator.
+
+    Raises:
+        PronkError: A property fails; the message names it.
+    """
+    info, joints = simulator.info, tuple(simulator.joints)
+    _require(info.timestep_s > 0.0 and info.decimation >= 1, "info: timestep and decimation > 0")
+    _require(bool(info.engine), "info: engine is named")
+    _require(len(joints) > 0 and len(set(joints)) == len(joints), "joints: unique names")
+    unknown = set(simulator.parameters) - set(PARAMETERS)
+    _require(not unknown, f"parameters: {', '.join(sorted(unknown))} unknown to pronk")
+    _require({"stiffness", "damping"} <= set(simulator.parameters), "parameters: the gains")
+    steps = max(40, round(0.2 / info.timestep_s))
+    rng = np.random.default_rng(0)
+    command = 0.1 * rng.standard_normal((2, 1, len(joints))) * np.ones((2, steps, 1))
+    command[:, steps // 2 :] += 0.05
+    usual = {"stiffness": 20.0, "damping": 0.5, "armature": 0.01, "frictionloss": 0.1, "delay": 0.0}
+    values = {
+        name: np.full((2, len(joints)), value)
+        for name, value in usual.items()
+        if name in simulator.parameters
+    }
+    before = command.copy()
+    out = simulator.rollout(command, values)
+    _require(np.shape(out) == command.shape, "rollout: the shape of the command is returned")
+    _require(np.array_equal(command, before), "rollout: the command is left unchanged")
+    _require(bool(np.isfinite(out).all()), "rollout: usual gains give finite positions")
+    quarter = slice(steps // 4, steps // 2)
+    drift = np.abs(np.diff(out[:, quarter], axis=1)).max()
+    _require(float(drift) < 1e-3, "rollout: rest at the first command")
+    moved = np.abs(out[:, -1] - out[:, steps // 2]).max(axis=0)
+    _require(bool((moved > 1e-3).all()), "rollout: every joint follows its command")
+    _require(np.allclose(simulator.rollout(command, values), out), "rollout: repeatable")
+    single = simulator.rollout(command[:1], {k: v[:1] for k, v in values.items()})
+    _require(np.allclose(single, out[:1], atol=1e-6), "rollout: runs are independent")
+    later = command.copy()
+    later[:, -5:] += 0.1
+    early = simulator.rollout(later, values)[:, :-5]
+    _require(np.allclose(early, out[:, :-5], atol=1e-9), "rollout: no response before its command")
+    if len(joints) > 1:
+        held = simulator.rollout(command, values, locked=joints[1:])
+        _require(bool(np.ptp(held[..., 0], axis=1).min() > 1e-3), "locked: the free joint moves")
+        _require(bool(np.isfinite(held).all()), "locked: positions stay finite")
+    other = {
+        "stiffness": 10.0,
+        "damping": 1.0,
+        "armature": 0.05,
+        "frictionloss": 0.5,
+        "delay": 0.02,
+    }
+    for name in sorted(simulator.parameters):
+        changed = {**values, name: np.full((2, len(joints)), other[name])}
+        effect = np.abs(simulator.rollout(command, changed) - out).max()
+        _require(float(effect) > 1e-5, f"parameters: {name} has an effect")
+
+
+def _require(kept: bool, rule: str) -> None:
+    """Raise if a rule of a protocol is not kept."""
+    if not kept:
+        raise PronkError(f"the conformance check failed at: {rule}.")
