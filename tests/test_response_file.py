@@ -52,7 +52,7 @@ def test_damage_is_said(tmp_path: Path) -> None:
     with pytest.raises(ArtefactError, match="not a response file"):
         load(path)
     np.savez(path, header=np.array(json.dumps({"schema": "pronk/response/0"})))
-    with pytest.raises(ArtefactError, match="this pronk reads 'pronk/response/1'"):
+    with pytest.raises(ArtefactError, match="this pronk reads"):
         load(path)
     np.savez(path, header=np.array([{"schema": "pronk/response/1"}], dtype=object))
     with pytest.raises(ArtefactError, match="not a response file"):

@@ -117,7 +117,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(capsys, tmp_path):
 
 
 def test_gains_of_another_robot_are_refused(capsys, tmp_path):
-    simulator = gains_file.Simulator(version="3.11.0")
+    simulator = gains_file.SimulatorInfo(version="3.11.0")
     gains = gains_file.MatchedGains(robot="so101", simulator=simulator, joints={}, groups={})
     gains_file.save(tmp_path / "arm.yaml", gains)
     said = refused(capsys, "walk", "--gains", tmp_path / "arm.yaml", "--out", tmp_path / "run")

@@ -9,11 +9,14 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 
 from pronk.errors import ArtefactError
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -96,3 +99,68 @@ def stored_arrays(
         raise ArtefactError(
             f"{path}: not {what} of pronk ({type(error).__name__}); `{writer}` writes one."
         ) from error
+
+
+def save_artefact(path: Path, value: Any, schema: str) -> None:
+    """Write a dataclass with arrays in it to one `.npz`, whole or not at all; no pickle.
+
+    Args:
+        path: Where to.
+        value: A dataclass of numbers, text, arrays and further dataclasses.
+        schema: What the file is, with its version.
+    """
+    arrays: dict[str, Any] = {}
+
+    def hook(item: Any) -> Any:
+        if isinstance(item, np.ndarray):
+            arrays[str(len(arrays))] = item
+            return str(len(arrays) - 1)
+        return item.item() if isinstance(item, np.generic) else dict(item)
+
+    content = msgspec.to_builtins(value, enc_hook=hook)
+    save_arrays(path, {"schema": schema, "content": content}, arrays)
+
+
+def load_artefact(path: Path, kind: type[T], schema: str, *, what: str, writer: str) -> T:
+    """Read what `save_artefact` wrote.
+
+    Args:
+        path: The file.
+        kind: The dataclass.
+        schema: The schema that this pronk reads.
+        what: What the file is, for errors, as in `a match file`.
+        writer: The command that writes one, for errors.
+
+    Raises:
+        ArtefactError: Missing, damaged, of another schema, or a field has another type.
+    """
+    with stored_arrays(path, schema, what=what, writer=writer) as (header, arrays):
+        return converted(header["content"], kind, path, lambda _, key: arrays[key])
+
+
+def converted(data: Any, kind: type[T], path: Path, hook: Any = None) -> T:
+    """Make a dataclass of what YAML or JSON gave; unknown fields are refused.
+
+    Raises:
+        ArtefactError: A field is missing, unknown or of another type; the message names it.
+    """
+    try:
+        out = msgspec.convert(data, kind, dec_hook=hook)
+    except msgspec.ValidationError as error:
+        raise ArtefactError(f"{path}: {error}.") from None
+    if hook is None:
+        _refuse_unknown(data, msgspec.to_builtins(out), path, "")
+    return out
+
+
+def _refuse_unknown(data: Any, known: Any, path: Path, where: str) -> None:
+    """Compare the keys of two trees."""
+    if not isinstance(data, dict) or not isinstance(known, dict):
+        return
+    for name in data:
+        if name not in known:
+            place = f" of {where}" if where else ""
+            raise ArtefactError(
+                f"{path}: unknown field {name!r}{place}; the fields are {', '.join(known)}."
+            )
+        _refuse_unknown(data[name], known[name], path, f"{where}.{name}" if where else name)

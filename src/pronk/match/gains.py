@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from pronk.errors import ArtefactError
-from pronk.files import write_text
+from pronk.files import converted, write_text
 from pronk.simulators.simulator import SimulatorInfo
 
 SCHEMA = "pronk/gains/1"
@@ -134,20 +134,6 @@ def save(path: Path, gains: MatchedGains) -> None:
     write_text(path, yaml.dump(body, Dumper=_Dumper, sort_keys=False, width=10_000))
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
-
-
-def _read(kind: type[Any], name: str, entry: Any, path: Path) -> Any:
-    if not isinstance(entry, dict):
-        raise ArtefactError(f"{path}: {name} is {entry!r}; expected a mapping.")
-    try:
-        return kind(**{k: _tuples(v) for k, v in entry.items()})
-    except TypeError as error:
-        fields = ", ".join(kind.__dataclass_fields__)
-        raise ArtefactError(f"{path}: {name}: {error}; the fields are {fields}.") from None
-
-
 def load(path: Path) -> MatchedGains:
     """Read `gains.yaml`.
 
@@ -163,14 +149,5 @@ def load(path: Path) -> MatchedGains:
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         got = body.get("schema") if isinstance(body, dict) else type(body).__name__
         raise ArtefactError(f"{path}: schema {got!r}; this pronk reads {SCHEMA!r}.")
-    try:
-        return MatchedGains(
-            robot=body["robot"],
-            virtual=bool(body.get("virtual", False)),
-            simulator=_read(SimulatorInfo, "simulator", body["simulator"], path),
-            joints={k: _read(JointGains, k, v, path) for k, v in body["joints"].items()},
-            groups={k: _read(GroupGains, k, v, path) for k, v in body["groups"].items()},
-            logs=dict(body.get("logs") or {}),
-        )
-    except (KeyError, AttributeError) as error:
-        raise ArtefactError(f"{path}: {error} is missing or not a mapping.") from None
+    del body["schema"]
+    return converted(body, MatchedGains, path)

@@ -12,14 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.files import save_arrays, stored_arrays
+from pronk.files import load_artefact, save_artefact
 
-SCHEMA = "pronk/prediction/1"
+SCHEMA = "pronk/prediction/2"
 
 Array = NDArray[np.float64]
-
-_ARRAYS = ("time", "command", "measured", "naive", "naive_delayed", "matched")
-_SCALARS = ("joint", "signal", "unit")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,19 +93,7 @@ def r2(simulated: Array, measured: Array) -> float:
 
 def save(path: Path, prediction: Prediction) -> None:
     """Write a prediction, whole or not at all."""
-    header = {
-        "schema": SCHEMA,
-        "virtual": prediction.virtual,
-        "source": prediction.source,
-        "excluded": dict(prediction.excluded),
-        "joints": [{name: getattr(one, name) for name in _SCALARS} for one in prediction.joints],
-    }
-    arrays = {
-        f"{i}/{name}": getattr(one, name)
-        for i, one in enumerate(prediction.joints)
-        for name in _ARRAYS
-    }
-    save_arrays(path, header, arrays)
+    save_artefact(path, prediction, SCHEMA)
 
 
 def load(path: Path) -> Prediction:
@@ -117,16 +102,4 @@ def load(path: Path) -> Prediction:
     Raises:
         ArtefactError: Missing, damaged or of another schema.
     """
-    with stored_arrays(path, SCHEMA, what="a prediction", writer="pronk predict LOG") as (
-        header,
-        arrays,
-    ):
-        return Prediction(
-            joints=tuple(
-                JointPrediction(**entry, **{name: arrays[f"{i}/{name}"] for name in _ARRAYS})
-                for i, entry in enumerate(header["joints"])
-            ),
-            source=str(header["source"]),
-            virtual=bool(header["virtual"]),
-            excluded=header["excluded"],
-        )
+    return load_artefact(path, Prediction, SCHEMA, what="a prediction", writer="pronk predict LOG")

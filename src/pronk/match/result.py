@@ -9,16 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.files import save_arrays, stored_arrays
+from pronk.files import load_artefact, save_artefact
 from pronk.match.gains import MatchedGains
-from pronk.response.response import FrequencyResponse, packed, unpacked
+from pronk.response.response import FrequencyResponse
 
-SCHEMA = "pronk/match/1"
+SCHEMA = "pronk/match/2"
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -71,54 +70,23 @@ class MatchResult:
     """Physics steps per second of the grid search, both cores together."""
 
 
-_MATCH_ARRAYS = (
-    "grid_stiffness",
-    "grid_damping",
-    "grid_error",
-    "covariance",
-    "matched",
-    "naive",
-    "repeat_gains",
-    "amplitude_gains",
-)
-_MATCH_SCALARS = (
-    "joint",
-    "stiffness",
-    "damping",
-    "error_db",
-    "naive_error_db",
-    "zero_armature_error_db",
-)
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """A match without its gains, which have a file of their own."""
+
+    joints: Mapping[str, JointMatch]
+    seconds: Mapping[str, float]
+    grid_steps_per_second: float
 
 
 def save(path: Path, result: MatchResult) -> None:
     """Write `match.npz`; the gains themselves are written by `pronk.match.gains.save`."""
-    entries = []
-    arrays: dict[str, Any] = {}
-    for i, joint in enumerate(result.joints.values()):
-        arrays |= {f"{i}/{name}": np.asarray(getattr(joint, name)) for name in _MATCH_ARRAYS}
-        if joint.zero_armature is not None:
-            arrays[f"{i}/zero_armature"] = joint.zero_armature
-        responses = []
-        for k, response in enumerate(joint.responses):
-            scalars, parts = packed(response, f"{i}/{k}")
-            responses.append(scalars)
-            arrays |= parts
-        entries.append(
-            {
-                **{name: getattr(joint, name) for name in _MATCH_SCALARS},
-                "band_hz": joint.band_hz,
-                "flags": joint.flags,
-                "responses": responses,
-            }
-        )
-    header = {
-        "schema": SCHEMA,
-        "joints": entries,
-        "seconds": dict(result.seconds),
-        "grid_steps_per_second": result.grid_steps_per_second,
-    }
-    save_arrays(path, header, arrays)
+    stored = _Stored(
+        joints=result.joints,
+        seconds=result.seconds,
+        grid_steps_per_second=result.grid_steps_per_second,
+    )
+    save_artefact(path, stored, SCHEMA)
 
 
 def load(path: Path, gains: MatchedGains) -> MatchResult:
@@ -127,23 +95,5 @@ def load(path: Path, gains: MatchedGains) -> MatchResult:
     Raises:
         ArtefactError: Missing, damaged or of another schema.
     """
-    with stored_arrays(path, SCHEMA, what="a match file", writer="pronk match") as (header, arrays):
-        return MatchResult(
-            gains=gains,
-            joints={
-                entry["joint"]: JointMatch(
-                    **{name: entry[name] for name in _MATCH_SCALARS},
-                    **{name: arrays[f"{i}/{name}"] for name in _MATCH_ARRAYS},
-                    band_hz=tuple(entry["band_hz"]),
-                    flags=tuple(entry["flags"]),
-                    responses=tuple(
-                        unpacked(scalars, arrays, f"{i}/{k}")
-                        for k, scalars in enumerate(entry["responses"])
-                    ),
-                    zero_armature=arrays.get(f"{i}/zero_armature"),
-                )
-                for i, entry in enumerate(header["joints"])
-            },
-            seconds=header["seconds"],
-            grid_steps_per_second=header["grid_steps_per_second"],
-        )
+    stored = load_artefact(path, _Stored, SCHEMA, what="a match file", writer="pronk match")
+    return MatchResult(gains=gains, **vars(stored))

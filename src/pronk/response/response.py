@@ -7,34 +7,20 @@ to the measured position; the hold itself is not part of it, so it compares dire
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pronk.files import save_arrays, stored_arrays
+from pronk.files import load_artefact, save_artefact
 
-SCHEMA = "pronk/response/1"
+SCHEMA = "pronk/response/2"
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-
-_ARRAYS = ("omega", "response", "coherence", "averages", "repeats")
-_SCALARS = (
-    "joint",
-    "amplitude",
-    "estimator",
-    "window",
-    "segment_s",
-    "delay_s",
-    "third_harmonic",
-    "virtual",
-    "source",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,27 +109,14 @@ class FrequencyResponse:
         return np.asarray(inside & (self.coherence >= coherence))
 
 
-def packed(response: FrequencyResponse, prefix: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A response as what JSON can hold and as arrays named `prefix/...`."""
-    scalars = {name: getattr(response, name) for name in _SCALARS}
-    return scalars, {f"{prefix}/{name}": getattr(response, name) for name in _ARRAYS}
-
-
-def unpacked(
-    scalars: Mapping[str, Any], arrays: Mapping[str, Any], prefix: str
-) -> FrequencyResponse:
-    """The response that `packed` took apart."""
-    return FrequencyResponse(**scalars, **{name: arrays[f"{prefix}/{name}"] for name in _ARRAYS})
+@dataclass(frozen=True)
+class _Stored:
+    responses: list[FrequencyResponse]
 
 
 def save(path: Path, responses: Sequence[FrequencyResponse]) -> None:
     """Write responses to one `*.response.npz` (plain arrays and a JSON header, no pickle)."""
-    parts = [packed(response, str(i)) for i, response in enumerate(responses)]
-    save_arrays(
-        path,
-        {"schema": SCHEMA, "responses": [scalars for scalars, _ in parts]},
-        {name: array for _, arrays in parts for name, array in arrays.items()},
-    )
+    save_artefact(path, _Stored(list(responses)), SCHEMA)
 
 
 def load(path: Path) -> list[FrequencyResponse]:
@@ -152,8 +125,6 @@ def load(path: Path) -> list[FrequencyResponse]:
     Raises:
         ArtefactError: Not such a file, damaged, or of another schema.
     """
-    with stored_arrays(path, SCHEMA, what="a response file", writer="pronk response LOG") as (
-        header,
-        arrays,
-    ):
-        return [unpacked(entry, arrays, str(i)) for i, entry in enumerate(header["responses"])]
+    return load_artefact(
+        path, _Stored, SCHEMA, what="a response file", writer="pronk response LOG"
+    ).responses
