@@ -141,7 +141,7 @@ class Policy:
             )
 
 
-def load_policy(path: Path) -> Policy:
+def load_policy(path: Path | str) -> Policy:
     """Open a policy. Whether it fits a robot, `pronk.policy.contract.check` says.
 
     Args:
@@ -152,6 +152,7 @@ def load_policy(path: Path) -> Policy:
             pronk builds observations.
         PronkError: ONNX Runtime is not installed.
     """
+    path = Path(path)
     try:
         data = path.read_bytes()
     except FileNotFoundError:

@@ -1,0 +1,49 @@
+"""The README: its Python example runs as it stands, its commands exist, it is short."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from command_line import invoke
+from pronk.cli.main import COMMANDS
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(ROOT / "policies", "policies")
+    sweep = ["sweep", "mini_cheetah", "--joints", "FR_knee"]
+    for words in (["--out", "logs"], ["--out", "fresh", "--signal", "log-chirp", "--seed", "1"]):
+        done = invoke([*sweep, *words])
+        assert done.exit_code == 0, done.stderr
+    names: dict[str, Any] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    knee = names["result"].gains.joints["FR_knee"]
+    # The paper's Table I, from which the virtual robot's hidden parameters derive; two grid cells.
+    assert knee.stiffness == pytest.approx(21.8, abs=2 * 14 / 49)
+    assert knee.damping == pytest.approx(0.541, abs=2 * 0.6 / 49)
+    (replay,) = names["replay"].joints
+    assert replay.rmse_matched < 0.5 * replay.rmse_naive
+
+
+def test_every_command_of_the_documentation_exists() -> None:
+    pages = [README, *(page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))]
+    fenced = "\n".join(re.findall(r"```sh\n(.*?)```", "\n".join(pages), flags=re.DOTALL))
+    named = {
+        *re.findall(r"^pronk ([a-z]+)", fenced, flags=re.MULTILINE),
+        *(name for page in pages for name in re.findall(r"`pronk ([a-z]+)", page)),
+    }
+    assert named <= {*COMMANDS, "robot"}
+    assert set(COMMANDS) - {"demo"} <= named
+
+
+def test_the_readme_is_at_most_900_words() -> None:
+    assert len(README.split()) <= 900
