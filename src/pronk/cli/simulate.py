@@ -140,7 +140,7 @@ def _open_wire(
     """The robot's end of the wire, and its address in words."""
     if link == "lcm":
         from pronk.links.lcm.address import url_of
-        from pronk.links.lcm.layout import layout_of
+        from pronk.links.lcm.codec import layout_of
         from pronk.virtual.lcm_server import LcmWire
 
         if domain is not None:

@@ -19,6 +19,14 @@ Array = NDArray[np.float64]
 TorqueKind = Literal["measured", "computed", "absent"]
 
 
+class RefusedError(HardwareError):
+    """A message that is not what it must be; `reason` is a label to count it under."""
+
+    def __init__(self, reason: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.reason = reason
+
+
 @dataclass(frozen=True, kw_only=True)
 class State:
     """What the machine measured at one instant."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pronk.errors import HardwareError
-from pronk.links.dds import idl
+from pronk.links.dds import messages
 from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take, write
 from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
 from pronk.links.dds.service import (
@@ -26,8 +26,7 @@ from pronk.links.dds.service import (
     UNKNOWN_API,
     Server,
 )
-from pronk.links.lcm.message import RefusedError
-from pronk.links.machine import Command, State
+from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import Robot
 
 Spoil = Callable[[bytes], bytes]
@@ -71,14 +70,14 @@ class DdsWire:
         self._joints = joint_map(robot)
         self._names = robot.joint_names
         own = Participant(network)
-        self._commands = own.reader(COMMANDS, idl.LowCmd, raw=True)
-        self._states = own.writer(STATES, idl.LowState, raw=True)
+        self._commands = own.reader(COMMANDS, messages.LowCmd, raw=True)
+        self._states = own.writer(STATES, messages.LowState, raw=True)
         self._servers = [
             Server(own, SWITCHER, self._switch, self.counts),
             Server(own, BENCH, self._bench, self.counts),
         ]
         # Another writer is another participant.
-        self._other = Participant(network).writer(COMMANDS, idl.LowCmd, raw=True)
+        self._other = Participant(network).writer(COMMANDS, messages.LowCmd, raw=True)
         self._polls = 0
 
     def poll(self) -> list[Command]:

@@ -10,20 +10,21 @@ from collections import Counter
 
 from pronk.errors import HardwareError
 from pronk.links.lcm.address import open_lcm
-from pronk.links.lcm.codec import decode_command, encode_command, encode_state
-from pronk.links.lcm.layout import Layout
-from pronk.links.lcm.message import RefusedError
-from pronk.links.lcm.service import (
+from pronk.links.lcm.codec import (
     BEACON_CHANNEL,
     BENCH_CHANNEL,
     MODES,
     REQUEST_CHANNEL,
     RESPONSE_CHANNEL,
+    Layout,
     clamp_message,
+    decode_command,
+    encode_command,
+    encode_state,
     read_clamp_message,
     read_mode_request,
 )
-from pronk.links.machine import Command, State
+from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import Robot
 from pronk.virtual.server import Spoil
 

@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.links.dds import idl
-from pronk.links.dds.layout import pack, record, unpack
-from pronk.links.lcm.message import RefusedError
-from pronk.links.machine import Command, State, check_command
+from pronk.links.dds import messages
+from pronk.links.dds.messages import pack, record, unpack
+from pronk.links.machine import Command, RefusedError, State, check_command
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -40,8 +39,8 @@ POS_STOP = 2.146e9
 """`q` of a motor whose position is not controlled (Unitree's PosStopF)."""
 VEL_STOP = 16000.0
 """`dq` of a motor whose speed is not controlled (Unitree's VelStopF)."""
-VIRTUAL = (0x4E4F5250, 0x4E495754)
-"""`sn` by which a virtual robot says that it is one: `PRONTWIN`."""
+VIRTUAL = (0x4E4F5250, 0x4D49534B)
+"""`sn` that identifies a virtual robot: `PRONKSIM`."""
 TICKS_PER_S = 1000
 """Of the robot's clock in its states."""
 
@@ -66,7 +65,7 @@ class JointMap:
     robot: str
     sign: Array
     """A motor's angle is sign times the joint's, shape (12,)."""
-    sink: float
+    sink_damping: float
     """Damping with which the joints sink softly [N m s/rad]."""
     virtual_only: bool
     """True where no real robot of this name speaks these messages."""
@@ -86,7 +85,7 @@ def joint_map(robot: Robot) -> JointMap:
     return JointMap(
         robot=robot.name,
         sign=np.tile(_SIGNS[robot.name], _JOINTS // 3),
-        sink=_SINK[robot.name],
+        sink_damping=_SINK[robot.name],
         virtual_only=robot.name in _VIRTUAL_ONLY,
     )
 
@@ -116,12 +115,12 @@ def encode_command(joints: JointMap, command: Command) -> bytes:
     q[:] = np.where(stiffness > 0.0, joints.sign * position, POS_STOP)
     dq[:] = np.where(damping > 0.0, 0.0, VEL_STOP)
     kp[:], kd[:] = stiffness, damping
-    return pack(idl.LowCmd, message)
+    return pack(messages.LowCmd, message)
 
 
 def idle_command() -> NDArray[Any]:
     """A `LowCmd` record that asks nothing of any motor, shape (1,)."""
-    message = np.zeros(1, dtype=record(idl.LowCmd))
+    message = np.zeros(1, dtype=record(messages.LowCmd))
     message["head"] = HEAD
     message["level_flag"] = LOW_LEVEL
     motors = message["motor_cmd"]
@@ -137,7 +136,7 @@ def decode_command(joints: JointMap, data: bytes) -> Command:
             `out of range`, or `feed-forward` (a target speed or torque, which a `Command` does
             not have).
     """
-    message = unpack(idl.LowCmd, data)
+    message = unpack(messages.LowCmd, data)
     if tuple(message["head"][0]) != HEAD:
         raise RefusedError("head", f"LowCmd.head is {message['head'][0]}, expected {HEAD}.")
     if message["level_flag"][0] != LOW_LEVEL:
@@ -173,7 +172,7 @@ def encode_state(joints: JointMap, state: State) -> bytes:
 
     What the virtual robot does not know (battery cells, foot forces, remote) is zero.
     """
-    message = np.zeros(1, dtype=record(idl.LowState))
+    message = np.zeros(1, dtype=record(messages.LowState))
     message["head"] = HEAD
     message["level_flag"] = LOW_LEVEL
     message["sn"] = VIRTUAL
@@ -189,7 +188,7 @@ def encode_state(joints: JointMap, state: State) -> bytes:
     tau[:] = joints.sign * state.torque
     if state.temperature is not None:
         motors["temperature"][0, :_JOINTS] = np.clip(np.rint(state.temperature), 0, 255)
-    return pack(idl.LowState, message)
+    return pack(messages.LowState, message)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,14 +261,14 @@ def decode_state(joints: JointMap, data: bytes) -> LowState:
     Raises:
         RefusedError: `header`, `length` or `checksum`.
     """
-    return LowState(joints=joints, message=unpack(idl.LowState, data))
+    return LowState(joints=joints, message=unpack(messages.LowState, data))
 
 
 def _columns(motors: NDArray[Any], first: str, last: str) -> NDArray[np.float32]:
     """The numbers from one member of the twelve motors to another, shape (12, members); a view."""
     fields = motors.dtype.fields
     assert fields is not None
-    words = motors.view("<f4").reshape(idl.MOTORS, -1)
+    words = motors.view("<f4").reshape(messages.MOTORS, -1)
     return words[:_JOINTS, fields[first][1] // 4 : fields[last][1] // 4 + 1]
 
 

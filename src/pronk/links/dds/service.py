@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pronk.errors import HardwareError
-from pronk.links.dds import idl
+from pronk.links.dds import messages
 from pronk.links.dds.address import Participant, take
 
 SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
@@ -40,10 +40,10 @@ class Client:
     def __init__(self, participant: Participant, service: str) -> None:
         """Prepare to ask; nothing is sent."""
         self._service = service
-        self._requests = participant.writer(f"rt/api/{service}/request", idl.Request)
-        self._responses = participant.reader(f"rt/api/{service}/response", idl.Response)
+        self._requests = participant.writer(f"rt/api/{service}/request", messages.Request)
+        self._responses = participant.reader(f"rt/api/{service}/response", messages.Response)
 
-    def ask(self, api_id: int, parameter: Any, *, timeout_s: float = 2.0) -> Any | None:
+    def call(self, api_id: int, parameter: Any, *, timeout_s: float = 2.0) -> Any | None:
         """Ask, and ask again while there is no answer.
 
         Args:
@@ -57,13 +57,13 @@ class Client:
         Raises:
             HardwareError: The service answered with another code than 0.
         """
-        identity = idl.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
-        header = idl.RequestHeader(
+        identity = messages.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
+        header = messages.RequestHeader(
             identity=identity,
-            lease=idl.RequestLease(id=0),
-            policy=idl.RequestPolicy(priority=0, noreply=False),
+            lease=messages.RequestLease(id=0),
+            policy=messages.RequestPolicy(priority=0, noreply=False),
         )
-        request = idl.Request(header=header, parameter=json.dumps(parameter), binary=[])
+        request = messages.Request(header=header, parameter=json.dumps(parameter), binary=[])
         end = time.monotonic() + timeout_s
         again = -1.0
         while time.monotonic() < end:
@@ -106,8 +106,8 @@ class Server:
             answer: What to answer.
             counts: Where refused requests are counted.
         """
-        self._requests = participant.reader(f"rt/api/{service}/request", idl.Request)
-        self._responses = participant.writer(f"rt/api/{service}/response", idl.Response)
+        self._requests = participant.reader(f"rt/api/{service}/request", messages.Request)
+        self._responses = participant.writer(f"rt/api/{service}/response", messages.Response)
         self._reply = answer
         self._counts = counts
 
@@ -123,10 +123,10 @@ class Server:
                 code, data = self._reply(identity.api_id, parameter)
             if code != DONE:
                 self._counts["refused: request"] += 1
-            status = idl.ResponseStatus(code=code)
-            header = idl.ResponseHeader(identity=identity, status=status)
+            status = messages.ResponseStatus(code=code)
+            header = messages.ResponseHeader(identity=identity, status=status)
             text = "" if data is None else json.dumps(data)
-            self._responses.write(idl.Response(header=header, data=text, binary=[]))
+            self._responses.write(messages.Response(header=header, data=text, binary=[]))
 
 
 def own_controller(participant: Participant, *, release: bool, timeout_s: float = 2.0) -> str:
@@ -145,7 +145,7 @@ def own_controller(participant: Participant, *, release: bool, timeout_s: float 
             does not answer.
     """
     switcher = Client(participant, SWITCHER)
-    answer = switcher.ask(CHECK_MODE, {}, timeout_s=timeout_s)
+    answer = switcher.call(CHECK_MODE, {}, timeout_s=timeout_s)
     if answer is None:
         if release and _switched_off(participant, timeout_s):
             return "sport_mode"
@@ -157,9 +157,9 @@ def own_controller(participant: Participant, *, release: bool, timeout_s: float 
     for _ in range(_RELEASE_TRIES if release else 0):
         if not name:
             break
-        switcher.ask(RELEASE_MODE, {}, timeout_s=timeout_s)
+        switcher.call(RELEASE_MODE, {}, timeout_s=timeout_s)
         time.sleep(_RELEASE_PAUSE_S)
-        name = _name(switcher.ask(CHECK_MODE, {}, timeout_s=timeout_s))
+        name = _name(switcher.call(CHECK_MODE, {}, timeout_s=timeout_s))
     if name and release:
         raise HardwareError(
             f"the robot's own controller {name!r} did not let go of the joints after "
@@ -182,4 +182,4 @@ def _switched_off(participant: Participant, timeout_s: float) -> bool:
     """Ask older firmware to end its sport mode; whether it answered."""
     states = Client(participant, STATES)
     parameter = {"name": "sport_mode", "switch": 0}
-    return states.ask(SERVICE_SWITCH, parameter, timeout_s=timeout_s) is not None
+    return states.call(SERVICE_SWITCH, parameter, timeout_s=timeout_s) is not None

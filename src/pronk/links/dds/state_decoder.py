@@ -1,4 +1,4 @@
-"""From the bytes of `rt/lowstate` to numbered states, and why some make none. No sockets.
+"""From the bytes of `rt/lowstate` to numbered states, without a socket.
 
 Unitree's states carry no number, but the robot's clock in milliseconds; at 500 Hz it tells how many
 states were lost on the way.
@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections import Counter
 
 from pronk.links.dds.codec import TICKS_PER_S, JointMap, decode_state
-from pronk.links.lcm.message import RefusedError
-from pronk.links.machine import State
+from pronk.links.machine import RefusedError, State
 
 STATE_RATE_HZ = 500.0
 """Of `rt/lowstate`."""
@@ -22,8 +21,8 @@ jumped [ms]."""
 _LEAST_STEP_S = 1e-6
 
 
-class Intake:
-    """What has come of a robot's states so far."""
+class StateDecoder:
+    """Makes states of messages as they come."""
 
     def __init__(self, joints: JointMap, counts: Counter[str]) -> None:
         """Begin.
@@ -36,7 +35,7 @@ class Intake:
         self.counts = counts
         self.virtual = False
         """Whether the last state said that it is a virtual robot's."""
-        self.complaint = ""
+        self.last_error = ""
         """Why the last refused message was refused, one sentence."""
         self._joints = joints
         self._tick: int | None = None
@@ -55,7 +54,7 @@ class Intake:
             return self._take(data, arrived)
         except RefusedError as error:
             self.counts[f"refused: {error.reason}"] += 1
-            self.complaint = str(error).rstrip(".")
+            self.last_error = str(error).rstrip(".")
             return None
 
     def _take(self, data: bytes, arrived: float) -> State | None:

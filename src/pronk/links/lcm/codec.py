@@ -1,25 +1,46 @@
 """Bytes to states and commands, and back: pure functions, no sockets.
 
-The wire has no checksum. What can be told from the bytes is refused: another fingerprint, another
-length, a number that is not finite, or one that no motor or sensor of such a machine can mean.
+Layouts. `cheetah` is Cheetah-Software on the robot with MiniCheetahSpi_Controller: states are
+spi_data_t and microstrain_lcmt, commands are leg_control_command_lcmt on spi_debug_cmd, of which
+the robot reads q_des, kp_joint and kd_joint. `wtw` is the bridge of walk-these-ways (Go1, and the
+Go2 forks that kept its messages): states are leg_control_data_lcmt and state_estimator_lcmt,
+commands are pd_tau_targets_lcmt.
+
+Joints. All three orders agree: legs FR FL HR HL (RR and RL in the stacks), then abad, hip, knee.
+Signs: Cheetah-Software's are pronk's own. Unitree's hip pitch and knee axes point the other way
+(thigh +0.8, calf -1.6 where pronk has -0.8, +1.6); the abduction axes are the same.
+
+The knee's gains. Cheetah-Software converts the knee's angle, speed and torque by its extra ratio
+6 / 9.33, but not its gains (`rt_spi.cpp`): a wire gain k acts as k / 0.6429^2 = 2.42 k at the
+joint. Hence a command's knee gains are multiplied by 0.6429^2 on their way to the wire.
+
+The wire has no checksum. Refused are: another fingerprint, another length, a number that is not
+finite, or one that no motor or sensor of such a machine can give.
+
+Parameters. Cheetah-Software sets its parameters by messages; `control_mode` chooses which of the
+robot's own controllers holds the joints. The virtual robot has a bench: it holds joints
+mechanically on request, and its beacon identifies it and lists the joints that it holds.
 """
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.links.lcm import types
-from pronk.links.lcm.layout import Layout
-from pronk.links.lcm.message import Message, RefusedError
-from pronk.links.machine import Command, State
+from pronk.links.lcm import messages
+from pronk.links.lcm.messages import Message
+from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
 
 Array = NDArray[np.float64]
 
+KNEE_RATIO = 0.6429
+"""Motor to joint beyond the hips' 6:1, as `rt_spi.cpp` has it (6 / 9.33 = .6431)."""
 # What the motors' CAN messages can carry, motor firmware of bgkatz [rad, N m/rad, N m s/rad].
 _MOST_POSITION, _MOST_STIFFNESS, _MOST_DAMPING = 12.5, 500.0, 5.0
 # Beyond what any such machine can do or measure: 65 rad/s is the fastest that a motor's CAN
@@ -27,11 +48,105 @@ _MOST_POSITION, _MOST_STIFFNESS, _MOST_DAMPING = 12.5, 500.0, 5.0
 # 16 g are the ranges of inertial units [rad/s, N m, rad/s, m/s^2].
 _MOST_SPEED, _MOST_TORQUE, _MOST_TURN, _MOST_FORCE = 65.0, 170.0, 35.0, 160.0
 _JOINTS = 12
+_SPI_JOINTS = ("abad", "hip", "knee")
+
+REQUEST_CHANNEL, RESPONSE_CHANNEL = "interface_request", "interface_response"
+"""Where parameters are set and confirmed (`HardwareBridge.cpp`)."""
+BENCH_CHANNEL, BEACON_CHANNEL = "pronk_bench", "pronk_virtual"
+"""Requests for clamps to the virtual robot, and its beacon."""
+MODES = {0: "", 1: "stand_up", 3: "balance_stand", 4: "locomotion", 6: "recovery_stand"}
+"""`control_mode` (`FSM_State.h`); 0 is passive, the joints are free for others."""
+_MODE = b"control_mode"
+# ControlParameters.h: the value is a double. ControlParameterInterface.h: set a robot's parameter.
+_DOUBLE, _SET = 1, 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Messages, their channels and fields, and how their numbers become pronk's."""
+
+    name: str
+    command: Message
+    command_channel: str
+    gain_fields: tuple[str, str]
+    """Of stiffness and damping in a command."""
+    joints: Message
+    joints_channel: str
+    attitude: Message
+    attitude_channel: str
+    imu_fields: tuple[str, str]
+    """Of angular velocity and specific force."""
+    numbered: bool
+    """Commands and states carry `timestamp_us` and `id`."""
+    sign: tuple[float, float, float]
+    """Of a leg's three joints: pronk's angle is sign times the wire's."""
+    gain: tuple[float, float, float]
+    """Of a leg's three joints: the wire's stiffness and damping per the joint's own [1]."""
+    torque_kind: TorqueKind
+    state_rate_hz: float = 500.0
+
+    @cached_property
+    def signs(self) -> Array:
+        """`sign` for every joint, shape (12,)."""
+        return np.tile(self.sign, 4)
+
+    @cached_property
+    def gains(self) -> Array:
+        """`gain` for every joint, shape (12,)."""
+        return np.tile(self.gain, 4)
+
+
+CHEETAH = Layout(
+    name="cheetah",
+    command=messages.LEG_CONTROL_COMMAND,
+    command_channel="spi_debug_cmd",
+    gain_fields=("kp_joint", "kd_joint"),
+    joints=messages.SPI_DATA,
+    joints_channel="spi_data",
+    attitude=messages.MICROSTRAIN,
+    attitude_channel="microstrain",
+    imu_fields=("omega", "acc"),
+    numbered=False,
+    sign=(1.0, 1.0, 1.0),
+    gain=(1.0, 1.0, KNEE_RATIO**2),
+    # spi_data_t carries none, and what leg_control_data_lcmt calls tau_est is computed from the
+    # command on the host, on the knee wrongly.
+    torque_kind="absent",
+)
+WTW = Layout(
+    name="wtw",
+    command=messages.WTW_PD_TAU_TARGETS,
+    command_channel="pd_plustau_targets",
+    gain_fields=("kp", "kd"),
+    joints=messages.WTW_LEG_CONTROL_DATA,
+    joints_channel="leg_control_data",
+    attitude=messages.WTW_STATE_ESTIMATOR,
+    attitude_channel="state_estimator_data",
+    imu_fields=("omegaBody", "aBody"),
+    numbered=True,
+    sign=(1.0, -1.0, -1.0),
+    gain=(1.0, 1.0, 1.0),
+    # Unitree's tauEst, which the motor board computes from its current.
+    torque_kind="measured",
+)
+LAYOUTS = {"cheetah": CHEETAH, "spi": CHEETAH, "wtw": WTW}
+"""By name; `spi` is another name of `cheetah`."""
+
+
+def layout_of(name: str) -> Layout:
+    """Look a layout up.
+
+    Raises:
+        HardwareError: There is none of that name.
+    """
+    if name not in LAYOUTS:
+        raise HardwareError(f"no LCM layout {name!r}; there are {', '.join(LAYOUTS)}.")
+    return LAYOUTS[name]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Joints:
-    """What a message of the joints says, in pronk's order and signs."""
+    """A message of the joints, in pronk's order and signs."""
 
     position: Array
     """[rad], shape (12,)."""
@@ -39,15 +154,15 @@ class Joints:
     """[rad/s], shape (12,)."""
     torque: Array
     """[N m], shape (12,); zeros where the layout has none."""
-    robot_time: float | None
+    robot_time: float | None = None
     """The robot's own stamp [s]; None where it is not filled."""
-    number: int | None
+    number: int | None = None
     """The robot's own count; None where it is not filled."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Attitude:
-    """What a message of the inertial unit says."""
+    """A message of the inertial unit."""
 
     orientation: Array
     """Trunk to world, w, x, y, z, shape (4,)."""
@@ -58,114 +173,97 @@ class Attitude:
 
 
 def encode_command(layout: Layout, command: Command) -> bytes:
-    """The message that puts a command into force.
+    """Encode a command.
 
     Raises:
-        HardwareError: A field has another shape than (12,).
+        HardwareError: It is not for twelve joints, or no drive could follow it.
     """
-    for name in ("position", "stiffness", "damping"):
-        if np.shape(getattr(command, name)) != (_JOINTS,):
-            raise HardwareError(
-                f"command.{name} has shape {np.shape(getattr(command, name))}, expected "
-                f"({_JOINTS},): the messages of {layout.name} are for twelve joints."
-            )
-    position = command.position * layout.signs
-    stiffness, damping = command.stiffness * layout.gains, command.damping * layout.gains
-    if layout.command is types.LEG_CONTROL_COMMAND:
-        return layout.command.encode(q_des=position, kp_joint=stiffness, kd_joint=damping)
-    return layout.command.encode(
-        q_des=position,
-        kp=stiffness,
-        kd=damping,
-        timestamp_us=round(command.made * 1e6),
-        id=command.sequence,
-    )
+    check_command(command, _JOINTS)
+    stiffness, damping = layout.gain_fields
+    fields: dict[str, Any] = {
+        "q_des": command.position * layout.signs,
+        stiffness: command.stiffness * layout.gains,
+        damping: command.damping * layout.gains,
+    }
+    if layout.numbered:
+        fields |= {"timestamp_us": round(command.made * 1e6), "id": command.sequence}
+    return layout.command.encode(**fields)
 
 
 def decode_command(layout: Layout, data: bytes) -> Command:
-    """The command that a message asks for.
+    """Decode a command.
 
     Raises:
         RefusedError: `fingerprint`, `length`, `not finite`, `out of range`, or `feed-forward` (a
             target speed or torque, which a `Command` does not have).
     """
-    fields = layout.command.decode(data)
-    cheetah = layout.command is types.LEG_CONTROL_COMMAND
     message = layout.command
+    fields = message.decode(data)
+    kp, kd = layout.gain_fields
     position = _within(message, "q_des", fields["q_des"], -_MOST_POSITION, _MOST_POSITION)
-    names = ("kp_joint", "kd_joint") if cheetah else ("kp", "kd")
-    stiffness = _within(message, names[0], fields[names[0]], 0.0, _MOST_STIFFNESS)
-    damping = _within(message, names[1], fields[names[1]], 0.0, _MOST_DAMPING)
-    if not cheetah and (np.any(fields["qd_des"]) or np.any(fields["tau_ff"])):
+    stiffness = _within(message, kp, fields[kp], 0.0, _MOST_STIFFNESS)
+    damping = _within(message, kd, fields[kd], 0.0, _MOST_DAMPING)
+    # Of Cheetah-Software's message the robot reads nothing else.
+    if layout is WTW and (np.any(fields["qd_des"]) or np.any(fields["tau_ff"])):
         raise RefusedError(
             "feed-forward",
-            f"{layout.command.name} asks for a speed or a torque; only positions, stiffness and "
-            "damping are understood.",
+            f"{message.name} commands a speed or a torque; only positions, stiffness and damping "
+            "are understood.",
         )
     return Command(
         position=position * layout.signs,
         stiffness=stiffness / layout.gains,
         damping=damping / layout.gains,
-        sequence=0 if cheetah else int(fields["id"]),
-        made=0.0 if cheetah else 1e-6 * int(fields["timestamp_us"]),
+        sequence=int(fields["id"]) if layout.numbered else 0,
+        made=1e-6 * int(fields["timestamp_us"]) if layout.numbered else 0.0,
     )
 
 
 def encode_state(layout: Layout, state: State) -> tuple[tuple[str, bytes], tuple[str, bytes]]:
-    """The two messages of a state as (channel, bytes): the attitude first, then the joints.
-
-    In this order, because the joints' message is the one that completes a state.
-    """
+    """Encode a state as two (channel, bytes): attitude, then joints, which complete a state."""
     position, velocity = state.position * layout.signs, state.velocity * layout.signs
+    turn, force = layout.imu_fields
     attitude: dict[str, Any] = {"quat": state.orientation, "rpy": roll_pitch_yaw(state.orientation)}
+    attitude |= {turn: state.gyro, force: state.accelerometer}
     joints: dict[str, Any]
-    if layout.joints is types.SPI_DATA:
-        attitude |= {"omega": state.gyro, "acc": state.accelerometer}
+    if layout.numbered:
+        stamp = {"timestamp_us": round(1e6 * (state.robot_time or 0.0)), "id": state.sequence}
+        attitude |= stamp
+        joints = {"q": position, "qd": velocity, "tau_est": state.torque * layout.signs, **stamp}
+    else:
         attitude |= {"good_packets": state.sequence}
         joints = {f"q_{name}": position[k::3] for k, name in enumerate(_SPI_JOINTS)}
         joints |= {f"qd_{name}": velocity[k::3] for k, name in enumerate(_SPI_JOINTS)}
-    else:
-        stamp = {
-            "timestamp_us": round(1e6 * (state.robot_time or 0.0)),
-            "id": state.sequence,
-        }
-        attitude |= {"omegaBody": state.gyro, "aBody": state.accelerometer, **stamp}
-        joints = {"q": position, "qd": velocity, "tau_est": state.torque * layout.signs, **stamp}
     return (
         (layout.attitude_channel, layout.attitude.encode(**attitude)),
         (layout.joints_channel, layout.joints.encode(**joints)),
     )
 
 
-_SPI_JOINTS = ("abad", "hip", "knee")
-
-
 def decode_joints(layout: Layout, data: bytes) -> Joints:
-    """The joints of a state.
+    """Decode the joints of a state.
 
     Raises:
         RefusedError: `fingerprint`, `length`, `not finite` or `out of range`.
     """
     fields, message = layout.joints.decode(data), layout.joints
-    if message is types.SPI_DATA:
+    torque, stamp, number = np.zeros(_JOINTS), 0, 0
+    if layout.numbered:
+        q, qd = fields["q"], fields["qd"]
+        torque = _within(message, "tau_est", fields["tau_est"], -_MOST_TORQUE, _MOST_TORQUE)
+        stamp, number = int(fields["timestamp_us"]), int(fields["id"])
+    else:
         # By joint, then leg, on the wire; by leg, then joint, here.
         q, qd = (
             np.array([fields[f"{kind}_{name}"] for name in _SPI_JOINTS]).T.ravel()
             for kind in ("q", "qd")
         )
-        torque, stamp, number = np.zeros(_JOINTS), 0, 0
-    else:
-        q, qd = fields["q"], fields["qd"]
-        torque = layout.signs * _within(
-            message, "tau_est", fields["tau_est"], -_MOST_TORQUE, _MOST_TORQUE
-        )
-        stamp, number = int(fields["timestamp_us"]), int(fields["id"])
     position = _within(message, "q", q, -_MOST_POSITION, _MOST_POSITION)
     velocity = _within(message, "qd", qd, -_MOST_SPEED, _MOST_SPEED)
     return Joints(
         position=position * layout.signs,
         velocity=velocity * layout.signs,
-        torque=torque,
+        torque=torque * layout.signs,
         # The bridge of walk-these-ways itself leaves both at 0.
         robot_time=1e-6 * stamp if stamp else None,
         number=number or None,
@@ -173,14 +271,13 @@ def decode_joints(layout: Layout, data: bytes) -> Joints:
 
 
 def decode_attitude(layout: Layout, data: bytes) -> Attitude:
-    """The trunk's part of a state.
+    """Decode the trunk's part of a state.
 
     Raises:
         RefusedError: `fingerprint`, `length`, `not finite`, `out of range`, or `quaternion` (not of
             length 1).
     """
     fields, message = layout.attitude.decode(data), layout.attitude
-    cheetah = message is types.MICROSTRAIN
     orientation = _within(message, "quat", fields["quat"], -2.0, 2.0)
     length = float(np.sqrt(orientation @ orientation))
     if not abs(length - 1.0) <= 0.02:
@@ -189,23 +286,22 @@ def decode_attitude(layout: Layout, data: bytes) -> Attitude:
             f"{message.name}.quat has length {length:.3f}, expected 1 within .02; the inertial "
             "unit is not running, or the order of the numbers is another.",
         )
-    names = ("omega", "acc") if cheetah else ("omegaBody", "aBody")
-    gyro = _within(message, names[0], fields[names[0]], -_MOST_TURN, _MOST_TURN)
-    force = _within(message, names[1], fields[names[1]], -_MOST_FORCE, _MOST_FORCE)
-    return Attitude(orientation=orientation / length, gyro=gyro, accelerometer=force)
+    turn, force = layout.imu_fields
+    return Attitude(
+        orientation=orientation / length,
+        gyro=_within(message, turn, fields[turn], -_MOST_TURN, _MOST_TURN),
+        accelerometer=_within(message, force, fields[force], -_MOST_FORCE, _MOST_FORCE),
+    )
 
 
 def state_of(joints: Joints, attitude: Attitude, *, time: float, sequence: int) -> State:
-    """A state from its two halves.
+    """Join the two halves of a state; its bus voltage is NaN, which neither layout carries.
 
     Args:
         joints: The newest.
         attitude: The newest before it.
         time: When the joints' message arrived, on the local clock [s].
         sequence: Local count.
-
-    Returns:
-        The state; its bus voltage is NaN, for neither layout carries it.
     """
     return State(
         time=time,
@@ -230,8 +326,61 @@ def roll_pitch_yaw(orientation: Array) -> Array:
     return np.array([roll, pitch, yaw])
 
 
+def mode_request(mode: int, number: int) -> bytes:
+    """Encode the request that sets `control_mode`; the same bytes confirm it.
+
+    Args:
+        mode: As in `MODES`.
+        number: Of the request.
+    """
+    # The robot copies memory here: little-endian, unlike everything else on this wire.
+    value = struct.pack("<d", mode).ljust(64, b"\0")
+    return messages.CONTROL_PARAMETER.encode(
+        name=list(_MODE.ljust(64, b"\0")),
+        requestNumber=number,
+        value=list(memoryview(value).cast("b")),
+        parameterKind=_DOUBLE,
+        requestKind=_SET,
+    )
+
+
+def read_mode_request(data: bytes) -> str:
+    """Name of the mode that a request sets; empty for passive.
+
+    Raises:
+        RefusedError: `fingerprint`, `length`, or `parameter` (not `control_mode`, or no mode).
+    """
+    fields = messages.CONTROL_PARAMETER.decode(data)
+    name = fields["name"].tobytes().split(b"\0")[0]
+    kinds = (int(fields["parameterKind"]), int(fields["requestKind"]))
+    (value,) = struct.unpack_from("<d", fields["value"].tobytes())
+    if name != _MODE or kinds != (_DOUBLE, _SET) or value not in MODES:
+        raise RefusedError(
+            "parameter",
+            f"a request sets {name!r} to {value}; only {_MODE.decode()} can be set here, to one "
+            f"of {', '.join(map(str, MODES))}.",
+        )
+    return MODES[int(value)]
+
+
+def clamp_message(names: tuple[str, ...], held: tuple[str, ...], number: int) -> bytes:
+    """Encode a request for clamps, or the beacon: joints to hold, or held, of all `names`."""
+    return messages.VIRTUAL_ROBOT.encode(request=number, clamped=[int(n in held) for n in names])
+
+
+def read_clamp_message(names: tuple[str, ...], data: bytes) -> tuple[int, tuple[str, ...]]:
+    """Number of the request, and the joints that are or shall be held.
+
+    Raises:
+        RefusedError: `fingerprint` or `length`.
+    """
+    fields = messages.VIRTUAL_ROBOT.decode(data)
+    flags = zip(names, fields["clamped"].tolist(), strict=True)
+    return int(fields["request"]), tuple(name for name, held in flags if held)
+
+
 def _within(message: Message, name: str, values: NDArray[Any], low: float, high: float) -> Array:
-    """The numbers of a field as float64, if they are what a machine can mean.
+    """Convert a field to float64, within bounds.
 
     Raises:
         RefusedError: `not finite` or `out of range`.

@@ -9,35 +9,38 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
+from typing import Any
 
 from pronk.errors import HardwareError
+from pronk.links.command_writer import CommandWriter
 from pronk.links.lcm.address import open_lcm, url_of
-from pronk.links.lcm.layout import layout_of
-from pronk.links.lcm.reader import StateReader
-from pronk.links.lcm.service import (
+from pronk.links.lcm.codec import (
     BEACON_CHANNEL,
     BENCH_CHANNEL,
     REQUEST_CHANNEL,
     RESPONSE_CHANNEL,
     clamp_message,
+    encode_command,
+    layout_of,
     mode_request,
 )
-from pronk.links.lcm.writer import CommandWriter
-from pronk.links.link_checks import ANSWER_S, Hand, check_alone, fresh_states, waited_for
+from pronk.links.lcm.state_decoder import StateDecoder
 from pronk.links.machine import State, TorqueKind
-from pronk.links.network_link import NetworkLink
-from pronk.links.preflight import Freshness, check_rest
+from pronk.links.network_link import ANSWER_S, NetworkLink, wait_for
+from pronk.links.state_checks import check_rest
 from pronk.robots.robot import Robot
 
 _QUEUE = 100
+_REMEMBERED = 512
+"""Commands kept to recognize one's own."""
 
 
 class LcmMachine(NetworkLink):
     """A robot with twelve joints behind LCM. Implements `Machine`.
 
     Pre-flight, in this order: states arrive at the layout's rate without gaps for 200 ms; gravity
-    points where the attitude says; every joint is within its limits; nobody else commands.
+    points where the attitude says; every joint is within its limits; no other program commands.
     """
 
     wire = "LCM"
@@ -49,71 +52,58 @@ class LcmMachine(NetworkLink):
         layout: str = "cheetah",
         port: int | None = None,
         interface: str | None = None,
-        hand: Hand | None = None,
-        release: bool = False,
-        alone_s: float = 1.0,
-        fresh: Freshness | None = None,
+        **common: Any,
     ) -> None:
         """Describe the link; nothing is opened yet.
 
         Args:
             robot: Names, order and limits of the joints.
-            layout: `cheetah` or `wtw`.
+            layout: `cheetah` (or `spi`) or `wtw`.
             port: UDP port; None for the virtual robot's on loopback, the robots' on an interface.
             interface: Network interface of a real robot, `lo` on the robot itself; None never
                 leaves this computer and meets no real robot.
-            hand: Who fixes joints on a real bench; None if nobody.
-            release: Ask the robot's own controller to let go of the joints first.
-            alone_s: How long the command channel must be silent before pronk writes to it [s].
-            fresh: How fresh states must be; None for what moving a robot takes.
+            **common: As `NetworkLink` takes them.
 
         Raises:
             HardwareError: The layout is unknown, the robot has not twelve joints, or the address
                 is impossible.
         """
+        super().__init__(robot, **common)
         self._layout = layout_of(layout)
         if len(robot.joints) != 12:
             raise HardwareError(
                 f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
                 "for twelve."
             )
-        super().__init__(robot, hand=hand, release=release, alone_s=alone_s, fresh=fresh)
         self.torque_kind: TorqueKind = self._layout.torque_kind
+        self._command_topic = self._layout.command_channel
         self._interface = interface
         self._url = url_of(port=port, interface=interface)
         self._foreign = 0
-        self._reader = StateReader(self._layout, robot.joint_names)
-        self._commands: CommandWriter | None = None
+        self._decoder = StateDecoder(self._layout, robot.joint_names)
         self._written: Counter[str] = Counter()
 
     @property
     def counts(self) -> Counter[str]:
-        """What was met: states, and why some were not made; commands, `expired`, `foreign`."""
-        met = Counter(self._reader.counts)
-        met["foreign"] = self._foreign
-        return met + self._written
+        """States, and why some were not made; commands, `expired`, `foreign`."""
+        return self._decoder.counts + self._written + Counter(foreign=self._foreign)
 
     def _open(self) -> None:
         layout = self._layout
-        reader = self._reader = StateReader(layout, self._robot.joint_names)
+        decoder = self._decoder = StateDecoder(layout, self._robot.joint_names)
         self._foreign = 0
         self._responses: list[bytes] = []
+        # Newest first: a message that comes back is nearly always the last one.
+        self._own: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._publishing, self._remembering = threading.Lock(), threading.Lock()
         self._in, self._out = open_lcm(self._url), open_lcm(self._url)
-        self._publishing = threading.Lock()
-        self._commands = writer = CommandWriter(
-            layout, lambda data: self._publish(layout.command_channel, data)
-        )
-
-        self._written = writer.counts
-
-        def command(_: str, data: bytes) -> None:
-            self._foreign += not writer.is_own(data)
-
+        self._writer = CommandWriter(lambda command: encode_command(layout, command), self._command)
+        self._written = self._writer.counts
         for channel, handler in (
-            (layout.attitude_channel, lambda _, data: reader.attitude(data, time.monotonic())),
-            (layout.joints_channel, lambda _, data: reader.joints(data, time.monotonic())),
-            (layout.command_channel, command),
-            (BEACON_CHANNEL, lambda _, data: reader.beacon(data)),
+            (layout.attitude_channel, lambda _, data: decoder.attitude(data, time.monotonic())),
+            (layout.joints_channel, lambda _, data: decoder.joints(data, time.monotonic())),
+            (layout.command_channel, lambda _, data: self._met_command(data)),
+            (BEACON_CHANNEL, lambda _, data: decoder.beacon(data)),
             (RESPONSE_CHANNEL, lambda _, data: self._responses.append(data)),
         ):
             self._in.subscribe(channel, handler).set_queue_capacity(_QUEUE)
@@ -122,30 +112,19 @@ class LcmMachine(NetworkLink):
         self._thread.start()
 
     def _shut(self) -> None:
-        if self._commands is not None:
-            self._commands.stop()
         self._reading = False
         self._thread.join()
-        self._commands = None
         del self._in, self._out
-
-    @property
-    def _writer(self) -> CommandWriter | None:
-        return self._commands
-
-    @property
-    def _command_topic(self) -> str:
-        return self._layout.command_channel
 
     @property
     def _foreign_commands(self) -> int:
         return self._foreign
 
     def _newest(self) -> State | None:
-        return self._reader.latest
+        return self._decoder.latest
 
     def _arrived(self) -> list[State]:
-        return self._reader.drain()
+        return self._decoder.drain()
 
     def _read(self) -> None:
         while self._reading:
@@ -156,52 +135,57 @@ class LcmMachine(NetworkLink):
         with self._publishing:
             self._out.publish(channel, data)
 
+    def _command(self, data: bytes) -> None:
+        with self._remembering:
+            self._own.appendleft(data)
+        self._publish(self._command_topic, data)
+
+    def _met_command(self, data: bytes) -> None:
+        """Count a command that was not written here; each of one's own comes back once."""
+        with self._remembering:
+            try:
+                self._own.remove(data)
+            except ValueError:
+                self._foreign += 1
+
     def _preflight(self) -> None:
-        reader, layout = self._reader, self._layout
+        decoder, layout = self._decoder, self._layout
         begun = time.monotonic()
-        if not waited_for(lambda: reader.latest is not None):
+        if not wait_for(lambda: decoder.latest is not None):
             raise HardwareError(
                 f"{self.robot} sent no state on {layout.joints_channel} and "
                 f"{layout.attitude_channel} within {ANSWER_S:g} s at {self._url}"
-                + (f"; what came was refused: {reader.complaint}" if reader.complaint else "")
+                + (f"; what came was refused: {decoder.last_error}" if decoder.last_error else "")
                 + "; check that its program runs, the layout, the port and the network."
             )
         if self._release:
             self._let_go()
         self._foreign, silent_from = 0, time.monotonic()
-        states = fresh_states(
-            self.robot,
-            self.wait,
-            layout.state_rate_hz,
-            self._fresh,
-            until=begun + 2.0 * ANSWER_S,
-        )
+        states = self.fresh_states(layout.state_rate_hz, until=begun + 2.0 * ANSWER_S)
         check_rest(self._robot, states)
-        time.sleep(max(0.0, silent_from + self._alone_s - time.monotonic()))
-        check_alone(self._foreign, layout.command_channel, self._alone_s)
+        self.check_exclusive(silent_from)
         if self._interface is None:
-            # It says so ten times a second; someone else's simulator never does.
-            waited_for(lambda: reader.virtual)
-        self.virtual = reader.virtual
-        reader.drain()
+            # Its beacon comes ten times a second; no other simulator has one.
+            wait_for(lambda: decoder.virtual)
+        self.virtual = decoder.virtual
+        decoder.drain()
 
     def _let_go(self) -> None:
         data = mode_request(0, time.monotonic_ns())
         self._publish(REQUEST_CHANNEL, data)
-        if not waited_for(lambda: data in self._responses):
+        if not wait_for(lambda: data in self._responses):
             raise HardwareError(
                 f"{self.robot} did not confirm control_mode 0 on {RESPONSE_CHANNEL} within "
                 f"{ANSWER_S:g} s; release it by its own remote."
             )
 
     def _hold(self, joints: tuple[str, ...]) -> bool:
-        """Ask the virtual robot to fix joints; whether it confirmed."""
         names, request = self._robot.joint_names, time.monotonic_ns()
         data = clamp_message(names, joints, request)
         held = (request, tuple(name for name in names if name in joints))
-        # Asked again, for the way there may lose messages.
+        # Requested again, for the way there may lose messages.
         for _ in range(4):
             self._publish(BENCH_CHANNEL, data)
-            if waited_for(lambda: self._reader.held == held, ANSWER_S / 4):
+            if wait_for(lambda: self._decoder.held == held, ANSWER_S / 4):
                 return True
         return False

@@ -1,20 +1,23 @@
-"""From messages to states: what the reader's thread does with bytes, without a socket.
+"""From LCM messages to numbered states, without a socket.
 
-What keeps a state from being made, each counted: a message that is not what it must be; joints
-without a young attitude; values that repeat to the last bit, which no live sensor's do (frozen
-data behind a live count); a count that went backwards. A link that makes no states grows old, and
-age is what whoever commands watches.
+No state is made, and the reason counted, of a message that is refused; of joints without a young
+attitude; of values that repeat to the last bit, as no live sensor's do (frozen data behind a live
+count); of a count that went backwards.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
 
-from pronk.links.lcm.codec import Attitude, decode_attitude, decode_joints, state_of
-from pronk.links.lcm.layout import Layout
-from pronk.links.lcm.message import RefusedError
-from pronk.links.lcm.service import read_clamp_message
-from pronk.links.machine import State
+from pronk.links.lcm.codec import (
+    Attitude,
+    Layout,
+    decode_attitude,
+    decode_joints,
+    read_clamp_message,
+    state_of,
+)
+from pronk.links.machine import RefusedError, State
 
 _OLDEST_ATTITUDE_S = 0.02
 _NUMBER_JUMP = 1000
@@ -22,11 +25,11 @@ _NUMBER_JUMP = 1000
 _KEPT_STATES = 10_000
 
 
-class StateReader:
+class StateDecoder:
     """Makes states of messages as they come. One thread writes; any may read what it holds."""
 
     def __init__(self, layout: Layout, names: tuple[str, ...]) -> None:
-        """Nothing met yet.
+        """Begin without a state.
 
         Args:
             layout: Messages.
@@ -34,13 +37,13 @@ class StateReader:
         """
         self.counts: Counter[str] = Counter()
         """`states`, and for each reason how often no state was made."""
-        self.complaint = ""
-        """The last refusal in words."""
+        self.last_error = ""
+        """The last refusal."""
         self.latest: State | None = None
         self.virtual = False
-        """Whether the robot has said that it is the virtual one."""
+        """Whether the beacon of the virtual robot has come."""
         self.held: tuple[int, tuple[str, ...]] = (0, ())
-        """Of the virtual robot: the last request for clamps that it met, and what it holds."""
+        """Last request for clamps that the virtual robot met, and the joints it holds."""
         self._states: deque[State] = deque(maxlen=_KEPT_STATES)
         self._layout = layout
         self._names = names
@@ -96,7 +99,7 @@ class StateReader:
         self._states.append(self.latest)
 
     def beacon(self, data: bytes) -> None:
-        """Take what the virtual robot says of itself."""
+        """Take the beacon of the virtual robot."""
         try:
             self.held = read_clamp_message(self._names, data)
         except RefusedError as error:
@@ -106,4 +109,4 @@ class StateReader:
 
     def _refuse(self, error: RefusedError) -> None:
         self.counts[f"refused: {error.reason}"] += 1
-        self.complaint = str(error).rstrip(".")
+        self.last_error = str(error).rstrip(".")

@@ -1,8 +1,13 @@
-"""What an LCM message is: its fields, and all that follows from them.
+"""LCM messages of the Mini Cheetah and of the walk-these-ways bridge, from their fields.
 
 A message on the wire is its fingerprint (8 bytes) and then its fields, big-endian and without
 padding. The fingerprint is a hash of the fields' names, types and dimensions by the rule of
-lcm-gen (`lcmgen.c`). The name of the type is not hashed, nor is the channel.
+lcm-gen (`lcmgen.c`). The name of the type is not hashed, nor is the channel. Two stacks use the
+same names and channels for different layouts, so the fingerprint alone identifies a message. A
+table whose fingerprint is not the one lcm-gen gives is refused when this module is imported.
+
+Sources: the `lcm-types` of Cheetah-Software (MIT Biomimetics) and of walk-these-ways
+(Improbable AI), both MIT licence.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import HardwareError
+from pronk.links.machine import RefusedError
 
 _WORD = (1 << 64) - 1
 # LCM's primitive types as numpy sees them, big-endian.
@@ -30,14 +36,6 @@ _KINDS = {
 _NAMES: dict[int, str] = {}
 """Of the messages made so far, by fingerprint: to say what came where another was expected."""
 _FIELD = re.compile(r"\s*(\w+)\s+(\w+)(?:\[(\d+)\])?\s*")
-
-
-class RefusedError(HardwareError):
-    """A message that is not what it must be; `reason` is a label to count it under."""
-
-    def __init__(self, reason: str, sentence: str) -> None:
-        super().__init__(sentence)
-        self.reason = reason
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,3 +169,77 @@ def _hash_text(value: int, text: str) -> int:
     for byte in text.encode():
         value = _hash(value, byte)
     return value
+
+
+# --- Cheetah-Software ---------------------------------------------------------------------------
+# Arrays of 12 are leg by leg (FR FL HR HL), abad, hip, knee; arrays of 4 are by leg.
+
+SPI_DATA = Message(
+    "cheetah.spi_data_t",
+    0x3A5F506B524D7E4F,
+    "float q_abad[4]; float q_hip[4]; float q_knee[4];"
+    "float qd_abad[4]; float qd_hip[4]; float qd_knee[4];"
+    "int32_t flags[4]; int32_t spi_driver_status",
+)
+LEG_CONTROL_COMMAND = Message(
+    "cheetah.leg_control_command_lcmt",
+    0x277F792B531376CF,
+    "float tau_ff[12]; float f_ff[12]; float q_des[12]; float qd_des[12]; float p_des[12];"
+    "float v_des[12]; float kp_cartesian[12]; float kd_cartesian[12]; float kp_joint[12];"
+    "float kd_joint[12]",
+)
+MICROSTRAIN = Message(
+    "cheetah.microstrain_lcmt",
+    0xE21531EA1392FAAA,
+    "float quat[4]; float rpy[3]; float omega[3]; float acc[3];"
+    "int64_t good_packets; int64_t bad_packets",
+)
+CONTROL_PARAMETER = Message(
+    # Request and response (control_parameter_respones_lcmt) have the same fields, hence the same
+    # fingerprint; the channel tells them apart.
+    "cheetah.control_parameter_request_lcmt",
+    0xD04FD3ECA4A52D73,
+    "int8_t name[64]; int64_t requestNumber; int8_t value[64]; int8_t parameterKind;"
+    "int8_t requestKind",
+)
+
+# --- walk-these-ways ----------------------------------------------------------------------------
+# Arrays of 12 are leg by leg (FR FL RR RL), hip, thigh, calf, in Unitree's signs.
+
+WTW_LEG_CONTROL_DATA = Message(
+    "wtw.leg_control_data_lcmt",
+    0x5352516A697F890F,
+    "float q[12]; float qd[12]; float p[12]; float v[12]; float tau_est[12];"
+    "int64_t timestamp_us; int64_t id; int64_t robot_id",
+)
+WTW_PD_TAU_TARGETS = Message(
+    "wtw.pd_tau_targets_lcmt",
+    0xDB10251DE2523982,
+    "double q_des[12]; double qd_des[12]; double tau_ff[12]; double kp[12]; double kd[12];"
+    "int64_t timestamp_us; int64_t id; int64_t robot_id; double se_contactState[4]",
+)
+WTW_STATE_ESTIMATOR = Message(
+    "wtw.state_estimator_lcmt",
+    0xD50F90505DFFCB6D,
+    "float p[3]; float vWorld[3]; float vBody[3]; float rpy[3]; float omegaBody[3];"
+    "float omegaWorld[3]; float quat[4]; float contact_estimate[4]; float aBody[3];"
+    "float aWorld[3]; int64_t timestamp_us; int64_t id; int64_t robot_id",
+)
+
+# --- pronk's own, of the virtual robot alone ----------------------------------------------------
+
+VIRTUAL_ROBOT = Message(
+    "pronk.virtual_robot_lcmt", 0x23FC8EF4C8F343CB, "int64_t request; int8_t clamped[12]"
+)
+"""From the bench: joints to hold. From the virtual robot: joints held, and the request answered."""
+
+MESSAGES = (
+    SPI_DATA,
+    LEG_CONTROL_COMMAND,
+    MICROSTRAIN,
+    CONTROL_PARAMETER,
+    WTW_LEG_CONTROL_DATA,
+    WTW_PD_TAU_TARGETS,
+    WTW_STATE_ESTIMATOR,
+    VIRTUAL_ROBOT,
+)

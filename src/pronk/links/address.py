@@ -1,0 +1,153 @@
+"""Address of a robot: `lcm://eth0?layout=wtw`, `dds://eth0`, `sim://ground`, or a short name.
+
+The scheme names a link: one of `BUILT_IN`, or an entry point of the group `pronk.links`. What
+stands after `//` is the network interface to a real robot; without one nothing leaves this
+computer. A link is a callable `(robot, *, interface, clamp_operator, release, exclusive_s, fresh,
+**options) -> Machine`; its further keyword arguments are the options of its addresses.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import entry_points
+from types import NoneType
+from typing import Any, get_type_hints
+from urllib.parse import parse_qsl, quote, urlsplit
+
+import msgspec
+
+from pronk.errors import HardwareError
+from pronk.links.machine import Machine
+from pronk.links.network_link import ClampOperator
+from pronk.links.state_checks import Freshness
+from pronk.robots.robot import Robot
+
+SIM = "sim"
+BUILT_IN = {
+    SIM: "pronk.virtual.robot:open_sim",
+    "lcm": "pronk.links.lcm.link:LcmMachine",
+    "dds": "pronk.links.dds.link:DdsMachine",
+}
+GROUP = "pronk.links"
+_COMMON = ("robot", "interface", "clamp_operator", "release", "exclusive_s", "fresh")
+
+
+def link_names() -> tuple[str, ...]:
+    """Names of all links, those of installed packages included."""
+    return (*BUILT_IN, *sorted(point.name for point in entry_points(group=GROUP)))
+
+
+def find_link(name: str) -> Callable[..., Machine]:
+    """Import a link.
+
+    Raises:
+        HardwareError: There is no such link, or its library is not installed.
+    """
+    target = BUILT_IN.get(name)
+    if target is None:
+        for point in entry_points(group=GROUP):
+            if point.name == name:
+                return point.load()  # type: ignore[no-any-return]
+        raise HardwareError(f"no link {name!r}; the links are {', '.join(link_names())}.")
+    module, _, attribute = target.partition(":")
+    return getattr(import_module(module), attribute)  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Address:
+    """How a robot is reached."""
+
+    kind: str = SIM
+    """Name of the link."""
+    interface: str | None = None
+    """Network interface to a real robot (`lo` for LCM on the robot itself), None for loopback; of
+    `sim`, `bench` or `ground`."""
+    options: Mapping[str, str | int] = field(default_factory=dict)
+    """Of the link: `layout` and `port` (lcm), `domain` (dds), `params` and `seed` (sim)."""
+
+    @classmethod
+    def parse(cls, text: str, interface: str | None = None, **options: str | int | None) -> Address:
+        """Read an address, and check that the link has its options.
+
+        Args:
+            text: A URI or a short name.
+            interface: Where the text names none.
+            options: Added to those of the text; None is no option.
+
+        Raises:
+            HardwareError: The link or an option is unknown, or an option is given twice.
+        """
+        kind, found, query = text, "", ""
+        if "://" in text:
+            parts = urlsplit(text)
+            kind, found, query = parts.scheme, parts.netloc, parts.query
+        if found and interface not in (None, found):
+            raise HardwareError(f"{text} names the interface {found}; leave out {interface}.")
+        if kind == "twin":
+            raise HardwareError("link 'twin' is now called 'sim'.")
+        known = _options_of(find_link(kind))
+        merged = dict(parse_qsl(query)) | {k: v for k, v in options.items() if v is not None}
+        for name, value in merged.items():
+            if name not in known:
+                raise HardwareError(
+                    f"link {kind} has no {name}; its options are {', '.join(known) or 'none'}."
+                )
+            try:
+                merged[name] = msgspec.convert(value, known[name], strict=False)
+            except msgspec.ValidationError:
+                raise HardwareError(
+                    f"{name} of link {kind} is {value!r}; expected {known[name]}."
+                ) from None
+        return cls(kind=kind, interface=found or interface, options=merged)
+
+    @property
+    def local(self) -> bool:
+        """True where nothing leaves this computer, so that no real robot can move."""
+        return self.kind == SIM or self.interface is None
+
+    def __str__(self) -> str:
+        query = "&".join(f"{name}={quote(str(value))}" for name, value in self.options.items())
+        return f"{self.kind}://{self.interface or ''}" + (f"?{query}" if query else "")
+
+    def machine(
+        self,
+        robot: Robot,
+        *,
+        clamp_operator: ClampOperator | None = None,
+        release: bool = False,
+        exclusive_s: float = 1.0,
+        fresh: Freshness | None = None,
+    ) -> Machine:
+        """Make the machine, not yet connected.
+
+        Args:
+            robot: Expected at the address.
+            clamp_operator: Fixes joints on a real bench; None without one.
+            release: Make the robot's own controller let go of the joints first.
+            exclusive_s: How long no other program may have commanded before pronk does [s].
+            fresh: How fresh states must be; None for what moving a robot takes.
+
+        Raises:
+            HardwareError: The link's library is not installed, the address is impossible, or the
+                robot does not fit behind its messages.
+        """
+        return find_link(self.kind)(
+            robot,
+            interface=self.interface,
+            clamp_operator=clamp_operator,
+            release=release,
+            exclusive_s=exclusive_s,
+            fresh=fresh,
+            **self.options,
+        )
+
+
+def _options_of(link: Callable[..., Machine]) -> dict[str, Any]:
+    """A link's own keyword arguments and their types."""
+    function = link.__init__ if inspect.isclass(link) else link
+    names = [n for n in inspect.signature(link).parameters if n not in _COMMON]
+    hints = get_type_hints(function)
+    return {name: hints.get(name, str | NoneType) for name in names}
