@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from pronk.links.address import Address
 from pronk.runtime.ipc import Event
 from pronk.runtime.link import Link
 from pronk.runtime.plan import Plan
@@ -29,7 +30,7 @@ def tell(notice: Event) -> None:
 
 def main() -> int:
     plan = Plan(
-        link=Link(kind="sim", robot="mini_cheetah", base="bench"),
+        link=Link(robot="mini_cheetah", address=Address.parse("sim://bench")),
         policy=Path(sys.argv[1]),
         log=Path(sys.argv[2]),
         timing=QUICK,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pronk.errors import HardwareError
+from pronk.links.address import Address
 from pronk.links.machine import Command, State
 from pronk.runtime.link import Link, Paced
 
@@ -34,7 +35,7 @@ class FaultyLink:
     robot: str = "mini_cheetah"
 
     def __call__(self) -> Faulty:
-        return Faulty(Link(kind="sim", robot=self.robot, base="bench")(), self)
+        return Faulty(Link(robot=self.robot, address=Address.parse("sim://bench"))(), self)
 
 
 class Faulty:

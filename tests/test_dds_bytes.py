@@ -16,7 +16,7 @@ pytest.importorskip("cyclonedds")
 
 from broken_message import mutated
 from pronk.errors import HardwareError
-from pronk.links.dds import idl
+from pronk.links.dds import messages as idl
 from pronk.links.dds.codec import (
     LowState,
     decode_command,
@@ -26,9 +26,8 @@ from pronk.links.dds.codec import (
     idle_command,
     joint_map,
 )
-from pronk.links.dds.layout import HEADER, checksum, pack, record, unpack, wire_size
-from pronk.links.lcm.message import RefusedError
-from pronk.links.machine import Command, State
+from pronk.links.dds.messages import HEADER, checksum, pack, record, unpack, wire_size
+from pronk.links.machine import Command, RefusedError, State
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from pronk.links.dds.codec import encode_state, joint_map
-from pronk.links.dds.state_decoder import Intake
+from pronk.links.dds.state_decoder import StateDecoder
 from pronk.links.machine import State
 from pronk.robots import load_robot
 
@@ -38,7 +38,7 @@ def said(tick: int, *, value: float | None = None) -> bytes:
 
 def taken(*ticks: int, every: float = 0.002) -> tuple[list[int], Counter[str]]:
     """Sequence numbers of the states made, and the counts, of messages that come regularly."""
-    intake = Intake(JOINTS, Counter())
+    intake = StateDecoder(JOINTS, Counter())
     states = [intake.take(said(tick), 10.0 + every * k) for k, tick in enumerate(ticks)]
     return [state.sequence for state in states if state is not None], intake.counts
 
@@ -74,7 +74,7 @@ def test_a_clock_passes_its_largest_number() -> None:
 
 
 def test_frozen_values_behind_a_live_clock_make_no_states() -> None:
-    intake = Intake(JOINTS, Counter())
+    intake = StateDecoder(JOINTS, Counter())
     made = [intake.take(said(2 * k, value=0.5), 0.002 * k) for k in range(5)]
     assert made[0] is not None
     assert made[1:] == [None] * 4
@@ -84,24 +84,24 @@ def test_frozen_values_behind_a_live_clock_make_no_states() -> None:
 
 
 def test_refused_messages_are_counted_and_leave_their_sentence() -> None:
-    intake = Intake(JOINTS, Counter())
+    intake = StateDecoder(JOINTS, Counter())
     broken = bytearray(said(2))
     broken[300] ^= 1
     assert intake.take(bytes(broken), 0.0) is None
     assert intake.take(said(4, value=float("nan")), 0.002) is None
     assert intake.counts == Counter({"refused: checksum": 1, "refused: not finite": 1})
-    assert intake.complaint == "motor_state holds a number that is not finite"
+    assert intake.last_error == "motor_state holds a number that is not finite"
 
 
 def test_times_grow_even_where_messages_came_at_once() -> None:
-    intake = Intake(JOINTS, Counter())
+    intake = StateDecoder(JOINTS, Counter())
     times = [state.time for k in range(4) if (state := intake.take(said(2 * k), 7.0)) is not None]
     assert times == pytest.approx([7.0, 7.0 + 1e-6, 7.0 + 2e-6, 7.0 + 3e-6], abs=1e-8)
     assert (np.diff(times) > 0.0).all()
 
 
 def test_a_virtual_robot_says_that_it_is_one() -> None:
-    intake = Intake(JOINTS, Counter())
+    intake = StateDecoder(JOINTS, Counter())
     assert not intake.virtual
     intake.take(said(2), 0.0)
     assert intake.virtual

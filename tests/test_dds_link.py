@@ -18,13 +18,13 @@ pytest.importorskip("cyclonedds")
 
 from broken_message import mutated
 from pronk.errors import HardwareError, RobotError
-from pronk.links.dds import idl
+from pronk.links.dds import messages as idl
 from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Message, Participant, take
 from pronk.links.dds.codec import encode_command, joint_map
 from pronk.links.dds.link import DdsMachine
 from pronk.links.dds.service import SWITCHER, Client
 from pronk.links.machine import Command
-from pronk.links.preflight import Freshness
+from pronk.links.state_checks import Freshness
 from pronk.robots import load_robot
 from pronk.virtual.dds_server import DdsWire
 from pronk.virtual.robot import VirtualRobot
@@ -102,8 +102,8 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     network = double.network
     # Its own controller holds the joints: refused, unless it may be released.
     with pytest.raises(HardwareError, match="own controller 'normal' holds the joints"):
-        DdsMachine(ROBOT, network=network).connect()
-    machine = DdsMachine(ROBOT, network=network, release=True, alone_s=0.3, fresh=FRESH)
+        DdsMachine(ROBOT, domain=network.domain).connect()
+    machine = DdsMachine(ROBOT, domain=network.domain, release=True, exclusive_s=0.3, fresh=FRESH)
     machine.connect()
     assert machine.virtual
     begun = machine.latest()
@@ -138,8 +138,8 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     machine.clamp(())
 
     # A second pronk finds the first one writing.
-    second = DdsMachine(ROBOT, network=network, alone_s=0.3, fresh=FRESH)
-    with pytest.raises(HardwareError, match="someone else commands the joints"):
+    second = DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.3, fresh=FRESH)
+    with pytest.raises(HardwareError, match="another program commands the joints"):
         second.connect()
     assert second.counts["commands"] == second.counts["repeats"] == 0
 
@@ -178,7 +178,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
 
 def test_nobody_there() -> None:
     with pytest.raises(HardwareError, match=r"sent no state on rt/lowstate .*on loopback; check"):
-        DdsMachine(ROBOT, network=own_network(1)).connect()
+        DdsMachine(ROBOT, domain=own_network(1).domain).connect()
 
 
 def test_the_mode_switcher_and_the_bench_answer_like_unitrees_services() -> None:
@@ -218,7 +218,7 @@ def asked(wire: DdsWire, client: Client, api_id: int, parameter: Any) -> Any:
     thread = Thread(target=poll)
     thread.start()
     try:
-        return client.ask(api_id, parameter)
+        return client.call(api_id, parameter)
     finally:
         polling = False
         thread.join()
@@ -279,7 +279,7 @@ def test_two_robots_on_one_domain_are_refused() -> None:
     thread.start()
     try:
         with pytest.raises(HardwareError, match="2 robots speak on rt/lowstate"):
-            DdsMachine(ROBOT, network=network, alone_s=0.0).connect()
+            DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.0).connect()
     finally:
         polling = False
         thread.join()

@@ -35,7 +35,6 @@ from pronk.runtime.ipc import (
     get_state,
     put_state,
 )
-from pronk.runtime.link import Link
 from pronk.runtime.log import DeployLogWriter, is_deploy_log, read_deploy_log
 from pronk.runtime.preflight import delay_objection, refusals
 from pronk.runtime.safety import FilterAction, FilterState, Limits, Reason, fault
@@ -621,13 +620,6 @@ def test_a_gamepad(tmp_path: Path) -> None:
     pad.close()
     with pytest.raises(HardwareError, match="js9"):
         Gamepad(tmp_path / "js9", RANGES)
-
-
-def test_a_link_that_there_is_not_is_refused() -> None:
-    with pytest.raises(HardwareError, match="sim, lcm, dds"):
-        Link(kind="usb", robot="mini_cheetah")
-    assert Link(kind="lcm", robot="mini_cheetah").local
-    assert not Link(kind="dds", robot="mini_cheetah", interface="eth0").local
 
 
 # --- The log ------------------------------------------------------------------------------------

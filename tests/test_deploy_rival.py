@@ -23,9 +23,9 @@ import pytest
 
 from hopper import write_hopper
 from pronk.errors import HardwareError
+from pronk.links.address import Address
 from pronk.links.machine import Command, Machine
-from pronk.links.open import Address
-from pronk.links.preflight import Freshness
+from pronk.links.state_checks import Freshness
 from pronk.robots import load_robot
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.log import read_deploy_log
@@ -59,7 +59,7 @@ class PatientLink:
 
     def __call__(self) -> Machine:
         fresh = Freshness(share=0.02, longest_gap_s=10.0)
-        return self.address.machine(ROBOT, alone_s=0.5, fresh=fresh)
+        return self.address.machine(ROBOT, exclusive_s=0.5, fresh=fresh)
 
 
 class Wire:
@@ -123,8 +123,7 @@ def over_lcm(port: int) -> Wire:
     import lcm
 
     from pronk.links.lcm.address import url_of
-    from pronk.links.lcm.codec import decode_command, encode_command
-    from pronk.links.lcm.layout import CHEETAH
+    from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
 
     mouth, ear = (lcm.LCM(url_of(port=port)) for _ in range(2))
     met: list[tuple[float, bytes]] = []
@@ -148,7 +147,7 @@ def over_lcm(port: int) -> Wire:
 
 
 def over_dds(domain: int) -> Wire:
-    from pronk.links.dds import idl
+    from pronk.links.dds import messages as idl
     from pronk.links.dds.address import COMMANDS, DdsNetwork, Participant, take, write
     from pronk.links.dds.codec import decode_command, encode_command, joint_map
 
@@ -177,9 +176,7 @@ def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
         port = int(probe.getsockname()[1])
     domain = 150 + os.getpid() % 50
     lcm = request.param == "lcm"
-    address = Address(
-        kind=request.param, port=port if lcm else None, domain=None if lcm else domain
-    )
+    address = Address.parse(f"lcm://?port={port}" if lcm else f"dds://?domain={domain}")
     where = ("--port", str(port)) if lcm else ("--domain", str(domain))
     running = subprocess.Popen(
         [
@@ -235,7 +232,7 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
     # It is there before: nothing is written, and one line says why.
     wire.speak()
     refused = Deployment(plan)
-    with pytest.raises(HardwareError, match="was not opened: someone else commands the joints"):
+    with pytest.raises(HardwareError, match="was not opened: another program commands the joints"):
         refused.__enter__()
     wire.hush()
     assert len(wire.heard()[0]) == 0

@@ -17,6 +17,7 @@ import pytest
 
 from deploy_faults import FaultyLink
 from pronk.errors import HardwareError
+from pronk.links.address import Address
 from pronk.links.machine import Machine
 from pronk.runtime.ipc import OPERATOR, Mode, OperatorRequest, Shared
 from pronk.runtime.link import Link
@@ -181,7 +182,7 @@ def test_nothing_is_lost_where_nothing_is_kept(
 def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     folder = tmp_path / "file"
     folder.write_text("no folder")
-    link = Link(kind="sim", robot="mini_cheetah", base="ground")
+    link = Link(robot="mini_cheetah", address=Address.parse("sim://ground"))
     with flown(link, capture=folder / "seen.npz") as run:
         run.mode(Mode.DAMP)
     (why,) = run.texts("lost")

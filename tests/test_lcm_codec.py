@@ -11,25 +11,27 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pronk.errors import HardwareError
-from pronk.links.lcm import types
+from pronk.links.lcm import messages as types
 from pronk.links.lcm.codec import (
+    CHEETAH,
+    KNEE_RATIO,
+    LAYOUTS,
+    WTW,
+    Layout,
+    clamp_message,
     decode_attitude,
     decode_command,
     decode_joints,
     encode_command,
     encode_state,
-    roll_pitch_yaw,
-    state_of,
-)
-from pronk.links.lcm.layout import CHEETAH, KNEE_RATIO, LAYOUTS, WTW, Layout, layout_of
-from pronk.links.lcm.message import RefusedError
-from pronk.links.lcm.service import (
-    clamp_message,
+    layout_of,
     mode_request,
     read_clamp_message,
     read_mode_request,
+    roll_pitch_yaw,
+    state_of,
 )
-from pronk.links.machine import Command, State
+from pronk.links.machine import Command, RefusedError, State
 from pronk.robots import load_robot
 
 BOTH = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -202,7 +204,7 @@ def test_impossible_commands_are_refused(
 
 def test_feed_forward_is_refused_where_the_robot_would_obey_it() -> None:
     for name in ("qd_des", "tau_ff"):
-        with pytest.raises(RefusedError, match="asks for a speed or a torque"):
+        with pytest.raises(RefusedError, match="a speed or a torque"):
             decode_command(WTW, changed(WTW, name, 0.5))
         # The Mini Cheetah's controller does not read these fields.
         got = decode_command(CHEETAH, changed(CHEETAH, name, 0.5))
@@ -224,7 +226,7 @@ def test_impossible_states_are_refused(layout: Layout) -> None:
 def test_the_other_layouts_command_is_refused() -> None:
     with pytest.raises(RefusedError, match="speaks another layout"):
         decode_command(WTW, encode_command(CHEETAH, command()))
-    with pytest.raises(HardwareError, match="no LCM layout 'go2'; there are cheetah, wtw"):
+    with pytest.raises(HardwareError, match="no LCM layout 'go2'"):
         layout_of("go2")
     with pytest.raises(HardwareError, match=r"has shape \(6,\), expected \(12,\)"):
         encode_command(CHEETAH, Command(position=np.zeros(6), stiffness=np.zeros(6),

@@ -7,13 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from pronk.links.lcm.codec import decode_command, encode_command, encode_state
-from pronk.links.lcm.layout import LAYOUTS, Layout
-from pronk.links.lcm.message import RefusedError
-from pronk.links.lcm.reader import StateReader
-from pronk.links.lcm.service import BENCH_CHANNEL, REQUEST_CHANNEL
-from pronk.links.lcm.types import MESSAGES
-from pronk.links.machine import Command, State
+from pronk.links.lcm.codec import (
+    BENCH_CHANNEL,
+    LAYOUTS,
+    REQUEST_CHANNEL,
+    Layout,
+    decode_command,
+    encode_command,
+    encode_state,
+)
+from pronk.links.lcm.messages import MESSAGES
+from pronk.links.lcm.state_decoder import StateDecoder
+from pronk.links.machine import Command, RefusedError, State
 from pronk.robots import load_robot
 from pronk.virtual.faults import flip_bit
 from pronk.virtual.robot import VirtualRobot
@@ -44,7 +49,7 @@ class Breaker:
         self.rng = np.random.default_rng(seed)
         self.good = good_command(layout)
         self.layout = layout
-        self.others = [m.encode() for m in MESSAGES.values() if m is not layout.command]
+        self.others = [m.encode() for m in MESSAGES if m is not layout.command]
         gains = ("kp_joint", "kd_joint") if layout.name == "cheetah" else ("kp", "kd")
         self.fields = ("q_des", *gains)
         self.ways = (
@@ -164,7 +169,7 @@ def test_one_flipped_bit_never_asks_for_the_impossible(layout: Layout) -> None:
 
 @BOTH
 def test_broken_states_make_no_state(layout: Layout) -> None:
-    reader = StateReader(layout, ROBOT.joint_names)
+    reader = StateDecoder(layout, ROBOT.joint_names)
     state = State(
         time=0.0, sequence=1, position=np.zeros(12), velocity=np.zeros(12), torque=np.zeros(12),
         gyro=np.zeros(3), accelerometer=np.array([0.0, 0.0, 9.81]), bus_voltage=24.0,

@@ -10,12 +10,10 @@ import pytest
 
 from pronk.errors import HardwareError
 from pronk.links.lcm.address import VIRTUAL_PORT, multicast_interface, url_of
-from pronk.links.lcm.codec import encode_state
-from pronk.links.lcm.layout import CHEETAH, WTW, Layout
-from pronk.links.lcm.reader import StateReader
-from pronk.links.lcm.service import clamp_message
+from pronk.links.lcm.codec import CHEETAH, WTW, Layout, clamp_message, encode_state
+from pronk.links.lcm.state_decoder import StateDecoder
 from pronk.links.machine import State
-from pronk.links.preflight import Freshness, check_rate, check_rest, up_of
+from pronk.links.state_checks import Freshness, check_rate, check_rest, up_of
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
@@ -32,7 +30,7 @@ STATE = State(
 )
 
 
-def tell(reader: StateReader, layout: Layout, state: State, now: float) -> None:
+def tell(reader: StateDecoder, layout: Layout, state: State, now: float) -> None:
     (_, attitude), (_, joints) = encode_state(layout, state)
     reader.attitude(attitude, now)
     reader.joints(joints, now)
@@ -43,7 +41,7 @@ def shaken(k: int) -> State:
 
 
 def test_states_arrive_with_the_local_time_and_count() -> None:
-    reader = StateReader(WTW, ROBOT.joint_names)
+    reader = StateDecoder(WTW, ROBOT.joint_names)
     for k in range(3):
         tell(reader, WTW, shaken(k), 100.0 + k)
     states = reader.drain()
@@ -58,14 +56,14 @@ def test_states_arrive_with_the_local_time_and_count() -> None:
 
 def test_a_lost_state_is_missing_in_the_count_where_the_robot_counts() -> None:
     for layout, expected in ((WTW, [0, 1, 5]), (CHEETAH, [0, 1, 2])):
-        reader = StateReader(layout, ROBOT.joint_names)
+        reader = StateDecoder(layout, ROBOT.joint_names)
         for k in (0, 1, 5):
             tell(reader, layout, shaken(k), k * 2e-3)
         assert [s.sequence for s in reader.drain()] == expected
 
 
 def test_late_and_doubled_states_are_dropped_where_the_robot_counts() -> None:
-    reader = StateReader(WTW, ROBOT.joint_names)
+    reader = StateDecoder(WTW, ROBOT.joint_names)
     for k in (0, 2, 1, 2, 3):
         tell(reader, WTW, shaken(k), 0.01)
     assert [s.sequence for s in reader.drain()] == [0, 2, 3]
@@ -78,7 +76,7 @@ def test_late_and_doubled_states_are_dropped_where_the_robot_counts() -> None:
 
 @pytest.mark.parametrize("layout", [CHEETAH, WTW], ids=["cheetah", "wtw"])
 def test_frozen_values_make_no_states_however_their_count_lives(layout: Layout) -> None:
-    reader = StateReader(layout, ROBOT.joint_names)
+    reader = StateDecoder(layout, ROBOT.joint_names)
     for k in range(50):
         tell(reader, layout, replace(STATE, sequence=10 + k, robot_time=1.0 + k), 2e-3 * k)
     assert len(reader.drain()) == 1
@@ -88,7 +86,7 @@ def test_frozen_values_make_no_states_however_their_count_lives(layout: Layout) 
 
 
 def test_joints_without_a_young_attitude_make_no_state() -> None:
-    reader = StateReader(CHEETAH, ROBOT.joint_names)
+    reader = StateDecoder(CHEETAH, ROBOT.joint_names)
     (_, attitude), (_, joints) = encode_state(CHEETAH, STATE)
     reader.joints(joints, 0.0)
     assert reader.counts["no attitude"] == 1
@@ -101,10 +99,10 @@ def test_joints_without_a_young_attitude_make_no_state() -> None:
 
 
 def test_refusals_are_counted_and_said() -> None:
-    reader = StateReader(CHEETAH, ROBOT.joint_names)
+    reader = StateDecoder(CHEETAH, ROBOT.joint_names)
     tell(reader, WTW, STATE, 0.0)
     assert reader.counts["refused: fingerprint"] == 2
-    assert "speaks another layout" in reader.complaint
+    assert "speaks another layout" in reader.last_error
     tell(reader, CHEETAH, replace(STATE, position=np.full(12, math.nan)), 0.0)
     assert reader.counts["refused: not finite"] == 1
     reader.beacon(b"none")
@@ -136,7 +134,7 @@ def test_gravity_and_limits() -> None:
     up = np.array([0.0, math.sin(0.5), math.cos(0.5)])
     np.testing.assert_allclose(up_of(rolled), up, atol=1e-12)
     check_rest(ROBOT, [replace(STATE, orientation=rolled, accelerometer=9.81 * up)])
-    with pytest.raises(HardwareError, match="disagree about where up is by 29 degrees"):
+    with pytest.raises(HardwareError, match="29 degrees"):
         check_rest(ROBOT, [replace(STATE, orientation=rolled)])
     # An attitude in the order x, y, z, w.
     with pytest.raises(HardwareError, match="disagree about where up is"):

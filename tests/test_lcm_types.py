@@ -13,28 +13,20 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.links.lcm.message import Message, RefusedError
-from pronk.links.lcm.types import MESSAGES, SPI_DATA, identify
+from pronk.links.lcm.messages import MESSAGES, SPI_DATA, Message
+from pronk.links.machine import RefusedError
 
 # Fingerprints and lengths as lcm-gen 1.5.3 gave them for the two stacks' own .lcm files.
 KNOWN = {
-    "cheetah.leg_control_data_lcmt": (0x4FA4EEB480FBD94F, 248),
     "cheetah.leg_control_command_lcmt": (0x277F792B531376CF, 488),
-    "cheetah.state_estimator_lcmt": (0x86530874C8755CB7, 96),
     "cheetah.microstrain_lcmt": (0xE21531EA1392FAAA, 76),
-    "cheetah.spi_command_t": (0xD991D54C6D3782CF, 264),
     "cheetah.spi_data_t": (0x3A5F506B524D7E4F, 124),
-    "cheetah.spi_torque_t": (0x508E263BB0CB6A4F, 56),
-    "cheetah.gamepad_lcmt": (0x6F8E39912AF60B9E, 80),
     "cheetah.control_parameter_request_lcmt": (0xD04FD3ECA4A52D73, 146),
-    "cheetah.cheetah_visualization_lcmt": (0xD3D2413766DE929F, 100),
-    "cheetah.vectornav_lcmt": (0xEAF20DBD97EFD7B9, 48),
     "wtw.leg_control_data_lcmt": (0x5352516A697F890F, 272),
     "wtw.pd_tau_targets_lcmt": (0xDB10251DE2523982, 544),
-    "wtw.rc_command_lcmt": (0x8EE4D605D87CFBC5, 46),
     "wtw.state_estimator_lcmt": (0xD50F90505DFFCB6D, 160),
 }
-ALL = sorted(MESSAGES.values(), key=lambda message: message.name)
+ALL = sorted(MESSAGES, key=lambda message: message.name)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +77,6 @@ def test_bytes_are_those_of_lcm_gen(message: Message, generated: ModuleType) -> 
     decoded = message.decode(golden)
     for name, value in values.items():
         np.testing.assert_array_equal(decoded[name], value)
-    assert identify(golden) is message
 
 
 def test_golden_bytes() -> None:
@@ -125,14 +116,12 @@ def test_a_wrong_table_is_refused() -> None:
 )
 def test_what_is_not_a_message_is_refused(data: bytes, reason: str) -> None:
     with pytest.raises(RefusedError) as met:
-        identify(data)
-    assert met.value.reason == reason
-    with pytest.raises(RefusedError):
         SPI_DATA.decode(data)
+    assert met.value.reason == reason
 
 
 def test_a_message_of_the_other_stack_is_named() -> None:
-    ours = next(m for m in ALL if m.name == "cheetah.leg_control_data_lcmt")
+    ours = next(m for m in ALL if m.name == "cheetah.spi_data_t")
     theirs = next(m for m in ALL if m.name == "wtw.leg_control_data_lcmt")
     with pytest.raises(RefusedError, match=r"\(wtw.leg_control_data_lcmt\), expected"):
         ours.decode(theirs.encode())

@@ -28,12 +28,11 @@ from pronk.cli.sweep_wire import record_wire
 from pronk.errors import HardwareError, LogError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
+from pronk.links.address import Address
 from pronk.links.lcm.address import url_of
-from pronk.links.lcm.codec import decode_command, encode_command
-from pronk.links.lcm.layout import CHEETAH
+from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
 from pronk.links.machine import Command
-from pronk.links.open import Address
-from pronk.links.preflight import Freshness
+from pronk.links.state_checks import Freshness
 from pronk.logs.joint_log import SweepLog
 from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import Robot, load_robot
@@ -130,7 +129,7 @@ class Ear:
 
 
 def swept(robot: Robot, plan: SweepPlan, out: Path, port: int) -> Recorded:
-    address = Address(kind="lcm", port=port)
+    address = Address.parse("lcm", port=port)
     return record_wire(robot, plan, out, address, timing=PATIENT, fresh=FRESH, real_time=True)
 
 
@@ -334,14 +333,6 @@ def test_real_hardware_asks_for_its_name(
     words = ["sweep", "mini_cheetah", "--link", "lcm", "--interface", "lo", "--joints", "FR_knee"]
     assert cli.run([*words, "--out", str(tmp_path / "x")]) == 2
     told = capsys.readouterr()
-    assert "A real mini_cheetah at LCM, messages of cheetah, on lo is about to move" in told.out
+    assert "A real mini_cheetah at lcm://lo is about to move" in told.out
     assert "nothing was moved" in told.err
     assert not (tmp_path / "x").exists()
-
-
-def test_addresses() -> None:
-    assert str(Address(kind="dds", interface="eth0")) == "DDS on eth0"
-    assert not Address(kind="dds", interface="eth0").local
-    assert str(Address(kind="dds", domain=5)) == "DDS on loopback, domain 5"
-    with pytest.raises(HardwareError, match="wires are lcm, dds"):
-        Address(kind="can")

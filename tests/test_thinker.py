@@ -34,7 +34,7 @@ DECIDED = ("observation", "action", "target", "contact", "linear_velocity", "com
 def thinking() -> Iterator[PolicyProcess]:
     shared = Shared()
     try:
-        plan = Plan(link=Link(kind="sim", robot="mini_cheetah"), policy=POLICY)
+        plan = Plan(link=Link(robot="mini_cheetah"), policy=POLICY)
         yield PolicyProcess(plan, shared, load_policy(POLICY))
     finally:
         shared.close()

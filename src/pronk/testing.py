@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
-from pronk.errors import PronkError
+from pronk.errors import HardwareError, PronkError
+from pronk.links.machine import Command, RefusedError, damping_command
+from pronk.links.stream_link import Codec, Transport
+from pronk.robots.robot import Robot
 from pronk.simulators.simulator import PARAMETERS, Simulator
 
 
@@ -70,6 +75,64 @@ def check_simulator(simulator: Simulator) -> None:
         changed = {**values, name: np.full((2, len(joints)), other[name])}
         effect = np.abs(simulator.rollout(command, changed) - out).max()
         _require(float(effect) > 1e-5, f"parameters: {name} has an effect")
+
+
+def check_link(
+    robot: Robot,
+    codec: Codec,
+    states: Sequence[bytes],
+    transport: Callable[[], Transport] | None = None,
+) -> None:
+    """Check a link's codec, and its transport where one is given.
+
+    States decode to finite numbers of the robot's joints; cut, empty and foreign bytes are refused;
+    commands encode to the same bytes every time, and impossible ones are refused; without an
+    interface the transport is local.
+
+    Args:
+        robot: At the other end.
+        codec: Of its messages.
+        states: Messages of a live robot, two or more.
+        transport: Opens the wire as an address without an interface does.
+
+    Raises:
+        PronkError: A property fails; the message names it.
+    """
+    joints = len(robot.joints)
+    _require(len(states) >= 2, "give two or more recorded states")
+    for data in states:
+        state = codec.decode(data)
+        for name, size in (("position", joints), ("velocity", joints), ("torque", joints),
+                           ("gyro", 3), ("accelerometer", 3), ("orientation", 4)):  # fmt: skip
+            values = np.asarray(getattr(state, name))
+            _require(values.shape == (size,), f"state.{name} has shape {values.shape}, not ({size},)")
+            _require(np.isfinite(values).all(), f"state.{name} is not finite")
+        norm = float(np.linalg.norm(state.orientation))
+        _require(abs(norm - 1.0) < 0.02, f"state.orientation has length {norm:.3f}, not 1")
+    for data in (b"", states[0][:-1], b"\xff" * len(states[0])):
+        try:
+            codec.decode(data)
+        except RefusedError:
+            continue
+        _require(False, f"decode: {len(data)} bytes that are no state are refused")
+    pose = np.array([joint.default_position for joint in robot.joints])
+    command = Command(position=pose, stiffness=np.full(joints, 10.0), damping=np.ones(joints))
+    _require(codec.encode(command) == codec.encode(command), "encode differs from call to call")
+    _require(codec.encode(command) != codec.encode(damping_command(joints)), "damping is no command")
+    for wrong in (np.nan, np.inf):
+        try:
+            codec.encode(Command(position=pose + wrong, stiffness=pose * 0, damping=pose * 0))
+        except HardwareError:
+            continue
+        _require(False, f"encode: a position of {wrong} is refused")
+    _require(codec.state_rate_hz > 0.0, "state_rate_hz is not positive")
+    if transport is not None:
+        wire = transport()
+        try:
+            _require(wire.local, "without an interface something may leave this computer")
+            _require(isinstance(wire.receive(0.0), list), "receive does not return a list")
+        finally:
+            wire.close()
 
 
 def _require(kept: bool, rule: str) -> None:

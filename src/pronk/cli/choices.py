@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-Link = Literal["sim", "lcm", "dds"]
-"""How the machine is reached."""
-
-
 Layout = Literal["cheetah", "wtw"]
 """The messages on LCM."""
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from pronk.cli import confirm, console
-from pronk.cli.choices import Base, Link
+from pronk.cli.choices import Base, Layout
 from pronk.errors import HardwareError, PronkError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _INTERRUPTED = 130
 
 def deploy(
     policy: tyro.conf.Positional[Path],
-    link: Link = "sim",
+    link: str = "sim",
     interface: str | None = None,
     script: str | None = None,
     walk_only: bool = False,
@@ -39,10 +39,10 @@ def deploy(
     seconds: float | None = None,
     blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = 0.4,
     tilt: float = 0.8,
-    base: Base = "ground",
+    base: Base | None = None,
     sim_params: Path | None = None,
     seed: int = 0,
-    layout: str = "cheetah",
+    layout: Layout | None = None,
     port: int | None = None,
     domain: int | None = None,
     release: Annotated[bool, tyro.conf.arg(name="disable-onboard-controller")] = False,
@@ -55,7 +55,8 @@ def deploy(
 
     Args:
         policy: policy.onnx, as `pronk train` writes it.
-        link: sim: the virtual robot in this program; lcm, dds: by wire.
+        link: sim, the virtual robot in this program; lcm or dds, by wire; or a URI such as
+            dds://eth0, lcm://eth0?layout=wtw, sim://ground.
         interface: Network interface to a real robot; without it nothing leaves here.
         script: Fly this unattended: paper, or a command such as 1,0,0.
         walk_only: A script without jumps.
@@ -65,10 +66,10 @@ def deploy(
         seconds: Sit down after this time with the policy in charge.
         blend: Time in which the policy takes over, in s; 0 as in training.
         tilt: Largest tilt of the trunk, in rad.
-        base: Of the virtual robot.
+        base: Of the virtual robot; the ground if left out.
         sim_params: Parameters of the virtual robot, instead of the shipped one.
         seed: Of the virtual robot's noise.
-        layout: Messages on LCM: cheetah or wtw.
+        layout: Messages on LCM; cheetah if left out.
         port: UDP port of LCM.
         domain: Domain of DDS.
         release: Make the robot's own controller let go of the joints.
@@ -77,6 +78,7 @@ def deploy(
         yes: Do not ask before real hardware moves.
         json_file: Also write the figures to this file.
     """
+    from pronk.links.address import SIM, Address
     from pronk.policy.runtime import load_policy
     from pronk.runtime.link import Link as Opener
     from pronk.runtime.plan import Plan
@@ -84,21 +86,15 @@ def deploy(
     from pronk.runtime.trajectories import Timing
 
     contract = load_policy(policy).contract
-    if capture is not None and (link != "sim" or base != "ground"):
+    if link.partition(":")[0] == SIM:
+        params = None if sim_params is None else str(sim_params)
+        address = Address.parse(link, base, seed=seed or None, params=params)
+    else:
+        address = Address.parse(link, interface, layout=layout, port=port, domain=domain)
+    if capture is not None and (address.kind != SIM or address.interface == "bench"):
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
     plan = Plan(
-        link=Opener(
-            kind=link,
-            robot=contract.robot,
-            interface=interface,
-            layout=layout,
-            port=port,
-            domain=domain,
-            release=release,
-            sim_params=sim_params,
-            seed=seed,
-            base=base,
-        ),
+        link=Opener(robot=contract.robot, address=address, release=release),
         policy=policy,
         log=log,
         capture=capture,
@@ -108,8 +104,8 @@ def deploy(
         real_time=real_time,
     )
     scripts = None if script is None else _scripts(script, contract, walk_only)
-    if interface is not None and link != "sim" and not yes:
-        confirm.before_it_moves(contract.robot, f"{link} on {interface}")
+    if not address.local and not yes:
+        confirm.before_it_moves(contract.robot, str(address))
     with _operator(contract, scripts, gamepad, seconds) as (operator, words):
         console.say(words)
         summary = run(plan, operator, _tell)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from pronk.cli import confirm, console, sweep_wire
-from pronk.cli.choices import Layout, Link
+from pronk.cli.choices import Layout
 from pronk.cli.sweep_virtual import record_virtual as record_virtual
 from pronk.errors import HardwareError
 
@@ -30,7 +30,7 @@ AMPLITUDES = (0.25, 0.125)
 def sweep(
     robot: tyro.conf.Positional[str],
     out: Path,
-    link: Link = "sim",
+    link: str = "sim",
     interface: str | None = None,
     layout: Layout | None = None,
     port: int | None = None,
@@ -53,7 +53,8 @@ def sweep(
     Args:
         robot: Robot, for instance mini_cheetah.
         out: Folder for the logs, one MCAP per joint.
-        link: sim: the virtual robot in this program; lcm, dds: by wire.
+        link: sim, the virtual robot in this program; lcm or dds, by wire; or a URI such as
+            dds://eth0, lcm://eth0?layout=wtw.
         interface: Network interface to a real robot; without it nothing leaves here.
         layout: Messages on LCM; cheetah if left out.
         port: UDP port of LCM.
@@ -71,28 +72,20 @@ def sweep(
         yes: Do not ask before real hardware moves.
         json_file: Also write the figures to this file.
     """
+    from pronk.links.address import SIM, Address
     from pronk.robots import load_robot
 
     machine = load_robot(robot)
-    address = None
-    if link == "sim":
-        sweep_wire.refuse_without_wire(
-            interface=interface, layout=layout, port=port, domain=domain, release=release
+    virtual = link.partition(":")[0] == SIM
+    options = {"layout": layout, "port": port, "domain": domain}
+    address = Address.parse(link, interface, **options)
+    if virtual and (address.interface not in (None, "bench") or address.options or release):
+        raise HardwareError(
+            f"{address}: the virtual robot of a sweep is on the bench, without a wire; leave out "
+            "--interface and --release, and give --seed and --sim-params."
         )
-    else:
-        from pronk.links.open import Address
-
-        if sim_params is not None:
-            raise HardwareError(
-                "--sim-params is of --link sim; give it to `pronk simulate` instead."
-            )
-        address = Address(
-            kind=link,
-            interface=interface,
-            layout=layout and layout,
-            port=port,
-            domain=domain,
-        )
+    if not virtual and sim_params is not None:
+        raise HardwareError("--sim-params is of --link sim; give it to `pronk simulate` instead.")
     names = [part for entry in joints or () for part in entry.split(",") if part]
     with console.progress() as report:
         report("forecast", 0.0)
@@ -102,16 +95,16 @@ def sweep(
     plan.check()
     figures: dict[str, Any] = {
         "robot": machine.name,
-        "link": str(address or "sim"),
+        "link": str(address),
         "duration_s": plan.duration_s,
         "plan": plan.rows(),
         "logs": [],
-    } | ({"virtual": True} if address is None else {})
+    } | ({"virtual": True} if virtual else {})
     if plan_only:
         console.write_json(json_file, figures)
         console.say("next: the same command without --plan-only")
         return
-    if address is None:
+    if virtual:
         with console.progress() as report:
             paths = record_virtual(
                 machine,
@@ -136,7 +129,7 @@ def sweep(
                 release=release,
                 overwrite=overwrite,
                 real_time=real_time,
-                progress=report.bar(f"ask over {link}"),
+                progress=report.bar(f"ask over {address.kind}"),
             )
         figures |= {
             "virtual": recorded.virtual,

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pronk.cli import confirm, console
-from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
-    from pronk.links.open import Address
-    from pronk.links.preflight import Freshness
+    from pronk.links.address import Address
+    from pronk.links.state_checks import Freshness
     from pronk.robots.robot import Robot
     from pronk.runtime.sweep.record_subprocess import Recorded
     from pronk.runtime.sweep.servo import Timing
@@ -67,7 +66,11 @@ def record_wire(
     logs: list[Path] = []
     try:
         return record_apart(
-            job, hand=confirm.Person(), progress=progress, say=console.say, begun=logs.append
+            job,
+            clamp_operator=confirm.Person(),
+            progress=progress,
+            say=console.say,
+            begun=logs.append,
         )
     except BaseException:
         _say_what_is_kept(out_dir, logs)
@@ -91,17 +94,4 @@ def _say_what_is_kept(out_dir: Path, logs: list[Path]) -> None:
         console.warn(
             f"ended early; in {out_dir} are kept {whole}what was recorded until then of "
             f"{logs[-1].stem}; ask the others with --joints"
-        )
-
-
-def refuse_without_wire(**options: object) -> None:
-    """See that nothing of a wire was given without one.
-
-    Raises:
-        HardwareError: Names what was.
-    """
-    given = [f"--{name}" for name, value in options.items() if value]
-    if given:
-        raise HardwareError(
-            f"{', '.join(given)}: of --link lcm or dds; the virtual robot has no wire."
         )

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
-from pronk.errors import HardwareError
+from pronk.links.address import Address
 from pronk.links.machine import Command, Machine, State, TorqueKind
-from pronk.links.open import WIRES, Address
 from pronk.links.realtime import sleep_until
-
-if TYPE_CHECKING:
-    from pronk.virtual.robot import VirtualRobot
-
-LINKS = ("sim", *WIRES)
+from pronk.virtual.robot import VirtualRobot
 
 
 class Opener(Protocol):
@@ -31,73 +25,31 @@ class Opener(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """A link by its name. Implements `Opener`."""
+    """A robot at an address. Implements `Opener`."""
 
-    kind: str
-    """One of `LINKS`."""
     robot: str
-    interface: str | None = None
-    """Network interface; None is loopback."""
-    layout: str = "cheetah"
-    """Of LCM's messages: `cheetah` or `wtw`."""
-    port: int | None = None
-    """Of LCM; None for the virtual robot's on loopback and the robots' on an interface."""
-    domain: int | None = None
-    """Of DDS; None for the virtual robot's on loopback and the robots' on an interface."""
+    address: Address = field(default_factory=Address)
     release: bool = False
     """Make the robot's own controller let go of the joints first."""
-    sim_params: Path | None = None
-    """Of the virtual robot; None for the one that comes with pronk."""
-    seed: int = 0
-    """Of the virtual robot's noise."""
-    base: Literal["bench", "ground"] = "ground"
-    """How the virtual robot is set up."""
-
-    def __post_init__(self) -> None:
-        """Refuse a link that there is not.
-
-        Raises:
-            HardwareError: Names those there are.
-        """
-        if self.kind not in LINKS:
-            raise HardwareError(f"link {self.kind!r}; the links are {', '.join(LINKS)}.")
 
     def __call__(self) -> Machine:
-        """The machine, not yet connected.
+        """Make the machine, not yet connected; the virtual robot in real time.
 
         Raises:
             HardwareError: The link's library is not installed.
         """
-        if self.kind == "sim":
-            return Paced(self._virtual())
         from pronk.robots import load_robot
 
-        lcm = self.kind == "lcm"
-        address = Address(
-            kind=self.kind,
-            interface=self.interface,
-            layout=self.layout if lcm else None,
-            port=self.port if lcm else None,
-            domain=None if lcm else self.domain,
-        )
-        return address.machine(load_robot(self.robot), release=self.release)
+        machine = self.address.machine(load_robot(self.robot), release=self.release)
+        return Paced(machine) if isinstance(machine, VirtualRobot) else machine
 
     @property
     def local(self) -> bool:
         """True where nothing leaves this computer, so that no real robot can move."""
-        return self.kind == "sim" or self.interface is None
+        return self.address.local
 
     def __str__(self) -> str:
-        where = "" if self.kind == "sim" else f" on {self.interface or 'loopback'}"
-        return f"{self.kind}{where}"
-
-    def _virtual(self) -> VirtualRobot:
-        from pronk.robots import load_robot
-        from pronk.virtual.robot import VirtualRobot
-        from pronk.virtual.sim_params import load_sim_params
-
-        robot = load_robot(self.robot)
-        return VirtualRobot(robot, load_sim_params(self.sim_params), seed=self.seed, base=self.base)
+        return str(self.address)
 
 
 class Paced:

@@ -25,7 +25,7 @@ policy that walks and jumps (means; n jumps with the same seeds at every step):
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from pronk.virtual.ground import Ground, Start
 from pronk.virtual.physics import Physics, Transport
 from pronk.virtual.plant import build_plant, legs_of
 from pronk.virtual.sensors import FreeBody, Raw, Sensors, StandingBody
-from pronk.virtual.sim_params import SimParams
+from pronk.virtual.sim_params import SimParams, load_sim_params
 
 TIMESTEP_S = 0.25e-3
 """Physics step; see the module's docstring for why it suffices."""
@@ -289,6 +289,27 @@ class VirtualRobot:
                 motion=self._body.motion(block.qpos, block.qvel),
             )
         )
+
+
+def open_sim(
+    robot: Robot,
+    *,
+    interface: str | None = None,
+    seed: int = 0,
+    params: str | None = None,
+    **common: Any,
+) -> VirtualRobot:
+    """Make the virtual robot of an address `sim://BASE?seed=0&params=FILE`.
+
+    Args:
+        robot: Structure.
+        interface: The base, `bench` or `ground`; None is the ground.
+        seed: Of all noise.
+        params: File of its parameters; the shipped one if None.
+        **common: Of links with a wire; of no effect.
+    """
+    base: Any = interface or "ground"
+    return VirtualRobot(robot, load_sim_params(params), seed=seed, base=base)
 
 
 def _check_base(

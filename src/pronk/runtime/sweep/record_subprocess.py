@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pronk.errors import HardwareError, PronkError
-from pronk.links.link_checks import Hand
+from pronk.links.network_link import ClampOperator
 from pronk.links.terminal import Interrupts, unheard
 from pronk.logs.mcap_writer import McapLogWriter, reason_of
 from pronk.runtime.sweep.channel import Channel
@@ -46,7 +46,7 @@ class Recorded:
 def record_apart(
     job: Job,
     *,
-    hand: Hand,
+    clamp_operator: ClampOperator,
     progress: Callable[[float], None] = lambda share: None,
     say: Callable[[str], None] = lambda line: None,
     begun: Callable[[Path], None] = lambda path: None,
@@ -55,7 +55,7 @@ def record_apart(
 
     Args:
         job: What to do.
-        hand: Fixes joints on a real bench; called in a thread of its own.
+        clamp_operator: Fixes joints on a real bench; called in a thread of its own.
         progress: Told the share done, 0 to 1.
         say: Told what the system granted the servo, line by line.
         begun: Told each log that is opened.
@@ -70,7 +70,14 @@ def record_apart(
         servo.start()
     theirs.close()
     channel = Channel(ours)
-    desk = Desk(channel, kill=servo.kill, hand=hand, progress=progress, say=say, begun=begun)
+    desk = Desk(
+        channel,
+        kill=servo.kill,
+        clamp_operator=clamp_operator,
+        progress=progress,
+        say=say,
+        begun=begun,
+    )
     with Interrupts() as interrupts:
         try:
             desk.attend(interrupts.check)
@@ -103,14 +110,19 @@ class Desk:
         channel: Channel,
         *,
         kill: Callable[[], None],
-        hand: Hand,
+        clamp_operator: ClampOperator,
         progress: Callable[[float], None],
         say: Callable[[str], None],
         begun: Callable[[Path], None],
     ) -> None:
         """Begin; `kill` ends the servo's process, the others as of `record_apart`."""
         self._channel, self._kill = channel, kill
-        self._hand, self._progress, self._say, self._begun = hand, progress, say, begun
+        self._clamp_operator, self._progress, self._say, self._begun = (
+            clamp_operator,
+            progress,
+            say,
+            begun,
+        )
         self._log: McapLogWriter | None = None
         self._recorded: Recorded | None = None
         self._failed: PronkError | None = None
@@ -210,7 +222,7 @@ class Desk:
     def _ask(self, joints: tuple[str, ...]) -> None:
         error: PronkError | None = None
         try:
-            self._hand(joints)
+            self._clamp_operator(joints)
         except PronkError as refused:
             error = refused
         except Exception as broken:

@@ -18,9 +18,9 @@ from pathlib import Path
 
 from pronk.errors import HardwareError, PronkError
 from pronk.excitation.plan import SweepPlan
-from pronk.links.open import Address
-from pronk.links.preflight import Freshness
+from pronk.links.address import Address
 from pronk.links.realtime import Wanted, enter
+from pronk.links.state_checks import Freshness
 from pronk.links.terminal import leave
 from pronk.robots.robot import Robot
 from pronk.runtime.sweep.channel import Channel
@@ -74,7 +74,7 @@ def serve(job: Job, end: socket.socket) -> None:
     servo = Servo(job.timing, owner.check)
     try:
         machine = job.address.machine(
-            job.robot, hand=owner.hand, release=job.release, fresh=job.fresh
+            job.robot, clamp_operator=owner.clamp, release=job.release, fresh=job.fresh
         )
         logs = record(
             machine,
@@ -143,7 +143,7 @@ class Owner:
         if self._ending:
             raise HardwareError("the servo was told to end (SIGTERM); the joints were damped.")
 
-    def hand(self, joints: tuple[str, ...]) -> None:
+    def clamp(self, joints: tuple[str, ...]) -> None:
         """Have a person fix joints; returns when it is done. Of another thread than `check`.
 
         Raises:

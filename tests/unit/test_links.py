@@ -1,0 +1,268 @@
+"""Every link alike, without a wire: addresses, fresh states, other programs, clamps, rest."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from pronk.errors import HardwareError, PronkError, RobotError
+from pronk.links import address as addresses
+from pronk.links import network_link
+from pronk.links.address import Address
+from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
+from pronk.links.network_link import NetworkLink, await_rest, wait_for
+from pronk.links.stream_link import StreamLink
+from pronk.robots import load_robot
+from pronk.robots.robot import Robot
+from pronk.testing import check_link
+from pronk.virtual.robot import VirtualRobot
+
+ROBOT = load_robot("mini_cheetah")
+DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
+
+
+class Clock:
+    """A clock that only sleeping moves on."""
+
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(network_link, "time", made)
+    return made
+
+
+def state(when: float = 0.0, speed: float = 0.0) -> State:
+    return State(
+        time=when,
+        sequence=0,
+        position=DEFAULT,
+        velocity=np.full(12, -speed),
+        torque=np.zeros(12),
+        gyro=np.zeros(3),
+        accelerometer=np.array([0.0, 0.0, 9.81]),
+        bus_voltage=24.0,
+    )
+
+
+class Windows(NetworkLink):
+    """A link that gives so many states a window."""
+
+    wire = "test"
+    foreign = 0
+
+    def __init__(self, *windows: int, clamps: bool = True, **options: object) -> None:
+        super().__init__(ROBOT, **options)  # type: ignore[arg-type]
+        self.left, self.waits, self.clamps = list(windows), list[float](), clamps
+        self._command_topic = "rt/lowcmd"
+
+    def wait(self, until: float) -> list[State]:
+        self.waits.append(until)
+        return [state(0.002 * k) for k in range(self.left.pop(0))] if until else [state()]
+
+    @property
+    def _foreign_commands(self) -> int:
+        return self.foreign
+
+    def _open(self) -> None: ...
+    def _preflight(self) -> None: ...
+    def _shut(self) -> None: ...
+    def _newest(self) -> State | None:
+        return state()
+
+    def _arrived(self) -> list[State]:
+        return []
+
+
+def test_a_condition_is_waited_for_and_given_up(clock: Clock) -> None:
+    assert wait_for(lambda: clock.now > 1.5)
+    assert clock.now == pytest.approx(1.5, abs=0.01)
+    assert not wait_for(lambda: False, 0.5)
+    assert clock.now == pytest.approx(2.0, abs=0.01)
+
+
+def test_windows_of_a_busy_computer_may_fail_and_those_of_a_slow_robot_may_not() -> None:
+    link = Windows(20, 0, 100)
+    assert len(link.fresh_states(500.0, until=math.inf)) == 100
+    # Before each window, what had come until then is dropped.
+    assert [until == 0.0 for until in link.waits] == [True, False] * 3
+    with pytest.raises(HardwareError, match="20 fresh states"):
+        Windows(20, 100).fresh_states(500.0, until=0.0)
+
+
+def test_commands_of_other_programs_are_refused(clock: Clock) -> None:
+    link = Windows()
+    link.check_exclusive(0.0)
+    assert clock.now == pytest.approx(1.0)
+    link.foreign = 3
+    with pytest.raises(HardwareError, match="3 commands on rt/lowcmd"):
+        link.check_exclusive(0.0)
+
+
+def test_joints_are_clamped_by_a_person_or_not_at_all() -> None:
+    requests: list[tuple[str, ...]] = []
+    Windows(clamp_operator=requests.append).clamp(("FL_knee",))
+    assert requests == [("FL_knee",)]
+    Windows().clamp(())
+    with pytest.raises(HardwareError, match="FL_knee, FR_knee"):
+        Windows().clamp(("FL_knee", "FR_knee"))
+    with pytest.raises(RobotError, match="tail"):
+        Windows(clamp_operator=requests.append).clamp(("FR_knee", "tail"))
+    assert len(requests) == 1
+
+
+@pytest.mark.parametrize(
+    ("newest", "takes"),
+    [
+        (lambda now: None, 1.0),
+        (lambda now: state(speed=0.4), 1.0),
+        (lambda now: state(speed=5.0 if now < 1.7 else 0.0), 1.7),
+        (lambda now: state(speed=0.6), 3.0),
+        (lambda now: state(speed=math.nan), 3.0),
+    ],
+    ids=["no state", "slow enough", "in between", "never", "not a number"],
+)
+def test_a_robot_is_left_at_rest(
+    newest: Callable[[float], State | None], takes: float, clock: Clock
+) -> None:
+    await_rest(lambda: newest(clock.now))
+    assert clock.now == pytest.approx(takes, abs=0.01)
+
+
+# --- Addresses ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "interface", "options", "local"),
+    [
+        ("sim", None, {}, True),
+        ("sim://ground?seed=3", "ground", {"seed": 3}, True),
+        ("lcm", None, {}, True),
+        ("lcm://lo?layout=wtw&port=7668", "lo", {"layout": "wtw", "port": 7668}, False),
+        ("dds://eth0", "eth0", {}, False),
+        ("dds://?domain=5", None, {"domain": 5}, True),
+    ],
+)
+def test_addresses_are_read_and_written(
+    text: str, interface: str | None, options: dict[str, object], local: bool
+) -> None:
+    found = Address.parse(text)
+    assert (found.interface, found.options, found.local) == (interface, options, local)
+    assert Address.parse(str(found)) == found
+    kind = text.partition(":")[0]
+    assert Address.parse(kind, interface, **options) == found  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("can", "no link 'can'; the links are sim, lcm, dds"),
+        ("twin", "'sim'"),
+        ("dds://?port=3", "dds has no port"),
+        ("lcm://?domain=3", "lcm has no domain"),
+        ("lcm://?port=many", "port of link lcm is 'many'"),
+    ],
+)
+def test_addresses_that_are_refused(text: str, words: str) -> None:
+    with pytest.raises(HardwareError, match=words):
+        Address.parse(text)
+    with pytest.raises(HardwareError, match="eth0"):
+        Address.parse("dds://eth0", "eth1")
+
+
+def test_the_virtual_robot_has_an_address() -> None:
+    machine = Address.parse("sim://bench?seed=4").machine(ROBOT)
+    assert isinstance(machine, VirtualRobot)
+    with pytest.raises(HardwareError, match="no_base"):
+        Address.parse("sim://no_base").machine(ROBOT)
+
+
+# --- A link of somebody else --------------------------------------------------------------------
+
+
+class Serial:
+    """Position, velocity (12 floats each) and a checksum byte; commands have three times twelve."""
+
+    name, state_rate_hz = "serial", 100.0
+    torque_kind: TorqueKind = "absent"
+
+    def encode(self, command: Command) -> bytes:
+        check_command(command, 12)
+        values = np.concatenate([command.position, command.stiffness, command.damping])
+        return struct.pack("<36f", *values)
+
+    def decode(self, data: bytes) -> State:
+        if len(data) != 97 or sum(data[:-1]) % 251 != data[-1]:
+            raise RefusedError("checksum", "a message is damaged.")
+        values = np.array(struct.unpack("<24f", data[:-1]))
+        return replace(state(), position=values[:12], velocity=values[12:])
+
+
+def message(speed: float) -> bytes:
+    body = struct.pack("<24f", *DEFAULT, *np.full(12, speed))
+    return body + bytes([sum(body) % 251])
+
+
+class Loop:
+    """A transport without a robot."""
+
+    local = True
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+
+    def receive(self, timeout_s: float) -> list[bytes]:
+        return []
+
+    def send(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def foreign_commands(self) -> int:
+        return 0
+
+    def close(self) -> None: ...
+
+
+def serial(robot: Robot, *, interface: str | None = None, speed: int = 9600, **common: object):  # type: ignore[no-untyped-def]
+    link = StreamLink(robot, Serial(), Loop, **common)  # type: ignore[arg-type]
+    link.counts = Counter(speed=speed)
+    return link
+
+
+def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    point = EntryPoint("serial", f"{__name__}:serial", addresses.GROUP)
+    monkeypatch.setattr(addresses, "entry_points", lambda group: [point])
+    monkeypatch.setattr(EntryPoint, "load", lambda self: serial)
+    machine = Address.parse("serial://ttyUSB0?speed=115200").machine(ROBOT)
+    assert isinstance(machine, StreamLink)
+    assert machine.counts == {"speed": 115200}
+    assert "serial" in addresses.link_names()
+    check_link(ROBOT, Serial(), [message(0.0), message(0.1)], Loop)
+
+
+@pytest.mark.parametrize("wrong", ["decode", "encode", "local"])
+def test_a_link_with_a_defect_fails_the_check(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if wrong == "local":
+        monkeypatch.setattr(Loop, "local", False)
+    else:
+        careless = {"decode": lambda *_: state(), "encode": lambda *_: b""}
+        monkeypatch.setattr(Serial, wrong, careless[wrong])
+    with pytest.raises(PronkError, match=wrong):
+        check_link(ROBOT, Serial(), [message(0.0), message(0.1)], Loop)
