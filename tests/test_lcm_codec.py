@@ -228,7 +228,7 @@ def test_the_other_layouts_command_is_refused() -> None:
         decode_command(WTW, encode_command(CHEETAH, command()))
     with pytest.raises(HardwareError, match="no LCM layout 'go2'"):
         layout_of("go2")
-    with pytest.raises(HardwareError, match=r"has shape \(6,\), expected \(12,\)"):
+    with pytest.raises(HardwareError, match=r"has shape \(6,\)"):
         encode_command(CHEETAH, Command(position=np.zeros(6), stiffness=np.zeros(6),
                                         damping=np.zeros(6)))  # fmt: skip
 

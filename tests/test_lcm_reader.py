@@ -137,7 +137,7 @@ def test_gravity_and_limits() -> None:
     with pytest.raises(HardwareError, match="29 degrees"):
         check_rest(ROBOT, [replace(STATE, orientation=rolled)])
     # An attitude in the order x, y, z, w.
-    with pytest.raises(HardwareError, match="disagree about where up is"):
+    with pytest.raises(HardwareError, match="disagree about the vertical"):
         check_rest(
             ROBOT, [replace(STATE, orientation=np.roll(rolled, -1), accelerometer=9.81 * up)]
         )

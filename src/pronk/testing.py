@@ -99,16 +99,16 @@ def check_link(
         PronkError: A property fails; the message names it.
     """
     joints = len(robot.joints)
-    _require(len(states) >= 2, "give two or more recorded states")
+    _require(len(states) >= 2, "states: two or more are given")
     for data in states:
         state = codec.decode(data)
-        for name, size in (("position", joints), ("velocity", joints), ("torque", joints),
-                           ("gyro", 3), ("accelerometer", 3), ("orientation", 4)):  # fmt: skip
+        sizes = dict.fromkeys(("position", "velocity", "torque"), joints)
+        for name, size in {**sizes, "gyro": 3, "accelerometer": 3, "orientation": 4}.items():
             values = np.asarray(getattr(state, name))
-            _require(values.shape == (size,), f"state.{name} has shape {values.shape}, not ({size},)")
-            _require(np.isfinite(values).all(), f"state.{name} is not finite")
+            _require(values.shape == (size,), f"decode: {name} has shape ({size},)")
+            _require(bool(np.isfinite(values).all()), f"decode: {name} is finite")
         norm = float(np.linalg.norm(state.orientation))
-        _require(abs(norm - 1.0) < 0.02, f"state.orientation has length {norm:.3f}, not 1")
+        _require(abs(norm - 1.0) < 0.02, "decode: orientation has length 1")
     for data in (b"", states[0][:-1], b"\xff" * len(states[0])):
         try:
             codec.decode(data)
@@ -117,20 +117,22 @@ def check_link(
         _require(False, f"decode: {len(data)} bytes that are no state are refused")
     pose = np.array([joint.default_position for joint in robot.joints])
     command = Command(position=pose, stiffness=np.full(joints, 10.0), damping=np.ones(joints))
-    _require(codec.encode(command) == codec.encode(command), "encode differs from call to call")
-    _require(codec.encode(command) != codec.encode(damping_command(joints)), "damping is no command")
+    _require(codec.encode(command) == codec.encode(command), "encode: repeatable")
+    _require(
+        codec.encode(command) != codec.encode(damping_command(joints)), "encode: commands differ"
+    )
     for wrong in (np.nan, np.inf):
         try:
             codec.encode(Command(position=pose + wrong, stiffness=pose * 0, damping=pose * 0))
         except HardwareError:
             continue
         _require(False, f"encode: a position of {wrong} is refused")
-    _require(codec.state_rate_hz > 0.0, "state_rate_hz is not positive")
+    _require(codec.state_rate_hz > 0.0, "state_rate_hz > 0")
     if transport is not None:
         wire = transport()
         try:
-            _require(wire.local, "without an interface something may leave this computer")
-            _require(isinstance(wire.receive(0.0), list), "receive does not return a list")
+            _require(wire.local, "transport: local without an interface")
+            _require(isinstance(wire.receive(0.0), list), "transport: receive returns a list")
         finally:
             wire.close()
 

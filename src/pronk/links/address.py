@@ -148,6 +148,9 @@ class Address:
 def _options_of(link: Callable[..., Machine]) -> dict[str, Any]:
     """A link's own keyword arguments and their types."""
     function = link.__init__ if inspect.isclass(link) else link
-    names = [n for n in inspect.signature(link).parameters if n not in _COMMON]
     hints = get_type_hints(function)
-    return {name: hints.get(name, str | NoneType) for name in names}
+    return {
+        name: hints.get(name, str | NoneType)
+        for name, parameter in inspect.signature(link).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY and name not in _COMMON
+    }
