@@ -1,51 +1,31 @@
-"""`pronk demo`: the whole way, on the virtual robot, on one CPU."""
+"""`pronk demo`: sweep, match, predict and jump on the virtual robot, on one CPU."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pronk.cli import console, demo_trial
+import pronk
+from pronk.cli import console
 from pronk.cli.sweep import AMPLITUDES, make
 from pronk.cli.sweep_virtual import record_virtual
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
+    from pronk.evaluation.result import Trial
     from pronk.match.prediction import JointPrediction
     from pronk.match.result import MatchResult
     from pronk.robots.robot import Robot
 
 ROBOT = "mini_cheetah"
-
-
-class Clock:
-    """How long each part of the demo takes, and what is done beside them meanwhile."""
-
-    def __init__(self) -> None:
-        """Start."""
-        self.seconds: dict[str, float] = {}
-        self.beside: dict[str, float] = {}
-        self._begun = self._lap = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        """A part is done."""
-        now = time.perf_counter()
-        self.seconds[name], self._lap = now - self._lap, now
-
-    @property
-    def total(self) -> float:
-        """Since the start [s]."""
-        return time.perf_counter() - self._begun
-
-    def words(self) -> str:
-        """All of it, as one line."""
-        parts, beside = (
-            ", ".join(f"{name} {value:.0f} s" for name, value in each.items())
-            for each in (self.seconds, self.beside)
-        )
-        return f"{self.total:.0f} s in all: {parts}" + (f"; meanwhile: {beside}" if beside else "")
+FILMED = "forward 2"
+"""The command of which one jump is filmed."""
 
 
 def demo(
@@ -57,122 +37,143 @@ def demo(
     quick: bool = False,
     json_file: console.JsonFile = None,
 ) -> None:
-    """Ask and match all joints of the virtual robot, let trained policies jump on it, report.
+    """Sweep and match all joints of the virtual robot, let trained policies jump on it, report.
 
     Args:
         out: Folder for everything.
         policies: Folder of policies to try; those that come with pronk if left out.
         jumps: Jumps with each of the paper's commands.
-        repeats: Times the matched amplitude is asked.
+        repeats: Repeats of the matched amplitude.
         seed: Of the virtual robot's noise.
         quick: Search the linearized model instead of the grid.
         json_file: Also write the figures to this file.
-    """
-    if jumps < 1:
-        raise PronkError(f"--jumps {jumps}; expected 1 or more.")
-    console.say(
-        "Everything below is about pronk's virtual robot, a simulated stand-in for the Mini "
-        "Cheetah whose true parameters the match cannot see."
-    )
-    clock = Clock()
-    with console.progress() as report:
-        found = run(
-            out,
-            policies,
-            jumps=jumps,
-            repeats=repeats,
-            seed=seed,
-            quick=quick,
-            report=report,
-            clock=clock,
-        )
-    summary(found["result"], found["replays"])
-    if found["trial"] is not None:
-        demo_trial.summary(found["trial"])
-    console.say(
-        "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`; the policies "
-        "were trained before."
-    )
-    console.say(clock.words())
-    wrote = [out / "logs", out / "gains.yaml", out / "match.npz", found["hero"], *found["videos"]]
-    console.wrote(*wrote, found["page"])
-    console.write_json(
-        json_file,
-        figures_of(found)
-        | {
-            "seconds_total": clock.total,
-            "seconds": clock.seconds,
-            "seconds_meanwhile": clock.beside,
-        },
-    )
-    console.following(
-        f"open {found['page']} in a browser",
-        f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
-        *(f"pronk trial {path} --out out/trial" for path in found["policies"][:1]),
-        f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS",
-    )
-
-
-def run(
-    out: Path,
-    policies: Path | None = None,
-    *,
-    jumps: int,
-    repeats: int,
-    seed: int,
-    quick: bool,
-    report: console.Reporter,
-    clock: Clock,
-) -> dict[str, Any]:
-    """The whole way; returns the match, the replays, the trial and the paths.
-
-    Args:
-        out: Folder; `logs`, `fresh` and `trial` are made in it.
-        policies: Folder of policies; those that come with pronk if None.
-        jumps: With each command.
-        repeats: Times the matched amplitude is asked; the smaller one, which only checks whether
-            the gains hold there too, is asked once.
-        seed: Of the virtual robot's noise.
-        quick: Search the linearized model.
-        report: Told the stage and the share done.
-        clock: Told when a part is done.
     """
     from pronk.report import figures, style
     from pronk.report.whole import write_report
     from pronk.robots import load_robot
 
+    if jumps < 1:
+        raise PronkError(f"--jumps {jumps}; expected 1 or more.")
+    console.say(
+        "All results below are of pronk's virtual robot, a simulated stand-in for the Mini "
+        "Cheetah whose parameters the match cannot read."
+    )
+    begun = time.perf_counter()
     robot = load_robot(ROBOT)
-    tried, lack = demo_trial.find(policies, robot)
-    if lack:
-        console.warn(lack)
-    # The jumps need nothing of the match: they fill the cores that it leaves idle.
-    with demo_trial.beside(
-        tried, out / demo_trial.FOLDER, robot=robot, jumps=jumps, seed=seed, report=report
-    ) as jumped:
-        found = ask_and_match(
-            robot, out, repeats=repeats, seed=seed, quick=quick, report=report, clock=clock
+    tried = find_policies(policies, robot)
+    trial: Trial | None = None
+    films: tuple[Path, ...] = ()
+    # The jumps need nothing of the match; their process uses the cores that it leaves idle.
+    with (
+        console.progress() as report,
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
+    ):
+        jumping = pool.submit(jump_and_film, tried, out / "trial", jumps=jumps, seed=seed)
+        result, replays = sweep_and_match(
+            robot, out, repeats=repeats, seed=seed, quick=quick, report=report
         )
-        came = jumped()
-    clock.lap("wait for the jumps")
-    clock.beside |= came.seconds
-    found |= {"policies": tried, "trial": came.trial, "videos": came.videos}
-    found["hero"] = style.save(figures.hero(found["result"]), out / "hero.svg")
-    found["page"], _ = write_report(out, report)
-    clock.lap("page")
+        report("jumps and film", 0.0)
+        if tried:
+            trial, films = jumping.result()
+        report("jumps and film", 1.0)
+        hero = style.save(figures.hero(result), out / "hero.svg")
+        page, _ = write_report(out, report)
+    seconds = time.perf_counter() - begun
+    show_match(result, replays)
+    if trial is not None:
+        show_trial(trial)
+    console.say(
+        "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`. The policies "
+        f"come with pronk. {seconds:.0f} s in all."
+    )
+    console.wrote(out / "logs", out / "gains.yaml", out / "match.npz", hero, *films, page)
+    console.write_json(
+        json_file, figures_of(result, replays, trial) | {"page": page, "seconds_total": seconds}
+    )
+    console.following(
+        f"open {page} in a browser",
+        f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
+        *(f"pronk trial {path} --out out/trial" for path in tried[:1]),
+        f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS",
+    )
+
+
+def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
+    """Return the policies to try, the matched one first; a warning says why there are none.
+
+    Args:
+        folder: Searched with its folders; the policies of pronk's source if None.
+        robot: The robot that they must fit.
+
+    Raises:
+        PronkError: A given folder has none, or one of them cannot be used.
+    """
+    from pronk.evaluation.subjects import load_subjects
+
+    place = folder or Path(pronk.__file__).parents[2] / "policies"
+    found = [*place.glob("policy.onnx"), *place.glob("*/policy.onnx")]
+    found.sort(key=lambda path: (path.parent.name != "matched", path.parent.name))
+    if folder is not None and not found:
+        raise PronkError(
+            f"--policies {folder}: no policy.onnx in it or in a folder in it; give one that "
+            "`pronk train` wrote to, or leave the option out."
+        )
+    if not found:
+        console.warn(f"no jumps: there are no policies in {place}; --policies DIR names others.")
+    elif folder is None and importlib.util.find_spec("onnxruntime") is None:
+        console.warn("no jumps: onnxruntime is missing; `pip install 'pronk[policy]'`.")
+        return []
+    if found:
+        load_subjects(found, robot)
     return found
 
 
-def ask_and_match(
-    robot: Robot,
-    out: Path,
-    *,
-    repeats: int,
-    seed: int,
-    quick: bool,
-    report: console.Reporter,
-    clock: Clock,
-) -> dict[str, Any]:
-    """Sweep all joints, match them, and predict a sweep that was not matched; as `run`."""
+def jump_and_film(
+    policies: Sequence[Path], out: Path, *, jumps: int, seed: int
+) -> tuple[Trial | None, tuple[Path, ...]]:
+    """Run a short trial on the shipped virtual robot and film one jump of the first policy.
+
+    Args:
+        policies: From `find_policies`.
+        out: Folder of the trial; an existing trial is replaced.
+        jumps: With each of the paper's commands.
+        seed: Of starts and noise.
+
+    Returns:
+        The trial, None without policies, and the files of the film.
+    """
+    from dataclasses import replace
+
+    from pronk.cli.trial import painted
+    from pronk.evaluation.processes import cores
+    from pronk.evaluation.run import Plan, run
+    from pronk.files import sha256
+    from pronk.robots import load_robot
+    from pronk.virtual.sim_params import SHIPPED, load_sim_params
+
+    if not policies:
+        return None, ()
+    trial = run(
+        policies,
+        Plan(jumps=jumps, seed=seed),
+        robot=load_robot(ROBOT),
+        sim_params=load_sim_params(SHIPPED),
+        out=out,
+        about={"file": "shipped with pronk", "sha256": sha256(SHIPPED)},
+        overwrite=True,
+        processes=cores(),
+    )
+    first = replace(trial, subjects=trial.subjects[:1])
+    return trial, painted(first, out, report=None, at_once=1, cases=(FILMED,), slow=2.0)
+
+
+def sweep_and_match(
+    robot: Robot, out: Path, *, repeats: int, seed: int, quick: bool, report: console.Reporter
+) -> tuple[MatchResult, list[JointPrediction]]:
+    """Sweep all joints, match them, and predict a sweep that was not matched.
+
+    The smaller amplitude only shows whether the gains hold there too; it has one repeat.
+    """
     from pronk.logs.readers import read_logs
     from pronk.match import gains as gains_file
     from pronk.match import prediction as prediction_file
@@ -182,50 +183,41 @@ def ask_and_match(
     from pronk.match.settings import MatchSettings
     from pronk.response import save as save_responses
 
-    report("plan", 0.0)
-    plan = make(robot, None, "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])))
-    plan.check()
-    report("plan", 0.5)
-    fresh_plan = make(robot, None, "log-chirp", AMPLITUDES[:1], 1)
-    fresh_plan.check()
-    report("plan", 1.0)
-    clock.lap("plan")
-    paths = record_virtual(
-        robot, plan, out / "logs", seed=seed, overwrite=True, progress=report.bar("ask")
-    )
-    fresh = record_virtual(
-        robot,
-        fresh_plan,
-        out / "fresh",
-        seed=seed + 1,
-        overwrite=True,
-        progress=report.bar("ask something else"),
-    )
-    clock.lap("sweep")
+    def record(folder: str, signal: Any, amplitudes: Any, counts: Any, seed: int) -> list[Path]:
+        plan = make(robot, None, signal, amplitudes, counts)
+        plan.check()
+        return record_virtual(
+            robot,
+            plan,
+            out / folder,
+            seed=seed,
+            overwrite=True,
+            progress=report.bar(f"sweep ({folder})"),
+        )
+
+    paths = record("logs", "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])), seed)
+    fresh = record("fresh", "log-chirp", AMPLITUDES[:1], 1, seed + 1)
     logs = read_logs(paths, processes=os.cpu_count() or 1, robot=robot)
-    clock.lap("read")
     settings = MatchSettings(method="quick" if quick else "grid")
     result = match_logs(logs, robot, settings=settings, progress=report)
     gains_file.save(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():
         save_responses(out / "logs" / f"{name}.response.npz", joint.responses)
-    clock.lap("match")
-    replays: list[JointPrediction] = []
-    told = report.bar("predict")
-    for i, log in enumerate(read_logs(fresh, robot=robot)):
-        replays += predict(log, robot, result.gains).joints
-        told((i + 1) / len(fresh))
+    replays = [
+        one
+        for log in read_logs(fresh, robot=robot)
+        for one in predict(log, robot, result.gains).joints
+    ]
     prediction_file.save(
         out / "fresh.prediction.npz",
         prediction_file.Prediction(joints=tuple(replays), source="fresh", virtual=True),
     )
-    clock.lap("predict")
-    return {"result": result, "replays": replays}
+    return result, replays
 
 
-def summary(result: MatchResult, replays: list[JointPrediction]) -> None:
-    """Print matched gains beside the paper's, and what became of the errors."""
+def show_match(result: MatchResult, replays: list[JointPrediction]) -> None:
+    """Print matched gains beside the paper's, and the errors with nominal and matched gains."""
     from pronk.report.paper import published
 
     paper = published(ROBOT)
@@ -237,9 +229,9 @@ def summary(result: MatchResult, replays: list[JointPrediction]) -> None:
         "matched",
         "Table I",
         "grid cells apart",
-        "gain error naive [dB]",
+        "gain error nominal [dB]",
         "matched [dB]",
-        "unseen RMSE naive [rad]",
+        "fresh RMSE nominal [rad]",
         "matched [rad]",
         "no rotor inertia [dB]",
     )
@@ -250,8 +242,8 @@ def summary(result: MatchResult, replays: list[JointPrediction]) -> None:
             made,
             name,
             f"{gains.stiffness:.2f} / {gains.damping:.3f}",
-            f"{paper.joints[name][0]:g} / {paper.joints[name][1]:g}",
-            f"{cells[0]:.1f} / {cells[1]:.1f}",
+            "{:g} / {:g}".format(*paper.joints[name]),
+            "{:.1f} / {:.1f}".format(*cells),
             console.number(gains.naive_error_db),
             console.number(gains.error_db),
             console.number(one.rmse_naive, 4),
@@ -261,35 +253,47 @@ def summary(result: MatchResult, replays: list[JointPrediction]) -> None:
     console.show(made)
 
 
+def show_trial(trial: Trial) -> None:
+    """Print heights, distances and landings."""
+    from pronk.cli.trial import show
+    from pronk.evaluation.outcome import tables
+
+    for figure in ("height", "distance"):
+        show(tables.table_iii(trial, figure))
+    for subject in trial.subjects:
+        cells = [cell for cell in trial.cells if cell.policy == subject.name]
+        console.say(
+            f"{subject.name} policy on the virtual robot: {sum(cell.succeeded for cell in cells)} "
+            f"of {sum(cell.n for cell in cells)} jumps landed, {cells[0].n} with each command; "
+            "`pronk trial` does 20."
+        )
+
+
 def cells_apart(result: MatchResult, name: str, pair: tuple[float, float]) -> tuple[float, float]:
     """Distance from the matched gains to another pair, in cells of the grid."""
     joint = result.joints[name]
-    cell = (
-        joint.grid_stiffness[1] - joint.grid_stiffness[0],
-        joint.grid_damping[1] - joint.grid_damping[0],
-    )
+    stiffness, damping = (grid[1] - grid[0] for grid in (joint.grid_stiffness, joint.grid_damping))
     return (
-        float(abs(joint.stiffness - pair[0]) / cell[0]),
-        float(abs(joint.damping - pair[1]) / cell[1]),
+        float(abs(joint.stiffness - pair[0]) / stiffness),
+        float(abs(joint.damping - pair[1]) / damping),
     )
 
 
-def figures_of(found: dict[str, Any]) -> dict[str, Any]:
-    """What `--json` gives of the demo."""
+def figures_of(
+    result: MatchResult, replays: list[JointPrediction], trial: Trial | None
+) -> dict[str, Any]:
+    """Collect the figures for `--json`."""
     from pronk.cli.match import figures_of as match_figures
     from pronk.cli.predict import row_of
     from pronk.cli.trial import figures as trial_figures
     from pronk.report.paper import published
 
-    result: MatchResult = found["result"]
     paper = published(ROBOT)
     assert paper is not None
     return match_figures(result) | {
         "cells_from_table_1": {
             name: cells_apart(result, name, paper.joints[name]) for name in result.joints
         },
-        "predictions": [row_of(one) for one in found["replays"]],
-        "trial": trial_figures(found["trial"]) if found["trial"] is not None else None,
-        "videos": found["videos"],
-        "page": found["page"],
+        "predictions": [row_of(one) for one in replays],
+        "trial": trial_figures(trial) if trial is not None else None,
     }

@@ -143,7 +143,7 @@ def painted(
     found: Trial,
     out: Path,
     *,
-    report: console.Reporter,
+    report: console.Reporter | None,
     at_once: int,
     cases: Sequence[str] | None = None,
     slow: float | None = None,
@@ -172,7 +172,7 @@ def painted(
         cases=cases,
         slow=slow or SLOW,
         at_once=at_once,
-        progress=report.bar("painting videos"),
+        progress=report.bar("painting videos") if report else lambda _: None,
     )
 
 
