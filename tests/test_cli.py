@@ -207,8 +207,8 @@ def test_wrong_robot_joint_and_file_names_list_what_there_is(capsys, tmp_path):
 def test_a_sweep_by_wire_is_refused_with_the_way_out(capsys, tmp_path):
     asked = ("sweep", "mini_cheetah", "--out", tmp_path / "x")
     assert "has no port" in refused(capsys, *asked, "--port", "7801")
-    assert "give a domain" in refused(capsys, *asked, "--link", "dds", "--port", "7801")
-    assert "give a port" in refused(capsys, *asked, "--link", "lcm", "--domain", "3")
+    assert "no port" in refused(capsys, *asked, "--link", "dds", "--port", "7801")
+    assert "no domain" in refused(capsys, *asked, "--link", "lcm", "--domain", "3")
     assert "pronk simulate" in refused(capsys, *asked, "--link", "lcm", "--sim-params", "t.yaml")
     assert not (tmp_path / "x").exists()
 

@@ -26,7 +26,7 @@ from pronk.links.dds.service import SWITCHER, Client
 from pronk.links.machine import Command
 from pronk.links.state_checks import Freshness
 from pronk.robots import load_robot
-from pronk.virtual.dds_server import DdsWire
+from pronk.virtual.dds_server import DdsServerTransport
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.server import RobotServer
 from pronk.virtual.sim_params import load_sim_params
@@ -52,7 +52,7 @@ def live(network: DdsNetwork, end: Connection) -> None:
     """Body of the server's process, until it is told to stop; it tells what it met."""
     robot = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",))
     robot.connect()
-    wire = DdsWire(ROBOT, network, mode="normal")
+    wire = DdsServerTransport(ROBOT, network, mode="normal")
     server = RobotServer(robot, wire, hold=HOLD)
     end.send("ready")
     server.run(end.poll)
@@ -183,7 +183,7 @@ def test_nobody_there() -> None:
 
 def test_the_mode_switcher_and_the_bench_answer_like_unitrees_services() -> None:
     network = own_network(1)
-    wire = DdsWire(ROBOT, network, mode="mcf")
+    wire = DdsServerTransport(ROBOT, network, mode="mcf")
     client = Client(Participant(network), SWITCHER)
     assert asked(wire, client, 1001, {}) == {"form": "0", "name": "mcf"}
     assert asked(wire, client, 1003, {}) == {}
@@ -206,7 +206,7 @@ def test_the_mode_switcher_and_the_bench_answer_like_unitrees_services() -> None
     assert wire.clamps == ("FR_knee", "FL_knee")
 
 
-def asked(wire: DdsWire, client: Client, api_id: int, parameter: Any) -> Any:
+def asked(wire: DdsServerTransport, client: Client, api_id: int, parameter: Any) -> Any:
     """Ask while the wire is polled, as the server does, from this very thread."""
     polling = True
 
@@ -225,19 +225,19 @@ def asked(wire: DdsWire, client: Client, api_id: int, parameter: Any) -> Any:
 
 
 def test_a_wire_hears_its_rival_and_refuses_what_is_spoiled() -> None:
-    wire = DdsWire(ROBOT, own_network(1))
+    wire = DdsServerTransport(ROBOT, own_network(1))
     wire.contend(turned(0.1))
     met: list[Command] = []
     assert eventually(lambda: bool(met.extend(wire.poll()) or met))
     np.testing.assert_allclose(met[0].position, turned(0.1).position, atol=1e-6)
-    wire.spoil_in = lambda data: data[:-1] + bytes([data[-1] ^ 1])
+    wire.corrupt_in = lambda data: data[:-1] + bytes([data[-1] ^ 1])
     wire.contend(turned(0.1))
     assert eventually(lambda: not wire.poll() and wire.counts["refused: checksum"] == 1)
 
 
 def test_a_hundred_thousand_mutated_commands_move_nothing() -> None:
     """Refused and counted, or the same command: the bytes between the numbers carry nothing."""
-    wire = DdsWire(ROBOT, own_network(1))
+    wire = DdsServerTransport(ROBOT, own_network(1))
     data = encode_command(JOINTS, turned(0.3))
     honest = wire.receive(data)
     assert honest is not None
@@ -257,7 +257,7 @@ def test_a_hundred_thousand_mutated_commands_move_nothing() -> None:
 def test_two_robots_on_one_domain_are_refused() -> None:
     """Both wires speak; no physics is needed to say the same twice over."""
     network = own_network(1)
-    wires = [DdsWire(ROBOT, network) for _ in range(2)]
+    wires = [DdsServerTransport(ROBOT, network) for _ in range(2)]
     robots = [VirtualRobot(ROBOT, load_sim_params(), legs=("FR",), seed=k) for k in range(2)]
     said = []
     for robot in robots:
@@ -314,7 +314,7 @@ def test_an_interface_that_is_not_there_is_one_sentence() -> None:
 
 def test_a_virtual_robot_stays_on_loopback() -> None:
     with pytest.raises(HardwareError, match="a virtual robot does not go to DDS domain 0 on eth0"):
-        DdsWire(ROBOT, DdsNetwork(interface="eth0"))
+        DdsServerTransport(ROBOT, DdsNetwork(interface="eth0"))
     with pytest.raises(HardwareError, match="mode 'dance'; expected one of normal, ai"):
-        DdsWire(ROBOT, own_network(1), mode="dance")
+        DdsServerTransport(ROBOT, own_network(1), mode="dance")
     assert STATES == "rt/lowstate"

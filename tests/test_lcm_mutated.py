@@ -99,12 +99,12 @@ def undisturbed() -> list[State]:
 def test_a_hundred_thousand_broken_messages_move_nothing(
     layout: Layout, undisturbed: list[State]
 ) -> None:
-    from pronk.virtual.lcm_server import LcmWire
+    from pronk.virtual.lcm_server import LcmServerTransport
 
     machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
     machine.connect()
     states = [machine.latest()]
-    wire = LcmWire(ROBOT, layout, "memq://")
+    wire = LcmServerTransport(ROBOT, layout, "memq://")
     server = RobotServer(machine, wire, hold=hold_of(ROBOT))
     broken = Breaker(layout, seed=2)
     # On the channels of requests, too, none of these may do anything.
@@ -134,11 +134,11 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
 def test_the_same_server_does_move_when_it_is_told_to(
     layout: Layout, undisturbed: list[State]
 ) -> None:
-    from pronk.virtual.lcm_server import LcmWire
+    from pronk.virtual.lcm_server import LcmServerTransport
 
     machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
     machine.connect()
-    wire = LcmWire(ROBOT, layout, "memq://")
+    wire = LcmServerTransport(ROBOT, layout, "memq://")
     server = RobotServer(machine, wire, hold=hold_of(ROBOT))
     wire.receive(layout.command_channel, good_command(layout))
     for step in range(STEPS):

@@ -17,7 +17,7 @@ from pronk.robots import load_robot
 from pronk.virtual.capture import load
 from pronk.virtual.faults import Faults, parse_faults
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.server import TICK_S, RobotServer, Silence, Spoil, hold_of
+from pronk.virtual.server import TICK_S, Corrupt, RobotServer, Watchdog, hold_of
 from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
@@ -32,8 +32,8 @@ class Desk:
         self.counts: Counter[str] = Counter()
         self.mode = ""
         self.clamps: tuple[str, ...] = ()
-        self.spoil_in: Spoil = bytes
-        self.spoil_out: Spoil = bytes
+        self.corrupt_in: Corrupt = bytes
+        self.corrupt_out: Corrupt = bytes
         self.inbox: list[Command] = []
         self.heard: list[State] = []
 
@@ -52,13 +52,13 @@ class Desk:
 
 
 def made(
-    faults: str = "", silence: Silence | None = None, legs: tuple[str, ...] = ("FR",)
+    faults: str = "", watchdog: Watchdog | None = None, legs: tuple[str, ...] = ("FR",)
 ) -> tuple[RobotServer, Desk, VirtualRobot]:
     machine = VirtualRobot(ROBOT, load_sim_params(None), seed=3, legs=legs)
     machine.connect()
     desk = Desk()
     server = RobotServer(
-        machine, desk, hold=HOLD, faults=parse_faults(faults), silence=silence, seed=1
+        machine, desk, hold=HOLD, faults=parse_faults(faults), watchdog=watchdog, seed=1
     )  # fmt: skip
     return server, desk, machine
 
@@ -93,7 +93,7 @@ def test_a_command_moves_the_machine() -> None:
 
 @pytest.mark.parametrize("action", ["hold", "zero", "damp"])
 def test_what_the_drives_do_when_commands_stop(action: str) -> None:
-    server, desk, _ = made(silence=Silence(action=action, after_s=0.1))  # type: ignore[arg-type]
+    server, desk, _ = made(watchdog=Watchdog(action=action, after_s=0.1))  # type: ignore[arg-type]
     live(server, 0.0, 0.5)
     # Nobody has commanded yet: the drives hold what they held.
     assert "silences" not in server.counts
@@ -116,9 +116,9 @@ def test_what_the_drives_do_when_commands_stop(action: str) -> None:
             live(server, 1.9 + 0.05 * k, 1.95 + 0.05 * k)
         assert np.abs(desk.heard[-1].position[:3] - RAISED.position[:3]).max() < 0.15
     with pytest.raises(HardwareError, match="expected hold, zero or damp"):
-        Silence(action="sleep")  # type: ignore[arg-type]
+        Watchdog(action="sleep")  # type: ignore[arg-type]
     with pytest.raises(HardwareError, match="expected a time above 0"):
-        Silence(after_s=0.0)
+        Watchdog(after_s=0.0)
 
 
 def test_a_rival_comes_when_asked_and_the_robots_own_controller_until_released() -> None:
@@ -180,11 +180,11 @@ def test_lost_commands_are_not_heard_and_lost_states_not_told() -> None:
 def test_bits_are_flipped_where_the_wire_lets_them() -> None:
     server, desk, _ = made("command.flip=1")
     live(server, 0.0, 0.01)
-    assert desk.spoil_out is bytes
+    assert desk.corrupt_out is bytes
     data = bytes(100)
-    changed = desk.spoil_in(data)
+    changed = desk.corrupt_in(data)
     assert sum(byte.bit_count() for byte in changed) == 1
-    assert desk.spoil_in(b"") == b""
+    assert desk.corrupt_in(b"") == b""
 
 
 def test_clamps_of_the_bench() -> None:

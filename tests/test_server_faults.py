@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pronk.errors import HardwareError
-from pronk.virtual.faults import Faults, Lane, LaneFaults, flip_bit, parse_faults
+from pronk.virtual.faults import ChannelFaults, FaultChannel, Faults, flip_bit, parse_faults
 
 
-def through(faults: LaneFaults, count: int = 4000, seed: int = 0, after: float = 0.0) -> tuple[
-    Lane[int], list[tuple[float, int]]
+def through(faults: ChannelFaults, count: int = 4000, seed: int = 0, after: float = 0.0) -> tuple[
+    FaultChannel[int], list[tuple[float, int]]
 ]:  # fmt: skip
     """Messages 0, 1, 2 ... put in each millisecond, and when which came out."""
-    lane: Lane[int] = Lane(faults, after=after, seed=seed)
+    lane: FaultChannel[int] = FaultChannel(faults, after=after, seed=seed)
     out = []
     for k in range(count):
         lane.put(k, k * 1e-3)
@@ -28,12 +28,12 @@ def through(faults: LaneFaults, count: int = 4000, seed: int = 0, after: float =
 
 
 def test_without_faults_everything_passes_at_once() -> None:
-    _, out = through(LaneFaults(), 100)
+    _, out = through(ChannelFaults(), 100)
     assert out == [(k * 1e-3, k) for k in range(100)]
 
 
 def test_loss() -> None:
-    lane, out = through(LaneFaults(loss=0.3))
+    lane, out = through(ChannelFaults(loss=0.3))
     assert lane.counts["lost"] == 4000 - len(out)
     # Four standard deviations of a binomial.
     assert abs(lane.counts["lost"] / 4000 - 0.3) < 4 * math.sqrt(0.21 / 4000)
@@ -41,7 +41,7 @@ def test_loss() -> None:
 
 
 def test_duplicates() -> None:
-    lane, out = through(LaneFaults(duplicate=0.1))
+    lane, out = through(ChannelFaults(duplicate=0.1))
     items = [item for _, item in out]
     assert len(items) == 4000 + lane.counts["duplicated"]
     assert 300 < lane.counts["duplicated"] < 500
@@ -49,7 +49,7 @@ def test_duplicates() -> None:
 
 
 def test_reordering_swaps_neighbours_and_loses_nothing() -> None:
-    lane, out = through(LaneFaults(reorder=0.1))
+    lane, out = through(ChannelFaults(reorder=0.1))
     items = [item for _, item in out]
     # The last message may still wait for one that never comes.
     assert set(items) >= set(range(3999))
@@ -59,12 +59,12 @@ def test_reordering_swaps_neighbours_and_loses_nothing() -> None:
 
 
 def test_delay_and_jitter() -> None:
-    _, out = through(LaneFaults(delay=5e-3))
+    _, out = through(ChannelFaults(delay=5e-3))
     late = np.array([when - item * 1e-3 for when, item in out if when < math.inf])
     # Looked at once per millisecond.
     assert late.min() >= 5e-3 - 1e-9
     assert late.max() <= 6e-3 + 1e-9
-    _, out = through(LaneFaults(delay=5e-3, jitter=4e-3))
+    _, out = through(ChannelFaults(delay=5e-3, jitter=4e-3))
     late = np.array([when - item * 1e-3 for when, item in out if when < math.inf])
     assert late.min() >= 5e-3 - 1e-9
     # The mean of what comes on top, and half a look.
@@ -73,22 +73,22 @@ def test_delay_and_jitter() -> None:
 
 
 def test_faults_begin_when_they_are_told_to() -> None:
-    lane, out = through(LaneFaults(loss=1.0), after=2.0)
+    lane, out = through(ChannelFaults(loss=1.0), after=2.0)
     assert [item for _, item in out] == list(range(2000))
     assert lane.counts["lost"] == 2000
 
 
 def test_same_seed_same_faults_and_one_more_changes_no_other() -> None:
-    one = through(LaneFaults(loss=0.3, jitter=1e-3), seed=5)[1]
-    assert one == through(LaneFaults(loss=0.3, jitter=1e-3), seed=5)[1]
-    assert one != through(LaneFaults(loss=0.3, jitter=1e-3), seed=6)[1]
+    one = through(ChannelFaults(loss=0.3, jitter=1e-3), seed=5)[1]
+    assert one == through(ChannelFaults(loss=0.3, jitter=1e-3), seed=5)[1]
+    assert one != through(ChannelFaults(loss=0.3, jitter=1e-3), seed=6)[1]
     lost = {item for _, item in one}
-    twice = through(LaneFaults(loss=0.3, jitter=1e-3, duplicate=0.5, nan=0.5), seed=5)[1]
+    twice = through(ChannelFaults(loss=0.3, jitter=1e-3, duplicate=0.5, nan=0.5), seed=5)[1]
     assert {item for _, item in twice} == lost
 
 
 def test_spoiling_strikes_as_often_as_asked() -> None:
-    lane: Lane[int] = Lane(LaneFaults(flip=0.25), after=1.0, seed=0)
+    lane: FaultChannel[int] = FaultChannel(ChannelFaults(flip=0.25), after=1.0, seed=0)
     assert not any(lane.strikes("flip", 0.5) for _ in range(100))
     struck = sum(lane.strikes("flip", 1.5) for _ in range(4000))
     assert 890 < struck < 1110
@@ -112,8 +112,8 @@ def test_words_are_read() -> None:
         "freeze=3s:500ms,clock=5:-0.2,rival=4s,after=2"
     )
     assert got == Faults(
-        command=LaneFaults(loss=0.3, jitter=200e-6, nan=0.01),
-        state=LaneFaults(loss=0.5, delay=5e-3, nan=0.01),
+        command=ChannelFaults(loss=0.3, jitter=200e-6, nan=0.01),
+        state=ChannelFaults(loss=0.5, delay=5e-3, nan=0.01),
         freeze=(3.0, 0.5),
         clock=(5.0, -0.2),
         rival=4.0,

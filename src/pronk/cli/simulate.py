@@ -1,4 +1,4 @@
-"""`pronk simulate`: the virtual robot as a process of its own, behind real bytes."""
+"""`pronk simulate`: the virtual robot as a process, behind the messages of a real one."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.robots.robot import Robot
-    from pronk.virtual.server import RobotServer, Wire
+    from pronk.virtual.server import RobotServer, ServerTransport
 
 
 _PRIORITY = 30
-"""Of SCHED_FIFO; below that of whoever commands."""
+"""Of SCHED_FIFO; below that of the commanding process."""
 _LATE_MS = 5.0
 """Lateness of one tick in a hundred above which a virtual robot no longer moves like one [ms]."""
 
 
 WireLink = Literal["lcm", "dds"]
-"""The wire that the virtual robot speaks."""
+"""Wire of the virtual robot."""
 
 
 Silence = Literal["hold", "zero", "damp"]
@@ -50,7 +50,7 @@ def simulate(
     realtime: bool = False,
     json_file: console.JsonFile = None,
 ) -> None:
-    """Run the virtual robot in real time, behind the very bytes of a real one.
+    """Run the virtual robot in real time, behind the messages of a real one.
 
     Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
 
@@ -81,15 +81,14 @@ def simulate(
     from pronk.virtual.capture import save
     from pronk.virtual.faults import parse_faults
     from pronk.virtual.robot import VirtualRobot
-    from pronk.virtual.server import RobotServer, hold_of
-    from pronk.virtual.server import Silence as WhenSilent
+    from pronk.virtual.server import RobotServer, Watchdog, hold_of
     from pronk.virtual.sim_params import load_sim_params
 
     if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
     known = load_robot(robot)
     wrong = parse_faults(faults)
-    when_silent = WhenSilent(action=silence, after_s=silence_after)
+    watchdog = Watchdog(action=silence, after_s=silence_after)
     machine = VirtualRobot(
         known,
         load_sim_params(sim_params),
@@ -104,15 +103,15 @@ def simulate(
     wire, where = _open_wire(link, known, layout, port=port, domain=domain, mode=mode)
     try:
         machine.connect()
-        lives = RobotServer(
-            machine, wire, hold=hold_of(known), faults=wrong, silence=when_silent, seed=seed
+        server = RobotServer(
+            machine, wire, hold=hold_of(known), faults=wrong, watchdog=watchdog, seed=seed
         )
         console.say(
             f"ready: the virtual {known.name} on the {base}, seed {seed}, on {where}; "
             "Ctrl-C ends it"
         )
-        _run(lives, duration)
-        figures = lives.figures()
+        _run(server, duration)
+        figures = server.figures()
         if capture is not None:
             save(capture, machine.capture())
             console.wrote(capture)
@@ -136,37 +135,37 @@ def _open_wire(
     port: int | None,
     domain: int | None,
     mode: str,
-) -> tuple[Wire, str]:
+) -> tuple[ServerTransport, str]:
     """The robot's end of the wire, and its address in words."""
     if link == "lcm":
         from pronk.links.lcm.address import url_of
         from pronk.links.lcm.codec import layout_of
-        from pronk.virtual.lcm_server import LcmWire
+        from pronk.virtual.lcm_server import LcmServerTransport
 
         if domain is not None:
             raise HardwareError("--domain is of DDS; with --link lcm give --port.")
         url = url_of(port=port)
-        wire = LcmWire(robot, layout_of(layout), url, mode=mode)
+        wire = LcmServerTransport(robot, layout_of(layout), url, mode=mode)
         return wire, f"LCM, messages of {layout}, {url}"
     from pronk.links.dds.address import DdsNetwork
-    from pronk.virtual.dds_server import DdsWire
+    from pronk.virtual.dds_server import DdsServerTransport
 
     if port is not None:
         raise HardwareError("--port is of LCM; with --link dds give --domain.")
     network = DdsNetwork() if domain is None else DdsNetwork(domain=domain)
-    return DdsWire(robot, network, mode=mode), str(network)
+    return DdsServerTransport(robot, network, mode=mode), str(network)
 
 
-def _run(lives: RobotServer, duration: float | None) -> None:
+def _run(server: RobotServer, duration: float | None) -> None:
     """Live until Ctrl-C, a SIGTERM, or the end of the time given."""
-    asked: list[int] = []
+    signals: list[int] = []
     end = time.monotonic() + duration if duration is not None else float("inf")
     before = {
-        number: signal.signal(number, lambda got, _: asked.append(got))
+        number: signal.signal(number, lambda got, _: signals.append(got))
         for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
-        lives.run(lambda: bool(asked) or time.monotonic() >= end)
+        server.run(lambda: bool(signals) or time.monotonic() >= end)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -178,7 +177,7 @@ def _tell(figures: dict[str, Any]) -> None:
     refused = sum(count for name, count in wire.items() if name.startswith("refused"))
     late = figures["lateness_ms"]
     console.say(
-        f"the virtual robot lived {figures['duration_s']:.1f} s: {wire.get('states', 0)} states, "
+        f"the virtual robot ran {figures['duration_s']:.1f} s: {wire.get('states', 0)} states, "
         f"{wire.get('commands', 0)} commands, {refused} messages refused; ticks late by "
         f"{late['p50']:.2f} ms (median), {late['p99']:.2f} ms (p99); "
         f"{100 * figures['cpu_share']:.0f} % of one core"

@@ -1,4 +1,4 @@
-"""The robot's end of a DDS link: what a Go2 would do with bytes, and stricter.
+"""The robot's end of a DDS link, as of a Go2 and stricter.
 
 A message that is not a possible command (above all one with a wrong checksum) is refused and
 counted. Behind the bytes is a virtual robot of whatever kind `dds.codec` has a joint map for.
@@ -6,8 +6,6 @@ counted. Behind the bytes is a virtual robot of whatever kind `dds.codec` has a 
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
 from pronk.errors import HardwareError
@@ -28,8 +26,7 @@ from pronk.links.dds.service import (
 )
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import Robot
-
-Spoil = Callable[[bytes], bytes]
+from pronk.virtual.server import ServerTransport
 
 MODES = ("", "normal", "ai", "advanced", "mcf")
 """Controllers of a Go2 that can hold its joints; the first is none."""
@@ -37,8 +34,8 @@ _SERVICE_POLLS = 20
 """Looks for commands to one for requests: 10 ms at the virtual robot's rate."""
 
 
-class DdsWire:
-    """Implements `Wire` in Unitree's messages, on loopback only."""
+class DdsServerTransport(ServerTransport):
+    """The robot's end in Unitree's messages, on loopback only."""
 
     def __init__(self, robot: Robot, network: DdsNetwork, *, mode: str = "") -> None:
         """Join the domain.
@@ -57,18 +54,8 @@ class DdsWire:
                 f"a virtual robot does not go to {network}, where real ones listen; leave the "
                 "interface out."
             )
-        if mode not in MODES:
-            raise HardwareError(
-                f"mode {mode!r}; expected one of {', '.join(filter(None, MODES))}, or none for "
-                "released."
-            )
-        self.counts: Counter[str] = Counter()
-        self.mode = mode
-        self.clamps: tuple[str, ...] = ()
-        self.spoil_in: Spoil = lambda data: data
-        self.spoil_out: Spoil = lambda data: data
+        super().__init__(robot, mode, MODES)
         self._joints = joint_map(robot)
-        self._names = robot.joint_names
         own = Participant(network)
         self._commands = own.reader(COMMANDS, messages.LowCmd, raw=True)
         self._states = own.writer(STATES, messages.LowState, raw=True)
@@ -90,18 +77,18 @@ class DdsWire:
         return [command for command in met if command is not None]
 
     def receive(self, data: bytes) -> Command | None:
-        """The command that bytes ask for, whatever they are; None if none. Never raises."""
+        """Decode a command; None where it is refused. Never raises."""
         try:
-            command = decode_command(self._joints, self.spoil_in(data))
+            command = decode_command(self._joints, self.corrupt_in(data))
         except RefusedError as error:
-            self.counts[f"refused: {error.reason}"] += 1
+            self._refuse(error)
             return None
         self.counts["commands"] += 1
         return command
 
     def publish(self, state: State) -> None:
         """Put a state on the wire."""
-        write(self._states, self.spoil_out(encode_state(self._joints, state)), self.counts)
+        write(self._states, self.corrupt_out(encode_state(self._joints, state)), self.counts)
         self.counts["states"] += 1
 
     def contend(self, command: Command) -> None:
@@ -113,7 +100,7 @@ class DdsWire:
         del self._commands, self._states, self._servers, self._other
 
     def _switch(self, api_id: int, parameter: Any) -> tuple[int, Any]:
-        """The service that says and changes which controller holds the joints."""
+        """The service that reports and changes which controller holds the joints."""
         if api_id == CHECK_MODE:
             return DONE, {"form": "0", "name": self.mode}
         if api_id == RELEASE_MODE:

@@ -1,8 +1,8 @@
-"""What goes wrong on a link, on purpose and repeatably.
+"""Seeded, repeatable faults of a link.
 
-A `Lane` is one direction of a link: what is put in comes out late, twice, in another order, or
-never. Draws are seeded, one of each kind per message whether it is used or not, so that asking for
-one fault more does not change when the others strike.
+A `FaultChannel` is one direction of a link: what is put in comes out late, twice, in another order,
+or never. One number of each kind is drawn per message whether it is used or not, so that one fault
+more does not change when the others strike.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import heapq
 import math
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _JITTER_SHAPE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class LaneFaults:
+class ChannelFaults:
     """One direction. Probabilities are per message."""
 
     delay: float = 0.0
@@ -40,14 +40,10 @@ class LaneFaults:
     nan: float = 0.0
     """That one number of a state is not a number. Has no meaning for commands."""
     flip: float = 0.0
-    """That one bit of a message is another."""
+    """That one bit of a message is inverted."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible faults.
-
-        Raises:
-            HardwareError: A time is negative or not finite, or a probability not in 0 to 1.
-        """
+        """Refuse a negative or infinite time, and a probability out of 0 to 1."""
         for entry in fields(self):
             value = getattr(self, entry.name)
             if entry.name in ("delay", "jitter"):
@@ -59,12 +55,12 @@ class LaneFaults:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Everything that goes wrong with a machine behind a link. Times on the machine's clock."""
+    """Faults of a machine behind a link. Times on the machine's clock."""
 
-    command: LaneFaults = field(default_factory=LaneFaults)
-    """From whoever commands to the machine."""
-    state: LaneFaults = field(default_factory=LaneFaults)
-    """From the machine to whoever listens."""
+    command: ChannelFaults = field(default_factory=ChannelFaults)
+    """To the machine."""
+    state: ChannelFaults = field(default_factory=ChannelFaults)
+    """From the machine."""
     after: float = 0.0
     """When the faults of both directions begin [s]."""
     freeze: tuple[float, float] | None = None
@@ -77,7 +73,7 @@ class Faults:
 
 
 def parse_faults(text: str) -> Faults:
-    """Faults from words such as `loss=0.3,state.delay=5ms,freeze=3s:0.5s`.
+    """Read faults such as `loss=0.3,state.delay=5ms,freeze=3s:0.5s`.
 
     `delay`, `jitter`, `loss`, `duplicate`, `reorder`, `nan`, `flip` are of both directions unless
     `command.` or `state.` stands before them; `after=T`, `rival=T`, `freeze=T:LENGTH` and
@@ -86,30 +82,26 @@ def parse_faults(text: str) -> Faults:
     Raises:
         HardwareError: A word is unknown, or a value cannot be read or is impossible.
     """
-    lanes: dict[str, dict[str, float]] = {"command": {}, "state": {}}
-    whole: dict[str, float | tuple[float, float]] = {}
-    known = [entry.name for entry in fields(LaneFaults)]
+    channels: dict[str, dict[str, float]] = {"command": {}, "state": {}}
+    whole: dict[str, Any] = {}
+    known = [entry.name for entry in fields(ChannelFaults)]
     for word in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = word.partition("=")
-        lane, dot, bare = name.rpartition(".")
-        if bare in known and (not dot or lane in lanes):
-            for each in (lane,) if dot else tuple(lanes):
-                lanes[each][bare] = _number(word, value)
+        channel, dot, bare = name.rpartition(".")
+        if bare in known and (not dot or channel in channels):
+            for each in (channel,) if dot else tuple(channels):
+                channels[each][bare] = _number(word, value)
         elif name in ("after", "rival"):
             whole[name] = _number(word, value)
         elif name in ("freeze", "clock") and value.count(":") == 1:
-            first, second = value.split(":")
-            whole[name] = (_number(word, first), _number(word, second))
+            whole[name] = tuple(_number(word, part) for part in value.split(":"))
         else:
             raise HardwareError(
                 f"fault {word!r} is unknown; expected {', '.join(known)} (both directions, or with "
                 "command. or state. before it), after=T, rival=T, freeze=T:LENGTH, clock=T:STEP."
             )
-    return Faults(
-        command=LaneFaults(**lanes["command"]),
-        state=LaneFaults(**lanes["state"]),
-        **whole,  # type: ignore[arg-type]
-    )
+    command, state = (ChannelFaults(**channels[name]) for name in ("command", "state"))
+    return Faults(command=command, state=state, **whole)
 
 
 def _number(word: str, text: str) -> float:
@@ -127,34 +119,23 @@ def _number(word: str, text: str) -> float:
     return value
 
 
-class Lane(Generic[T]):
-    """One direction of a link and what happens to messages in it."""
+class FaultChannel(Generic[T]):
+    """One direction of a link and its faults."""
 
-    def __init__(self, faults: LaneFaults, *, after: float, seed: int) -> None:
-        """An empty lane.
-
-        Args:
-            faults: What happens.
-            after: Messages put in before this time pass untouched [s].
-            seed: Of all draws.
-        """
+    def __init__(self, faults: ChannelFaults, *, after: float, seed: int) -> None:
+        """Begin empty; messages put in before `after` [s] pass unchanged."""
         self.counts: Counter[str] = Counter()
         """How many messages met each fault."""
         self._faults = faults
         self._after = after
-        self._rng, self._spoiling = (np.random.default_rng([seed, k]) for k in range(2))
-        self._idle = faults == LaneFaults()
+        self._rng, self._corrupting = (np.random.default_rng([seed, k]) for k in range(2))
+        self._idle = faults == ChannelFaults()
         self._queue: list[tuple[float, int, T]] = []
         self._put = 0
         self._held: T | None = None
 
     def put(self, item: T, now: float) -> None:
-        """A message enters the lane.
-
-        Args:
-            item: The message.
-            now: [s]
-        """
+        """Put a message in at a time [s]."""
         if self._idle or now < self._after:
             self._push(item, now)
             return
@@ -178,24 +159,24 @@ class Lane(Generic[T]):
             self._held = None
 
     def due(self, now: float) -> list[T]:
-        """The messages that leave the lane until `now` [s], in the order they leave."""
+        """Take out the messages due until `now` [s], in order."""
         out: list[T] = []
         while self._queue and self._queue[0][0] <= now:
             out.append(heapq.heappop(self._queue)[2])
         return out
 
     def strikes(self, kind: str, now: float) -> bool:
-        """Whether a fault of this kind (`nan` or `flip`) strikes the message at hand."""
+        """Whether a fault of this kind (`nan` or `flip`) strikes the present message."""
         chance: float = getattr(self._faults, kind)
         if chance == 0.0 or now < self._after:
             return False
-        struck = bool(self._spoiling.random() < chance)
+        struck = bool(self._corrupting.random() < chance)
         self.counts[kind] += struck
         return struck
 
     def pick(self, below: int) -> int:
-        """A random number from 0 to `below` - 1: which bit, which joint."""
-        return int(self._spoiling.integers(below))
+        """Draw a number from 0 to `below` - 1: which bit, which joint."""
+        return int(self._corrupting.integers(below))
 
     def _push(self, item: T, due: float) -> None:
         heapq.heappush(self._queue, (due, self._put, item))
@@ -203,7 +184,7 @@ class Lane(Generic[T]):
 
 
 def flip_bit(data: bytes, bit: int) -> bytes:
-    """The same bytes with one bit turned over."""
+    """Copy bytes with one bit inverted."""
     changed = bytearray(data)
     changed[bit // 8] ^= 1 << bit % 8
     return bytes(changed)

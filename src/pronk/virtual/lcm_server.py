@@ -1,14 +1,11 @@
-"""The robot's end of an LCM link: what a Mini Cheetah, or the bridge on a Go1, would do with bytes.
+"""The robot's end of an LCM link, as of a Mini Cheetah or of the bridge on a Go1.
 
 Stricter than they are: a message that is not a possible command is refused and counted, where
-Cheetah-Software would hand it to the motors.
+Cheetah-Software would pass it to the motors.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-
-from pronk.errors import HardwareError
 from pronk.links.lcm.address import open_lcm
 from pronk.links.lcm.codec import (
     BEACON_CHANNEL,
@@ -26,16 +23,16 @@ from pronk.links.lcm.codec import (
 )
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import Robot
-from pronk.virtual.server import Spoil
+from pronk.virtual.server import ServerTransport
 
 _BEACON_STATES = 50
 """States between two beacons: 10 Hz."""
 _QUEUE = 1000
-"""Messages that may wait for one poll; whoever sends more cannot keep the robot from moving on."""
+"""Messages read in one poll; a sender of more cannot keep the robot from moving on."""
 
 
-class LcmWire:
-    """Implements `Wire` for a layout."""
+class LcmServerTransport(ServerTransport):
+    """The robot's end in the messages of a layout."""
 
     def __init__(self, robot: Robot, layout: Layout, url: str, *, mode: str = "") -> None:
         """Open the robot's end.
@@ -49,23 +46,13 @@ class LcmWire:
         Raises:
             HardwareError: The mode is unknown, or the address cannot be opened.
         """
-        if mode not in MODES.values():
-            raise HardwareError(
-                f"mode {mode!r}; expected one of {', '.join(filter(None, MODES.values()))}, or "
-                "none for released."
-            )
-        self.counts: Counter[str] = Counter()
-        self.mode = mode
-        self.clamps: tuple[str, ...] = ()
-        self.spoil_in: Spoil = bytes
-        self.spoil_out: Spoil = bytes
+        super().__init__(robot, mode, MODES.values())
         self._layout = layout
-        self._names = robot.joint_names
         self._lcm = open_lcm(url)
         # Another writer is another sender.
         self._other = open_lcm(url)
         self._arrived: list[Command] = []
-        self._bench_request, self._asked = 0, False
+        self._bench_request, self._requested = 0, False
         for channel in (layout.command_channel, REQUEST_CHANNEL, BENCH_CHANNEL):
             self._lcm.subscribe(channel, self.receive).set_queue_capacity(_QUEUE)
 
@@ -81,7 +68,7 @@ class LcmWire:
         """Take one message, whatever it is. Never raises."""
         try:
             if channel == self._layout.command_channel:
-                self._arrived.append(decode_command(self._layout, self.spoil_in(data)))
+                self._arrived.append(decode_command(self._layout, self.corrupt_in(data)))
                 self.counts["commands"] += 1
             elif channel == REQUEST_CHANNEL:
                 self.mode = read_mode_request(data)
@@ -89,16 +76,16 @@ class LcmWire:
                 self._lcm.publish(RESPONSE_CHANNEL, data)
             elif channel == BENCH_CHANNEL:
                 self._bench_request, self.clamps = read_clamp_message(self._names, data)
-                self._asked = True
+                self._requested = True
         except RefusedError as error:
-            self.counts[f"refused: {error.reason}"] += 1
+            self._refuse(error)
 
     def publish(self, state: State) -> None:
-        """Put a state on the wire, and now and then say that it is a virtual robot's."""
+        """Put a state on the wire, and at 10 Hz the beacon of the virtual robot."""
         for channel, data in encode_state(self._layout, state):
-            self._lcm.publish(channel, self.spoil_out(data))
-        if self._asked or self.counts["states"] % _BEACON_STATES == 0:
-            self._asked = False
+            self._lcm.publish(channel, self.corrupt_out(data))
+        if self._requested or self.counts["states"] % _BEACON_STATES == 0:
+            self._requested = False
             beacon = clamp_message(self._names, self.clamps, self._bench_request)
             self._lcm.publish(BEACON_CHANNEL, beacon)
         self.counts["states"] += 1

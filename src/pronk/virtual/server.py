@@ -1,8 +1,8 @@
-"""The virtual robot as a machine of its own: real time, real bytes, and what goes wrong with them.
+"""The virtual robot as a machine of its own: real time, a wire, and its faults.
 
-A `Wire` is the robot end of a link. `RobotServer` holds a virtual robot to the clock, passes it
-what the wire brings, and puts its states on the wire. The drives' PD runs inside physics at 4 kHz;
-nothing in here computes a torque.
+A `ServerTransport` is the robot's end of a link. `RobotServer` runs a virtual robot on the wall
+clock, passes it the commands of the wire, and puts its states on the wire. The drives' PD runs
+inside physics at 4 kHz; nothing in here computes a torque.
 """
 
 from __future__ import annotations
@@ -10,69 +10,85 @@ from __future__ import annotations
 import gc
 import math
 import time
+from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.links.machine import Command, Machine, State
+from pronk.links.machine import Command, Machine, RefusedError, State, damping_command
 from pronk.robots.robot import Robot
-from pronk.virtual.faults import Faults, Lane, flip_bit
+from pronk.virtual.faults import FaultChannel, Faults, flip_bit
 
 Array = NDArray[np.float64]
-Spoil = Callable[[bytes], bytes]
+Corrupt = Callable[[bytes], bytes]
 
 TICK_S = 0.5e-3
-"""How often the wire is asked: commands act on the machine at a multiple of this."""
+"""Period of polling the wire: commands act on the machine at a multiple of this."""
 _CONTEND_S = 0.01
 """Between two commands of the rival and of the robot's own controller."""
-HITCH_S = 0.01
-"""Lateness that is told one by one: half a step of a policy."""
 _SLIP_S = 0.1
 """Lateness beyond which the machine's clock is put back instead of catching up: a robot that was
 stopped does not live its past at once."""
-_SINK_DAMPING = 1.0
-"""Damping when the drives damp by themselves [N m s/rad], as in `VirtualRobot.damp`."""
 
 
-class Wire(Protocol):
+class ServerTransport(ABC):
     """The robot's end of a link. Everything is non-blocking and called from one thread.
 
     Whatever arrives, `poll` never raises: a message that is not a possible command is refused and
     counted under its reason.
     """
 
-    counts: Counter[str]
-    """What was met: `commands`, `states`, and one `refused: REASON` for each reason to refuse."""
-    mode: str
-    """Name of the robot's own controller that holds the drives; empty when it is released."""
-    clamps: tuple[str, ...]
-    """Joints that whoever is at the bench wants held mechanically; the virtual robot holds them."""
-    spoil_in: Spoil
-    """Applied to the bytes of every command that comes in, before anything is checked."""
-    spoil_out: Spoil
-    """Applied to the bytes of every state that goes out, after its checksum is in."""
+    def __init__(self, robot: Robot, mode: str, modes: Iterable[str]) -> None:
+        """Begin with a mode of the robot's own controller.
 
+        Raises:
+            HardwareError: There is no such mode.
+        """
+        if mode not in (modes := tuple(modes)):
+            raise HardwareError(
+                f"mode {mode!r}; expected one of {', '.join(filter(None, modes))}, or none for "
+                "released."
+            )
+        self.counts: Counter[str] = Counter()
+        """`commands`, `states`, and one `refused: REASON` for each reason to refuse."""
+        self.mode = mode
+        """Name of the robot's own controller that holds the drives; empty when it is released."""
+        self.clamps: tuple[str, ...] = ()
+        """Joints to hold mechanically, as requested over the wire."""
+        self.corrupt_in: Corrupt = bytes
+        """Applied to the bytes of every command that comes in, before anything is checked."""
+        self.corrupt_out: Corrupt = bytes
+        """Applied to the bytes of every state that goes out, after its checksum is in."""
+        self._names = robot.joint_names
+
+    @abstractmethod
     def poll(self) -> list[Command]:
         """Commands that arrived since the last poll, oldest first, in the robot's joint order."""
 
+    @abstractmethod
     def publish(self, state: State) -> None:
         """Put a state on the wire."""
 
+    @abstractmethod
     def contend(self, command: Command) -> None:
         """Put a command on the wire as another writer would; `poll` meets it like any other."""
 
+    @abstractmethod
     def close(self) -> None:
         """Leave the wire."""
 
+    def _refuse(self, error: RefusedError) -> None:
+        self.counts[f"refused: {error.reason}"] += 1
+
 
 @dataclass(frozen=True, kw_only=True)
-class Silence:
+class Watchdog:
     """What the drives do when commands stop."""
 
     action: Literal["hold", "zero", "damp"] = "hold"
@@ -82,11 +98,7 @@ class Silence:
     """Time without a command after which they do it [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse what no drive can do.
-
-        Raises:
-            HardwareError: The action is unknown, or the time not positive.
-        """
+        """Refuse an unknown action, and a time that is not positive."""
         if self.action not in ("hold", "zero", "damp"):
             raise HardwareError(f"silence {self.action!r}; expected hold, zero or damp.")
         if not self.after_s > 0.0:
@@ -94,7 +106,7 @@ class Silence:
 
 
 def hold_of(robot: Robot) -> Command:
-    """The default pose at the drives' own gains: what someone else at the wire would command."""
+    """The default pose at the drives' own gains."""
     return Command(
         position=np.array([joint.default_position for joint in robot.joints]),
         stiffness=np.array([joint.stiffness for joint in robot.joints]),
@@ -108,11 +120,11 @@ class RobotServer:
     def __init__(
         self,
         machine: Machine,
-        wire: Wire,
+        wire: ServerTransport,
         *,
         hold: Command,
         faults: Faults | None = None,
-        silence: Silence | None = None,
+        watchdog: Watchdog | None = None,
         seed: int = 0,
     ) -> None:
         """Put a machine behind a wire.
@@ -122,51 +134,50 @@ class RobotServer:
             wire: The robot's end of the link.
             hold: What a rival, and the robot's own controller, command.
             faults: What goes wrong; nothing if None.
-            silence: What the drives do when commands stop.
+            watchdog: What the drives do when commands stop.
             seed: Of the faults.
         """
         self.counts: Counter[str] = Counter()
-        """What the virtual robot itself met: `commands applied`, `silences`, `slips`."""
+        """Of the server: `commands applied`, `silences`, `slips`."""
         self._machine = machine
         self._wire = wire
         self._hold = hold
         self._faults = faults or Faults()
-        self._silence = silence or Silence()
+        self._watchdog = watchdog or Watchdog()
         after = self._faults.after
-        self._commands: Lane[Command] = Lane(self._faults.command, after=after, seed=2 * seed)
-        self._states: Lane[State] = Lane(self._faults.state, after=after, seed=2 * seed + 1)
+        self._commands: FaultChannel[Command] = FaultChannel(
+            self._faults.command, after=after, seed=2 * seed
+        )
+        self._states: FaultChannel[State] = FaultChannel(
+            self._faults.state, after=after, seed=2 * seed + 1
+        )
         self._now = machine.now()
-        self._heard = math.inf
+        self._last_command = math.inf
         self._contended = -math.inf
         self._clamps: tuple[str, ...] = ()
         self._frozen: State | None = None
         self._slipped = self._cpu = 0.0
-        self._zero = math.nan
-        self._hitches: list[tuple[float, float, bool]] = []
         self._late = array("f")
         # Without bit flips the bytes are not even looked at.
         if self._faults.command.flip:
-            wire.spoil_in = lambda data: self._flip(self._commands, data)
+            wire.corrupt_in = lambda data: self._flip(self._commands, data)
         if self._faults.state.flip:
-            wire.spoil_out = lambda data: self._flip(self._states, data)
+            wire.corrupt_out = lambda data: self._flip(self._states, data)
 
     def step(self, until: float) -> None:
-        """Live to `until` on the machine's clock [s]: hear, move, tell. Takes no wall time."""
+        """Advance to `until` on the machine's clock [s]. Takes no wall time."""
         self._now = until
         for command in self._wire.poll():
             self._commands.put(command, until)
         for command in self._commands.due(until):
-            self._heard = until
+            self._last_command = until
             self._machine.send(command)
             self.counts["commands applied"] += 1
-        if until - self._heard > self._silence.after_s and self._silence.action != "hold":
+        if until - self._last_command > self._watchdog.after_s and self._watchdog.action != "hold":
             self.counts["silences"] += 1
-            self._heard = math.inf
-            none = np.zeros_like(self._hold.stiffness)
-            damping = none + _SINK_DAMPING if self._silence.action == "damp" else none
-            self._machine.send(
-                Command(position=self._hold.position, stiffness=none, damping=damping)
-            )
+            self._last_command = math.inf
+            damping = 1.0 if self._watchdog.action == "damp" else 0.0
+            self._machine.send(damping_command(len(self._hold.position), damping))
         if self._wire.clamps != self._clamps:
             try:
                 self._machine.clamp(self._wire.clamps)
@@ -177,18 +188,17 @@ class RobotServer:
             self._clamps = self._wire.clamps
         self._contend(until)
         for state in self._machine.wait(until):
-            self._states.put(self._told(state), until)
+            self._states.put(self._reported(state), until)
         for state in self._states.due(until):
             self._wire.publish(state)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Live in real time until `stop()` is true, at most one tick after that."""
+        """Run in real time until `stop()` is true, at most one tick after that."""
         # What was built until now lives as long as the server; the collector need not walk it.
         gc.freeze()
         start = time.monotonic() - self._machine.now()
         worked = time.process_time()
         ticks = round(self._machine.now() / TICK_S)
-        self._zero, before = start, 0.0
         while not stop():
             ticks += 1
             late = time.monotonic() - start - ticks * TICK_S
@@ -199,21 +209,15 @@ class RobotServer:
                 self.counts["slips"] += 1
                 self._slipped += late
                 start += late
-                self._zero = start
-            if late > HITCH_S >= before:
-                self._hitches.append((time.monotonic(), late, late > _SLIP_S))
-            before = late
             self._late.append(late)
             self.step(ticks * TICK_S)
         self._cpu += time.process_time() - worked
 
     def figures(self) -> dict[str, object]:
-        """What happened: counts of server, wire and faults, and what real time cost.
+        """Counts of server, wire and faults and lateness.
 
         Lateness is from a tick's instant to its beginning [ms]; the share of the processor is of
-        one core, all threads of the process counted. `zero_s` is when the machine's clock was at
-        zero, on CLOCK_MONOTONIC; a slip moves it on by its lateness. `hitches` are the moments at
-        which ticks began to be late by more than 10 ms: when, by how much [s], whether it slipped.
+        one core, all threads of the process counted.
         """
         late = np.array(self._late or [0.0], dtype=float) * 1e3
         return {
@@ -224,8 +228,6 @@ class RobotServer:
             "command_faults": dict(self._commands.counts),
             "state_faults": dict(self._states.counts),
             "slipped_s": self._slipped,
-            "zero_s": self._zero,
-            "hitches": self._hitches,
             "cpu_share": self._cpu / max(self._now, TICK_S),
             "ticks": len(self._late),
             "lateness_ms": {
@@ -236,15 +238,15 @@ class RobotServer:
         }
 
     def _contend(self, now: float) -> None:
-        """Let the robot's own controller and the rival speak, where there are any."""
+        """Command as the robot's own controller and the rival, where there are any."""
         rival = self._faults.rival is not None and now >= self._faults.rival
         if (rival or self._wire.mode) and now - self._contended >= _CONTEND_S:
             self._contended = now
             self.counts["commands of others"] += 1
             self._wire.contend(self._hold)
 
-    def _told(self, state: State) -> State:
-        """What the machine says of a state: the parameters, unless a fault is due."""
+    def _reported(self, state: State) -> State:
+        """The state as it goes out: the measured one, unless a fault is due."""
         now, faults = self._now, self._faults
         stamp = state.time if state.robot_time is None else state.robot_time
         if faults.clock is not None and now >= faults.clock[0]:
@@ -263,6 +265,6 @@ class RobotServer:
             state = replace(state, **{name: values})
         return replace(state, robot_time=stamp)
 
-    def _flip(self, lane: Lane[Command] | Lane[State], data: bytes) -> bytes:
-        struck = bool(data) and lane.strikes("flip", self._now)
-        return flip_bit(data, lane.pick(8 * len(data))) if struck else data
+    def _flip(self, channel: FaultChannel[Command] | FaultChannel[State], data: bytes) -> bytes:
+        struck = bool(data) and channel.strikes("flip", self._now)
+        return flip_bit(data, channel.pick(8 * len(data))) if struck else data
