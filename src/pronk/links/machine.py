@@ -58,7 +58,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """What the drives are asked until the next command or until it expires."""
+    """Targets of the drives until the next command or until it expires."""
 
     position: Array
     """Target positions [rad], shape (joints,)."""
@@ -73,7 +73,7 @@ class Command:
     made: float = 0.0
     """When it was decided, on the machine's clock [s]."""
     valid_for: float = math.inf
-    """Time after `made` at which whoever writes the wire damps instead of repeating it [s]."""
+    """Time after `made` at which the writer damps instead of repeating it [s]."""
 
 
 def damping_command(joints: int, damping: float = 1.0) -> Command:

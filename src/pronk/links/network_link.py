@@ -154,7 +154,7 @@ class NetworkLink(ABC):
 
         Raises:
             RobotError: A joint is unknown.
-            HardwareError: Nobody is there to fix them, or no reply came.
+            HardwareError: There is no clamp operator, or no reply came.
         """
         for name in joints:
             self._robot.joint(name)

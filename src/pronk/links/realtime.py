@@ -1,7 +1,7 @@
 """What the operating system grants a loop, and pacing by absolute deadlines.
 
 Nothing here is needed for a loop to be right, only for it to be on time; so what is not granted is
-said in plain words and the loop runs without it.
+reported and the loop runs without it.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class Capture:
         """Refuse arrays that do not belong together.
 
         Raises:
-            ArtefactError: A shape is not the one that is said.
+            ArtefactError: A shape is wrong.
         """
         for name, rest in _SHAPES.items():
             shape = np.shape(getattr(self, name))

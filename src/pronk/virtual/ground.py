@@ -12,7 +12,7 @@ it approaches with the regularization R = A (1 - d) / d. Hence, in newtons,
     stiffness = k / (A (1 - d)),  damping = b / (A (1 - d)),  added_mass = d / (A (1 - d)),
 
 solved here for k and b at d = 1/2: the added mass is then that of the foot itself (0.17 kg), and
-the static spring is exactly the one that was asked for. Training's contact is another one: a
+the static spring is exactly `stiffness`. Training's contact is another one: a
 reference of 20 ms and an impedance of .9 and more, seen through a step of 5 ms.
 
 Two traits of MuJoCo's friction remain. A sticking foot creeps, by 1 / (impratio damping) = 0.02

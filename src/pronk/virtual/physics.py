@@ -1,7 +1,7 @@
 """A plant that runs: commands arrive, the battery sags, samples of the capture are kept.
 
 Time is counted in physics steps from the clock's zero. Steps are taken natively in blocks; Python
-looks in where a state or a sample is due, or a command is heard.
+looks in where a state or a sample is due, or a command takes effect.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Transport:
 
         Args:
             joints: How many the commands are for.
-            delay_s: From sending to being heard [s].
+            delay_s: From sending to taking effect [s].
             step_s: Physics step [s].
         """
         self._sinking = damping_command(joints)
@@ -67,11 +67,11 @@ class Transport:
 
     @property
     def soonest(self) -> float:
-        """Physics step at which the next command is heard, of those on the way; may be infinite."""
+        """Physics step at which the next command takes effect; infinite without one."""
         return min(self._under_way[0][0], self._expiry) if self._under_way else self._expiry
 
     def take(self, before: int) -> tuple[int, Command] | None:
-        """The next command that is heard before a physics step, and the step; None without one."""
+        """The next command that takes effect before a step, and when; None without one."""
         step = self._under_way[0][0] if self._under_way else before
         # At the same step the newer command wins: it is taken after the expiry.
         if self._expiry <= step and self._expiry < before:
@@ -125,15 +125,15 @@ class Physics:
         self.data.qpos[self.plant.link_qpos] = pose[self._columns]
         self.plant.set_clamps((), self.data.qpos, 0.0, 0.0)
 
-    def hear(self, command: Command) -> None:
+    def apply(self, command: Command) -> None:
         """Let the drives act on a command, through encoders that may be off."""
         columns = self._columns
         target = np.asarray(command.position, dtype=float)[columns] - self._offset
         self.data.ctrl[self.plant.actuator] = target
         gains = np.asarray([command.stiffness, command.damping], dtype=float)
-        # A policy says the same gains again with every command.
-        if (told := gains.tobytes()) != self._gains:
-            self._gains = told
+        # A policy repeats the same gains with every command.
+        if (packed := gains.tobytes()) != self._gains:
+            self._gains = packed
             self.plant.set_gains(*gains[:, columns])
 
     def run(self, steps: list[int], transport: Transport) -> Block:
@@ -146,19 +146,19 @@ class Physics:
         Raises:
             HardwareError: The numbers ran away.
         """
-        plant, data, told = self.plant, self.data, set(steps)
+        plant, data, wanted = self.plant, self.data, set(steps)
         due = [] if self.recorder is None else self.recorder.due(steps[-1])
         # Where a sample and a state are of the same step, one look does for both.
-        stops = sorted(steps + [step for step in due if step not in told])
+        stops = sorted(steps + [step for step in due if step not in wanted])
         rows, voltages = np.empty((len(stops), plant.state_size)), []
-        heard = transport.soonest
+        next_due = transport.soonest
         for stop, row in zip(stops, rows, strict=True):
-            if heard < stop:
-                heard = self._obey(stop, transport)
+            if next_due < stop:
+                next_due = self._obey(stop, transport)
             self._step_to(stop)
             plant.read(data, row)
             voltages.append(self._voltage)
-            if stop in told:
+            if stop in wanted:
                 self._sag()
         voltage = np.array(voltages)
         self._check()
@@ -166,7 +166,7 @@ class Physics:
             sampled = np.searchsorted(stops, due)
             self.recorder.keep(rows[sampled], voltage[sampled])
         if len(stops) > len(steps):
-            chosen = [stop in told for stop in stops]
+            chosen = [stop in wanted for stop in stops]
             rows, voltage = rows[chosen], voltage[chosen]
         qpos, qvel, act = plant.parts(rows)
         return Block(qpos=qpos, qvel=qvel, torque=plant.motor_torque(act), voltage=voltage)
@@ -178,14 +178,14 @@ class Physics:
         return seen(self.plant, np.array([self.step * self._dt]), row, np.array([self._voltage]))
 
     def _obey(self, before: int, transport: Transport) -> float:
-        """Step to where commands are heard before a physics step, and put them in.
+        """Step to where commands take effect before a physics step, and put them in.
 
         Returns:
-            The step at which the next one is heard.
+            The step at which the next one takes effect.
         """
-        while (heard := transport.take(before)) is not None:
-            self._step_to(heard[0])
-            self.hear(heard[1])
+        while (arrived := transport.take(before)) is not None:
+            self._step_to(arrived[0])
+            self.apply(arrived[1])
         return transport.soonest
 
     def _step_to(self, step: int) -> None:
@@ -206,7 +206,7 @@ class Physics:
         power = float(torque.dot(speed) + (current * current).dot(plant.resistance))
         share = machine.bus_resistance * power / self._voltage**2
         sagged = machine.bus_voltage / (1.0 + max(share, _LEAST_SHARE))
-        # A battery gives most at half its voltage; asked for more, it gives no more.
+        # A battery gives most at half its voltage; above that it gives no more.
         self._voltage = max(sagged, 0.5 * machine.bus_voltage)
         plant.set_bus_voltage(self._voltage)
 

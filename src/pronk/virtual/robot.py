@@ -1,9 +1,9 @@
-"""The virtual robot: a stand-in for hardware, and it says so (`virtual` is True).
+"""The virtual robot: a stand-in for hardware, marked as such (`virtual` is True).
 
 It stands on the bench or on the ground.
 
 Physics runs in blocks (`physics.py`), and each block of raw states is turned into what sensors
-would have said (`sensors.py`).
+would have measured (`sensors.py`).
 
 The physics step is 0.25 ms, and that has converged. On the bench the Bode gains of hip_roll,
 hip_pitch and knee differ by 0.004, 0.003 and 0.002 dB at most from those at 25 us (40 kHz, the rate
@@ -150,7 +150,7 @@ class VirtualRobot:
             if self._capture_rate is not None:
                 self._recorder = Recorder(plant, 1.0 / self._capture_rate)
         self._physics.recorder = self._recorder
-        self._physics.hear(
+        self._physics.apply(
             Command(
                 position=pose,
                 stiffness=np.array([joint.stiffness for joint in robot.joints]),
@@ -274,7 +274,7 @@ class VirtualRobot:
         """Advance over the next `count` ticks and return what the sensors say of them."""
         plant, first = self._plant, self._sensors.sequence
         ticks = np.arange(first, first + count) / self._rate
-        # What a state says was measured some time before its timestamp.
+        # A state was measured some time before its timestamp.
         delay = self._sim_params.machine.measurement_delay_s
         steps = np.rint((ticks - delay) / self._dt).astype(int)
         block = self._physics.run(steps.tolist(), self._transport)

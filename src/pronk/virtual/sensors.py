@@ -48,7 +48,7 @@ class StandingBody:
         """Of a plant on the bench."""
         self._stand = plant.stand
         self._still: Motion | None = None
-        """Of a rigid stand, as many instants as were last asked for."""
+        """Of a rigid stand, for as many instants as last time."""
 
     def motion(self, qpos: Array, qvel: Array) -> Motion:
         """The motion at instants, from the plant's positions (n, nq) and velocities (n, nv)."""

@@ -1,4 +1,4 @@
-"""Where DDS messages go: the loopback interface and a domain of pronk's own, unless told otherwise.
+"""DDS domains and interfaces: loopback and a domain of pronk's own by default.
 
 A Go2 listens on domain 0. Nothing here reaches a real network, or domain 0, without an interface
 that the user named.
@@ -156,7 +156,7 @@ class Participant:
             topic: Its name.
             message: Its IDL type.
             raw: Leave the samples bytes (`Message`).
-            own: Hear this participant as well.
+            own: Receive from this participant as well.
         """
         policies = [Policy.History.KeepLast(_QUEUE)]
         if not own:
@@ -164,7 +164,7 @@ class Participant:
         return DataReader(self.entity, self._topic(topic, message, raw), Qos(*policies))
 
     def writer(self, topic: str, message: Any, *, raw: bool = False) -> Any:
-        """Speak; arguments as for `reader`. Fits every reader, and waits for none of them."""
+        """Make a writer, arguments as for `reader`. Fits every reader, and waits for none."""
         waits = Policy.Reliability.Reliable(_WRITE_NS)
         return DataWriter(self.entity, self._topic(topic, message, raw), Qos(waits))
 

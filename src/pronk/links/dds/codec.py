@@ -10,7 +10,7 @@ zeros, so behind these messages (where there is only its virtual double: the rea
 and likewise for speeds and torques; gains are the same. Trunk frame and quaternion agree.
 
 A `Command` with no stiffness goes out as PosStopF, one with no damping as VelStopF, which is how
-Unitree's drives are told to leave that part out.
+makes Unitree's drives leave that part out.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def encode_command(joints: JointMap, command: Command) -> bytes:
 
 
 def idle_command() -> NDArray[Any]:
-    """A `LowCmd` record that asks nothing of any motor, shape (1,)."""
+    """A `LowCmd` record that commands nothing, shape (1,)."""
     message = np.zeros(1, dtype=record(messages.LowCmd))
     message["head"] = HEAD
     message["level_flag"] = LOW_LEVEL
@@ -129,7 +129,7 @@ def idle_command() -> NDArray[Any]:
 
 
 def decode_command(joints: JointMap, data: bytes) -> Command:
-    """The command that a `LowCmd` asks for. A position that is not controlled reads as 0.
+    """Decode a `LowCmd`. A position that is not controlled reads as 0.
 
     Raises:
         RefusedError: `header`, `length`, `checksum`, `head`, `level`, `mode`, `not finite`,
@@ -144,7 +144,7 @@ def decode_command(joints: JointMap, data: bytes) -> Command:
     on = message["motor_cmd"]["mode"][0, :_JOINTS]
     if on.max() > SERVO:
         raise RefusedError("mode", f"a motor's mode is {on.max()}, expected 1 (servo) or 0 (off).")
-    # A motor that is off hears nothing, and a part that is stopped has no gain.
+    # A motor that is off obeys nothing, and a part that is stopped has no gain.
     q, dq, tau, kp, kd = _finite("motor_cmd", _columns(message["motor_cmd"], "q", "kd")).T
     tau = tau * on
     stiffness, damping = kp * on * (q != _POS_STOP), kd * on * (dq != VEL_STOP)
@@ -157,18 +157,18 @@ def decode_command(joints: JointMap, data: bytes) -> Command:
             )
     if np.abs(position).max() > _MOST_POSITION:
         far = np.abs(position).max()
-        raise RefusedError("out of range", f"a motor is asked to turn to {far:g} rad.")
+        raise RefusedError("out of range", f"a motor is commanded to {far:g} rad.")
     if tau.any() or (damping * dq).any():
         raise RefusedError(
             "feed-forward",
-            "LowCmd asks for a speed or a torque; only positions, stiffness and damping are "
+            "LowCmd commands a speed or a torque; only positions, stiffness and damping are "
             "understood.",
         )
     return Command(position=position, stiffness=stiffness, damping=damping)
 
 
 def encode_state(joints: JointMap, state: State) -> bytes:
-    """The `LowState` of a virtual robot, which says in `sn` that it is one.
+    """The `LowState` of a virtual robot, identified by its `sn`.
 
     What the virtual robot does not know (battery cells, foot forces, remote) is zero.
     """
@@ -256,7 +256,7 @@ class LowState:
 
 
 def decode_state(joints: JointMap, data: bytes) -> LowState:
-    """What a `LowState` says.
+    """Decode a `LowState`.
 
     Raises:
         RefusedError: `header`, `length` or `checksum`.

@@ -21,7 +21,7 @@ from pronk.links.command_writer import CommandWriter
 from pronk.links.dds import messages
 from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take, write
 from pronk.links.dds.codec import encode_command, joint_map
-from pronk.links.dds.service import BENCH, CLAMP, Client, own_controller
+from pronk.links.dds.service import BENCH, CLAMP, Client, check_own_controller
 from pronk.links.dds.state_decoder import STATE_RATE_HZ, StateDecoder
 from pronk.links.machine import State, TorqueKind
 from pronk.links.network_link import ANSWER_S, NetworkLink, wait_for
@@ -41,8 +41,8 @@ class DdsMachine(NetworkLink):
 
     Pre-flight, in this order: states arrive with right checksums; none of the robot's own
     controllers holds the joints (or it lets go of them); states come at 500 Hz without gaps, from
-    one robot; gravity points where the attitude says; every joint is within its limits; nobody
-    else commands.
+    one robot; gravity agrees with the attitude; every joint is within its limits; no other
+    program commands.
     """
 
     wire = "DDS"
@@ -126,7 +126,7 @@ class DdsMachine(NetworkLink):
             raise HardwareError(
                 f"{self.robot} sent no state on {STATES} within {ANSWER_S:g} s in {self._network}"
                 + (f"; what came was refused: {why}" if (why := self._decoder.last_error) else "")
-                + "; check that the robot or its double runs, the domain and the interface."
+                + "; check that the robot or the virtual one runs, the domain and the interface."
             )
         self.virtual = self._decoder.virtual
         if self._joints.virtual_only and not self.virtual:
@@ -135,7 +135,7 @@ class DdsMachine(NetworkLink):
                 f"{self.robot} speaks Unitree's messages; name the robot that it is."
             )
         self._bench = Client(self._participant, BENCH)
-        own_controller(self._participant, release=self._release, timeout_s=ANSWER_S)
+        check_own_controller(self._participant, release=self._release, timeout_s=ANSWER_S)
         silent_from = time.monotonic()
         self.counts["foreign"] = 0
         self._check_states(begun)
@@ -170,7 +170,7 @@ class DdsMachine(NetworkLink):
             self._foreign()
         messages = take(self._states_in, self.counts)
         for message in messages:
-            # Those that waited together are told apart by when they were sent.
+            # Those that waited together are distinguished by when they were sent.
             before = (
                 messages[-1].sample_info.source_timestamp - message.sample_info.source_timestamp
             )

@@ -289,7 +289,7 @@ def unpack(message: Any, data: bytes) -> NDArray[Any]:
         raise RefusedError("length", f"{name} has {len(data)} bytes, expected {size}.")
     payload = np.frombuffer(data[len(HEADER) :] + b"\x00", dtype=np.uint8)
     image = payload.take(to_image).tobytes()
-    said, right = int.from_bytes(image[-4:], "little"), checksum(image)
-    if said != right:
-        raise RefusedError("checksum", f"{name}.crc is {said:#010x}, expected {right:#010x}.")
+    found, right = int.from_bytes(image[-4:], "little"), checksum(image)
+    if found != right:
+        raise RefusedError("checksum", f"{name}.crc is {found:#010x}, expected {right:#010x}.")
     return np.frombuffer(image, dtype=record(message))

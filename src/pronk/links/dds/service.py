@@ -1,8 +1,8 @@
-"""Unitree's services: a question and its answer on two topics, in JSON.
+"""Unitree's services: a request and its response on two topics, in JSON.
 
 A request carries an id of its own and the number of a function (`api_id`); the response carries
-both again, and a code, 0 for done. `motion_switcher` (1001 CheckMode, 1003 ReleaseMode) says which
-of the robot's own controllers holds the joints, and makes it let go. Older firmware has
+both again, and a code, 0 for done. `motion_switcher` (1001 CheckMode, 1003 ReleaseMode) reports
+which of the robot's own controllers holds the joints, and releases it. Older firmware has
 `robot_state` (1001 ServiceSwitch) instead.
 """
 
@@ -21,41 +21,38 @@ from pronk.links.dds.address import Participant, take
 SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
 STATES, SERVICE_SWITCH = "robot_state", 1001
 BENCH, CLAMP = "pronk_bench", 1
-"""Of the virtual robot alone: whoever is at its bench asks for clamps."""
+"""Of the virtual robot alone: requests for clamps."""
 
 DONE, UNKNOWN_API, BAD_PARAMETER = 0, 3203, 3204
-"""Codes of a response; the errors are unitree_sdk2's for a function that there is not, and for a
-parameter that cannot be."""
+"""Codes of a response; the errors are unitree_sdk2's for an unknown function and for an impossible
+parameter."""
 
 _POLL_S = 0.002
 _RELEASE_TRIES, _RELEASE_PAUSE_S = 10, 0.2
 
-Answer = Callable[[int, Any], tuple[int, Any]]
-"""From a function's number and its parameter to the code and what is answered."""
+Handler = Callable[[int, Any], tuple[int, Any]]
+"""From a function's number and its parameter to the code and the data of the response."""
 
 
 class Client:
-    """Who asks a service."""
+    """Calls a service."""
 
     def __init__(self, participant: Participant, service: str) -> None:
-        """Prepare to ask; nothing is sent."""
+        """Prepare; nothing is sent."""
         self._service = service
         self._requests = participant.writer(f"rt/api/{service}/request", messages.Request)
         self._responses = participant.reader(f"rt/api/{service}/response", messages.Response)
 
     def call(self, api_id: int, parameter: Any, *, timeout_s: float = 2.0) -> Any | None:
-        """Ask, and ask again while there is no answer.
+        """Call a function, again while there is no response; its data, or None without one.
 
         Args:
             api_id: Number of the function.
             parameter: What JSON can hold.
             timeout_s: How long to try in all [s].
 
-        Returns:
-            What was answered; None if nothing was.
-
         Raises:
-            HardwareError: The service answered with another code than 0.
+            HardwareError: The service responded with another code than 0.
         """
         identity = messages.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
         header = messages.RequestHeader(
@@ -72,11 +69,11 @@ class Client:
                 again = time.monotonic() + timeout_s / 4
             for response in take(self._responses, Counter()):
                 if response.header.identity == identity:
-                    return self._answer(api_id, response)
+                    return self._data(api_id, response)
             time.sleep(_POLL_S)
         return None
 
-    def _answer(self, api_id: int, response: Any) -> Any:
+    def _data(self, api_id: int, response: Any) -> Any:
         code = response.header.status.code
         if code != DONE:
             raise HardwareError(
@@ -93,26 +90,19 @@ class Client:
 
 
 class Server:
-    """Who answers for a service: the virtual robot. One thread, never blocks, never raises."""
+    """A service of the virtual robot. One thread, never blocks, never raises."""
 
     def __init__(
-        self, participant: Participant, service: str, answer: Answer, counts: Counter[str]
+        self, participant: Participant, service: str, handler: Handler, counts: Counter[str]
     ) -> None:
-        """Begin to listen.
-
-        Args:
-            participant: Whose.
-            service: Its name.
-            answer: What to answer.
-            counts: Where refused requests are counted.
-        """
+        """Begin to listen; refused requests are counted in `counts`."""
         self._requests = participant.reader(f"rt/api/{service}/request", messages.Request)
         self._responses = participant.writer(f"rt/api/{service}/response", messages.Response)
-        self._reply = answer
+        self._handler = handler
         self._counts = counts
 
     def poll(self) -> None:
-        """Answer what has come."""
+        """Respond to what has come."""
         for request in take(self._requests, self._counts):
             identity = request.header.identity
             try:
@@ -120,7 +110,7 @@ class Server:
             except (ValueError, RecursionError):
                 code, data = BAD_PARAMETER, None
             else:
-                code, data = self._reply(identity.api_id, parameter)
+                code, data = self._handler(identity.api_id, parameter)
             if code != DONE:
                 self._counts["refused: request"] += 1
             status = messages.ResponseStatus(code=code)
@@ -129,31 +119,31 @@ class Server:
             self._responses.write(messages.Response(header=header, data=text, binary=[]))
 
 
-def own_controller(participant: Participant, *, release: bool, timeout_s: float = 2.0) -> str:
-    """See that none of the robot's own controllers holds the joints.
+def check_own_controller(participant: Participant, *, release: bool, timeout_s: float) -> None:
+    """Check that none of the robot's own controllers holds the joints.
 
     Args:
-        participant: Who asks.
-        release: Make it let go if one does. A standing robot falls then.
-        timeout_s: How long the robot is given to answer each question [s].
-
-    Returns:
-        The name of the one that was made to let go; empty if none had to be.
+        participant: Of the link.
+        release: Release the controller that does. A standing robot falls then.
+        timeout_s: Time for each response [s].
 
     Raises:
-        HardwareError: One holds them and may not be, or could not be, released; or the robot
-            does not answer.
+        HardwareError: One holds them and may not be, or could not be, released; or the robot does
+            not respond.
     """
     switcher = Client(participant, SWITCHER)
-    answer = switcher.call(CHECK_MODE, {}, timeout_s=timeout_s)
-    if answer is None:
-        if release and _switched_off(participant, timeout_s):
-            return "sport_mode"
+    response = switcher.call(CHECK_MODE, {}, timeout_s=timeout_s)
+    if response is None:
+        # Older firmware ends its sport mode by another service.
+        sport = {"name": "sport_mode", "switch": 0}
+        older = Client(participant, STATES)
+        if release and older.call(SERVICE_SWITCH, sport, timeout_s=timeout_s) is not None:
+            return
         raise HardwareError(
             f"the robot did not answer on its service {SWITCHER} within {timeout_s:g} s, so it is "
             "not known whether its own controller is off; check the network, and its firmware."
         )
-    held = name = _name(answer)
+    name = _name(response)
     for _ in range(_RELEASE_TRIES if release else 0):
         if not name:
             break
@@ -170,16 +160,7 @@ def own_controller(participant: Participant, *, release: bool, timeout_s: float 
             f"the robot's own controller {name!r} holds the joints; lay the robot down or hang it "
             "up, and have the controller released (--disable-onboard-controller)."
         )
-    return held
 
 
-def _name(answer: Any) -> str:
-    name = answer.get("name", "") if isinstance(answer, dict) else ""
-    return name if isinstance(name, str) else str(name)
-
-
-def _switched_off(participant: Participant, timeout_s: float) -> bool:
-    """Ask older firmware to end its sport mode; whether it answered."""
-    states = Client(participant, STATES)
-    parameter = {"name": "sport_mode", "switch": 0}
-    return states.call(SERVICE_SWITCH, parameter, timeout_s=timeout_s) is not None
+def _name(response: Any) -> str:
+    return str(response.get("name", "")) if isinstance(response, dict) else ""

@@ -1,6 +1,6 @@
 """From the bytes of `rt/lowstate` to numbered states, without a socket.
 
-Unitree's states carry no number, but the robot's clock in milliseconds; at 500 Hz it tells how many
+Unitree's states carry no number, but the robot's clock in milliseconds; at 500 Hz it shows how many
 states were lost on the way.
 """
 
@@ -34,7 +34,7 @@ class StateDecoder:
         """
         self.counts = counts
         self.virtual = False
-        """Whether the last state said that it is a virtual robot's."""
+        """Whether the last state was a virtual robot's."""
         self.last_error = ""
         """Why the last refused message was refused, one sentence."""
         self._joints = joints
@@ -58,10 +58,10 @@ class StateDecoder:
             return None
 
     def _take(self, data: bytes, arrived: float) -> State | None:
-        said = decode_state(self._joints, data)
+        low = decode_state(self._joints, data)
         steps = 1
         if self._tick is not None:
-            ahead = (said.tick - self._tick + 2**31) % 2**32 - 2**31
+            ahead = (low.tick - self._tick + 2**31) % 2**32 - 2**31
             if -_TICKS_BACK < ahead <= 0:
                 self.counts["out of order"] += 1
                 return None
@@ -70,13 +70,13 @@ class StateDecoder:
             else:
                 steps = max(1, round(ahead * STATE_RATE_HZ / TICKS_PER_S))
         arrived = max(arrived, self._time + _LEAST_STEP_S)
-        state = said.state(time=arrived, sequence=self._sequence + steps)
-        self._tick, self._time, self._sequence = said.tick, arrived, state.sequence
-        measured = said.measured
+        state = low.state(time=arrived, sequence=self._sequence + steps)
+        self._tick, self._time, self._sequence = low.tick, arrived, state.sequence
+        measured = low.measured
         if measured == self._measured:
             self.counts["repeated"] += 1
             return None
         self._measured = measured
-        self.virtual = said.virtual
+        self.virtual = low.virtual
         self.counts["states"] += 1
         return state

@@ -1,7 +1,7 @@
 """Where LCM messages go: nowhere but this computer, unless an interface is named.
 
 LCM is UDP multicast. With a time-to-live of 0 a packet never leaves the host; a private port keeps
-it from whoever else speaks LCM here. LCM itself cannot choose an interface: the system's routes do
+it from other users of LCM here. LCM itself cannot choose an interface: the system's routes do
 (a missing one is the commonest first failure on the Mini Cheetah, Cheetah-Software issue 8), so
 the route is looked up and must lead out of the interface that was named.
 """

@@ -40,7 +40,7 @@ class LcmMachine(NetworkLink):
     """A robot with twelve joints behind LCM. Implements `Machine`.
 
     Pre-flight, in this order: states arrive at the layout's rate without gaps for 200 ms; gravity
-    points where the attitude says; every joint is within its limits; no other program commands.
+    agrees with the attitude; every joint is within its limits; no other program commands.
     """
 
     wire = "LCM"

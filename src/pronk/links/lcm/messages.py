@@ -146,7 +146,7 @@ class Message:
             raise RefusedError(
                 "fingerprint",
                 f"a message has fingerprint {got}, expected {self.fingerprint:#018x} "
-                f"({self.name}); whoever sends it speaks another layout.",
+                f"({self.name}); its sender uses another layout.",
             )
         if len(data) != self.size:
             raise RefusedError(
@@ -196,7 +196,7 @@ MICROSTRAIN = Message(
 )
 CONTROL_PARAMETER = Message(
     # Request and response (control_parameter_respones_lcmt) have the same fields, hence the same
-    # fingerprint; the channel tells them apart.
+    # fingerprint; the channel distinguishes them.
     "cheetah.control_parameter_request_lcmt",
     0xD04FD3ECA4A52D73,
     "int8_t name[64]; int64_t requestNumber; int8_t value[64]; int8_t parameterKind;"

@@ -34,7 +34,7 @@ from pronk.links.lcm.codec import (
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots import load_robot
 
-BOTH = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+BOTH = pytest.mark.parametrize("layout", (CHEETAH, WTW), ids=LAYOUTS)
 ROBOT = load_robot("mini_cheetah")
 DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
 
@@ -224,7 +224,7 @@ def test_impossible_states_are_refused(layout: Layout) -> None:
 
 
 def test_the_other_layouts_command_is_refused() -> None:
-    with pytest.raises(RefusedError, match="speaks another layout"):
+    with pytest.raises(RefusedError, match="another layout"):
         decode_command(WTW, encode_command(CHEETAH, command()))
     with pytest.raises(HardwareError, match="no LCM layout 'go2'"):
         layout_of("go2")
