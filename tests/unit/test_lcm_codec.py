@@ -15,7 +15,6 @@ from pronk.links.lcm import messages as types
 from pronk.links.lcm.codec import (
     CHEETAH,
     KNEE_RATIO,
-    LAYOUTS,
     WTW,
     Layout,
     clamp_message,
@@ -34,7 +33,7 @@ from pronk.links.lcm.codec import (
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots import load_robot
 
-BOTH = pytest.mark.parametrize("layout", (CHEETAH, WTW), ids=LAYOUTS)
+BOTH = pytest.mark.parametrize("layout", [CHEETAH, WTW], ids=["cheetah", "wtw"])
 ROBOT = load_robot("mini_cheetah")
 DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
 
