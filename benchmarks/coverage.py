@@ -20,10 +20,10 @@ from scipy.stats import binom
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
-from pronk.match.interval import interval
 from pronk.match.measured_joint import measured_joints
 from pronk.match.refine import refine
 from pronk.match.settings import MatchSettings
+from pronk.match.uncertainty import interval
 from pronk.report.paper import published
 from pronk.response.estimate import operators
 from pronk.robots import load_robot

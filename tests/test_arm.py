@@ -12,10 +12,10 @@ from pronk.errors import IdentifiabilityError, LogError, PronkError
 from pronk.logs.joint_log import Segment, SweepLog
 from pronk.logs.readers import read_log
 from pronk.match import gains as gains_file
-from pronk.match.arm.fit import fit_drive
-from pronk.match.arm.match import ArmMatch, drives_of, match_arm
-from pronk.match.arm.sample_mask import trusted_frequency, trusted_samples
+from pronk.match.arm import drives_of, fit_arm, match_arm
 from pronk.match.predict import predict
+from pronk.match.result import MatchResult
+from pronk.match.sample_mask import trusted_frequency, trusted_samples
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation, JointDrive, held_mean, moves_together
 
@@ -68,7 +68,7 @@ def answered(log: SweepLog, truth: dict[str, JointDrive]) -> SweepLog:
 
 def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
     log = answered(commands(65.0, (0.15, 8.0), 0.35), TRUTH)
-    fit = fit_drive([log], ARM)
+    fit = fit_arm([log], ARM)
     for name, truth in TRUTH.items():
         joint = fit.joints[name]
         assert joint.drive.stiffness == truth.stiffness
@@ -82,7 +82,7 @@ def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
 def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
     log = answered(commands(65.0, (0.05, 0.4), 0.1), TRUTH)
     with pytest.raises(IdentifiabilityError) as refused:
-        fit_drive([log], ARM)
+        fit_arm([log], ARM)
     assert "armature" in str(refused.value)
     assert "a sweep to higher frequencies" in str(refused.value)
 
@@ -90,11 +90,11 @@ def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
 def test_too_short_and_misspelled_are_refused() -> None:
     log = commands(30.0, (0.2, 3.0), 0.2)
     with pytest.raises(LogError, match="intervals need at least 3"):
-        fit_drive([log], ARM)
+        fit_arm([log], ARM)
     with pytest.raises(PronkError, match="expected some of stiffness, damping"):
-        fit_drive([log], ARM, parameters=("kd",))
+        fit_arm([log], ARM, parameters=("kd",))
     with pytest.raises(LogError, match="at least one"):
-        fit_drive([], ARM)
+        fit_arm([], ARM)
     with pytest.raises(PronkError, match="gains or drive"):
         match_arm([log], ARM, mode="both")  # type: ignore[arg-type]
 
@@ -149,18 +149,18 @@ def test_sweep_is_believed_up_to_where_it_breaks() -> None:
 
 
 @pytest.fixture(scope="module")
-def matched() -> ArmMatch:
+def matched() -> MatchResult:
     return match_arm([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM)
 
 
 @recorded
 def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
-    matched: ArmMatch, tmp_path: Path
+    matched: MatchResult, tmp_path: Path
 ) -> None:
     gains_file.save(tmp_path / "gains.yaml", matched.gains)
     gains = gains_file.load(tmp_path / "gains.yaml")
     assert drives_of(ARM, gains)["elbow_flex"].frictionloss == pytest.approx(
-        matched.fit.drives["elbow_flex"].frictionloss, rel=1e-5
+        matched.joints["elbow_flex"].frictionloss, rel=1e-5
     )
     found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains)
     assert tuple(one.joint for one in found.joints) == JOINTS
@@ -172,9 +172,9 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
 
 
 @recorded
-def test_what_the_recording_does_not_tell_is_held_and_said(matched: ArmMatch) -> None:
+def test_what_the_recording_does_not_tell_is_held_and_said(matched: MatchResult) -> None:
     # No gravity about shoulder_pan: only the ratios of its parameters can be seen.
-    assert "stiffness" in matched.held["shoulder_pan"]
+    assert "stiffness" in matched.joints["shoulder_pan"].held
     pan = matched.gains.joints["shoulder_pan"]
     assert pan.stiffness == ARM.joint("shoulder_pan").stiffness
     assert any("stiffness held at 17.8: these recordings do not tell it" in f for f in pan.flags)
@@ -184,7 +184,7 @@ def test_what_the_recording_does_not_tell_is_held_and_said(matched: ArmMatch) ->
 
 
 @recorded
-def test_matched_response_is_nearer_in_the_frequency_domain_too(matched: ArmMatch) -> None:
+def test_matched_response_is_nearer_in_the_frequency_domain_too(matched: MatchResult) -> None:
     assert set(matched.joints) == set(JOINTS)
     for name, joint in matched.joints.items():
         assert joint.error_db < 0.5 * joint.naive_error_db, name

@@ -12,11 +12,12 @@ from benchmarks.engine import engine_gap
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError
 from pronk.excitation.signals import Chirp
-from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
-from pronk.match.interval import interval, measurement_error_db
+from pronk.match.diagnostics import amplitude_flags, amplitude_gains
 from pronk.match.measured_joint import MeasuredJoint, measured_joints
 from pronk.match.refine import refine
+from pronk.match.result import amplitude_spread
 from pronk.match.settings import MatchSettings
+from pronk.match.uncertainty import interval, measurement_error_db
 from pronk.response.estimate import operators
 from pronk.response.estimator import Estimator
 from pronk.robots import load_robot

@@ -14,9 +14,9 @@ from pronk.errors import ArtefactError
 from pronk.match import gains as gains_file
 from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
-from pronk.match.command_delay import command_delay
+from pronk.match.diagnostics import command_delay
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import JointFit, MatchResult
 from pronk.report import figures, page, replay, style
 from pronk.report.paper import published
 from pronk.response.response import FrequencyResponse
@@ -85,7 +85,7 @@ def joint_match(name, leg, *, virtual=True, amplitudes=(0.25, 0.125), grid=21, s
         ]
     )
     naive = second_order(omega, *NAIVE, inertia)
-    return JointMatch(
+    return JointFit(
         joint=first.joint,
         responses=tuple(responses),
         grid_stiffness=axis_k,
@@ -332,7 +332,7 @@ def test_zero_armature_is_refused_where_it_was_not_tried(match):
 
 def test_no_amplitude_figure_with_one_amplitude():
     one = joint_match("knee", 0, amplitudes=(0.25,))
-    alone = JointMatch(**{**vars(one), "amplitude_gains": one.amplitude_gains[:1]})
+    alone = JointFit(**{**vars(one), "amplitude_gains": one.amplitude_gains[:1]})
     gains = synthetic().gains
     assert figures.amplitudes(MatchResult(gains=gains, joints={"FR_knee": alone})) is None
 
@@ -427,7 +427,7 @@ def test_a_joint_without_match_is_counted_and_named(tmp_path):
     name = "HL_knee"
     joint = result.joints[name]
     doubt = "no match: the best gains miss the measured response by 2 dB RMS"
-    bad = JointMatch(**{**vars(joint), "flags": (doubt,)})
+    bad = JointFit(**{**vars(joint), "flags": (doubt,)})
     worse = MatchResult(gains=result.gains, joints={**result.joints, name: bad})
     assert page.verdict(worse)["matched"] == 11
     assert doubt in page.verdict(worse)["flags"][name]
@@ -469,9 +469,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
 def test_page_without_predictions_and_zero_armature_leaves_them_out(tmp_path):
     result = synthetic(legs=1)
     bare = {
-        name: JointMatch(
-            **{**vars(j), "zero_armature": None, "zero_armature_error_db": float("nan")}
-        )
+        name: JointFit(**{**vars(j), "zero_armature": None, "zero_armature_error_db": float("nan")})
         for name, j in result.joints.items()
     }
     folder = written(tmp_path, MatchResult(gains=result.gains, joints=bare), predictions=False)
@@ -510,8 +508,10 @@ def test_gains_under_another_name_are_found(tmp_path):
 
 def test_delay_is_what_the_phase_lags_behind_the_matched_simulation(match):
     for name in ("FR_knee", "HL_hip_roll"):
-        # The synthetic joint answers 2 ms late (noise of a quarter per cent).
-        assert command_delay(match.joints[name]) == pytest.approx(0.002, abs=2e-4)
+        one = match.joints[name]
+        # The synthetic joint responds 2 ms late (noise of a quarter per cent).
+        delay = command_delay(one.responses[0], one.matched, one.band_hz)
+        assert delay == pytest.approx(0.002, abs=2e-4)
 
 
 def test_no_delay_is_made_up_for_an_incoherent_joint(match):
@@ -519,4 +519,4 @@ def test_no_delay_is_made_up_for_an_incoherent_joint(match):
     deaf = FrequencyResponse(
         **{**vars(joint.responses[0]), "coherence": np.zeros_like(joint.responses[0].coherence)}
     )
-    assert command_delay(JointMatch(**{**vars(joint), "responses": (deaf,)})) == 0.0
+    assert command_delay(deaf, joint.matched, joint.band_hz) == 0.0

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from pronk.cli import console, logs
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.logs.joint_log import SweepLog
-    from pronk.match.arm.match import ArmMatch
     from pronk.match.result import MatchResult
-    from pronk.robots.robot import Robot
 
 
 Mode = Literal["gains", "drive"]
@@ -62,12 +58,9 @@ def match(
         json_file: Also write the figures to this file.
         reading: How logs are read.
     """
-    from pronk.match.drive import match_drives
-    from pronk.match.parameters import DRIVE_MODE
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.robots import load_robot
-    from pronk.simulators.chain import moves_together
 
     machine = load_robot(robot)
     if out.suffix not in (".yaml", ".yml"):
@@ -85,27 +78,15 @@ def match(
     )
     if free and mode != "drive":
         raise PronkError("--fit names what --mode drive looks for; say --mode drive as well.")
-    arm: ArmMatch | None = None
     with console.progress() as report:
-        if any(moves_together(log) for log in read):
-            if simulator != "mujoco":
-                raise PronkError(
-                    f"--simulator {simulator}: several joints of these logs move at once, which "
-                    "only simulator mujoco matches; record one joint at a time."
-                )
-            arm, result = together(read, machine, mode, report)
-        elif mode == "drive":
-            result = match_drives(
-                read, machine, free=free or DRIVE_MODE, settings=settings, progress=report
-            )
-        else:
-            result = match_logs(read, machine, settings=settings, progress=report)
+        result = match_logs(read, machine, mode=mode, free=free, settings=settings, progress=report)
         page = write(result, out, report)
     show(result)
     figures = figures_of(result)
-    if arm is not None:
-        show_arm(arm)
-        figures |= {"mode": arm.mode, "held": dict(arm.held), "rmse": rmse_of(arm)}
+    if any(np.isfinite(joint.rmse) for joint in result.joints.values()):
+        show_arm(result)
+        held = {name: joint.held for name, joint in result.joints.items() if joint.held}
+        figures |= {"mode": mode, "held": held, "rmse": rmse_of(result)}
     console.wrote(out, out.parent / "match.npz", page)
     console.write_json(json_file, figures)
     console.following(
@@ -115,31 +96,15 @@ def match(
     )
 
 
-def together(
-    read: Sequence[SweepLog],
-    robot: Robot,
-    mode: Literal["gains", "drive"],
-    report: console.Reporter,
-) -> tuple[ArmMatch, MatchResult]:
-    """Match an arm whose joints moved at the same time; there is no grid then."""
-    from pronk.match.arm.match import match_arm
-    from pronk.match.result import MatchResult
-
-    begin = time.perf_counter()
-    arm = match_arm(read, robot, mode=mode, progress=report)
-    seconds = {"fit of the whole arm": time.perf_counter() - begin}
-    return arm, MatchResult(gains=arm.gains, joints=arm.joints, seconds=seconds)
-
-
-def rmse_of(arm: ArmMatch) -> dict[str, dict[str, float]]:
+def rmse_of(result: MatchResult) -> dict[str, dict[str, float]]:
     """Error in time of each joint over the logs that were fitted [rad]."""
     return {
         name: {"published": joint.published_rmse, "matched": joint.rmse}
-        for name, joint in arm.fit.joints.items()
+        for name, joint in result.joints.items()
     }
 
 
-def show_arm(arm: ArmMatch) -> None:
+def show_arm(result: MatchResult) -> None:
     """Print what belongs to the gains of an arm, and its error in time."""
     made = console.table(
         "Several joints moved at once, so the whole arm was fitted in time",
@@ -150,18 +115,18 @@ def show_arm(arm: ArmMatch) -> None:
         "RMSE published [rad]",
         "RMSE matched [rad]",
     )
-    for name, joint in arm.fit.joints.items():
+    for name, joint in result.joints.items():
         console.row(
             made,
             name,
-            console.number(joint.drive.armature, 4),
-            console.number(joint.drive.frictionloss, 3),
-            console.number(1000.0 * joint.drive.delay, 1),
+            console.number(joint.armature, 4),
+            console.number(joint.frictionloss, 3),
+            console.number(1000.0 * joint.delay_s, 1),
             console.number(joint.published_rmse, 4),
             console.number(joint.rmse, 4),
         )
     console.show(made)
-    for name, reason in arm.fit.excluded.items():
+    for name, reason in result.excluded.items():
         console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.match.grid import GridSearch
-from pronk.match.interval import measurement_error_db
 from pronk.match.measured_joint import MeasuredJoint
 from pronk.match.refine import Fit
+from pronk.match.result import ZERO_ARMATURE, amplitude_spread
 from pronk.match.settings import MatchSettings
+from pronk.match.uncertainty import measurement_error_db
+from pronk.response.response import FrequencyResponse
 
 NO_MATCH_DB = 1.0
 """Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
@@ -22,7 +24,7 @@ NO_ARMATURE_RATIO = 5.0
 """Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
 
 
-def doubts(
+def warnings(
     goal: MeasuredJoint, fit: Fit, grid: GridSearch, settings: MatchSettings
 ) -> Iterator[str]:
     """What speaks against the optimum."""
@@ -64,4 +66,51 @@ def armature_flags(fit: Fit, zero_db: float, settings: MatchSettings) -> Iterato
     else:
         # A light rotor on a heavy link: other gains make up for it.
         verdict = "not ruled out by this joint, its best node misses"
-    yield f"zero armature: {verdict} by {zero_db:.2g} dB RMS, {ratio:.3g} times the match"
+    yield f"{ZERO_ARMATURE}{verdict} by {zero_db:.2g} dB RMS, {ratio:.3g} times the match"
+
+
+SPREAD_MAX = 0.05
+"""Relative change of stiffness between amplitudes that is worth a flag; the paper's own
+randomization is 2 N m/rad on 20 (D3), twice that."""
+
+
+def amplitude_gains(fits: Sequence[Fit]) -> NDArray[np.float64]:
+    """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
+    return np.array(
+        [(fit.target.measured.amplitude, fit.stiffness, fit.damping) for fit in fits]
+    ).reshape(-1, 3)
+
+
+def amplitude_flags(gains: NDArray[np.float64]) -> tuple[str, ...]:
+    """What to tell the user of the spread."""
+    spread = amplitude_spread(gains)
+    if not spread > SPREAD_MAX:
+        return ()
+    largest, smallest = gains[:, 0].max(), gains[:, 0].min()
+    return (
+        f"friction: stiffness changes by {100.0 * spread:.0f} % between {smallest:.3g} and "
+        f"{largest:.3g} rad; give the simulator the joint's dry friction, or match at the "
+        "amplitude that the policy will use",
+    )
+
+
+def command_delay(
+    measured: FrequencyResponse,
+    matched: NDArray[np.complex128],
+    band_hz: tuple[float, float],
+    *,
+    coherence_min: float = 0.8,
+) -> float:
+    """Delay of the measured response behind the matched one [s], never negative.
+
+    The magnitude gives the gains (paper F9); phase = -omega * delay, a straight line through zero.
+
+    Least squares through zero over the joint's band: every frequency with enough coherence counts
+    alike. Zero where none has.
+    """
+    band = measured.band(*band_hz, coherence_min)
+    if not band.any():
+        return 0.0
+    omega = measured.omega[band]
+    lag = -np.unwrap(np.angle(measured.response[band] / matched[band]))
+    return max(0.0, float(omega @ lag / (omega @ omega)))

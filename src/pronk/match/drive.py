@@ -9,16 +9,13 @@ they cannot, and names the experiment that would.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
-from scipy.optimize import least_squares
 
-from pronk.errors import IdentifiabilityError, PronkError
+from pronk.errors import IdentifiabilityError
 from pronk.logs.joint_log import SweepLog
-from pronk.match.gains import JointGains
 from pronk.match.identifiability import EXPERIMENTS, bench_experiment, require_identifiable
 from pronk.match.measured_joint import (
     DB,
@@ -28,11 +25,13 @@ from pronk.match.measured_joint import (
     measured_joints,
     merged,
 )
-from pronk.match.parameters import DRIVE_MODE, KINDS, gains_covariance
+from pronk.match.parameters import DRIVE_MODE, PARAMETERS, begin, bounds, checked_names
+from pronk.match.problem import solve
 from pronk.match.ranges import matched_gains
 from pronk.match.refine import residual_db
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import JointFit, MatchResult
 from pronk.match.settings import MatchSettings
+from pronk.match.uncertainty import estimate, jackknife
 from pronk.robots.robot import Robot
 from pronk.simulators.simulator import JointRig, joint_rigs
 
@@ -41,38 +40,12 @@ ComplexArray = NDArray[np.complex128]
 Progress = Callable[[str, float], None]
 
 FREE = ("stiffness", "damping", "armature", "frictionloss", "delay")
-"""What `match_drives` can be asked for."""
+"""What `match_drives` can fit."""
+_SETTLED = 1e-7
+"""Relative change of cost or parameters that ends the search."""
+_ROUNDS = 100
 _NOISE_MIN = 0.01
 """Least standard deviation of the log response to plan with: no model is better than 1 %."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriveFit:
-    """One joint's drive."""
-
-    values: Mapping[str, float]
-    """Every one of `FREE`, fitted or known."""
-    fitted: tuple[str, ...]
-    covariance: Array
-    """Of the fitted ones in the units of `KINDS`, shape (p, p); NaN without repeats."""
-    ci95: Mapping[str, tuple[float, float]]
-    matched: ComplexArray
-    """Response at the largest amplitude, shape (f,)."""
-    naive: ComplexArray
-    flags: tuple[str, ...] = ()
-
-
-def _drive_responses(
-    rig: JointRig, goal: MeasuredJoint, drives: Sequence[Mapping[str, float]]
-) -> ComplexArray:
-    """Full responses of a joint with several drives, the delay included, shape (drives, f)."""
-    values = {name: np.array([drive[name] for drive in drives]) for name in FREE}
-    command = goal.trace.mirrored(rig.robot)[2]
-    late = values.pop("delay")
-    ((_, position),) = rig.run([command], [rig.pose(goal.trace)], **values)
-    return np.asarray(
-        goal.full_response(position) * np.exp(-1j * late[:, None] * goal.measured.omega)
-    )
 
 
 def match_drives(
@@ -97,35 +70,27 @@ def match_drives(
         LogError: No joint of the robot was asked, or a log cannot be used.
         IdentifiabilityError: The sweeps cannot tell apart what was asked.
     """
-    if not free or (unknown := [name for name in free if name not in FREE]):
-        raise PronkError(
-            f"free parameters {', '.join(unknown) if free else 'none'}; expected some of "
-            f"{', '.join(FREE)}."
-        )
+    names = checked_names(free, FREE)
     chosen = settings or MatchSettings()
-    told = progress or (lambda _stage, _share: None)
-    with joint_rigs(chosen.simulator, robot) as rigs:
-        robot, info = rigs.robot, rigs.info
-    where = logs_by_joint(logs, robot)
-    asked = {
-        name: merged([measured_joints(log, name, robot, chosen) for log in sources])
-        for name, sources in where.items()
-    }
-    names = tuple(name for name in FREE if name in free)
-    for name, goals in asked.items():
-        _require(robot, name, goals, names)
-    joints: dict[str, JointMatch] = {}
-    gains: dict[str, JointGains] = {}
-    for k, (name, goals) in enumerate(asked.items()):
-        told("fit", k / len(asked))
-        on_drive = gains_on_drive(where[name][0], name, robot)
-        fit = fit_drive(robot, goals, on_drive, names, chosen)
-        joints[name], gains[name] = _artefacts(robot, goals[0], goals, fit)
-    told("fit", 1.0)
-    return MatchResult(
-        gains=matched_gains(robot, gains, logs, info),
-        joints=joints,
-    )
+    with joint_rigs(chosen.simulator, robot, threads=chosen.threads) as rigs:
+        where = logs_by_joint(logs, rigs.robot)
+        measured = {
+            name: merged([measured_joints(log, name, rigs.robot, chosen) for log in sources])
+            for name, sources in where.items()
+        }
+        for name, goals in measured.items():
+            _require(rigs.robot, name, goals, names)
+        joints = {}
+        for k, (name, goals) in enumerate(measured.items()):
+            if progress is not None:
+                progress("fit", k / len(measured))
+            on_drive = gains_on_drive(where[name][0], name, robot)
+            joints[name] = fit_joint(rigs.rig(name), goals, on_drive, names)
+        info = rigs.info
+    if progress is not None:
+        progress("fit", 1.0)
+    gains = {name: joint.gains() for name, joint in joints.items()}
+    return MatchResult(gains=matched_gains(robot, gains, logs, info), joints=joints)
 
 
 def _require(
@@ -149,26 +114,86 @@ def _require(
         raise IdentifiabilityError(f"{joint}: {error}") from None
 
 
-def fit_drive(
-    robot: Robot,
+class ResponseProblem:
+    """Residuals of one joint's drive in frequency, all amplitudes together, as a `Problem`."""
+
+    def __init__(
+        self,
+        rig: JointRig,
+        goals: Sequence[MeasuredJoint],
+        fitted: tuple[str, ...],
+        known: Mapping[str, float],
+    ) -> None:
+        """Take in what was measured.
+
+        Args:
+            rig: The rig of the joint's original.
+            goals: The joint at every amplitude, largest first.
+            fitted: Names of the parameters to fit.
+            known: Value of every one of `FREE`; of the fitted ones, where to begin.
+        """
+        self._rig, self._goals, self._fitted, self._known = rig, goals, fitted, known
+        self.low, self.high = bounds(fitted)
+        self.begin = begin(fitted, [known[name] for name in fitted], [False] * len(fitted))
+        self._step = np.array([PARAMETERS[name].step for name in fitted])
+        self._cache: dict[bytes, tuple[Array, Array]] = {}
+
+    def values(self, x: Array) -> dict[str, float]:
+        """Every parameter that some searched numbers stand for."""
+        return {
+            **self._known,
+            **{n: PARAMETERS[n].unscaled(float(v)) for n, v in zip(self._fitted, x, strict=True)},
+        }
+
+    def residual(self, x: Array) -> Array:
+        """Weighted gain and phase of simulated over measured responses, shape (m,)."""
+        return self._at(x)[0]
+
+    def jacobian(self, x: Array) -> Array:
+        """Derivative of `residual` by forward differences, shape (m, p)."""
+        return self._at(x)[1]
+
+    def responses(self, goal: MeasuredJoint, drives: Sequence[Mapping[str, float]]) -> ComplexArray:
+        """Full responses with several drives, the delay included, shape (drives, f)."""
+        values = {name: np.array([drive[name] for drive in drives]) for name in FREE}
+        command = goal.trace.mirrored(self._rig.robot)[2]
+        late = np.exp(-1j * values.pop("delay")[:, None] * goal.measured.omega)
+        ((_, position),) = self._rig.run([command], [self._rig.pose(goal.trace)], **values)
+        return np.asarray(goal.full_response(position) * late)
+
+    def _at(self, x: Array) -> tuple[Array, Array]:
+        key = x.tobytes()
+        if key not in self._cache:
+            drives = [self.values(point) for point in (x, *(x + np.diag(self._step)))]
+            parts = []
+            for goal in self._goals:
+                simulated = self.responses(goal, drives)[:, goal.fit_mask]
+                measured = goal.measured.response[goal.fit_mask]
+                parts.append(residual_db(goal, simulated, measured, True) * _weight(goal))
+            rows = np.concatenate(parts, axis=1)
+            self._cache[key] = rows[0], ((rows[1:] - rows[0]) / self._step[:, None]).T
+        return self._cache[key]
+
+
+def fit_joint(
+    rig: JointRig,
     goals: Sequence[MeasuredJoint],
     on_drive: tuple[float, float],
-    free: tuple[str, ...],
-    settings: MatchSettings,
-) -> DriveFit:
+    fitted: tuple[str, ...],
+) -> JointFit:
     """Fit one joint's drive to its responses at all amplitudes.
 
     Args:
-        robot: The robot.
-        goals: The joint's targets, largest amplitude first.
+        rig: The rig of the joint's original.
+        goals: The joint at every amplitude, largest first.
         on_drive: Stiffness and damping on the real drive.
-        free: What to look for.
-        settings: Threads.
+        fitted: What to fit.
 
     Raises:
-        IdentifiabilityError: A fitted parameter turns out to be unknown.
+        IdentifiabilityError: The repeats leave a fitted parameter unknown.
     """
-    joint = robot.joint(goals[0].joint)
+    goal = goals[0]
+    joint = rig.robot.joint(goal.joint)
     known = {
         "stiffness": on_drive[0],
         "damping": on_drive[1],
@@ -176,98 +201,43 @@ def fit_drive(
         "frictionloss": joint.drive.frictionloss,
         "delay": 0.0,
     }
-    kinds = [KINDS[name] for name in free]
-    steps = np.array([kind.step for kind in kinds])
-
-    def drive(x: Array) -> dict[str, float]:
-        found = {
-            name: kind.unscaled(float(v)) for name, kind, v in zip(free, kinds, x, strict=True)
-        }
-        return {**known, **found}
-
-    with joint_rigs(settings.simulator, robot, threads=settings.threads) as rigs:
-        rig = rigs.rig(joint.name)
-
-        def rows(x: Array) -> tuple[Array, Array]:
-            """Weighted residuals and their Jacobian by forward differences."""
-            points = [x, *(x + np.diag(steps))]
-            parts = []
-            for goal in goals:
-                answers = _drive_responses(rig, goal, [drive(point) for point in points])[
-                    :, goal.fit_mask
-                ]
-                measured = goal.measured.response[goal.fit_mask]
-                parts.append(residual_db(goal, answers, measured, True) * _weight(goal))
-            every = np.concatenate(parts, axis=1)
-            return every[0], ((every[1:] - every[0]) / steps[:, None]).T
-
-        cache: dict[bytes, tuple[Array, Array]] = {}
-
-        def at(x: Array) -> tuple[Array, Array]:
-            key = x.tobytes()
-            if key not in cache:
-                cache[key] = rows(x)
-            return cache[key]
-
-        def residual(x: Array) -> Array:
-            return at(x)[0]
-
-        def jacobian(x: Array) -> Array:
-            return at(x)[1]
-
-        low = np.array([kind.scaled(kind.low) for kind in kinds])
-        high = np.array([kind.scaled(kind.high) for kind in kinds])
-        start = np.array(
-            [
-                kind.scaled(max(known[name], kind.start))
-                for name, kind in zip(free, kinds, strict=True)
-            ]
+    problem = ResponseProblem(rig, goals, fitted, known)
+    solution = solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
+    covariance, freedom = _covariance(goals, solution.jacobian)
+    found = estimate(fitted, solution.x, covariance, freedom, known)
+    if freedom and found.unidentified:
+        name = found.unidentified[0]
+        raise IdentifiabilityError(
+            f"{joint.name}: these sweeps do not identify the {name} (deviation "
+            f"{found.sd[name]:.2g}); {EXPERIMENTS[name]}; or hold it at a known value."
         )
-        found = least_squares(
-            residual,
-            np.clip(start, low + 1e-6, high - 1e-6),
-            jac=jacobian,
-            bounds=(low, high),
-            x_scale=steps,
-            xtol=1e-5,
-            ftol=1e-8,
-        )
-        best = drive(found.x)
-        matched, naive = _drive_responses(rig, goals[0], [best, known])
-    scale = np.array([kind.slope(float(v)) for kind, v in zip(kinds, found.x, strict=True)])
-    covariance, freedom = _covariance(goals, np.asarray(found.jac))
-    deviation = np.sqrt(np.diag(covariance))
-    flags = []
-    if freedom == 0:
-        flags.append("one repeat: no interval; record three or more")
-    for name, kind, sd in zip(free, kinds, deviation, strict=True):
-        # A logarithm's deviation is relative, as is the limit of such a kind.
-        if freedom and not sd <= kind.sd_max:
-            raise IdentifiabilityError(
-                f"{joint.name}: these sweeps do not tell the {name} (deviation {sd:.2g}); "
-                f"{EXPERIMENTS[name]}; or hold it at a known value."
-            )
-    if not found.success:
-        flags.append("the fit did not settle")
-    quantile = float(stats.t.ppf(0.975, freedom)) if freedom else float("nan")
-    return DriveFit(
-        values=best,
-        fitted=free,
-        covariance=covariance * np.outer(scale, scale),
-        ci95={
-            name: (kind.unscaled(v - quantile * sd), kind.unscaled(v + quantile * sd))
-            for name, kind, v, sd in zip(free, kinds, found.x, deviation, strict=True)
-        }
-        if freedom
-        else {},
+    matched, naive = problem.responses(goal, [found.values, known])
+    errors = [
+        float(np.sqrt(np.mean(goal.error_db(one[goal.fit_mask]) ** 2))) for one in (matched, naive)
+    ]
+    flags = () if freedom else ("one repeat: no interval; record three or more",)
+    return JointFit(
+        joint=joint.name,
+        responses=tuple(one.measured for one in goals),
+        stiffness=found.values["stiffness"],
+        damping=found.values["damping"],
+        armature=found.values["armature"],
+        frictionloss=found.values["frictionloss"],
+        delay_s=found.values["delay"],
+        ci95=found.ci95,
+        covariance=found.covariance,
+        band_hz=joint.band_hz,
+        error_db=errors[0],
+        naive_error_db=errors[1],
+        coherence_min=float(goal.measured.coherence[goal.measured.band(*joint.band_hz)].min()),
         matched=matched,
         naive=naive,
-        flags=tuple(flags),
+        flags=flags if solution.settled else (*flags, "the fit did not settle"),
     )
 
 
 def _weight(goal: MeasuredJoint) -> Array:
-    """Weight of gain and of phase at each frequency [1/dB], shape (2 inside,)."""
+    """Weight of gain and of phase at each frequency [1/dB], shape (2 fit_mask,)."""
     return np.tile(1.0 / goal.deviation_db(), 2)
 
 
@@ -275,68 +245,20 @@ def _covariance(goals: Sequence[MeasuredJoint], jacobian: Array) -> tuple[Array,
     """Covariance of the searched numbers from the scatter over repeats, and its freedom.
 
     Every repeat of every amplitude moves the optimum by `(J^T J)^-1 J^T` times what it differs
-    from their mean; repeats are independent whatever the colour of their noise.
+    from their mean.
     """
     influence = np.linalg.pinv(jacobian)
     covariance = np.zeros((len(influence), len(influence)))
     freedom = 0
-    begin = 0
+    first = 0
     for goal in goals:
         count, width = len(goal.measured.repeats), 2 * int(goal.fit_mask.sum())
-        part = influence[:, begin : begin + width]
-        begin += width
+        part = influence[:, first : first + width]
+        first += width
         if count < 2:
             continue
         mean = goal.measured.response[goal.fit_mask]
         change = residual_db(goal, goal.measured.repeats[:, goal.fit_mask], mean, True)
-        moved = (change * _weight(goal)) @ part.T
-        covariance += np.atleast_2d(np.cov(moved.T, ddof=1)) / count
+        covariance += jackknife((change * _weight(goal)) @ part.T / (count - 1))
         freedom += count - 1
     return covariance, freedom
-
-
-def _artefacts(
-    robot: Robot, goal: MeasuredJoint, goals: Sequence[MeasuredJoint], fit: DriveFit
-) -> tuple[JointMatch, JointGains]:
-    """One joint's fit as the artefacts have it; there is no grid."""
-    joint, values = robot.joint(goal.joint), fit.values
-    covariance = gains_covariance(fit.fitted, fit.covariance)
-    errors = [
-        float(np.sqrt(np.mean(goal.error_db(answer[goal.fit_mask]) ** 2)))
-        for answer in (fit.matched, fit.naive)
-    ]
-    band = goal.measured.band(*joint.band_hz)
-    gains = JointGains(
-        stiffness=values["stiffness"],
-        damping=values["damping"],
-        grid_stiffness=float("nan"),
-        grid_damping=float("nan"),
-        stiffness_ci95=fit.ci95.get("stiffness", (values["stiffness"],) * 2),
-        damping_ci95=fit.ci95.get("damping", (values["damping"],) * 2),
-        covariance=covariance,
-        band_hz=joint.band_hz,
-        error_db=errors[0],
-        naive_error_db=errors[1],
-        coherence_min=float(goal.measured.coherence[band].min()),
-        armature=values["armature"],
-        frictionloss=values["frictionloss"],
-        delay_s=values["delay"],
-        flags=fit.flags,
-    )
-    match = JointMatch(
-        joint=goal.joint,
-        responses=tuple(one.measured for one in goals),
-        grid_stiffness=np.empty(0),
-        grid_damping=np.empty(0),
-        grid_error=np.empty((0, 0)),
-        stiffness=values["stiffness"],
-        damping=values["damping"],
-        covariance=np.array(covariance),
-        band_hz=joint.band_hz,
-        matched=fit.matched,
-        naive=fit.naive,
-        error_db=errors[0],
-        naive_error_db=errors[1],
-        flags=fit.flags,
-    )
-    return match, gains

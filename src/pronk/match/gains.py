@@ -30,9 +30,9 @@ class JointGains:
     damping: float
     """[N m s/rad]"""
     grid_stiffness: float
-    """The paper's grid optimum [N m/rad]."""
+    """The paper's grid optimum [N m/rad]; NaN without a grid."""
     grid_damping: float
-    """The paper's grid optimum [N m s/rad]."""
+    """The paper's grid optimum [N m s/rad]; NaN without a grid."""
     stiffness_ci95: tuple[float, float]
     damping_ci95: tuple[float, float]
     covariance: tuple[tuple[float, float], tuple[float, float]]

@@ -1,4 +1,4 @@
-"""The parameters of a drive that a log may tell, and how each is searched."""
+"""The parameters of a joint's drive that a log can give, and how each is searched."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from pronk.errors import PronkError
 from pronk.match.identifiability import SD_MAX
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
-    """One kind of parameter. Positive ones are searched in their logarithm."""
+class Parameter:
+    """One parameter. Positive ones are searched in their logarithm."""
 
     low: float
     high: float
@@ -40,69 +42,66 @@ class Kind:
         return float(np.exp(scaled)) if self.log else 1.0
 
 
-KINDS: Mapping[str, Kind] = {
-    "stiffness": Kind(low=0.5, high=200.0, unit="N m/rad", start=0.5, step=0.02, sd_max=SD_MAX),
-    "damping": Kind(low=0.005, high=20.0, unit="N m s/rad", start=0.005, step=0.02, sd_max=SD_MAX),
-    "armature": Kind(low=1e-4, high=1.0, unit="kg m^2", start=1e-3, step=0.03, sd_max=SD_MAX),
+PARAMETERS: Mapping[str, Parameter] = {
+    "stiffness": Parameter(
+        low=0.5, high=200.0, unit="N m/rad", start=0.5, step=0.02, sd_max=SD_MAX
+    ),
+    "damping": Parameter(
+        low=0.005, high=20.0, unit="N m s/rad", start=0.005, step=0.02, sd_max=SD_MAX
+    ),
+    "armature": Parameter(low=1e-4, high=1.0, unit="kg m^2", start=1e-3, step=0.03, sd_max=SD_MAX),
     # From too little friction the search sees no sticking and does not find it.
-    "frictionloss": Kind(low=1e-3, high=3.0, unit="N m", start=0.2, step=0.03, sd_max=SD_MAX),
+    "frictionloss": Parameter(low=1e-3, high=3.0, unit="N m", start=0.2, step=0.03, sd_max=SD_MAX),
     # A delay is known if it is known to a physics step of the training simulator.
-    "delay": Kind(low=0.0, high=0.1, unit="s", start=0.01, step=1e-3, sd_max=0.005, log=False),
-    "offset": Kind(low=-0.2, high=0.2, unit="rad", start=-0.2, step=2e-3, sd_max=0.01, log=False),
+    "delay": Parameter(low=0.0, high=0.1, unit="s", start=0.01, step=1e-3, sd_max=0.005, log=False),
+    "offset": Parameter(
+        low=-0.2, high=0.2, unit="rad", start=-0.2, step=2e-3, sd_max=0.01, log=False
+    ),
 }
 """Bounds are far from what servos of small robots have; a fit that ends there is flagged."""
 
-PARAMETERS = tuple(KINDS)
-"""What `fit_drive` can be asked for."""
 DRIVE_MODE = ("damping", "armature", "frictionloss", "delay")
 """Mode `drive`: the stiffness is known."""
 GAINS_MODE = ("stiffness", "damping", "frictionloss", "delay")
-"""Mode `gains`: the armature is known; friction and delay are fitted too, so that they do not pose
-as damping."""
+"""Mode `gains` of whole arms: the armature is known; friction and delay are fitted too, so that
+they do not pass for damping."""
 
 
-def asked_of(
-    parameters: Sequence[str] | Mapping[str, Sequence[str]], joints: Sequence[str]
-) -> dict[str, tuple[str, ...]]:
-    """Parameter names by joint, checked, in the order of `PARAMETERS`.
+def checked_names(names: Sequence[str], allowed: Sequence[str]) -> tuple[str, ...]:
+    """Parameter names in the order of `PARAMETERS`.
 
     Raises:
-        PronkError: A name is unknown, or nothing is asked.
+        PronkError: A name is unknown, or there is none.
     """
-    by_joint = (
-        {joint: tuple(parameters.get(joint, ())) for joint in joints}
-        if isinstance(parameters, Mapping)
-        else {joint: tuple(parameters) for joint in joints}
+    if not names or (unknown := [name for name in names if name not in allowed]):
+        raise PronkError(
+            f"free parameters {', '.join(unknown) if names else 'none'}; expected some of "
+            f"{', '.join(allowed)}."
+        )
+    return tuple(name for name in PARAMETERS if name in names)
+
+
+def bounds(names: Sequence[str]) -> tuple[Array, Array]:
+    """Lower and upper bounds of the searched numbers, each of shape (p,)."""
+    kinds = [PARAMETERS[name] for name in names]
+    return (
+        np.array([kind.scaled(kind.low) for kind in kinds]),
+        np.array([kind.scaled(kind.high) for kind in kinds]),
     )
-    for names in by_joint.values():
-        for name in names:
-            if name not in KINDS:
-                raise PronkError(
-                    f"there is no drive parameter {name!r}; expected some of "
-                    f"{', '.join(PARAMETERS)}."
-                )
-    if not any(by_joint.values()):
-        raise PronkError(f"no parameter to fit; expected some of {', '.join(PARAMETERS)}.")
-    return {
-        joint: tuple(name for name in PARAMETERS if name in names)
-        for joint, names in by_joint.items()
-    }
 
 
-def gains_covariance(
-    fitted: Sequence[str], covariance: NDArray[np.float64]
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The part of a covariance that is of (stiffness, damping); zero for what was held.
+def begin(names: Sequence[str], values: Sequence[float], fitted: Sequence[bool]) -> Array:
+    """Searched numbers to begin with, inside the bounds, shape (p,).
 
     Args:
-        fitted: Names of the rows and columns.
-        covariance: Shape (fitted, fitted).
+        names: The parameters.
+        values: Their values so far.
+        fitted: True for a value from an earlier fit; a published one may be a bad place to begin.
     """
-
-    def of(first: str, second: str) -> float:
-        if first not in fitted or second not in fitted:
-            return 0.0
-        return float(covariance[fitted.index(first), fitted.index(second)])
-
-    kp, kd = "stiffness", "damping"
-    return (of(kp, kp), of(kp, kd)), (of(kd, kp), of(kd, kd))
+    low, high = bounds(names)
+    scaled = []
+    for name, value, known in zip(names, values, fitted, strict=True):
+        kind = PARAMETERS[name]
+        scaled.append(kind.scaled(max(value if known else max(value, kind.start), kind.low)))
+    margin = 1e-3 * (high - low)
+    return np.asarray(np.clip(scaled, low + margin, high - margin))

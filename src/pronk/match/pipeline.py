@@ -5,18 +5,25 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.errors import PronkError
 from pronk.logs.joint_log import SweepLog
-from pronk.match.amplitude import amplitude_flags, amplitude_gains, amplitude_spread
-from pronk.match.command_delay import command_delay
-from pronk.match.diagnostics import armature_flags, doubts, missing
-from pronk.match.gains import JointGains
+from pronk.match.arm import match_arm
+from pronk.match.diagnostics import (
+    amplitude_flags,
+    amplitude_gains,
+    armature_flags,
+    command_delay,
+    missing,
+    warnings,
+)
+from pronk.match.drive import match_drives
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
-from pronk.match.interval import interval
 from pronk.match.measured_joint import (
     MeasuredJoint,
     SimRequest,
@@ -26,12 +33,15 @@ from pronk.match.measured_joint import (
     merged,
     responses,
 )
+from pronk.match.parameters import DRIVE_MODE
 from pronk.match.quick import quick_search
 from pronk.match.ranges import matched_gains
 from pronk.match.refine import Fit, refine
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import JointFit, MatchResult
 from pronk.match.settings import MatchSettings
+from pronk.match.uncertainty import interval
 from pronk.robots.robot import Robot
+from pronk.simulators.chain import moves_together
 from pronk.simulators.simulator import JointRigs, joint_rigs
 
 Array = NDArray[np.float64]
@@ -67,23 +77,54 @@ def match_logs(
     logs: Sequence[SweepLog],
     robot: Robot,
     *,
+    mode: Literal["gains", "drive"] = "gains",
+    free: Sequence[str] = (),
     settings: MatchSettings | None = None,
     progress: Progress | None = None,
 ) -> MatchResult:
-    """Match every joint that was asked in some logs.
+    """Match every joint that was excited in some logs.
+
+    Sweeps of one joint at a time are matched in frequency; where several joints move at once the
+    whole arm is fitted in time.
 
     Args:
-        logs: One or more logs of one robot; a joint may be asked in several.
+        logs: One or more logs of one robot; a joint may be excited in several.
         robot: The robot.
+        mode: `gains` finds stiffness and damping (the paper's); `drive` takes the stiffness for
+            known and fits damping, armature, dry friction and delay.
+        free: Parameters to fit in mode `drive` instead.
         settings: How to match; the paper's search if not given.
-        progress: Told the stage in words and the share of it that is done, 0 to 1.
+        progress: Called with the stage and the share of it that is done, 0 to 1.
 
     Raises:
-        LogError: No joint of the robot was asked, or a log cannot be used.
-        IdentifiabilityError: A joint's band is mostly incoherent or too short.
-        PronkError: The device of the settings cannot be used here.
+        LogError: No joint of the robot was excited, or a log cannot be used.
+        IdentifiabilityError: A joint's band is mostly incoherent or too short, or a parameter
+            cannot be identified.
+        PronkError: The device or simulator of the settings cannot be used here.
     """
     chosen = settings or MatchSettings()
+    if mode not in ("gains", "drive"):
+        raise PronkError(f"mode {mode!r}; expected gains or drive.")
+    if free and mode != "drive":
+        raise PronkError("parameters to fit can be named in mode drive only.")
+    if any(moves_together(log) for log in logs):
+        if chosen.simulator != "mujoco":
+            raise PronkError(
+                f"simulator {chosen.simulator}: several joints of these logs move at once, which "
+                "only simulator mujoco matches; record one joint at a time."
+            )
+        return match_arm(logs, robot, mode=mode, threads=chosen.threads, progress=progress)
+    if mode == "drive":
+        return match_drives(
+            logs, robot, free=free or DRIVE_MODE, settings=chosen, progress=progress
+        )
+    return _match_gains(logs, robot, chosen, progress)
+
+
+def _match_gains(
+    logs: Sequence[SweepLog], robot: Robot, chosen: MatchSettings, progress: Progress | None
+) -> MatchResult:
+    """The paper's search, its refinement and intervals, joint by joint."""
     clock = _Clock(progress)
     # The simulator first: a device that is missing must not cost the user an estimate.
     with joint_rigs(
@@ -101,13 +142,13 @@ def match_logs(
         if chosen.zero_armature and "armature" in simulator.parameters:
             with clock.stage("zero armature"):
                 zero = _without_armature(simulator, asked, found, chosen, clock)
-    joints: dict[str, JointMatch] = {}
-    gains: dict[str, JointGains] = {}
-    for name, item in asked.items():
-        joints[name], gains[name] = _report(
+    joints = {
+        name: _joint_fit(
             robot, item, found[name], matched[name], naive[name], zero.get(name), chosen
         )
-        gains[name] = replace(gains[name], delay_s=command_delay(joints[name]))
+        for name, item in asked.items()
+    }
+    gains = {name: joint.gains() for name, joint in joints.items()}
     return MatchResult(
         gains=matched_gains(robot, gains, logs, simulator.info),
         joints=joints,
@@ -250,7 +291,7 @@ def _without_armature(
     return {request.target.joint: answer for request, answer in zip(requests, answers, strict=True)}
 
 
-def _report(
+def _joint_fit(
     robot: Robot,
     item: _Asked,
     found: _Found,
@@ -258,8 +299,8 @@ def _report(
     naive: NDArray[np.complex128],
     zero: NDArray[np.complex128] | None,
     settings: MatchSettings,
-) -> tuple[JointMatch, JointGains]:
-    """Put one joint's findings into the artefacts."""
+) -> JointFit:
+    """Put one joint's findings together."""
     goal, fit, grid = item.main, found.fit, found.grid
     joint = robot.joint(goal.joint)
     bounds = interval(fit, level=settings.level, method=settings.interval)
@@ -267,51 +308,37 @@ def _report(
     naive_db = float(np.sqrt(np.mean(goal.error_db(naive[goal.fit_mask]) ** 2)))
     zero_db = float("nan") if found.zero is None else found.zero.error_db
     band = goal.measured.band(*joint.band_hz)
-    flags = (
-        *doubts(goal, fit, grid, settings),
-        *bounds.flags,
-        *amplitude_flags(per_amplitude),
-        *missing(goal, band),
-        *goal.warnings,
-    )
-    covariance = bounds.covariance
-    gains = JointGains(
+    return JointFit(
+        joint=goal.joint,
+        responses=tuple(one.measured for one in item.targets),
         stiffness=fit.stiffness,
         damping=fit.damping,
-        grid_stiffness=grid.gains[0],
-        grid_damping=grid.gains[1],
-        stiffness_ci95=bounds.around(fit.stiffness, 0),
-        damping_ci95=bounds.around(fit.damping, 1),
-        covariance=(
-            (float(covariance[0, 0]), float(covariance[0, 1])),
-            (float(covariance[1, 0]), float(covariance[1, 1])),
-        ),
+        armature=joint.drive.armature,
+        delay_s=command_delay(goal.measured, matched, joint.band_hz),
+        ci95={
+            "stiffness": bounds.around(fit.stiffness, 0),
+            "damping": bounds.around(fit.damping, 1),
+        },
+        covariance=bounds.covariance,
         band_hz=joint.band_hz,
         error_db=fit.error_db,
         naive_error_db=naive_db,
         coherence_min=float(goal.measured.coherence[band].min()),
-        armature=joint.drive.armature,
-        amplitude_spread=amplitude_spread(per_amplitude),
-        flags=flags,
-    )
-    match = JointMatch(
-        joint=goal.joint,
-        responses=tuple(one.measured for one in item.targets),
+        matched=matched,
+        naive=naive,
         grid_stiffness=grid.stiffness,
         grid_damping=grid.damping,
         grid_error=grid.error,
-        stiffness=fit.stiffness,
-        damping=fit.damping,
-        covariance=covariance,
-        band_hz=joint.band_hz,
-        matched=matched,
-        naive=naive,
-        error_db=fit.error_db,
-        naive_error_db=naive_db,
         zero_armature_error_db=zero_db,
         zero_armature=zero,
         repeat_gains=bounds.repeat_gains,
         amplitude_gains=per_amplitude,
-        flags=(*flags, *armature_flags(fit, zero_db, settings)),
+        flags=(
+            *warnings(goal, fit, grid, settings),
+            *bounds.flags,
+            *amplitude_flags(per_amplitude),
+            *missing(goal, band),
+            *goal.warnings,
+            *armature_flags(fit, zero_db, settings),
+        ),
     )
-    return match, gains

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError, PronkError
 from pronk.logs.joint_log import Segment, SweepLog
-from pronk.match.arm.match import drives_of
+from pronk.match.arm import drives_of
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.measured_joint import gains_on_drive
 from pronk.match.prediction import JointPrediction, Prediction

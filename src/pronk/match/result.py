@@ -9,53 +9,106 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.files import load_artefact, save_artefact
-from pronk.match.gains import MatchedGains
+from pronk.match.gains import JointGains, MatchedGains
 from pronk.response.response import FrequencyResponse
 
 SCHEMA = "pronk/match/2"
+ZERO_ARMATURE = "zero armature: "
+"""Beginning of the flag on the search without rotor inertia; it says nothing of the gains."""
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
+def _none(*shape: int) -> Any:
+    return field(default_factory=lambda: np.empty(shape))
+
+
 @dataclass(frozen=True, kw_only=True)
-class JointMatch:
+class JointFit:
     """How one joint was matched. Responses share the frequencies of `responses[0]`."""
 
     joint: str
     responses: tuple[FrequencyResponse, ...]
-    """Measured, one per amplitude; the first (largest amplitude) is the one matched."""
-    grid_stiffness: Array
-    """Axis of the grid [N m/rad], shape (a,)."""
-    grid_damping: Array
-    """Axis of the grid [N m s/rad], shape (b,)."""
-    grid_error: Array
-    """Mean squared magnitude error in the band [dB^2], shape (a, b)."""
+    """Measured, one per amplitude; the first (largest amplitude) is the one matched. Empty where
+    several joints moved together and none could be estimated."""
     stiffness: float
+    """[N m/rad]"""
     damping: float
+    """[N m s/rad]"""
+    armature: float = float("nan")
+    """[kg m^2]"""
+    frictionloss: float = float("nan")
+    """Fitted dry friction [N m]; NaN: that of the robot's drive."""
+    delay_s: float = 0.0
+    """Command delay [s]."""
+    ci95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """95 % interval of each fitted parameter."""
     covariance: Array
     """Of (stiffness, damping), shape (2, 2)."""
+    held: tuple[str, ...] = ()
+    """Parameters that were to be fitted but are held, because the logs do not identify them."""
     band_hz: tuple[float, float]
+    error_db: float
+    """Root mean square of the gain error in the band at the optimum [dB]."""
+    naive_error_db: float
+    """The same with the gains of the real drive put into the simulator."""
+    coherence_min: float = float("nan")
     matched: ComplexArray
     """Simulated response with the matched gains, shape (f,)."""
     naive: ComplexArray
     """Simulated response with the real drive's gains put into the simulator, shape (f,)."""
-    error_db: float
-    naive_error_db: float
+    grid_stiffness: Array = _none(0)
+    """Axis of the grid [N m/rad], shape (a,); empty where no grid was searched."""
+    grid_damping: Array = _none(0)
+    """Axis of the grid [N m s/rad], shape (b,)."""
+    grid_error: Array = _none(0, 0)
+    """Mean squared magnitude error in the band [dB^2], shape (a, b)."""
     zero_armature_error_db: float = float("nan")
     """Smallest error over the same grid with no rotor inertia (paper F13)."""
     zero_armature: ComplexArray | None = None
     """Simulated response at that point of the grid, shape (f,)."""
-    repeat_gains: Array = field(default_factory=lambda: np.empty((0, 2)))
+    repeat_gains: Array = _none(0, 2)
     """(stiffness, damping) of each repeat fitted by itself, shape (repeats, 2)."""
-    amplitude_gains: Array = field(default_factory=lambda: np.empty((0, 3)))
+    amplitude_gains: Array = _none(0, 3)
     """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
+    rmse: float = float("nan")
+    """Simulated less recorded position where several joints moved together [rad]."""
+    published_rmse: float = float("nan")
+    """The same with the robot's published parameters [rad]."""
     flags: tuple[str, ...] = ()
+
+    def gains(self) -> JointGains:
+        """The part of the fit that training needs."""
+        best = (float("nan"), float("nan"))
+        if self.grid_error.size:
+            i, j = np.unravel_index(int(np.nanargmin(self.grid_error)), self.grid_error.shape)
+            best = (float(self.grid_stiffness[i]), float(self.grid_damping[j]))
+        (a, b), (c, d) = self.covariance.tolist()
+        return JointGains(
+            stiffness=self.stiffness,
+            damping=self.damping,
+            grid_stiffness=best[0],
+            grid_damping=best[1],
+            stiffness_ci95=self.ci95.get("stiffness", (self.stiffness, self.stiffness)),
+            damping_ci95=self.ci95.get("damping", (self.damping, self.damping)),
+            covariance=((a, b), (c, d)),
+            band_hz=self.band_hz,
+            error_db=self.error_db,
+            naive_error_db=self.naive_error_db,
+            coherence_min=self.coherence_min,
+            armature=self.armature,
+            amplitude_spread=amplitude_spread(self.amplitude_gains),
+            frictionloss=self.frictionloss,
+            delay_s=self.delay_s,
+            flags=tuple(f for f in self.flags if not f.startswith(ZERO_ARMATURE)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,20 +116,23 @@ class MatchResult:
     """A whole match: the gains and what they rest on."""
 
     gains: MatchedGains
-    joints: Mapping[str, JointMatch]
+    joints: Mapping[str, JointFit]
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time of each stage [s]."""
     grid_steps_per_second: float = float("nan")
     """Physics steps per second of the grid search, both cores together."""
+    excluded: Mapping[str, str] = field(default_factory=dict)
+    """Joints that moved and were not matched, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Stored:
     """A match without its gains, which have a file of their own."""
 
-    joints: Mapping[str, JointMatch]
+    joints: Mapping[str, JointFit]
     seconds: Mapping[str, float]
     grid_steps_per_second: float
+    excluded: Mapping[str, str] = field(default_factory=dict)
 
 
 def save(path: Path, result: MatchResult) -> None:
@@ -85,6 +141,7 @@ def save(path: Path, result: MatchResult) -> None:
         joints=result.joints,
         seconds=result.seconds,
         grid_steps_per_second=result.grid_steps_per_second,
+        excluded=result.excluded,
     )
     save_artefact(path, stored, SCHEMA)
 
@@ -97,3 +154,14 @@ def load(path: Path, gains: MatchedGains) -> MatchResult:
     """
     stored = load_artefact(path, _Stored, SCHEMA, what="a match file", writer="pronk match")
     return MatchResult(gains=gains, **vars(stored))
+
+
+def amplitude_spread(gains: Array) -> float:
+    """Largest relative change of stiffness from the first amplitude; NaN with one amplitude.
+
+    Args:
+        gains: (amplitude, stiffness, damping), the matched amplitude first, shape (m, 3).
+    """
+    if len(gains) < 2:
+        return float("nan")
+    return float(np.abs(gains[1:, 1] / gains[0, 1] - 1.0).max())

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import JointFit, MatchResult
 from pronk.report import style
 from pronk.response.response import FrequencyResponse
 
@@ -62,7 +62,7 @@ def _gain(axes: Axes, response: FrequencyResponse, curve: ComplexArray, **look: 
     axes.plot(response.frequency_hz, _hidden(response, style.decibel(curve)), **look)
 
 
-def _gain_limits(joint: JointMatch, *, room: float = 0.0) -> tuple[float, float]:
+def _gain_limits(joint: JointFit, *, room: float = 0.0) -> tuple[float, float]:
     """Limits of the gain axis that hold every curve where the measurement is worth reading.
 
     Args:
@@ -77,7 +77,7 @@ def _gain_limits(joint: JointMatch, *, room: float = 0.0) -> tuple[float, float]
     return float(max(values.min(), -60.0)) - 2.0 - room, float(values.max()) + 2.0 + room
 
 
-def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True) -> Figure:
+def bode(joint: JointFit, *, title: str | None = None, coherence: bool = True) -> Figure:
     """Bode plot of one joint: measured with its 95 % interval, matched, naive, coherence below.
 
     Args:
@@ -142,7 +142,7 @@ def bode(joint: JointMatch, *, title: str | None = None, coherence: bool = True)
     return figure
 
 
-def _phase_limits(joint: JointMatch) -> tuple[float, float]:
+def _phase_limits(joint: JointFit) -> tuple[float, float]:
     response = joint.responses[0]
     inside = _worth(response)
     curves = [response.phase, *(np.unwrap(np.angle(c)) for c in (joint.matched, joint.naive))]
@@ -151,7 +151,7 @@ def _phase_limits(joint: JointMatch) -> tuple[float, float]:
     return float(max(values.min() - 15.0, -720.0)), float(min(values.max() + 15.0, 90.0))
 
 
-def _bode_handles(joint: JointMatch | None, virtual: bool = False) -> list[Line2D | Patch]:
+def _bode_handles(joint: JointFit | None, virtual: bool = False) -> list[Line2D | Patch]:
     """Legend entries; with a joint, its errors stand beside the names."""
     matched, naive = "simulator, matched gains", "simulator, naive gains"
     band = "frequencies compared"
@@ -232,7 +232,7 @@ def overview(result: MatchResult) -> Figure:
     return figure
 
 
-def zero_armature(joint: JointMatch) -> Figure:
+def zero_armature(joint: JointFit) -> Figure:
     """Gain of one joint with the best match that a simulator without rotor inertia allows.
 
     The paper's Fig. 3: no gains make up for inertia that is not there.

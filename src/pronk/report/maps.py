@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pronk.match.gains import MatchedGains
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import JointFit, MatchResult
 from pronk.report import style
 from pronk.report.paper import published
 
@@ -122,7 +122,7 @@ _DOT: dict[str, Any] = {
 }
 
 
-def _mark_map(axes: Axes, joint: JointMatch) -> None:
+def _mark_map(axes: Axes, joint: JointFit) -> None:
     i, j = np.unravel_index(int(np.nanargmin(joint.grid_error)), joint.grid_error.shape)
     axes.plot(joint.grid_stiffness[i], joint.grid_damping[j], **_SQUARE)
     if np.isfinite(joint.covariance).all():

@@ -18,12 +18,12 @@ from pronk.evaluation.outcome.table_text import Sheet, number
 from pronk.evaluation.result import Subject, Trial
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
-from pronk.match.result import JointMatch, MatchResult
+from pronk.match.result import JointFit, MatchResult
 from pronk.report import style
 from pronk.report.page import find_gains
 
 
-def joint_error_db(joint: JointMatch, stiffness: float, damping: float) -> float:
+def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
     """Error of a joint's simulated gain with these gains, RMS over its band [dB].
 
     Args:

@@ -1,14 +1,15 @@
-"""How far the matched gains can be believed: repeats are the unit of uncertainty.
+"""Uncertainty of fitted parameters: a delete-one-block jackknife, linearized at the optimum.
 
-Noise on a robot is coloured and neighbouring frequencies share it, so intervals that take
-samples or frequencies for independent are several times too narrow. Repeats of the same question
-are independent whatever the colour. Every repeat is fitted by itself, and the interval is
-Student's t over the fits, which holds with as few as three; with many repeats the bootstrap over
-them asks for no normal distribution.
+A block is a repeat of a sweep, or 20 s of a recording in time. Noise on a robot is coloured and
+neighbouring frequencies and samples share it, so intervals that take them for independent are
+several times too narrow; repeats and long blocks are independent whatever the colour. The interval
+is Student's t over the blocks, which holds with as few as three; with many repeats the bootstrap
+over them assumes no normal distribution.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,6 +19,7 @@ from scipy import stats
 
 from pronk.errors import IdentifiabilityError
 from pronk.match.measured_joint import DB, FLOOR_DB
+from pronk.match.parameters import PARAMETERS
 from pronk.match.refine import Fit, residual_db
 
 Array = NDArray[np.float64]
@@ -30,6 +32,103 @@ BOOTSTRAP_REPEATS = 8
 """Fewest repeats to resample: with n of them the bootstrap's spread is too small by
 sqrt((n - 1) / n), and its tails hold no more than the repeats do."""
 _RESAMPLES = 2000
+
+
+def jackknife(moves: Array) -> Array:
+    """Covariance of an optimum that moves by `moves` when one block is left out.
+
+    `(n - 1) / n sum (move - mean) (move - mean)^T`; where the optimum is the mean of n repeats,
+    `moves = repeats / (n - 1)` gives their sample covariance over n.
+
+    Args:
+        moves: Shape (n, p).
+
+    Returns:
+        Shape (p, p).
+    """
+    about = moves - np.mean(moves, axis=0)
+    count = len(moves)
+    return np.asarray((count - 1) / count * about.T @ about)
+
+
+def block_moves(jacobian: Array, residual: Array, blocks: NDArray[np.int64]) -> Array:
+    """Where the optimum moves when one block of residuals is left out, to first order.
+
+    `(A - A_b)^-1 J_b^T r_b` with A = J^T J and A_b = J_b^T J_b.
+
+    Args:
+        jacobian: Shape (m, p).
+        residual: Shape (m,).
+        blocks: Number of the block of each residual, shape (m,).
+
+    Returns:
+        Shape (blocks, p).
+    """
+    whole = jacobian.T @ jacobian
+    # A parameter without effect must come out as very uncertain, not as an error.
+    whole = whole + 1e-12 * np.trace(whole) * np.eye(len(whole))
+    moves = []
+    for number in np.unique(blocks):
+        own = jacobian[blocks == number]
+        left = whole - own.T @ own
+        moves.append(np.linalg.lstsq(left, own.T @ residual[blocks == number], rcond=None)[0])
+    return np.array(moves)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Fitted parameters of one joint with their uncertainty."""
+
+    values: Mapping[str, float]
+    """Every parameter, fitted or held."""
+    fitted: tuple[str, ...]
+    covariance: Array
+    """Of (stiffness, damping), zero for what was held, shape (2, 2)."""
+    sd: Mapping[str, float]
+    """Standard deviation of each fitted parameter: relative, of delay and offset in [s], [rad]."""
+    ci95: Mapping[str, tuple[float, float]]
+    """95 % interval of each fitted parameter, Student's t; empty without repeats."""
+
+    @property
+    def unidentified(self) -> tuple[str, ...]:
+        """Fitted parameters whose deviation is beyond the limit of `PARAMETERS`."""
+        return tuple(n for n in self.fitted if not self.sd[n] <= PARAMETERS[n].sd_max)
+
+
+def estimate(
+    fitted: Sequence[str], x: Array, covariance: Array, freedom: int, held: Mapping[str, float]
+) -> Estimate:
+    """Turn searched numbers into parameters with intervals.
+
+    Args:
+        fitted: Names of the searched numbers.
+        x: The optimum, shape (p,).
+        covariance: Of the searched numbers, shape (p, p).
+        freedom: Degrees of freedom of the covariance; with 0 there are no intervals.
+        held: Values of the parameters that were not fitted.
+    """
+    kinds = [PARAMETERS[name] for name in fitted]
+    sd = np.sqrt(np.diag(covariance))
+    slope = np.array([kind.slope(float(value)) for kind, value in zip(kinds, x, strict=True)])
+    own = covariance * np.outer(slope, slope)
+    places = [fitted.index(name) if name in fitted else None for name in ("stiffness", "damping")]
+    ci95 = {}
+    if freedom:
+        # e^20 is as good as infinite and does not overflow.
+        half = np.minimum(sd * float(stats.t.ppf(0.975, freedom)), 20.0)
+        for name, kind, value, reach in zip(fitted, kinds, x, half, strict=True):
+            floor = -np.inf if name == "offset" else 0.0
+            ci95[name] = (max(kind.unscaled(value - reach), floor), kind.unscaled(value + reach))
+    values = {name: kind.unscaled(float(v)) for name, kind, v in zip(fitted, kinds, x, strict=True)}
+    return Estimate(
+        values={**held, **values},
+        fitted=tuple(fitted),
+        covariance=np.array(
+            [[0.0 if i is None or j is None else own[i, j] for j in places] for i in places]
+        ),
+        sd=dict(zip(fitted, sd.tolist(), strict=True)),
+        ci95=ci95,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +185,7 @@ def interval(
     change = residual_db(goal, measured, goal.measured.response[goal.fit_mask], use_phase)
     # The residual is simulated less measured: a larger answer asks for a larger simulated one.
     gains = optimum * np.exp(change @ fit.influence().T)
-    spread = np.atleast_2d(np.cov(gains.T, ddof=1))
-    covariance = spread / count
+    covariance = jackknife(gains / (count - 1))
     if method == "bootstrap":
         below, above = _bootstrapped(gains, level)
     else:
