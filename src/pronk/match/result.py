@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +23,6 @@ ZERO_ARMATURE = "zero armature: "
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-
-
-def _none(*shape: int) -> Any:
-    return field(default_factory=lambda: np.empty(shape))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,19 +59,19 @@ class JointFit:
     """Simulated response with the matched gains, shape (f,)."""
     naive: ComplexArray
     """Simulated response with the real drive's gains put into the simulator, shape (f,)."""
-    grid_stiffness: Array = _none(0)
+    grid_stiffness: Array = field(default_factory=lambda: np.empty(0))
     """Axis of the grid [N m/rad], shape (a,); empty where no grid was searched."""
-    grid_damping: Array = _none(0)
+    grid_damping: Array = field(default_factory=lambda: np.empty(0))
     """Axis of the grid [N m s/rad], shape (b,)."""
-    grid_error: Array = _none(0, 0)
+    grid_error: Array = field(default_factory=lambda: np.empty((0, 0)))
     """Mean squared magnitude error in the band [dB^2], shape (a, b)."""
     zero_armature_error_db: float = float("nan")
     """Smallest error over the same grid with no rotor inertia (paper F13)."""
     zero_armature: ComplexArray | None = None
     """Simulated response at that point of the grid, shape (f,)."""
-    repeat_gains: Array = _none(0, 2)
+    repeat_gains: Array = field(default_factory=lambda: np.empty((0, 2)))
     """(stiffness, damping) of each repeat fitted by itself, shape (repeats, 2)."""
-    amplitude_gains: Array = _none(0, 3)
+    amplitude_gains: Array = field(default_factory=lambda: np.empty((0, 3)))
     """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
     rmse: float = float("nan")
     """Simulated less recorded position where several joints moved together [rad]."""
