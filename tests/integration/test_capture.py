@@ -121,7 +121,7 @@ def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
 
 
 def test_power_is_what_the_battery_gives(seen: Capture) -> None:
-    # Before anything is asked, current squared times resistance.
+    # Before any command, current squared times resistance.
     constants = [MotorConstants.of(joint.drive) for joint in ROBOT.joints]
     scale = np.array([SIM_PARAMS.joints[name].torque_scale for name in ROBOT.joint_names])
     current = seen.torque[0] / (scale * np.array([c.constant for c in constants]))

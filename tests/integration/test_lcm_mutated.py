@@ -90,7 +90,7 @@ class Breaker:
 
 @pytest.fixture(scope="module")
 def undisturbed() -> list[State]:
-    """What one leg of the virtual robot does when nobody says anything."""
+    """What one leg of the virtual robot does without a command."""
     machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
     machine.connect()
     return [machine.latest(), *machine.wait(STEPS * 0.002)]
@@ -132,9 +132,7 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
 
 
 @BOTH
-def test_the_same_server_does_move_when_it_is_told_to(
-    layout: Layout, undisturbed: list[State]
-) -> None:
+def test_the_same_server_does_move_when_commanded(layout: Layout, undisturbed: list[State]) -> None:
     from pronk.virtual.lcm_server import LcmServerTransport
 
     machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
@@ -149,7 +147,7 @@ def test_the_same_server_does_move_when_it_is_told_to(
 
 
 @BOTH
-def test_one_flipped_bit_never_asks_for_the_impossible(layout: Layout) -> None:
+def test_one_flipped_bit_never_commands_the_impossible(layout: Layout) -> None:
     # Without a checksum a flipped bit may leave a possible command: then it is one the motors'
     # bus can carry, and nothing else.
     good = good_command(layout)
@@ -170,13 +168,13 @@ def test_one_flipped_bit_never_asks_for_the_impossible(layout: Layout) -> None:
 
 @BOTH
 def test_broken_states_make_no_state(layout: Layout) -> None:
-    reader = StateDecoder(layout, ROBOT.joint_names)
+    decoder = StateDecoder(layout, ROBOT.joint_names)
     state = State(
         time=0.0, sequence=1, position=np.zeros(12), velocity=np.zeros(12), torque=np.zeros(12),
         gyro=np.zeros(3), accelerometer=np.array([0.0, 0.0, 9.81]), bus_voltage=24.0,
     )  # fmt: skip
     (_, attitude), (_, joints) = encode_state(layout, state)
-    reader.attitude(attitude, 0.0)
+    decoder.attitude(attitude, 0.0)
     rng = np.random.default_rng(3)
     for k in range(20_000):
         good = (attitude, joints)[k % 2]
@@ -186,9 +184,9 @@ def test_broken_states_make_no_state(layout: Layout) -> None:
             good[:8] + rng.bytes(int(rng.integers(len(good)))),
             rng.bytes(int(rng.integers(300))),
         )[rng.integers(4)]
-        (reader.attitude, reader.joints)[k % 2](data, 0.001)
-        reader.beacon(data)
-    assert reader.latest is None
-    assert not reader.virtual
-    reader.joints(joints, 0.002)
-    assert reader.latest is not None
+        (decoder.attitude, decoder.joints)[k % 2](data, 0.001)
+        decoder.beacon(data)
+    assert decoder.latest is None
+    assert not decoder.virtual
+    decoder.joints(joints, 0.002)
+    assert decoder.latest is not None

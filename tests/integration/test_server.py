@@ -121,7 +121,7 @@ def test_what_the_drives_do_when_commands_stop(action: str) -> None:
         Watchdog(after_s=0.0)
 
 
-def test_a_rival_comes_when_asked_and_the_robots_own_controller_until_released() -> None:
+def test_a_rival_commands_from_its_time_on_and_the_robots_own_controller_until_released() -> None:
     server, desk, _ = made("rival=0.2")
     live(server, 0.0, 0.19)
     assert server.counts["commands applied"] == 0
@@ -166,7 +166,7 @@ def test_some_states_hold_no_number() -> None:
     assert server.figures()["state_faults"] == {"nan": sum(broken)}
 
 
-def test_lost_commands_are_not_heard_and_lost_states_not_told() -> None:
+def test_lost_commands_are_not_applied_and_lost_states_not_published() -> None:
     server, desk, _ = made("loss=1,after=0.1")
     live(server, 0.0, 0.1)
     desk.inbox.append(RAISED)
@@ -211,13 +211,13 @@ def test_on_the_ground_nothing_is_clamped_and_nothing_falls_over_it() -> None:
     assert len(desk.heard) == 25
 
 
-def test_real_time_goes_on_and_ends_when_asked() -> None:
+def test_real_time_goes_on_and_ends() -> None:
     server, desk, machine = made()
-    asked: list[int] = []
+    calls: list[int] = []
 
     def stop() -> bool:
-        asked.append(1)
-        return len(asked) > 400
+        calls.append(1)
+        return len(calls) > 400
 
     server.run(stop)
     figures = server.figures()
@@ -244,7 +244,7 @@ def test_a_server_that_cannot_be_is_one_sentence(words: list[str], complaint: st
     assert complaint in done.stderr
 
 
-def test_a_server_ends_by_itself_and_says_what_happened(tmp_path: Path) -> None:
+def test_a_server_ends_by_itself_and_writes_its_figures(tmp_path: Path) -> None:
     pytest.importorskip("lcm")
     seen, figures = tmp_path / "seen.npz", tmp_path / "figures.json"
     done = invoke(
@@ -254,8 +254,8 @@ def test_a_server_ends_by_itself_and_says_what_happened(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.exit_code == 0
     assert "ready: the virtual mini_cheetah on the ground, seed 0, on LCM" in done.output
-    told = json.loads(figures.read_text(encoding="utf-8"))
-    assert told["virtual"] is True
+    written = json.loads(figures.read_text(encoding="utf-8"))
+    assert written["virtual"] is True
     # Its own controller speaks, and is heard, on the wire itself.
-    assert told["wire"]["commands"] > 0
-    assert load(seen).time[-1] == pytest.approx(told["duration_s"], abs=0.01)
+    assert written["wire"]["commands"] > 0
+    assert load(seen).time[-1] == pytest.approx(written["duration_s"], abs=0.01)

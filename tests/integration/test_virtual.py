@@ -73,7 +73,7 @@ def offset(joint: str, value: float) -> Array:
     return position
 
 
-def ask(machine: VirtualRobot, joint: str, command: Array) -> list[State]:
+def excite(machine: VirtualRobot, joint: str, command: Array) -> list[State]:
     states = [machine.latest()]
     start = machine.latest().time
     for k, value in enumerate(command):
@@ -110,7 +110,7 @@ def test_the_step_has_converged_to_40_khz(joint: str) -> None:
     command = chirp(6.0)
     coarse, fine = (
         gain_db(
-            command, column(ask(connected(quiet(), timestep_s=step), joint, command), joint), 10
+            command, column(excite(connected(quiet(), timestep_s=step), joint, command), joint), 10
         )[1]
         for step in (0.25e-3, 0.025e-3)
     )
@@ -136,7 +136,7 @@ def test_without_imperfections_a_joint_answers_as_its_equation_says() -> None:
     machine = connected(sim_params)
     machine.clamp(ROBOT.joint(joint).clamped)
     command = chirp(20.0)
-    position = column(ask(machine, joint, command), joint)
+    position = column(excite(machine, joint, command), joint)
     hz, measured = gain_db(command, position, 10)
     # I = reflected rotor + shank about the knee (its own inertia and Steiner's term).
     model = ROBOT.build_spec().compile()
@@ -171,15 +171,15 @@ def test_damped_legs_sink_and_come_to_rest() -> None:
     assert np.abs(states[-1].velocity).max() < np.abs(states[200].velocity).max()
 
 
-def test_dry_friction_holds_a_joint_that_is_asked_too_softly() -> None:
+def test_dry_friction_holds_a_joint_that_is_commanded_too_softly() -> None:
     sim_params = with_joint(quiet(), "FR_knee", coulomb=0.4, breakaway=0.5)
     machine = connected(sim_params)
     before = machine.latest().position[2]
-    ask_torque = 0.2  # N m, asked through 17 N m/rad, well below break-away
-    step = ask_torque / 17.0
-    small = ask(machine, "FR_knee", np.full(25, step))[-1].position[2] - before
+    command_torque = 0.2  # N m, commanded through 17 N m/rad, well below break-away
+    step = command_torque / 17.0
+    small = excite(machine, "FR_knee", np.full(25, step))[-1].position[2] - before
     assert 0.0 < small < 0.3 * step
-    large = ask(machine, "FR_knee", np.full(25, 0.3))[-1].position[2] - before
+    large = excite(machine, "FR_knee", np.full(25, 0.3))[-1].position[2] - before
     assert large > 0.8 * 0.3
 
 
@@ -239,7 +239,7 @@ def test_battery_sags_with_the_power_drawn() -> None:
 def test_delays_shift_the_answer() -> None:
     command = chirp(1.0)
     prompt, late = (
-        column(ask(connected(quiet(**delays)), "FR_knee", command), "FR_knee")
+        column(excite(connected(quiet(**delays)), "FR_knee", command), "FR_knee")
         for delays in ({}, {"command_delay_s": 0.004, "measurement_delay_s": 0.002})
     )
     np.testing.assert_allclose(late[3:], prompt[:-3], atol=1e-6)
@@ -271,11 +271,11 @@ def test_same_seed_same_numbers_however_time_is_cut() -> None:
 
 def test_connecting_again_starts_anew() -> None:
     machine = connected(SIM_PARAMS)
-    first = ask(machine, "FR_knee", np.full(5, 0.1))
+    first = excite(machine, "FR_knee", np.full(5, 0.1))
     machine.clamp(("FR_knee",))
     machine.close()
     machine.connect()
-    again = ask(machine, "FR_knee", np.full(5, 0.1))
+    again = excite(machine, "FR_knee", np.full(5, 0.1))
     assert np.array_equal(column(first, "FR_knee"), column(again, "FR_knee"))
 
 
@@ -292,7 +292,7 @@ def test_a_time_already_past_brings_no_states() -> None:
 
 def test_positions_lie_on_the_grid_of_the_encoder() -> None:
     machine = connected(replace(SIM_PARAMS, machine=replace(SIM_PARAMS.machine, encoder_bits=10)))
-    states = ask(machine, "FR_knee", chirp(2.0))
+    states = excite(machine, "FR_knee", chirp(2.0))
     for joint in machine.joints:
         grid = 2.0 * np.pi / 2**10 / ROBOT.joint(joint).drive.gear_ratio
         steps = column(states, joint) / grid
@@ -320,7 +320,7 @@ def test_inertial_unit_feels_gravity_and_its_bias() -> None:
 def test_a_compliant_stand_is_felt_by_the_gyro() -> None:
     sim_params = quiet(stand_stiffness=500.0, stand_damping=5.0, gyro_bias=(0.0, 0.0, 0.0))
     machine = connected(sim_params, legs=None)
-    states = ask(machine, "FR_hip_pitch", chirp(3.0))
+    states = excite(machine, "FR_hip_pitch", chirp(3.0))
     rate = np.array([state.gyro for state in states])
     assert np.abs(rate[:, 1]).max() > 0.05
     assert np.abs(rate[0]).max() < 1e-2
@@ -334,7 +334,7 @@ def test_clamp_holds_a_link_but_no_fixture_is_rigid() -> None:
     machine = connected(quiet())
     machine.clamp((joint,))
     rest = machine.latest().position[1]
-    held = ask(machine, joint, np.full(25, 0.2))[-1].position[1] - rest
+    held = excite(machine, joint, np.full(25, 0.2))[-1].position[1] - rest
     # Torque through belt and fixture in series, the drive's own stiffness beside them.
     torque = 17.0 * SIM_PARAMS.joints[joint].torque_scale * 0.2
     give = (
@@ -343,14 +343,14 @@ def test_clamp_holds_a_link_but_no_fixture_is_rigid() -> None:
     )
     assert 0.5 * give < held < 1.1 * give
     machine.clamp(())
-    free = ask(machine, joint, np.full(50, 0.2))[-1].position[1] - rest
+    free = excite(machine, joint, np.full(50, 0.2))[-1].position[1] - rest
     assert free > 0.15
 
 
 def test_legs_on_a_rigid_bench_do_not_feel_each_other() -> None:
     command = chirp(1.0)
     alone, together = (
-        ask(connected(quiet(), legs=legs), "FR_knee", command) for legs in (("FR",), None)
+        excite(connected(quiet(), legs=legs), "FR_knee", command) for legs in (("FR",), None)
     )
     np.testing.assert_allclose(
         column(alone, "FR_knee"), column(together, "FR_knee"), rtol=0.0, atol=1e-9
@@ -361,12 +361,12 @@ def test_legs_on_a_rigid_bench_do_not_feel_each_other() -> None:
     assert all(len(state.position) == 12 for state in alone)
 
 
-def test_mirrored_legs_mirror_each_other_when_their_truths_agree() -> None:
+def test_mirrored_legs_mirror_each_other_when_their_parameters_agree() -> None:
     same = replace(SIM_PARAMS.joints["FR_hip_roll"], encoder_offset=0.0)
     sim_params = replace(quiet(), joints=dict.fromkeys(NAMES, same))
     command = chirp(1.0)
-    right = column(ask(connected(sim_params, legs=None), "FR_hip_roll", command), "FR_hip_roll")
-    left = column(ask(connected(sim_params, legs=None), "FL_hip_roll", -command), "FL_hip_roll")
+    right = column(excite(connected(sim_params, legs=None), "FR_hip_roll", command), "FR_hip_roll")
+    left = column(excite(connected(sim_params, legs=None), "FL_hip_roll", -command), "FL_hip_roll")
     np.testing.assert_allclose(left, -right, atol=1e-6)
 
 

@@ -44,12 +44,12 @@ PITCH = ROBOT.joint_names.index("FR_hip_pitch")
 
 
 def own_network(shift: int = 0) -> DdsNetwork:
-    """Two test processes on one computer must not hear each other."""
+    """Two test processes on one computer must not reach each other."""
     return DdsNetwork(domain=2 + (2 * os.getpid() + shift) % 70)
 
 
 def live(network: DdsNetwork, end: Connection) -> None:
-    """Body of the server's process, until it is told to stop; it tells what it met."""
+    """Body of the server's process, until it receives stop; it sends its figures."""
     robot = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",))
     robot.connect()
     wire = DdsServerTransport(ROBOT, network, mode="normal")
@@ -59,7 +59,7 @@ def live(network: DdsNetwork, end: Connection) -> None:
     end.send(server.figures())
 
 
-class Double:
+class Robot:
     """A server in another process, whose own controller holds the joints at first."""
 
     def __init__(self) -> None:
@@ -78,13 +78,13 @@ class Double:
 
 
 @pytest.fixture
-def double() -> Iterator[Double]:
-    made = Double()
+def double() -> Iterator[Robot]:
+    made = Robot()
     yield made
     made.process.kill()
 
 
-def eventually(done: Callable[[], bool], seconds: float = 2.0) -> bool:
+def eventually(done: Callable[[], bool], seconds: float = 120.0) -> bool:
     end = time.monotonic() + seconds
     while not (is_done := done()) and time.monotonic() < end:
         time.sleep(0.005)
@@ -98,7 +98,7 @@ def turned(angle: float) -> Command:
     return Command(position=position, stiffness=STIFF, damping=DAMPED)
 
 
-def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
+def test_a_robot_behind_dds_from_preflight_to_close(double: Robot) -> None:
     network = double.network
     # Its own controller holds the joints: refused, unless it may be released.
     with pytest.raises(HardwareError, match="own controller 'normal' holds the joints"):
@@ -111,7 +111,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     assert begun.bus_voltage == pytest.approx(24.5, abs=0.5)
     assert machine.counts["commands"] == machine.counts["repeats"] == 0
 
-    # What has a wrong checksum, or asks for the impossible, moves nothing.
+    # What has a wrong checksum, or commands the impossible, moves nothing.
     stranger = Participant(network).writer(COMMANDS, idl.LowCmd, raw=True)
     assert eventually(lambda: len(stranger.get_matched_subscriptions()) >= 2)
     far = bytearray(encode_command(JOINTS, turned(0.5)))
@@ -121,12 +121,12 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
         time.sleep(0.002)
     states = machine.wait(machine.now() + 0.2)
     assert max(abs(state.position[PITCH] - begun.position[PITCH]) for state in states) < 0.01
-    # But whoever wrote that is another writer: no commands beside him, and none after.
+    # But its sender is another writer: no commands beside it, and none after.
     with pytest.raises(HardwareError, match="another program commands the joints on rt/lowcmd"):
         machine.send(HOLD)
     machine.close()
 
-    # While he is silent, a joint moves as asked, for as long as the command is valid.
+    # While it is silent, a joint moves as commanded, for as long as the command is valid.
     machine.connect()
     machine.send(turned(-0.2))
     states = machine.wait(machine.now() + 0.5)
@@ -143,8 +143,8 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
         second.connect()
     assert second.counts["commands"] == second.counts["repeats"] == 0
 
-    # Expiry: damping on the wire, without anybody's doing.
-    heard = Participant(network).reader(COMMANDS, idl.LowCmd)
+    # Expiry: damping on the wire, without a call.
+    received = Participant(network).reader(COMMANDS, idl.LowCmd)
     machine.send(
         Command(
             position=DEFAULT, stiffness=STIFF, damping=DAMPED, made=machine.now(), valid_for=0.1
@@ -152,7 +152,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     )
     assert eventually(lambda: machine.counts["expired"] == 1)
     time.sleep(0.05)
-    last = take(heard, Counter())[-1].motor_cmd[PITCH]
+    last = take(received, Counter())[-1].motor_cmd[PITCH]
     assert (last.kp, last.kd, last.q) == (0.0, 1.0, 2.146e9)
 
     # And another writer in the middle of it all is answered with damping.
@@ -161,8 +161,8 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     assert eventually(lambda: machine.counts["foreign"] > 0)
     with pytest.raises(HardwareError, match="another program commands"):
         machine.send(HOLD)
-    take(heard, Counter())
-    assert eventually(lambda: any(m.motor_cmd[PITCH].kp == 0.0 for m in take(heard, Counter())))
+    take(received, Counter())
+    assert eventually(lambda: any(m.motor_cmd[PITCH].kp == 0.0 for m in take(received, Counter())))
 
     begun_closing = time.monotonic()
     machine.close()
@@ -176,7 +176,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Double) -> None:
     assert figures["server"]["commands of others"] > 0
 
 
-def test_nobody_there() -> None:
+def test_no_robot() -> None:
     with pytest.raises(HardwareError, match=r"sent no state on rt/lowstate .*on loopback; check"):
         DdsMachine(ROBOT, domain=own_network(1).domain).connect()
 
@@ -185,29 +185,29 @@ def test_the_mode_switcher_and_the_bench_answer_like_unitrees_services() -> None
     network = own_network(1)
     wire = DdsServerTransport(ROBOT, network, mode="mcf")
     client = Client(Participant(network), SWITCHER)
-    assert asked(wire, client, 1001, {}) == {"form": "0", "name": "mcf"}
-    assert asked(wire, client, 1003, {}) == {}
+    assert call(wire, client, 1001, {}) == {"form": "0", "name": "mcf"}
+    assert call(wire, client, 1003, {}) == {}
     assert wire.mode == ""
-    assert asked(wire, client, 1002, {"name": "ai"}) == {}
+    assert call(wire, client, 1002, {"name": "ai"}) == {}
     assert wire.mode == "ai"
     for parameter in ({"name": "dance"}, None, [1], "x"):
         with pytest.raises(HardwareError, match="answered 3204 to function 1002"):
-            asked(wire, client, 1002, parameter)
+            call(wire, client, 1002, parameter)
     with pytest.raises(HardwareError, match="answered 3203 to function 9"):
-        asked(wire, client, 9, {})
+        call(wire, client, 9, {})
     assert wire.mode == "ai"
     bench = Client(Participant(network), "pronk_bench")
-    assert asked(wire, bench, 1, {"joints": ["FL_knee", "FR_knee"]}) == {
+    assert call(wire, bench, 1, {"joints": ["FL_knee", "FR_knee"]}) == {
         "joints": ["FR_knee", "FL_knee"]
     }
     assert wire.clamps == ("FR_knee", "FL_knee")
     with pytest.raises(HardwareError, match="answered 3204"):
-        asked(wire, bench, 1, {"joints": ["tail"]})
+        call(wire, bench, 1, {"joints": ["tail"]})
     assert wire.clamps == ("FR_knee", "FL_knee")
 
 
-def asked(wire: DdsServerTransport, client: Client, api_id: int, parameter: Any) -> Any:
-    """Ask while the wire is polled, as the server does, from this very thread."""
+def call(wire: DdsServerTransport, client: Client, api_id: int, parameter: Any) -> Any:
+    """Call while the wire is polled, as the server does, from this very thread."""
     polling = True
 
     def poll() -> None:
@@ -224,7 +224,7 @@ def asked(wire: DdsServerTransport, client: Client, api_id: int, parameter: Any)
         thread.join()
 
 
-def test_a_wire_hears_its_rival_and_refuses_what_is_spoiled() -> None:
+def test_a_wire_meets_its_rival_and_refuses_what_is_spoiled() -> None:
     wire = DdsServerTransport(ROBOT, own_network(1))
     wire.contend(turned(0.1))
     met: list[Command] = []
@@ -255,19 +255,19 @@ def test_a_hundred_thousand_mutated_commands_move_nothing() -> None:
 
 
 def test_two_robots_on_one_domain_are_refused() -> None:
-    """Both wires speak; no physics is needed to say the same twice over."""
+    """Both wires speak; no physics is needed for that."""
     network = own_network(1)
     wires = [DdsServerTransport(ROBOT, network) for _ in range(2)]
     robots = [VirtualRobot(ROBOT, load_sim_params(), legs=("FR",), seed=k) for k in range(2)]
-    said = []
+    streams = []
     for robot in robots:
         robot.connect()
-        said.append(robot.wait(4.0))
+        streams.append(robot.wait(4.0))
     polling = True
 
     def speak() -> None:
         start = time.monotonic()
-        for k, pair in enumerate(zip(*said, strict=True)):
+        for k, pair in enumerate(zip(*streams, strict=True)):
             for wire, state in zip(wires, pair, strict=True):
                 wire.poll()
                 wire.publish(state)

@@ -39,6 +39,8 @@ pytestmark = pytest.mark.live
 lcm = pytest.importorskip("lcm")
 
 DAMPING = 1.0
+LIMIT_S = 300.0
+"""A busy computer may take long; nothing here is a measure of speed."""
 ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
 KNEE = ROBOT.joint_names.index("FL_knee")
@@ -115,9 +117,9 @@ def moved_knee(angle: float) -> np.ndarray:
 def follow(
     machine: LcmMachine, command: Command | None, there: Callable[[np.ndarray], bool]
 ) -> list[State]:
-    """Command at 50 Hz until the joints are there, for 20 s at most; the states met."""
+    """Command at 50 Hz until the joints are there, for LIMIT_S at most; the states met."""
     states: list[State] = []
-    for k in range(1000):
+    for k in range(round(LIMIT_S / 0.02)):
         if command is not None:
             machine.send(replace(command, made=machine.now(), valid_for=10.0, sequence=k))
         states += machine.wait(machine.now() + 0.02)
@@ -164,30 +166,32 @@ def test_a_command_that_expires_is_followed_by_damping(servers: dict[str, Proces
     process = servers["cheetah"]
     machine = process.machine()
     listener = lcm.LCM(url_of(port=process.port))
-    heard: list[Command] = []
+    received: list[Command] = []
     listener.subscribe(
-        CHEETAH.command_channel, lambda _, data: heard.append(decode_command(CHEETAH, data))
+        CHEETAH.command_channel, lambda _, data: received.append(decode_command(CHEETAH, data))
     )
     machine.connect()
     machine.send(replace(HOLD, made=machine.now(), valid_for=0.5))
-    until = time.monotonic() + 20.0
-    while len(heard) < 6 and time.monotonic() < until:
+    until = time.monotonic() + LIMIT_S
+    while len(received) < 6 and time.monotonic() < until:
         listener.handle_timeout(100)
-    assert heard[0].stiffness.min() > 1.0
-    assert len(heard) == 6
-    for command in heard[1:]:
+    assert received[0].stiffness.min() > 1.0
+    assert len(received) == 6
+    for command in received[1:]:
         np.testing.assert_array_equal(command.stiffness, 0.0)
         np.testing.assert_allclose(command.damping, DAMPING, rtol=1e-6)
     # One that is late already is not sent at all.
     machine.send(replace(HOLD, made=machine.now() - 1.0, valid_for=0.5))
     while listener.handle_timeout(0) > 0:
         pass
-    assert all(command.stiffness.max() == 0.0 for command in heard[1:])
+    assert all(command.stiffness.max() == 0.0 for command in received[1:])
     assert machine.counts["expired"] == 2
     machine.close()
 
 
-def test_who_else_commands_is_met_before_and_while_pronk_does(servers: dict[str, Process]) -> None:
+def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
+    servers: dict[str, Process],
+) -> None:
     process = servers["cheetah"]
     machine = process.machine()
     other = lcm.LCM(url_of(port=process.port))
@@ -210,7 +214,7 @@ def test_who_else_commands_is_met_before_and_while_pronk_does(servers: dict[str,
     machine.send(HOLD)
     foreign = replace(HOLD, position=HOLD.position + 0.01)
     other.publish(CHEETAH.command_channel, encode_command(CHEETAH, foreign))
-    until = time.monotonic() + 20.0
+    until = time.monotonic() + LIMIT_S
     while not machine.counts["foreign"] and time.monotonic() < until:
         machine.wait(machine.now() + 0.01)
     with pytest.raises(HardwareError, match="another program commands the joints"):
@@ -218,7 +222,7 @@ def test_who_else_commands_is_met_before_and_while_pronk_does(servers: dict[str,
     machine.close()
 
 
-def test_the_robots_own_controller_is_asked_to_let_go(servers: dict[str, Process]) -> None:
+def test_the_robots_own_controller_is_released(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
     lcm.LCM(url_of(port=process.port)).publish(REQUEST_CHANNEL, mode_request(4, 1))
     with pytest.raises(HardwareError, match="another program commands the joints"):
@@ -228,21 +232,21 @@ def test_the_robots_own_controller_is_asked_to_let_go(servers: dict[str, Process
     machine.close()
 
 
-def test_the_wrong_layout_is_said(servers: dict[str, Process]) -> None:
+def test_the_wrong_layout_is_refused(servers: dict[str, Process]) -> None:
     # Both stacks have a channel leg_control_data: what comes there is refused by its fingerprint.
     machine = LcmMachine(ROBOT, layout="wtw", port=servers["cheetah"].port)
     with pytest.raises(HardwareError, match="sent no state on leg_control_data"):
         machine.connect()
 
 
-def test_a_real_bench_needs_a_hand() -> None:
-    asked: list[tuple[str, ...]] = []
+def test_a_real_bench_needs_a_clamp_operator() -> None:
+    requests: list[tuple[str, ...]] = []
     machine = LcmMachine(ROBOT, port=free_port())
     with pytest.raises(HardwareError, match="FR_knee must be fixed mechanically"):
         machine.clamp(("FR_knee",))
     machine.clamp(())
-    LcmMachine(ROBOT, port=free_port(), clamp_operator=asked.append).clamp(("FR_knee",))
-    assert asked == [("FR_knee",)]
+    LcmMachine(ROBOT, port=free_port(), clamp_operator=requests.append).clamp(("FR_knee",))
+    assert requests == [("FR_knee",)]
     # Never opened: nothing to damp, nothing to close.
     machine.damp()
     machine.close()
@@ -282,12 +286,12 @@ def test_a_wire_that_fails_never_ends_the_damping() -> None:
     try:
         writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
         cut.set()
-        # It expires while the wire takes nothing; nobody else is there to damp.
-        until = time.monotonic() + 20.0
+        # It expires while the wire takes nothing; only the writer can damp.
+        until = time.monotonic() + LIMIT_S
         while writer.counts["not written"] < 5 and time.monotonic() < until:
             time.sleep(0.01)
         assert (len(wire), writer.counts["expired"]) == (1, 1)
-        # Whoever commands is told; damping never complains.
+        # The sender of a command gets the error; damping never raises.
         with pytest.raises(
             HardwareError, match=r"put on the wire \(\[Errno 101\] Network is unrea"
         ):
@@ -321,16 +325,16 @@ def test_a_server_that_dies_leaves_a_link_that_still_closes(servers: dict[str, P
         machine.connect()
 
 
-def test_a_server_ends_cleanly_when_told_to(servers: dict[str, Process]) -> None:
+def test_a_server_ends_cleanly_on_a_signal(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
     machine = process.machine()
     machine.connect()
     machine.send(HOLD)
     machine.close()
     process.running.send_signal(signal.SIGTERM)
-    out, _ = process.running.communicate(timeout=30)
+    out, _ = process.running.communicate(timeout=LIMIT_S)
     assert process.running.returncode == 0
-    assert "the virtual robot lived" in out
+    assert "the virtual robot ran" in out
     figures = json.loads(process.json.read_text(encoding="utf-8"))
     assert figures["virtual"] is True
     # The command, and a second of damping after it.

@@ -14,7 +14,7 @@ from pronk.links.terminal import ENDING, TERMINAL, Interrupts, unheard
 
 
 @pytest.mark.parametrize("number", ENDING)
-def test_an_interrupt_waits_until_it_is_asked_for(number: signal.Signals) -> None:
+def test_an_interrupt_waits_until_it_is_checked(number: signal.Signals) -> None:
     before = signal.getsignal(number)
     interrupts = Interrupts()
     with interrupts:

@@ -17,7 +17,7 @@ from pronk.robots import load_robot
 JOINTS = joint_map(load_robot("mini_cheetah"))
 
 
-def said(tick: int, *, value: float | None = None) -> bytes:
+def message(tick: int, *, value: float | None = None) -> bytes:
     """A message at a robot's time [ms]; its joints are at `value`, by default as many mrad."""
     angle = np.full(12, 1e-3 * (tick % 1000) if value is None else value)
     return encode_state(
@@ -38,9 +38,9 @@ def said(tick: int, *, value: float | None = None) -> bytes:
 
 def taken(*ticks: int, every: float = 0.002) -> tuple[list[int], Counter[str]]:
     """Sequence numbers of the states made, and the counts, of messages that come regularly."""
-    intake = StateDecoder(JOINTS, Counter())
-    states = [intake.take(said(tick), 10.0 + every * k) for k, tick in enumerate(ticks)]
-    return [state.sequence for state in states if state is not None], intake.counts
+    decoder = StateDecoder(JOINTS, Counter())
+    states = [decoder.take(message(tick), 10.0 + every * k) for k, tick in enumerate(ticks)]
+    return [state.sequence for state in states if state is not None], decoder.counts
 
 
 def test_regular_states_are_numbered_one_by_one() -> None:
@@ -74,34 +74,36 @@ def test_a_clock_passes_its_largest_number() -> None:
 
 
 def test_frozen_values_behind_a_live_clock_make_no_states() -> None:
-    intake = StateDecoder(JOINTS, Counter())
-    made = [intake.take(said(2 * k, value=0.5), 0.002 * k) for k in range(5)]
+    decoder = StateDecoder(JOINTS, Counter())
+    made = [decoder.take(message(2 * k, value=0.5), 0.002 * k) for k in range(5)]
     assert made[0] is not None
     assert made[1:] == [None] * 4
-    assert intake.counts == Counter({"states": 1, "repeated": 4})
-    alive = intake.take(said(12, value=0.6), 0.012)
+    assert decoder.counts == Counter({"states": 1, "repeated": 4})
+    alive = decoder.take(message(12, value=0.6), 0.012)
     assert alive is not None
 
 
-def test_refused_messages_are_counted_and_leave_their_sentence() -> None:
-    intake = StateDecoder(JOINTS, Counter())
-    broken = bytearray(said(2))
+def test_refused_messages_are_counted_and_keep_their_message() -> None:
+    decoder = StateDecoder(JOINTS, Counter())
+    broken = bytearray(message(2))
     broken[300] ^= 1
-    assert intake.take(bytes(broken), 0.0) is None
-    assert intake.take(said(4, value=float("nan")), 0.002) is None
-    assert intake.counts == Counter({"refused: checksum": 1, "refused: not finite": 1})
-    assert intake.last_error == "motor_state holds a number that is not finite"
+    assert decoder.take(bytes(broken), 0.0) is None
+    assert decoder.take(message(4, value=float("nan")), 0.002) is None
+    assert decoder.counts == Counter({"refused: checksum": 1, "refused: not finite": 1})
+    assert decoder.last_error == "motor_state holds a number that is not finite"
 
 
 def test_times_grow_even_where_messages_came_at_once() -> None:
-    intake = StateDecoder(JOINTS, Counter())
-    times = [state.time for k in range(4) if (state := intake.take(said(2 * k), 7.0)) is not None]
+    decoder = StateDecoder(JOINTS, Counter())
+    times = [
+        state.time for k in range(4) if (state := decoder.take(message(2 * k), 7.0)) is not None
+    ]
     assert times == pytest.approx([7.0, 7.0 + 1e-6, 7.0 + 2e-6, 7.0 + 3e-6], abs=1e-8)
     assert (np.diff(times) > 0.0).all()
 
 
-def test_a_virtual_robot_says_that_it_is_one() -> None:
-    intake = StateDecoder(JOINTS, Counter())
-    assert not intake.virtual
-    intake.take(said(2), 0.0)
-    assert intake.virtual
+def test_a_virtual_robot_is_recognized() -> None:
+    decoder = StateDecoder(JOINTS, Counter())
+    assert not decoder.virtual
+    decoder.take(message(2), 0.0)
+    assert decoder.virtual

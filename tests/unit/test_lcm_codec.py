@@ -71,11 +71,11 @@ def state(**changes: object) -> State:
 def test_commands_come_back(
     layout: Layout, position: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
 ) -> None:
-    asked = Command(position=position, stiffness=stiffness, damping=damping, sequence=3, made=1.5)
-    got = decode_command(layout, encode_command(layout, asked))
+    sent = Command(position=position, stiffness=stiffness, damping=damping, sequence=3, made=1.5)
+    got = decode_command(layout, encode_command(layout, sent))
     for name in ("position", "stiffness", "damping"):
         # The wire has floats of 32 bits; the knee's gains are scaled there and back.
-        np.testing.assert_allclose(getattr(got, name), getattr(asked, name), rtol=3e-7, atol=1e-40)
+        np.testing.assert_allclose(getattr(got, name), getattr(sent, name), rtol=3e-7, atol=1e-40)
     if layout is WTW:
         assert (got.sequence, got.made) == (3, 1.5)
 
@@ -95,7 +95,7 @@ def test_states_come_back(
     quaternion: np.ndarray,
 ) -> None:
     orientation = quaternion / np.linalg.norm(quaternion)
-    told = state(
+    sent = state(
         position=position,
         velocity=velocity,
         torque=torque,
@@ -103,7 +103,7 @@ def test_states_come_back(
         accelerometer=force,
         orientation=orientation,
     )
-    (one, attitude), (two, joints) = encode_state(layout, told)
+    (one, attitude), (two, joints) = encode_state(layout, sent)
     assert (one, two) == (layout.attitude_channel, layout.joints_channel)
     got = state_of(
         decode_joints(layout, joints), decode_attitude(layout, attitude), time=3.0, sequence=9
@@ -259,5 +259,5 @@ def test_control_mode_comes_back() -> None:
 @given(st.sets(st.sampled_from(ROBOT.joint_names)), st.integers(0, 2**62))
 def test_clamps_come_back(held: set[str], number: int) -> None:
     names = ROBOT.joint_names
-    asked = tuple(name for name in names if name in held)
-    assert read_clamp_message(names, clamp_message(names, asked, number)) == (number, asked)
+    sent = tuple(name for name in names if name in held)
+    assert read_clamp_message(names, clamp_message(names, sent, number)) == (number, sent)

@@ -30,10 +30,10 @@ STATE = State(
 )
 
 
-def tell(reader: StateDecoder, layout: Layout, state: State, now: float) -> None:
+def feed(decoder: StateDecoder, layout: Layout, state: State, now: float) -> None:
     (_, attitude), (_, joints) = encode_state(layout, state)
-    reader.attitude(attitude, now)
-    reader.joints(joints, now)
+    decoder.attitude(attitude, now)
+    decoder.joints(joints, now)
 
 
 def shaken(k: int) -> State:
@@ -41,75 +41,75 @@ def shaken(k: int) -> State:
 
 
 def test_states_arrive_with_the_local_time_and_count() -> None:
-    reader = StateDecoder(WTW, ROBOT.joint_names)
+    decoder = StateDecoder(WTW, ROBOT.joint_names)
     for k in range(3):
-        tell(reader, WTW, shaken(k), 100.0 + k)
-    states = reader.drain()
+        feed(decoder, WTW, shaken(k), 100.0 + k)
+    states = decoder.drain()
     assert [(s.time, s.sequence, s.robot_time) for s in states] == [
         (100.0, 0, pytest.approx(0.02)),
         (101.0, 1, pytest.approx(0.022)),
         (102.0, 2, pytest.approx(0.024)),
     ]
-    assert reader.latest is states[-1]
-    assert reader.drain() == []
+    assert decoder.latest is states[-1]
+    assert decoder.drain() == []
 
 
 def test_a_lost_state_is_missing_in_the_count_where_the_robot_counts() -> None:
     for layout, expected in ((WTW, [0, 1, 5]), (CHEETAH, [0, 1, 2])):
-        reader = StateDecoder(layout, ROBOT.joint_names)
+        decoder = StateDecoder(layout, ROBOT.joint_names)
         for k in (0, 1, 5):
-            tell(reader, layout, shaken(k), k * 2e-3)
-        assert [s.sequence for s in reader.drain()] == expected
+            feed(decoder, layout, shaken(k), k * 2e-3)
+        assert [s.sequence for s in decoder.drain()] == expected
 
 
 def test_late_and_doubled_states_are_dropped_where_the_robot_counts() -> None:
-    reader = StateDecoder(WTW, ROBOT.joint_names)
+    decoder = StateDecoder(WTW, ROBOT.joint_names)
     for k in (0, 2, 1, 2, 3):
-        tell(reader, WTW, shaken(k), 0.01)
-    assert [s.sequence for s in reader.drain()] == [0, 2, 3]
-    assert reader.counts["out of order"] == 2
+        feed(decoder, WTW, shaken(k), 0.01)
+    assert [s.sequence for s in decoder.drain()] == [0, 2, 3]
+    assert decoder.counts["out of order"] == 2
     # A robot that was started again counts from the beginning, and a broken count is no count.
-    tell(reader, WTW, replace(shaken(9), sequence=10**9), 0.02)
-    tell(reader, WTW, replace(shaken(8), sequence=1), 0.02)
-    assert [s.sequence for s in reader.drain()] == [4, 5]
+    feed(decoder, WTW, replace(shaken(9), sequence=10**9), 0.02)
+    feed(decoder, WTW, replace(shaken(8), sequence=1), 0.02)
+    assert [s.sequence for s in decoder.drain()] == [4, 5]
 
 
 @pytest.mark.parametrize("layout", [CHEETAH, WTW], ids=["cheetah", "wtw"])
 def test_frozen_values_make_no_states_however_their_count_lives(layout: Layout) -> None:
-    reader = StateDecoder(layout, ROBOT.joint_names)
+    decoder = StateDecoder(layout, ROBOT.joint_names)
     for k in range(50):
-        tell(reader, layout, replace(STATE, sequence=10 + k, robot_time=1.0 + k), 2e-3 * k)
-    assert len(reader.drain()) == 1
-    assert reader.counts["repeated"] == 49
-    tell(reader, layout, shaken(60), 0.2)
-    assert len(reader.drain()) == 1
+        feed(decoder, layout, replace(STATE, sequence=10 + k, robot_time=1.0 + k), 2e-3 * k)
+    assert len(decoder.drain()) == 1
+    assert decoder.counts["repeated"] == 49
+    feed(decoder, layout, shaken(60), 0.2)
+    assert len(decoder.drain()) == 1
 
 
 def test_joints_without_a_young_attitude_make_no_state() -> None:
-    reader = StateDecoder(CHEETAH, ROBOT.joint_names)
+    decoder = StateDecoder(CHEETAH, ROBOT.joint_names)
     (_, attitude), (_, joints) = encode_state(CHEETAH, STATE)
-    reader.joints(joints, 0.0)
-    assert reader.counts["no attitude"] == 1
-    reader.attitude(attitude, 1.0)
-    reader.joints(joints, 1.03)
-    assert reader.counts["no attitude"] == 2
-    assert reader.latest is None
-    reader.joints(joints, 1.01)
-    assert reader.latest is not None
+    decoder.joints(joints, 0.0)
+    assert decoder.counts["no attitude"] == 1
+    decoder.attitude(attitude, 1.0)
+    decoder.joints(joints, 1.03)
+    assert decoder.counts["no attitude"] == 2
+    assert decoder.latest is None
+    decoder.joints(joints, 1.01)
+    assert decoder.latest is not None
 
 
-def test_refusals_are_counted_and_said() -> None:
-    reader = StateDecoder(CHEETAH, ROBOT.joint_names)
-    tell(reader, WTW, STATE, 0.0)
-    assert reader.counts["refused: fingerprint"] == 2
-    assert "another layout" in reader.last_error
-    tell(reader, CHEETAH, replace(STATE, position=np.full(12, math.nan)), 0.0)
-    assert reader.counts["refused: not finite"] == 1
-    reader.beacon(b"none")
-    assert not reader.virtual
-    reader.beacon(clamp_message(ROBOT.joint_names, ("FR_knee",), 4))
-    assert reader.virtual
-    assert reader.held == (4, ("FR_knee",))
+def test_refusals_are_counted() -> None:
+    decoder = StateDecoder(CHEETAH, ROBOT.joint_names)
+    feed(decoder, WTW, STATE, 0.0)
+    assert decoder.counts["refused: fingerprint"] == 2
+    assert "another layout" in decoder.last_error
+    feed(decoder, CHEETAH, replace(STATE, position=np.full(12, math.nan)), 0.0)
+    assert decoder.counts["refused: not finite"] == 1
+    decoder.beacon(b"none")
+    assert not decoder.virtual
+    decoder.beacon(clamp_message(ROBOT.joint_names, ("FR_knee",), 4))
+    assert decoder.virtual
+    assert decoder.held == (4, ("FR_knee",))
 
 
 def states_at(times: np.ndarray) -> list[State]:
@@ -129,7 +129,7 @@ def test_rate_and_gaps() -> None:
 
 def test_gravity_and_limits() -> None:
     check_rest(ROBOT, [STATE])
-    # Rolled by 0.5 rad: up is (0, sin, cos) in the trunk's frame, and the accelerometer says so.
+    # Rolled by 0.5 rad: up is (0, sin, cos) in the trunk's frame, as for the accelerometer.
     rolled = np.array([math.cos(0.25), math.sin(0.25), 0.0, 0.0])
     up = np.array([0.0, math.sin(0.5), math.cos(0.5)])
     np.testing.assert_allclose(up_of(rolled), up, atol=1e-12)

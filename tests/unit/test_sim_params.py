@@ -28,7 +28,7 @@ def changed(*path: str, value: Any) -> dict[str, Any]:
     return body
 
 
-def test_shipped_truth_is_of_the_mini_cheetah_and_plausible() -> None:
+def test_the_shipped_file_is_of_the_mini_cheetah_and_plausible() -> None:
     sim_params = load_sim_params()
     sim_params.check_joints(ROBOT.joint_names)
     assert sim_params.robot == ROBOT.name
@@ -64,6 +64,10 @@ def test_no_two_joints_are_alike() -> None:
         (("machine", "gyro_bias"), [0.0, 1.0], "gyro_bias is [0.0, 1.0]"),
         (("machine", "bus_voltage"), -24, "machine.bus_voltage is -24"),
         (("machine", "command_delay"), 0.002, "machine.command_delay is unknown; the fields are"),
+        (("ground", "friction"), "ice", "ground.friction is 'ice'"),
+        (("ground", "terrain"), [], "ground.terrain is unknown; the fields are friction"),
+        (("trunk",), {"inertia_scale": [1, -1, 1]}, "trunk.inertia_scale is [1, -1, 1]"),
+        (("attitude", "noise"), float("nan"), "attitude.noise is nan"),
         (("robot",), 7, "`$.robot`"),
         (("colour",), "red", "`colour`"),
         (("schema",), "pronk/gains/1", "this pronk reads 'pronk/sim_params/1'"),
@@ -114,7 +118,7 @@ def test_belt_too_stiff_for_the_step_is_refused_with_the_stiffest_that_fits() ->
     build_plant(ROBOT, broken, ("FR",), 0.025e-3)
 
 
-def test_files_that_are_no_truth(tmp_path: Path) -> None:
+def test_files_that_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match="no such sim_params file"):
         load_sim_params(tmp_path / "none.yaml")
     bad = tmp_path / "bad.yaml"
@@ -132,3 +136,10 @@ def test_a_file_of_ones_own_replaces_the_shipped_one(tmp_path: Path) -> None:
     assert load_sim_params(path) == replace(
         load_sim_params(), machine=replace(load_sim_params().machine, bus_voltage=22.0)
     )
+
+
+def test_parts_for_the_ground_may_be_left_out_of_a_file() -> None:
+    body = {name: BODY[name] for name in ("schema", "robot", "machine", "joints")}
+    sim_params = parse_sim_params(body | {"trunk": {"mass_offset": 1}}, "my.yaml")
+    assert sim_params.trunk.mass_offset == 1.0
+    assert sim_params.attitude.noise == 0.0

@@ -1,4 +1,4 @@
-"""Faults of a link: what is asked for happens, as often as asked, and the same way each time."""
+"""Faults of a link strike as specified, as often as specified, and the same way each time."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_delay_and_jitter() -> None:
     assert sorted(item for _, item in out) == list(range(4000))
 
 
-def test_faults_begin_when_they_are_told_to() -> None:
+def test_faults_begin_at_their_time() -> None:
     lane, out = through(ChannelFaults(loss=1.0), after=2.0)
     assert [item for _, item in out] == list(range(2000))
     assert lane.counts["lost"] == 2000
@@ -87,7 +87,7 @@ def test_same_seed_same_faults_and_one_more_changes_no_other() -> None:
     assert {item for _, item in twice} == lost
 
 
-def test_spoiling_strikes_as_often_as_asked() -> None:
+def test_corruption_strikes_as_often_as_specified() -> None:
     lane: FaultChannel[int] = FaultChannel(ChannelFaults(flip=0.25), after=1.0, seed=0)
     assert not any(lane.strikes("flip", 0.5) for _ in range(100))
     struck = sum(lane.strikes("flip", 1.5) for _ in range(4000))
