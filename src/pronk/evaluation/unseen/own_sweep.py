@@ -20,7 +20,7 @@ from pronk.match.pipeline import match_logs
 from pronk.match.result import MatchResult
 from pronk.match.settings import MatchSettings
 from pronk.robots.robot import Robot
-from pronk.runtime.sweep.record import record
+from pronk.runtime.sweep import record
 from pronk.virtual.plant import legs_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams
