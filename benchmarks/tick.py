@@ -225,7 +225,9 @@ def checks(rows: list[Row]) -> list[Check]:
             ("network", way.network, NETWORK_MS),
         ):
             name = f"{row.case}: {what}, 99 %"
-            found.append(Check(what=name, value=figures["p99_ms"], sense="<=", bar=bar, unit="ms"))
+            found.append(
+                Check(what=name, value=figures["p99_ms"], sense="<=", limit=bar, unit="ms")
+            )
     return found
 
 
@@ -270,7 +272,7 @@ def bars(rows: list[Row]) -> Table:
         made.add_column(Text(column), justify="left" if column == "what" else "right")
     for check in checks(rows):
         word = "yes" if check.passed else "NO"
-        made.add_row(check.what, f"{check.value:.3f}", f"{check.sense} {check.bar:g}", word)
+        made.add_row(check.what, f"{check.value:.3f}", f"{check.sense} {check.limit:g}", word)
     return made
 
 

@@ -29,10 +29,8 @@ from rich.table import Table
 from rich.text import Text
 
 from pronk.errors import PronkError
-from pronk.evaluation.job import Job, jump
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
-from pronk.evaluation.run import Plan, jobs_of, versions
-from pronk.evaluation.subjects import load_subjects
+from pronk.evaluation.trial import Job, Plan, load_subjects, plan_jobs, run_job, versions
 from pronk.robots import load_robot
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
@@ -161,7 +159,7 @@ def tape(job: Job) -> Tape:
     """Run one job, taped."""
     taped = Tape()
     with patch.object(mujoco, "mj_step", taped.step):
-        jump(job)
+        run_job(job)
     return taped
 
 
@@ -192,7 +190,7 @@ def run(
     robot = load_robot(ROBOT)
     (subject,) = load_subjects([policy], robot)
     plan = Plan(cases=(case,), jumps=1, seed=seed)
-    [(_, job)] = jobs_of(
+    [(_, job)] = plan_jobs(
         [subject], plan, robot=robot, sim_params=sim_params or load_sim_params(), out=Path()
     )
     job = replace(job, keep=None)
@@ -223,7 +221,7 @@ def run(
 def _whole(job: Job) -> float:
     """Processor time of the whole trial loop [s]."""
     begun = time.process_time()
-    jump(job)
+    run_job(job)
     return time.process_time() - begun
 
 

@@ -18,20 +18,16 @@ from PIL import Image
 
 from pronk.cli import main as cli
 from pronk.errors import ArtefactError
-from pronk.evaluation import result, variation, walk
-from pronk.evaluation import result_io as sheet
+from pronk.evaluation import bodies, published, results, tables, variation, walk
+from pronk.evaluation.bodies import Bodies, Body, GainsError
+from pronk.evaluation.course import CrossingFigures
+from pronk.evaluation.crossing import CROSSING, climbs
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.metrics import JumpFigures, measure
-from pronk.evaluation.outcome import published, tables
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
-from pronk.evaluation.result import Subject, Trial
-from pronk.evaluation.rows import Row
-from pronk.evaluation.terrain import crossing
-from pronk.evaluation.terrain.crossing import Crossing, Crossings
-from pronk.evaluation.unseen import bodies
-from pronk.evaluation.unseen.bodies import Bodies, Body, GainsError
-from pronk.evaluation.variation import Variation, Varied
-from pronk.evaluation.walk import Walk, Walks
+from pronk.evaluation.results import Kind, Results, Row, Subject
+from pronk.evaluation.variation import NOMINAL, VARIATION
+from pronk.evaluation.walk import WALK, walk_script
 from pronk.evaluation.walk_metrics import WalkFigures
 from pronk.match import gains as gains_file
 from pronk.match import result as match_file
@@ -93,7 +89,7 @@ def made(
     *,
     keep: bool = True,
     times: int = 1,
-) -> Trial:
+) -> Results:
     """A trial in a folder, measured by `pronk.evaluation.metrics` on jumps made by hand."""
     rows = []
     for name in policies:
@@ -115,7 +111,7 @@ def made(
                         capture=where if keep else "",
                     )
                 )
-    trial = Trial(
+    trial = Results(
         robot=ROBOT.name,
         virtual=True,
         subjects=tuple(subject(name) for name in policies),
@@ -131,109 +127,100 @@ def made(
         versions={"pronk": "0.1.0"},
         timing={"seconds": 2.0, "simulated_s": 9.0, "processes": 1},
     )
-    result.save(folder, trial)
-    return result.load(folder)
+    results.save(folder, trial)
+    return results.load(folder)
 
 
-def origin(*names: str) -> sheet.Origin:
-    return sheet.Origin(
+def of_kind(kind: Kind, names: tuple[str, ...], **rest: Any) -> Results:
+    kept: dict[str, Any] = {"script": SCRIPT, "joint_names": ROBOT.joint_names}
+    return Results(
+        kind=kind,
         robot=ROBOT.name,
-        virtual=True,
         subjects=tuple(map(subject, names)),
         sim_params={"sha256": "cd" * 32},
         seed=1,
         versions={"pronk": "0.1.0"},
+        **(kept | rest),
     )
 
 
-def walked() -> Walks:
+def row(policy: str, case: Case, number: int, figures: Any, **rest: Any) -> Row:
+    script = replace(SCRIPT, command=case.command)
+    return Row(
+        policy=policy,
+        case=case.name,
+        number=number,
+        seed=number,
+        figures=figures,
+        script=script,
+        **rest,
+    )
+
+
+def walked() -> Results:
     """Two walks a policy; the naive one falls once."""
     case = walk.WALKS[0]
-    kept: dict[str, Any] = {"touched": False, "lasted": 20.0, "forward": 1.9}
-    return Walks(
-        origin=origin("matched", "naive"),
-        cases=(case,),
-        seconds=20.0,
-        rows=tuple(
-            Walk(
-                policy=name,
-                case=case.name,
-                number=i,
-                seed=i,
-                figures=WalkFigures(
-                    fell=name == "naive" and i == 0, speed_error_averaged=0.1 + 0.02 * i, **kept
-                ),
-            )
-            for name in ("matched", "naive")
-            for i in range(2)
-        ),
+    kept: dict[str, Any] = {"non_foot_contact": False, "lasted": 20.0, "forward": 1.9}
+    rows = tuple(
+        row(
+            name,
+            case,
+            i,
+            WalkFigures(
+                fell=name == "naive" and i == 0, speed_error_averaged=0.1 + 0.02 * i, **kept
+            ),
+        )
+        for name in ("matched", "naive")
+        for i in range(2)
     )
+    script = walk_script((0.0, 0.0, 0.0))
+    return of_kind(WALK, ("matched", "naive"), cases=(case,), rows=rows, script=script)
 
 
-def crossed() -> Crossings:
-    """Gaps of .2 m crossed 4 times of 5, of .4 m never."""
-    return Crossings(
-        origin=origin("matched"),
-        cases=(PAPER_COMMANDS[1],),
-        kinds=("gap", "up"),
-        runs=5,
-        enough=4,
-        rows=tuple(
-            Crossing(
-                policy="matched",
-                case="forward 2",
-                kind="gap",
+def crossed() -> Results:
+    """Gaps of 0.2 m crossed 4 times of 5, of 0.4 m never."""
+    case = PAPER_COMMANDS[1]
+    rows = tuple(
+        row(
+            "matched",
+            case,
+            i,
+            CrossingFigures(
+                obstacle="gap",
                 size=size,
                 lead=0.4,
-                number=i,
                 why="" if size < 0.3 and i else "a foot was in the gap",
                 take_off=0.1,
                 landing=0.1,
                 reach=0.3,
                 speed=2.0,
-            )
-            for size in (0.2, 0.4)
-            for i in range(5)
-        ),
+            ),
+        )
+        for size in (0.2, 0.4)
+        for i in range(5)
     )
+    settings = {"kinds": ["gap", "up"], "runs": 5, "enough": 4}
+    return of_kind(CROSSING, ("matched",), cases=(case,), rows=rows, settings=settings)
 
 
-def varied() -> Variation:
-    """Heights of .4 m as it is and .3 m with 1 kg more mass, with which the naive policy falls."""
-    mass = variation.PARAMETERS[0]
-    heavier = replace(mass, values=(1.0,))
+def varied() -> Results:
+    """Heights of 0.4 m, and 0.3 m with 1 kg more mass, with which the naive policy falls."""
+    mass = replace(variation.PARAMETERS[0], values=(1.0,))
     rows = []
-    for name in ("matched", "naive"):
-        for parameter, value, height in (
-            (variation.AS_IT_IS, math.nan, 0.4),
-            (mass.name, 1.0, 0.3),
-        ):
+    for parameter, value, height in ((NOMINAL, 0.0, 0.4), (mass.name, 1.0, 0.3)):
+        for name in ("matched", "naive"):
             for case in CASES[:2]:
                 for number in range(3):
                     good = name == "matched" or parameter != mass.name
-                    figures = dict.fromkeys(variation.VARIED_FIGURES, 0.5 + 0.1 * number)
-                    figures["height"] = height + 0.01 * (number - 1)
-                    rows.append(
-                        Varied(
-                            parameter=parameter,
-                            value=value,
-                            policy=name,
-                            case=case.name,
-                            number=number,
-                            seed=number,
-                            found=True,
-                            success=good,
-                            fell=not good,
-                            **figures,
-                        )
+                    known = dict.fromkeys(variation.VARIED_FIGURES, 0.5 + 0.1 * number)
+                    known["height"] = height + 0.01 * (number - 1)
+                    figures = JumpFigures(
+                        standing=True, found=True, upright=good, fell=not good, **known
                     )
-    return Variation(
-        origin=origin("matched", "naive"),
-        cases=CASES[:2],
-        parameters=(heavier,),
-        own={mass.name: 0.0},
-        rows=tuple(rows),
-    )
+                    rows.append(row(name, case, number, figures, parameter=parameter, value=value))
+    settings = {"parameters": [asdict(mass)], "nominal": {mass.name: 0.0}}
+    names = ("matched", "naive")
+    return of_kind(VARIATION, names, cases=CASES[:2], rows=tuple(rows), settings=settings)
 
 
 def embodied(folder: Path) -> Bodies:
@@ -264,7 +251,14 @@ def embodied(folder: Path) -> Bodies:
                 trial=made(folder / where / "trial", cases=CASES[:2], keep=False),
             )
         )
-    return Bodies(origin=origin("matched", "naive"), bodies=tuple(found))
+    return Bodies(
+        robot=ROBOT.name,
+        subjects=tuple(map(subject, ("matched", "naive"))),
+        sim_params={"sha256": "cd" * 32},
+        seed=1,
+        versions={"pronk": "0.1.0"},
+        bodies=tuple(found),
+    )
 
 
 def matched(folder: Path) -> MatchResult:
@@ -282,9 +276,8 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("tree")
     matched(root)
     made(root / "trial")
-    walk.save(root / "trial", walked())
-    crossing.save(root / "trial", crossed())
-    variation.save(root / "trial", varied())
+    for each in (walked(), crossed(), varied()):
+        results.save(root / "trial", each)
     bodies.save(root / "trial", embodied(root / "trial"))
     frames = [Image.new("RGB", (64, 40), (i * 60, 90, 120)) for i in range(4)]
     (root / "trial" / "videos").mkdir()
@@ -300,8 +293,8 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def trial(tree: Path) -> Trial:
-    return result.load(tree / "trial")
+def trial(tree: Path) -> Results:
+    return results.load(tree / "trial")
 
 
 @pytest.fixture(scope="module")
@@ -392,7 +385,7 @@ def test_nobody_takes_the_virtual_robot_for_a_real_one(html: str) -> None:
 
 
 def test_every_definition_and_every_number_of_the_tables_is_on_the_page(
-    html: str, trial: Trial
+    html: str, trial: Results
 ) -> None:
     text = re.sub(r"\s+", " ", " ".join(checked(html).text))
     for one in tables.sheets(trial):
@@ -404,7 +397,7 @@ def test_every_definition_and_every_number_of_the_tables_is_on_the_page(
     assert "nan" not in re.sub(r"[A-Za-z]+nan|nan[a-z]+", "", text).lower()
 
 
-def test_hashes_seeds_and_versions_are_on_the_page(html: str, trial: Trial) -> None:
+def test_hashes_seeds_and_versions_are_on_the_page(html: str, trial: Results) -> None:
     for word in (*(s.sha256 for s in trial.subjects), "ab" * 32, "seed 3", "pronk 0.1.0"):
         assert word in html
 
@@ -476,8 +469,8 @@ def test_captures_that_are_gone_are_counted(tmp_path: Path) -> None:
 
 def test_a_policy_that_never_jumps_makes_a_page_of_dashes(tmp_path: Path) -> None:
     trial = made(tmp_path, ("matched",), CASES[:2], keep=False)
-    rows = tuple(replace(row, figures=JumpFigures(told=True, fell=True)) for row in trial.rows)
-    result.save(tmp_path, replace(trial, rows=rows))
+    rows = tuple(replace(row, figures=JumpFigures(standing=True, fell=True)) for row in trial.rows)
+    results.save(tmp_path, replace(trial, rows=rows))
     page, _ = whole.write_report(tmp_path)
     text = " ".join(checked(page.read_text(encoding="utf-8")).text)
     assert "6 jumps asked with 2 commands, 0 jumped" in re.sub(r"\s+", " ", text)
@@ -547,7 +540,7 @@ def test_the_command_writes_the_page_and_its_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made(tmp_path / "trial", ("matched",), CASES[:1], keep=False)
-    walk.save(tmp_path / "trial", walked())
+    results.save(tmp_path / "trial", walked())
     figures = tmp_path / "figures.json"
     assert cli.run(["report", str(tmp_path), "--json", str(figures)]) == 0
     said = capsys.readouterr().out
@@ -563,7 +556,7 @@ def test_the_command_writes_the_page_and_its_figures(
 # --- What is drawn ------------------------------------------------------------------------------
 
 
-def test_cells_draw_mean_spread_and_the_paper(trial: Trial) -> None:
+def test_cells_draw_mean_spread_and_the_paper(trial: Results) -> None:
     names = [case.name for case in CASES]
     distance = trial_data.values(trial, "distance", names)
     paper = trial_data.published("distance")
@@ -583,12 +576,12 @@ def test_cells_draw_mean_spread_and_the_paper(trial: Trial) -> None:
     assert paper["matched"]["forward 2"] == (0.969, 0.026)
 
 
-def test_naive_stands_before_matched_as_in_the_paper(trial: Trial) -> None:
+def test_naive_stands_before_matched_as_in_the_paper(trial: Results) -> None:
     assert trial_data.policies(trial) == ["naive", "matched"]
     assert trial.subjects[0].name == "matched"
 
 
-def test_scatter_has_a_panel_a_command(trial: Trial) -> None:
+def test_scatter_has_a_panel_a_command(trial: Results) -> None:
     names = [case.name for case in CASES]
     height, distance = (trial_data.values(trial, what, names) for what in ("height", "distance"))
     figure = scatter(height, distance, {}, {})
@@ -616,7 +609,7 @@ def test_ratios_are_naive_over_matched_whichever_came_first(tmp_path: Path) -> N
     assert forward.paper == pytest.approx(0.076 / 0.042)
 
 
-def test_a_trace_begins_at_the_jump_input(trial: Trial, tree: Path) -> None:
+def test_a_trace_begins_at_the_jump_input(trial: Results, tree: Path) -> None:
     found = trial_data.see(trial, tree / "trial")
     assert found is not None
     trace = found.height["matched"]["forward 1"][0]
@@ -631,7 +624,7 @@ def test_a_trace_begins_at_the_jump_input(trial: Trial, tree: Path) -> None:
 
 
 def test_rates_are_those_of_the_acceleration_at_the_papers_speed_alone(
-    trial: Trial, tree: Path
+    trial: Results, tree: Path
 ) -> None:
     found = trial_data.see(trial, tree / "trial")
     assert found is not None
@@ -648,7 +641,7 @@ def test_rates_are_those_of_the_acceleration_at_the_papers_speed_alone(
     assert "RMS 0.00 rad/s over 3 runs" in words
 
 
-def test_torque_over_speed_stands_in_the_drives_limits(trial: Trial, tree: Path) -> None:
+def test_torque_over_speed_stands_in_the_drives_limits(trial: Results, tree: Path) -> None:
     found = trial_data.see(trial, tree / "trial")
     assert found is not None
     hard = found.hardest
@@ -671,11 +664,11 @@ def test_torque_over_speed_stands_in_the_drives_limits(trial: Trial, tree: Path)
     assert np.allclose(points.get_ydata(), 0.5 * points.get_xdata())
 
 
-def test_the_hardest_jump_has_the_least_margin(trial: Trial) -> None:
+def test_the_hardest_jump_has_the_least_margin(trial: Results) -> None:
     rows = [row for row in trial.rows if row.policy == "matched"]
     easy = replace(rows[0], figures=replace(rows[0].figures, torque_margin=(0.5,) * 12))
     hard = replace(rows[1], figures=replace(rows[1].figures, torque_margin=(0.9, *(0.1,) * 11)))
-    missed = replace(rows[2], figures=JumpFigures(told=True))
+    missed = replace(rows[2], figures=JumpFigures(standing=True))
     assert trial_data.hardest([easy, hard, missed]) is hard
     assert trial_data.hardest([missed]) is None
 
@@ -706,7 +699,7 @@ def test_lines_are_drawn_in_order_with_their_bars_and_marks() -> None:
 
 
 def test_crossings_become_shares_with_wilsons_interval() -> None:
-    climb = crossed().climbs[0]
+    climb = climbs(crossed())[0]
     line = trial_crossing.line(climb)
     assert line.x.tolist() == [0.2, 0.4]
     assert line.y.tolist() == [0.8, 0.0]
@@ -765,7 +758,7 @@ def test_the_error_of_gains_is_the_map_between_its_nodes() -> None:
     assert math.isnan(joint_error_db(replace(joint, grid_error=np.empty((0, 0))), 20.0, 0.5))
 
 
-def test_naive_gains_have_the_naive_error_of_the_match(trial: Trial) -> None:
+def test_naive_gains_have_the_naive_error_of_the_match(trial: Results) -> None:
     match = synthetic()
     errors = bode_errors_db(trial, match)
     naive = [joint.naive_error_db for joint in match.joints.values()]
@@ -773,7 +766,7 @@ def test_naive_gains_have_the_naive_error_of_the_match(trial: Trial) -> None:
     assert errors["matched"] < errors["naive"]
 
 
-def test_no_error_is_made_up_for_a_policy_outside_of_the_maps(trial: Trial) -> None:
+def test_no_error_is_made_up_for_a_policy_outside_of_the_maps(trial: Results) -> None:
     far = replace(trial, subjects=(subject("matched", stiffness=(99.0,) * 12), *trial.subjects[1:]))
     assert bode_errors_db(far, synthetic()) == {}
     silent = replace(trial, subjects=(subject("matched", joint_names=()), *trial.subjects[1:]))
@@ -787,7 +780,7 @@ def test_the_nearest_match_above_a_trial_is_taken_and_none_above_the_root(tree: 
     assert match_near(tree / "trial", tree / "trial") is None
 
 
-def test_the_argument_draws_spread_over_error(trial: Trial) -> None:
+def test_the_argument_draws_spread_over_error(trial: Results) -> None:
     distance = trial_data.values(trial, "distance", ["forward 1", "forward 2"])
     axes = argument({"matched": 0.1, "naive": 0.6}, {"distance [m]": distance}).axes[0]
     joined = [line for line in axes.lines if line.get_color() == "#b0b0b0"]

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from hopper import ROBOT, write_hopper
 from pronk import opengl
 from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation.jump_events import Marks, marks_of
+from pronk.evaluation.jump_events import JumpEvents, jump_events
 from pronk.evaluation.pictures import film as films
 from pronk.evaluation.pictures import overlay, video, videos
 from pronk.evaluation.pictures.film import FPS, Film, plan
@@ -28,8 +28,8 @@ from pronk.evaluation.pictures.render import in_gif
 from pronk.evaluation.pictures.stage import FOV_DEG, TAPE_M, Tape
 from pronk.evaluation.pictures.view import View
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.run import Plan as TrialPlan
-from pronk.evaluation.run import run as run_trial
+from pronk.evaluation.trial import Plan as TrialPlan
+from pronk.evaluation.trial import run_trial
 from pronk.runtime.script import STILL, Script
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Box, Ground
@@ -40,7 +40,7 @@ GRAVITY = 9.81
 STAND = 0.3
 LIFTOFF, RISE_SPEED = 1.0, 2.0
 FLIGHT = 2.0 * RISE_SPEED / GRAVITY
-MARKS = Marks(on=0.8, off=1.3, liftoff=LIFTOFF, touchdown=LIFTOFF + FLIGHT)
+MARKS = JumpEvents(on=0.8, off=1.3, liftoff=LIFTOFF, touchdown=LIFTOFF + FLIGHT)
 
 
 def captured(
@@ -85,13 +85,13 @@ def planned(**changes: Any) -> Film:
 
 def test_marks_are_those_of_the_jump() -> None:
     script = Script(command=(1.0, 0.0, 0.0), stand_s=0.2, run_s=0.4)
-    marks = marks_of(captured(), script, began=0.2)
+    marks = jump_events(captured(), script, began=0.2)
     assert marks is not None
     found = (marks.on, marks.off, marks.liftoff, marks.touchdown)
     expected = (MARKS.on, MARKS.off, MARKS.liftoff, MARKS.touchdown)
     assert found == pytest.approx(expected, abs=1.01 / RATE)
     late = Script(command=(1.0, 0.0, 0.0), run_s=1.0)
-    assert marks_of(captured(), late) is None, "it lifted off before it was told"
+    assert jump_events(captured(), late) is None, "it lifted off before it was told"
 
 
 def test_real_time_is_shown_in_equal_steps() -> None:
@@ -179,7 +179,7 @@ def test_what_cannot_be_shown_is_refused() -> None:
     with pytest.raises(PronkError, match="expected an end after the start"):
         planned(start=2.0, end=1.0)
     with pytest.raises(PronkError, match="on <= liftoff < touchdown"):
-        Marks(on=1.0, off=1.5, liftoff=0.5, touchdown=0.9)
+        JumpEvents(on=1.0, off=1.5, liftoff=0.5, touchdown=0.9)
 
 
 def test_a_film_is_read_as_it_was_written(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from pronk.cli.sweep_virtual import record_virtual
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.evaluation.result import Trial
+    from pronk.evaluation.results import Results
     from pronk.match.prediction import JointPrediction
     from pronk.match.result import MatchResult
     from pronk.robots.robot import Robot
@@ -61,7 +61,7 @@ def demo(
     begun = time.perf_counter()
     robot = load_robot(ROBOT)
     tried = find_policies(policies, robot)
-    trial: Trial | None = None
+    trial: Results | None = None
     films: tuple[Path, ...] = ()
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
     with (
@@ -108,7 +108,7 @@ def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
     Raises:
         PronkError: A given folder has none, or one of them cannot be used.
     """
-    from pronk.evaluation.subjects import load_subjects
+    from pronk.evaluation.trial import load_subjects
 
     place = folder or Path(pronk.__file__).parents[2] / "policies"
     found = [*place.glob("policy.onnx"), *place.glob("*/policy.onnx")]
@@ -130,7 +130,7 @@ def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
 
 def jump_and_film(
     policies: Sequence[Path], out: Path, *, jumps: int, seed: int
-) -> tuple[Trial | None, tuple[Path, ...]]:
+) -> tuple[Results | None, tuple[Path, ...]]:
     """Run a short trial on the shipped virtual robot and film one jump of the first policy.
 
     Args:
@@ -146,14 +146,14 @@ def jump_and_film(
 
     from pronk.cli.trial import painted
     from pronk.evaluation.processes import cores
-    from pronk.evaluation.run import Plan, run
+    from pronk.evaluation.trial import Plan, run_trial
     from pronk.files import sha256
     from pronk.robots import load_robot
     from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
     if not policies:
         return None, ()
-    trial = run(
+    trial = run_trial(
         policies,
         Plan(jumps=jumps, seed=seed),
         robot=load_robot(ROBOT),
@@ -253,10 +253,10 @@ def show_match(result: MatchResult, replays: list[JointPrediction]) -> None:
     console.show(made)
 
 
-def show_trial(trial: Trial) -> None:
+def show_trial(trial: Results) -> None:
     """Print heights, distances and landings."""
     from pronk.cli.trial import show
-    from pronk.evaluation.outcome import tables
+    from pronk.evaluation import tables
 
     for figure in ("height", "distance"):
         show(tables.table_iii(trial, figure))
@@ -280,7 +280,7 @@ def cells_apart(result: MatchResult, name: str, pair: tuple[float, float]) -> tu
 
 
 def figures_of(
-    result: MatchResult, replays: list[JointPrediction], trial: Trial | None
+    result: MatchResult, replays: list[JointPrediction], trial: Results | None
 ) -> dict[str, Any]:
     """Collect the figures for `--json`."""
     from pronk.cli.match import figures_of as match_figures

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,8 @@ import tyro
 from pronk.cli import console
 
 if TYPE_CHECKING:
-    from pronk.evaluation.outcome.table_text import Sheet
-    from pronk.evaluation.result import Trial
+    from pronk.evaluation.results import Results
+    from pronk.evaluation.tables import Sheet
 
 ROBOT = "mini_cheetah"
 RATES_JUMPS = 3
@@ -56,24 +57,22 @@ def trial(
         walk: Also walk 20 s with each velocity, 20 times.
         crossing: Also cross gaps and steps of growing size.
         variation: Also vary mass, friction, delay and bus voltage, one by one.
-        bodies: Also try three bodies never seen, each matched anew.
+        bodies: Also try three randomized robots, each matched by its own sweep.
         own: A policy trained with the gains of the first body of --bodies; give it
             again for the second and the third.
-        video: MP4, GIF and strip of each command, where this machine can paint.
-        keep_captures: Keep what was seen of every jump (4 MB each), not of the first of
-            each command.
+        video: MP4, GIF and strip of each command, where this machine can render.
+        keep_captures: Keep the capture of every jump (4 MB each), not of the first of each
+            command.
         overwrite: Replace the trial in that folder.
         definitions: Also print the equation of every figure.
         json_file: Also write the figures to this file.
     """
-    from pronk.cli.trial_more import more
     from pronk.errors import PronkError
-    from pronk.evaluation.folder import CAPTURES, VIDEOS
-    from pronk.evaluation.outcome import tables
+    from pronk.evaluation import tables
     from pronk.evaluation.processes import cores
     from pronk.evaluation.protocol import parse_cases
-    from pronk.evaluation.result import SUMMARY, TABLE
-    from pronk.evaluation.run import Plan, run
+    from pronk.evaluation.results import SUMMARY, TABLE
+    from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, run_trial
     from pronk.files import sha256
     from pronk.report.whole import write_report
     from pronk.robots import load_robot
@@ -88,12 +87,13 @@ def trial(
         seed=seed,
     )
     file = sim_params or SHIPPED
-    # A wrong number of processes is refused by `run`; None is left to the machine.
+    # A wrong number of processes is refused by `run_trial`.
     count = cores() if processes is None else processes
-    policies = [policy, *(also or ())]
-    asked: dict[str, Any] = {
+    policies = [policy, *also]
+    common: dict[str, Any] = {
         "robot": load_robot(ROBOT),
         "sim_params": load_sim_params(file),
+        "out": out,
         "about": {
             "file": str(sim_params) if sim_params else "shipped with pronk",
             "sha256": sha256(file),
@@ -101,35 +101,31 @@ def trial(
         "processes": count,
     }
     with console.progress() as report:
-        found = run(
+        found = run_trial(
             policies,
             plan,
-            out=out,
             keep_captures=keep_captures,
             overwrite=overwrite,
             progress=report.bar("jumping"),
-            **asked,
+            **common,
         )
     for sheet in tables.sheets(found):
         if definitions or sheet.title != tables.DEFINITIONS:
             show(sheet)
     console.say(spent(found))
     console.wrote(out / TABLE, out / SUMMARY, out / CAPTURES)
+    extras = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
     with console.progress() as report:
         shown = [case.name for case in plan.cases]
         films = painted(found, out, report=report, at_once=count, cases=shown) if video else ()
         sheets, files = more(
+            [name for name, wanted in extras.items() if wanted],
             policies,
-            out,
+            common,
             seed=seed,
-            report=report,
-            walk=walk,
-            crossing=crossing,
-            variation=variation,
-            bodies=bodies,
-            own=[[path] for path in own or ()],
             jumps=jumps,
-            **asked,
+            own=[[path] for path in own],
+            report=report,
         )
         page, _ = write_report(out, report)
     for sheet in sheets:
@@ -139,8 +135,68 @@ def trial(
     console.following(f"open {page} in a browser", f"pronk play {policy}")
 
 
+def more(
+    extras: Sequence[str],
+    policies: Sequence[Path],
+    common: dict[str, Any],
+    *,
+    seed: int,
+    jumps: int,
+    own: Sequence[Sequence[Path]],
+    report: console.Reporter,
+) -> tuple[list[Sheet], list[Path]]:
+    """Run what belongs to a trial besides the jumps; return tables and files.
+
+    Args:
+        extras: Of `walk`, `crossing`, `variation` and `bodies`.
+        policies: Of the trial.
+        common: Arguments that all of them take.
+        seed: Of all draws.
+        jumps: With each command on each randomized robot.
+        own: Policies that were trained with each randomized robot's gains.
+        report: Shows the progress.
+    """
+    from pronk.evaluation import bodies, variation
+    from pronk.evaluation.crossing import CROSSING, CrossingPlan, add_crossings
+    from pronk.evaluation.trial import Plan
+    from pronk.evaluation.walk import WALK, add_walks
+    from pronk.report.trial import crossing as crossing_page
+    from pronk.report.trial import walk as walk_page
+
+    sheets: list[Sheet] = []
+    files: list[Path] = []
+    if "walk" in extras:
+        walks = add_walks(policies, seed=seed, progress=report.bar("walking"), **common)
+        sheets += [on_virtual("walking", one) for one in walk_page.tables(walks)]
+        files.append(Path(WALK.summary))
+    if "crossing" in extras:
+        crossed = add_crossings(
+            policies, CrossingPlan(seed=seed), progress=report.bar("crossing"), **common
+        )
+        sheets.append(on_virtual("crossing", crossing_page.table(crossed)))
+        files.append(Path(CROSSING.summary))
+    if "variation" in extras:
+        plan = Plan(jumps=5, seed=seed)
+        varied = variation.add_variation(
+            policies, plan, progress=report.bar("varying the robot"), **common
+        )
+        sheets.append(variation.table(varied))
+        files.append(Path(variation.VARIATION.summary))
+    if "bodies" in extras:
+        plan = Plan(jumps=jumps, seed=seed)
+        found = bodies.add_bodies(policies, plan, own=own, seed=seed, progress=report, **common)
+        sheets.append(bodies.table(found))
+        files += [Path(bodies.FILE), Path(bodies.FOLDER)]
+    return sheets, [common["out"] / name for name in files]
+
+
+def on_virtual(what: str, sheet: Sheet) -> Sheet:
+    """Add where and what to the title of a table of the page."""
+    return replace(sheet, title=f"Virtual robot, {what}: {sheet.title}")
+
+
 def painted(
-    found: Trial,
+    found: Results,
     out: Path,
     *,
     report: console.Reporter | None,
@@ -148,21 +204,21 @@ def painted(
     cases: Sequence[str] | None = None,
     slow: float | None = None,
 ) -> tuple[Path, ...]:
-    """Paint the films of a trial, where this machine can; one line says what it lacks.
+    """Render the films of a trial, where this machine can; warn of what it lacks.
 
     Args:
         found: The trial.
         out: Its folder.
-        report: Told the share that is painted.
-        at_once: How many films at once.
+        report: Shows the progress.
+        at_once: Films at once.
         cases: Names of the commands to show; all if None.
-        slow: How many times slower than real time the flight is shown; as usual if None.
+        slow: Slow-down of the flight; the default if None.
 
     Returns:
         The files.
     """
-    from pronk.evaluation.folder import VIDEOS
     from pronk.evaluation.pictures.videos import SLOW, record_all
+    from pronk.evaluation.trial import VIDEOS
 
     return record_all(
         found,
@@ -188,8 +244,8 @@ def show(sheet: Sheet) -> None:
         console.say(f"  {note}")
 
 
-def spent(found: Trial) -> str:
-    """How long it took."""
+def spent(found: Results) -> str:
+    """The computing time, in words."""
     timing = found.timing
     return (
         f"{len(found.rows)} jumps, {timing['simulated_s']:.0f} s of the virtual robot in "
@@ -199,22 +255,15 @@ def spent(found: Trial) -> str:
     )
 
 
-def figures(found: Trial, more: Sequence[Sheet] = ()) -> dict[str, Any]:
-    """What `--json` writes: tables and bars; `summary.json` has the numbers in full.
-
-    Args:
-        found: The trial.
-        more: Tables of what else was tried.
-    """
-    from dataclasses import asdict
-
-    from pronk.evaluation.outcome import criteria as bars
-    from pronk.evaluation.outcome import tables
+def figures(found: Results, more: Sequence[Sheet] = ()) -> dict[str, Any]:
+    """Return what `--json` writes: tables and checks; `summary.json` has the numbers in full."""
+    from pronk.evaluation import tables
+    from pronk.evaluation.criteria import trial_checks
 
     return {
         "virtual": found.virtual,
         "sheets": [asdict(sheet) for sheet in (*tables.sheets(found), *more)],
-        "checks": [check.row() for check in bars.checks(found)],
+        "checks": [check.row() for check in trial_checks(found)],
         "cells": [asdict(cell) for cell in found.cells],
         "ratios": [asdict(ratio) for ratio in found.ratios],
         "timing": dict(found.timing),

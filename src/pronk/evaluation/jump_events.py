@@ -1,26 +1,24 @@
-"""When a jump was asked, and when it was."""
+"""The times of a jump: rise and fall of the jump input, lift-off, touchdown."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-import numpy as np
-
 from pronk.errors import PronkError
-from pronk.evaluation.jumps import JumpRules, answer
-from pronk.evaluation.metrics import series_of
+from pronk.evaluation.jumps import JumpRules, jump_flights
+from pronk.evaluation.metrics import sample_at, series_of
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 
 
 @dataclass(frozen=True, kw_only=True)
-class Marks:
-    """When a jump was asked and when it was."""
+class JumpEvents:
+    """Times on the capture's clock."""
 
     on: float
-    """The jump input rises [s]."""
+    """Rise of the jump input [s]."""
     off: float
-    """It falls [s]."""
+    """Fall of the jump input [s]."""
     liftoff: float
     """[s]"""
     touchdown: float
@@ -34,27 +32,29 @@ class Marks:
         """
         if not (self.on < self.off and self.on <= self.liftoff < self.touchdown):
             raise PronkError(
-                f"Marks are {asdict(self)}; expected on < off and on <= liftoff < touchdown [s]."
+                f"JumpEvents are {asdict(self)}; expected on < off and on <= liftoff < touchdown "
+                "[s]."
             )
 
 
-def marks_of(
+def jump_events(
     capture: Capture, script: Script, *, began: float = 0.0, rules: JumpRules | None = None
-) -> Marks | None:
-    """Return the events of the main flight, by the rules of `evaluation.jumps`, or None.
+) -> JumpEvents | None:
+    """Return the events of the main flight, or None without a jump.
 
     Args:
-        capture: What was seen.
-        script: What was asked.
+        capture: The recorded run.
+        script: What was commanded.
         began: When the policy took over, on the capture's clock [s].
         rules: Of the definitions.
     """
     series, rise = series_of(capture), began + script.on
-    on = int(np.searchsorted(capture.time, rise - 1e-3 * capture.dt))
-    main = answer(series, on, rules or JumpRules()).main if on < len(series.position) else None
+    on = sample_at(capture, rise)
+    ahead = on < len(series.position)
+    main = jump_flights(series, on, rules or JumpRules()).main if ahead else None
     if main is None:
         return None
-    return Marks(
+    return JumpEvents(
         on=rise,
         off=began + script.off,
         liftoff=float(capture.time[main.liftoff]),

@@ -1,31 +1,31 @@
-"""What a jump was: flight phases and the figures of one jump, from the series of one robot.
+"""Flight phases and the figures of a jump, from the recorded motion of one robot.
 
-The definitions stand here, once; `pronk.evaluation.training_sim.flight` computes the same for
-thousands of robots while they run. Samples k = 0, 1, ... are taken at every
-physics step, at times k dt; foot contacts of a sample belong to its position. The trunk is
-followed at the origin of its frame, z up, the world's frame.
+The only measure of a jump: trials of the virtual robot and the evaluation in the training simulator
+record the trunk and the foot contacts and call `measure_jump`. Samples k = 0, 1, ... are those of
+the physics steps, at times k dt; the foot contacts of a sample belong to its position. The trunk's
+position is that of its frame's origin in the world, z up. A series ends where the robot falls.
 
 Flight phase: samples l .. d-1 without any foot on the ground, at least `flight_s` long; l is its
 lift-off, d (the first sample with a foot on the ground) its touchdown, (d - l) dt its duration.
 Shorter gaps are contact chatter. Sampling cuts up to one step off each end.
 
 A jump belongs to a jump input that rises at sample c. Its flights are those with
-c <= l <= c + search_s / dt. A running robot has flights too, `long_s` or longer in a fast gait, but
-they do not lift the trunk. So a flight is a high one if it lasts `long_s` or more and max z over
-its samples is more than `rise` over standing height. The main flight is the longest of the high
-ones, at equal length the first; without one there was no jump. Then
+c <= l <= c + search_s / dt. A fast gait has flights of `long_s` or longer, too, but they do not
+lift the trunk: a high flight lasts `long_s` or more with max z more than `rise` over standing
+height. The main flight is the longest high one, at equal length the first; without one there was no
+jump. With p, z the trunk's position and height, v its velocity, e = d + tail_s / dt:
 
-    height       max z - min z over samples c .. d + tail_s / dt          (paper E5)
-                 (without a jump: over c .. c + search_s / dt)
-    apex         max z over samples l .. d-1
-    delay        (l - c) dt
-    vertical     vz at l;  horizontal  |v_xy| at l                        (reading A6)
-    distance     |xy_d - xy_l|                                            (reading A17)
-    along        (xy_d - xy_l) . R_yaw(l) u, u the unit command in the trunk's frame
-    upright      at d + upright_s / dt the robot has not fallen and the trunk's z axis is within
-                 `tilt_deg` of the vertical
-
-A series ends where the robot falls.
+    height                 max z - min z over c .. e                       (paper E5)
+                           (without a jump: over c .. c + search_s / dt)
+    apex_gain              max z over l .. d-1, less standing height
+    rise, ballistic        max z over l .. d-1 less z_l;  v_z^2 / 2g at l
+    delay, duration        (l - c) dt;  (d - l) dt
+    lift_off_velocity      v_z at l;  horizontal_velocity |v_xy| at l      (reading A6)
+    distance               |xy_d - xy_l|                                   (reading A17)
+    along                  (xy_d - xy_l) . R_yaw(l) u, u the unit command in the trunk's frame
+    distance_minima        |xy_b - xy_a|, z_a the least over c .. l, z_b the least over d .. e
+    upright                at d + upright_s / dt the robot has not fallen and the trunk's z axis is
+                           within `tilt_deg` of the vertical
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,13 +44,15 @@ from pronk.robots.mini_cheetah.model import standing_height
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+GRAVITY = 9.81
+"""[m/s^2]"""
 RISE = 0.03
-"""Over standing height; a flight whose trunk goes higher is a jump, asked for or not [m]."""
+"""Over standing height; a flight in which the trunk goes higher is a jump, commanded or not [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JumpRules:
-    """Times [s] and heights that the definitions rest on."""
+    """Times [s] and heights of the definitions."""
 
     flight_s: float = 0.015
     """Shortest flight phase: three physics steps."""
@@ -98,24 +101,24 @@ class JumpRules:
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """One robot, from its start to its fall or to the end."""
+    """The recorded motion of one robot, from its start to its fall or to the end."""
 
     position: Array
     """Trunk, world frame [m]. (T, 3)"""
     velocity: Array
     """Trunk, world frame [m/s]. (T, 3)"""
     orientation: Array
-    """Trunk, unit quaternions w, x, y, z. (T, 4)"""
+    """Trunk to world, unit quaternions w, x, y, z. (T, 4)"""
     contact: Mask
     """Feet on the ground. (T, 4)"""
     dt: float
     """Time between samples [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse series of different lengths.
+        """Refuse arrays of other shapes.
 
         Raises:
-            PronkError: A shape is not the one that is said.
+            PronkError: A shape is not the documented one.
         """
         length = len(self.position)
         for name, width in (("position", 3), ("velocity", 3), ("orientation", 4), ("contact", 4)):
@@ -137,42 +140,24 @@ class Flight:
 
     @property
     def samples(self) -> int:
-        """How many samples it lasts."""
+        """Length in samples."""
         return self.touchdown - self.liftoff
 
 
 @dataclass(frozen=True, kw_only=True)
-class Jump:
-    """The figures of one jump, as the module says; NaN where there was none."""
+class JumpFlights:
+    """The flight phases of one jump input, and the others."""
 
-    flights: int
-    """Flight phases that belong to the jump input."""
-    long_flights: int
-    """Those of `long_s` or more."""
-    high_flights: int
-    """Those of them that are high."""
-    height: float
-    """[m]"""
-    apex: float = math.nan
-    """Over ground [m]."""
-    delay: float = math.nan
-    """[s]"""
-    duration: float = math.nan
-    """Of the main flight [s]."""
-    vertical: float = math.nan
-    """[m/s]"""
-    horizontal: float = math.nan
-    """[m/s]"""
-    distance: float = math.nan
-    """[m]"""
-    along: float = math.nan
-    """[m]"""
-    upright: bool = False
+    all: tuple[Flight, ...]
+    high: tuple[Flight, ...]
+    """Those of `long_s` or more that are high."""
+    uncommanded: tuple[Flight, ...]
+    """Those that belong to no jump input."""
 
     @property
-    def found(self) -> bool:
-        """True if there was a jump."""
-        return self.high_flights > 0
+    def main(self) -> Flight | None:
+        """The longest of the high ones; None if there was no jump."""
+        return max(self.high, key=lambda phase: phase.samples, default=None)
 
 
 def steps(seconds: float, dt: float) -> int:
@@ -191,26 +176,33 @@ def heading(orientation: Array) -> Array:
     return yaw
 
 
-def along(displacement: Array, orientation: Array, command: Array) -> Array:
+def cosine_of_tilt(orientation: Array) -> Array:
+    """Vertical part of the trunk's z axis, 1 - 2 (x^2 + y^2). (...,).
+
+    Args:
+        orientation: w, x, y, z. (..., 4)
+    """
+    cosine: Array = 1.0 - 2.0 * (orientation[..., 1] ** 2 + orientation[..., 2] ** 2)
+    return cosine
+
+
+def along(displacement: Array, orientation: Array, command: Sequence[float]) -> float:
     """Part of a horizontal displacement along the commanded direction [m].
 
     Args:
-        displacement: World frame [m]. (..., 2)
-        orientation: Of the trunk at lift-off, w, x, y, z. (..., 4)
-        command: Horizontal velocity in the trunk's frame [m/s]; zero gives NaN. (..., 2)
+        displacement: World frame [m]. (2,)
+        orientation: Of the trunk at lift-off, w, x, y, z. (4,)
+        command: Horizontal velocity in the trunk's frame [m/s]; zero gives NaN.
     """
-    yaw = heading(orientation)
-    forward, left = command[..., 0], command[..., 1]
-    speed = np.hypot(forward, left)
-    x = np.cos(yaw) * forward - np.sin(yaw) * left
-    y = np.sin(yaw) * forward + np.cos(yaw) * left
-    dot = displacement[..., 0] * x + displacement[..., 1] * y
-    part: Array = np.divide(dot, speed, out=np.full(np.shape(dot), np.nan), where=speed > 0.0)
-    return part
+    yaw, (forward, left) = float(heading(orientation)), command[:2]
+    speed = math.hypot(forward, left)
+    x = math.cos(yaw) * forward - math.sin(yaw) * left
+    y = math.sin(yaw) * forward + math.cos(yaw) * left
+    return float(displacement[0] * x + displacement[1] * y) / speed if speed else math.nan
 
 
 def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
-    """Flight phases that have ended, in their order.
+    """Return the flight phases that have ended, in their order.
 
     Args:
         contact: Feet on the ground. (T, 4)
@@ -218,118 +210,92 @@ def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
     """
     airborne = ~np.asarray(contact, dtype=bool).any(axis=-1)
     edges = np.flatnonzero(np.diff(airborne.astype(np.int8), prepend=0))
-    begins, ends = edges[0::2], edges[1::2]
     return tuple(
         Flight(liftoff=int(begin), touchdown=int(end))
-        for begin, end in zip(begins, ends, strict=False)
+        for begin, end in zip(edges[0::2], edges[1::2], strict=False)
         if end - begin >= least
     )
 
 
-def commanded(
-    phases: Sequence[Flight], on: int | None, rules: JumpRules, dt: float
-) -> tuple[Flight, ...]:
-    """Those flight phases that belong to the jump input that rises at sample `on`."""
-    if on is None:
-        return ()
-    last = on + steps(rules.search_s, dt)
-    return tuple(phase for phase in phases if on <= phase.liftoff <= last)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Answer:
-    """The flight phases that belong to a jump input, in their order."""
-
-    all: tuple[Flight, ...]
-    long: tuple[Flight, ...]
-    """Those of `long_s` or more."""
-    high: tuple[Flight, ...]
-    """Those of them that are high."""
-
-    @property
-    def main(self) -> Flight | None:
-        """The longest of the high ones; None if there was no jump."""
-        return max(self.high, key=lambda phase: phase.samples, default=None)
-
-
-def answer(series: Series, on: int, rules: JumpRules) -> Answer:
-    """The flight phases that belong to the jump input which rises at sample `on`.
+def jump_flights(series: Series, on: int | None, rules: JumpRules) -> JumpFlights:
+    """Sort the flight phases by whether they belong to the jump input.
 
     Args:
         series: The robot.
-        on: First sample with the jump input.
+        on: First sample with the jump input; None without one.
         rules: Of the definitions.
     """
     z = series.position[:, 2]
     phases = flights(series.contact, least=series.steps(rules.flight_s))
-    own = commanded(phases, on, rules, series.dt)
-    long = tuple(phase for phase in own if phase.samples >= series.steps(rules.long_s))
+    last = -1 if on is None else on + series.steps(rules.search_s)
+    own = tuple(phase for phase in phases if on is not None and on <= phase.liftoff <= last)
+    long = (phase for phase in own if phase.samples >= series.steps(rules.long_s))
     high = (phase for phase in long if z[phase.liftoff : phase.touchdown].max() > rules.high)
-    return Answer(all=own, long=long, high=tuple(high))
+    others = tuple(phase for phase in phases if phase not in own)
+    return JumpFlights(all=own, high=tuple(high), uncommanded=others)
 
 
-def measure(series: Series, on: int, command: Sequence[float], rules: JumpRules) -> Jump | None:
-    """The jump that belongs to the input which rises at sample `on`.
+def uncommanded_height(series: Series, on: int | None, rules: JumpRules) -> float:
+    """Highest trunk in a flight phase that belongs to no jump input [m]; NaN without one.
 
     Args:
         series: The robot.
+        on: First sample with the jump input; None for a robot that only walks.
+        rules: Of the definitions; flights that lift off within `grace_s` do not count.
+    """
+    tops = [
+        series.position[phase.liftoff : phase.touchdown, 2].max()
+        for phase in jump_flights(series, on, rules).uncommanded
+        if phase.liftoff >= series.steps(rules.grace_s)
+    ]
+    return float(max(tops, default=math.nan))
+
+
+def measure_jump(
+    series: Series, on: int, command: Sequence[float], rules: JumpRules
+) -> tuple[dict[str, Any], Flight | None]:
+    """Measure the jump of the input that rises at sample `on`.
+
+    Args:
+        series: The robot; it has sample `on`.
         on: First sample with the jump input.
         command: Forward and left velocity command [m/s].
         rules: Of the definitions.
 
     Returns:
-        The jump; None if the robot fell before the command.
+        The figures of the module by name; without a jump only `found`, `flights`, `high_flights`
+        and `height`. And the main flight, or None.
     """
-    if on >= len(series.position):
-        return None
-    dt, z = series.dt, series.position[:, 2]
-    found = answer(series, on, rules)
-    own, long, main = len(found.all), len(found.long), found.main
+    dt, plane, z = series.dt, series.position[:, :2], series.position[:, 2]
+    found = jump_flights(series, on, rules)
+    main = found.main
+    figures: dict[str, Any] = {
+        "found": main is not None,
+        "flights": float(len(found.all)),
+        "high_flights": float(len(found.high)),
+    }
     if main is None:
         window = z[on : on + series.steps(rules.search_s) + 1]
-        return Jump(flights=own, long_flights=long, high_flights=0, height=float(np.ptp(window)))
+        return figures | {"height": float(np.ptp(window))}, None
     up, down = main.liftoff, main.touchdown
-    displacement = series.position[down, :2] - series.position[up, :2]
-    end = down + series.steps(rules.upright_s)
-    return Jump(
-        flights=own,
-        long_flights=long,
-        high_flights=len(found.high),
-        height=float(np.ptp(z[on : down + series.steps(rules.tail_s) + 1])),
-        apex=float(z[up:down].max()),
-        delay=(up - on) * dt,
-        duration=main.samples * dt,
-        vertical=float(series.velocity[up, 2]),
-        horizontal=float(np.hypot(*series.velocity[up, :2])),
-        distance=float(np.hypot(*displacement)),
-        along=float(along(displacement, series.orientation[up], np.asarray(command[:2]))),
-        upright=end < len(z) and cosine_of_tilt(series.orientation[end]) >= rules.upright_cosine,
-    )
-
-
-def cosine_of_tilt(orientation: Array) -> float:
-    """Vertical part of the trunk's z axis, 1 - 2 (x^2 + y^2).
-
-    Args:
-        orientation: w, x, y, z. (4,)
-    """
-    _, x, y, _ = orientation
-    return float(1.0 - 2.0 * (x * x + y * y))
-
-
-def unasked_height(series: Series, on: int | None, rules: JumpRules) -> float:
-    """Highest trunk in a flight phase that belongs to no jump input [m]; NaN without one.
-
-    Args:
-        series: The robot.
-        on: First sample with the jump input; None for a robot that is never told to jump.
-        rules: Of the definitions; flights that lift off within `grace_s` do not count.
-    """
-    phases = flights(series.contact, least=series.steps(rules.flight_s))
-    own = commanded(phases, on, rules, series.dt)
-    tops = [
-        series.position[phase.liftoff : phase.touchdown, 2].max()
-        for phase in phases
-        if phase not in own and phase.liftoff >= series.steps(rules.grace_s)
-    ]
-    return float(max(tops, default=math.nan))
+    end = down + series.steps(rules.tail_s) + 1
+    judged = down + series.steps(rules.upright_s)
+    displacement, vertical = plane[down] - plane[up], float(series.velocity[up, 2])
+    before, after = on + int(np.argmin(z[on : up + 1])), down + int(np.argmin(z[down:end]))
+    apex = float(z[up:down].max())
+    return figures | {
+        "upright": bool(
+            judged < len(z) and cosine_of_tilt(series.orientation[judged]) >= rules.upright_cosine
+        ),
+        "height": float(np.ptp(z[on:end])),
+        "apex_gain": apex - rules.standing_height,
+        "rise": float(apex - z[up]),
+        "ballistic": vertical**2 / (2.0 * GRAVITY),
+        "distance": float(np.hypot(*displacement)),
+        "along": along(displacement, series.orientation[up], command),
+        "distance_minima": float(np.hypot(*(plane[after] - plane[before]))),
+        "lift_off_velocity": vertical,
+        "horizontal_velocity": float(np.hypot(*series.velocity[up, :2])),
+        "delay": (up - on) * dt,
+        "duration": main.samples * dt,
+    }, main

@@ -1,8 +1,7 @@
-"""The figures of one jump, from what cameras and force plates around the robot saw.
+"""The figures of one jump of the virtual robot, from its capture.
 
-When the robot flies, lifts off and touches down, and what belongs to a jump input, is said in
-`pronk.evaluation.jumps`, which training's evaluation uses too. In short, with samples k of the
-capture:
+`pronk.evaluation.jumps` defines flights and the figures of the trunk; here are those of feet,
+joints and energy, too. In short, with samples k of the capture:
 
     c       the jump input rises
     l, d    lift-off and touchdown of the main flight: the longest one in which the trunk rises
@@ -28,8 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.actuator import model as drive
-from pronk.evaluation.jumps import Flight, JumpRules, Series, answer, heading
-from pronk.evaluation.jumps import measure as measure_jump
+from pronk.evaluation.jumps import (
+    GRAVITY,
+    Flight,
+    JumpRules,
+    Series,
+    cosine_of_tilt,
+    heading,
+    measure_jump,
+)
 from pronk.robots.mini_cheetah.constants import FOOT_RADIUS
 from pronk.robots.robot import Robot
 from pronk.runtime.script import Script
@@ -37,8 +43,6 @@ from pronk.virtual.capture import Capture
 
 Array = NDArray[np.float64]
 
-GRAVITY = 9.81
-"""[m/s^2]"""
 FALLEN_COSINE = 0.34
 """A trunk that leans further (70 degrees) has fallen, as in training."""
 FALLEN_HEIGHT = 0.08
@@ -75,11 +79,13 @@ UNITS = {
     "rad/s": "_rad_per_s",
     "N m": "_N_m",
     "J": "_J",
+    "W": "_W",
 }
 """How a unit is spelled in the name of a column."""
 
 
-def _number(unit: str, says: str) -> Any:
+def number(unit: str, says: str) -> Any:
+    """Declare a figure that is a number: its unit and its equation."""
     return field(default=math.nan, metadata={"unit": unit, "says": says})
 
 
@@ -91,64 +97,62 @@ def _joints(unit: str, says: str) -> Any:
 class JumpFigures:
     """One jump. Every number's unit and equation is in `FIGURES`."""
 
-    told: bool
+    standing: bool
     """The robot had not fallen when the jump input came."""
     found: bool = False
     """There was a jump."""
-    touched: bool = False
-    """Something else than a foot touched the ground, from c to 2 s after d."""
+    non_foot_contact: bool = False
+    """Something but a foot touched the ground, from c to 2 s after d."""
     fell: bool = False
     """The robot fell, at any time of the run."""
     upright: bool = False
-    """There was a jump, and 2 s after d the robot had not fallen and leant 30 degrees at most."""
+    """There was a jump, and 2 s after d the robot stood, tilted by 30 degrees at most."""
 
-    height: float = _number("m", "max z - min z over c .. e (paper E5)")
-    apex_gain: float = _number(
+    height: float = number("m", "max z - min z over c .. e (paper E5)")
+    apex_gain: float = number(
         "m", "max z over l .. d-1, less the height of the trunk in the default pose"
     )
-    rise: float = _number("m", "max z over l .. d-1, less z_l")
-    ballistic: float = _number("m", "v_z^2 / 2g with v_z at l: what a stone would rise")
-    clearance: float = _number(
+    rise: float = number("m", "max z over l .. d-1, less z_l")
+    ballistic: float = number("m", "v_z^2 / 2g with v_z at l: what a stone would rise")
+    clearance: float = number(
         "m",
         "max over l .. d-1 of min over the feet of (height of f_i - r): all feet are this high at "
         "once",
     )
-    clearance_half: float = _number(
+    clearance_half: float = number(
         "m",
         "min over the middle half of l .. d-1 of min over the feet of (height of f_i - r): no foot "
         "is lower for half of the flight",
     )
-    distance: float = _number("m", "|p_d - p_l| in the plane (paper E6, reading A17)")
-    along: float = _number("m", "(p_d - p_l) along the commanded direction, heading at l")
-    distance_minima: float = _number(
+    distance: float = number("m", "|p_d - p_l| in the plane (paper E6, reading A17)")
+    along: float = number("m", "(p_d - p_l) along the commanded direction, heading at l")
+    distance_minima: float = number(
         "m",
         "|p_b - p_a| in the plane, z_a the least over c .. l and z_b the least over d .. e "
         "(the other reading of A17)",
     )
-    gap: float = _number(
+    gap: float = number(
         "m",
         "min over the feet of f_i . u at its first contact from d on, less max over the feet of "
         "f_i . u at its last contact before l (reading A16)",
     )
-    lift_off_velocity: float = _number("m/s", "v_z at l (reading A6)")
-    horizontal_velocity: float = _number("m/s", "|v_xy| at l")
-    delay: float = _number("s", "time from c to l")
-    duration: float = _number("s", "time from l to d")
-    flights: float = _number("1", "flight phases that lift off from c to c + 1.5 s")
-    high_flights: float = _number("1", "those of them that are 60 ms or longer and high")
-    speed: float = _number(
+    lift_off_velocity: float = number("m/s", "v_z at l (reading A6)")
+    horizontal_velocity: float = number("m/s", "|v_xy| at l")
+    delay: float = number("s", "time from c to l")
+    duration: float = number("s", "time from l to d")
+    flights: float = number("1", "flight phases that lift off from c to c + 1.5 s")
+    high_flights: float = number("1", "those of them that are 60 ms or longer and high")
+    speed: float = number(
         "m/s", "mean velocity along the command and the heading, from 1 s after it to c"
     )
-    roll_rate_rms: float = _number("rad/s", "root mean square of the roll rate while accelerating")
-    roll_rate_peak: float = _number("rad/s", "greatest |roll rate| while accelerating")
-    pitch_rate_rms: float = _number(
-        "rad/s", "root mean square of the pitch rate while accelerating"
-    )
-    pitch_rate_peak: float = _number("rad/s", "greatest |pitch rate| while accelerating")
-    energy: float = _number(
+    roll_rate_rms: float = number("rad/s", "root mean square of the roll rate while accelerating")
+    roll_rate_peak: float = number("rad/s", "greatest |roll rate| while accelerating")
+    pitch_rate_rms: float = number("rad/s", "root mean square of the pitch rate while accelerating")
+    pitch_rate_peak: float = number("rad/s", "greatest |pitch rate| while accelerating")
+    energy: float = number(
         "J", "electrical energy over c .. e, what comes back into the battery taken off"
     )
-    cost_of_transport: float = _number(
+    cost_of_transport: float = number(
         "1", "electrical energy / (m g |p_c - p_b|) from b, 1 s after the command to run, to c"
     )
     peak_torque: tuple[float, ...] = _joints("N m", "greatest |motor torque| over c .. e")
@@ -165,22 +169,24 @@ class JumpFigures:
     @property
     def success(self) -> bool:
         """The landing: upright 2 s later, and nothing but feet touched the ground."""
-        return self.upright and not self.touched
+        return self.upright and not self.non_foot_contact
 
 
-FIGURES: Mapping[str, Figure] = {
-    entry.name: Figure(name=entry.name, **entry.metadata)
-    for entry in fields(JumpFigures)
-    if entry.metadata
-}
-"""Every figure that is a number, by name."""
-FLAGS = tuple(entry.name for entry in fields(JumpFigures) if not entry.metadata)
-"""Those that are true or false."""
+def figures_of(kind: type[Any]) -> dict[str, Figure]:
+    """Return every figure that is a number, by name, of a dataclass of figures."""
+    return {
+        entry.name: Figure(name=entry.name, **entry.metadata)
+        for entry in fields(kind)
+        if entry.metadata
+    }
 
 
-def series_of(capture: Capture) -> Series:
-    """The trunk and the contacts up to the fall, if there is one."""
-    end = fallen_at(capture)
+FIGURES: Mapping[str, Figure] = figures_of(JumpFigures)
+
+
+def series_of(capture: Capture, *, whole: bool = False) -> Series:
+    """Return the trunk and the contacts, up to the fall unless `whole`."""
+    end = len(capture.time) if whole else fallen_at(capture)
     return Series(
         position=capture.position[:end],
         velocity=capture.velocity[:end],
@@ -191,10 +197,15 @@ def series_of(capture: Capture) -> Series:
 
 
 def fallen_at(capture: Capture) -> int:
-    """First sample at which the robot lies or leans too far; their number if it never does."""
-    cosine = 1.0 - 2.0 * (capture.orientation[:, 1] ** 2 + capture.orientation[:, 2] ** 2)
+    """First sample at which the robot lies or leans too far; the sample count if it never does."""
+    cosine = cosine_of_tilt(capture.orientation)
     fallen = (cosine < FALLEN_COSINE) | (capture.position[:, 2] < FALLEN_HEIGHT)
     return int(np.argmax(fallen)) if fallen.any() else len(fallen)
+
+
+def sample_at(capture: Capture, time: float) -> int:
+    """First sample at or after a time on the capture's clock [s]."""
+    return int(np.searchsorted(capture.time, time - 1e-3 * capture.dt))
 
 
 def measure(
@@ -206,65 +217,43 @@ def measure(
     mass: float,
     rules: JumpRules | None = None,
 ) -> JumpFigures:
-    """The figures of one run.
+    """Return the figures of one run.
 
     Args:
-        capture: What was seen.
-        script: What was asked.
-        robot: Whose drives the loads are compared with.
+        capture: The recorded run.
+        script: What was commanded.
+        robot: Its drives' limits give the torque margin.
         began: When the policy took over, on the capture's clock [s].
         mass: Of the robot, for the cost of transport [kg].
         rules: Of the definitions.
     """
     rules = rules or JumpRules()
     series = series_of(capture)
-    dt = series.dt
-    told, on = (_sample(capture, began + t, dt) for t in (script.start, script.on))
+    run, on = (sample_at(capture, began + t) for t in (script.start, script.on))
     fell = len(series.position) < len(capture.time)
-    jump = measure_jump(series, on, script.command, rules)
-    if jump is None:
-        return JumpFigures(told=False, fell=fell)
-    main = answer(series, on, rules).main
-    end = _end(series, on, main, rules)
+    if on >= len(series.position):
+        return JumpFigures(standing=False, fell=fell)
+    figures, main = measure_jump(series, on, script.command, rules)
+    seconds = rules.search_s if main is None else rules.tail_s
+    last = (on if main is None else main.touchdown) + series.steps(seconds)
+    end = min(last, len(series.position) - 1)
     judged = (main.touchdown + series.steps(rules.upright_s)) if main else end
-    figures: dict[str, Any] = {
-        "told": True,
-        "found": main is not None,
-        "touched": bool(capture.other_contact[on : judged + 1].any()),
-        "fell": fell,
-        "upright": jump.upright,
-        "height": jump.height,
-        "apex_gain": jump.apex - rules.standing_height,
-        "distance": jump.distance,
-        "along": jump.along,
-        "lift_off_velocity": jump.vertical,
-        "horizontal_velocity": jump.horizontal,
-        "delay": jump.delay,
-        "duration": jump.duration,
-        "flights": float(jump.flights),
-        "high_flights": float(jump.high_flights),
-        "energy": float(capture.electrical_power[on : end + 1].sum() * dt),
+    figures |= {
+        "non_foot_contact": bool(capture.other_contact[on : judged + 1].any()),
+        "energy": float(capture.electrical_power[on : end + 1].sum() * capture.dt),
     }
-    figures |= _rates(capture, told, on)
-    figures |= _walk(capture, script, told + series.steps(SETTLE_S), on, mass=mass, dt=dt)
+    figures |= _rates(capture, run, on)
+    figures |= _run(capture, script, run + series.steps(SETTLE_S), on, mass=mass)
     figures |= _loads(capture, robot, on, end)
     if main is not None:
-        figures |= _flight(capture, main, on, end)
-    return JumpFigures(**figures)
-
-
-def _sample(capture: Capture, time: float, dt: float) -> int:
-    """First sample at or after a time."""
-    return int(np.searchsorted(capture.time, time - 1e-3 * dt))
-
-
-def _end(series: Series, on: int, main: Flight | None, rules: JumpRules) -> int:
-    """Sample e, of those there are."""
-    if main is None:
-        end = on + series.steps(rules.search_s)
-    else:
-        end = main.touchdown + series.steps(rules.tail_s)
-    return min(end, len(series.position) - 1)
+        low = capture.foot_position[main.liftoff : main.touchdown, :, 2].min(axis=1) - FOOT_RADIUS
+        quarter = len(low) // 4
+        figures |= {
+            "clearance": float(low.max()),
+            "clearance_half": float(low[quarter : len(low) - quarter].min()),
+            "gap": gap(capture, main),
+        }
+    return JumpFigures(standing=True, fell=fell, **figures)
 
 
 def _rates(capture: Capture, start: int, on: int) -> dict[str, float]:
@@ -280,18 +269,16 @@ def _rates(capture: Capture, start: int, on: int) -> dict[str, float]:
     }
 
 
-def _walk(
-    capture: Capture, script: Script, start: int, on: int, *, mass: float, dt: float
-) -> dict[str, float]:
+def _run(capture: Capture, script: Script, start: int, on: int, *, mass: float) -> dict[str, float]:
     """Speed and cost of transport of the steady run before the jump."""
     if start >= on:
         return {}
     travelled = float(np.hypot(*(capture.position[on, :2] - capture.position[start, :2])))
-    work = float(capture.electrical_power[start:on].sum() * dt)
+    work = float(capture.electrical_power[start:on].sum() * capture.dt)
     figures = {"cost_of_transport": work / (mass * GRAVITY * travelled)} if travelled else {}
     forward, left = script.command[:2]
-    asked = math.hypot(forward, left)
-    if asked:
+    speed = math.hypot(forward, left)
+    if speed:
         direction = heading(capture.orientation[start:on]) + math.atan2(left, forward)
         velocity = capture.velocity[start:on]
         part = velocity[:, 0] * np.cos(direction) + velocity[:, 1] * np.sin(direction)
@@ -321,33 +308,15 @@ def _loads(capture: Capture, robot: Robot, on: int, end: int) -> dict[str, tuple
     }
 
 
-def _flight(capture: Capture, main: Flight, on: int, end: int) -> dict[str, float]:
-    """What only a jump has."""
-    up, down = main.liftoff, main.touchdown
-    z, plane = capture.position[:, 2], capture.position[:, :2]
-    lowest = capture.foot_position[up:down, :, 2].min(axis=1) - FOOT_RADIUS
-    quarter = len(lowest) // 4
-    before = on + int(np.argmin(z[on : up + 1]))
-    after = down + int(np.argmin(z[down : end + 1]))
-    return {
-        "rise": float(z[up:down].max() - z[up]),
-        "ballistic": float(capture.velocity[up, 2] ** 2 / (2.0 * GRAVITY)),
-        "clearance": float(lowest.max()),
-        "clearance_half": float(lowest[quarter : len(lowest) - quarter].min()),
-        "distance_minima": float(np.hypot(*(plane[after] - plane[before]))),
-        "gap": gap(capture, main),
-    }
-
-
 def gap(capture: Capture, flight: Flight) -> float:
-    """Widest gap across the way of travel into which no foot stepped (reading A16) [m].
+    """Return the widest gap across the way of travel without a foothold (reading A16) [m].
 
     Hind-most first touch of a foot after the flight less front-most last stand of a foot before
     it, along the trunk's displacement. Negative if the feet overlap; NaN if a foot never stood
     before or never touches again, or the robot came down where it lifted off.
 
     Args:
-        capture: What was seen.
+        capture: The recorded run.
         flight: The main flight.
     """
     up, down = flight.liftoff, flight.touchdown

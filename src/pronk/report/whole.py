@@ -15,15 +15,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pronk.errors import ArtefactError, LogError
-from pronk.evaluation import variation, walk
-from pronk.evaluation.outcome.criteria import checks
-from pronk.evaluation.result import SUMMARY
-from pronk.evaluation.terrain import crossing
-from pronk.evaluation.terrain.crossing import Crossings
-from pronk.evaluation.unseen import bodies
-from pronk.evaluation.unseen.bodies import Bodies
-from pronk.evaluation.variation import Variation
-from pronk.evaluation.walk import Walks
+from pronk.evaluation import bodies, results
+from pronk.evaluation.bodies import Bodies
+from pronk.evaluation.criteria import trial_checks
+from pronk.evaluation.crossing import CROSSING
+from pronk.evaluation.results import SUMMARY, Results
+from pronk.evaluation.variation import VARIATION
+from pronk.evaluation.walk import WALK
 from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
@@ -83,11 +81,11 @@ def _trials(root: Path, told: Callable[[float], None]) -> Iterator[Found]:
             source=source,
             virtual=material.trial.virtual,
             draw=partial(trial_part.part, material, anchor=anchor, title=f"Trial{added}"),
-            figures={"checks": [check.row() for check in checks(material.trial)]},
+            figures={"checks": [check.row() for check in trial_checks(material.trial)]},
         )
 
 
-R = TypeVar("R", Walks, Crossings, Variation, Bodies)
+R = TypeVar("R", Results, Bodies)
 
 
 def _extra(
@@ -112,20 +110,20 @@ def _extra(
         read = load(folder)
         yield Found(
             source=source,
-            virtual=read.origin.virtual,
+            virtual=read.virtual,
             draw=partial(make, read, anchor=name, title=f"{title}{added}"),
         )
 
 
 def _extras(root: Path) -> Iterator[Found]:
-    yield from _extra(root, "walk", "Walking", walk.FILE, walk.load, walk_part)
-    yield from _extra(
-        root, "crossing", "Crossing gaps and steps", crossing.FILE, crossing.load, crossing_part
-    )
-    yield from _extra(
-        root, "variation", "Variation", variation.FILE, variation.load, variation_part
-    )
-    yield from _extra(root, "bodies", "Bodies never seen", bodies.FILE, bodies.load, bodies_part)
+    for anchor, title, kind, make in (
+        ("walk", "Walking", WALK, walk_part),
+        ("crossing", "Crossing gaps and steps", CROSSING, crossing_part),
+        ("variation", "Variation", VARIATION, variation_part),
+    ):
+        load = partial(results.load, kind=kind)
+        yield from _extra(root, anchor, title, kind.summary, load, make)
+    yield from _extra(root, "bodies", "Randomized robots", bodies.FILE, bodies.load, bodies_part)
 
 
 def _matches(root: Path) -> Iterator[Found]:

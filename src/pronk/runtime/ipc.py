@@ -176,8 +176,6 @@ class Mode(IntEnum):
     """On the way down."""
     FAULT = 7
     """Joints damped by a fault."""
-    SWEEP = 9
-    """Joints are excited one after another."""
     ENDED = 8
     """The link is closed."""
 
@@ -195,8 +193,6 @@ class OperatorRequest(IntEnum):
     """Stop, sit down, damp."""
     RESET = 5
     """The cause of a latched fault is gone."""
-    CLAMPED = 7
-    """The joints of a sweep are clamped as reported."""
     QUIT = 6
     """Damp and leave."""
 
@@ -215,16 +211,7 @@ _STATE: list[Any] = [
     ("temperature", "<f8", JOINTS),
 ]
 
-STATE = np.dtype(
-    [
-        *_STATE,
-        ("now", "<f8"),
-        ("start", "<f8"),
-        ("mode", "<i8"),
-        ("entry", "<i8"),
-        ("progress", "<f8"),
-    ]
-)
+STATE = np.dtype([*_STATE, ("now", "<f8"), ("start", "<f8"), ("mode", "<i8"), ("entry", "<i8")])
 """Servo to all, every tick: the newest state, the time of tick 0, the mode and how often it has
 changed."""
 
@@ -301,36 +288,6 @@ STEP = np.dtype(
     ]
 )
 """Policy to logger, every step."""
-
-
-class SampleKind(IntEnum):
-    """What a record of `SAMPLE` holds."""
-
-    SAMPLE = 0
-    OPEN = 1
-    """A log begins; `number` is its place in the task, `text` the torque's kind."""
-    SEGMENT = 2
-    """An excitation begins; `number` is its place in the log."""
-    END = 3
-    """The log ends; `text` says why, empty if it is whole."""
-
-
-SAMPLE = np.dtype(
-    [
-        ("kind", "<i8"),
-        ("number", "<i8"),
-        ("time", "<f8"),
-        ("command", "<f8", JOINTS),
-        ("position", "<f8", JOINTS),
-        ("velocity", "<f8", JOINTS),
-        ("torque", "<f8", JOINTS),
-        ("frequency", "<f8"),
-        ("virtual", "<i8"),
-        ("text", "S240"),
-    ]
-)
-"""Servo to logger during a sweep, in the order of the log; `number` of a sample is that of its
-excitation, -1 between."""
 
 VIRTUAL, REAL = "the virtual robot", "a real robot"
 """Text of the event `robot`."""
@@ -432,7 +389,6 @@ class Names:
     steps: str
     events: str
     policy_events: str
-    samples: str
     events_seen: str
 
 
@@ -457,8 +413,6 @@ class Shared:
         """Policy to logger."""
         self.events = Ring(EVENT, _EVENTS, called("events"))
         """Servo to logger."""
-        self.samples = Ring(SAMPLE, _TICKS, called("samples"))
-        """Servo to logger, during a sweep."""
         self.policy_events = Ring(EVENT, _EVENTS, called("policy_events"))
         """Policy to logger."""
         self.events_seen = Ring(EVENT, _EVENTS, called("events_seen"))
@@ -471,12 +425,7 @@ class Shared:
 
     def dropped(self) -> dict[str, int]:
         """Records that found no room on their way to the logger."""
-        queues = {
-            "ticks": self.ticks,
-            "steps": self.steps,
-            "events": self.events,
-            "samples": self.samples,
-        }
+        queues = {"ticks": self.ticks, "steps": self.steps, "events": self.events}
         return {name: ring.dropped for name, ring in queues.items()}
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from pronk.errors import PronkError
-from pronk.evaluation.jump_events import Marks
+from pronk.evaluation.jump_events import JumpEvents
 from pronk.evaluation.jumps import heading
 from pronk.files import save_arrays, stored_arrays
 from pronk.virtual.capture import Capture
@@ -54,7 +54,7 @@ class Film:
     """What else has to be known, for instance which policy."""
     virtual: bool
     """True for the virtual robot; the frames say so."""
-    marks: Marks | None
+    marks: JumpEvents | None
     origin: tuple[float, float]
     """Zero of the tape on the floor: the trunk at lift-off, or at the start [m]."""
     direction: float
@@ -97,7 +97,7 @@ def plan(
     title: str,
     note: str = "",
     virtual: bool = True,
-    marks: Marks | None = None,
+    marks: JumpEvents | None = None,
     ground: Ground | None = None,
     start: float | None = None,
     end: float | None = None,
@@ -166,7 +166,7 @@ def plan(
 
 
 def _clock(
-    begin: float, finish: float, marks: Marks | None, slow: float, fps: float
+    begin: float, finish: float, marks: JumpEvents | None, slow: float, fps: float
 ) -> tuple[Array, Array]:
     """Moments that are shown, and how fast the film is there."""
     times, rates, now = [], [], begin
@@ -209,7 +209,7 @@ def _look(capture: Capture) -> Array:
     return look
 
 
-def _direction(capture: Capture, marks: Marks | None, begin: float, finish: float) -> float:
+def _direction(capture: Capture, marks: JumpEvents | None, begin: float, finish: float) -> float:
     """Of travel: in flight, else over the film, else where the robot looks [rad]."""
     spans = [(begin, finish)]
     if marks:
@@ -226,7 +226,7 @@ def _quarter(yaw: float, direction: float) -> float:
     return math.copysign(math.radians(_QUARTER), math.cos(direction - yaw))
 
 
-def _poses(capture: Capture, marks: Marks) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+def _poses(capture: Capture, marks: JumpEvents) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Samples of a strip and their labels: crouch, lift-off, apex, touchdown, and between them."""
     up, down = _sample(capture, marks.liftoff), _sample(capture, marks.touchdown)
     z, on = capture.position[:, 2], min(_sample(capture, marks.on), up)
@@ -262,7 +262,7 @@ def load(path: Path) -> Film:
     """
     with stored_arrays(path, SCHEMA, what="a film", writer="pronk trial") as (header, stored):
         del header["schema"]
-        header["marks"] = Marks(**header["marks"]) if header["marks"] else None
+        header["marks"] = JumpEvents(**header["marks"]) if header["marks"] else None
         header["origin"] = tuple(header["origin"])
         header["labels"] = tuple(header["labels"])
         ground = header["ground"]

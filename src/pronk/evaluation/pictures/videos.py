@@ -11,11 +11,10 @@ from collections.abc import Callable, Container, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from pronk.evaluation.jump_events import marks_of
+from pronk.evaluation.jump_events import jump_events
 from pronk.evaluation.pictures import video
 from pronk.evaluation.pictures.film import Film, plan
-from pronk.evaluation.result import Trial
-from pronk.evaluation.rows import Row
+from pronk.evaluation.results import Results, Row
 from pronk.virtual import capture as captures
 
 SLOW = 4.0
@@ -26,7 +25,7 @@ _AFTER_S = 2.5
 
 
 def films_of(
-    found: Trial, folder: Path, *, cases: Container[str] | None = None, slow: float = SLOW
+    found: Results, folder: Path, *, cases: Container[str] | None = None, slow: float = SLOW
 ) -> Iterator[tuple[str, Film]]:
     """Plan a film of each policy with each command.
 
@@ -54,7 +53,7 @@ def films_of(
 
 
 def record_all(
-    found: Trial,
+    found: Results,
     folder: Path,
     out: Path,
     *,
@@ -104,9 +103,9 @@ def record_all(
     return tuple(path for paths, _ in painted for path in paths)
 
 
-def _film(found: Trial, row: Row, folder: Path, slow: float) -> Film:
+def _film(found: Results, row: Row, folder: Path, slow: float) -> Film:
     seen = captures.load(folder / row.capture)
-    marks = marks_of(seen, row.script, began=row.began)
+    marks = jump_events(seen, row.script, began=row.began)
     on = row.began + row.script.on
     return plan(
         seen,

@@ -1,1 +1,1 @@
-"""How good a policy is: a thousand robots a command in the training simulator."""
+"""The evaluation of a policy in the training simulator: many robots for each command."""

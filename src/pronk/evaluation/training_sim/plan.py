@@ -1,9 +1,8 @@
-"""What a policy is asked in the evaluation: who is told what, and when.
+"""The commands of an evaluation in the training simulator, robot by robot.
 
-Every robot has a script of its own, all in one batch. Walking robots are told one velocity from
-the first sample on. Jumping robots do what the paper's robot did (E1): stand, accelerate, jump
-while running, run on for a moment, stop. The jump input rises at a time of its own for each robot,
-so that it meets every phase of the gait.
+Walking robots have one velocity from the first sample on. Jumping robots do what the paper's robot
+did (E1): stand, accelerate, jump while running, run on for a moment, stop. The jump input rises at
+each robot's own time, so that it meets every phase of the gait.
 """
 
 from __future__ import annotations
@@ -15,22 +14,10 @@ from numpy.typing import NDArray
 
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpRules, steps
-from pronk.policy import paper
-from pronk.policy.stride import MOST_S
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 
 NEVER = 2**30
 """A sample that does not come."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Case:
-    """A velocity that robots are told."""
-
-    name: str
-    command: tuple[float, float, float]
-    """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
-
-
 WALKS = (
     Case(name="forward 2", command=(2.0, 0.0, 0.0)),
     Case(name="back 2", command=(-2.0, 0.0, 0.0)),
@@ -42,10 +29,8 @@ WALKS = (
     Case(name="yaw -2", command=(0.0, 0.0, -2.0)),
     Case(name="stand", command=(0.0, 0.0, 0.0)),
 )
-"""Velocities that the policy is asked to keep."""
-
-JUMPS = tuple(Case(name=name, command=told) for name, told in paper.JUMPS.items())
-"""The paper's five."""
+"""Velocities to keep."""
+JUMPS = PAPER_COMMANDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,21 +48,21 @@ class Plan:
     settle_s: float = 2.0
     """Time to accelerate, left out of the errors [s]."""
     average_s: float = 0.5
-    """Window of the moving average that takes the stride out of the velocity [s]."""
+    """Window of the moving average, which takes the stride out of the velocity [s]."""
     stand_s: float = 1.0
-    """Before a jumping robot is told to run [s]."""
+    """Of a jumping robot, before the velocity command [s]."""
     run_s: float = 2.5
-    """From there until a jump is asked for, at least [s]."""
+    """From there to the jump input, at least [s]."""
     spread_s: float = 0.5
-    """It is asked for up to this much later, uniformly [s]."""
+    """The jump input rises up to this much later, uniformly [s]."""
     jump_s: float = 0.5
-    """As long as that [s]; the jump input waits for the stride meanwhile."""
+    """Its length [s]."""
     keep_s: float = 0.5
-    """From its end to the command to stop [s]."""
+    """From its end to the zero command [s]."""
     rules: JumpRules = field(default_factory=JumpRules)
 
     def __post_init__(self) -> None:
-        """Refuse a plan that asks nothing, or asks it at impossible times.
+        """Refuse an empty plan, or impossible times.
 
         Raises:
             PronkError: One sentence that names the field.
@@ -106,28 +91,30 @@ class Plan:
 
     @property
     def walkers(self) -> int:
-        """How many of them walk."""
+        """Robots that walk."""
         return self.robots * len(self.walks)
 
     @property
+    def jump_seconds(self) -> float:
+        """Time until the latest jump is judged [s]; a flight takes less than 1 s."""
+        latest = self.stand_s + self.run_s + self.spread_s
+        return latest + self.rules.search_s + 1.0 + self.rules.upright_s if self.jumps else 0.0
+
+    @property
     def seconds(self) -> float:
-        """Simulated time [s]: the walks, and the latest jump until it is judged."""
-        walks = self.walk_s if self.walks else 0.0
-        told = self.stand_s + self.run_s + self.spread_s + MOST_S
-        # A flight takes less than a second: 1 s is a jump of 1.2 m.
-        jumps = told + self.rules.search_s + 1.0 + self.rules.upright_s if self.jumps else 0.0
-        return max(walks, jumps)
+        """Simulated time [s]."""
+        return max(self.walk_s if self.walks else 0.0, self.jump_seconds)
 
     def commands(self) -> NDArray[np.float64]:
-        """The velocity each robot is told. (N, 3)."""
-        told = [case.command for case in (*self.walks, *self.jumps)]
-        return np.repeat(np.array(told, dtype=float), self.robots, axis=0)
+        """The velocity command of each robot. (N, 3)."""
+        commands = [case.command for case in (*self.walks, *self.jumps)]
+        return np.repeat(np.array(commands, dtype=float), self.robots, axis=0)
 
     def times(self, dt: float) -> dict[str, NDArray[np.int64]]:
-        """When each robot is told what, in samples of `dt`; each of shape (N,).
+        """Return the times of each robot's commands, in samples of `dt`; each of shape (N,).
 
         Returns:
-            `start` and `stop` of the velocity command, `on` and `off` of asking for a jump; `NEVER`
+            `start` and `stop` of the velocity command, `on` and `off` of the jump input; `NEVER`
             for what does not happen.
         """
         count = self.size - self.walkers

@@ -1,8 +1,8 @@
-"""Who is evaluated: a policy of a training run, or an exported one.
+"""The policy under evaluation: of a training run, or an exported one.
 
 A checkpoint runs in PyTorch on the device of the simulation. An exported policy runs as it would
-on the robot, in ONNX Runtime on the processor, so every step waits for it; the robots are dealt
-out to the processor's cores.
+on the robot, in ONNX Runtime on the processor, so every step waits for it; the robots are
+spread over its cores.
 """
 
 from __future__ import annotations
@@ -37,18 +37,16 @@ from pronk.train.tasks import rl_cfg
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """A policy that can be asked."""
+    """A policy under evaluation."""
 
     act: Callable[[TensorDict], Tensor]
     """Observation groups to actions (N, 12)."""
     estimate: Callable[[TensorDict], tuple[Tensor, Tensor]] | None
     """Observation groups to contact probabilities (N, 4) and trunk velocity [m/s] (N, 3)."""
     jump: bool
-    """Whether it knows the jump input."""
-    waits: bool
-    """Whether its jump input waits for the stride (`pronk.policy.stride`)."""
+    """Whether it has the jump input."""
     about: dict[str, Any]
-    """File, hash, and what the file says of itself."""
+    """File, hash, and provenance."""
 
     def knows(self, gains: TrainingGains) -> bool:
         """Whether it was trained with these nominal gains."""
@@ -60,8 +58,8 @@ def load_subject(path: Path, device: str) -> Subject:
     """Read a policy.
 
     Args:
-        path: `policy.onnx`, a checkpoint, or the folder of a run, whose last checkpoint is meant.
-        device: Where a checkpoint's networks shall run.
+        path: `policy.onnx`, a checkpoint, or the folder of a run (its last checkpoint).
+        device: Of a checkpoint's networks.
 
     Raises:
         ArtefactError: Missing, damaged, or none of these.
@@ -92,7 +90,7 @@ def _trained(path: Path, device: str) -> Subject:
         ) from error
     actor = actor.to(device).eval()
     about = {"file": str(path), "sha256": sha256(path), **stored.about}
-    return Subject(act=actor, estimate=actor.estimate, jump=jump, waits=jump, about=about)
+    return Subject(act=actor, estimate=actor.estimate, jump=jump, about=about)
 
 
 def blank_actor(*, jump: bool) -> EstimatorActor:
@@ -137,44 +135,43 @@ def _exported(path: Path, device: str) -> Subject:
         act=runner.act,
         estimate=runner.estimate,
         jump=contract.jump,
-        waits=contract.waits_for_stride,
         about=about,
     )
 
 
 class _Exported:
-    """An exported policy that many robots ask at once."""
+    """An exported policy that acts for many robots at once."""
 
     def __init__(self, policy: Policy, device: str) -> None:
         self._policy, self._device = policy, device
         self._workers = os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(self._workers)
-        self._asked: Tensor | None = None
-        self._answers: list[Inference] = []
+        self._last: Tensor | None = None
+        self._inferred: list[Inference] = []
 
     def act(self, obs: TensorDict) -> Tensor:
-        self._ask(obs)
+        self._infer(obs)
         # The next observations may be written into the same tensor.
-        self._asked = None
+        self._last = None
         return self._joined("action")
 
     def estimate(self, obs: TensorDict) -> tuple[Tensor, Tensor]:
-        self._ask(obs)
+        self._infer(obs)
         return self._joined("contact"), self._joined("linear_velocity")
 
-    def _ask(self, obs: TensorDict) -> None:
-        """Run the network, unless it was these observations that it was last asked."""
+    def _infer(self, obs: TensorDict) -> None:
+        """Run the network, unless it has just been run on these observations."""
         measured = obs["measured"]
-        if measured is self._asked:
+        if measured is self._last:
             return
         jump = obs["jump"].cpu().numpy()
         if not self._policy.contract.jump:
             jump = np.zeros_like(jump)
         parts = [np.array_split(a, self._workers) for a in (measured.cpu().numpy(), jump)]
         rows = [(m, j) for m, j in zip(*parts, strict=True) if len(m)]
-        self._answers = list(self._pool.map(lambda row: self._policy.infer(*row), rows))
-        self._asked = measured
+        self._inferred = list(self._pool.map(lambda row: self._policy.infer(*row), rows))
+        self._last = measured
 
     def _joined(self, name: str) -> Tensor:
-        whole = np.concatenate([getattr(answer, name) for answer in self._answers])
+        whole = np.concatenate([getattr(part, name) for part in self._inferred])
         return torch.from_numpy(whole).to(self._device)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pronk.evaluation.outcome.table_text import Sheet
+from pronk.evaluation.tables import Sheet
 from pronk.report.deploy import data as deploy_data
 from pronk.report.deploy import times as deploy_times
 from pronk.report.deploy.data import Intervention

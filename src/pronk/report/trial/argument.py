@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from pronk.errors import ArtefactError
-from pronk.evaluation.outcome.table_text import Sheet, number
-from pronk.evaluation.result import Subject, Trial
+from pronk.evaluation.results import Results, Subject
+from pronk.evaluation.tables import Sheet, number
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.result import JointFit, MatchResult
@@ -64,7 +64,7 @@ def bode_error_db(result: MatchResult, subject: Subject) -> float:
     return float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
 
 
-def joint_errors(trial: Trial, result: MatchResult) -> Sheet:
+def joint_errors(trial: Results, result: MatchResult) -> Sheet:
     """Errors of every policy's training gains, and of the matched gains of each joint by itself."""
     found = {subject.name: errors_db(result, subject) for subject in trial.subjects}
     return Sheet(
@@ -99,7 +99,7 @@ def match_near(folder: Path, root: Path) -> MatchResult | None:
     return None
 
 
-def bode_errors_db(trial: Trial, result: MatchResult) -> Mapping[str, float]:
+def bode_errors_db(trial: Results, result: MatchResult) -> Mapping[str, float]:
     """By policy; empty unless every policy's is known."""
     found = {subject.name: bode_error_db(result, subject) for subject in trial.subjects}
     return found if all(np.isfinite(value) for value in found.values()) else {}

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from pronk.evaluation.outcome.comparison import verdict
-from pronk.evaluation.outcome.criteria import checks
-from pronk.evaluation.outcome.table_text import Sheet, number
-from pronk.evaluation.outcome.tables import table_iii
-from pronk.evaluation.unseen.bodies import Bodies, Body
+from pronk.evaluation.bodies import Bodies, Body
+from pronk.evaluation.criteria import trial_checks
+from pronk.evaluation.tables import Sheet, number, table_iii, verdict
 from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.cells import Array, Values, cells
@@ -76,12 +74,12 @@ def _summary(bodies: Bodies) -> Sheet:
             "best height [m]",
             "height scatter [m]",
             "distance scatter [m]",
-            "bars",
+            "criteria",
         ),
         rows=tuple(rows),
         notes=(
             "gains: error of the policy's training gains on the body's own sweep. scatter: mean of "
-            "the commands' standard deviations. bars: passed by the first policy.",
+            "the commands' standard deviations. criteria: passed by the first policy.",
             *(
                 f"{body.name}: {verdict(body.trial, other.name)}"
                 for body in bodies.bodies
@@ -92,7 +90,7 @@ def _summary(bodies: Bodies) -> Sheet:
 
 
 def _passed(body: Body) -> str:
-    found = checks(body.trial)
+    found = trial_checks(body.trial)
     return f"{sum(check.passed for check in found)}/{len(found)}"
 
 
@@ -115,7 +113,7 @@ def _gains(bodies: Bodies) -> Sheet:
 
 def bodies_part(bodies: Bodies, *, anchor: str, title: str = "Bodies never seen") -> Part:
     """The bodies as a part of a page."""
-    where, count = place(bodies.origin), len(bodies.bodies)
+    where, count = place(bodies), len(bodies.bodies)
     blocks = [
         Block(
             anchor="summary",
@@ -171,7 +169,7 @@ def bodies_part(bodies: Bodies, *, anchor: str, title: str = "Bodies never seen"
         anchor=anchor,
         title=title,
         says=f"{count} other {where}s: {landed} of {asked} jumps landed well.",
-        origin=bodies.origin,
+        origin=bodies,
         lines=(
             "Each was drawn within stated tolerances, asked by its own sweep and matched anew; its "
             f"folder ({', '.join(body.folder for body in bodies.bodies)}) has a page of its own: "

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pronk.errors import ArtefactError
-from pronk.evaluation.result import SUMMARY
+from pronk.evaluation.results import SUMMARY
 from pronk.report.shell import Picture
 
 LARGEST_BYTES = 1_500_000

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pronk.evaluation.outcome.table_text import Sheet, number
-from pronk.evaluation.summary import share_interval
-from pronk.evaluation.terrain.crossing import Climb, Crossings
+from pronk.evaluation.crossing import Climb, climbs
+from pronk.evaluation.results import Results, share_interval
+from pronk.evaluation.tables import Sheet, number
 from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.extra import Block, part, place
@@ -31,7 +31,7 @@ def line(climb: Climb) -> Line:
     )
 
 
-def panels(crossings: Crossings) -> list[Panel]:
+def panels(crossings: Results) -> list[Panel]:
     """A row for each kind of obstacle, a column for each command."""
     return [
         Panel(
@@ -40,21 +40,21 @@ def panels(crossings: Crossings) -> list[Panel]:
             y_label="crossed [1]",
             lines={
                 climb.policy: line(climb)
-                for climb in crossings.climbs
+                for climb in climbs(crossings)
                 if (climb.case, climb.kind) == (case.name, kind) and climb.rungs
             },
             marks=(PAPER_GAPS[case.name],) if kind == "gap" and case.name in PAPER_GAPS else (),
             share=True,
         )
-        for kind in crossings.kinds
+        for kind in crossings.settings["kinds"]
         for case in crossings.cases
     ]
 
 
-def table(crossings: Crossings) -> Sheet:
+def table(crossings: Results) -> Sheet:
     """Largest sizes, and why larger ones were not crossed."""
     rows, reasons = [], []
-    for climb in crossings.climbs:
+    for climb in climbs(crossings):
         what = f"{climb.policy}: {_WORDS.get(climb.kind, climb.kind)}, {climb.case}"
         last = climb.rungs[-1] if climb.rungs else None
         paper = PAPER_GAPS.get(climb.case, math.nan) if climb.kind == "gap" else math.nan
@@ -70,20 +70,20 @@ def table(crossings: Crossings) -> Sheet:
         columns=("policy: obstacle", "crossed", "ever crossed", "paper, from video", "failed at"),
         rows=tuple(rows),
         notes=(
-            f"crossed: in {crossings.enough} or more of {crossings.runs} runs, as were all smaller "
-            "ones. ever: in any run. The paper's gaps were judged from video of jumps over flat "
-            "floor, not crossed.",
+            f"crossed: in {crossings.settings['enough']} or more of {crossings.settings['runs']} "
+            "runs, as were all smaller ones. ever: in any run. The paper's gaps were judged "
+            "from video of jumps over flat floor, not crossed.",
             *reasons,
         ),
     )
 
 
 def crossing_part(
-    crossings: Crossings, *, anchor: str, title: str = "Crossing gaps and steps"
+    crossings: Results, *, anchor: str, title: str = "Crossing gaps and steps"
 ) -> Part:
     """The crossings as a part of a page."""
-    where, first = place(crossings.origin), crossings.origin.subjects[0].name
-    own = [c for c in crossings.climbs if c.policy == first and c.kind == "gap"]
+    where, first = place(crossings), crossings.subjects[0].name
+    own = [c for c in climbs(crossings) if c.policy == first and c.kind == "gap"]
     reached = ", ".join(f"{number(climb.largest, 2)} m ({climb.case})" for climb in own)
     drawn = Block(
         anchor="sizes",
@@ -109,5 +109,5 @@ def crossing_part(
         anchor=anchor,
         title=title,
         says=f"{first}, {where}: gaps crossed {reached}." if own else f"{first}, {where}.",
-        origin=crossings.origin,
+        origin=crossings,
     )

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.evaluation.outcome.published import PAPER_RATIOS, TABLE_III, in_paper_order
 from pronk.evaluation.protocol import RATES
-from pronk.evaluation.result import Trial
-from pronk.evaluation.rows import Row
+from pronk.evaluation.published import PAPER_RATIOS, TABLE_III, in_paper_order
+from pronk.evaluation.results import Results, Row
 from pronk.report.trial.cells import Published, Values
 from pronk.report.trial.ratios import Ratio
 from pronk.report.trial.traces import Trace
@@ -28,12 +27,12 @@ TRACE_RATE_HZ = 250.0
 """Rate that traces are drawn at: no figure is wide enough to show more."""
 
 
-def policies(trial: Trial) -> list[str]:
+def policies(trial: Results) -> list[str]:
     """Names of the policies, a naive one first, as in the paper's table."""
     return in_paper_order(subject.name for subject in trial.subjects)
 
 
-def values(trial: Trial, figure: str, cases: Sequence[str]) -> Values:
+def values(trial: Results, figure: str, cases: Sequence[str]) -> Values:
     """One figure of every jump that was found, by policy and command."""
     return {
         name: {case: trial.values(name, case, figure) for case in cases} for name in policies(trial)
@@ -50,7 +49,7 @@ def published(figure: str) -> Published:
     }
 
 
-def naive_over_matched(trial: Trial, figure: str) -> list[Ratio]:
+def naive_over_matched(trial: Results, figure: str) -> list[Ratio]:
     """Ratios of the standard deviations with the naive policy above the line, whichever came first.
 
     Empty unless the trial has the paper's two policies, and without those of too few jumps for an
@@ -133,14 +132,14 @@ def cut(time: Array, value: Array, start: float, end: float) -> Trace:
     return Trace(time=time[inside], value=value[inside])
 
 
-def _captures(trial: Trial, folder: Path) -> Iterator[tuple[Row, Path]]:
+def _captures(trial: Results, folder: Path) -> Iterator[tuple[Row, Path]]:
     for row in trial.rows:
         if row.capture:
             yield row, folder / row.capture
 
 
 def see(
-    trial: Trial, folder: Path, *, told: Callable[[float], None] = lambda share: None
+    trial: Results, folder: Path, *, told: Callable[[float], None] = lambda share: None
 ) -> Seen | None:
     """Read the captures of a trial; None if it kept none, or none is there any more.
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from pronk.evaluation.bodies import Bodies
 from pronk.evaluation.metrics import Figure
-from pronk.evaluation.outcome.table_text import Sheet
-from pronk.evaluation.result_io import Origin
+from pronk.evaluation.results import Results
+from pronk.evaluation.tables import Sheet
 from pronk.report import shell
 from pronk.report.shell import Part, Picture
 
@@ -25,7 +26,7 @@ class Block:
     """Tables that open when asked for."""
 
 
-def place(origin: Origin) -> str:
+def place(origin: Results | Bodies) -> str:
     """Where it was measured, in words."""
     return "virtual robot" if origin.virtual else "robot"
 
@@ -36,7 +37,7 @@ def part(
     anchor: str,
     title: str,
     says: str,
-    origin: Origin,
+    origin: Results | Bodies,
     lines: Iterable[str] = (),
     doubt: bool = False,
     definitions: Iterable[Figure] = (),

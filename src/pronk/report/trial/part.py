@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from pronk.errors import RobotError
-from pronk.evaluation.outcome import comparison, tables
-from pronk.evaluation.outcome import criteria as bars
-from pronk.evaluation.outcome.table_text import Sheet, place
+from pronk.evaluation import tables
+from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.protocol import RATES
-from pronk.evaluation.result import Subject, Trial, load
-from pronk.evaluation.summary import share_interval
+from pronk.evaluation.results import Results, Subject, load, share_interval
+from pronk.evaluation.tables import Sheet, place
 from pronk.match.result import MatchResult
 from pronk.report import shell, style
 from pronk.report.shell import Part, Picture
@@ -44,7 +43,7 @@ gives no spread."""
 class Material:
     """All that the part of a trial is made from, read and found good."""
 
-    trial: Trial
+    trial: Results
     seen: Seen | None
     """What its captures hold; None without any."""
     clips: Clips
@@ -88,12 +87,12 @@ def part(material: Material, *, anchor: str, title: str = "Trial") -> Part:
         trial=trial,
         first=trial.subjects[0].name,
         totals=totals(trial),
-        checks=bars.checks(trial),
-        verdicts=[comparison.verdict(trial, other.name) for other in trial.subjects[1:]],
+        checks=trial_checks(trial),
+        verdicts=[tables.verdict(trial, other.name) for other in trial.subjects[1:]],
         table_iii=[tables.table_iii(trial, figure) for figure in ("height", "distance")],
         landings=tables.landings(trial),
-        bars=tables.bars(trial),
-        scatter=comparison.scatter(trial) if trial.ratios else None,
+        criteria=tables.criteria(trial),
+        scatter=tables.scatter(trial) if trial.ratios else None,
         more=[_by_policy(trial, subject.name) for subject in trial.subjects],
         drives=tables.drives(trial),
         definitions=tables.definitions(),
@@ -128,7 +127,7 @@ class Total:
         return share_interval(self.succeeded, self.n)
 
 
-def totals(trial: Trial) -> dict[str, Total]:
+def totals(trial: Results) -> dict[str, Total]:
     """Over all commands, by policy."""
     return {
         name: Total(
@@ -143,7 +142,7 @@ def totals(trial: Trial) -> dict[str, Total]:
 
 
 def _pictures(
-    trial: Trial, seen: Seen | None, errors: Mapping[str, float]
+    trial: Results, seen: Seen | None, errors: Mapping[str, float]
 ) -> dict[str, Picture | None]:
     cases = [case.name for case in trial.cases]
     where = place(trial)
@@ -187,7 +186,7 @@ def _pictures(
     return drawn | _seen_pictures(trial, seen)
 
 
-def _seen_pictures(trial: Trial, seen: Seen | None) -> dict[str, Picture | None]:
+def _seen_pictures(trial: Results, seen: Seen | None) -> dict[str, Picture | None]:
     """Those that need captures."""
     drawn: dict[str, Picture | None] = dict.fromkeys(("heights", "rates", "torque_speed"))
     if seen is None:
@@ -223,7 +222,7 @@ def _seen_pictures(trial: Trial, seen: Seen | None) -> dict[str, Picture | None]
     return drawn
 
 
-def _robot(trial: Trial) -> Robot | None:
+def _robot(trial: Results) -> Robot | None:
     """The robot of a trial; None for one that this pronk does not know."""
     try:
         return load_robot(trial.robot)
@@ -231,7 +230,7 @@ def _robot(trial: Trial) -> Robot | None:
         return None
 
 
-def _kept(trial: Trial, seen: Seen | None) -> str:
+def _kept(trial: Results, seen: Seen | None) -> str:
     """How many jumps the captures are of, in words."""
     if seen is None:
         return ""
@@ -245,7 +244,7 @@ def _kept(trial: Trial, seen: Seen | None) -> str:
     )
 
 
-def _by_policy(trial: Trial, name: str) -> Sheet:
+def _by_policy(trial: Results, name: str) -> Sheet:
     """The columns of one policy of the table of all other figures."""
     whole = tables.more(trial)
     head = f"{name}: "

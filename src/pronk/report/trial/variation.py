@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pronk.evaluation.metrics import FIGURES
-from pronk.evaluation.outcome.published import in_paper_order
-from pronk.evaluation.outcome.table_text import Sheet, number, spread
-from pronk.evaluation.summary import share_interval
-from pronk.evaluation.variation import AS_IT_IS, VARIED_FIGURES, Parameter, Point, Variation
+from pronk.evaluation.published import in_paper_order
+from pronk.evaluation.results import Cell, Results, share_interval
+from pronk.evaluation.tables import Sheet, number, spread
+from pronk.evaluation.variation import NOMINAL, VARIED_FIGURES, Parameter, line, parameters_of
 from pronk.report import shell
 from pronk.report.shell import Part
 from pronk.report.trial.extra import Block, part, place
@@ -26,13 +26,13 @@ def known_mean(values: Sequence[float]) -> float:
     return float(np.mean(kept)) if kept else float("nan")
 
 
-def by_value(variation: Variation, parameter: str, policy: str) -> list[tuple[Point, ...]]:
+def by_value(variation: Results, parameter: str, policy: str) -> list[tuple[Cell, ...]]:
     """The points of a policy, those of all commands at one value together, in its order."""
-    per_case = [variation.line(parameter, policy, case.name) for case in variation.cases]
+    per_case = [line(variation, parameter, policy, case.name) for case in variation.cases]
     return list(zip(*per_case, strict=True))
 
 
-def figure_line(together: Sequence[Sequence[Point]], figure: str) -> Line:
+def figure_line(together: Sequence[Sequence[Cell]], figure: str) -> Line:
     """Mean of the commands' means over the value, with the mean of their standard deviations.
 
     Args:
@@ -45,7 +45,7 @@ def figure_line(together: Sequence[Sequence[Point]], figure: str) -> Line:
     return Line(x=x, y=y, low=y - std, high=y + std)
 
 
-def success_line(together: Sequence[Sequence[Point]]) -> Line:
+def success_line(together: Sequence[Sequence[Cell]]) -> Line:
     """Share of good landings of all jumps over the value, with Wilson's interval."""
     counts = [(sum(p.succeeded for p in points), sum(p.n for p in points)) for points in together]
     ends = [share_interval(*count) for count in counts]
@@ -57,10 +57,10 @@ def success_line(together: Sequence[Sequence[Point]]) -> Line:
     )
 
 
-def panels(variation: Variation) -> list[Panel]:
+def panels(variation: Results) -> list[Panel]:
     """A column for each parameter; rows of height, distance and success."""
-    policies = in_paper_order(subject.name for subject in variation.origin.subjects)
-    rows: list[tuple[str, bool, Callable[[Sequence[Sequence[Point]]], Line]]] = [
+    policies = in_paper_order(subject.name for subject in variation.subjects)
+    rows: list[tuple[str, bool, Callable[[Sequence[Sequence[Cell]]], Line]]] = [
         *(
             (f"{name} [m]", False, lambda together, name=name: figure_line(together, name))
             for name in _DRAWN
@@ -73,11 +73,11 @@ def panels(variation: Variation) -> list[Panel]:
             x_label=f"{_title(each)} [{each.unit}]" if i == len(rows) - 1 else "",
             y_label=label,
             lines={name: draw(by_value(variation, each.name, name)) for name in policies},
-            marks=(variation.own[each.name],),
+            marks=(variation.settings["nominal"][each.name],),
             share=share,
         )
         for i, (label, share, draw) in enumerate(rows)
-        for each in variation.parameters
+        for each in parameters_of(variation)
     ]
 
 
@@ -86,14 +86,14 @@ def _title(parameter: Parameter) -> str:
     return parameter.name.removesuffix("_s").replace("_", " ")
 
 
-def _table(variation: Variation, parameter: Parameter) -> Sheet:
+def _table(variation: Results, parameter: Parameter) -> Sheet:
     """One row a value; means over the commands."""
-    names = [subject.name for subject in variation.origin.subjects]
+    names = [subject.name for subject in variation.subjects]
     by_policy = {name: by_value(variation, parameter.name, name) for name in names}
     rows = []
     for i, points in enumerate(by_policy[names[0]]):
         value = points[0].value
-        own = f" ({AS_IT_IS})" if value == variation.own[parameter.name] else ""
+        own = f" ({NOMINAL})" if value == variation.settings["nominal"][parameter.name] else ""
         cells = [f"{value:g}{own}"]
         for name in names:
             here = by_policy[name][i]
@@ -111,13 +111,13 @@ def _table(variation: Variation, parameter: Parameter) -> Sheet:
     )
 
 
-def _mean_spread(points: Sequence[Point], figure: str) -> str:
+def _mean_spread(points: Sequence[Cell], figure: str) -> str:
     mean = known_mean([p.figures[figure].mean for p in points])
     std = known_mean([p.figures[figure].std for p in points])
     return f"{number(mean)} ± {number(std)}"
 
 
-def _everything(variation: Variation) -> Sheet:
+def _everything(variation: Results) -> Sheet:
     """Every point of every command, in full."""
     return Sheet(
         title="Every command",
@@ -134,7 +134,7 @@ def _everything(variation: Variation) -> Sheet:
         rows=tuple(
             (
                 point.parameter.replace("_", " "),
-                "-" if point.parameter == AS_IT_IS else f"{point.value:g}",
+                "-" if point.parameter == NOMINAL else f"{point.value:g}",
                 point.policy,
                 point.case,
                 f"{point.found}/{point.n}",
@@ -142,15 +142,15 @@ def _everything(variation: Variation) -> Sheet:
                 str(point.fell),
                 *(spread(point.figures[name]) for name in VARIED_FIGURES),
             )
-            for point in variation.points
+            for point in variation.cells
         ),
     )
 
 
-def variation_part(variation: Variation, *, anchor: str, title: str = "Variation") -> Part:
+def variation_part(variation: Results, *, anchor: str, title: str = "Variation") -> Part:
     """The variation as a part of a page."""
-    where, first = place(variation.origin), variation.origin.subjects[0].name
-    own = [point for point in variation.points if point.policy == first]
+    where, first = place(variation), variation.subjects[0].name
+    own = [point for point in variation.cells if point.policy == first]
     good, n = sum(p.succeeded for p in own), sum(p.n for p in own)
     drawn = Block(
         anchor="moves",
@@ -163,14 +163,14 @@ def variation_part(variation: Variation, *, anchor: str, title: str = "Variation
         picture=shell.picture(
             lines(
                 panels(variation),
-                across=len(variation.parameters),
-                mark="as it is",
+                across=len(parameters_of(variation)),
+                mark="nominal",
                 bar="mean standard deviation; 95 % interval of the share",
             ),
             f"Height, distance and success on the {where} over trunk mass, friction, delay and "
             "bus voltage",
         ),
-        sheets=tuple(_table(variation, each) for each in variation.parameters),
+        sheets=tuple(_table(variation, each) for each in parameters_of(variation)),
         folded=(_everything(variation),),
     )
     return part(
@@ -178,6 +178,6 @@ def variation_part(variation: Variation, *, anchor: str, title: str = "Variation
         anchor=anchor,
         title=title,
         says=f"{first}, {where}: {good} of {n} jumps on varied bodies landed well.",
-        origin=variation.origin,
+        origin=variation,
         definitions=[FIGURES[name] for name in VARIED_FIGURES],
     )

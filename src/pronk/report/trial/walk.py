@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pronk.evaluation.outcome.published import in_paper_order
-from pronk.evaluation.outcome.table_text import Sheet, spread
-from pronk.evaluation.walk import Walks
+from pronk.evaluation.published import in_paper_order
+from pronk.evaluation.results import Results
+from pronk.evaluation.tables import Sheet, spread
 from pronk.evaluation.walk_metrics import SETTLE_S, WALK_FIGURES
 from pronk.report import shell
 from pronk.report.shell import Part
@@ -30,7 +30,7 @@ _SHOWN = (
 )
 
 
-def values(walks: Walks, figure: str) -> Values:
+def values(walks: Results, figure: str) -> Values:
     """One figure of every walk, by policy and command."""
     return {
         name: {
@@ -44,21 +44,21 @@ def values(walks: Walks, figure: str) -> Values:
             )
             for case in walks.cases
         }
-        for name in in_paper_order(subject.name for subject in walks.origin.subjects)
+        for name in in_paper_order(subject.name for subject in walks.subjects)
     }
 
 
-def tables(walks: Walks) -> tuple[Sheet, ...]:
+def tables(walks: Results) -> tuple[Sheet, ...]:
     """One for each policy: figures by velocity."""
-    return tuple(_table(walks, subject.name) for subject in walks.origin.subjects)
+    return tuple(_table(walks, subject.name) for subject in walks.subjects)
 
 
-def _table(walks: Walks, policy: str) -> Sheet:
+def _table(walks: Results, policy: str) -> Sheet:
     own = [cell for cell in walks.cells if cell.policy == policy]
     counts = {
         "walks": [cell.n for cell in own],
         "fell": [cell.fell for cell in own],
-        "touched": [cell.touched for cell in own],
+        "non-foot contact": [cell.non_foot_contact for cell in own],
     }
     return Sheet(
         title=f"{policy}: mean ± standard deviation",
@@ -74,25 +74,25 @@ def _table(walks: Walks, policy: str) -> Sheet:
             ),
         ),
         notes=(
-            f"touched: walks in which something else than a foot did. The first {SETTLE_S:g} s "
-            "after the command are left out; a walk that ended in a fall counts with what came "
-            "before.",
+            "non-foot contact: walks in which something but a foot touched the ground. The first "
+            f"{SETTLE_S:g} s after the command are left out; a walk that ended "
+            "in a fall counts with what came before.",
         ),
     )
 
 
-def walk_part(walks: Walks, *, anchor: str, title: str = "Walking") -> Part:
+def walk_part(walks: Results, *, anchor: str, title: str = "Walking") -> Part:
     """The walks as a part of a page."""
-    first = walks.origin.subjects[0].name
+    first = walks.subjects[0].name
     own = [cell for cell in walks.cells if cell.policy == first and cell.case in PAPER_WALKS] or [
         cell for cell in walks.cells if cell.policy == first
     ]
     fell, n = sum(cell.fell for cell in own), sum(cell.n for cell in own)
-    where = place(walks.origin)
+    where = place(walks)
     names = ", ".join(cell.case for cell in own)
     lines = [
         "The paper says that its robot walks stably at 2 m/s forward and backward and at 1 m/s "
-        f"sideways (R4). Counted here: {names}, each for {walks.seconds:g} s.",
+        f"sideways (R4). Counted here: {names}, each for {walks.script.run_s:g} s.",
     ]
     shown = Block(
         anchor="errors",
@@ -109,7 +109,7 @@ def walk_part(walks: Walks, *, anchor: str, title: str = "Walking") -> Part:
         anchor=anchor,
         title=title,
         says=f"{first}, {where}: {fell} of {n} walks ended in a fall.",
-        origin=walks.origin,
+        origin=walks,
         lines=lines,
         doubt=fell > 0,
         definitions=WALK_FIGURES.values(),

@@ -1,1 +1,0 @@
-"""What a trial came to: tables, bars, the paper's figures beside ours."""

@@ -1,0 +1,558 @@
+"""The results of a trial: one row a run in a CSV file, and a JSON file with what was run and sums.
+
+Jumps, walks, varied robots and crossings share one container, one table and one codec; a `Kind` has
+what differs. Unknown numbers are NaN, in CSV an empty cell, in JSON null. Sums are computed from
+the rows; those in the JSON file are for readers of it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pronk.errors import ArtefactError
+from pronk.evaluation.metrics import JumpFigures, figures_of
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case
+from pronk.files import write_text
+from pronk.runtime.script import STILL, Script
+
+Array = NDArray[np.float64]
+
+RESAMPLES = 4999
+"""Of a bootstrap."""
+FEWEST = 5
+"""Jumps, the paper's number, below which the bootstrap gives no interval: a resample is too often
+one jump alone, which does not scatter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """A kind of results: its files and its figures."""
+
+    table: str
+    summary: str
+    schema: str
+    writer: str
+    """The command that writes it."""
+    figures: type[Any]
+    """Dataclass of one run's figures: flags, and numbers with `Figure` metadata."""
+    compared: tuple[str, ...] = ()
+    """Figures whose scatter is compared between policies."""
+
+
+JUMPS = Kind(
+    table="trials.csv",
+    summary="summary.json",
+    schema="pronk/trial/2",
+    writer="pronk trial POLICY --out FOLDER",
+    figures=JumpFigures,
+    compared=(
+        "height",
+        "apex_gain",
+        "lift_off_velocity",
+        "distance",
+        "along",
+        "distance_minima",
+        "gap",
+    ),
+)
+TABLE, SUMMARY = JUMPS.table, JUMPS.summary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """A policy under trial."""
+
+    name: str
+    path: str
+    sha256: str
+    contract: Mapping[str, Any]
+    """Robot, gains with their hash, rates, delays, ranges."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One run."""
+
+    policy: str
+    case: str
+    """Name of the command."""
+    number: int
+    """0 for the first run with this command."""
+    seed: int
+    """Of the virtual robot's noise."""
+    figures: Any
+    """Of the kind's class, `JumpFigures` for jumps."""
+    script: Script
+    """With the time of this run's jump input."""
+    capture: str = ""
+    """The capture's file beside the table; empty if it was not kept."""
+    began: float = 0.0
+    """When the policy took over, on the capture's clock [s]."""
+    parameter: str = ""
+    """Of the body, that is varied; empty for none."""
+    value: float = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """A figure over many runs; unknown values are left out. NaN where there are none."""
+
+    mean: float = math.nan
+    std: float = math.nan
+    """With n - 1; NaN for one."""
+    least: float = math.nan
+    p05: float = math.nan
+    p50: float = math.nan
+    p95: float = math.nan
+    most: float = math.nan
+    n: int = 0
+    """Runs that have the figure."""
+
+    @classmethod
+    def of(cls, values: ArrayLike) -> Self:
+        """Sum up one value a run."""
+        known = np.asarray(values, dtype=float)
+        known = known[np.isfinite(known)]
+        if not len(known):
+            return cls()
+        quantiles = np.quantile(known, [0.0, 0.05, 0.5, 0.95, 1.0]).tolist()
+        return cls(
+            **dict(zip(("least", "p05", "p50", "p95", "most"), quantiles, strict=True)),
+            mean=float(known.mean()),
+            std=float(known.std(ddof=1)) if len(known) > 1 else math.nan,
+            n=len(known),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """The runs of one policy with one command, and of one varied body if there are any."""
+
+    policy: str
+    case: str
+    parameter: str
+    value: float
+    n: int
+    """Runs."""
+    standing: int
+    """Robots that had not fallen when the jump input came."""
+    found: int
+    """Jumps there were."""
+    succeeded: int
+    success: float
+    """Share of all n."""
+    success_ci95: tuple[float, float]
+    """Wilson's interval of it."""
+    fell: int
+    non_foot_contact: int
+    figures: Mapping[str, Spread]
+    """Over the runs with a jump; over all runs of another kind."""
+    joints: Mapping[str, Mapping[str, Spread]]
+    """Figures of every joint: by figure, then by joint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ratio:
+    """Scatter of another policy over that of the first."""
+
+    figure: str
+    case: str | None
+    """None: sums of the standard deviations over the paper's commands, which is the ratio of their
+    means (reading A4); over all commands if none of the paper's was run."""
+    policy: str
+    other: str
+    value: float
+    """Standard deviation of the other over that of the first."""
+    low: float
+    high: float
+    """95 % bootstrap interval; NaN with fewer than `FEWEST` jumps of either policy in a command."""
+    n: tuple[int, int]
+    """Jumps of the first and of the other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """The runs of one kind, and what was run."""
+
+    kind: Kind = JUMPS
+    robot: str
+    virtual: bool = True
+    """Measured on pronk's virtual robot."""
+    subjects: tuple[Subject, ...]
+    cases: tuple[Case, ...]
+    rows: tuple[Row, ...]
+    """By policy, then command, then number."""
+    joint_names: tuple[str, ...] = ()
+    seed: int
+    sim_params: Mapping[str, Any]
+    """The virtual robot's parameters: their file and its hash."""
+    script: Script
+    """Without the spread of the jump input's time."""
+    spread_s: float = 0.0
+    rules: Mapping[str, float] = field(default_factory=dict)
+    """Of the definitions, see `pronk.evaluation.jumps.JumpRules`."""
+    mass: float = math.nan
+    """Of the robot, for the cost of transport [kg]."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """What else belongs to the kind."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    timing: Mapping[str, float] = field(default_factory=dict)
+    """Wall seconds, simulated seconds, processes: the only numbers that a repeat changes."""
+
+    @property
+    def pooled(self) -> tuple[str, ...]:
+        """Commands that an overall figure is over: the paper's, or all without them."""
+        paper = tuple(case.name for case in self.cases if case in PAPER_COMMANDS)
+        return paper or tuple(case.name for case in self.cases)
+
+    def of(self, policy: str, case: str) -> tuple[Row, ...]:
+        """Return the runs of one policy with one command."""
+        return tuple(row for row in self.rows if (row.policy, row.case) == (policy, case))
+
+    def values(self, policy: str, case: str, figure: str) -> Array:
+        """Return the known values of one figure, of the jumps that were found."""
+        rows = [row.figures for row in self.of(policy, case) if getattr(row.figures, "found", True)]
+        known = np.array([getattr(figures, figure) for figures in rows], dtype=float)
+        finite: Array = known[np.isfinite(known)]
+        return finite
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """Every policy with every command, on every varied body."""
+        groups: dict[tuple[str, float, str, str], list[Row]] = {}
+        for row in self.rows:
+            # NaN is equal to nothing, not even as a key.
+            key = (row.parameter, row.value if row.parameter else 0.0, row.policy, row.case)
+            groups.setdefault(key, []).append(row)
+        return tuple(self._cell(rows) for rows in groups.values())
+
+    def cell(self, policy: str, case: str) -> Cell:
+        """Return one of `cells`."""
+        return next(c for c in self.cells if (c.policy, c.case) == (policy, case))
+
+    def _cell(self, rows: Sequence[Row]) -> Cell:
+        figures = [row.figures for row in rows]
+        found = [each for each in figures if getattr(each, "found", True)]
+        succeeded = sum(each.success for each in figures)
+        known = figures_of(self.kind.figures)
+
+        def spread(name: str, joint: int | None = None) -> Spread:
+            values = (getattr(each, name) for each in found)
+            return Spread.of([v if joint is None else v[joint] if v else math.nan for v in values])
+
+        return Cell(
+            policy=rows[0].policy,
+            case=rows[0].case,
+            parameter=rows[0].parameter,
+            value=rows[0].value,
+            n=len(rows),
+            standing=sum(getattr(each, "standing", True) for each in figures),
+            found=len(found),
+            succeeded=succeeded,
+            success=succeeded / len(rows),
+            success_ci95=share_interval(succeeded, len(rows)),
+            fell=sum(getattr(each, "fell", False) for each in figures),
+            non_foot_contact=sum(getattr(each, "non_foot_contact", False) for each in figures),
+            figures={name: spread(name) for name, each in known.items() if not each.joints},
+            joints={
+                name: {joint: spread(name, i) for i, joint in enumerate(self.joint_names)}
+                for name, each in known.items()
+                if each.joints
+            },
+        )
+
+    @cached_property
+    def ratios(self) -> tuple[Ratio, ...]:
+        """Scatter of every other policy over that of the first, by command and altogether."""
+        return tuple(
+            self._ratio(figure, other.name, case)
+            for other in self.subjects[1:]
+            for figure in self.kind.compared
+            for case in (None, *(case.name for case in self.cases))
+        )
+
+    def _ratio(self, figure: str, other: str, case: str | None) -> Ratio:
+        first = self.subjects[0].name
+        cases = self.pooled if case is None else (case,)
+        own, others = (
+            [self.values(name, each, figure) for each in cases] for name in (first, other)
+        )
+        value, low, high = ratio_of_scatter(own, others, seed=self.seed)
+        return Ratio(
+            figure=figure,
+            case=case,
+            policy=first,
+            other=other,
+            value=value,
+            low=low,
+            high=high,
+            n=(sum(map(len, own)), sum(map(len, others))),
+        )
+
+
+def share_interval(count: int, n: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    from scipy.stats import binomtest
+
+    interval = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def ratio_of_scatter(
+    own: Sequence[Array], others: Sequence[Array], *, seed: int, resamples: int = RESAMPLES
+) -> tuple[float, float, float]:
+    """Sum of the standard deviations of `others` over that of `own`, and its 95 % interval.
+
+    The interval is that of the percentile bootstrap, every sample resampled by itself. All NaN
+    where a sample has fewer than two values or `own` does not scatter; with fewer than `FEWEST`
+    values in a sample the interval alone is NaN.
+
+    Args:
+        own: One sample of a figure for each command.
+        others: The same of the other policy.
+        seed: Of the bootstrap.
+        resamples: Of the bootstrap.
+
+    Returns:
+        (ratio, low, high)
+    """
+    from scipy.stats import DegenerateDataWarning, bootstrap
+
+    least = 1e-9 * max((float(np.abs(each).max()) for each in own if len(each)), default=0.0)
+
+    def ratio(*samples: Array, axis: int = -1) -> Array:
+        spreads = [np.std(sample, axis=axis, ddof=1) for sample in samples]
+        above, below = sum(spreads[len(own) :]), sum(spreads[: len(own)])
+        # A resample of one value alone scatters by rounding only.
+        out = np.full(np.shape(below), np.nan)
+        share: Array = np.divide(above, below, out=out, where=np.asarray(below) > least)
+        return share
+
+    samples = (*own, *others)
+    value = float(ratio(*samples)) if min(map(len, samples)) > 1 else math.nan
+    if not math.isfinite(value) or min(map(len, samples)) < FEWEST:
+        return value, math.nan, math.nan
+    with warnings.catch_warnings():
+        # Of resamples without scatter, which the quantiles below leave out.
+        warnings.simplefilter("ignore", DegenerateDataWarning)
+        drawn = bootstrap(
+            samples,
+            ratio,
+            n_resamples=resamples,
+            vectorized=True,
+            method="percentile",
+            rng=np.random.default_rng(seed),
+            batch=1000,
+        ).bootstrap_distribution
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return value, float(low), float(high)
+
+
+# ---- files ----
+
+
+def _columns(kind: Kind, joint_names: Sequence[str]) -> Iterator[tuple[str, str, int | None]]:
+    """Column, field of the figures, and index of the joint, flags first."""
+    known = figures_of(kind.figures)
+    for entry in fields(kind.figures):
+        figure = known.get(entry.name)
+        if figure is None:
+            yield entry.name, entry.name, None
+        elif figure.joints:
+            unit = figure.column.removeprefix(entry.name)
+            yield from (
+                (f"{entry.name}_{joint}{unit}", entry.name, i)
+                for i, joint in enumerate(joint_names)
+            )
+        else:
+            yield figure.column, entry.name, None
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return str(int(value))
+    return repr(value) if math.isfinite(value) else ""
+
+
+def to_csv(results: Results) -> str:
+    """One row a run; unknown figures are empty, flags 1 and 0, numbers exact."""
+    text, columns = io.StringIO(), list(_columns(results.kind, results.joint_names))
+    varied = any(row.parameter for row in results.rows)
+    writer = csv.writer(text, lineterminator="\n")
+    own = ["policy", "command", *(["parameter", "value"] if varied else []), "number", "seed"]
+    own += ["capture", "success", "run_s", "began_s"]
+    writer.writerow([*own, *(column for column, _, _ in columns)])
+    for row in results.rows:
+        cells: list[Any] = [row.policy, row.case]
+        cells += [row.parameter, row.value] if varied else []
+        cells += [row.number, row.seed, row.capture, row.figures.success]
+        cells += [row.script.run_s, row.began]
+        for _, name, joint in columns:
+            value = getattr(row.figures, name)
+            cells.append(value if joint is None else value[joint] if value else math.nan)
+        writer.writerow([_text(cell) for cell in cells])
+    return text.getvalue()
+
+
+def _rows(table: str, head: Results, path: Path) -> Iterator[Row]:
+    commands = {case.name: case.command for case in head.cases}
+    columns = list(_columns(head.kind, head.joint_names))
+    types = {entry.name: str(entry.type) for entry in fields(head.kind.figures)}
+    for line, entry in enumerate(csv.DictReader(io.StringIO(table)), start=2):
+        try:
+            figures: dict[str, Any] = {}
+            for column, name, joint in columns:
+                text = entry[column]
+                if text is None:
+                    raise ValueError("the line is cut off")
+                if joint is not None:
+                    if text:
+                        figures[name] = (*figures.get(name, ()), float(text))
+                elif types[name] == "float":
+                    figures[name] = float(text or "nan")
+                else:
+                    figures[name] = bool(int(text)) if types[name] == "bool" else str(text)
+            yield Row(
+                policy=entry["policy"],
+                case=entry["command"],
+                number=int(entry["number"]),
+                seed=int(entry["seed"]),
+                figures=head.kind.figures(**figures),
+                script=replace(
+                    head.script, command=commands[entry["command"]], run_s=float(entry["run_s"])
+                ),
+                capture=entry["capture"],
+                began=float(entry["began_s"]),
+                parameter=entry.get("parameter", ""),
+                value=float(entry.get("value") or "nan"),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ArtefactError(
+                f"{path}: line {line} cannot be read ({type(error).__name__}: {error}); "
+                f"`{head.kind.writer}` writes it anew."
+            ) from None
+
+
+def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
+    """Write a body of dataclasses and plain values as JSON, whole or not at all.
+
+    NaN becomes null. Returns the path.
+    """
+    text = msgspec.json.format(msgspec.json.encode({"schema": schema, **body}), indent=2)
+    write_text(path, text.decode() + "\n")
+    return path
+
+
+@contextmanager
+def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
+    """Read a JSON file of one schema; errors of the block count as damage of the file.
+
+    Raises:
+        ArtefactError: Missing, damaged or of another schema; the sentence names the file.
+    """
+    try:
+        body = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ArtefactError(f"{path}: no such file; `{writer}` writes it.") from None
+    except (OSError, ValueError) as error:
+        raise ArtefactError(f"{path}: cannot be read ({type(error).__name__}).") from None
+    found = body.get("schema") if isinstance(body, dict) else None
+    if found != schema:
+        raise ArtefactError(f"{path}: schema {found!r}; this pronk reads {schema!r}.")
+    try:
+        yield body
+    except (KeyError, TypeError, AttributeError, ValueError, msgspec.ValidationError) as error:
+        raise ArtefactError(
+            f"{path}: damaged ({type(error).__name__}: {error}); `{writer}` writes it anew."
+        ) from error
+
+
+_HEAD = ("robot", "virtual", "joint_names", "seed", "sim_params", "mass", "settings")
+_LATE = ("versions", "timing")
+
+
+def save(folder: Path, results: Results) -> tuple[Path, Path]:
+    """Write table and summary, each whole or not at all, the summary last; return the files."""
+    kind = results.kind
+    table = folder / kind.table
+    write_text(table, to_csv(results))
+    script = {k: v for k, v in asdict(results.script).items() if k != "command"}
+    summary = save_json(
+        folder / kind.summary,
+        kind.schema,
+        {name: getattr(results, name) for name in _HEAD}
+        | {
+            "policies": results.subjects,
+            "protocol": {
+                "commands": results.cases,
+                "script": script,
+                "spread_s": results.spread_s,
+                "rules": results.rules,
+            },
+        }
+        | {name: getattr(results, name) for name in _LATE}
+        | {
+            "definitions": figures_of(kind.figures),
+            "cells": results.cells,
+            "ratios": results.ratios,
+        },
+    )
+    return table, summary
+
+
+def load(folder: Path, kind: Kind = JUMPS) -> Results:
+    """Read what `save` wrote.
+
+    Raises:
+        ArtefactError: Missing, damaged or of another schema; the sentence names file and field.
+    """
+    with load_json(folder / kind.summary, kind.schema, kind.writer) as body:
+        protocol = body["protocol"]
+        head = Results(
+            kind=kind,
+            subjects=msgspec.convert(body["policies"], tuple[Subject, ...]),
+            cases=msgspec.convert(protocol["commands"], tuple[Case, ...]),
+            rows=(),
+            script=Script(command=STILL, **protocol["script"]),
+            spread_s=protocol["spread_s"],
+            rules=protocol["rules"],
+            **{name: body[name] for name in (*_HEAD, *_LATE)}
+            | {"joint_names": tuple(body["joint_names"])},
+        )
+        counts = {
+            (c["parameter"], c["value"], c["policy"], c["case"]): c["n"] for c in body["cells"]
+        }
+    path = folder / kind.table
+    try:
+        table = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ArtefactError(
+            f"{path}: cannot be read ({error.strerror}); `{kind.writer}` writes it."
+        ) from None
+    results = replace(head, rows=tuple(_rows(table, head, path)))
+    found = {
+        (c.parameter, c.value if c.parameter else None, c.policy, c.case): c.n
+        for c in results.cells
+    }
+    if found != counts:
+        raise ArtefactError(
+            f"{path}: {len(results.rows)} runs do not fit the {sum(counts.values())} that "
+            f"{kind.summary} counts; run the trial again."
+        )
+    return results

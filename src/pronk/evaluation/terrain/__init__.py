@@ -1,1 +1,0 @@
-"""Gaps and platforms of growing size, until they are too much."""

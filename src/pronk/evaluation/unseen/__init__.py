@@ -1,1 +1,0 @@
-"""Bodies that no policy was trained for, each matched anew by its own sweep."""

@@ -1,0 +1,1 @@
+"""Recording of a sweep on a machine."""

@@ -1,0 +1,189 @@
+"""Randomized and varied robots, walks, and the error of gains on a sweep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.synthetic_log import Excitation, synthetic_log
+from hopper import ROBOT, write_hopper
+from pronk.errors import ArtefactError, PronkError
+from pronk.evaluation import results, variation, walk
+from pronk.evaluation.bodies import gains_errors, gains_of
+from pronk.evaluation.protocol import Case
+from pronk.evaluation.random_params import GROUP_TORQUE, TOLERANCES, draw, save_sim_params
+from pronk.evaluation.trial import Plan, load_subjects
+from pronk.evaluation.variation import NOMINAL, VARIATION, Parameter, add_variation
+from pronk.excitation.signals import Chirp
+from pronk.match.pipeline import match_logs
+from pronk.match.settings import MatchSettings
+from pronk.response.estimator import Estimator
+from pronk.runtime.script import Script
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import load_sim_params
+
+SIM_PARAMS = load_sim_params()
+QUICK = MatchSettings(method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False)
+
+
+# --- Draws --------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000))
+def test_draws_stay_within_their_tolerances(seed: int) -> None:
+    drawn = draw(SIM_PARAMS, ROBOT, seed=seed)
+    parts = {
+        "machine": [(SIM_PARAMS.machine, drawn.machine)],
+        "trunk": [(SIM_PARAMS.trunk, drawn.trunk)],
+        "attitude": [(SIM_PARAMS.attitude, drawn.attitude)],
+        "ground": [(SIM_PARAMS.ground, drawn.ground)],
+        "joints": [(SIM_PARAMS.joints[name], drawn.joints[name]) for name in ROBOT.joint_names],
+    }
+    for part, tolerances in TOLERANCES.items():
+        for field, tolerance in tolerances.items():
+            batch = GROUP_TORQUE * (1.0 + tolerance.half) if field == "torque_scale" else 0.0
+            for own, new in parts[part]:
+                if field == "breakaway":
+                    assert new.breakaway >= new.coulomb  # type: ignore[attr-defined]
+                    continue
+                value, found = (np.atleast_1d(getattr(each, field)) for each in (own, new))
+                centre = tolerance.centre if tolerance.kind == "about" else value
+                half = tolerance.half + batch
+                half = half * np.abs(value) if tolerance.kind == "relative" else half
+                # Rounded to five digits.
+                assert (np.abs(found - centre) <= half + 1e-4 * np.abs(found)).all(), field
+
+
+def test_a_body_is_its_seed_and_its_file(tmp_path: Path) -> None:
+    one, again, other = (draw(SIM_PARAMS, ROBOT, seed=seed) for seed in (1, 1, 2))
+    assert one == again != other
+    assert one.joints["FR_knee"] != SIM_PARAMS.joints["FR_knee"]
+    path = tmp_path / "body" / "sim_params.yaml"
+    save_sim_params(path, one, says="A body.\nFrom a test.")
+    assert load_sim_params(path) == one
+    assert path.read_text().startswith("# A body.\n# From a test.\n")
+    # What is not drawn stays.
+    assert one.machine.encoder_bits == SIM_PARAMS.machine.encoder_bits
+    scene = replace(one, ground=replace(one.ground, floor=-1.0))
+    with pytest.raises(PronkError, match="no terrain"):
+        save_sim_params(path, scene, says="")
+    assert load_sim_params(path) == one
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_drawn_bodies_can_exist(seed: int) -> None:
+    VirtualRobot(ROBOT, draw(SIM_PARAMS, ROBOT, seed=seed), base="ground")
+
+
+# --- The Bode error of gains --------------------------------------------------------------------
+
+
+def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
+    pairs = (20.6, 0.492)
+    logs = [
+        synthetic_log(
+            ROBOT, "FR_hip_roll", [Excitation(offsets=Chirp(length_s=8.0).samples())], *pairs
+        )
+    ]
+    gains = {"naive": {"FR_hip_roll": (17.0, 0.4)}, "own": {"FR_hip_roll": pairs}}
+    off, right = gains_errors(logs, ROBOT, gains, settings=QUICK)
+    assert right.rms_db < 0.01
+    matched = match_logs(logs, ROBOT, settings=QUICK).gains.joints["FR_hip_roll"]
+    assert off.rms_db == off.joints_db["FR_hip_roll"]
+    assert off.rms_db == pytest.approx(matched.naive_error_db, rel=1e-4)
+    with pytest.raises(PronkError, match="FR_hip_roll"):
+        gains_errors(logs, ROBOT, {"empty": {}}, settings=QUICK)
+
+
+def test_a_policys_training_gains_are_in_its_contract(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    (subject,) = load_subjects([write_hopper(tmp_path / "policy.onnx")], ROBOT)
+    gains = gains_of(subject)
+    assert gains["FR_hip_roll"] == gains["HL_hip_roll"] == (20.0, 0.45)
+    assert gains["FL_knee"] == (21.5, 0.55)
+
+
+# --- One number at a time -----------------------------------------------------------------------
+
+
+def test_only_the_varied_number_differs(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    policy = write_hopper(tmp_path / "policy.onnx")
+    on_the_spot = Script(
+        command=(0.0, 0.0, 0.0), stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=1.0
+    )
+    plan = Plan(
+        cases=(Case(name="spot", command=(0.0, 0.0, 0.0)),),
+        jumps=1,
+        script=on_the_spot,
+        spread_s=0.0,
+    )
+    own = SIM_PARAMS.machine.bus_voltage
+    volts = Parameter(
+        name="bus_voltage", says="battery", unit="V", values=(18.0, own), trained="24 V"
+    )
+    found = add_variation(
+        [policy], plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path, parameters=(volts,)
+    )
+    nominal, low, same = found.rows
+    assert nominal.parameter == NOMINAL
+    # The same value again is the same jump, to the last digit; another is another.
+    assert same.figures == nominal.figures
+    assert low.figures.height < nominal.figures.height
+    line = variation.line(found, "bus_voltage", "matched", "spot")
+    assert [cell.value for cell in line] == [18.0, own, own]
+    assert [cell.n for cell in line] == [1, 1, 1]
+    read = results.load(tmp_path, VARIATION)
+    assert repr(read.rows) == repr(found.rows)
+    assert repr(read.cells) == repr(found.cells)
+    assert variation.parameters_of(read) == (volts,)
+    assert len(variation.table(read).rows) == 2
+
+
+def test_parameters_know_their_own_value() -> None:
+    values = {each.name: each.of(SIM_PARAMS) for each in variation.PARAMETERS}
+    assert values == {
+        "trunk_mass_offset": SIM_PARAMS.trunk.mass_offset,
+        "friction": SIM_PARAMS.ground.friction,
+        "command_delay_s": SIM_PARAMS.machine.command_delay_s,
+        "bus_voltage": SIM_PARAMS.machine.bus_voltage,
+    }
+    with pytest.raises(PronkError, match="all different"):
+        replace(variation.PARAMETERS[0], values=(1.0, 1.0))
+
+
+def test_a_walking_policy_stands(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    policy = write_hopper(tmp_path / "policy.onnx", jump=False)
+    cases = (
+        Case(name="stand", command=(0.0, 0.0, 0.0)),
+        Case(name="slow", command=(0.1, 0.0, 0.0)),
+    )
+    found = walk.add_walks(
+        [policy],
+        robot=ROBOT,
+        sim_params=load_sim_params(),
+        out=tmp_path,
+        cases=cases,
+        runs=1,
+        seconds=2.4,
+    )
+    stand, slow = (found.cell("matched", case.name) for case in cases)
+    assert (stand.n, stand.fell, stand.non_foot_contact) == (1, 0, 0)
+    # It stands whatever it is told; only the command differs.
+    assert stand.figures["speed_error"].mean < 0.01
+    assert slow.figures["speed_error"].mean == pytest.approx(0.1, abs=0.01)
+    assert stand.figures["lasted"].mean == pytest.approx(2.4)
+    read = results.load(tmp_path, walk.WALK)
+    assert repr(read.rows) == repr(found.rows)
+    assert repr(read.cells) == repr(found.cells)
+    path = tmp_path / walk.WALK.table
+    path.write_text(path.read_text().replace("speed_error_m", "error_m"))
+    with pytest.raises(ArtefactError, match="--walk"):
+        results.load(tmp_path, walk.WALK)

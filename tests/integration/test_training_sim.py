@@ -1,0 +1,548 @@
+"""The evaluation in the training simulator: criteria, plan, and a run in mjlab."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pronk.errors import ArtefactError, PronkError
+from pronk.evaluation.criteria import cost_of_jumping, evaluation_checks
+from pronk.evaluation.jumps import JumpRules, Series, measure_jump
+from pronk.evaluation.protocol import Case
+from pronk.evaluation.results import Spread
+from pronk.evaluation.tables import evaluation_sheets
+from pronk.evaluation.training_sim.evaluation import (
+    CommandResult,
+    EstimatorResult,
+    Evaluation,
+    evaluate_policy,
+    load_speed_errors,
+    save,
+)
+from pronk.evaluation.training_sim.plan import JUMPS, NEVER, WALKS, Plan
+
+DT = 0.005
+
+
+def spread(mean: float, std: float = 0.01) -> Spread:
+    return Spread(mean=mean, std=std, p05=mean, p95=mean, most=mean, n=10)
+
+
+GOOD_WALK = {
+    "speed_error": spread(0.1),
+    "yaw_error": spread(0.1),
+    "speed_error_averaged": spread(0.04),
+    "yaw_error_averaged": spread(0.05),
+    "forward": spread(2.0),
+    "left": spread(0.0),
+    "yaw_rate": spread(0.0),
+    "drift": spread(0.1),
+    "uncommanded": Spread(),
+}
+GOOD_JUMP = {
+    "height": spread(0.5),
+    "distance": spread(1.2),
+    "along": spread(1.2),
+    "lift_off_velocity": spread(2.4),
+    "delay": spread(0.2),
+    "flights": spread(1.0),
+    "high_flights": spread(1.0),
+    "uncommanded": Spread(),
+}
+
+
+def command_result(name: str, jump: bool, **changes: Any) -> CommandResult:
+    shares = {"fell": 0.0, "non_finite": 0.0, "uncommanded": 0.0, "too_high": 0.0}
+    if jump:
+        shares |= dict.fromkeys(("standing", "found", "upright", "single"), 1.0)
+        shares["non_foot_contact"] = 0.0
+    figures = dict(GOOD_JUMP if jump else GOOD_WALK)
+    for what, value in changes.items():
+        (shares if what in shares and not isinstance(value, Spread) else figures)[what] = value
+    return CommandResult(
+        name=name, command=(2.0, 0.0, 0.0), robots=10, shares=shares, figures=figures
+    )
+
+
+def evaluation(**changes: Any) -> Evaluation:
+    whole = Evaluation(
+        walks=tuple(command_result(case.name, jump=False) for case in WALKS),
+        jumps=tuple(command_result(case.name, jump=True) for case in JUMPS),
+        estimator=EstimatorResult(rmse=(0.1, 0.1, 0.0), rmse_vector=0.14, contacts_right=0.96),
+        plan={"robots": 10, "seed": 3},
+        seconds=1.0,
+        about={"policy": {"file": "policy.onnx"}, "randomization": "full"},
+    )
+    return replace(whole, **changes)
+
+
+def failed(whole: Evaluation) -> list[str]:
+    return [check.what for check in evaluation_checks(whole) if not check.passed]
+
+
+# --- Acceptance criteria ------------------------------------------------------------------------
+
+
+def test_a_good_policy_meets_every_criterion() -> None:
+    found = evaluation_checks(evaluation(before={case.name: 0.1 for case in WALKS}))
+    assert [check.what for check in found if not check.passed] == []
+    # 4 walks of two, 2 turns, standing; 5 jumps of seven; 2 of flights without a jump input; 2 of
+    # the estimator; the cost.
+    assert len(found) == 8 + 2 + 1 + 5 * 7 + 2 + 2 + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "jump", "changes", "what"),
+    [
+        ("forward 2", False, {"speed_error": spread(0.151)}, "forward 2: speed error"),
+        ("forward 2", False, {"speed_error": spread(math.nan)}, "forward 2: speed error"),
+        ("forward 2", False, {"fell": 0.0051}, "forward 2: falls"),
+        ("yaw 2", False, {"yaw_error": spread(0.21)}, "yaw 2: yaw rate error"),
+        ("stand", False, {"speed_error_averaged": spread(0.06)}, "stand: speed"),
+        ("forward 3", False, {"speed_error": spread(1.0), "fell": 1.0}, None),
+        ("stand", False, {"uncommanded": spread(0.04)}, "flight without a jump input, walking"),
+        ("stand", False, {"uncommanded": spread(0.02)}, None),
+        ("forward 1", True, {"height": spread(0.44)}, "jump forward 1: height"),
+        ("forward 1", True, {"height": spread(0.5, 0.04)}, "jump forward 1: std of height"),
+        ("forward 1", True, {"distance": spread(0.69)}, "jump forward 1: distance"),
+        ("forward 1", True, {"upright": 0.98}, "jump forward 1: upright"),
+        ("forward 1", True, {"single": 0.94}, "jump forward 1: one high flight"),
+        ("forward 1", True, {"lift_off_velocity": spread(2.1)}, "jump forward 1: lift-off vel"),
+        ("forward 1", True, {"delay": spread(0.31)}, "jump forward 1: lift-off after"),
+    ],
+)
+def test_a_bad_number_fails_its_criterion_and_no_other(
+    name: str, jump: bool, changes: dict[str, Any], what: str | None
+) -> None:
+    one = (command_result(name, jump, **changes),)
+    found = failed(evaluation(jumps=one) if jump else evaluation(walks=one))
+    assert len(found) == (what is not None)
+    assert what is None or found[0].startswith(what)
+
+
+def test_the_cost_of_jumping_is_the_growth_of_the_mean_error() -> None:
+    before = dict.fromkeys(("forward 2", "back 2", "left 1", "right 1"), 0.1)
+    assert cost_of_jumping(before, dict.fromkeys(before, 0.12)) == pytest.approx(1.2)
+    assert math.isnan(cost_of_jumping({"forward 2": 0.1}, before))
+    assert failed(evaluation(before=dict.fromkeys(before, 0.09))) == [
+        "speed error over that before jumping"
+    ]
+
+
+def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
+    path = tmp_path / "evaluation.json"
+    save(path, evaluation())
+    assert load_speed_errors(path) == {case.name: 0.1 for case in WALKS}
+    assert len(json.loads(path.read_text())["checks"]) == 50
+    for text in ('{"schema": "pronk/evaluation/9"}', '{"schema": "pronk/evaluation/2"}', "not"):
+        path.write_text(text)
+        with pytest.raises(ArtefactError, match=r"evaluation\.json"):
+            load_speed_errors(path)
+
+
+# --- The plan -----------------------------------------------------------------------------------
+
+
+def test_every_robot_has_its_command_and_its_times() -> None:
+    plan = Plan(robots=200, seed=4)
+    assert plan.size == 14 * 200
+    commands = plan.commands()
+    assert commands[0].tolist() == [2.0, 0.0, 0.0]
+    assert commands[plan.walkers - 1].tolist() == [0.0, 0.0, 0.0]
+    assert commands[-1].tolist() == [-2.0, 0.0, 0.0]
+    times = plan.times(DT)
+    walking = {name: set(values[: plan.walkers].tolist()) for name, values in times.items()}
+    assert walking == {"start": {0}, "stop": {NEVER}, "on": {NEVER}, "off": {NEVER}}
+    on = times["on"][plan.walkers :] * DT
+    # 1 s of standing, 2.5 s of running, up to half a second more, evenly.
+    assert 3.5 <= on.min() < 3.51
+    assert 3.99 < on.max() <= 4.0
+    assert on.mean() == pytest.approx(3.75, abs=0.02)
+    assert np.array_equal(times["off"] - times["on"], np.r_[[0] * plan.walkers, [100] * 1000])
+    assert set((times["stop"] - times["off"])[plan.walkers :]) == {100}
+    assert set(times["start"][plan.walkers :]) == {200}
+    assert np.array_equal(on, plan.times(DT)["on"][plan.walkers :] * DT)
+    assert not np.array_equal(on, replace(plan, seed=5).times(DT)["on"][plan.walkers :] * DT)
+    assert plan.seconds == 20.0
+    assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"robots": 0}, "robots"),
+        ({"walks": (), "jumps": ()}, "neither"),
+        ({"walk_s": 0.0}, "walk_s"),
+        ({"keep_s": -1.0}, "keep_s"),
+        ({"settle_s": 20.0}, "settle"),
+        ({"average_s": 2.5}, "settle"),
+    ],
+)
+def test_an_impossible_plan_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(PronkError, match=message):
+        Plan(**changes)
+
+
+# --- A run in mjlab -----------------------------------------------------------------------------
+
+DROP = 0.3
+"""Height of the fall at the start [m]."""
+SHORT = Plan(
+    robots=2,
+    seed=7,
+    walks=(
+        Case(name="forward 2", command=(2.0, 0.0, 0.0)),
+        Case(name="stand", command=(0.0, 0.0, 0.0)),
+    ),
+    jumps=(Case(name="side +1", command=(0.0, 1.0, 0.0)),),
+    walk_s=1.5,
+    settle_s=0.8,
+    stand_s=0.6,
+    run_s=0.2,
+    spread_s=0.2,
+    jump_s=0.4,
+    keep_s=0.1,
+    # No grace: the fall at the start is a flight without a jump input.
+    rules=JumpRules(search_s=0.2, tail_s=0.1, upright_s=0.2, grace_s=0.001),
+)
+BIAS = 0.1
+"""Error of the estimate, forward [m/s]."""
+
+
+@dataclass
+class Observed:
+    """An evaluation, its run, and each time the policy read its command."""
+
+    evaluation: Evaluation
+    state: np.ndarray
+    feet: np.ndarray
+    other: np.ndarray
+    fell_at: np.ndarray
+    reads: list[tuple[int, np.ndarray, np.ndarray]]
+    shares: list[float]
+
+
+@pytest.fixture(scope="module")
+def observed() -> Observed:
+    """Six robots fall 0.3 m onto their feet; steps of 2 to 6 samples; one lies down."""
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("mjlab")
+    from mjlab.envs import ManagerBasedRlEnv
+
+    from pronk.evaluation.training_sim.run import TERM, evaluation_cfg
+    from pronk.train.mdp.randomization import Randomization
+    from pronk.train.tasks import env_cfg
+
+    cfg = env_cfg(randomization=replace(Randomization.none(), decimation=(-2, 2)))
+    cfg.events["start"].params = dict.fromkeys(("place", "speed", "heading", "joints"), 0.0)
+    state = cfg.scene.entities["robot"].init_state
+    state.pos = (0.0, 0.0, state.pos[2] + DROP)
+    env = ManagerBasedRlEnv(evaluation_cfg(cfg, SHORT), device="cpu")
+    listener = env.metrics_manager.cfg[TERM].func
+    runs: list[Any] = []
+    reads: list[Any] = []
+    shares: list[float] = []
+
+    def policy(obs: Any) -> Any:
+        runs[:] = [listener.listener.__self__]
+        jump = obs["jump"][:, 0].numpy().copy()
+        reads.append((runs[0].sample, obs["measured"][:, -3:].numpy().copy(), jump))
+        actions = torch.zeros(SHORT.size, 12)
+        if runs[0].sample > 60:
+            actions[5] = torch.tensor([2.0, 2.0, -4.0, 2.0, 0.0, 0.0] * 2)
+        return actions
+
+    def estimate(obs: Any) -> Any:
+        target = obs["target"].clone()
+        target[:, 4] += BIAS
+        return target[:, :4], target[:, 4:]
+
+    found = evaluate_policy(policy, env, SHORT, estimate=estimate, progress=shares.append)
+    env.close()
+    recordings = runs[0].recordings
+    shortest = min(len(each.state) for each in recordings)
+    state, feet, other = (
+        np.concatenate([getattr(each, name)[:shortest].numpy() for each in recordings], axis=1)
+        for name in ("state", "feet", "other")
+    )
+    return Observed(found, state, feet, other, runs[0].fell_at.numpy(), reads, shares)
+
+
+@pytest.mark.train
+def test_contacts_belong_to_the_positions_they_are_paired_with(observed: Observed) -> None:
+    """The feet meet the ground when the trunk is at standing height: 12 mm a sample by then."""
+    z = observed.state[:, 0, 2]
+    landing = int(np.argmax(observed.feet[:, 0].any(axis=-1)))
+    samples = np.arange(landing)
+    fall = SHORT.rules.standing_height + DROP - 0.5 * 9.81 * DT**2 * samples * (samples + 1)
+    assert z[:landing] == pytest.approx(fall, abs=1e-4)
+    assert z[landing - 1] - z[landing] == pytest.approx(0.012, abs=1e-3)
+    assert z[landing] <= SHORT.rules.standing_height < z[landing - 1]
+    # Held by soft drives alone the robots sink onto their knees, feet first.
+    first = observed.other[:, :5].argmax(axis=0)
+    feet = observed.feet[:, :5].any(axis=-1).argmax(axis=0)
+    assert np.all((first > feet) & (first < feet + 40))
+
+
+@pytest.mark.train
+def test_the_policy_reads_the_command_of_the_moment(observed: Observed) -> None:
+    commands, times = SHORT.commands(), SHORT.times(DT)
+    assert {2, 3, 4, 5, 6} == set(np.diff([sample for sample, _, _ in observed.reads]))
+    for sample, command, jump in observed.reads:
+        moving = (times["start"] <= sample) & (sample < times["stop"])
+        assert np.array_equal(command, np.where(moving[:, None], commands, 0.0))
+        assert np.array_equal(jump > 0.0, (times["on"] <= sample) & (sample < times["off"]))
+
+
+@pytest.mark.train
+def test_figures_are_those_of_the_recorded_motion(observed: Observed) -> None:
+    found = observed.evaluation
+    results = (*found.walks, *found.jumps)
+    assert [r.shares["uncommanded"] for r in results] == [1.0, 1.0, 1.0]
+    highest = [r.figures["uncommanded"].most for r in results]
+    assert highest == pytest.approx([DROP] * 3, abs=2e-3)
+    # The standing one of the two jumping robots.
+    on = next(sample for sample, _, jump in observed.reads if jump[4])
+    series = Series(
+        position=observed.state[:, 4, :3].astype(float),
+        velocity=observed.state[:, 4, 7:10].astype(float),
+        orientation=observed.state[:, 4, 3:7].astype(float),
+        contact=observed.feet[:, 4],
+        dt=DT,
+    )
+    figures, _ = measure_jump(series, on, (0.0, 1.0), SHORT.rules)
+    (jump,) = found.jumps
+    assert jump.figures["height"].mean == pytest.approx(figures["height"])
+    assert jump.shares["non_foot_contact"] == observed.other[on : on + 41, 4].any() / 2
+    # Walks from 0.8 to 1.5 s.
+    walked = observed.state[160:300, :4]
+    turns = Rotation.from_quat(np.roll(walked[..., 3:7].reshape(-1, 4), -1, axis=-1))
+    velocity = turns.inv().apply(walked[..., 7:10].reshape(-1, 3))[:, :2].reshape(140, 4, 2)
+    errors = np.linalg.norm(velocity - SHORT.commands()[:4, :2], axis=-1).mean(axis=0)
+    for walk, expected in zip(found.walks, (errors[:2].mean(), errors[2:].mean()), strict=True):
+        assert walk.figures["speed_error"].mean == pytest.approx(expected, abs=1e-5)
+        assert walk.shares["fell"] == 0.0
+
+
+@pytest.mark.train
+def test_a_robot_that_lies_down_is_out(observed: Observed) -> None:
+    (jump,) = observed.evaluation.jumps
+    assert (observed.fell_at[:5] == NEVER).all()
+    assert observed.fell_at[5] < SHORT.times(DT)["on"][5]
+    assert (jump.shares["standing"], jump.figures["height"].n) == (0.5, 1)
+    assert (jump.shares["found"], jump.shares["upright"]) == (0.0, 0.0)
+
+
+@pytest.mark.train
+def test_the_estimate_is_compared_with_the_target(observed: Observed) -> None:
+    estimator = observed.evaluation.estimator
+    assert estimator is not None
+    assert estimator.rmse == pytest.approx((BIAS, 0.0, 0.0), abs=1e-6)
+    assert estimator.rmse_vector == pytest.approx(BIAS, abs=1e-6)
+    assert estimator.contacts_right == 1.0
+    assert observed.shares[0] == 0.0
+    assert observed.shares[-1] == 1.0
+    assert np.all(np.diff(observed.shares) > 0.0)
+
+
+@pytest.mark.train
+def test_a_run_is_written_and_printed(observed: Observed, tmp_path: Path) -> None:
+    path = tmp_path / "evaluation.json"
+    save(path, observed.evaluation)
+    assert load_speed_errors(path) == pytest.approx(observed.evaluation.speed_errors())
+    sheets = evaluation_sheets(observed.evaluation)
+    assert [sheet.title.split(":")[0] for sheet in sheets] == [
+        "Walking",
+        "Jumping",
+        "Acceptance criteria",
+    ]
+    assert all(len(row) == len(sheet.columns) for sheet in sheets for row in sheet.rows)
+
+
+@pytest.mark.train
+def test_an_environment_of_training_is_refused() -> None:
+    pytest.importorskip("mjlab")
+    from types import SimpleNamespace
+
+    plain = SimpleNamespace(metrics_manager=SimpleNamespace(cfg=None), num_envs=6)
+    with pytest.raises(PronkError, match="evaluation_cfg"):
+        evaluate_policy(lambda obs: obs, SimpleNamespace(unwrapped=plain), SHORT)
+
+
+# --- The policy under evaluation ----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    """The folder of a run with one checkpoint of random weights, and its actor."""
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("mjlab")
+    from pronk.evaluation.training_sim.subject import blank_actor
+    from pronk.train.runner import checkpoint
+    from pronk.train.runner.run_folder import RunFolder
+
+    torch.manual_seed(5)
+    actor = blank_actor(jump=True)
+    folder = RunFolder(tmp_path_factory.mktemp("run"))
+    about = {"phase": "jump_b", "gains": "matched", "gains_sha256": "ab" * 32}
+    tree = {"algorithm": {"actor_state_dict": actor.state_dict()}}
+    path = checkpoint.numbered(folder.checkpoints, 7)
+    checkpoint.save(path, checkpoint.Checkpoint(about=about, tree=tree))
+    return folder.path, actor
+
+
+@pytest.mark.train
+def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) -> None:
+    torch = pytest.importorskip("torch")
+    from tensordict import TensorDict
+
+    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.robots import load_robot
+    from pronk.train.gains import training_gains
+
+    folder, actor = trained
+    subject = load_subject(folder, "cpu")
+    obs = TensorDict({"measured": torch.randn(5, 105), "jump": torch.ones(5, 1)}, [5])
+    with torch.no_grad():
+        assert torch.equal(subject.act(obs), actor(obs))
+        assert subject.estimate is not None
+        assert torch.equal(subject.estimate(obs)[1], actor.estimate(obs)[1])
+    assert subject.jump
+    assert subject.about["phase"] == "jump_b"
+    naive = training_gains("naive", load_robot("mini_cheetah"))
+    assert not subject.knows(naive)
+    matched = replace(naive, name="matched", sha256="ab" * 32)
+    assert subject.knows(matched)
+    assert not subject.knows(replace(matched, sha256="cd" * 32))
+
+
+@pytest.mark.train
+def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
+    pytest.importorskip("mjlab")
+    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.train.runner import checkpoint
+
+    with pytest.raises(ArtefactError, match="no checkpoints in it; expected the folder of a run"):
+        load_subject(tmp_path, "cpu")
+    with pytest.raises(ArtefactError, match="no such file"):
+        load_subject(tmp_path / "policy.onnx", "cpu")
+    with pytest.raises(ArtefactError, match="no such file"):
+        load_subject(tmp_path / "model_3.pt", "cpu")
+    found = checkpoint.load(trained[0] / "checkpoints" / "model_7.pt")
+    walking = tmp_path / "model_1.pt"
+    about = {**found.about, "phase": "walk"}
+    checkpoint.save(walking, checkpoint.Checkpoint(about=about, tree=found.tree))
+    with pytest.raises(ArtefactError, match="its actor is not that of this pronk"):
+        load_subject(walking, "cpu")
+
+
+@pytest.mark.train
+def test_an_exported_policy_does_what_its_checkpoint_does(
+    trained: tuple[Path, Any], tmp_path: Path
+) -> None:
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("onnxruntime")
+    from tensordict import TensorDict
+
+    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.robots import load_robot
+    from pronk.train.gains import training_gains
+    from pronk.train.rl.export import contract_for, export_policy
+
+    robot = load_robot("mini_cheetah")
+    gains = training_gains("naive", robot)
+    contract = contract_for(
+        robot,
+        gains,
+        action_scale=0.35,
+        delay_steps=(0, 1),
+        command_limits=(3.0, 1.0, 2.0),
+        lift_off_velocity=2.5,
+        provenance={},
+    )
+    path = tmp_path / "policy.onnx"
+    export_policy(trained[1], contract, path)
+    subject, original = load_subject(path, "cpu"), load_subject(trained[0], "cpu")
+    assert subject.jump
+    assert subject.knows(gains)
+    assert subject.estimate is not None
+    assert original.estimate is not None
+    # More robots than cores, fewer robots than cores, each with its own output.
+    for count in (33, 1):
+        for _ in range(2):
+            groups = {"measured": torch.randn(count, 105), "jump": torch.ones(count, 1)}
+            obs = TensorDict(groups, [count])
+            with torch.no_grad():
+                assert torch.allclose(subject.act(obs), original.act(obs), atol=1e-5)
+                for got, expected in zip(
+                    subject.estimate(obs), original.estimate(obs), strict=True
+                ):
+                    assert torch.allclose(got, expected, atol=1e-5)
+
+
+# --- The command ---------------------------------------------------------------------------------
+
+
+@pytest.mark.train
+def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> None:
+    pytest.importorskip("mjlab")
+    from pronk.cli.evaluate import run
+    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.robots import load_robot
+    from pronk.train.gains import training_gains
+
+    plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
+    gains = training_gains("naive", load_robot("mini_cheetah"))
+    before = {"forward 2": 0.1}
+    found = run(load_subject(trained[0], "cpu"), gains, plan, "cpu", "full", before)
+    assert [walk.name for walk in found.walks] == ["forward 2", "stand"]
+    assert found.jumps == ()
+    assert found.before == before
+    assert found.about["randomization"] == "full"
+    assert found.about["policy"]["phase"] == "jump_b"
+    assert found.about["gains"] == {"name": "naive", "sha256": "", "virtual": False}
+    assert found.about["device"]["device"] == "cpu"
+    assert found.about["versions"]["mjlab"]
+
+
+@pytest.mark.train
+def test_one_robot_is_measured_many_times_with_noise_alone() -> None:
+    pytest.importorskip("mjlab")
+    from pronk.evaluation.training_sim.run import RANDOMIZATIONS
+    from pronk.robots import load_robot
+    from pronk.train.gains import training_gains
+    from pronk.train.mdp.randomization import delay_steps, events, noise
+
+    full, alone, none = (RANDOMIZATIONS[name] for name in ("full", "noise", "none"))
+    robot = load_robot("mini_cheetah")
+    gains = training_gains("naive", robot)
+    assert noise(alone) == noise(full)
+    assert delay_steps(robot, gains, alone) == delay_steps(robot, gains, full)
+    # Of all that can be drawn, bodies, gains and pushes are not.
+    assert list(events(robot, gains, alone)) == ["decimation"]
+    assert events(robot, gains, none) == {}
+
+
+@pytest.mark.train
+def test_a_policy_without_jump_input_is_not_evaluated_in_jumps(
+    trained: tuple[Path, Any], tmp_path: Path
+) -> None:
+    pytest.importorskip("mjlab")
+    from pronk.cli.evaluate import evaluate
+    from pronk.evaluation.training_sim.subject import blank_actor
+    from pronk.train.runner import checkpoint
+
+    path = tmp_path / "model_1.pt"
+    tree = {"algorithm": {"actor_state_dict": blank_actor(jump=False).state_dict()}}
+    checkpoint.save(path, checkpoint.Checkpoint(about={"phase": "walk"}, tree=tree))
+    with pytest.raises(PronkError, match="without the jump input; evaluate it with --what walk"):
+        evaluate(path, "naive", tmp_path / "evaluation.json", what="jump")
+    with pytest.raises(PronkError, match=r"expected a name that ends in \.json"):
+        evaluate(path, "naive", tmp_path / "evaluation.yaml")

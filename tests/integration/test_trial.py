@@ -1,0 +1,300 @@
+"""A whole trial with a policy made by hand: what is drawn, run, kept and refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import yaml
+
+from hopper import ROBOT, write_hopper
+from pronk.cli.trial import trial as trial_command
+from pronk.errors import ArtefactError, PronkError, RobotError
+from pronk.evaluation import results
+from pronk.evaluation.metrics import measure
+from pronk.evaluation.processes import in_processes
+from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
+from pronk.evaluation.trial import Plan, draw, load_subjects, plan_jobs, prepare, run_trial
+from pronk.files import sha256
+from pronk.runtime.script import STILL, Script
+from pronk.virtual import capture
+from pronk.virtual.sim_params import SHIPPED, load_sim_params
+
+pytest.importorskip("onnxruntime")
+
+# A hop on the spot takes half a second; then it is watched for two.
+SCRIPT = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=2.4)
+CASE = Case(name="forward 1", command=(1.0, 0.0, 0.0))
+PLAN = Plan(cases=(CASE,), jumps=1, script=SCRIPT, spread_s=0.1)
+SIM_PARAMS = load_sim_params()
+
+
+@pytest.fixture(scope="module")
+def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_hopper(tmp_path_factory.mktemp("hopper") / "policy.onnx")
+
+
+@pytest.fixture(scope="module")
+def weak(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Called naive: it is thrown only half as far."""
+    path = tmp_path_factory.mktemp("weak") / "policy.onnx"
+    gains = {
+        "gains": "naive",
+        "gains_sha256": "",
+        "stiffness": (17.0,) * 12,
+        "damping": (0.4,) * 12,
+    }
+    return write_hopper(path, 0.5, **gains)
+
+
+def go(policies: list[Path], out: Path, **changes: Any) -> results.Results:
+    kept: dict[str, Any] = {"robot": ROBOT, "sim_params": SIM_PARAMS, "out": out}
+    return run_trial(policies, PLAN, **(kept | changes))
+
+
+# --- What is drawn ------------------------------------------------------------------------------
+
+
+def test_every_jump_has_a_start_of_its_own() -> None:
+    plan = Plan(spread_s=0.5)
+    drawn = [draw(plan, case, n, ROBOT) for case in plan.cases for n in range(30)]
+    assert len({start.yaw for _, start, _ in drawn}) == len(drawn)
+    assert len({start.joint_offset for _, start, _ in drawn}) == len(drawn)
+    assert len({seed for _, _, seed in drawn}) == len(drawn)
+    later = {round((script.run_s - 2.5) * 50, 6) for script, _, _ in drawn}
+    # Whole policy steps, from none to all 25 of them.
+    assert later <= set(range(26))
+    assert {0, 25} <= later
+    offsets = [each for _, start, _ in drawn for each in start.joint_offset or ()]
+    assert 0.04 < max(offsets) <= 0.05
+    assert -0.05 <= min(offsets) < -0.04
+
+
+def test_draws_depend_on_seed_command_and_number_alone() -> None:
+    few = Plan(cases=PAPER_COMMANDS[3:4], jumps=2)
+    for number in range(2):
+        one, other = (draw(plan, PAPER_COMMANDS[3], number, ROBOT) for plan in (Plan(), few))
+        assert one == other
+    assert draw(replace(few, seed=1), PAPER_COMMANDS[3], 0, ROBOT) != one
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"jumps": 0}, "0 jumps for each command"),
+        ({"seed": -1}, "seed -1"),
+        ({"cases": ()}, "the commands are none"),
+        ({"cases": PAPER_COMMANDS[:1] * 2}, "forward 1, forward 1"),
+        ({"spread_s": -0.1}, "Plan.spread_s"),
+        ({"joint_offset": float("nan")}, "Plan.joint_offset"),
+    ],
+)
+def test_impossible_plans_are_refused(changes: dict[str, Any], what: str) -> None:
+    with pytest.raises(PronkError, match=what):
+        Plan(**changes)
+
+
+# --- Running ------------------------------------------------------------------------------------
+
+
+def test_jumps_at_the_speed_of_the_rates_are_few_and_all_kept(hopper: Path, tmp_path: Path) -> None:
+    plan = replace(PLAN, jumps=3, rates=2)
+    subjects = load_subjects([hopper], ROBOT)
+    planned = plan_jobs(subjects, plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
+    assert [(row.case, row.number, bool(row.capture)) for row, _ in planned] == [
+        ("forward 1", 0, True),
+        ("forward 1", 1, False),
+        ("forward 1", 2, False),
+        (RATES.name, 0, True),
+        (RATES.name, 1, True),
+    ]
+    # They stand beside the paper's commands and change nothing of those.
+    alone = plan_jobs(
+        subjects, replace(plan, rates=0), robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path
+    )
+    assert planned[:3] == alone
+    with pytest.raises(PronkError, match="all different"):
+        replace(plan, cases=(RATES,))
+
+
+@pytest.fixture(scope="module")
+def tried(hopper: Path, weak: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a trial of both, in one process."""
+    out = tmp_path_factory.mktemp("tried")
+    shares: list[float] = []
+    go([hopper, weak], out, progress=shares.append, about={"sha256": "ab"})
+    assert shares == pytest.approx([0.5, 1.0])
+    return out
+
+
+def test_the_number_of_processes_changes_no_digit(
+    tried: Path, hopper: Path, weak: Path, tmp_path: Path
+) -> None:
+    go([hopper, weak], tmp_path, processes=2, about={"sha256": "ab"})
+    assert (tmp_path / "trials.csv").read_bytes() == (tried / "trials.csv").read_bytes()
+    summaries = [json.loads((out / "summary.json").read_text()) for out in (tried, tmp_path)]
+    assert [summary.pop("timing")["processes"] for summary in summaries] == [1, 2]
+    assert summaries[0] == summaries[1]
+
+
+def test_a_trial_says_what_it_ran(tried: Path, hopper: Path) -> None:
+    made = results.load(tried)
+    assert [subject.name for subject in made.subjects] == ["matched", "naive"]
+    assert made.subjects[0].sha256 == sha256(hopper)
+    assert made.subjects[0].contract["gains_sha256"] == "0f" * 32
+    assert made.virtual
+    assert made.mass == pytest.approx(12.0)
+    assert made.sim_params == {"sha256": "ab"}
+    assert made.versions["mujoco"]
+    # The hop is real, and half a throw is a lower one.
+    strong, half = (made.cell(n, CASE.name).figures["height"].mean for n in ("matched", "naive"))
+    assert 0.2 < strong < 0.5
+    assert half < strong
+
+
+def test_what_is_kept_measures_the_same_again(tried: Path) -> None:
+    made = results.load(tried)
+    kept = sorted(path.name for path in (tried / "captures").iterdir())
+    assert kept == ["matched_forward_1_000.npz", "naive_forward_1_000.npz"]
+    for row in made.rows:
+        seen = capture.load(tried / row.capture)
+        again = measure(seen, row.script, ROBOT, began=row.began, mass=made.mass)
+        assert repr(again) == repr(row.figures)
+    jump = made.rows[0].figures
+    assert jump.found
+    # The trunk rises about as far as its lift-off velocity takes it.
+    assert jump.rise == pytest.approx(jump.ballistic, abs=0.03)
+    assert jump.lift_off_velocity > 1.0
+    assert jump.peak_torque[2] > 15.0
+
+
+def test_processes_keep_the_order_and_pass_errors_on() -> None:
+    assert in_processes(abs, [-3, 2, -1]) == [3, 2, 1]
+    with pytest.raises(PronkError, match="0 processes"):
+        in_processes(abs, [1], processes=0)
+    with pytest.raises(PronkError, match=r"seed -5"):
+        in_processes(_plan, [1, -5], processes=2)
+
+
+def _plan(seed: int) -> Plan:
+    return Plan(seed=seed)
+
+
+# --- What is refused before the first step ------------------------------------------------------
+
+
+def test_policies_are_named_apart(hopper: Path, weak: Path, tmp_path: Path) -> None:
+    assert [s.name for s in load_subjects([hopper, weak], ROBOT)] == ["matched", "naive"]
+    other = write_hopper(tmp_path / "other.onnx", 0.7)
+    assert [s.name for s in load_subjects([hopper, other], ROBOT)] == ["policy", "other"]
+    with pytest.raises(PronkError, match="same policy twice"):
+        load_subjects([hopper, hopper], ROBOT)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"joint_names": tuple(reversed(ROBOT.joint_names))}, "joint_names"),
+        ({"gains": "naive", "stiffness": (18.0,) * 12}, "stiffness of FR_hip_roll"),
+        ({"timestep_s": 0.002, "decimation": 10}, "timestep_s"),
+        ({"robot": "spot"}, "robot"),
+        ({"jump": False}, "walk only"),
+    ],
+)
+def test_a_policy_that_does_not_fit_is_refused(
+    changes: dict[str, Any], what: str, tmp_path: Path
+) -> None:
+    path = write_hopper(tmp_path / "policy.onnx", **changes)
+    with pytest.raises(ArtefactError, match=what) as caught:
+        go([path], tmp_path / "out")
+    assert str(caught.value).startswith(f"{path}: ")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="no such file"):
+        go([tmp_path / "policy.onnx"], tmp_path / "out")
+    (tmp_path / "policy.onnx").write_bytes(b"not a network")
+    with pytest.raises(ArtefactError, match="not a network that ONNX Runtime can run"):
+        go([tmp_path / "policy.onnx"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    prepare(tmp_path / "new")
+    assert (tmp_path / "new").is_dir()
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(PronkError, match="a file; expected"):
+        prepare(tmp_path / "file")
+    with pytest.raises(PronkError, match="not empty"):
+        prepare(tmp_path)
+    with pytest.raises(PronkError, match="holds no trial"):
+        prepare(tmp_path, overwrite=True)
+    assert (tmp_path / "file").read_text() == "mine"
+    with pytest.raises(PronkError, match="cannot be written to"):
+        prepare(tmp_path / "file" / "below")
+
+
+def test_overwriting_deletes_the_trial_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "videos").mkdir()
+    for name in ("trials.csv", "summary.json", "captures/a.npz", "videos/a.gif", "notes.txt"):
+        (tmp_path / name).write_text("old")
+    prepare(tmp_path, overwrite=True)
+    kept = sorted(path.name for path in tmp_path.rglob("*"))
+    assert kept == ["captures", "notes.txt", "videos"]
+
+
+# --- The command --------------------------------------------------------------------------------
+
+
+def command(*words: str) -> Any:
+    app = typer.Typer()
+    app.command()(trial_command)
+    return app(list(words), standalone_mode=False)
+
+
+def test_the_command_says_what_it_did(
+    hopper: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "trial"
+    figures = tmp_path / "figures.json"
+    words = [str(hopper), "--out", str(out), "--commands=0,-1"]
+    words += ["--jumps", "1", "--processes", "1", "--no-video", "--definitions"]
+    command(*words, "--json", str(figures))
+    said = capsys.readouterr().out
+    for text in ("side -1", "paper, matched", "not a real one", "Definitions"):
+        assert text in said
+    for text in (
+        f"wrote {out / 'trials.csv'}",
+        f"open {out / 'report.html'}",
+        "simulated seconds per",
+    ):
+        assert text in said
+    body = json.loads(figures.read_text())
+    assert body["virtual"] is True
+    assert [cell["case"] for cell in body["cells"]] == ["side -1"]
+    assert results.load(out).sim_params["file"] == "shipped with pronk"
+    assert "Table III" in (out / "report.html").read_text(encoding="utf-8")
+    assert not (out / "videos").exists()
+
+
+def test_an_impossible_body_is_refused(hopper: Path, tmp_path: Path) -> None:
+    body = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
+    body["joints"]["FR_knee"]["rotor_inertia"] = -1.0
+    path = tmp_path / "sim_params.yaml"
+    path.write_text(yaml.safe_dump(body))
+    words = (str(hopper), "--out", str(tmp_path / "out"), "--sim-params", str(path))
+    with pytest.raises(RobotError, match=r"joints\.FR_knee\.rotor_inertia is -1"):
+        command(*words)
+    with pytest.raises(RobotError, match="no such sim_params file"):
+        command(*words[:-1], str(tmp_path / "other.yaml"))
+    with pytest.raises(PronkError, match="command 'fast'"):
+        command(*words[:3], "--commands", "fast")
+    with pytest.raises(PronkError, match="--own without --bodies"):
+        command(*words[:3], "--own", str(hopper))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,270 @@
+"""Recording the virtual robot: what was asked is what is logged, whatever happens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pronk.errors import HardwareError, PlanError
+from pronk.excitation.plan import SweepPlan, make_plan
+from pronk.excitation.signals import Chirp, Multisine
+from pronk.links.machine import State
+from pronk.logs.joint_log import SweepLog
+from pronk.logs.mcap_reader import read_mcap
+from pronk.robots import Robot, load_robot
+from pronk.runtime.sweep.record import logged_joints, record
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import load_sim_params
+
+ROBOT = load_robot("mini_cheetah")
+SIM_PARAMS = load_sim_params(None)
+SHORT = Chirp(length_s=2.0, start_hz=0.5, stop_hz=10.0)
+
+
+class Watched(VirtualRobot):
+    """The virtual robot, with a note of when it was damped, clamped and closed."""
+
+    def __init__(self, **options: object) -> None:
+        super().__init__(ROBOT, SIM_PARAMS, legs=("FR",), **options)  # type: ignore[arg-type]
+        self.calls: list[str] = []
+        self.silent_after = np.inf
+
+    def damp(self) -> None:
+        self.calls.append("damp")
+        super().damp()
+
+    def close(self) -> None:
+        self.calls.append("close")
+        super().close()
+
+    def clamp(self, joints: tuple[str, ...]) -> None:
+        self.calls.append(f"clamp {' '.join(joints)}".rstrip())
+        super().clamp(joints)
+
+    def wait(self, until: float) -> list[State]:
+        states = super().wait(until)
+        return states if until < self.silent_after else []
+
+
+def plan_of(*joints: str, **options: object) -> SweepPlan:
+    settings = {"amplitudes": (0.2, 0.1), "repeats": 1, **options}
+    return make_plan(ROBOT, joints, SHORT, **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Watched, SweepPlan, list[Path]]:
+    machine, plan = Watched(), plan_of("FR_hip_roll", "FR_knee")
+    return machine, plan, record(machine, ROBOT, plan, tmp_path_factory.mktemp("sweep"))
+
+
+Recorded = tuple[Watched, SweepPlan, list[Path]]
+
+
+def test_one_whole_log_for_each_joint(recorded: Recorded) -> None:
+    machine, plan, paths = recorded
+    assert [path.name for path in paths] == ["FR_hip_roll.mcap", "FR_knee.mcap"]
+    for path, joint in zip(paths, plan.joints, strict=True):
+        log = read_mcap(path)
+        assert log.complete
+        assert log.notes == ()
+        assert log.virtual
+        assert log.robot == "mini_cheetah"
+        assert log.joints == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
+        assert [s.joints for s in log.segments] == [(joint,)] * 2
+        assert [s.amplitude for s in log.segments] == [0.2, 0.1]
+        assert log.stiffness is not None
+        np.testing.assert_array_equal(log.stiffness, [17.0] * 3)
+        assert log.rate_hz == pytest.approx(500.0, rel=1e-3)
+    assert machine.calls == [
+        *("clamp", "clamp", "clamp"),
+        *("clamp", "clamp FR_hip_roll FR_hip_pitch", "clamp"),
+        *("damp", "close", "damp"),
+    ]
+
+
+def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) -> None:
+    _, plan, paths = recorded
+    for path, joint in zip(paths, plan.joints, strict=True):
+        log = read_mcap(path)
+        column = log.column(joint)
+        assert log.pose is not None
+        asks = [ask for ask in plan.asks if ask.joints == (joint,)]
+        for segment, ask in zip(log.segments, asks, strict=True):
+            part = log.cut(segment)
+            tick = np.floor((part.time - segment.start) * 50.0 + 0.05).astype(int)
+            offsets = np.pad(ask.offsets(50.0)[:, 0], (0, 26))
+            # Every state carries the command of its tick: no edge is a sample late.
+            np.testing.assert_allclose(
+                part.command[:, column], log.pose[column] + offsets[tick], atol=1e-12
+            )
+            assert np.bincount(tick)[:-1].min() >= 9
+            others = [i for i in range(3) if i != column]
+            assert np.ptp(part.command[:, others]) == np.ptp(log.pose[others])
+
+
+def test_instantaneous_frequency_is_logged_inside_questions_only(recorded: Recorded) -> None:
+    _, _, paths = recorded
+    log = read_mcap(paths[0])
+    assert log.frequency is not None
+    inside = np.zeros(len(log.time), dtype=bool)
+    for segment in log.segments:
+        asked = (log.time >= segment.start) & (log.time <= segment.start + SHORT.length_s - 0.05)
+        inside |= asked
+        values = log.frequency[asked]
+        assert values[0] == pytest.approx(0.5, abs=0.01)
+        assert values[-1] == pytest.approx(10.0, abs=0.3)
+        assert (np.diff(values) >= 0.0).all()
+    before = log.time < log.segments[0].start - 0.01
+    assert np.isnan(log.frequency[before]).all()
+
+
+def test_who_else_moved_can_be_answered(recorded: Recorded) -> None:
+    _, _, paths = recorded
+    hip, knee = (read_mcap(path) for path in paths)
+    travel = np.ptp(hip.cut(hip.segments[0]).position, axis=0)
+    assert travel[0] > 0.2
+    assert 0.0 < travel[1] < 0.1
+    clamped = np.ptp(knee.cut(knee.segments[0]).position, axis=0)
+    assert clamped[:2].max() < 0.01
+    assert clamped[2] > 0.2
+
+
+def test_no_sample_belongs_to_two_questions(recorded: Recorded) -> None:
+    _, _, paths = recorded
+    first, second = read_mcap(paths[0]).segments
+    assert first.stop < second.start
+
+
+def interrupted(tmp_path: Path, machine: Watched, robot: Robot, **options: object) -> SweepLog:
+    """Run a plan that fails, and read what is left."""
+    record(machine, robot, plan_of("FR_knee"), tmp_path, **options)  # type: ignore[arg-type]
+    raise AssertionError("nothing failed")
+
+
+def test_a_breach_damps_the_joints_and_keeps_the_log(tmp_path: Path) -> None:
+    knee = ROBOT.joint("FR_knee")
+    narrow = replace(
+        ROBOT,
+        joints=tuple(
+            replace(j, range=(1.5, 1.7)) if j.name == knee.name else j for j in ROBOT.joints
+        ),
+    )
+    machine = Watched()
+    with pytest.raises(HardwareError, match=r"FR_knee is at 1\.\d+ rad at t = .* outside 1.500"):
+        interrupted(tmp_path, machine, narrow)
+    # At once where it happened, and again on the way out (closing damps too).
+    assert machine.calls[-4:] == ["damp", "damp", "close", "damp"]
+    log = read_mcap(tmp_path / "FR_knee.mcap")
+    assert not log.complete
+    assert "outside 1.500 to 1.700 rad" in log.notes[0]
+    # The state that breached is the last one or nearly, and the question is still known.
+    knees = log.position[:, log.column("FR_knee")]
+    outside = np.flatnonzero((knees < 1.5) | (knees > 1.7))
+    assert len(outside) >= 1
+    assert outside[0] >= len(knees) - 12
+    assert log.segments[0].joints == ("FR_knee",)
+    assert log.segments[0].stop == pytest.approx(log.time[-1])
+
+
+@pytest.mark.parametrize(
+    ("field", "drive"), [("speed", {"no_load_speed": 1.0}), ("torque", {"effort_limit": 0.5})]
+)
+def test_speed_and_torque_are_watched_as_well(
+    tmp_path: Path, field: str, drive: dict[str, float]
+) -> None:
+    weak = replace(
+        ROBOT, joints=tuple(replace(j, drive=replace(j.drive, **drive)) for j in ROBOT.joints)
+    )
+    unit = {"speed": "rad/s", "torque": "N m"}[field]
+    with pytest.raises(HardwareError, match=f"{unit} at t"):
+        interrupted(tmp_path, Watched(), weak)
+
+
+def test_the_interrupt_key_damps_the_joints_and_keeps_the_log(tmp_path: Path) -> None:
+    machine = Watched()
+
+    def impatient(share: float, what: str) -> None:
+        if share > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(tmp_path, machine, ROBOT, progress=impatient)
+    assert "damp" in machine.calls
+    assert "close" in machine.calls
+    log = read_mcap(tmp_path / "FR_knee.mcap")
+    assert not log.complete
+    assert "KeyboardInterrupt" in log.notes[0]
+    assert log.time[-1] > log.segments[0].start + 1.0
+
+
+def test_a_silent_machine_is_an_error(tmp_path: Path) -> None:
+    machine = Watched()
+    machine.silent_after = 4.0
+    with pytest.raises(HardwareError, match="sent no state between"):
+        interrupted(tmp_path, machine, ROBOT)
+    assert not read_mcap(tmp_path / "FR_knee.mcap").complete
+
+
+def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:
+    plan = plan_of("FR_hip_roll", "FR_knee", amplitudes=(0.1,))
+    shares: list[float] = []
+    paths = record(
+        Watched(),
+        ROBOT,
+        plan,
+        tmp_path,
+        joints=["FR_knee"],
+        prefix="run1_",
+        progress=lambda share, _: shares.append(share),
+    )
+    assert [path.name for path in paths] == ["run1_FR_knee.mcap"]
+    assert [path.name for path in tmp_path.iterdir()] == ["run1_FR_knee.mcap"]
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1.0)
+    with pytest.raises(HardwareError, match="none of FL_knee"):
+        record(Watched(), ROBOT, plan, tmp_path, joints=["FL_knee"])
+
+
+def test_a_log_in_the_way_is_not_lost(tmp_path: Path) -> None:
+    kept = tmp_path / "FR_knee.mcap"
+    kept.write_bytes(b"a day's work")
+    with pytest.raises(HardwareError, match="already there"):
+        record(Watched(), ROBOT, plan_of("FR_knee"), tmp_path)
+    assert kept.read_bytes() == b"a day's work"
+
+
+def test_a_plan_that_could_exceed_a_limit_moves_nothing(tmp_path: Path) -> None:
+    machine = Watched()
+    with pytest.raises(PlanError, match="fits"):
+        record(machine, ROBOT, plan_of("FR_knee", amplitudes=(1.5,)), tmp_path)
+    assert machine.calls == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_machine_of_another_robot_is_refused(tmp_path: Path) -> None:
+    machine = Watched()
+    machine.robot = "so101"
+    with pytest.raises(HardwareError, match="so101"):
+        record(machine, ROBOT, plan_of("FR_knee"), tmp_path)
+
+
+def test_joints_asked_together_are_logged_together(tmp_path: Path) -> None:
+    signal = Multisine(length_s=2.0, low_hz=0.5, high_hz=10.0, periods=1, amplitude=0.1)
+    names = ["FR_hip_roll", "FR_hip_pitch"]
+    plan = make_plan(ROBOT, names, signal, simultaneous=True, amplitudes=(0.1,), repeats=1)
+    (path,) = record(Watched(), ROBOT, plan, tmp_path)
+    log = read_mcap(path)
+    assert log.segments[0].joints == tuple(names)
+    assert log.segments[0].period_s == 2.0
+    part = log.cut(log.segments[0])
+    assert (np.ptp(part.command[:, :2], axis=0) > 0.1).all()
+
+
+def test_the_leg_is_what_is_logged() -> None:
+    leg = ("FL_hip_roll", "FL_hip_pitch", "FL_knee")
+    assert logged_joints(ROBOT, ["FL_knee"]) == leg
+    assert logged_joints(ROBOT, ["FL_hip_roll"]) == leg
+    assert len(logged_joints(load_robot("so101"), ["gripper"])) == 6

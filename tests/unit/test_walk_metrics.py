@@ -1,0 +1,142 @@
+"""The figures of a walk in closed form."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hopper import ROBOT
+from pronk.evaluation.walk import walk_script
+from pronk.evaluation.walk_metrics import SETTLE_S, WalkFigures, measure_walk
+from pronk.runtime.script import Script
+from pronk.virtual.capture import Capture
+from seen_jump import STANDING, changed
+
+DT = 0.002
+POWER, MASS = 120.0, 12.0
+COMMAND = (2.0, 0.0, 0.5)
+
+
+def walked(
+    forward: float = 1.8,
+    left: float = 0.1,
+    yaw_rate: float = 0.5,
+    sway: float = 0.0,
+    seconds: float = 8.0,
+) -> Capture:
+    """A trunk that moves at constant velocities in its own frame, and may sway sideways at 4 Hz."""
+    time = np.arange(round(seconds / DT)) * DT
+    yaw = yaw_rate * time
+    side = left + sway * np.sin(2.0 * np.pi * 4.0 * time)
+    velocity = np.column_stack(
+        [
+            forward * np.cos(yaw) - side * np.sin(yaw),
+            forward * np.sin(yaw) + side * np.cos(yaw),
+            np.zeros(len(time)),
+        ]
+    )
+    position = np.cumsum(velocity, axis=0) * DT
+    position[:, 2] = STANDING
+    orientation = np.zeros((len(time), 4))
+    orientation[:, 0], orientation[:, 3] = np.cos(yaw / 2), np.sin(yaw / 2)
+    rates = np.zeros((len(time), 3))
+    rates[:, 2] = yaw_rate
+    rates[:, 1] = 0.6 * np.sin(2.0 * np.pi * 4.0 * time)
+    zeros = np.zeros((len(time), 12))
+    return Capture(
+        time=time,
+        position=position,
+        orientation=orientation,
+        velocity=velocity,
+        angular_velocity=rates,
+        foot_position=np.zeros((len(time), 4, 3)),
+        contact=np.ones((len(time), 4), dtype=bool),
+        other_contact=np.zeros(len(time), dtype=bool),
+        joint_position=zeros,
+        joint_velocity=zeros,
+        torque=zeros,
+        electrical_power=np.full(len(time), POWER),
+        bus_voltage=np.full(len(time), 24.0),
+    )
+
+
+def script(command: tuple[float, float, float] = COMMAND) -> Script:
+    return replace(walk_script(command, seconds=6.0), stand_s=1.0)
+
+
+def measured(seen: Capture, **changes: Any) -> WalkFigures:
+    kept: dict[str, Any] = {"began": 0.0, "mass": MASS}
+    return measure_walk(seen, changes.pop("script", script()), ROBOT, **(kept | changes))
+
+
+def test_a_steady_walk_in_closed_form() -> None:
+    found = measured(walked())
+    assert not found.fell
+    assert not found.non_foot_contact
+    assert found.lasted == pytest.approx(6.0)
+    assert found.speed_error == pytest.approx(math.hypot(0.2, 0.1))
+    assert found.speed_error_averaged == pytest.approx(math.hypot(0.2, 0.1))
+    assert found.yaw_error == pytest.approx(0.0, abs=1e-12)
+    assert (found.forward, found.left) == pytest.approx((1.8, 0.1))
+    assert found.yaw_rate == pytest.approx(0.5)
+    # Root mean square of a sine over whole periods.
+    assert found.pitch_rate_rms == pytest.approx(0.6 / math.sqrt(2.0), rel=1e-6)
+    assert found.roll_rate_rms == 0.0
+    assert found.power == pytest.approx(POWER)
+    assert found.cost_of_transport == pytest.approx(
+        POWER / (MASS * 9.81 * math.hypot(1.8, 0.1)), rel=1e-9
+    )
+    assert math.isnan(found.uncommanded)
+
+
+def test_swaying_counts_for_nothing_once_averaged() -> None:
+    still, swaying = measured(walked(left=0.0)), measured(walked(left=0.0, sway=0.5))
+    # Half a second holds two whole periods.
+    assert swaying.speed_error_averaged == pytest.approx(0.2, abs=1e-9)
+    assert swaying.speed_error > 0.3
+    assert swaying.cost_of_transport == pytest.approx(still.cost_of_transport)
+
+
+@settings(max_examples=20)
+@given(forward=st.floats(-2.0, 2.0), left=st.floats(-1.0, 1.0), rate=st.floats(-2.0, 2.0))
+def test_a_robot_that_obeys_has_no_error(forward: float, left: float, rate: float) -> None:
+    command = (forward, left, rate)
+    found = measured(walked(*command), script=script(command))
+    assert found.speed_error == pytest.approx(0.0, abs=1e-9)
+    assert found.yaw_error == pytest.approx(0.0, abs=1e-9)
+
+
+def test_only_the_time_after_settling_counts_until_the_fall() -> None:
+    start = 1.0
+    begin, end = round((start + SETTLE_S) / DT), round((start + 4.0) / DT)
+    wild = changed(walked(), "velocity", slice(0, begin - 1), [9.0, 0.0, 0.0])
+    fallen = changed(wild, "position", (slice(end, None), 2), 0.05)
+    wilder = changed(fallen, "velocity", slice(end, None), [9.0, 0.0, 0.0])
+    found = measured(wilder)
+    assert found.fell
+    assert found.lasted == pytest.approx(4.0)
+    assert found.speed_error == pytest.approx(math.hypot(0.2, 0.1), rel=1e-6)
+    # Down before it settled: nothing but how long it lasted.
+    early = measured(changed(walked(), "position", (slice(begin - 10, None), 2), 0.05))
+    assert early.fell
+    assert math.isnan(early.speed_error)
+    # A fall after the end is no fall of the walk, a touch before the command none of it.
+    late = changed(walked(), "position", (slice(round(7.1 / DT), None), 2), 0.05)
+    late = changed(late, "other_contact", slice(0, round(0.9 / DT)), True)
+    assert not measured(late).fell
+    assert not measured(late).non_foot_contact
+    assert measured(changed(walked(), "other_contact", begin, True)).non_foot_contact
+
+
+def test_turning_on_the_spot_costs_no_transport() -> None:
+    turning = (0.0, 0.0, 0.5)
+    assert math.isnan(
+        measured(walked(forward=0.2, left=0.0), script=script(turning)).cost_of_transport
+    )
+    assert math.isnan(measured(walked(forward=0.01, left=0.0)).cost_of_transport)
