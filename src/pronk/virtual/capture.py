@@ -74,11 +74,7 @@ class Capture:
     """[V]. (T,)"""
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not belong together.
-
-        Raises:
-            ArtefactError: A shape is wrong.
-        """
+        """Refuse arrays of wrong shapes."""
         for name, rest in _SHAPES.items():
             shape = np.shape(getattr(self, name))
             if shape != (len(self.time), *rest):
@@ -100,11 +96,7 @@ def save(path: Path, capture: Capture) -> None:
 
 
 def load(path: Path) -> Capture:
-    """Read what `save` wrote.
-
-    Raises:
-        ArtefactError: Missing, damaged, or of another schema.
-    """
+    """Read a capture; refuse a missing or damaged file and another schema."""
     with stored_arrays(path, SCHEMA, what="a capture", writer="pronk trial") as (_, stored):
         return Capture(**{part.name: stored[part.name] for part in fields(Capture)})
 
@@ -113,12 +105,7 @@ class Recorder:
     """Keeps raw states of a plant while it runs, block after block as they come."""
 
     def __init__(self, plant: Plant, period_s: float) -> None:
-        """Begin empty, the first sample due at the clock's zero.
-
-        Args:
-            plant: On the ground.
-            period_s: Between samples [s].
-        """
+        """Begin empty, for a plant on the ground; the first sample is due at the clock's zero."""
         self._plant = plant
         self._step_s = float(plant.model.opt.timestep)
         self._period = period_s
@@ -136,12 +123,7 @@ class Recorder:
         return [step for step in steps if step <= last]
 
     def keep(self, rows: Array, voltage: Array) -> None:
-        """Keep the next samples.
-
-        Args:
-            rows: Raw states of the plant, at the steps that were due. (n, state_size)
-            voltage: Of the bus [V]. (n,)
-        """
+        """Keep the raw states (n, state_size) and bus voltages (n,) [V] of the due steps."""
         if len(rows):
             self._rows.append(rows)
             self._voltage.append(voltage)
@@ -155,11 +137,7 @@ class Recorder:
         return steps
 
     def capture(self, since: float = -math.inf) -> Capture:
-        """What was seen at and after a time.
-
-        Args:
-            since: [s]
-        """
+        """Samples at and after a time [s]."""
         times = self._step_s * self._steps(0, self._begins[-1]).astype(np.float64)
         first = int(np.searchsorted(times, since - 0.5 * self._step_s))
         # From the block that holds the first sample.
@@ -172,14 +150,7 @@ class Recorder:
 
 
 def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:
-    """Turn raw states into a capture.
-
-    Args:
-        plant: On the ground.
-        time: [s]. (T,)
-        rows: Raw states of the plant. (T, state_size)
-        voltage: Of the bus [V]. (T,)
-    """
+    """Turn times [s] (T,), raw states (T, state_size) and bus voltages [V] (T,) into a capture."""
     place, speed, act = plant.parts(rows)
     torque = plant.motor_torque(act)
     feet, contact, other = _touch(plant, place)
@@ -201,7 +172,7 @@ def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:
 
 
 def _touch(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
-    """Where the feet are (T, 4, 3), whether they touch (T, 4), and whether anything else does (T,).
+    """Feet (T, 4, 3), whether they touch (T, 4), and whether anything else does (T,).
 
     Args:
         plant: On the ground.

@@ -54,11 +54,7 @@ class Box:
     """[m]"""
 
     def __post_init__(self) -> None:
-        """Refuse a box that is none.
-
-        Raises:
-            RobotError: Not three finite numbers, or a size that is not positive.
-        """
+        """Refuse numbers that are not finite and sizes that are not positive."""
         for name in ("center", "half_size"):
             value = getattr(self, name)
             if np.shape(value) != (3,) or not np.isfinite(value).all():
@@ -99,11 +95,7 @@ class Ground(Bounded):
         )
 
     def add_to(self, spec: Any) -> None:
-        """Put floor and blocks into a model, to touch all that wants to be touched.
-
-        Args:
-            spec: mujoco.MjSpec.
-        """
+        """Put floor and blocks, which touch everything, into a mujoco.MjSpec."""
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = _IMPRATIO
         solid = {"contype": 1, "conaffinity": 1, "condim": 3, "rgba": _COLOUR}
@@ -125,11 +117,11 @@ class Ground(Bounded):
             )
 
     def set_down(self, model: Any, data: Any, feet: NDArray[np.intp], start: Start) -> None:
-        """Put a robot on the ground, its lowest foot `start.drop` above it.
+        """Put a robot with a free trunk down, its lowest foot `start.drop` above the ground.
 
         Args:
-            model: mujoco.MjModel of a robot whose first joint is free.
-            data: Its mujoco.MjData, the joints in their places; the trunk is put into its own.
+            model: mujoco.MjModel.
+            data: Its mujoco.MjData, the joints in their places; the trunk is placed here.
             feet: Geoms of the feet.
             start: Where to.
         """
@@ -188,11 +180,7 @@ class Start:
     """Time that it is given to come to rest, before the clock starts [s]."""
 
     def offset(self, joints: int) -> Array:
-        """The joint offset as an array [rad], shape (joints,).
-
-        Raises:
-            RobotError: It is of another number of joints.
-        """
+        """The joint offset as an array [rad], (joints,); refuse another number of joints."""
         offset = np.zeros(joints) if self.joint_offset is None else np.array(self.joint_offset)
         if offset.shape != (joints,):
             raise RobotError(
@@ -201,11 +189,7 @@ class Start:
         return offset
 
     def __post_init__(self) -> None:
-        """Refuse a start that is none.
-
-        Raises:
-            RobotError: A number is not finite, or negative where it cannot be.
-        """
+        """Refuse numbers that are not finite, or negative where they cannot be."""
         numbers = (*self.position, self.yaw, *(self.joint_offset or ()), self.drop, self.settle_s)
         if len(self.position) != 2 or not all(map(math.isfinite, numbers)):
             raise RobotError(f"{self}: position has two numbers, and all are finite.")

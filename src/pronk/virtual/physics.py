@@ -49,13 +49,7 @@ class Transport:
     """
 
     def __init__(self, joints: int, delay_s: float, step_s: float) -> None:
-        """Nothing is under way yet.
-
-        Args:
-            joints: How many the commands are for.
-            delay_s: From sending to taking effect [s].
-            step_s: Physics step [s].
-        """
+        """Begin empty, for `joints` joints, with a delay [s] in steps of `step_s` [s]."""
         self._sinking = damping_command(joints)
         self._delay, self._step = delay_s, step_s
         self._under_way: deque[tuple[int, Command]] = deque()
@@ -137,11 +131,7 @@ class Physics:
             self.plant.set_gains(*gains[:, columns])
 
     def run(self, steps: list[int], transport: Transport) -> Block:
-        """Go on to each of some physics steps, and look.
-
-        Args:
-            steps: Rising; those already past are looked at late.
-            transport: Whence commands come.
+        """Go on to each of some rising physics steps, and read the plant there.
 
         Raises:
             HardwareError: The numbers ran away.
@@ -178,11 +168,7 @@ class Physics:
         return seen(self.plant, np.array([self.step * self._dt]), row, np.array([self._voltage]))
 
     def _obey(self, before: int, transport: Transport) -> float:
-        """Step to where commands take effect before a physics step, and put them in.
-
-        Returns:
-            The step at which the next one takes effect.
-        """
+        """Apply the commands due before a physics step; return when the next one is due."""
         while (arrived := transport.take(before)) is not None:
             self._step_to(arrived[0])
             self.apply(arrived[1])

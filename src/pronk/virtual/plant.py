@@ -104,12 +104,7 @@ class Plant:
         return rows[..., :nq], rows[..., nq : nq + nv], rows[..., nq + nv :]
 
     def set_gains(self, stiffness: Array, damping: Array) -> None:
-        """Put gains on the drives, in force from the next physics step.
-
-        Args:
-            stiffness: [N m/rad], shape (joints,).
-            damping: [N m s/rad], shape (joints,).
-        """
+        """Put gains [N m/rad, N m s/rad] on the drives, in force from the next physics step."""
         volts = self.resistance / self.believed
         self.model.actuator_gainprm[self.actuator, _KP] = volts * stiffness
         self.model.actuator_gainprm[self.actuator, _KD] = volts * damping - self.constant
@@ -133,11 +128,7 @@ class Plant:
         return view
 
     def motor_torque(self, act: Array) -> Array:
-        """Torque of the motors without friction [N m], shape (..., joints).
-
-        Args:
-            act: Activation of the plant; the currents are in it. Shape (..., na).
-        """
+        """Motor torque without friction [N m], (..., joints), from activations (..., na)."""
         torque = self.constant * act.take(self.current, axis=-1)
         np.maximum(torque, self._least_torque, out=torque)
         limited: Array = np.minimum(torque, self.effort_limit, out=torque)
@@ -148,7 +139,7 @@ class Plant:
         return -self.effort_limit
 
     def electrical_power(self, torque: Array, speed: Array) -> Array:
-        """What the motors draw from the bus: mechanical power and heat, sum over joints [W].
+        """Power from the bus, mechanical and heat, summed over joints [W].
 
         Args:
             torque: Of the motors [N m], shape (..., joints).
@@ -163,11 +154,11 @@ class Plant:
     ) -> None:
         """Hold links where they are with a fixture; release all others.
 
-        The fixture is a spring and damper between link and body, not a constraint: its
-        stiffness has a unit that can be looked up, and it costs no solver iterations.
+        The fixture is a spring and damper between link and body, not a constraint: its stiffness
+        has a unit that can be looked up, and it costs no solver iterations.
 
         Args:
-            joints: Names of the joints whose links are held; () releases all.
+            joints: Joints whose links are held; () releases all.
             q: Generalized positions of the plant [rad].
             stiffness: [N m/rad]
             damping: [N m s/rad]
@@ -198,11 +189,7 @@ def _indices(joints: list[Any], of: str) -> NDArray[np.intp]:
 
 
 def _check_springs(plant: Plant, sim_params: SimParams) -> None:
-    """Refuse springs that the physics step cannot follow.
-
-    Raises:
-        RobotError: Names the field and the largest value that would do.
-    """
+    """Refuse springs that the physics step cannot follow; name the field and the largest value."""
     model = plant.model
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -229,16 +216,7 @@ _STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (
 
 
 def _free_base(spec: Any, robot: Robot, ground: Ground) -> None:
-    """Put a model's free trunk over the ground.
-
-    Args:
-        spec: mujoco.MjSpec to change.
-        robot: Which body is the trunk.
-        ground: Under it.
-
-    Raises:
-        RobotError: The robot's base is not free: an arm.
-    """
+    """Put a model's free trunk over the ground; refuse an arm."""
     base = spec.body(robot.base_body)
     if [joint.type for joint in base.joints] != [mujoco.mjtJoint.mjJNT_FREE]:
         raise RobotError(
@@ -251,12 +229,7 @@ def _free_base(spec: Any, robot: Robot, ground: Ground) -> None:
 
 
 def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
-    """Make the trunk what it truly is.
-
-    Args:
-        model: mujoco.MjModel to change; constants derived from masses are left to the caller.
-        body: Id of the trunk.
-        sim_params: What it is.
+    """Apply the trunk's parameters to a model; constants derived from masses are left alone.
 
     Raises:
         RobotError: No body could be like that.
@@ -285,13 +258,7 @@ def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
 
 
 def _fix_base(spec: Any, robot: Robot, sim_params: SimParams) -> None:
-    """Screw a model's trunk to its stand.
-
-    Args:
-        spec: mujoco.MjSpec to change.
-        robot: Which body is the trunk.
-        sim_params: How stiff the stand is.
-    """
+    """Fix a model's trunk to its stand."""
     base = spec.body(robot.base_body)
     for joint in list(base.joints):
         spec.delete(joint)

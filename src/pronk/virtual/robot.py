@@ -204,11 +204,7 @@ class VirtualRobot:
         self._transport.put(command, self._now)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
-        """Fix links where they are; () frees all.
-
-        Raises:
-            HardwareError: A joint is unknown, or the robot is not on the bench.
-        """
+        """Fix links where they are; () frees all. On the bench only."""
         self._check_open()
         if self._ground is not None:
             raise HardwareError(
@@ -227,12 +223,12 @@ class VirtualRobot:
         )
 
     def damp(self) -> None:
-        """Let the joints sink softly: no stiffness, some damping."""
+        """Damp the joints without stiffness."""
         self._check_open()
         self._transport.put(damping_command(len(self._robot.joints)), self._now)
 
     def capture(self, since: float = 0.0) -> Capture:
-        """What a motion-capture rig has seen so far; also after `close`.
+        """Motion capture so far; also after `close`.
 
         It ends at the physics step reached, which is behind `now` by the measurement delay.
 
@@ -250,11 +246,7 @@ class VirtualRobot:
         return self._recorder.capture(since)
 
     def snapshot(self) -> Capture:
-        """What a motion-capture rig sees at the physics step reached: one sample.
-
-        Raises:
-            HardwareError: On the bench, or not connected.
-        """
+        """One sample of the capture, at the physics step reached."""
         self._check_open()
         if self._ground is None:
             raise HardwareError("nothing is captured on the bench; use base='ground'.")

@@ -63,13 +63,13 @@ def _discrete_lag(lag_s: float, timestep_s: float) -> float:
 
 
 def add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: float) -> None:
-    """Give a joint of a model its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`.
+    """Give a joint of a spec its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`.
 
     Args:
         spec: mujoco.MjSpec to change.
         name: Of the joint.
-        drive: As the drive believes itself to be.
-        true: What is true of it.
+        drive: With the constants that the drive believes.
+        true: With the true ones.
         lag_s: By which torque is late [s].
 
     Raises:

@@ -66,11 +66,7 @@ class FreeBody:
     """A body that moves freely. Keeps the last instant between blocks."""
 
     def __init__(self, period_s: float) -> None:
-        """Begin at rest.
-
-        Args:
-            period_s: Between instants [s].
-        """
+        """Begin at rest, with a period between instants [s]."""
         self._period = period_s
         self._last: Array | None = None
 
@@ -85,28 +81,21 @@ class FreeBody:
 
 
 def resting_force(tilt: Array) -> Array:
-    """What an accelerometer at rest reads in the frame of a body with a small tilt [m/s^2].
-
-    Args:
-        tilt: Roll, pitch and yaw of the body [rad], shape (n, 3).
-    """
+    """Reading of an accelerometer at rest at small tilts (roll, pitch, yaw) (n, 3) [rad, m/s^2]."""
     roll, pitch = tilt[:, 0], tilt[:, 1]
     return _GRAVITY * np.stack([-pitch, roll, np.ones_like(roll)], axis=1)
 
 
 def moving_force(velocity: Array, orientation: Array, period_s: float) -> Array:
-    """What an accelerometer reads on average between instants, in the body's frame [m/s^2].
+    """Mean reading of an accelerometer between instants, in the body's frame (n, 3) [m/s^2].
 
-    The change of velocity and what gravity would have made of it, turned into the frame halfway;
-    a unit that integrates inside, as good ones do, gives this mean.
+    The change of velocity less that by gravity, turned into the frame halfway; a unit that
+    integrates inside, as good ones do, gives this mean.
 
     Args:
         velocity: World frame [m/s], shape (n + 1, 3).
         orientation: Body to world, unit quaternions w, x, y, z, shape (n + 1, 4).
         period_s: Between instants [s].
-
-    Returns:
-        Shape (n, 3).
     """
     force = (velocity[1:] - velocity[:-1]) / period_s
     force[:, 2] += _GRAVITY
@@ -146,14 +135,7 @@ class NoiseSource:
     """Noise, tick after tick."""
 
     def __init__(self, sim_params: SimParams, joints: int, *, rate_hz: float, seed: int) -> None:
-        """Start anew.
-
-        Args:
-            sim_params: How large everything is.
-            joints: Of the robot.
-            rate_hz: Ticks per second.
-            seed: Of all noise.
-        """
+        """Start the noise of all `joints` anew, at a rate [Hz], from a seed."""
         self._machine, self._filter = sim_params.machine, sim_params.attitude
         self._joints = joints
         self._period = 1.0 / rate_hz
@@ -274,15 +256,7 @@ class Sensors:
         rate_hz: float,
         seed: int,
     ) -> None:
-        """Start the noise anew.
-
-        Args:
-            robot: Names, gears and default pose.
-            sim_params: Noise, delays, encoders, attitude filter.
-            joints: The joints that are present, in file order.
-            rate_hz: States per second.
-            seed: Of all noise.
-        """
+        """Start anew, with the noise of a seed, for the joints that are present, in file order."""
         self._machine = machine = sim_params.machine
         names = robot.joint_names
         self._columns = np.array([names.index(name) for name in joints], dtype=np.intp)

@@ -132,8 +132,8 @@ class RobotServer:
         Args:
             machine: The virtual robot, connected. Its clock is the robot's own.
             wire: The robot's end of the link.
-            hold: What a rival, and the robot's own controller, command.
-            faults: What goes wrong; nothing if None.
+            hold: Command of a rival, and of the robot's own controller.
+            faults: None for none.
             watchdog: What the drives do when commands stop.
             seed: Of the faults.
         """

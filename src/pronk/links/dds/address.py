@@ -150,7 +150,7 @@ class Participant:
             ) from None
 
     def reader(self, topic: str, message: Any, *, raw: bool = False, own: bool = True) -> Any:
-        """Listen.
+        """Make a reader.
 
         Args:
             topic: Its name.

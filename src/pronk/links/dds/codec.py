@@ -72,11 +72,7 @@ class JointMap:
 
 
 def joint_map(robot: Robot) -> JointMap:
-    """The map of a robot.
-
-    Raises:
-        HardwareError: This robot does not fit behind Unitree's messages.
-    """
+    """The map of a robot; refuse one that does not fit behind Unitree's messages."""
     if robot.name not in _SIGNS:
         raise HardwareError(
             f"{robot.name} has no place in Unitree's messages; "
@@ -273,11 +269,7 @@ def _columns(motors: NDArray[Any], first: str, last: str) -> NDArray[np.float32]
 
 
 def _finite(name: str, values: NDArray[np.float32]) -> Array:
-    """Numbers as float64.
-
-    Raises:
-        RefusedError: `not finite`.
-    """
+    """Numbers as float64; refuse those that are not finite."""
     if not np.isfinite(values).all():
         raise RefusedError("not finite", f"{name} holds a number that is not finite.")
     return values.astype(np.float64)

@@ -25,13 +25,7 @@ class StateDecoder:
     """Makes states of messages as they come."""
 
     def __init__(self, joints: JointMap, counts: Counter[str]) -> None:
-        """Begin.
-
-        Args:
-            joints: Of the robot.
-            counts: Where everything met is counted: `states`, `out of order`, `clock jumps`,
-                `repeated` (the same to the last bit, as no live sensor is), `refused: REASON`.
-        """
+        """Begin; `counts` gets `states`, `out of order`, `clock jumps`, `repeated`, `refused: X`."""
         self.counts = counts
         self.virtual = False
         """Whether the last state was a virtual robot's."""
@@ -44,11 +38,9 @@ class StateDecoder:
         self._measured = b""
 
     def take(self, data: bytes, arrived: float) -> State | None:
-        """The state that a message brings, if it brings one. Never raises.
+        """The state of a message that arrived at a time [s], or None. Never raises.
 
-        Args:
-            data: What came, whatever it is.
-            arrived: When, on the local clock [s]. States that came together are put 1 us apart.
+        States that came together are put 1 us apart.
         """
         try:
             return self._take(data, arrived)

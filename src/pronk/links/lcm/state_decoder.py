@@ -29,12 +29,7 @@ class StateDecoder:
     """Makes states of messages as they come. One thread writes; any may read what it holds."""
 
     def __init__(self, layout: Layout, names: tuple[str, ...]) -> None:
-        """Begin without a state.
-
-        Args:
-            layout: Messages.
-            names: Of the joints, in pronk's order.
-        """
+        """Begin without a state, for the joints of these names."""
         self.counts: Counter[str] = Counter()
         """`states`, and for each reason how often no state was made."""
         self.last_error = ""
