@@ -25,7 +25,7 @@ class StateDecoder:
     """Makes states of messages as they come."""
 
     def __init__(self, joints: JointMap, counts: Counter[str]) -> None:
-        """Begin; `counts` gets `states`, `out of order`, `clock jumps`, `repeated`, `refused: X`."""
+        """Begin; `counts` gets `states`, `out of order`, `clock jumps`, `repeated`, refusals."""
         self.counts = counts
         self.virtual = False
         """Whether the last state was a virtual robot's."""
