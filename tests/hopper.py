@@ -1,4 +1,4 @@
-"""A policy made by hand: it stands still, and throws its legs straight while told to jump."""
+"""A policy made by hand: it stands still, and extends its legs at the jump input."""
 
 from __future__ import annotations
 

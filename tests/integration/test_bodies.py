@@ -176,7 +176,7 @@ def test_a_walking_policy_stands(tmp_path: Path) -> None:
     )
     stand, slow = (found.cell("matched", case.name) for case in cases)
     assert (stand.n, stand.fell, stand.non_foot_contact) == (1, 0, 0)
-    # It stands whatever it is told; only the command differs.
+    # It stands whatever the command.
     assert stand.figures["speed_error"].mean < 0.01
     assert slow.figures["speed_error"].mean == pytest.approx(0.1, abs=0.01)
     assert stand.figures["lasted"].mean == pytest.approx(2.4)

@@ -127,7 +127,7 @@ def test_a_repeat_is_the_same_to_the_last_digit(policy: Policy) -> None:
     assert not np.array_equal(one.position, other.position)
 
 
-def test_whoever_watches_sees_every_tick_and_can_stop(policy: Policy) -> None:
+def test_a_caller_reads_every_tick_and_can_stop(policy: Policy) -> None:
     seen: list[Tick] = []
     flown = run_policy(
         standing(), policy, ROBOT, lambda t: (STILL, False), seconds=0.1, watch=seen.append
@@ -143,16 +143,16 @@ def test_whoever_watches_sees_every_tick_and_can_stop(policy: Policy) -> None:
 
 def test_a_clock_that_runs_ahead_loses_ticks_and_no_time(policy: Policy) -> None:
     machine = standing()
-    asked: list[float] = []
+    commanded: list[float] = []
 
     def slow(t: float) -> tuple[tuple[float, float, float], bool]:
-        asked.append(t)
-        if len(asked) == 2:
-            machine.wait(machine.now() + 0.05)  # whoever decides takes 2.5 ticks once
+        commanded.append(t)
+        if len(commanded) == 2:
+            machine.wait(machine.now() + 0.05)  # one decision takes 2.5 ticks
         return STILL, False
 
     run_policy(machine, policy, ROBOT, slow, seconds=0.2)
-    assert asked == pytest.approx([0.0, 0.02, 0.08, 0.1, 0.12, 0.14, 0.16, 0.18])
+    assert commanded == pytest.approx([0.0, 0.02, 0.08, 0.1, 0.12, 0.14, 0.16, 0.18])
 
 
 def test_a_policy_of_another_robot_sends_nothing(tmp_path: Path) -> None:

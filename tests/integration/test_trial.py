@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 import yaml
 
+from command_line import invoke
 from hopper import ROBOT, write_hopper
-from pronk.cli.trial import trial as trial_command
-from pronk.errors import ArtefactError, PronkError, RobotError
+from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import results
 from pronk.evaluation.metrics import measure
 from pronk.evaluation.processes import in_processes
@@ -252,29 +251,13 @@ def test_overwriting_deletes_the_trial_and_nothing_else(tmp_path: Path) -> None:
 # --- The command --------------------------------------------------------------------------------
 
 
-def command(*words: str) -> Any:
-    app = typer.Typer()
-    app.command()(trial_command)
-    return app(list(words), standalone_mode=False)
-
-
-def test_the_command_says_what_it_did(
-    hopper: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "trial"
-    figures = tmp_path / "figures.json"
-    words = [str(hopper), "--out", str(out), "--commands=0,-1"]
-    words += ["--jumps", "1", "--processes", "1", "--no-video", "--definitions"]
-    command(*words, "--json", str(figures))
-    said = capsys.readouterr().out
-    for text in ("side -1", "paper, matched", "not a real one", "Definitions"):
-        assert text in said
-    for text in (
-        f"wrote {out / 'trials.csv'}",
-        f"open {out / 'report.html'}",
-        "simulated seconds per",
-    ):
-        assert text in said
+def test_the_command_writes_tables_page_and_figures(hopper: Path, tmp_path: Path) -> None:
+    out, figures = tmp_path / "trial", tmp_path / "figures.json"
+    words = ["trial", hopper, "--out", out, "--commands=0,-1", "--jumps", "1", "--processes", "1"]
+    done = invoke([*words, "--no-video", "--definitions", "--json", figures])
+    assert done.exit_code == 0, done.stderr
+    for text in ("side -1", "paper, matched", "not a real one", "Definitions", str(out)):
+        assert text in done.stdout
     body = json.loads(figures.read_text())
     assert body["virtual"] is True
     assert [cell["case"] for cell in body["cells"]] == ["side -1"]
@@ -283,18 +266,18 @@ def test_the_command_says_what_it_did(
     assert not (out / "videos").exists()
 
 
-def test_an_impossible_body_is_refused(hopper: Path, tmp_path: Path) -> None:
+def test_bad_input_is_refused_before_the_first_step(hopper: Path, tmp_path: Path) -> None:
     body = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
     body["joints"]["FR_knee"]["rotor_inertia"] = -1.0
-    path = tmp_path / "sim_params.yaml"
-    path.write_text(yaml.safe_dump(body))
-    words = (str(hopper), "--out", str(tmp_path / "out"), "--sim-params", str(path))
-    with pytest.raises(RobotError, match=r"joints\.FR_knee\.rotor_inertia is -1"):
-        command(*words)
-    with pytest.raises(RobotError, match="no such sim_params file"):
-        command(*words[:-1], str(tmp_path / "other.yaml"))
-    with pytest.raises(PronkError, match="command 'fast'"):
-        command(*words[:3], "--commands", "fast")
-    with pytest.raises(PronkError, match="--own without --bodies"):
-        command(*words[:3], "--own", str(hopper))
+    params = tmp_path / "sim_params.yaml"
+    params.write_text(yaml.safe_dump(body))
+    for words, what in (
+        (["--sim-params", params], "rotor_inertia"),
+        (["--sim-params", tmp_path / "other.yaml"], "other.yaml"),
+        (["--commands", "fast"], "fast"),
+        (["--own", hopper], "--bodies"),
+    ):
+        done = invoke(["trial", hopper, "--out", tmp_path / "out", *words])
+        assert done.exit_code == 2
+        assert what in done.stderr
     assert not (tmp_path / "out").exists()

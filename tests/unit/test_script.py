@@ -1,4 +1,4 @@
-"""What is asked over time."""
+"""The script of a run and the names of commands."""
 
 from __future__ import annotations
 

@@ -74,4 +74,4 @@ def in_processes(
 
 
 def _silent(share: float) -> None:
-    """Nobody watches."""
+    """Do nothing."""
