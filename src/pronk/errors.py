@@ -12,7 +12,7 @@ class PronkError(Exception):
 
 
 class LogError(PronkError):
-    """A log cannot be read, or what it holds cannot be believed."""
+    """A log cannot be read, or its content is implausible."""
 
 
 class RobotError(PronkError):
@@ -24,7 +24,7 @@ class PlanError(PronkError):
 
 
 class IdentifiabilityError(PronkError):
-    """The data cannot tell the asked parameters apart; the message names the missing experiment."""
+    """The data cannot tell the parameters apart; the message names the missing experiment."""
 
 
 class ArtefactError(PronkError):
@@ -32,4 +32,4 @@ class ArtefactError(PronkError):
 
 
 class HardwareError(PronkError):
-    """A machine does not answer, or a limit was breached while it moved."""
+    """A machine does not respond, or a limit was breached while it moved."""

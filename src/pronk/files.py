@@ -61,7 +61,7 @@ def save_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Any]
 
     Args:
         path: Where to.
-        header: What JSON can hold; its `schema` says what the file is.
+        header: What JSON can hold; its `schema` names the kind of file.
         arrays: Name to array.
     """
     with written_whole(path) as aside, aside.open("wb") as file:

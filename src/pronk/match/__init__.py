@@ -1,10 +1,10 @@
-"""The same question to the simulator: which gains make it answer like the real joint?
+"""Find the parameters with which a simulated joint responds as the measured one does.
 
-Start at `pipeline.match_logs`. What it uses, in order: `target` (measured responses, ready to be
-compared), `grid` (the paper's search), `quick` (the same optimum by the linearized model),
-`refine` (off the grid), `interval` (how far to believe it), `amplitude` (does friction show?),
-`ranges` (what training randomizes). Arms whose joints all moved at once have a room of their own,
-`arm`. Results are `result.MatchResult` and `gains.MatchedGains`.
+Start at `pipeline.match_logs`. In order: `measured_joint` (responses ready to be compared), `grid`
+(the paper's search) or `quick` (the linearized model), `refine` (off the grid), `drive` (mode
+drive), `arm` (joints that moved together), `uncertainty`, `diagnostics`, `ranges` (what training
+randomizes). Parameters are in `parameters`, the least-squares problem in `problem`, results in
+`result` and `gains`.
 """
 
 from __future__ import annotations

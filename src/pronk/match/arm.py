@@ -34,7 +34,7 @@ from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
 from pronk.response.estimate import estimate as estimate_response
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
-from pronk.simulators.chain import ChainSimulation, Drives, JointDrive, asked_joints
+from pronk.simulators.chain import ChainSimulation, Drives, JointDrive, excited_joints
 from pronk.simulators.mujoco import mujoco_info
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ _ROUNDS = 15
 _SETTLED = 1e-3
 """Relative change of cost or parameters that ends the search: far below the intervals."""
 _HOLD_FIRST = ("armature", "stiffness", "delay", "offset", "frictionloss", "damping")
-"""Of several parameters that cannot be told apart, the one to hold: best known otherwise first."""
+"""Of several parameters that cannot be distinguished, the first of these is held."""
 _STAGES = 3
 
 
@@ -192,7 +192,7 @@ def trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
     """
     masks, limit = [], dict.fromkeys(arm.joints, float("inf"))
     for log in arm.logs:
-        excited, _ = asked_joints(log, arm.robot)
+        excited, _ = excited_joints(log, arm.robot)
         mask = np.zeros((len(log.time), len(arm.joints)), dtype=bool)
         for i, joint in enumerate(arm.joints):
             if joint in excited:
@@ -315,11 +315,11 @@ def _refuse(fit: ArmFit) -> None:
     unknown = {name: joint.estimate.unidentified for name, joint in fit.joints.items()}
     if not any(unknown.values()):
         return
-    said = "; ".join(f"{joint}: {', '.join(names)}" for joint, names in unknown.items() if names)
+    words = "; ".join(f"{joint}: {', '.join(names)}" for joint, names in unknown.items() if names)
     wanted = {name for names in unknown.values() for name in names}
     cures = "; ".join(EXPERIMENTS[name] for name in PARAMETERS if name in wanted)
     raise IdentifiabilityError(
-        f"these recordings do not identify {said}; fit fewer parameters, or record more: {cures}."
+        f"these recordings do not identify {words}; fit fewer parameters, or record more: {cures}."
     )
 
 
@@ -477,13 +477,13 @@ def _joint_fits(
 
 def _flags(joint: ArmJoint, held: tuple[str, ...]) -> tuple[str, ...]:
     flags = [
-        f"{name} held at {joint.estimate.values[name]:.4g}: these recordings do not tell it; "
+        f"{name} held at {joint.estimate.values[name]:.4g}: these recordings do not identify it; "
         f"{EXPERIMENTS[name]}"
         for name in held
     ]
     if np.isfinite(joint.trusted_hz):
         flags.append(
-            f"believed up to {joint.trusted_hz:.2g} Hz, where the coherence falls "
+            f"used up to {joint.trusted_hz:.2g} Hz, where the coherence falls "
             f"({100 * joint.trusted_share:.0f} % of the samples)"
         )
     return (*flags, *joint.flags)

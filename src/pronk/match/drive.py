@@ -1,9 +1,9 @@
-"""Mode `drive` for swept joints: the stiffness is known, what else the joint is made of is asked.
+"""Identify damping, armature, friction and delay of swept joints at fixed stiffness.
 
 Gain and phase of every amplitude are fitted together: the phase holds the delay, and dry friction
-shows in how the answer changes with the amplitude. Before any fit the Fisher information of these
-very sweeps is asked whether they can tell the parameters apart (reading A10); pronk refuses what
-they cannot, and names the experiment that would.
+shows in how the response changes with the amplitude. Before any fit the Fisher information of the
+sweeps decides whether they can tell the parameters apart (reading A10); if not, the error names
+the experiment that would.
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ def match_drives(
     settings: MatchSettings | None = None,
     progress: Progress | None = None,
 ) -> MatchResult:
-    """Fit the drives of every joint that was asked in some sweeps.
+    """Fit the drives of every joint that was excited in some sweeps.
 
     Args:
         logs: Sweeps of one robot, one joint at a time.
         robot: The robot.
         free: What to look for, out of `FREE`; the rest is taken for known.
         settings: Estimator, coherence limit, threads.
-        progress: Told the stage and the share of it that is done, 0 to 1.
+        progress: Called with the stage and the share of it that is done, 0 to 1.
 
     Raises:
-        PronkError: A parameter is unknown, or none is asked.
-        LogError: No joint of the robot was asked, or a log cannot be used.
-        IdentifiabilityError: The sweeps cannot tell apart what was asked.
+        PronkError: A parameter is unknown, or there is none.
+        LogError: No joint of the robot was excited, or a log cannot be used.
+        IdentifiabilityError: The sweeps cannot tell the parameters apart.
     """
     names = checked_names(free, FREE)
     chosen = settings or MatchSettings()

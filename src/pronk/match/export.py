@@ -1,6 +1,6 @@
 """Matched gains as configuration of a simulator, as text to read and to paste.
 
-Every export says which simulator the gains hold for: the same numbers in another engine, at
+Every export names the simulator the gains hold for: the same numbers in another engine, at
 another timestep or with another actuator law are another joint. Delays are rounded to physics
 steps where a simulator knows no others.
 """
@@ -136,7 +136,7 @@ def mjlab_text(gains: MatchedGains) -> str:
         )
     return "\n".join(
         [
-            _comment(_face(gains), "# "),
+            _comment(_header(gains), "# "),
             "",
             "from mjlab.actuator import DcMotorActuatorCfg",
             "from mjlab.envs.mdp import dr",
@@ -170,7 +170,7 @@ def events_text(gains: MatchedGains) -> str:
         }
         for drive in drives
     }
-    return _comment(_face(gains), "# ") + "\n" + yaml.safe_dump(body, sort_keys=False)
+    return _comment(_header(gains), "# ") + "\n" + yaml.safe_dump(body, sort_keys=False)
 
 
 def mjcf_text(gains: MatchedGains) -> str:
@@ -201,16 +201,16 @@ def mjcf_text(gains: MatchedGains) -> str:
     )
     spec.compile()
     late = [f"{d.group} {d.delay_steps} steps" for d in drives if d.delay_steps]
-    said = _face(gains)
+    comment = _header(gains)
     if late:
-        said += "\nCommand delays that this file does not have: " + ", ".join(late) + "."
-    return f"<!--\n{said}\n-->\n{spec.to_xml()}"
+        comment += "\nCommand delays that this file does not have: " + ", ".join(late) + "."
+    return f"<!--\n{comment}\n-->\n{spec.to_xml()}"
 
 
 def isaaclab_text(gains: MatchedGains) -> str:
     """Python source for Isaac Lab: `ACTUATORS`, a dict of `DCMotorCfg` by group.
 
-    Isaac Lab runs PhysX; the text says on its face that the gains must be matched there anew.
+    Isaac Lab runs PhysX; its first line is a warning that the gains must be matched there anew.
     """
     drives = group_drives(gains, load_robot(gains.robot))
     entries = []
@@ -230,12 +230,12 @@ def isaaclab_text(gains: MatchedGains) -> str:
         )
     warning = (
         "NOT MATCHED IN THIS SIMULATOR. Isaac Lab runs PhysX, whose integrator and joint friction "
-        "are not MuJoCo's:\nwith the same numbers the joints answer differently. Take them as a "
+        "are not MuJoCo's:\nwith the same numbers the joints respond differently. Take them as a "
         "start, sweep the joints in\nIsaac Lab with the log's own commands, and match again."
     )
     return "\n".join(
         [
-            _comment(warning + "\n\n" + _face(gains), "# "),
+            _comment(warning + "\n\n" + _header(gains), "# "),
             "",
             "from isaaclab.actuators import DCMotorCfg",
             "",
@@ -272,8 +272,8 @@ def export_text(gains: MatchedGains, target: str) -> str:
     return EXPORTS[target](gains)
 
 
-def _face(gains: MatchedGains) -> str:
-    """What every export says first."""
+def _header(gains: MatchedGains) -> str:
+    """What every export begins with."""
     simulator = gains.simulator
     lines = [
         f"Gains of {gains.robot}, matched by pronk.",

@@ -1,4 +1,4 @@
-"""MatchedGains: the gains that make the simulated joint answer like the real one.
+"""MatchedGains: the gains that make the simulated joint respond like the real one.
 
 `gains.yaml` is the artefact that people read most, so it is laid out for reading: the simulator
 the gains hold for, a line per joint, a line per joint group.
@@ -52,7 +52,7 @@ class JointGains:
     delay_s: float = 0.0
     """Command delay that goes with the gains [s]."""
     flags: tuple[str, ...] = ()
-    """Doubts in words, for instance `at the edge of the grid` or `no match`."""
+    """Warnings, for instance `at the edge of the grid` or `no match`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +107,8 @@ def _rounded(value: Any) -> Any:
     return value
 
 
-def _silent(name: str, value: Any) -> bool:
-    """True for what says nothing: empty text and tuples, and unused optional parameters."""
+def _omitted(name: str, value: Any) -> bool:
+    """True for empty text and tuples, and for optional parameters that are not used."""
     if value in ((), ""):
         return True
     if name == "frictionloss":
@@ -117,7 +117,7 @@ def _silent(name: str, value: Any) -> bool:
 
 
 def _line(data: object) -> _Flow:
-    return _Flow({k: _rounded(v) for k, v in vars(data).items() if not _silent(k, v)})
+    return _Flow({k: _rounded(v) for k, v in vars(data).items() if not _omitted(k, v)})
 
 
 def save(path: Path, gains: MatchedGains) -> None:

@@ -24,7 +24,7 @@ from pronk.simulators.simulator import JointRig, JointRigs
 Array = NDArray[np.float64]
 
 DIVERGED_DB = 100.0
-"""Error written for a simulation that diverged or did not move [dB]: beyond any answer."""
+"""Error written for a simulation that diverged or did not move [dB]: beyond any response."""
 _NEAR_DB = 0.2
 """Nodes this close to the best of a shared map are simulated for themselves [dB]; two sides of a
 hip_roll differ by 0.03 dB around the best."""
@@ -86,7 +86,7 @@ def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128], weight: 
 
 
 def alike(targets: Sequence[MeasuredJoint], robot: Robot) -> list[list[MeasuredJoint]]:
-    """Targets gathered by simulation: mirror-image joints asked alike share one."""
+    """Targets gathered by simulation: mirror-image joints excited alike share one."""
     groups: list[list[MeasuredJoint]] = []
     for goal in targets:
         for group in groups:
@@ -114,7 +114,7 @@ def errors(
         stiffness: [N m/rad], shape (b,).
         damping: [N m s/rad], shape (b,).
         weighting: Weights of the frequencies.
-        progress: Told the share done, 0 to 1.
+        progress: Called with the share done, 0 to 1.
 
     Returns:
         Mean squared error of the gain [dB^2], shape (group, b).
@@ -153,7 +153,7 @@ def search(
         stiffness: Axis [N m/rad], shape (a,).
         damping: Axis [N m s/rad], shape (b,).
         weighting: Weights of the frequencies.
-        progress: Told the share done, 0 to 1.
+        progress: Called with the share done, 0 to 1.
     """
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
     shape = (len(stiffness), len(damping))
@@ -173,8 +173,8 @@ def search_all(
 ) -> list[GridSearch]:
     """The whole grid for any number of targets, each family of mirrored joints simulated once.
 
-    Joints asked alike share a simulation exactly. So do, nearly, joints asked the other way round
-    (a left hip_roll asked to the same side as the right one): only gravity and the pose tell the
+    Joints excited alike share a simulation. So do, nearly, joints excited the other way round
+    (a left hip_roll moved to the same side as the right one): only gravity and the pose tell the
     sides apart. Their maps are read off the shared simulation, then every node within `_NEAR_DB`
     of the best is simulated for itself. Should any of those have been wrong by half of that, all
     nodes are.
@@ -185,7 +185,7 @@ def search_all(
         stiffness: Axis [N m/rad], shape (a,).
         damping: Axis [N m s/rad], shape (b,).
         weighting: Weights of the frequencies.
-        progress: Told the share done, 0 to 1.
+        progress: Called with the share done, 0 to 1.
 
     Returns:
         One search a target, in their order.
@@ -222,7 +222,7 @@ def _look_again(
     shared: Sequence[GridSearch],
     weighting: Literal["none", "coherence"],
 ) -> list[GridSearch]:
-    """Simulate a group's own question wherever its shared maps could be the best."""
+    """Simulate a group's own command wherever its shared maps could be the best."""
     maps = np.array([one.error for one in shared])
     levels = np.sqrt(maps)
     near = (levels < levels.min(axis=(1, 2), keepdims=True) + _NEAR_DB).any(axis=0)
@@ -248,7 +248,7 @@ def coarse_search(
     """Look at every seventh node and the border, then ever closer around the best.
 
     Each stride looks around the best node so far until that no longer moves, so the search
-    follows a narrow valley to its bottom. Enough to say that no node fits (paper F13) at a
+    follows a narrow valley to its bottom. Enough to show that no node fits (paper F13) at a
     twentieth of the cost; nodes not looked at are NaN in the error map.
     """
     shape = (len(stiffness), len(damping))

@@ -1,6 +1,6 @@
 """What a set of experiments can tell apart, before anything is fitted (reading A10).
 
-A linear joint with position command answers
+A linear joint with position command responds with
 
     H = kp exp(-s delay) / ((J + armature) s^2 + (kd + viscous + dry) s + kp + m g l),
 
@@ -8,7 +8,7 @@ with kp and kd the true torques per angle, torque_scale times the gains on the d
 enters by its describing function, 4 frictionloss / (pi omega amplitude |H|), which is how it
 depends on amplitude. From |H| in one pose only stiffness / inertia and damping / inertia can be
 seen, and no amount of data changes that; a second pose, a torque channel or other gains on the
-drive do. The Fisher information of the logarithm of the response says so for any set of
+drive do. The Fisher information of the logarithm of the response shows it for any set of
 parameters and experiments, and which single further experiment would help.
 """
 
@@ -38,7 +38,7 @@ PARAMETERS = (
     "delay",
     "torque_scale",
 )
-"""What can be asked. What is not asked is taken for known."""
+"""What can be fitted; the rest is taken for known."""
 
 SD_MAX = 0.3
 """Relative standard deviation beyond which a parameter counts as unknown: at 95 % it would reach
@@ -93,7 +93,7 @@ class Experiment:
 
 @dataclass(frozen=True, kw_only=True)
 class Identifiability:
-    """What some experiments say about some parameters."""
+    """What some experiments tell about some parameters."""
 
     parameters: tuple[str, ...]
     condition: float
@@ -101,7 +101,7 @@ class Identifiability:
     sd: Mapping[str, float]
     """Relative standard deviation of each parameter; infinite if it cannot be known."""
     confused: tuple[str, ...]
-    """Parameters that cannot be told apart; empty if all can."""
+    """Parameters that cannot be distinguished; empty if all can."""
     cures: tuple[str, ...] = ()
     """Experiments each of which would make everything identifiable."""
 
@@ -117,14 +117,14 @@ def identifiability(
     """Analyse what some experiments can tell about some parameters.
 
     Args:
-        parameters: What is asked, out of `PARAMETERS`.
+        parameters: What is to be fitted, out of `PARAMETERS`.
         experiments: What is, or would be, recorded.
         nominal: Value of every parameter about which the response is linearized; stiffness and
-            damping are needed, the rest is 0 (torque_scale 1) if not given. An asked parameter
+            damping are needed, the rest is 0 (torque_scale 1) if not given. A fitted parameter
             must be positive.
 
     Raises:
-        PronkError: A parameter is unknown, not positive though asked, or nothing is asked.
+        PronkError: A parameter is unknown, not positive though fitted, or there is none.
     """
     names = tuple(parameters)
     values = _checked(names, experiments, nominal)
@@ -137,10 +137,10 @@ def identifiability(
 def require_identifiable(
     parameters: Sequence[str], experiments: Sequence[Experiment], nominal: Mapping[str, float]
 ) -> Identifiability:
-    """The same, refusing what cannot be told apart.
+    """The same, refusing what cannot be distinguished.
 
     Raises:
-        IdentifiabilityError: Some parameters cannot be told apart; the message names them and
+        IdentifiabilityError: Some parameters cannot be distinguished; the message names them and
             the experiments that would help.
         PronkError: As `identifiability`.
     """
@@ -150,14 +150,14 @@ def require_identifiable(
     known = (
         "any of these would: " + "; ".join(result.cures)
         if result.cures
-        else "no single further experiment would: ask for fewer parameters"
+        else "no single further experiment would: fit fewer parameters"
     )
     if len(result.confused) == 1:
-        said = f"these data say nothing about {result.confused[0]}"
+        words = f"these data do not identify {result.confused[0]}"
     else:
-        said = f"these data cannot tell apart {', '.join(result.confused)}"
+        words = f"these data cannot tell apart {', '.join(result.confused)}"
     raise IdentifiabilityError(
-        f"{said} (condition {result.condition:.1e}; asked: {', '.join(result.parameters)}); "
+        f"{words} (condition {result.condition:.1e}; fitted: {', '.join(result.parameters)}); "
         f"{known}; or hold one of them at a known value."
     )
 
@@ -306,15 +306,15 @@ def _cures(
 ) -> tuple[str, ...]:
     """Single experiments that would do; pairs of them where no single one does."""
     candidates = _candidates(experiments)
-    single = tuple(said for said, then in candidates if _analyse(names, then, values).ok)
+    single = tuple(words for words, then in candidates if _analyse(names, then, values).ok)
     if single:
         return single
     pairs = []
-    for (said, _), (other, _) in combinations(candidates, 2):
-        once = dict(_candidates(experiments))[said]
+    for (words, _), (other, _) in combinations(candidates, 2):
+        once = dict(_candidates(experiments))[words]
         then = dict(_candidates(once)).get(other)
         if then is not None and _analyse(names, then, values).ok:
-            pairs.append(f"{said} and {other}")
+            pairs.append(f"{words} and {other}")
     return tuple(pairs[:3])
 
 
@@ -336,7 +336,7 @@ def _checked(
     for name in {*names, "stiffness", "damping"}:
         if not values[name] > 0.0:
             raise PronkError(
-                f"nominal {name} is {values[name]:g}; what is asked (and stiffness and damping) "
+                f"nominal {name} is {values[name]:g}; what is fitted (and stiffness and damping) "
                 "must be positive to be linearized about."
             )
     return values

@@ -31,7 +31,7 @@ ComplexArray = NDArray[np.complex128]
 DB = 20.0 / np.log(10.0)
 """Decibels per neper: `20 log10(gain) = DB * log(gain)`."""
 FLOOR_DB = 0.1
-"""Smallest believed deviation of a measured gain [dB]. Coherence near 1 would otherwise let a few
+"""Smallest deviation used of a measured gain [dB]. Coherence near 1 would otherwise let a few
 frequencies outvote the band, though the model itself is not better than this."""
 _TAIL = 2e-4
 """Absolute error of gain that leaving out the end of the log would cause in a joint that follows
@@ -53,14 +53,14 @@ class MeasuredJoint:
     fit_matrix: Array
     """The part of `matrix` that the fit needs, real and imaginary columns side by side (one real
     product is faster than one of complex numbers), shape (steps heard, 2 inside). The estimator
-    hears nothing of the frequencies inside after these steps, so they need not be simulated."""
+    gets nothing of these frequencies from later steps, so they need not be simulated."""
 
     warnings: tuple[str, ...] = ()
     """What could not be used beside it."""
 
     @property
     def joint(self) -> str:
-        """The joint asked."""
+        """The excited joint."""
         return self.trace.joint
 
     @property
@@ -82,7 +82,7 @@ class MeasuredJoint:
         Returns:
             Shape (..., inside).
         """
-        # A constant is no answer; without it nothing is cut off where the steps end at rest.
+        # The mean is removed; without it nothing is cut off where the steps end at rest.
         moved = position[..., : self.steps] - position[..., :1]
         pair = moved @ self.fit_matrix
         half = pair.shape[-1] // 2
@@ -128,7 +128,7 @@ def logs_by_joint(logs: Sequence[SweepLog], robot: Robot) -> dict[str, list[Swee
     where: dict[str, list[SweepLog]] = {}
     for log in logs:
         names = {name for segment in log.segments for name in segment.joints}
-        # A log that does not say whom it asked asked those whose command moves.
+        # Without segments, the excited joints are those whose command moves.
         for i, name in enumerate(log.joints):
             if name in names or (not log.segments and np.ptp(log.command[:, i]) > 0.0):
                 where.setdefault(name, []).append(log)
@@ -136,8 +136,7 @@ def logs_by_joint(logs: Sequence[SweepLog], robot: Robot) -> dict[str, list[Swee
         robot.joint(name)
     if not where:
         raise LogError(
-            f"{len(logs)} logs ask no joint; expected questions to some of "
-            f"{', '.join(robot.joint_names)}."
+            f"{len(logs)} logs excite no joint; expected some of {', '.join(robot.joint_names)}."
         )
     return {name: where[name] for name in robot.joint_names if name in where}
 
@@ -171,15 +170,15 @@ def measured_joints(
         band_hz: Frequencies to compare; the joint's band if not given.
 
     Raises:
-        LogError: The joint was not asked or did not move, or its unit is unknown.
+        LogError: The joint was not excited or did not move, or its unit is unknown.
         IdentifiabilityError: Too little of the band is coherent at the largest amplitude.
     """
     chosen = tuple(segment for segment in log.segments if segment.kind != "sine_steps")
     if log.segments:
         if not any(joint in segment.joints for segment in chosen):
             raise LogError(
-                f"{log.source or 'log'}: {joint} was asked by sine steps alone; match a chirp or a "
-                "multisine, and keep the steps to check it."
+                f"{log.source or 'log'}: {joint} was excited by sine steps only; match a chirp or "
+                "a multisine, and keep the steps to check it."
             )
         log = replace(log, segments=chosen)
     measured = estimate(log, joint, settings.estimator)
@@ -195,7 +194,7 @@ def measured_joints(
             # The largest amplitude must be usable; a smaller one only checks it.
             if not found:
                 raise
-            warnings.append(f"the answer at {response.amplitude:.3g} rad is left out: {error}")
+            warnings.append(f"the response at {response.amplitude:.3g} rad is left out: {error}")
     found[0] = replace(found[0], warnings=tuple(warnings))
     return found
 
@@ -232,17 +231,17 @@ def target(
         IdentifiabilityError: Too little of the band is coherent, or the joint did not move.
     """
     joint = measured.joint
-    asked = command_trace(part, part.segments[0], joint, robot)
-    matrix = operator.matrix(asked.time)
+    trace = command_trace(part, part.segments[0], joint, robot)
+    matrix = operator.matrix(trace.time)
     low, high = band_hz or robot.joint(joint).band_hz
     inside = _inside(measured, low, high, settings, part.source or "log")
     return MeasuredJoint(
-        trace=asked,
+        trace=trace,
         sign=robot.joint(joint).original[1],
         measured=measured,
         matrix=matrix,
         fit_mask=inside,
-        fit_matrix=_heard(matrix, inside, asked.mirrored(robot)[2]),
+        fit_matrix=_fit_matrix(matrix, inside, trace.mirrored(robot)[2]),
     )
 
 
@@ -266,7 +265,7 @@ def merged(found: Sequence[Sequence[MeasuredJoint]]) -> list[MeasuredJoint]:
         alike = [g for g in goals if np.allclose(g.measured.omega, first.measured.omega)]
         if len(alike) < len(goals):
             raise LogError(
-                f"{first.joint} was asked at {first.measured.amplitude:.3g} rad in several logs "
+                f"{first.joint} was excited at {first.measured.amplitude:.3g} rad in several logs "
                 "whose responses have different frequencies; match them one at a time."
             )
         out.append(first if len(goals) == 1 else _together(goals))
@@ -286,24 +285,24 @@ def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
         repeats=np.concatenate([r.repeats for r in each]),
         source=", ".join(dict.fromkeys(r.source for r in each)),
     )
-    # Frequencies that any of the logs cannot be believed at are left out.
+    # Only frequencies that are coherent in all logs.
     inside = np.logical_and.reduce([goal.fit_mask for goal in goals])
     first = goals[0]
     kept = inside[first.fit_mask]
     heard = first.fit_matrix[:, np.concatenate([kept, kept])]
-    warnings = tuple(dict.fromkeys(doubt for goal in goals for doubt in goal.warnings))
+    warnings = tuple(dict.fromkeys(one for goal in goals for one in goal.warnings))
     return replace(first, measured=measured, fit_mask=inside, fit_matrix=heard, warnings=warnings)
 
 
 def _inside(
     measured: FrequencyResponse, low: float, high: float, settings: MatchSettings, where: str
 ) -> NDArray[np.bool_]:
-    """Frequencies of the band that can be believed; refuses a band that mostly cannot be."""
+    """Coherent frequencies of the band; refuses a band that is mostly incoherent."""
     band = measured.band(low, high)
     if int(band.sum()) < 3:
         raise IdentifiabilityError(
-            f"{where}: {measured.joint} was answered at {int(band.sum())} frequencies between "
-            f"{low:g} and {high:g} Hz; the match needs at least 3, so ask for longer or higher."
+            f"{where}: {measured.joint} has a response at {int(band.sum())} frequencies between "
+            f"{low:g} and {high:g} Hz; a match needs 3 or more, so sweep longer or higher."
         )
     coherent = measured.band(low, high, settings.coherence_min)
     moved = np.abs(measured.response[band]).max()
@@ -321,7 +320,7 @@ def _inside(
     return coherent
 
 
-def _heard(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array) -> Array:
+def _fit_matrix(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array) -> Array:
     """Rows and columns of the matrix that the fit needs (`MeasuredJoint.fit_matrix`).
 
     A chirp leaves the band long before it ends; the windows of the segments after that hold next

@@ -49,7 +49,7 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass
-class _Asked:
+class _Measured:
     """One joint and all that was measured of it."""
 
     targets: list[MeasuredJoint]
@@ -132,21 +132,21 @@ def _match_gains(
     ) as simulator:
         robot = simulator.robot
         with clock.stage("estimate"):
-            asked = _collect(logs, robot, chosen, clock)
-        found, rate = _search(simulator, asked, chosen, clock)
+            excited = _collect(logs, robot, chosen, clock)
+        found, rate = _search(simulator, excited, chosen, clock)
         with clock.stage("amplitudes"):
-            _fit_amplitudes(simulator, asked, found, chosen)
-        with clock.stage("answers"):
-            matched, naive = _answers(simulator, asked, found)
+            _fit_amplitudes(simulator, excited, found, chosen)
+        with clock.stage("responses"):
+            matched, naive = _final_responses(simulator, excited, found)
         zero: dict[str, NDArray[np.complex128]] = {}
         if chosen.zero_armature and "armature" in simulator.parameters:
             with clock.stage("zero armature"):
-                zero = _without_armature(simulator, asked, found, chosen, clock)
+                zero = _without_armature(simulator, excited, found, chosen, clock)
     joints = {
         name: _joint_fit(
             robot, item, found[name], matched[name], naive[name], zero.get(name), chosen
         )
-        for name, item in asked.items()
+        for name, item in excited.items()
     }
     gains = {name: joint.gains() for name, joint in joints.items()}
     return MatchResult(
@@ -158,7 +158,7 @@ def _match_gains(
 
 
 class _Clock:
-    """Wall time of each stage, and the voice of the progress."""
+    """Wall time of each stage, and reports of progress."""
 
     def __init__(self, progress: Progress | None) -> None:
         self.seconds: dict[str, float] = {}
@@ -167,15 +167,15 @@ class _Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a stage, and say when it begins and ends."""
+        """Time a stage; report its begin and end."""
         self._stage = name
-        self.tell(0.0)
+        self.report(0.0)
         begin = time.perf_counter()
         yield
         self.seconds[name] = time.perf_counter() - begin
-        self.tell(1.0)
+        self.report(1.0)
 
-    def tell(self, share: float) -> None:
+    def report(self, share: float) -> None:
         """Share of the stage that is done."""
         if self._progress is not None:
             self._progress(self._stage, share)
@@ -183,24 +183,24 @@ class _Clock:
 
 def _collect(
     logs: Sequence[SweepLog], robot: Robot, settings: MatchSettings, clock: _Clock
-) -> dict[str, _Asked]:
-    """Responses of every joint asked, in the robot's order."""
+) -> dict[str, _Measured]:
+    """Responses of every joint excited, in the robot's order."""
     where = logs_by_joint(logs, robot)
-    asked: dict[str, _Asked] = {}
+    excited: dict[str, _Measured] = {}
     for i, (name, sources) in enumerate(where.items()):
-        asked[name] = _Asked(
+        excited[name] = _Measured(
             targets=merged([measured_joints(log, name, robot, settings) for log in sources]),
             naive=gains_on_drive(sources[0], name, robot),
         )
-        clock.tell((i + 1) / len(where))
-    return asked
+        clock.report((i + 1) / len(where))
+    return excited
 
 
 def _search(
-    simulator: JointRigs, asked: dict[str, _Asked], settings: MatchSettings, clock: _Clock
+    simulator: JointRigs, excited: dict[str, _Measured], settings: MatchSettings, clock: _Clock
 ) -> tuple[dict[str, _Found], float]:
     """Best node and optimum off the grid of every joint; physics steps per second of the grid."""
-    main = [item.main for item in asked.values()]
+    main = [item.main for item in excited.values()]
     stiffness, damping = axes(simulator.robot, settings.grid_points)
     if settings.method == "quick":
         with clock.stage("quick search"):
@@ -218,7 +218,9 @@ def _search(
         }, float("nan")
     with clock.stage("grid"):
         begin = time.perf_counter()
-        grids = search_all(simulator, main, stiffness, damping, settings.grid_weighting, clock.tell)
+        grids = search_all(
+            simulator, main, stiffness, damping, settings.grid_weighting, clock.report
+        )
         # Everything the search does counts, not the simulator alone.
         rate = simulator.count.steps / (time.perf_counter() - begin)
     with clock.stage("refine"):
@@ -236,45 +238,45 @@ def _search(
 
 def _fit_amplitudes(
     simulator: JointRigs,
-    asked: dict[str, _Asked],
+    excited: dict[str, _Measured],
     found: dict[str, _Found],
     settings: MatchSettings,
 ) -> None:
     """Fit the smaller amplitudes, each by itself."""
-    others = [goal for item in asked.values() for goal in item.targets[1:]]
+    others = [goal for item in excited.values() for goal in item.targets[1:]]
     start = [(found[goal.joint].fit.stiffness, found[goal.joint].fit.damping) for goal in others]
     for fit in refine(simulator, others, start, use_phase=settings.use_phase):
         found[fit.target.joint].others.append(fit)
 
 
-def _answers(
-    simulator: JointRigs, asked: dict[str, _Asked], found: dict[str, _Found]
+def _final_responses(
+    simulator: JointRigs, excited: dict[str, _Measured], found: dict[str, _Found]
 ) -> tuple[dict[str, NDArray[np.complex128]], dict[str, NDArray[np.complex128]]]:
     """Whole responses with the matched and with the naive gains."""
-    main = [item.main for item in asked.values()]
+    main = [item.main for item in excited.values()]
     requests = [
         SimRequest(goal, found[goal.joint].fit.stiffness, found[goal.joint].fit.damping)
         for goal in main
     ]
-    requests += [SimRequest(item.main, *item.naive) for item in asked.values()]
-    answers = responses(simulator, requests, whole=True)
-    names = list(asked)
+    requests += [SimRequest(item.main, *item.naive) for item in excited.values()]
+    simulated = responses(simulator, requests, whole=True)
+    names = list(excited)
     return (
-        dict(zip(names, answers[: len(names)], strict=True)),
-        dict(zip(names, answers[len(names) :], strict=True)),
+        dict(zip(names, simulated[: len(names)], strict=True)),
+        dict(zip(names, simulated[len(names) :], strict=True)),
     )
 
 
 def _without_armature(
     simulator: JointRigs,
-    asked: dict[str, _Asked],
+    excited: dict[str, _Measured],
     found: dict[str, _Found],
     settings: MatchSettings,
     clock: _Clock,
 ) -> dict[str, NDArray[np.complex128]]:
     """The search without rotor inertia (F13); whole responses at its best nodes."""
     stiffness, damping = axes(simulator.robot, settings.grid_points)
-    groups = alike([item.main for item in asked.values()], simulator.robot)
+    groups = alike([item.main for item in excited.values()], simulator.robot)
     requests = []
     with simulator.without_armature() as rigs:
         for k, group in enumerate(groups):
@@ -286,14 +288,17 @@ def _without_armature(
             ):
                 found[goal.joint].zero = grid
                 requests.append(SimRequest(goal, *grid.gains))
-            clock.tell((k + 1) / len(groups))
-        answers = responses(rigs, requests, whole=True)
-    return {request.target.joint: answer for request, answer in zip(requests, answers, strict=True)}
+            clock.report((k + 1) / len(groups))
+        simulated = responses(rigs, requests, whole=True)
+    return {
+        request.target.joint: response
+        for request, response in zip(requests, simulated, strict=True)
+    }
 
 
 def _joint_fit(
     robot: Robot,
-    item: _Asked,
+    item: _Measured,
     found: _Found,
     matched: NDArray[np.complex128],
     naive: NDArray[np.complex128],

@@ -39,7 +39,7 @@ def predict(
 ) -> Prediction:
     """Simulate a log with naive and with matched gains.
 
-    Where several joints move at once the whole arm is simulated; otherwise each question to each
+    Where several joints move at once the whole arm is simulated; otherwise each segment of each
     joint by itself, the rest held as on the rig.
 
     Args:
@@ -75,7 +75,7 @@ def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pred
             name: replace(drive, delay=matched[name].delay) if name in matched else drive
             for name, drive in naive.items()
         }
-        (answer,), (plain,), (delayed,) = rig.run([matched, naive, late])
+        (best,), (plain,), (delayed,) = rig.run([matched, naive, late])
         excluded = dict(rig.excluded)
         names = rig.joints
     kinds = {name: s.kind for s in log.segments for name in s.joints}
@@ -93,7 +93,7 @@ def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pred
                 measured=log.position[:, column],
                 naive=plain[:, i],
                 naive_delayed=delayed[:, i],
-                matched=answer[:, i],
+                matched=best[:, i],
                 signal=kinds.get(name, "unknown"),
             )
         )
@@ -101,13 +101,13 @@ def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pred
 
 
 def _joint_by_joint(log: SweepLog, rigs: JointRigs, gains: MatchedGains) -> Prediction:
-    """One joint after the other, question by question."""
+    """One joint after the other, segment by segment."""
     robot = rigs.robot
     out, excluded = [], {}
     segments = log.segments or _single(log)
-    asked = {name for segment in segments for name in segment.joints}
+    excited = {name for segment in segments for name in segment.joints}
     for name in robot.joint_names:
-        if name not in asked:
+        if name not in excited:
             continue
         if name not in gains.joints:
             excluded[name] = _without_gains(name)
@@ -140,7 +140,7 @@ def _replay(
     rigs: JointRigs,
     gains: JointGains,
 ) -> tuple[Array, ...]:
-    """Time, command, measured, naive, naive with the delay and matched position of a question."""
+    """Time, command, measured, naive, naive with the delay and matched position of a segment."""
     robot, rig = rigs.robot, rigs.rig(name)
     trace = command_trace(part, segment, name, robot)
     late = _delayed(trace, gains.delay_s)
@@ -167,10 +167,10 @@ def _replay(
     # The last state is that at the start of the last step: no sample may lie beyond it.
     inside = (part.time >= trace.time[0]) & (part.time <= trace.time[-1])
     time, column = part.time[inside], part.column(name)
-    answers = (
+    simulated = (
         np.asarray(CubicSpline(trace.time, one)(time)) for one in (naive, naive_delayed, matched)
     )
-    return time, part.command[inside, column], part.position[inside, column], *answers
+    return time, part.command[inside, column], part.position[inside, column], *simulated
 
 
 def _delayed(trace: CommandTrace, delay: float) -> CommandTrace:
@@ -188,7 +188,7 @@ def _on_drive(log: SweepLog, robot: Robot, name: str) -> JointDrive:
 
 
 def _single(log: SweepLog) -> tuple[Segment, ...]:
-    """The whole log as one question to those whose command moves."""
+    """The whole log as one segment of those whose command moves."""
     moving = np.ptp(log.command, axis=0) > 0.0
     names = tuple(name for name, moves in zip(log.joints, moving, strict=True) if moves)
     if not names:
@@ -205,14 +205,16 @@ def _single(log: SweepLog) -> tuple[Segment, ...]:
 
 
 def _without_gains(name: str) -> str:
-    return f"{name} is left out: the gains have no entry for it; match a log in which it is asked."
+    return (
+        f"{name} is left out: the gains have no entry for it; match a log in which it is excited."
+    )
 
 
 def _prediction(
     log: SweepLog, joints: list[JointPrediction], excluded: dict[str, str]
 ) -> Prediction:
     if not joints:
-        reasons = " ".join(excluded.values()) or "no joint is asked in it."
+        reasons = " ".join(excluded.values()) or "no joint is excited in it."
         raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
     return Prediction(
         joints=tuple(joints), source=log.source, virtual=log.virtual, excluded=excluded

@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class JointPrediction:
-    """One joint's answer to a log, measured and simulated, at the log's timestamps."""
+    """One joint's response to a log, measured and simulated, at the log's timestamps."""
 
     joint: str
     time: Array
-    """Instants at which the joint was asked, all questions in a row [s], shape (n,)."""
+    """Instants at which the joint was excited, all segments in a row [s], shape (n,)."""
     command: Array
     """Position command in force [rad], shape (n,)."""
     measured: Array

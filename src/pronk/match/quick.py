@@ -2,7 +2,7 @@
 
 1. The closed form (`linear.py`) over the whole grid gives a first cell.
 2. Gauss-Newton with the simulator goes from there to the optimum off the grid.
-3. What the simulator says there, value and slope, corrects the closed form (manifold space
+3. The simulated value and slope there correct the closed form (manifold space
    mapping: Bandler et al., *Space mapping: the state of the art*, IEEE Trans. MTT 52(1), 2004),
    and the corrected map is searched again. Its best few nodes are simulated, and the simulator
    decides between them.
@@ -81,16 +81,16 @@ def quick_search(
         corrected = log + _correction(p, fit, kp, kd)
         maps.append(mean_square(goal, np.exp(corrected).astype(np.complex128), w))
         requests += [SimRequest(goal, kp[k], kd[k]) for k in np.argsort(maps[-1])[:_VERIFIED]]
-    answers = responses(simulator, requests)
+    simulated = responses(simulator, requests)
     found = []
     for i, (goal, w, fit) in enumerate(zip(targets, weight, fits, strict=True)):
         best = np.argsort(maps[i])[:_VERIFIED]
-        mine = answers[_VERIFIED * i : _VERIFIED * (i + 1)]
-        simulated = [float(mean_square(goal, answer, w)) for answer in mine]
-        # The simulator decides among them; no node that it has not seen may win.
-        floor = min(simulated)
+        mine = simulated[_VERIFIED * i : _VERIFIED * (i + 1)]
+        verified = [float(mean_square(goal, response, w)) for response in mine]
+        # The simulator decides among them; no node without a simulation may win.
+        floor = min(verified)
         maps[i] = np.maximum(maps[i], floor * (1.0 + 1e-9))
-        maps[i][best] = simulated
+        maps[i][best] = verified
         grid = GridSearch(stiffness=stiffness, damping=damping, error=maps[i].reshape(shape))
         found.append(QuickSearch(grid=grid, fit=fit))
     return found

@@ -1,7 +1,7 @@
 """From the gains of single joints to what training draws from: one pair and one range a group.
 
 The paper trains with one pair of gains per joint group and a uniform range about it (Table I, D3,
-D4) and does not say how it rounded from the matched joints to the group. pronk's rule:
+D4) and does not state how it rounded from the matched joints to the group. pronk's rule:
 
 1. Damping is the middle of the joints' intervals, rounded to 0.05 N m s/rad.
 2. Stiffness keeps the joint's impedance. Rounding the damping changes |stiffness + j omega
@@ -120,7 +120,7 @@ def matched_gains(
 def coverage(
     robot: Robot, groups: Mapping[str, GroupGains], joints: Mapping[str, JointGains]
 ) -> dict[str, tuple[str, ...]]:
-    """What the ranges of the groups leave out, said aloud (reading A13).
+    """List what the ranges of the groups leave out (reading A13).
 
     Args:
         robot: Gives each joint's group.
@@ -141,22 +141,22 @@ def coverage(
             ("damping", drawn.damping, drawn.damping_range, "N m s/rad"),
         )
         for joint, gains in group.items():
-            said = []
+            words = []
             for (what, centre, half, unit), value, bounds in zip(
                 spans, (gains.stiffness, gains.damping), _bounds(gains), strict=True
             ):
                 if abs(value - centre) > half + _SLACK:
-                    said.append(
+                    words.append(
                         f"{what} {value:.4g} {unit} lies outside the {name} range "
                         f"{centre:.4g} +- {half:.4g}"
                     )
                 elif max(bounds[1] - centre, centre - bounds[0]) > half + _SLACK:
-                    said.append(
+                    words.append(
                         f"{what} {value:.4g} {unit} lies inside the {name} range {centre:.4g} +- "
                         f"{half:.4g}, its interval {bounds[0]:.4g} to {bounds[1]:.4g} does not"
                     )
-            if said:
-                out[joint] = tuple(said)
+            if words:
+                out[joint] = tuple(words)
     return out
 
 

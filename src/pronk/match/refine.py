@@ -2,7 +2,7 @@
 
 Each round simulates every joint at its point and at one small step along each gain, all joints
 together in one rollout per original joint, so a round costs a fraction of a second. Frequencies
-are weighted by what their coherence says of them. The unknowns are the logarithms of the gains:
+are weighted by their coherence. The unknowns are the logarithms of the gains:
 positive, and alike in scale.
 """
 
@@ -47,7 +47,7 @@ class Fit:
     weight: Array
     """Weight of each residual [1/dB^2], shape (m,)."""
     residual: Array
-    """Simulated less measured [dB], gain first and then, if asked, phase, shape (m,)."""
+    """Simulated less measured [dB], gain first and then, if used, phase, shape (m,)."""
     settled: bool
     """False if the rounds ran out."""
 
@@ -68,7 +68,7 @@ class Fit:
 def residual_db(
     goal: MeasuredJoint, simulated: ComplexArray, measured: ComplexArray, use_phase: bool
 ) -> Array:
-    """Simulated over measured response in dB, gain and then (if asked) phase.
+    """Simulated over measured response in dB, gain and then (if used) phase.
 
     A radian of phase counts as a neper of gain, 8.69 dB: noise turns a response as much as it
     stretches it.
@@ -125,17 +125,17 @@ def refine(
             for i in active
             for offset in offsets
         ]
-        answers = responses(simulator, requests)
+        simulated = responses(simulator, requests)
         for k, i in enumerate(active):
-            _round(states[i], targets[i], np.array(answers[3 * k : 3 * k + 3]), use_phase)
+            _round(states[i], targets[i], np.array(simulated[3 * k : 3 * k + 3]), use_phase)
     fits = [state.fit for state in states]
     return [fit for fit in fits if fit is not None]
 
 
-def _round(state: _State, goal: MeasuredJoint, answers: ComplexArray, use_phase: bool) -> None:
+def _round(state: _State, goal: MeasuredJoint, simulated: ComplexArray, use_phase: bool) -> None:
     """Judge the last step by its simulation and take the next."""
     measured = goal.measured.response[goal.fit_mask]
-    rows = residual_db(goal, answers, measured, use_phase)
+    rows = residual_db(goal, simulated, measured, use_phase)
     weight = goal.deviation_db() ** -2.0
     if use_phase:
         weight = np.concatenate([weight, weight])
@@ -170,7 +170,7 @@ def _round(state: _State, goal: MeasuredJoint, answers: ComplexArray, use_phase:
         stiffness=float(np.exp(state.x[0])),
         damping=float(np.exp(state.x[1])),
         delay_s=delay * 1e-3 if use_phase else float("nan"),
-        simulated=answers[0],
+        simulated=simulated[0],
         jacobian=jacobian,
         weight=weight,
         residual=residual,

@@ -1,4 +1,4 @@
-"""MatchResult: everything a match found, for the page and for whoever wants to look again.
+"""MatchResult: everything a match found.
 
 `gains.yaml` holds what training needs; `match.npz` beside it holds the error maps and the
 responses that the page draws. No pickle.
@@ -19,7 +19,7 @@ from pronk.response.response import FrequencyResponse
 
 SCHEMA = "pronk/match/2"
 ZERO_ARMATURE = "zero armature: "
-"""Beginning of the flag on the search without rotor inertia; it says nothing of the gains."""
+"""Beginning of the flag on the search without rotor inertia; it is no flag on the gains."""
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

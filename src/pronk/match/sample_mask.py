@@ -1,7 +1,7 @@
-"""Which samples of a recording a fit may believe: where the command still explains the answer.
+"""Which samples of a recording a fit may use: where the command still explains the response.
 
 A servo has limits of its own (acceleration, speed, torque) that no gain describes. Beyond them the
-answer is no longer a linear joint's, and the coherence of a sweep that runs into them falls. The
+response is no longer a linear joint's, and the coherence of a sweep that runs into them falls. The
 fit uses the sweep up to there.
 """
 
@@ -18,9 +18,9 @@ Array = NDArray[np.float64]
 COHERENCE_MIN = 0.95
 _SEGMENT_S = 5.0
 _EXCITED = 1e-3
-"""Power of the command, over its largest, from which on a frequency counts as asked."""
+"""Power of the command, over its largest, from which on a frequency counts as excited."""
 _WIDE = 8.0
-"""A recording says where coherence ends only if it was coherent over three octaves below: a sweep
+"""A recording shows where coherence ends only if it was coherent over three octaves below: a sweep
 does; a few lines or a motion that mostly sticks do not."""
 _WINDOW_S = 2.0
 _AT_LIMIT = 0.25
@@ -36,22 +36,22 @@ def trusted_frequency(time: Array, command: Array, position: Array) -> float:
         position: [rad], shape (n,).
 
     Returns:
-        Lowest asked frequency above the coherent band that is not coherent; infinity if the
-        coherence does not end, or if the recording is too narrow to say so.
+        Lowest excited frequency above the coherent band that is not coherent; infinity if the
+        coherence does not end, or if the recording is too narrow to show it.
     """
     rate = (len(time) - 1) / (time[-1] - time[0])
     width = min(round(_SEGMENT_S * rate), len(time))
     hz, power = signal.welch(command, rate, nperseg=width)
-    asked = power > _EXCITED * power.max()
+    excited = power > _EXCITED * power.max()
     if power.max() == 0.0 or np.ptp(position) == 0.0:
         return float("inf")
     _, coherence = signal.coherence(command, position, rate, nperseg=width)
-    asked[0] = False  # each segment's mean is removed, so nothing was asked at 0 Hz
-    good = asked & (coherence >= COHERENCE_MIN)
+    excited[0] = False  # each segment's mean is removed, so 0 Hz is not excited
+    good = excited & (coherence >= COHERENCE_MIN)
     if not good.any():
         return float("inf")
     first = int(np.argmax(good))
-    fallen = np.flatnonzero(asked[first:] & ~good[first:])
+    fallen = np.flatnonzero(excited[first:] & ~good[first:])
     if len(fallen) == 0:
         return float("inf")
     last = hz[first + fallen[0] - 1]
@@ -59,7 +59,7 @@ def trusted_frequency(time: Array, command: Array, position: Array) -> float:
 
 
 def trusted_samples(log: SweepLog, joint: str) -> tuple[NDArray[np.bool_], float]:
-    """Samples at which a joint was asked nothing above its trusted frequency.
+    """Samples at which the command has nothing above its trusted frequency.
 
     Args:
         log: The recording.

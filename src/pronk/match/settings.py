@@ -1,4 +1,4 @@
-"""What a match may be asked to do, with the paper's choices as defaults."""
+"""Settings of a match; the defaults are the paper's choices."""
 
 from __future__ import annotations
 

@@ -160,11 +160,11 @@ def interval(
 
     With one repeat there is nothing to compare; the interval is then that of the coherence
     (Fisher information of the weighted fit, widened by the correlation of neighbouring
-    frequencies and by the misfit), which takes noise for white, and a flag says so.
+    frequencies and by the misfit), which takes noise for white, and a flag states it.
 
     Args:
         fit: The fit.
-        level: Share of such intervals that shall hold the truth.
+        level: Share of such intervals that shall hold the true value.
         method: `student`, or `bootstrap` (bias-corrected and accelerated, over repeats).
 
     Raises:
@@ -183,7 +183,7 @@ def interval(
     use_phase = len(fit.residual) > int(goal.fit_mask.sum())
     measured = goal.measured.repeats[:, goal.fit_mask]
     change = residual_db(goal, measured, goal.measured.response[goal.fit_mask], use_phase)
-    # The residual is simulated less measured: a larger answer asks for a larger simulated one.
+    # Residuals are simulated less measured: a larger measured response needs larger gains there.
     gains = optimum * np.exp(change @ fit.influence().T)
     covariance = jackknife(gains / (count - 1))
     if method == "bootstrap":

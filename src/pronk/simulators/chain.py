@@ -1,9 +1,9 @@
 """A whole chain of joints in the training simulator, all of them commanded as recorded.
 
-`pronk.simulators.mujoco` asks one joint and holds the rest; a recording in which every joint moves
-needs the chain as a whole, because each joint feels the others. The model is the same bench model,
-the drives are the same, only every joint gets its own command, held from its measured timestamp
-to the next one. A joint that was not recorded (or not in radians) is held at its default position.
+A test rig excites one joint and holds the rest; a recording in which every joint moves needs the
+chain as a whole, because each joint feels the others. Model and drives are those of the test rig,
+with a command for every joint, held from its measured timestamp to the next one. A joint that was
+not recorded (or not in radians) is held at its default position.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from pronk.simulators.command_trace import held_mean
 Array = NDArray[np.float64]
 
 MOVED_RAD = 1e-3
-"""A command that travels less than this asks nothing: it is below two counts of a 12-bit
+"""A command that travels less than this excites nothing: it is below two counts of a 12-bit
 encoder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointDrive:
-    """Everything of one joint's drive that a recording of the moving arm may tell."""
+    """Parameters of one joint's drive."""
 
     stiffness: float
     """[N m/rad]"""
@@ -66,7 +66,7 @@ class JointDrive:
 Drives = Mapping[str, JointDrive]
 
 
-def asked_joints(log: SweepLog, robot: Robot) -> tuple[tuple[str, ...], dict[str, str]]:
+def excited_joints(log: SweepLog, robot: Robot) -> tuple[tuple[str, ...], dict[str, str]]:
     """Which joints of a log can be simulated, and why the others cannot.
 
     Returns:
@@ -76,29 +76,29 @@ def asked_joints(log: SweepLog, robot: Robot) -> tuple[tuple[str, ...], dict[str
     Raises:
         LogError: No joint of the robot moves in radians.
     """
-    asked, excluded = [], {}
+    excited, excluded = [], {}
     for name in robot.joint_names:
         if name not in log.joints:
             continue
         if np.ptp(log.command[:, log.column(name)]) < MOVED_RAD:
             continue
         if log.unit(name) == "rad":
-            asked.append(name)
+            excited.append(name)
         else:
             excluded[name] = (
                 f"{name} is left out and held still: its scale is {log.unit(name)}, not radians; "
                 "give the reader its travel in radians to include it."
             )
-    if not asked:
+    if not excited:
         raise LogError(
-            f"{log.source or 'log'}: no joint of {robot.name} is asked to move in radians; its "
+            f"{log.source or 'log'}: no joint of {robot.name} is commanded to move in radians; its "
             f"columns are {', '.join(log.joints)}."
         )
-    return tuple(asked), excluded
+    return tuple(excited), excluded
 
 
 def moves_together(log: SweepLog) -> bool:
-    """True if several joints of a log are asked at once, so that only the whole arm can answer."""
+    """True if several joints of a log move at once, so that the whole arm must be simulated."""
     if log.segments:
         return any(
             set(one.joints) != set(other.joints) or len(one.joints) > 1
@@ -111,14 +111,14 @@ def moves_together(log: SweepLog) -> bool:
 
 
 class ChainSimulation:
-    """The chain, ready to be asked what one or more logs asked, with many sets of drives."""
+    """The chain with the commands of one or more logs, for many sets of drives."""
 
     def __init__(self, robot: Robot, logs: Sequence[SweepLog], *, threads: int = 2) -> None:
         """Compile the model and take in the logs.
 
         Args:
             robot: The robot.
-            logs: What to ask.
+            logs: What to simulate.
             threads: Threads of the simulator.
 
         Raises:
@@ -126,15 +126,15 @@ class ChainSimulation:
         """
         self.robot = robot
         self.logs = tuple(logs)
-        found = [asked_joints(log, robot) for log in self.logs]
-        names = {name for asked, _ in found for name in asked}
+        found = [excited_joints(log, robot) for log in self.logs]
+        names = {name for excited, _ in found for name in excited}
         self.joints = tuple(name for name in robot.joint_names if name in names)
         self.excluded = {k: v for _, reasons in found for k, v in reasons.items()}
         root = next((j for j in robot.joints if names <= set(j.chain)), None)
         if root is None:
             raise LogError(
                 f"{self.logs[0].source or 'log'}: {', '.join(self.joints)} move together but no "
-                f"chain of {robot.name} holds them all; ask the joints of one chain at a time."
+                f"chain of {robot.name} holds them all; excite the joints of one chain at a time."
             )
         self.model = bench_spec(robot, root.name).compile()
         self.chain = tuple(self.model.joint(i).name for i in range(self.model.njnt))
@@ -143,7 +143,7 @@ class ChainSimulation:
         self._threads = threads
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(threads, 1))]
-        self._questions = [self._question(log) for log in self.logs]
+        self._tracks = [self._track(log) for log in self.logs]
 
     def __enter__(self) -> ChainSimulation:
         return self
@@ -156,7 +156,7 @@ class ChainSimulation:
         self._pool.close()
 
     def run(self, sets: Sequence[Drives]) -> list[list[Array]]:
-        """Ask every log's question of every set of drives.
+        """Simulate every log with every set of drives.
 
         Args:
             sets: Drives by joint name; joints without an entry have the robot's published ones.
@@ -168,12 +168,12 @@ class ChainSimulation:
         """
         models = [self._with(drives) for drives in sets]
         out: list[list[Array]] = [[] for _ in sets]
-        for question in self._questions:
-            steps = question.steps
-            control = np.stack([self._control(question, drives) for drives in sets])
+        for track in self._tracks:
+            steps = track.steps
+            control = np.stack([self._control(track, drives) for drives in sets])
             state = np.zeros((len(sets), self._state_size()))
             for row, drives in enumerate(sets):
-                state[row, 1 : 1 + self.model.nq] = question.start - self._offsets(drives)
+                state[row, 1 : 1 + self.model.nq] = track.start - self._offsets(drives)
             trace, _ = self._pool.rollout(
                 models,
                 self._data,
@@ -186,24 +186,24 @@ class ChainSimulation:
             # trace[k] is the state after step k + 1; the start is the state before the first.
             whole = np.concatenate([state[:, None], trace], axis=1)[..., 1 : 1 + self.model.nq]
             for row, drives in enumerate(sets):
-                sampled = _sampled(whole[row], question.log.time, self.robot.timestep_s)
+                sampled = _sampled(whole[row], track.log.time, self.robot.timestep_s)
                 sampled += self._offsets(drives)
                 out[row].append(sampled[:, [self._rows[name] for name in self.joints]])
         return out
 
     def measured(self) -> list[Array]:
-        """What was recorded, one array per log [rad], shape (n, joints); NaN where not asked."""
+        """What was recorded, one array per log [rad], shape (n, joints); NaN where not excited."""
         out = []
         for log in self.logs:
-            asked, _ = asked_joints(log, self.robot)
+            excited, _ = excited_joints(log, self.robot)
             columns = np.full((len(log.time), len(self.joints)), np.nan)
             for i, name in enumerate(self.joints):
-                if name in asked:
+                if name in excited:
                     columns[:, i] = log.position[:, log.column(name)]
             out.append(columns)
         return out
 
-    def _question(self, log: SweepLog) -> _ArmQuestion:
+    def _track(self, log: SweepLog) -> _Track:
         start = np.array([self.robot.joint(name).default_position for name in self.chain])
         command = np.tile(start, (len(log.time), 1))
         for name in self.chain:
@@ -212,16 +212,16 @@ class ChainSimulation:
                 command[:, self._rows[name]] = log.command[:, log.column(name)]
         span = log.time[-1] - log.time[0]
         steps = int(np.ceil(span / self.robot.timestep_s)) + 1
-        return _ArmQuestion(log=log, start=start, command=command, steps=steps)
+        return _Track(log=log, start=start, command=command, steps=steps)
 
-    def _control(self, question: _ArmQuestion, drives: Drives) -> Array:
+    def _control(self, track: _Track, drives: Drives) -> Array:
         """Commands during each step, delayed and in the model's zero, shape (steps, actuators)."""
-        edges = question.log.time[0] + self.robot.timestep_s * np.arange(question.steps + 1)
-        control = np.empty((question.steps, self.model.nu))
+        edges = track.log.time[0] + self.robot.timestep_s * np.arange(track.steps + 1)
+        control = np.empty((track.steps, self.model.nu))
         for name, row in self._rows.items():
             drive = drives.get(name)
             delay, offset = (drive.delay, drive.offset) if drive else (0.0, 0.0)
-            held = held_mean(question.log.time, question.command[:, row], edges - delay)
+            held = held_mean(track.log.time, track.command[:, row], edges - delay)
             control[:, self._actuator[row]] = held - offset
         return control
 
@@ -245,8 +245,8 @@ class ChainSimulation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ArmQuestion:
-    """One log as the simulator is asked it."""
+class _Track:
+    """One log as the simulator needs it."""
 
     log: SweepLog
     start: Array

@@ -1,6 +1,6 @@
-"""The question a joint was asked, as the training simulator will be asked it.
+"""The command a joint was given, at every physics step of the training simulator.
 
-The log says which command was in force at each measured instant; the simulator holds a command
+The log holds which command was in force at each measured instant; the simulator holds a command
 for whole physics steps, and a policy's command for `decimation` of them. The jitter of the
 timestamps (tens of microseconds) must not move a command by a whole step, so the instants at
 which the command was seen to change are fitted by the clock of the policy, and the command is
@@ -24,7 +24,7 @@ _OFF_CLOCK = 0.25
 """Largest median distance of a change from the policy's clock, as a share of a tick, with which
 the command is still taken for one held at the policy's rate."""
 _SAME = 1e-6
-"""Commands closer than this are the same question [rad]: far below an encoder count."""
+"""Commands closer than this are the same [rad]: far below an encoder count."""
 _POSE_SLACK = 0.05
 """How far a clamped joint may be from where the bench model clamps it [rad]."""
 
@@ -34,7 +34,7 @@ class CommandTrace:
     """One command to one joint, at every physics step of the training simulator."""
 
     joint: str
-    """The joint that was asked."""
+    """The excited joint."""
     start: float
     """Instant of the first step, on the clock of the log [s]."""
     timestep: float
@@ -70,7 +70,7 @@ class CommandTrace:
         agree as well, mirrored.
 
         Args:
-            other: The question to compare with.
+            other: The trace to compare with.
             robot: The robot.
             sign: With -1, true if the other way round they would.
         """
@@ -86,13 +86,13 @@ class CommandTrace:
 
 
 def original_pose(trace: CommandTrace, robot: Robot) -> Array:
-    """Pose of the original joint's chain that mirrors the question's pose [rad], shape (chain,)."""
-    asked = robot.joint(trace.joint)
-    original = robot.joint(asked.original[0])
+    """Pose of the original joint's chain that mirrors the trace's pose [rad], shape (chain,)."""
+    excited = robot.joint(trace.joint)
+    original = robot.joint(excited.original[0])
     index = {name: i for i, name in enumerate(robot.joint_names)}
     pose = []
     # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
-    for own, first in zip(asked.chain, original.chain, strict=True):
+    for own, first in zip(excited.chain, original.chain, strict=True):
         sign = robot.joint(own).original[1] * robot.joint(first).original[1]
         pose.append(sign * trace.pose[index[own]])
     return np.array(pose)
@@ -132,7 +132,7 @@ def held(time: Array, command: Array, instants: Array) -> Array:
 def held_mean(time: Array, command: Array, edges: Array) -> Array:
     """Mean over each interval of a command that is held from each timestamp to the next.
 
-    The mean, not the value at the start: so the answer depends smoothly on a delay that is no
+    The mean, not the value at the start: so the response depends smoothly on a delay that is no
     multiple of the step, and a fit can find it.
 
     Args:
@@ -160,7 +160,7 @@ def held_mean(time: Array, command: Array, edges: Array) -> Array:
 def command_trace(
     log: SweepLog, segment: Segment, joint: str, robot: Robot, *, until: float | None = None
 ) -> CommandTrace:
-    """What the simulator must be asked to repeat one segment of a log.
+    """Command of one segment of a log at every physics step.
 
     Args:
         log: The log.
@@ -170,13 +170,13 @@ def command_trace(
         until: Stop at this instant [s]; the segment's end if not given.
 
     Raises:
-        LogError: The joint was not asked in the segment, its unit is unknown, or a joint that is
+        LogError: The joint was not excited in the segment, its unit is unknown, or a joint that is
             clamped in the bench model stood elsewhere.
     """
     where = log.source or "log"
     if joint not in segment.joints:
         raise LogError(
-            f"{where}: {joint} is not asked between {segment.start:.3f} and {segment.stop:.3f} s; "
+            f"{where}: {joint} is not excited from {segment.start:.3f} to {segment.stop:.3f} s; "
             f"{', '.join(segment.joints)} are."
         )
     if log.unit(joint) != "rad":
@@ -217,7 +217,7 @@ def command_trace(
 
 
 def _early_ticks(values: Array) -> int:
-    """Ticks to begin before the log, so that repeats of a question begin alike.
+    """Ticks to begin before the log, so that repeats begin alike.
 
     Whether the log caught the tick it began in is chance; a rest before the first change is
     therefore lengthened to a multiple of five ticks. A log that begins in motion is left alone.
@@ -245,13 +245,6 @@ def _pose(log: SweepLog, joint: str, robot: Robot) -> Array:
         if abs(stood - default) > _POSE_SLACK:
             raise LogError(
                 f"{log.source or 'log'}: {name} was clamped at {stood:.3f} rad while {joint} was "
-                f"asked; the bench model of {robot.name} clamps it at {default:.3f} rad."
+                f"excited; the bench model of {robot.name} clamps it at {default:.3f} rad."
             )
     return pose
-
-
-def asked(log: SweepLog, joint: str) -> list[Segment]:
-    """Segments in which a joint was asked, largest amplitude first, then by repeat."""
-    found = [segment for segment in log.segments if joint in segment.joints]
-    # NaN amplitudes (imported logs that do not say) keep the order of the log.
-    return sorted(found, key=lambda s: (-np.nan_to_num(s.amplitude), s.repeat, s.start))

@@ -1,14 +1,14 @@
 """The quick way: the simulator's own step, linearized, with the drive closed in closed form.
 
 The 5 ms step about the pose is differentiated by MuJoCo (`mjd_transitionFD`) with a torque in
-place of the asked joint's drive. That gives the discrete transfer functions from torque to
-position `P_q(z)` and speed `P_v(z)`; the explicit PD of the training simulator then answers
+place of the excited joint's drive. That gives the discrete transfer functions from torque to
+position `P_q(z)` and speed `P_v(z)`; the explicit PD of the training simulator then gives
 
     H(z) = kp P_q / (1 + kp P_q + (kd + c) P_v),    z = exp(j omega timestep)
 
 for a whole grid of gains without simulating anything. `c = 4 f / (pi |speed|)` is the describing
 function of the joint's dry friction `f` (Gelb and Vander Velde, *Multiple-Input Describing
-Functions*, 1968, table of appendix B: ideal relay), iterated with the amplitude of the answer.
+Functions*, 1968, table of appendix B: ideal relay), iterated with the amplitude of the response.
 What it misses (coupling through held joints that slip, the estimator's leakage, friction near
 sticking) is a smooth ratio that simulations at the optimum correct.
 """
@@ -34,7 +34,7 @@ _FRICTION_ROUNDS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Plant:
-    """Torque at the asked joint to its position and speed, at some frequencies."""
+    """Torque at the excited joint to its position and speed, at some frequencies."""
 
     omega: Array
     """[rad/s], shape (f,)."""
@@ -45,7 +45,7 @@ class Plant:
     timestep: float
     """[s]"""
     frictionloss: float
-    """Dry friction of the asked joint [N m]."""
+    """Dry friction of the excited joint [N m]."""
 
     def response(
         self, stiffness: ArrayLike, damping: ArrayLike, *, amplitude: float = float("nan")
@@ -84,7 +84,7 @@ def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
     """Linearize a bench model about a pose.
 
     Args:
-        rig: The asked joint's rig.
+        rig: The excited joint's rig.
         pose: Pose of its chain [rad], shape (chain,).
         omega: Frequencies to evaluate [rad/s], shape (f,).
     """
@@ -93,7 +93,7 @@ def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
     data.qpos[:] = pose
     data.ctrl[:] = rig.control(pose)
     mujoco.mj_forward(model, data)
-    # Hold the asked joint against gravity, so that the linearization is about rest.
+    # Hold the excited joint against gravity, so that the linearization is about rest.
     data.ctrl[rig.actuator] = data.qfrc_bias[rig.index]
     nx, nu = 2 * model.nv + model.na, model.nu
     a, b = np.zeros((nx, nx)), np.zeros((nx, nu))

@@ -1,11 +1,11 @@
-"""The training simulator, asked the way a joint was asked on the rig.
+"""The training simulator with one joint excited on the test rig, and whole chains.
 
 The model is `pronk.robots.model.bench_spec`: fixed base, the joint's own chain, explicit PD at the
 start of each 5 ms step, clipped by the torque-speed curve. One native MuJoCo model holds all of
 it, so `mujoco.rollout` runs thousands of gain pairs on its threads with no Python in the loop,
-and the trajectories are those of the training environment (held by a test of the robots' room).
+and the trajectories are those of the training environment (a test holds it).
 
-Only the asked joint's position is kept (a `jointpos` sensor, read at the start of each step);
+Only the excited joint's position is kept (a `jointpos` sensor, read at the start of each step);
 the other state columns are never stored. A joint that mirrors another is simulated as that other
 (`Joint.original`), so mirror-image legs cost one simulation.
 """
@@ -56,7 +56,7 @@ def rest_position(
 
 
 class JointTestRig:
-    """One joint on the rig, ready to be asked with many gain pairs.
+    """One joint on the test rig, simulated with many gain pairs.
 
     Built for the original of a mirrored family; positions and commands are about the pose, in
     the original's own sign.
@@ -78,9 +78,9 @@ class JointTestRig:
 
         Args:
             robot: The robot.
-            joint: The joint to ask; the original of a mirrored family.
-            armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
-            frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+            joint: The joint to excite; the original of a mirrored family.
+            armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
+            frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
             held_stiffness: Gains of the joints that are held [N m/rad]; the robot's if not given.
             held_damping: Gains of the joints that are held [N m s/rad]; the robot's if not given.
             threads: Threads of the simulator.
@@ -97,7 +97,7 @@ class JointTestRig:
             frictionloss=None if frictionloss is None else {joint: frictionloss},
         )
         spec.add_sensor(
-            name="asked",
+            name="excited",
             type=mujoco.mjtSensor.mjSENS_JOINTPOS,
             objtype=mujoco.mjtObj.mjOBJ_JOINT,
             objname=joint,
@@ -116,7 +116,7 @@ class JointTestRig:
         self._stiffness = np.array(
             [(held_stiffness or {}).get(name, robot.joint(name).stiffness) for name in self.chain]
         )
-        self._sensor = int(self.model.sensor_adr[self.model.sensor("asked").id])
+        self._sensor = int(self.model.sensor_adr[self.model.sensor("excited").id])
         # One actuator a joint; map joint order to the columns of ctrl.
         self._ctrl = np.array([self.model.actuator(name).id for name in self.chain])
         self._models: list[mujoco.MjModel] = []
@@ -135,7 +135,7 @@ class JointTestRig:
         self._pool.close()
 
     def pose(self, trace: CommandTrace) -> Array:
-        """Where the chain of this model is held for a question [rad], shape (chain,)."""
+        """Where the chain of this model is held for a trace [rad], shape (chain,)."""
         chain = self.robot.joint(self.joint.name).chain or (self.joint.name,)
         by_name = dict(zip(chain, original_pose(trace, self.robot), strict=True))
         return np.array(
@@ -144,7 +144,7 @@ class JointTestRig:
 
     @property
     def actuator(self) -> int:
-        """Column of the asked joint's command."""
+        """Column of the excited joint's command."""
         return int(self._ctrl[self.index])
 
     def control(self, pose: Array) -> Array:
@@ -154,7 +154,7 @@ class JointTestRig:
         return out
 
     def torque_model(self) -> mujoco.MjModel:
-        """A copy whose asked joint takes a torque [N m] and has no dry friction of its own."""
+        """A copy whose excited joint takes a torque [N m] and has no dry friction of its own."""
         model = copy.copy(self.model)
         i = self.actuator
         model.actuator_gaintype[i] = mujoco.mjtGain.mjGAIN_FIXED
@@ -294,8 +294,8 @@ class MujocoSimulator:
 
         Args:
             robot: The robot.
-            armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
-            frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+            armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
+            frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
             threads: Threads of the simulator.
             device: Where large runs are simulated; see `DEVICES`.
 
@@ -432,17 +432,17 @@ def simulate(
     held_damping: Mapping[str, float] | None = None,
     threads: int = 2,
 ) -> Array:
-    """Position of the asked joint in the training simulator, for many gain pairs.
+    """Position of the excited joint in the training simulator, for many gain pairs.
 
     The simulation begins at rest where gravity leaves the joint with its first command.
 
     Args:
         robot: The robot.
         trace: The command to repeat.
-        stiffness: Gains of the asked joint [N m/rad], shape (b,) or a scalar.
-        damping: Gains of the asked joint [N m s/rad], shape (b,) or a scalar.
-        armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
-        frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+        stiffness: Gains of the excited joint [N m/rad], shape (b,) or a scalar.
+        damping: Gains of the excited joint [N m s/rad], shape (b,) or a scalar.
+        armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
+        frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
         held_stiffness: Gains of the joints that are held; the robot's if not given.
         held_damping: Gains of the joints that are held; the robot's if not given.
         threads: Threads of the simulator.

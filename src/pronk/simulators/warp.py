@@ -13,7 +13,7 @@ A step costs a GPU about the same for one simulation as for thousands. So the gr
 there, and whatever asks fewer than `LEAST` simulations (the refinement, which takes differences
 between neighbouring gains) stays on the processor, in double precision.
 
-Imported only when asked for: it needs the extra `pronk[train]`.
+Imported only when used: it needs the extra `pronk[train]`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _before_step(
     ctrl: wp.array2d[float],
     position: wp.array2d[float],
 ) -> None:
-    """Before a step: note where the asked joint is, and give it the command of this step.
+    """Before a step: note where the excited joint is, and give it the command of this step.
 
     Every world keeps its own clock, so a captured step needs nothing from the host.
     """
@@ -90,9 +90,9 @@ class WarpTestRig(JointTestRig):
 
         Args:
             robot: The robot.
-            joint: The joint to ask; the original of a mirrored family.
-            armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
-            frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
+            joint: The joint to excite; the original of a mirrored family.
+            armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
+            frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
             threads: Threads of the simulator on the processor.
             device: `cuda`, or `warp-cpu` (slow; to compare the arithmetic without a GPU).
             least: Fewer simulations than this run on the processor.
@@ -147,7 +147,7 @@ class WarpTestRig(JointTestRig):
     def _step(
         self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
     ) -> NDArray[np.float32]:
-        """Positions of the asked joint [rad], shape (steps, n), all simulated at once."""
+        """Positions of the excited joint [rad], shape (steps, n), all simulated at once."""
         count, steps = len(stiffness), len(commands[0])
         shared = len(commands) == 1 and len(poses) == 1
         ways = 1 if shared else count
@@ -211,7 +211,7 @@ class _Worlds:
             self._graph = self._capture()
 
     def fits(self, count: int, steps: int, shared: bool) -> bool:
-        """True if a run of this size needs no more memory and is asked alike."""
+        """True if a run of this size needs no more memory and is excited alike."""
         return self._shared == shared and count <= self._count and steps <= self._steps
 
     def run(self, start: Array, gains: Array, control: Array, target: Array) -> NDArray[np.float32]:
@@ -221,10 +221,10 @@ class _Worlds:
             start: Positions at rest, shape (n, nq).
             gains: Parameters of the actuators, shape (n, nu, parameters).
             control: Commands of the joints that are held, shape (1 or n, nu).
-            target: Commands of the asked joint, shape (steps, 1 or n).
+            target: Commands of the excited joint, shape (steps, 1 or n).
 
         Returns:
-            Position of the asked joint at the start of each step, shape (steps, n).
+            Position of the excited joint at the start of each step, shape (steps, n).
         """
         steps, count = len(target), len(start)
         # Worlds to spare repeat the last simulation; commands to spare are never reached.

@@ -1,4 +1,4 @@
-"""The whole match: from logs to gains, with what it says of doubtful ones."""
+"""The whole match: from logs to gains, with flags on those that do not fit."""
 
 from __future__ import annotations
 
@@ -25,47 +25,47 @@ ROBOT = load_robot("mini_cheetah")
 QUICK = MatchSettings(
     method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False, grid_points=25
 )
-TRUTH = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": (21.8, 0.541)}
+KNOWN = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": (21.8, 0.541)}
 
 
-def log_of(joint: str, truth: tuple[float, float], *, seed: int = 0, **more: object) -> SweepLog:
+def log_of(joint: str, known: tuple[float, float], *, seed: int = 0, **more: object) -> SweepLog:
     rng = np.random.default_rng(seed)
     asks = [
         Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples(), repeats=3)
         for a in (0.25, 0.125)
     ]
     noise = list(0.001 * rng.standard_normal((6, 6000)))
-    log = synthetic_log(ROBOT, joint, asks, *truth, noise=noise, **more)  # type: ignore[arg-type]
+    log = synthetic_log(ROBOT, joint, asks, *known, noise=noise, **more)  # type: ignore[arg-type]
     return replace(log, source=f"/somewhere/{joint}.mcap", sha256=f"{seed:064x}")
 
 
 @pytest.fixture(scope="module")
 def matched() -> MatchResult:
-    told: list[tuple[str, float]] = []
-    logs = [log_of(joint, gains, seed=i) for i, (joint, gains) in enumerate(TRUTH.items())]
+    reports: list[tuple[str, float]] = []
+    logs = [log_of(joint, gains, seed=i) for i, (joint, gains) in enumerate(KNOWN.items())]
     result = match_logs(
         logs,
         ROBOT,
         settings=replace(QUICK, zero_armature=True),
-        progress=lambda stage, share: told.append((stage, share)),
+        progress=lambda stage, share: reports.append((stage, share)),
     )
-    assert {"estimate", "quick search", "amplitudes", "zero armature"} <= {s for s, _ in told}
-    assert all(0.0 <= share <= 1.0 for _, share in told)
+    assert {"estimate", "quick search", "amplitudes", "zero armature"} <= {s for s, _ in reports}
+    assert all(0.0 <= share <= 1.0 for _, share in reports)
     return result
 
 
-def test_the_truth_is_found_with_honest_intervals(matched: MatchResult) -> None:
+def test_known_gains_are_inside_their_intervals(matched: MatchResult) -> None:
     # The robot's order, not that of the logs.
     assert list(matched.gains.joints) == ["FR_hip_roll", "FR_knee", "FL_hip_roll"]
-    for joint, truth in TRUTH.items():
+    for joint, known in KNOWN.items():
         found = matched.gains.joints[joint]
-        assert (found.stiffness, found.damping) == pytest.approx(truth, rel=5e-3)
+        assert (found.stiffness, found.damping) == pytest.approx(known, rel=5e-3)
         assert found.stiffness_ci95[0] < found.stiffness < found.stiffness_ci95[1]
         assert found.damping_ci95[0] < found.damping < found.damping_ci95[1]
         spacing = 14.0 / 24, 0.6 / 24
         # Stiffness and damping rise together along a valley; a coarse grid may pick its next node.
-        assert abs(found.grid_stiffness - truth[0]) < 1.5 * spacing[0]
-        assert abs(found.grid_damping - truth[1]) < 1.5 * spacing[1]
+        assert abs(found.grid_stiffness - known[0]) < 1.5 * spacing[0]
+        assert abs(found.grid_damping - known[1]) < 1.5 * spacing[1]
         assert found.error_db < 0.05
         # The naive gains are those of the real drive, 17 / 0.4.
         assert found.naive_error_db > 5 * found.error_db
@@ -77,7 +77,7 @@ def test_the_truth_is_found_with_honest_intervals(matched: MatchResult) -> None:
 
 
 def test_the_result_holds_what_the_page_draws(matched: MatchResult) -> None:
-    for joint in TRUTH:
+    for joint in KNOWN:
         one = matched.joints[joint]
         assert [round(r.amplitude, 3) for r in one.responses] == [0.25, 0.125]
         assert one.grid_error.shape == (25, 25)
@@ -94,7 +94,7 @@ def test_the_result_holds_what_the_page_draws(matched: MatchResult) -> None:
     assert set(matched.seconds) >= {"estimate", "quick search", "zero armature"}
 
 
-def test_zero_armature_is_told_apart_where_the_data_can(matched: MatchResult) -> None:
+def test_zero_armature_is_refuted_where_the_data_can(matched: MatchResult) -> None:
     knee, roll = matched.joints["FR_knee"], matched.joints["FR_hip_roll"]
     assert knee.zero_armature_error_db > 5 * knee.error_db
     assert any(flag.startswith("zero armature: no match") for flag in knee.flags)
@@ -121,7 +121,7 @@ def test_the_artefacts_survive_a_round_trip(matched: MatchResult, tmp_path: Path
     result_file.save(tmp_path / "match.npz", matched)
     gains = gains_file.load(tmp_path / "gains.yaml")
     again = result_file.load(tmp_path / "match.npz", gains)
-    assert set(gains.joints) == set(TRUTH)
+    assert set(gains.joints) == set(KNOWN)
     one, other = matched.joints["FR_knee"], again.joints["FR_knee"]
     np.testing.assert_array_equal(one.grid_error, other.grid_error)
     np.testing.assert_array_equal(one.matched, other.matched)
@@ -129,7 +129,7 @@ def test_the_artefacts_survive_a_round_trip(matched: MatchResult, tmp_path: Path
 
 
 def test_the_grid_way_agrees_with_the_quick_way(matched: MatchResult) -> None:
-    log = log_of("FR_knee", TRUTH["FR_knee"], seed=2)
+    log = log_of("FR_knee", KNOWN["FR_knee"], seed=2)
     whole = match_logs([log], ROBOT, settings=replace(QUICK, method="grid", grid_points=25))
     found, quick = whole.gains.joints["FR_knee"], matched.gains.joints["FR_knee"]
     assert (found.grid_stiffness, found.grid_damping) == (
@@ -143,7 +143,7 @@ def test_the_grid_way_agrees_with_the_quick_way(matched: MatchResult) -> None:
 
 
 def test_a_joint_of_another_kind_is_no_match() -> None:
-    """A knee of three times the armature: no pair on or off the grid answers alike."""
+    """A knee of three times the armature: no pair on or off the grid responds alike."""
     log = log_of("FR_knee", (17.0, 0.2), frictionloss=0.6, armature=0.02)
     found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
     assert any(flag.startswith(("no match", "at the edge")) for flag in found.flags)
@@ -155,7 +155,7 @@ def test_a_small_amplitude_that_noise_drowns_is_left_out() -> None:
     noise = [np.zeros(6000), 0.1 * rng.standard_normal(6000)]
     log = synthetic_log(ROBOT, "FR_knee", asks, 20.0, 0.5, noise=noise)
     found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
-    assert any(f.startswith("the answer at 0.01 rad is left out") for f in found.flags)
+    assert any(f.startswith("the response at 0.01 rad is left out") for f in found.flags)
     assert np.isnan(found.amplitude_spread)
     assert found.stiffness == pytest.approx(20.0, rel=2e-3)
 
@@ -179,11 +179,11 @@ def test_naive_gains_are_those_that_the_log_says() -> None:
 
 def test_bad_logs_are_refused_in_one_sentence() -> None:
     good = log_of("FR_knee", (21.0, 0.5))
-    with pytest.raises(LogError, match="0 logs ask no joint; expected questions to some of FR_hip"):
+    with pytest.raises(LogError, match="FR_hip_roll"):
         match_logs([], ROBOT, settings=QUICK)
     elbow = tuple(replace(s, joints=("elbow",)) for s in good.segments)
     renamed = replace(good, joints=("elbow",), segments=elbow)
-    with pytest.raises(RobotError, match="no joint 'elbow'; its joints are FR_hip_roll"):
+    with pytest.raises(RobotError, match=r"elbow.*FR_hip_roll"):
         match_logs([renamed], ROBOT, settings=QUICK)
     with pytest.raises(LogError, match="FR_knee moved"):
         match_logs([replace(good, position=0 * good.position)], ROBOT, settings=QUICK)
@@ -194,7 +194,7 @@ def test_bad_logs_are_refused_in_one_sentence() -> None:
     with pytest.raises(IdentifiabilityError, match="FR_knee is coherent"):
         match_logs([drowned], ROBOT, settings=QUICK)
     steps = replace(good, segments=tuple(replace(s, kind="sine_steps") for s in good.segments))
-    with pytest.raises(LogError, match="sine steps alone"):
+    with pytest.raises(LogError, match="sine steps"):
         match_logs([steps], ROBOT, settings=QUICK)
 
 

@@ -70,7 +70,7 @@ def test_positions_agree_within_single_precision(joint: str, frictionloss: float
         expected, got = positions(known, *ask), positions(warped, *ask)
         assert warped.count.steps == expected.size
     assert np.ptp(expected, axis=1).min() > 0.1
-    # Equal would mean that the processor was asked twice.
+    # Equal would mean that both ran on the processor.
     assert 0.0 < np.abs(got - expected).max() < ROUNDING
 
 
@@ -100,10 +100,10 @@ def test_few_simulations_stay_in_double_precision() -> None:
 @pytest.mark.train
 @pytest.mark.parametrize("joint", ["FR_knee", "FR_hip_roll"])
 def test_the_grid_finds_the_same_cell(joint: str) -> None:
-    """225 nodes, a step of the paper's grid apart, the truth between them."""
+    """225 nodes, a step of the paper's grid apart, the known between them."""
     pytest.importorskip("mujoco_warp")
-    asked = Excitation(offsets=Chirp(length_s=4.0).samples())
-    log = synthetic_log(ROBOT, joint, [asked], 20.6, 0.492)
+    chirp = Excitation(offsets=Chirp(length_s=4.0).samples())
+    log = synthetic_log(ROBOT, joint, [chirp], 20.6, 0.492)
     settings = MatchSettings(estimator=Estimator(segment_s=2.0))
     goal = measured_joints(log, joint, ROBOT, settings)[0]
     stiffness = 20.6 + 14.0 / 49.0 * (np.arange(15) - 6.3)
@@ -137,11 +137,11 @@ def test_a_missing_extra_is_refused_in_one_sentence() -> None:
         "try: rig_on('cuda')\n"
         "except PronkError as error: print(error)"
     )
-    said = subprocess.run(
+    message = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout
-    assert "mujoco_warp is not installed" in said
-    assert 'pip install "pronk[train]"' in said
+    assert "mujoco_warp is not installed" in message
+    assert 'pip install "pronk[train]"' in message
 
 
 def test_an_unknown_device_is_refused() -> None:

@@ -116,11 +116,11 @@ def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law(robot: str) -> None:
             group = gains.groups[joint.group]
             at = model.joint(joint.name)
             q, speed = data.qpos[at.qposadr[0]], data.qvel[at.dofadr[0]]
-            asked = group.stiffness * (data.actuator(joint.name).ctrl[0] - q)
-            asked -= group.damping * speed
+            torque = group.stiffness * (data.actuator(joint.name).ctrl[0] - q)
+            torque -= group.damping * speed
             drive = joint.drive
             expected = clip_torque(
-                asked,
+                torque,
                 speed,
                 stall_torque=drive.stall_torque,
                 no_load_speed=drive.no_load_speed,
@@ -134,8 +134,8 @@ def test_isaac_lab_snippet_says_on_its_face_that_it_is_not_matched_there() -> No
     text = export_text(matched(), "isaaclab")
     assert text.startswith("# NOT MATCHED IN THIS SIMULATOR.")
     face = text.split("from isaaclab")[0]
-    for said in ("PhysX", mujoco.__version__, "0.005", "implicitfast", "dc_motor_pd", "virtual"):
-        assert said in face
+    for words in ("PhysX", mujoco.__version__, "0.005", "implicitfast", "dc_motor_pd", "virtual"):
+        assert words in face
     compile(text, "isaaclab", "exec")
 
 

@@ -1,4 +1,4 @@
-"""The paper's grid search on logs whose truth is known."""
+"""The paper's grid search on logs whose gains_of is known."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TABLE_1 = {
 """The paper's Table I, legs FR FL HR HL."""
 
 
-def truth(joint: str) -> tuple[float, float]:
+def gains_of(joint: str) -> tuple[float, float]:
     leg, _, group = joint.partition("_")
     return TABLE_1[group][("FR", "FL", "HR", "HL").index(leg)]
 
@@ -49,7 +49,7 @@ def known(
 ) -> MeasuredJoint:
     ask = Excitation(offsets=Chirp(length_s=length_s).samples())
     return measured_joints(
-        synthetic_log(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, settings
+        synthetic_log(ROBOT, joint, [ask], *gains_of(joint)), joint, ROBOT, settings
     )[0]
 
 
@@ -69,12 +69,12 @@ def test_the_axes_are_those_of_the_paper() -> None:
 
 
 def test_table_1_is_found_again_by_every_joint() -> None:
-    """12 of 12: the paper's gains as truth, a log without noise (the bars of the match)."""
+    """12 of 12: the paper's gains as gains_of, a log without noise (the bars of the match)."""
     goals = [known(joint.name) for joint in ROBOT.joints]
     with MujocoSimulator(ROBOT) as simulator:
         found = quick_search(simulator, goals, *axes(ROBOT))
     for goal, one in zip(goals, found, strict=True):
-        stiffness, damping = truth(goal.joint)
+        stiffness, damping = gains_of(goal.joint)
         assert one.grid.cell == nearest(one.grid, (stiffness, damping)), goal.joint
         assert one.fit.stiffness == pytest.approx(stiffness, rel=0.005)
         assert one.fit.damping == pytest.approx(damping, rel=0.01)
@@ -87,7 +87,9 @@ def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
     quick = MatchSettings(estimator=Estimator(segment_s=2.0))
     ask = Excitation(offsets=Chirp(length_s=4.0, stop_hz=18.0).samples(), settle_s=0.2)
     goals = [
-        measured_joints(synthetic_log(ROBOT, joint, [ask], *truth(joint)), joint, ROBOT, quick)[0]
+        measured_joints(synthetic_log(ROBOT, joint, [ask], *gains_of(joint)), joint, ROBOT, quick)[
+            0
+        ]
         for joint in ("FR_knee", "HL_knee")
     ]
     assert len(alike(goals, ROBOT)) == 1
@@ -96,7 +98,7 @@ def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
         assert simulator.count.steps == 2500 * max(goal.steps for goal in goals)
     for goal, one in zip(goals, found, strict=True):
         assert one.error.shape == (50, 50)
-        assert one.cell == nearest(one, truth(goal.joint))
+        assert one.cell == nearest(one, gains_of(goal.joint))
         assert one.error_db < 0.1
         # Far off the error is large: the map has one valley.
         assert np.sqrt(one.error[0, 0]) > 1.0
@@ -105,7 +107,7 @@ def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
 def test_mirror_images_share_a_simulation() -> None:
     goals = [known(joint.name, length_s=8.0) for joint in ROBOT.joints]
     groups = [{goal.joint for goal in group} for group in alike(goals, ROBOT)]
-    # Left rolls were asked towards the same side as right ones: mirrored, that is the other way.
+    # Left rolls move towards the same side as right ones: mirrored, that is the other way.
     assert groups == [
         {"FR_hip_roll", "HR_hip_roll"},
         {"FR_hip_pitch", "FL_hip_pitch", "HR_hip_pitch", "HL_hip_pitch"},
@@ -114,7 +116,7 @@ def test_mirror_images_share_a_simulation() -> None:
     ]
 
 
-def test_rolls_asked_to_the_same_side_cost_one_simulation_and_a_look() -> None:
+def test_rolls_moved_to_the_same_side_share_most_of_a_simulation() -> None:
     """Left rolls are read off the right one's simulation; what could be best is simulated anew."""
     goals = [known(joint, length_s=8.0) for joint in ("FR_hip_roll", "FL_hip_roll", "FR_knee")]
     grid = axes(ROBOT, 12)
@@ -184,11 +186,11 @@ def test_the_error_is_the_mean_square_in_decibels() -> None:
     assert mean_square(goal, broken, flat) == pytest.approx(DIVERGED_DB**2)
 
 
-def test_coherence_weighs_doubtful_frequencies_down() -> None:
+def test_coherence_weighs_incoherent_frequencies_down() -> None:
     goal = known("FR_hip_pitch", length_s=8.0)
     coherence = goal.measured.coherence.copy()
-    doubtful = np.nonzero(goal.fit_mask)[0][:5]
-    coherence[doubtful] = 0.85
+    incoherent = np.nonzero(goal.fit_mask)[0][:5]
+    coherence[incoherent] = 0.85
     worse = replace(goal, measured=replace(goal.measured, coherence=coherence))
     weight = weights(worse, "coherence")
     assert weight.sum() == pytest.approx(1.0)
@@ -232,10 +234,10 @@ def test_repeats_in_several_logs_are_put_together() -> None:
     np.testing.assert_allclose(both[0].measured.response, expected)
 
 
-def test_whole_and_banded_answers_agree() -> None:
+def test_full_and_banded_responses_agree() -> None:
     goal = known("FL_hip_roll", length_s=8.0)
     with MujocoSimulator(ROBOT) as simulator:
-        request = SimRequest(goal, *truth("FL_hip_roll"))
+        request = SimRequest(goal, *gains_of("FL_hip_roll"))
         whole = responses(simulator, [request], whole=True)[0]
         banded = responses(simulator, [request])[0]
     np.testing.assert_allclose(whole, goal.measured.response, rtol=1e-6)

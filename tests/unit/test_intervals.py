@@ -26,12 +26,12 @@ def coloured(rng: np.random.Generator, shape: tuple[int, ...], deviation: float)
     ]
 
 
-def covered(response: FrequencyResponse, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the intervals on gain and phase hold the truth, per bin."""
+def covered(response: FrequencyResponse, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the intervals on gain and phase hold the known, per bin."""
     low, high = response.gain_interval(0.95)
-    gain = (low <= np.abs(truth)) & (np.abs(truth) <= high)
+    gain = (low <= np.abs(known)) & (np.abs(known) <= high)
     low, high = response.phase_interval(0.95)
-    off = np.angle(truth / response.response)
+    off = np.angle(known / response.response)
     phase = (low - response.phase <= off) & (off <= high - response.phase)
     return gain, phase
 
@@ -44,7 +44,7 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
     clean = simulate_second_order(command, RATE, **KNEE)
     # What the interval is about: the estimate without noise. Its own bias (at most 0.3 %) is the
     # same for the measured and the simulated joint.
-    truth = operator.apply(clean)
+    known = operator.apply(clean)
     trials = 300
     noise = coloured(rng, (trials, repeats, len(time)), 2e-3)
     each = operator.apply(clean + noise)
@@ -63,7 +63,7 @@ def test_intervals_over_repeats_cover_coloured_noise(repeats: int) -> None:
             window="",
             segment_s=SETTINGS.segment_s,
         )
-        gain, phase = covered(response, truth)
+        gain, phase = covered(response, known)
         gains.append(gain)
         phases.append(phase)
     for hits in (np.array(gains), np.array(phases)):
@@ -81,9 +81,9 @@ def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> Non
     time, command, _ = chirp_command("chirp", RATE)
     grid = grid_over(time)
     where = layout(grid, SETTINGS, padded=True)
-    asked = segment_spectra(held_mean(time, command, grid), where, SETTINGS)
+    excited = segment_spectra(held_mean(time, command, grid), where, SETTINGS)
     clean = linear_joint(**KNEE)(command, RATE)
-    truth = sums(asked, segment_spectra(clean, where, SETTINGS), where).response(
+    known = sums(excited, segment_spectra(clean, where, SETTINGS), where).response(
         "H1", where.omega, RATE
     )
     hits = []
@@ -93,7 +93,7 @@ def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> Non
             if colour == "white"
             else coloured(rng, (len(time),), 8e-3)
         )
-        s = sums(asked, segment_spectra(clean + noise, where, SETTINGS), where)
+        s = sums(excited, segment_spectra(clean + noise, where, SETTINGS), where)
         estimate = s.response("H1", where.omega, RATE)
         response = FrequencyResponse(
             joint="knee",
@@ -107,5 +107,5 @@ def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> Non
             window="",
             segment_s=SETTINGS.segment_s,
         )
-        hits.append(covered(response, truth)[0])
+        hits.append(covered(response, known)[0])
     assert 0.90 < np.mean(hits) < 0.99

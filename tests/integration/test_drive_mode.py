@@ -15,12 +15,12 @@ from pronk.match.drive import match_drives
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
-TRUTH = {"damping": 0.33, "armature": 0.0055, "frictionloss": 0.3}
+KNOWN = {"damping": 0.33, "armature": 0.0055, "frictionloss": 0.3}
 LATE_S = 0.004
 
 
 def sweep(joint: str, amplitudes: tuple[float, ...] = (0.25, 0.125)) -> SweepLog:
-    """Known drive, two amplitudes of three repeats, 0.2 mrad of noise, answers 4 ms late."""
+    """Known drive, two amplitudes of three repeats, 0.2 mrad of noise, 4 ms late."""
     rng = np.random.default_rng(3)
     asks = [
         Excitation(offsets=Chirp(length_s=12.0, amplitude=a).samples(), repeats=3)
@@ -32,9 +32,9 @@ def sweep(joint: str, amplitudes: tuple[float, ...] = (0.25, 0.125)) -> SweepLog
         joint,
         asks,
         17.0,
-        TRUTH["damping"],
-        armature=TRUTH["armature"],
-        frictionloss=TRUTH["frictionloss"],
+        KNOWN["damping"],
+        armature=KNOWN["armature"],
+        frictionloss=KNOWN["frictionloss"],
         noise=noise,
     )
     late = round(LATE_S * 500.0)
@@ -46,9 +46,9 @@ def test_the_drive_is_found_again() -> None:
     result = match_drives([sweep("FR_knee")], ROBOT)
     found = result.gains.joints["FR_knee"]
     assert found.stiffness == 17.0
-    assert found.damping == pytest.approx(TRUTH["damping"], rel=0.02)
-    assert found.armature == pytest.approx(TRUTH["armature"], rel=0.02)
-    assert found.frictionloss == pytest.approx(TRUTH["frictionloss"], rel=0.05)
+    assert found.damping == pytest.approx(KNOWN["damping"], rel=0.02)
+    assert found.armature == pytest.approx(KNOWN["armature"], rel=0.02)
+    assert found.frictionloss == pytest.approx(KNOWN["frictionloss"], rel=0.05)
     assert found.delay_s == pytest.approx(LATE_S, abs=2e-4)
     low, high = found.damping_ci95
     assert low < found.damping < high
@@ -61,14 +61,14 @@ def test_what_magnitude_and_phase_cannot_tell_is_refused_with_the_cure() -> None
     everything = ("stiffness", "damping", "armature", "frictionloss", "delay")
     with pytest.raises(IdentifiabilityError) as refused:
         match_drives([log], ROBOT, free=everything)
-    said = str(refused.value)
-    assert said.startswith("FR_knee: these data cannot tell apart ")
+    message = str(refused.value)
+    assert message.startswith("FR_knee: ")
     for name in ("stiffness", "armature", "payload", "torque"):
-        assert name in said
+        assert name in message
 
 
 def test_unknown_parameters_are_refused() -> None:
-    with pytest.raises(PronkError, match="free parameters inertia; expected some of stiffness"):
+    with pytest.raises(PronkError, match=r"inertia.*stiffness"):
         match_drives([sweep("FR_knee")], ROBOT, free=("damping", "inertia"))
-    with pytest.raises(PronkError, match="free parameters none"):
+    with pytest.raises(PronkError, match="none"):
         match_drives([sweep("FR_knee")], ROBOT, free=())

@@ -65,9 +65,9 @@ def test_table_i_gives_the_papers_training_gains(rule: str) -> None:
 def test_paper_rule_gives_the_papers_ranges_and_says_a13_aloud() -> None:
     groups = group_gains(ROBOT, table_i(), rule="paper")
     assert {(g.stiffness_range, g.damping_range) for g in groups.values()} == {(2.0, 0.05)}
-    said = coverage(ROBOT, groups, table_i())
-    assert list(said) == ["FL_hip_roll"]
-    assert said["FL_hip_roll"] == (
+    message = coverage(ROBOT, groups, table_i())
+    assert list(message) == ["FL_hip_roll"]
+    assert message["FL_hip_roll"] == (
         "damping 0.516 N m s/rad lies outside the hip_roll range 0.45 +- 0.05",
     )
 
@@ -118,10 +118,10 @@ def test_every_interval_and_ellipse_is_inside(rows: list[tuple[float, ...]]) -> 
     assert reach_k > one_less[0] or group.stiffness_range == 0.5
 
 
-def test_interval_outside_the_range_is_told_from_a_value_outside() -> None:
+def test_interval_outside_the_range_differs_from_a_value_outside() -> None:
     groups = group_gains(ROBOT, {"FR_knee": joint(21.5, 0.55)})
-    said = coverage(ROBOT, groups, {"FR_knee": joint(21.5, 0.55, (0.9, 0.01))})
-    assert "its interval 20.6 to 22.4 does not" in said["FR_knee"][0]
+    message = coverage(ROBOT, groups, {"FR_knee": joint(21.5, 0.55, (0.9, 0.01))})
+    assert "its interval 20.6 to 22.4 does not" in message["FR_knee"][0]
 
 
 def test_enclosing_ellipse_of_a_square_is_its_circumcircle() -> None:

@@ -19,14 +19,14 @@ from pronk.match.sample_mask import trusted_frequency, trusted_samples
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation, JointDrive, held_mean, moves_together
 
-SO101 = Path(__file__).resolve().parents[2] / "shared" / "data" / "so101"
+SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the SO-101 recordings are not here")
 
 ARM = load_robot("so101")
 JOINTS = ARM.joint_names[:5]
 COUNT = 2.0 * np.pi / 4096
 """Encoder of the servo: 12 bits."""
-TRUTH = {
+KNOWN = {
     name: JointDrive(
         stiffness=17.8,
         damping=0.75 + 0.1 * i,
@@ -59,28 +59,28 @@ def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) ->
     )
 
 
-def answered(log: SweepLog, truth: dict[str, JointDrive]) -> SweepLog:
+def recorded_with(log: SweepLog, known: dict[str, JointDrive]) -> SweepLog:
     """What an arm with these drives and 12-bit encoders would have recorded."""
     with ChainSimulation(ARM, [log]) as bench:
-        position = bench.run([truth])[0][0]
+        position = bench.run([known])[0][0]
     return replace(log, position=np.round(position / COUNT) * COUNT)
 
 
 def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
-    log = answered(commands(65.0, (0.15, 8.0), 0.35), TRUTH)
+    log = recorded_with(commands(65.0, (0.15, 8.0), 0.35), KNOWN)
     fit = fit_arm([log], ARM)
-    for name, truth in TRUTH.items():
+    for name, known in KNOWN.items():
         joint = fit.joints[name]
-        assert joint.drive.stiffness == truth.stiffness
-        assert joint.drive.damping == pytest.approx(truth.damping, rel=0.03)
-        assert joint.drive.armature == pytest.approx(truth.armature, rel=0.08)
-        assert joint.drive.frictionloss == pytest.approx(truth.frictionloss, rel=0.05)
-        assert joint.drive.delay == pytest.approx(truth.delay, abs=1e-3)
+        assert joint.drive.stiffness == known.stiffness
+        assert joint.drive.damping == pytest.approx(known.damping, rel=0.03)
+        assert joint.drive.armature == pytest.approx(known.armature, rel=0.08)
+        assert joint.drive.frictionloss == pytest.approx(known.frictionloss, rel=0.05)
+        assert joint.drive.delay == pytest.approx(known.delay, abs=1e-3)
         assert joint.rmse < 1e-3 < joint.published_rmse
 
 
 def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
-    log = answered(commands(65.0, (0.05, 0.4), 0.1), TRUTH)
+    log = recorded_with(commands(65.0, (0.05, 0.4), 0.1), KNOWN)
     with pytest.raises(IdentifiabilityError) as refused:
         fit_arm([log], ARM)
     assert "armature" in str(refused.value)
@@ -89,9 +89,9 @@ def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
 
 def test_too_short_and_misspelled_are_refused() -> None:
     log = commands(30.0, (0.2, 3.0), 0.2)
-    with pytest.raises(LogError, match="intervals need at least 3"):
+    with pytest.raises(LogError, match="at least 3"):
         fit_arm([log], ARM)
-    with pytest.raises(PronkError, match="expected some of stiffness, damping"):
+    with pytest.raises(PronkError, match="stiffness, damping"):
         fit_arm([log], ARM, parameters=("kd",))
     with pytest.raises(LogError, match="at least one"):
         fit_arm([], ARM)
@@ -101,7 +101,7 @@ def test_too_short_and_misspelled_are_refused() -> None:
 
 def test_still_arm_is_refused() -> None:
     log = commands(30.0, (0.2, 3.0), 0.0)
-    with pytest.raises(LogError, match="asked to move in radians"):
+    with pytest.raises(LogError, match="radians"):
         ChainSimulation(ARM, [log])
 
 
@@ -114,7 +114,7 @@ def test_held_mean_is_the_command_on_the_grid_and_its_share_off_it() -> None:
     assert held_mean(time, command, np.array([-1.0, -0.5])) == pytest.approx([0.0])
 
 
-def test_moving_together_is_told_from_taking_turns() -> None:
+def test_moving_together_differs_from_taking_turns() -> None:
     log = commands(10.0, (0.2, 3.0), 0.2)
     assert moves_together(log)
 
@@ -172,12 +172,12 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
 
 
 @recorded
-def test_what_the_recording_does_not_tell_is_held_and_said(matched: MatchResult) -> None:
+def test_what_the_recording_does_not_identify_is_held_and_flagged(matched: MatchResult) -> None:
     # No gravity about shoulder_pan: only the ratios of its parameters can be seen.
     assert "stiffness" in matched.joints["shoulder_pan"].held
     pan = matched.gains.joints["shoulder_pan"]
     assert pan.stiffness == ARM.joint("shoulder_pan").stiffness
-    assert any("stiffness held at 17.8: these recordings do not tell it" in f for f in pan.flags)
+    assert any("stiffness held at 17.8" in f for f in pan.flags)
     for name in ("shoulder_lift", "elbow_flex"):
         low, high = matched.gains.joints[name].stiffness_ci95
         assert high - low < 0.3 * matched.gains.joints[name].stiffness
