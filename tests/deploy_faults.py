@@ -34,7 +34,7 @@ class FaultyLink:
     """Share of the states that is lost."""
     robot: str = "mini_cheetah"
 
-    def __call__(self) -> Faulty:
+    def __call__(self, clamp_operator: object = None) -> Faulty:
         return Faulty(Link(robot=self.robot, address=Address.parse("sim://bench"))(), self)
 
 

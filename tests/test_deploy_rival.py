@@ -57,7 +57,7 @@ class PatientLink:
     address: Address
     robot: str = ROBOT.name
 
-    def __call__(self) -> Machine:
+    def __call__(self, clamp_operator: object = None) -> Machine:
         fresh = Freshness(share=0.02, longest_gap_s=10.0)
         return self.address.machine(ROBOT, exclusive_s=0.5, fresh=fresh)
 

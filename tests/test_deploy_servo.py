@@ -38,7 +38,7 @@ class Unopened:
 
     robot: str = "mini_cheetah"
 
-    def __call__(self) -> Machine:
+    def __call__(self, clamp_operator: object = None) -> Machine:
         raise HardwareError("the library of the link is not installed.")
 
 

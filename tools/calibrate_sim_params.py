@@ -24,7 +24,7 @@ from pronk.logs.mcap_reader import read_mcap
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
-from pronk.runtime.sweep.record import record
+from pronk.runtime.sweep import record
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import (
     SCHEMA,

@@ -94,7 +94,7 @@ def _record_leg(
     told: queue.Queue[tuple[str, float]],
 ) -> list[Path]:
     """Ask one leg; runs in a process of its own."""
-    from pronk.runtime.sweep.record import record
+    from pronk.runtime.sweep import record
     from pronk.virtual.robot import VirtualRobot
     from pronk.virtual.sim_params import load_sim_params
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from pronk.links.address import Address
     from pronk.links.state_checks import Freshness
     from pronk.robots.robot import Robot
-    from pronk.runtime.sweep.record_subprocess import Recorded
-    from pronk.runtime.sweep.servo import Timing
+    from pronk.runtime.ipc import Event
+    from pronk.runtime.run import Recorded
 
 
 def record_wire(
@@ -26,54 +26,56 @@ def record_wire(
     release: bool = False,
     overwrite: bool = False,
     real_time: bool = False,
-    timing: Timing | None = None,
+    limits: Mapping[str, float] | None = None,
     fresh: Freshness | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Recorded:
-    """Ask a robot over a wire, all joints over one connection that a process of its own has.
+    """Sweep a robot in real time, all joints over one connection of the servo's process.
 
     Args:
         robot: The robot.
-        plan: What to ask; checked by the caller.
+        plan: What to excite; checked by the caller.
         out_dir: Folder for the logs.
         address: Where it is.
         release: Make its own controller let go of the joints first.
         overwrite: Replace logs that are already there.
-        real_time: Ask the system for real-time scheduling, and say what it answered.
-        timing: Of the servo; the usual if None.
+        real_time: Request real-time scheduling, and report what was granted.
+        limits: Other values for scalar limits of the safety filter.
         fresh: How fresh states must be at first; the usual if None.
-        progress: Told the share done, 0 to 1.
+        progress: Called with the share done, 0 to 1.
 
     Raises:
-        PronkError: The robot may not be moved or breached a limit, or the servo's process was
-            killed; what was recorded until then stays.
+        PronkError: The robot may not be moved or the filter stopped it, or a process was killed;
+            what was recorded until then stays.
     """
-    from pronk.runtime.sweep.record_subprocess import record_apart
-    from pronk.runtime.sweep.servo import Timing
-    from pronk.runtime.sweep.servo_process import Job
+    from pronk.runtime.link import Link
+    from pronk.runtime.plan import Plan
+    from pronk.runtime.run import run_sweep
+    from pronk.runtime.sweep import SweepTask
 
-    job = Job(
-        robot=robot,
-        plan=plan,
-        out_dir=out_dir,
-        address=address,
-        release=release,
-        overwrite=overwrite,
-        real_time=real_time,
-        timing=timing or Timing(),
-        fresh=fresh,
-    )
-    logs: list[Path] = []
+    rate = Plan.servo_rate_hz
+    metadata = {"link": str(address), "servo_rate_hz": f"{rate:g}"}
+    task = SweepTask(plan=plan, out_dir=out_dir, overwrite=overwrite, metadata=metadata)
+    link = Link(robot=robot.name, address=address, release=release, fresh=fresh)
+    whole: list[str] = []
+
+    def tell(event: Event) -> None:
+        if event.kind == "log":
+            whole.append(event.text)
+        elif event.kind == "system" and real_time:
+            console.say(event.text)
+
+    job = Plan(link=link, sweep=task, real_time=real_time, limits=limits or {})
     try:
-        return record_apart(
-            job,
-            clamp_operator=confirm.Person(),
-            progress=progress,
-            say=console.say,
-            begun=logs.append,
-        )
+        return run_sweep(job, clamp_operator=confirm.Person(), tell=tell, progress=progress)
     except BaseException:
-        _say_what_is_kept(out_dir, logs)
+        cut = [path.name for path in task.paths if path.exists() and path.name not in whole]
+        if whole or cut:
+            console.warn(
+                f"ended early; in {out_dir} are kept {', '.join(whole) or 'no whole log'} whole"
+                + (f", and {cut[0]} up to the end" if cut else "")
+                + "; sweep the others with --joints"
+            )
         raise
 
 
@@ -85,13 +87,3 @@ def tell(recorded: Recorded, out_dir: Path) -> None:
         f"servo: {late['n']} ticks, late by {late['p50_ms']:.2f} ms (median), "
         f"{late['p99_ms']:.2f} ms (99 %), {late['max_ms']:.1f} ms at most; {late['missed']} missed"
     )
-
-
-def _say_what_is_kept(out_dir: Path, logs: list[Path]) -> None:
-    """One line on the logs that were begun; the last one is that which was cut short."""
-    if logs:
-        whole = f"{', '.join(path.stem for path in logs[:-1])} whole, and " if logs[1:] else ""
-        console.warn(
-            f"ended early; in {out_dir} are kept {whole}what was recorded until then of "
-            f"{logs[-1].stem}; ask the others with --joints"
-        )

@@ -51,7 +51,7 @@ from pronk.match.measured_joint import SimRequest, logs_by_joint, measured_joint
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots.robot import Robot
-from pronk.runtime.sweep.record import record
+from pronk.runtime.sweep import record
 from pronk.simulators.mujoco import MujocoSimulator
 from pronk.virtual.plant import legs_of
 from pronk.virtual.robot import VirtualRobot

@@ -176,6 +176,8 @@ class Mode(IntEnum):
     """On the way down."""
     FAULT = 7
     """Joints damped by a fault."""
+    SWEEP = 9
+    """Joints are excited one after another."""
     ENDED = 8
     """The link is closed."""
 
@@ -193,6 +195,8 @@ class OperatorRequest(IntEnum):
     """Stop, sit down, damp."""
     RESET = 5
     """The cause of a latched fault is gone."""
+    CLAMPED = 7
+    """The joints of a sweep are clamped as reported."""
     QUIT = 6
     """Damp and leave."""
 
@@ -211,7 +215,16 @@ _STATE: list[Any] = [
     ("temperature", "<f8", JOINTS),
 ]
 
-STATE = np.dtype([*_STATE, ("now", "<f8"), ("start", "<f8"), ("mode", "<i8"), ("entry", "<i8")])
+STATE = np.dtype(
+    [
+        *_STATE,
+        ("now", "<f8"),
+        ("start", "<f8"),
+        ("mode", "<i8"),
+        ("entry", "<i8"),
+        ("progress", "<f8"),
+    ]
+)
 """Servo to all, every tick: the newest state, the time of tick 0, the mode and how often it has
 changed."""
 
@@ -288,6 +301,36 @@ STEP = np.dtype(
     ]
 )
 """Policy to logger, every step."""
+
+
+class SampleKind(IntEnum):
+    """What a record of `SAMPLE` holds."""
+
+    SAMPLE = 0
+    OPEN = 1
+    """A log begins; `number` is its place in the task, `text` the torque's kind."""
+    SEGMENT = 2
+    """An excitation begins; `number` is its place in the log."""
+    END = 3
+    """The log ends; `text` says why, empty if it is whole."""
+
+
+SAMPLE = np.dtype(
+    [
+        ("kind", "<i8"),
+        ("number", "<i8"),
+        ("time", "<f8"),
+        ("command", "<f8", JOINTS),
+        ("position", "<f8", JOINTS),
+        ("velocity", "<f8", JOINTS),
+        ("torque", "<f8", JOINTS),
+        ("frequency", "<f8"),
+        ("virtual", "<i8"),
+        ("text", "S240"),
+    ]
+)
+"""Servo to logger during a sweep, in the order of the log; `number` of a sample is that of its
+excitation, -1 between."""
 
 VIRTUAL, REAL = "the virtual robot", "a real robot"
 """Text of the event `robot`."""
@@ -389,6 +432,7 @@ class Names:
     steps: str
     events: str
     policy_events: str
+    samples: str
     events_seen: str
 
 
@@ -413,6 +457,8 @@ class Shared:
         """Policy to logger."""
         self.events = Ring(EVENT, _EVENTS, called("events"))
         """Servo to logger."""
+        self.samples = Ring(SAMPLE, _TICKS, called("samples"))
+        """Servo to logger, during a sweep."""
         self.policy_events = Ring(EVENT, _EVENTS, called("policy_events"))
         """Policy to logger."""
         self.events_seen = Ring(EVENT, _EVENTS, called("events_seen"))
@@ -425,7 +471,12 @@ class Shared:
 
     def dropped(self) -> dict[str, int]:
         """Records that found no room on their way to the logger."""
-        queues = {"ticks": self.ticks, "steps": self.steps, "events": self.events}
+        queues = {
+            "ticks": self.ticks,
+            "steps": self.steps,
+            "events": self.events,
+            "samples": self.samples,
+        }
         return {name: ring.dropped for name, ring in queues.items()}
 
     def close(self) -> None:

@@ -8,7 +8,9 @@ from typing import Protocol
 
 from pronk.links.address import Address
 from pronk.links.machine import Command, Machine, State, TorqueKind
+from pronk.links.network_link import ClampOperator
 from pronk.links.realtime import sleep_until
+from pronk.links.state_checks import Freshness
 from pronk.virtual.robot import VirtualRobot
 
 
@@ -19,8 +21,8 @@ class Opener(Protocol):
     def robot(self) -> str:
         """Name of the robot that it opens."""
 
-    def __call__(self) -> Machine:
-        """The machine."""
+    def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
+        """The machine; `clamp_operator` fixes joints on a real bench."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +33,10 @@ class Link:
     address: Address = field(default_factory=Address)
     release: bool = False
     """Make the robot's own controller let go of the joints first."""
+    fresh: Freshness | None = None
+    """How fresh states must be at first; the usual if None."""
 
-    def __call__(self) -> Machine:
+    def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
         """Make the machine, not yet connected; the virtual robot in real time.
 
         Raises:
@@ -40,7 +44,12 @@ class Link:
         """
         from pronk.robots import load_robot
 
-        machine = self.address.machine(load_robot(self.robot), release=self.release)
+        machine = self.address.machine(
+            load_robot(self.robot),
+            clamp_operator=clamp_operator,
+            release=self.release,
+            fresh=self.fresh,
+        )
         return Paced(machine) if isinstance(machine, VirtualRobot) else machine
 
     @property

@@ -36,7 +36,9 @@ from pronk.files import sha256
 from pronk.links.terminal import leave
 from pronk.policy.layout import MEASURED_SIZE
 from pronk.runtime.ipc import VIRTUAL, Mode, Names, Shared
+from pronk.runtime.plan import Plan
 from pronk.runtime.safety import FilterAction, Reason
+from pronk.runtime.sweep import SweepLogs
 
 if TYPE_CHECKING:
     from pronk.logs.mcap_stream import Record
@@ -364,11 +366,11 @@ _LAST_S = 6.0
 link for three at most [s]."""
 
 
-def write_log(path: Path, header: dict[str, Any], names: Names, talk: Connection) -> None:
+def write_log(plan: Plan, header: dict[str, Any], names: Names, talk: Connection) -> None:
     """Body of the logger's process; ends when it is told to, or after the servo if nobody can.
 
     Args:
-        path: MCAP file.
+        plan: Of the run.
         header: What is known beforehand.
         names: Of the shared memory.
         talk: Where it says that the file is open, or why not, and where the word to end comes
@@ -378,17 +380,23 @@ def write_log(path: Path, header: dict[str, Any], names: Names, talk: Connection
     parent = os.getppid()
     shared = Shared(names)
     try:
-        _write(path, header, shared, talk, parent)
+        if plan.sweep is not None:
+            _write(SweepLogs(plan.sweep), shared, talk, parent)
+        else:
+            assert plan.log is not None
+            _write(DeployLogWriter(plan.log, header), shared, talk, parent)
     except LogError as error:
         talk.send_bytes(str(error).encode())
+    except OSError as error:
+        why = f"the log cannot be written ({error}); free the disk or give another folder."
+        talk.send_bytes(why.encode())
     finally:
         shared.close()
 
 
 def _write(
-    path: Path, header: dict[str, Any], shared: Shared, talk: Connection, parent: int
+    writer: DeployLogWriter | SweepLogs, shared: Shared, talk: Connection, parent: int
 ) -> None:
-    writer = DeployLogWriter(path, header)
     talk.send_bytes(READY)
     flushed = time.monotonic()
 
@@ -411,6 +419,10 @@ def _write(
         while _moving(shared) and time.monotonic() < until:
             keep()
     _drain(writer, shared)
+    if isinstance(writer, SweepLogs):
+        # The servo ended its log, unless it was killed.
+        writer.end(complete=False, reason=figures.get("reason", "the servo's process was killed"))
+        return
     writer.end(complete=bool(figures) and not any(shared.dropped().values()), figures=figures)
 
 
@@ -420,8 +432,13 @@ def _moving(shared: Shared) -> bool:
     return record is not None and Mode(int(record["mode"])) is not Mode.ENDED
 
 
-def _drain(writer: DeployLogWriter, shared: Shared) -> None:
+def _drain(writer: DeployLogWriter | SweepLogs, shared: Shared) -> None:
     """Everything that waits, events first: they say what the rest means."""
+    if isinstance(writer, SweepLogs):
+        for record in shared.samples.take(4096):
+            writer.replay(record)
+        shared.events.take()
+        return
     for ring in (shared.events, shared.policy_events):
         for record in ring.take():
             writer.event(record)

@@ -12,6 +12,7 @@ from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.runtime.link import Opener
 from pronk.runtime.safety import Limits
+from pronk.runtime.sweep import SweepTask
 from pronk.runtime.trajectories import Timing
 
 SERVO_PRIORITY, POLICY_PRIORITY = 60, 50
@@ -20,10 +21,12 @@ SERVO_PRIORITY, POLICY_PRIORITY = 60, 50
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A deployment."""
+    """One run: a policy or a sweep on a machine."""
 
     link: Opener
-    policy: Path
+    policy: Path | None = None
+    sweep: SweepTask | None = None
+    """Instead of a policy."""
     log: Path | None = None
     """MCAP file; None for no log."""
     capture: Path | None = None
@@ -47,6 +50,8 @@ class Plan:
         Raises:
             HardwareError: Names the field.
         """
+        if (self.policy is None) == (self.sweep is None):
+            raise HardwareError("a run needs either a policy or a sweep.")
         for name in ("servo_rate_hz", "action_valid_s", "operator_timeout_s"):
             if not getattr(self, name) > 0.0:
                 raise HardwareError(f"Plan.{name} is {getattr(self, name)}; it must be positive.")
@@ -54,10 +59,12 @@ class Plan:
     @property
     def robot(self) -> Robot:
         """What the link's machine is."""
-        return load_robot(self.link.robot)
+        return load_robot(self.link.robot) if self.sweep is None else self.sweep.plan.robot
 
     def safety(self) -> Limits:
         """The limits of the safety filter."""
+        if self.sweep is not None:
+            return self.sweep.limits("absent", **self.limits)
         return Limits.of(self.robot, **self.limits)
 
     def wanted(self, priority: int, core: int) -> Wanted:

@@ -50,8 +50,10 @@ def serve_policy(plan: Plan, names: Names, end: Connection) -> None:
         end: Where the figures of the run go when it is over, as JSON.
     """
     leave()
+    policy = plan.policy
+    assert policy is not None
     shared = Shared(names)
-    thinker = PolicyProcess(plan, shared, load_policy(plan.policy))
+    thinker = PolicyProcess(plan, shared, load_policy(policy))
     signal.signal(signal.SIGTERM, lambda *_: thinker.stop())
     for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
         shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -16,15 +17,16 @@ import orjson
 
 from pronk import __version__
 from pronk.errors import HardwareError, LogError, PronkError
+from pronk.links.network_link import ClampOperator
 from pronk.links.terminal import Interrupts, unheard
 from pronk.policy.contract import check
-from pronk.policy.runtime import load_policy
+from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared
 from pronk.runtime.log import READY, write_log
 from pronk.runtime.plan import Plan
 from pronk.runtime.policy_process import serve_policy
 from pronk.runtime.servo import serve
-from pronk.runtime.teleop import Operator, OperatorCommand
+from pronk.runtime.teleop import BenchOperator, Operator, OperatorCommand
 
 _RATE_HZ = 50.0
 """Of the operator's program."""
@@ -43,6 +45,8 @@ class RunSummary:
     policy: dict[str, Any] = field(default_factory=dict)
     """Figures of the policy's process; empty if it was killed."""
     events_seen: list[Event] = field(default_factory=list)
+    log_error: str = ""
+    """Why the log could not be written to its end."""
     interrupted: bool = False
     """Whether somebody ended it by a signal: the interrupt key, or the end of the terminal."""
     trained_delay_s: tuple[float, float] = (0.0, 0.0)
@@ -99,15 +103,19 @@ class Deployment:
             ArtefactError: The policy cannot be read, or is not for this robot.
             PronkError: ONNX Runtime is not installed.
         """
-        policy = load_policy(plan.policy)
-        check(policy.contract, plan.robot)
         plan.safety()
         self.plan = plan
-        self.contract = policy.contract
-        self.policy_sha256 = policy.sha256
-        self.summary = RunSummary(trained_delay_s=policy.contract.delay_range_s)
+        self.summary = RunSummary()
+        self._header: dict[str, Any] = {}
+        if plan.policy is not None:
+            policy = load_policy(plan.policy)
+            check(policy.contract, plan.robot)
+            self.summary.trained_delay_s = policy.contract.delay_range_s
+            self._header = _header(plan, policy)
+        if plan.sweep is not None:
+            plan.sweep.check()
         self.servo: BaseProcess
-        self.policy: BaseProcess
+        self.policy: BaseProcess | None = None
         self.logger: BaseProcess | None = None
         self._stick = np.zeros((), dtype=OPERATOR)
         self._open = False
@@ -123,26 +131,28 @@ class Deployment:
         with unheard():
             self.shared = Shared()
         names = self.shared.names
-        trained = self.contract.delay_range_s
+        trained = self.summary.trained_delay_s
         self.write(OperatorCommand())
         self._servo_end, servo_end = context.Pipe(duplex=False)
         self._policy_end, policy_end = context.Pipe(duplex=False)
         self.servo = context.Process(
             target=serve, args=(plan, names, trained, servo_end), name="pronk servo"
         )
-        self.policy = context.Process(
-            target=serve_policy, args=(plan, names, policy_end), name="pronk policy"
-        )
-        if plan.log is not None:
+        if plan.policy is not None:
+            self.policy = context.Process(
+                target=serve_policy, args=(plan, names, policy_end), name="pronk policy"
+            )
+        if plan.log is not None or plan.sweep is not None:
             talk, self._logger_end = context.Pipe()
             self.logger = context.Process(
-                target=write_log, args=(plan.log, self._header(), names, talk), name="pronk log"
+                target=write_log, args=(plan, self._header, names, talk), name="pronk log"
             )
         self._interrupts.__enter__()
         self._open = True
         try:
             with unheard():
-                self.policy.start()
+                if self.policy is not None:
+                    self.policy.start()
                 if self.logger is not None:
                     self.logger.start()
             if self.logger is not None:
@@ -199,13 +209,17 @@ class Deployment:
         self.shared.operator.write(record)
 
     def run(
-        self, operator: Operator, tell: Callable[[Event], None] = lambda notice: None
+        self,
+        operator: Operator,
+        tell: Callable[[Event], None] = lambda event: None,
+        progress: Callable[[float], None] = lambda share: None,
     ) -> RunSummary:
         """Let an operator have the stick until they leave or the servo ends.
 
         Args:
             operator: Says what is wanted, 50 times a second.
-            tell: Called with everything the servo has to say.
+            tell: Called with every event of the servo.
+            progress: Called with the share of a sweep that is done, 0 to 1.
         """
         wake = time.monotonic()
         while True:
@@ -215,8 +229,12 @@ class Deployment:
             mode = self.mode
             if mode is Mode.ENDED:
                 break
+            progress(self._progress())
             try:
-                self.write(operator.command(time.monotonic(), mode))
+                command = operator.command(time.monotonic(), mode)
+                if self.plan.sweep is not None and not self._logging():
+                    command = OperatorCommand(request=OperatorRequest.QUIT)
+                self.write(command)
             except KeyboardInterrupt:
                 self.summary.interrupted = True
                 self.write(OperatorCommand(request=OperatorRequest.QUIT))
@@ -236,10 +254,11 @@ class Deployment:
             if self.servo.pid is not None:
                 self._stop_servo()
             self.summary.servo = _received(self._servo_end)
-            if self.policy.pid is not None:
+            if self.policy is not None and self.policy.pid is not None:
                 self.policy.terminate()
                 self.policy.join(_END_S)
-            self.summary.policy = _received(self._policy_end)
+            if self.policy is not None:
+                self.summary.policy = _received(self._policy_end)
             self.events_seen()
             if self.logger is not None and self.logger.pid is not None:
                 self._stop_logger(self.logger)
@@ -263,11 +282,25 @@ class Deployment:
             self.servo.join(_END_S)
 
     def _stop_logger(self, logger: BaseProcess) -> None:
+        summary = self.summary
+        figures = summary.figures()
+        if not summary.servo:
+            figures["reason"] = "the servo's process was killed"
         try:
-            self._logger_end.send_bytes(orjson.dumps(self.summary.figures()))
-        except OSError:
-            return  # it was killed; what it flushed is there
+            if self._logger_end.poll():
+                summary.log_error = self._logger_end.recv_bytes().decode()
+            self._logger_end.send_bytes(orjson.dumps(figures))
+        except (OSError, EOFError):
+            summary.log_error = summary.log_error or "the process that writes the log was killed"
+            return  # what it flushed is there
         logger.join(_END_S)
+
+    def _logging(self) -> bool:
+        return self.logger is not None and self.logger.is_alive()
+
+    def _progress(self) -> float:
+        record = self.shared.state.read()
+        return 0.0 if record is None else float(record["progress"])
 
     def _await_logger(self, logger: BaseProcess) -> None:
         until = time.monotonic() + _START_S
@@ -293,32 +326,6 @@ class Deployment:
                     f"the link was not open after {_START_S:.0f} s; check the robot and the cable."
                 )
 
-    def _header(self) -> dict[str, Any]:
-        import onnxruntime
-
-        robot, limits = self.plan.robot, self.plan.safety()
-        link = self.plan.link
-        return {
-            "robot": robot.name,
-            "joints": list(robot.joint_names),
-            "link": str(link),
-            "policy": {
-                "file": str(self.plan.policy),
-                "sha256": self.policy_sha256,
-                "gains": self.contract.gains,
-                "gains_sha256": self.contract.gains_sha256,
-                "delay_range_s": list(self.contract.delay_range_s),
-                "jump": self.contract.jump,
-                "virtual": self.contract.virtual,
-            },
-            "limits": {
-                name: value.tolist() if isinstance(value, np.ndarray) else value
-                for name, value in vars(limits).items()
-            },
-            "timing": vars(self.plan.timing),
-            "versions": {"pronk": __version__, "onnxruntime": onnxruntime.__version__},
-        }
-
 
 def _received(end: Connection) -> dict[str, Any]:
     """What a process said when it ended; nothing if it could not."""
@@ -342,3 +349,90 @@ def run(plan: Plan, operator: Operator, tell: Callable[[Event], None]) -> RunSum
     if not summary.servo:
         raise PronkError("the servo's process was killed; the robot's own watchdog had to stop it.")
     return summary
+
+
+def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
+    """Of a policy's log."""
+    import onnxruntime
+
+    robot, limits = plan.robot, plan.safety()
+    link = plan.link
+    return {
+        "robot": robot.name,
+        "joints": list(robot.joint_names),
+        "link": str(link),
+        "policy": {
+            "file": str(plan.policy),
+            "sha256": policy.sha256,
+            "gains": policy.contract.gains,
+            "gains_sha256": policy.contract.gains_sha256,
+            "delay_range_s": list(policy.contract.delay_range_s),
+            "jump": policy.contract.jump,
+            "virtual": policy.contract.virtual,
+        },
+        "limits": {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(limits).items()
+        },
+        "timing": vars(plan.timing),
+        "versions": {"pronk": __version__, "onnxruntime": onnxruntime.__version__},
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What a sweep in real time left."""
+
+    logs: list[Path]
+    virtual: bool
+    servo: dict[str, float | int]
+    """Lateness of the servo's ticks, and how many were `missed`."""
+
+    @property
+    def words(self) -> str:
+        """Whose logs they are."""
+        return "the virtual robot" if self.virtual else "a robot that is not the virtual one"
+
+
+def run_sweep(
+    plan: Plan,
+    *,
+    clamp_operator: ClampOperator,
+    tell: Callable[[Event], None] = lambda event: None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Recorded:
+    """Carry out a sweep on a machine in real time.
+
+    Args:
+        plan: With a sweep.
+        clamp_operator: Clamps joints on a real bench; called in a thread of its own.
+        tell: Called with every event.
+        progress: Called with the share done, 0 to 1.
+
+    Raises:
+        PronkError: The robot may not be moved, the filter stopped the sweep, or a process was
+            killed. What was recorded until then stays, a log that reads and says why it ended.
+        KeyboardInterrupt: The run was interrupted; the joints were damped.
+    """
+    assert plan.sweep is not None
+    operator = BenchOperator(clamp_operator)
+    with Deployment(plan) as deployment:
+        summary = deployment.run(operator, tell, progress)
+    servo = summary.servo
+    if not servo:
+        raise HardwareError(
+            "the servo's process was killed; only the robot's own watchdog damps the joints now: "
+            "see to them before anything else."
+        )
+    if summary.interrupted:
+        raise KeyboardInterrupt
+    if operator.error is not None:
+        raise operator.error
+    if summary.log_error:
+        raise HardwareError(f"{summary.log_error}; the joints were damped.")
+    if reasons := summary.refusals or servo["faults"]:
+        raise HardwareError(" ".join(reasons))
+    if not servo["finished"]:
+        raise HardwareError("the sweep was ended (SIGTERM); the joints were damped.")
+    figures = {**servo["lateness"], "missed": servo["missed_ticks"]}
+    return Recorded(logs=plan.sweep.paths, virtual=bool(servo["virtual"]), servo=figures)

@@ -12,6 +12,7 @@ reset.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
@@ -64,6 +65,7 @@ class Reason(IntEnum):
     DEAD_MAN = 19
     ENDED = 20
     LINK = 21
+    OVERLOAD = 22
 
     @property
     def text(self) -> str:
@@ -94,6 +96,7 @@ TEXTS: dict[Reason, str] = {
     Reason.DEAD_MAN: "the dead-man button is not held",
     Reason.ENDED: "the program that the operator sits at has gone",
     Reason.LINK: "the link reports a fault",
+    Reason.OVERLOAD: "a joint's measured torque is beyond its limit",
 }
 
 
@@ -121,6 +124,9 @@ class Limits:
     """Speed at which nothing is left of it [rad/s]."""
     loss: Array
     """Winding loss of each joint, per square of its torque [W / (N m)^2]."""
+    measured_torque: float = math.inf
+    """Largest measured torque of any joint, as a multiple of `torque`; infinite where it is not
+    checked: a policy's landings exceed it for some milliseconds."""
     stiffness: float = 100.0
     """Largest that a command may set; five times what any legged robot of this size runs
     [N m/rad]."""
@@ -174,7 +180,9 @@ class Limits:
             raise RobotError("Limits.margin leaves no room between low and high; make it smaller.")
         for field in fields(self)[1 + len(_ARRAYS) :]:
             value = getattr(self, field.name)
-            if not value > 0 or (math.isinf(value) and field.name != "tilt"):
+            if not value > 0 or (
+                math.isinf(value) and field.name not in ("tilt", "measured_torque")
+            ):
                 raise RobotError(f"Limits.{field.name} is {value}; it must be positive.")
         if not self.hold_s <= self.damp_s <= self.latch_s:
             raise RobotError(
@@ -232,6 +240,8 @@ class SafetyInput:
     """Measured [rad]. (..., n)"""
     velocity: Array
     """Measured [rad/s]. (..., n)"""
+    torque: Array
+    """Measured [N m]; NaN where it is not. (..., n)"""
     orientation: Array
     """Trunk to world, unit quaternion w, x, y, z. (..., 4)"""
     gyro: Array
@@ -346,6 +356,11 @@ def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
         # Last of the measurements: the others say more about why nothing fits.
         (Reason.IMPOSSIBLE, FilterAction.LATCH, ~possible),
         (Reason.DEAD_MAN, FilterAction.DAMP, ~given.held),
+        (
+            Reason.OVERLOAD,
+            FilterAction.LATCH,
+            (np.abs(given.torque) > limits.torque * limits.measured_torque).any(axis=-1),
+        ),
     )
     found = np.stack([met for _, _, met in faults], axis=-1)
     first = found.argmax(axis=-1)
@@ -503,61 +518,72 @@ def filtered(
     t: float,
     *,
     held: bool = True,
+    earlier: Sequence[State] = (),
 ) -> tuple[Command | None, FilterDecision, FilterState]:
-    """What may be sent of a command.
+    """Apply the rules to one command.
 
     Args:
         state: The newest.
-        command: What is given.
+        command: Requested.
         memory: From the tick before.
         limits: The limits.
         t: Now, on the machine's clock [s].
         held: Whether the dead-man button is held.
+        earlier: Other states since the tick before; a fault in any of them counts.
 
     Returns:
         The command to send, None for damping; why; and the memory for the next tick.
     """
     n = len(limits.joints)
-    position = _numbers(state.position, n)
-    # Temperatures that are not measured are NaN, and NaN is not hot.
-    temperature = _numbers(state.temperature, n)
-    answers = command.state_sequence >= 0
-    judged = apply_rules(
+    states = (*earlier, state)
+    rows = (len(states),)
+    position = _stacked([each.position for each in states], n)
+    last = position[-1] if memory.last is None else memory.last
+
+    def alike(values: object, count: int) -> Array:
+        return np.broadcast_to(_numbers(values, count), (*rows, count))
+
+    result = apply_rules(
         SafetyInput(
             position=position,
-            velocity=_numbers(state.velocity, n),
-            orientation=_numbers(state.orientation, 4),
-            gyro=_numbers(state.gyro, 3),
-            temperature=temperature,
-            state_age=np.asarray(t - state.time),
-            target=_numbers(command.position, n),
-            stiffness=_numbers(command.stiffness, n),
-            damping=_numbers(command.damping, n),
-            command_age=np.asarray(t - command.made),
-            valid_for=np.asarray(command.valid_for, dtype=float),
-            lag=np.asarray(state.sequence - command.state_sequence if answers else 0),
-            last=position if memory.last is None else memory.last,
-            held=np.asarray(held),
+            velocity=_stacked([each.velocity for each in states], n),
+            torque=_stacked([each.torque for each in states], n),
+            orientation=_stacked([each.orientation for each in states], 4),
+            gyro=_stacked([each.gyro for each in states], 3),
+            # Temperatures that are not measured are NaN, and NaN is below every limit.
+            temperature=_stacked([each.temperature for each in states], n),
+            state_age=np.full(rows, t - state.time),
+            target=alike(command.position, n),
+            stiffness=alike(command.stiffness, n),
+            damping=alike(command.damping, n),
+            command_age=np.full(rows, t - command.made),
+            valid_for=np.full(rows, float(command.valid_for)),
+            lag=np.full(
+                rows, state.sequence - command.state_sequence if command.state_sequence >= 0 else 0
+            ),
+            last=np.broadcast_to(last, (*rows, n)),
+            held=np.full(rows, held),
         ),
         limits,
     )
-    level, reason = FilterAction(int(judged.level)), Reason(int(judged.reason))
+    # The worst of the states decides; the newest if none is worse.
+    row = int(np.argmax(result.level >= FilterAction.DAMP)) if len(states) > 1 else 0
+    if result.level[row] < FilterAction.DAMP:
+        row = -1
+    level, reason = FilterAction(int(result.level[row])), Reason(int(result.reason[row]))
     if memory.faulted:
         # A fault can only become worse.
         if level is FilterAction.LATCH and memory.level is FilterAction.DAMP:
             memory = replace(memory, level=level, reason=reason)
-        return (
-            None,
-            FilterDecision(level=memory.level, reason=memory.reason),
-            replace(memory, last=None),
-        )
+        lasting = FilterDecision(level=memory.level, reason=memory.reason)
+        return None, lasting, replace(memory, last=None)
     if level >= FilterAction.DAMP:
-        decision = FilterDecision(
-            level=level, reason=reason, detail=detail(reason, state, command, limits, t)
-        )
+        numbers = detail(reason, states[row], command, limits, t)
+        decision = FilterDecision(level=level, reason=reason, detail=numbers)
         return None, decision, FilterState(level=level, reason=reason, since=t)
-    sent = replace(command, position=judged.target)
-    return sent, FilterDecision(level=level, reason=reason), FilterState(last=judged.target)
+    target = result.target[-1]
+    sent = replace(command, position=target)
+    return sent, FilterDecision(level=level, reason=reason), FilterState(last=target)
 
 
 def fault(memory: FilterState, level: FilterAction, reason: Reason, t: float) -> FilterState:
@@ -586,6 +612,10 @@ def detail(reason: Reason, state: State, command: Command, limits: Limits, t: fl
     if reason is Reason.SPEED:
         i = int(np.argmax(np.abs(v) - limits.speed))
         return f"{limits.joints[i]} {v[i]:.1f} of {limits.speed[i]:.1f} rad/s"
+    if reason is Reason.OVERLOAD:
+        excess = np.abs(state.torque) - limits.torque * limits.measured_torque
+        i = int(np.nanargmax(excess))
+        return f"{limits.joints[i]} {state.torque[i]:.1f} of {limits.torque[i]:.1f} N m"
     if reason is Reason.OVERRUN:
         i = int(np.argmax(np.maximum(limits.low - q, q - limits.high)))
         return f"{limits.joints[i]} {q[i]:.2f}, of {limits.low[i]:.2f} to {limits.high[i]:.2f} rad"
@@ -611,6 +641,10 @@ def tilt(orientation: Array) -> float:
     """
     _, x, y, _ = np.asarray(orientation) / np.linalg.norm(orientation)
     return float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))
+
+
+def _stacked(rows: Sequence[object], count: int) -> Array:
+    return np.stack([_numbers(values, count) for values in rows])
 
 
 def _numbers(values: object, count: int) -> Array:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 import orjson
 
-from pronk.errors import PronkError
+from pronk.errors import HardwareError, PronkError
 from pronk.links.machine import Command, Machine, State
 from pronk.links.realtime import Histogram, Pace, enter, sleep_until
 from pronk.links.terminal import leave
@@ -47,7 +48,8 @@ from pronk.runtime.safety import (
     fault,
     filtered,
 )
-from pronk.runtime.state_machine import PREFLIGHT_S, DesiredCommand, StateMachine
+from pronk.runtime.state_machine import PREFLIGHT_S, VALID_S, DesiredCommand, StateMachine
+from pronk.runtime.sweep import SweepController, SweepRing, SweepTask
 
 _SWITCH_S = 0.5e-3
 """Longest that a thread of the link keeps the loop waiting [s]."""
@@ -112,6 +114,12 @@ class Servo:
         self._parent = os.getppid()
         self._alone = False
         self._seen: list[State] = []
+        self._met: list[State] = []
+        """New states of this tick."""
+        self._sweep: SweepController | None = None
+        self._progress = 0.0
+        self._finished = False
+        self._clamped = threading.Event()
 
     def stop(self) -> None:
         """Damp and end, soon."""
@@ -120,11 +128,12 @@ class Servo:
     def run(self) -> None:
         """Open the machine, tick until told to stop, damp, close."""
         try:
-            machine = self.plan.link()
+            machine = self.plan.link(self._fix)
             self._open(machine)
             while not self._over():
                 self._one(machine)
         except PronkError as error:
+            self.faults.append(str(error))
             self._report("refused", str(error), level=FilterAction.LATCH)
         finally:
             if self._machine is not None:
@@ -145,6 +154,7 @@ class Servo:
             "state_to_command": self.latency.figures(),
             "state_age": self.age.figures(),
             "interventions": self.interventions,
+            "finished": self._finished,
             "faults": self.faults,
             "refusals": list(self.machine_state.refusals),
             # Without a log nobody empties the queues to it, and nothing is lost.
@@ -159,7 +169,11 @@ class Servo:
             return False, now - self.machine_state.since > 10.0 * timeout
         if int(record["requests"]) != self._requests:
             self._requests = int(record["requests"])
-            self.machine_state.request(OperatorRequest(int(record["request"])))
+            request = OperatorRequest(int(record["request"]))
+            if request is OperatorRequest.CLAMPED:
+                self._clamped.set()
+            else:
+                self.machine_state.request(request)
         gone = now - float(record["time"]) > timeout
         return bool(record["held"]) and not gone, gone
 
@@ -203,6 +217,7 @@ class Servo:
         if state is not None:
             put_state(record, state, 0.0)
         record["now"], record["start"] = now, pace.start
+        record["progress"] = self._progress
         record["mode"], record["entry"] = self.machine_state.mode, self.machine_state.entry
         self.shared.state.write(record)
 
@@ -324,6 +339,11 @@ class Servo:
         self.memory = memory
         if memory.faulted:
             self.machine_state.faulted(begun)
+        if self._sweep is not None and mode is Mode.SWEEP:
+            if sent is not None:
+                self._sweep.sent(begun, sent.position)
+            if self.machine_state.mode is not Mode.SWEEP:
+                self._end_sweep()
         if self.machine_state.mode is not mode:
             self._report_mode()
         action = self.action
@@ -331,10 +351,13 @@ class Servo:
         if fresh and action is not None and self.machine_state.mode in _THINKING:
             latency = done - action.state_time
             self.latency.add(max(0.0, latency))
+        if self.plan.sweep is not None:
+            return  # its log is the samples'
         times = (pace.deadline, begun, done)
         self._log_tick(pace.tick, state, times, desired, sent, decision, latency)
 
     def _take(self, met: list[State]) -> None:
+        self._met.clear()
         for state in met:
             state = replace(state, time=state.time + self._offset)
             if self._state is not None:
@@ -346,6 +369,9 @@ class Servo:
                 self.lost += max(0, state.sequence - self._state.sequence - 1)
             self._state = state
             self.states += 1
+            self._met.append(state)
+            if self._sweep is not None:
+                self._sweep.take([state])
             if self.machine_state.mode is Mode.PREFLIGHT:
                 self._seen.append(state)
 
@@ -357,8 +383,61 @@ class Servo:
         self._seen.clear()
         for sentence in found:
             self._report("refused", sentence)
+        if self.plan.sweep is not None:
+            self._begin_sweep(self.plan.sweep)
         self.machine_state.preflighted(found, now)
         self._report_mode()
+
+    # --- a sweep ----------------------------------------------------------------------------------
+
+    def _begin_sweep(self, task: SweepTask) -> None:
+        assert self._machine is not None
+        assert self._state is not None
+        self._sweep = SweepController(
+            task,
+            self._machine,
+            SweepRing(self.shared.samples),
+            state=self._state,
+            real_time=True,
+            progress=self._note_progress,
+            limits=self.plan.limits,
+        )
+        self.limits = self._sweep.limits
+        self.machine_state.controller = self._excite
+
+    def _excite(self, t: float, state: State) -> DesiredCommand | None:
+        """The sweep's command at a tick; None once it is over."""
+        del state
+        sweep = self._sweep
+        assert sweep is not None
+        if self.shared.samples.dropped:
+            raise HardwareError(
+                "the process that writes the log fell behind; the joints were damped; see that "
+                "the disk is not busy."
+            )
+        if sweep.due(t, 0.5 / self.plan.servo_rate_hz):
+            if sweep.advance(t) is None:
+                self._finished = True
+                return None
+            self.limits = sweep.limits
+        return DesiredCommand(command=sweep.command(t, VALID_S), stiffness=1.0)
+
+    def _note_progress(self, share: float, what: str) -> None:
+        self._progress = share
+        if what.startswith("wrote "):
+            self._report("log", what.removeprefix("wrote "))
+
+    def _end_sweep(self) -> None:
+        """End a log that is still open, and say why."""
+        if self._sweep is not None:
+            parent = "the program that started the sweep ended" if self._alone else "interrupted"
+            self._sweep.end(self.faults[-1] if self.faults else parent)
+
+    def _fix(self, joints: tuple[str, ...]) -> None:
+        """Have a person clamp joints; returns when it is done. Runs in a thread of its own."""
+        self._clamped.clear()
+        self._report("clamp", ", ".join(joints))
+        self._clamped.wait()
 
     def _objection(self) -> str:
         if self.plan.ignore_latency or self.machine_state.mode is not Mode.STAND:
@@ -375,7 +454,13 @@ class Servo:
             return None, quiet, replace(memory, last=None)
         needed = self.machine_state.mode is Mode.POLICY
         sent, decision, memory = filtered(
-            state, desired.command, memory, self.limits, now, held=held or not needed
+            state,
+            desired.command,
+            memory,
+            self.limits,
+            now,
+            held=held or not needed,
+            earlier=self._met[:-1],
         )
         if FilterAction.PASS < decision.level < FilterAction.DAMP:
             name = decision.reason.name.lower()
@@ -401,6 +486,7 @@ class Servo:
 
     def _close(self, machine: Machine) -> None:
         """Leave the joints damped, whatever happened before, and keep what the cameras saw."""
+        self._end_sweep()
         quiet = self.machine_state.mode in (Mode.IDLE, Mode.PREFLIGHT)
         try:
             if not quiet and self.machine_state.mode not in (Mode.DAMP, Mode.FAULT):

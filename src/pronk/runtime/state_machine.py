@@ -9,7 +9,7 @@ and requests as arguments and has no clock of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +66,8 @@ class StateMachine:
         self._kd = np.array([joint.damping for joint in robot.joints])
         self._path: Path | None = None
         self._blending: float | None = None
+        self.controller: Callable[[float, State], DesiredCommand | None] | None = None
+        """Of a sweep: what it requests at a time; None once it is over."""
         self._took_over = 0
         """Entry with which the policy took over."""
         self._request = OperatorRequest.NONE
@@ -78,7 +80,11 @@ class StateMachine:
     def preflighted(self, refusals: Sequence[str], t: float) -> None:
         """What the pre-flight checks found: nothing, and the joints are damped; or back to idle."""
         self.refusals = tuple(refusals)
-        self.enter(Mode.IDLE if refusals else Mode.DAMP, t)
+        if self.controller is None:
+            self.enter(Mode.IDLE if refusals else Mode.DAMP, t)
+        else:
+            self._request = OperatorRequest.QUIT if refusals else self._request
+            self.enter(Mode.IDLE if refusals else Mode.SWEEP, t)
 
     def request(self, request: OperatorRequest) -> None:
         """Take a request; it waits until it can be granted or another comes."""
@@ -96,6 +102,8 @@ class StateMachine:
                 if self._request is OperatorRequest.QUIT
                 else OperatorRequest.NONE
             )
+            if self.controller is not None:
+                self._request = OperatorRequest.QUIT
             self.enter(Mode.FAULT, t)
 
     def step(
@@ -123,6 +131,12 @@ class StateMachine:
         memory = self._grant(t, state, memory, objection)
         if self.mode in _SILENT:
             return DesiredCommand(command=None, silent=True), memory
+        if self.mode is Mode.SWEEP and self.controller is not None:
+            desired = self.controller(t, state)
+            if desired is not None:
+                return desired, memory
+            self._request = OperatorRequest.QUIT
+            self.enter(Mode.DAMP, t)
         if self.mode is Mode.STAND and self._path is not None:
             share = self._path.stiffness(t)
             return self._pose(t, self._path.target(t), share), memory

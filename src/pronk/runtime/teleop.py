@@ -7,6 +7,7 @@ import select
 import struct
 import sys
 import termios
+import threading
 import tty
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from pronk.errors import HardwareError
+from pronk.errors import HardwareError, PronkError
+from pronk.links.network_link import ClampOperator
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.script import STILL, Script, Velocity
 
@@ -115,6 +117,41 @@ class ScriptedOperator:
             return OperatorRequest.NONE
         self._asked = mode
         return request
+
+
+class BenchOperator:
+    """Beside a sweep: clamps joints by hand when the servo requests it."""
+
+    def __init__(self, clamp_operator: ClampOperator) -> None:
+        """`clamp_operator` clamps joints; it is called in a thread of its own."""
+        self._clamp = clamp_operator
+        self._next = OperatorRequest.NONE
+        self.error: PronkError | None = None
+        """Why joints could not be clamped."""
+
+    def notified(self, kind: str, text: str) -> None:
+        """Have joints clamped."""
+        if kind == "clamp":
+            joints = tuple(name for name in text.split(", ") if name)
+            threading.Thread(target=self._fix, args=(joints,), daemon=True).start()
+
+    def leave(self) -> None:
+        """No-op: the run requests the end itself."""
+
+    def command(self, now: float, mode: Mode) -> OperatorCommand:
+        """The dead-man button is held; a request once joints are clamped, or cannot be."""
+        del now, mode
+        request, self._next = self._next, OperatorRequest.NONE
+        return OperatorCommand(held=True, request=request)
+
+    def _fix(self, joints: tuple[str, ...]) -> None:
+        try:
+            self._clamp(joints)
+        except PronkError as error:
+            self.error = error
+        except Exception as error:
+            self.error = HardwareError(f"{type(error).__name__}: {error}")
+        self._next = OperatorRequest.CLAMPED if self.error is None else OperatorRequest.QUIT
 
 
 class TimeLimit:

