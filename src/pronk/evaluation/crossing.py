@@ -41,7 +41,7 @@ from pronk.evaluation.trial import (
     build,
     case_rng,
     load_subjects,
-    mass_of,
+    planned_run,
     set_down,
     versions,
 )
@@ -299,26 +299,15 @@ class Search:
         found = []
         for number in range(runs):
             start, seed = draw_start(plan, case, number, self._robot)
-            script = replace(plan.script, command=case.command)
-            row = Row(
-                policy=subject.name,
-                case=case.name,
-                number=number,
-                seed=seed,
-                figures=None,
-                script=script,
-            )
-            job = Job(
-                policy=Path(subject.path),
-                sha256=subject.sha256,
-                robot=self._robot.name,
+            row, job = planned_run(
+                subject,
+                case,
+                number,
+                drawn=(replace(plan.script, command=case.command), start, seed),
+                robot=self._robot,
                 sim_params=self._sim_params,
-                ground=obstacle.on(self._sim_params.ground, case.command, edge),
-                start=start,
-                seed=seed,
-                script=script,
                 rules=plan.rules,
-                mass=mass_of(self._robot),
+                ground=obstacle.on(self._sim_params.ground, case.command, edge),
             )
             found.append((row, Attempt(job=job, obstacle=obstacle, edge=edge, lead=lead)))
         return found

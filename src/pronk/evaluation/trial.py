@@ -50,26 +50,8 @@ CAPTURES, VIDEOS = "captures", "videos"
 """Folders beside the table."""
 _OFFSETS = (1.0, 0.5, 0.0)
 """Shares of the drawn joint offsets that are tried until the robot stands."""
-_CONTRACT = (
-    "robot",
-    "gains",
-    "gains_sha256",
-    "virtual",
-    "policy_rate_hz",
-    "timestep_s",
-    "decimation",
-    "delay_range_s",
-    "command_ranges",
-    "jump",
-    "lift_off_velocity",
-    "joint_names",
-    "stiffness",
-    "damping",
-    "action_scale",
-    "default_position",
-    "versions",
-)
-"""Fields of a policy's contract that a trial keeps."""
+_LEFT_OUT = ("observation", "provenance", "waits_for_stride")
+"""Fields of a policy's contract that a trial does not keep."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,6 +258,59 @@ def mass_of(robot: Robot) -> float:
     return _mass(robot.name)
 
 
+def planned_run(
+    subject: Subject,
+    case: Case,
+    number: int,
+    *,
+    drawn: tuple[Script, Start, int],
+    robot: Robot,
+    sim_params: SimParams,
+    rules: JumpRules,
+    ground: Ground | None = None,
+    keep: tuple[Path, str] | None = None,
+    measure: Callable[..., Any] = measure,
+) -> tuple[Row, Job]:
+    """Return one run as a row without figures, and as a job.
+
+    Args:
+        subject: The policy.
+        case: The command.
+        number: Of the run, from 0.
+        drawn: Script, start and noise seed.
+        robot: The robot of the policy.
+        sim_params: Of the virtual robot.
+        rules: Of the definitions.
+        ground: Under the robot; None for that of the parameters.
+        keep: Folder, and the capture's file in it; None to keep none.
+        measure: From capture to figures.
+    """
+    script, start, seed = drawn
+    row = Row(
+        policy=subject.name,
+        case=case.name,
+        number=number,
+        seed=seed,
+        figures=None,
+        script=script,
+        capture=keep[1] if keep else "",
+    )
+    return row, Job(
+        policy=Path(subject.path),
+        sha256=subject.sha256,
+        robot=robot.name,
+        sim_params=sim_params,
+        ground=ground,
+        start=start,
+        seed=seed,
+        script=script,
+        rules=rules,
+        mass=mass_of(robot),
+        keep=keep[0] / keep[1] if keep else None,
+        measure=measure,
+    )
+
+
 def plan_jobs(
     subjects: Sequence[Subject],
     plan: Plan,
@@ -292,43 +327,27 @@ def plan_jobs(
     With `keep="some"` the captures of the first jump with each command and of those at `RATES` are
     kept.
     """
-    mass, found = mass_of(robot), []
-    numbered = [
-        (case, number)
-        for case in plan.tried
-        for number in range(plan.jumps if case in plan.cases else plan.rates)
-    ]
+    found = []
     for subject in subjects:
-        for case, number in numbered:
-            script, start, seed = draw(plan, case, number, robot)
-            capture = ""
-            if keep == "all" or (keep == "some" and (number == 0 or case not in plan.cases)):
+        for case in plan.tried:
+            for number in range(plan.jumps if case in plan.cases else plan.rates):
                 stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
-                capture = f"{CAPTURES}/{stem}.npz"
-            row = Row(
-                policy=subject.name,
-                case=case.name,
-                number=number,
-                seed=seed,
-                figures=None,
-                script=script,
-                capture=capture,
-            )
-            job = Job(
-                policy=Path(subject.path),
-                sha256=subject.sha256,
-                robot=robot.name,
-                sim_params=sim_params,
-                ground=ground,
-                start=start,
-                seed=seed,
-                script=script,
-                rules=plan.rules,
-                mass=mass,
-                keep=out / capture if capture else None,
-                measure=measure,
-            )
-            found.append((row, job))
+                some = number == 0 or case not in plan.cases
+                kept = keep == "all" or (keep == "some" and some)
+                found.append(
+                    planned_run(
+                        subject,
+                        case,
+                        number,
+                        drawn=draw(plan, case, number, robot),
+                        robot=robot,
+                        sim_params=sim_params,
+                        rules=plan.rules,
+                        ground=ground,
+                        keep=(out, f"{CAPTURES}/{stem}.npz") if kept else None,
+                        measure=measure,
+                    )
+                )
     return found
 
 
@@ -473,8 +492,8 @@ def load_subjects(paths: Sequence[Path], robot: Robot, *, jump: bool = True) -> 
             sha256=policy.sha256,
             contract={
                 key: dict(value) if isinstance(value, Mapping) else value
-                for key in _CONTRACT
-                for value in (getattr(policy.contract, key),)
+                for key, value in vars(policy.contract).items()
+                if key not in _LEFT_OUT
             },
         )
         for name, (path, policy) in zip(names, found, strict=True)

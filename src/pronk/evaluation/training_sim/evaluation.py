@@ -252,22 +252,13 @@ def _summary(
             "too_high": float((np.nan_to_num(high, nan=-1.0) > RISE).mean()),
         },
         figures={name: Spread.of(values) for name, values in columns.items()}
-        | {name: Spread() for name in _NEEDED[bool(jumps)] if name not in columns},
+        | {name: Spread() for name in _NEEDED[bool(jumps)].split() if name not in columns},
     )
 
 
 _NEEDED = (
-    (
-        "speed_error",
-        "yaw_error",
-        "speed_error_averaged",
-        "yaw_error_averaged",
-        "forward",
-        "left",
-        "yaw_rate",
-        "drift",
-    ),
-    ("height", "distance", "along", "lift_off_velocity", "delay", "flights", "high_flights"),
+    "speed_error yaw_error speed_error_averaged yaw_error_averaged forward left yaw_rate drift",
+    "height distance along lift_off_velocity delay flights high_flights",
 )
 """Figures of a walk and of a jump that are there even if no robot has them."""
 
