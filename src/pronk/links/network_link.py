@@ -98,7 +98,7 @@ class NetworkLink(ABC):
         self._fresh = fresh
 
     def connect(self) -> None:
-        """Open the link and check that the robot is fit to move. One or two seconds.
+        """Open the link and check that states come and no other program commands. 1 or 2 s.
 
         Raises:
             HardwareError: A check failed; nothing was written to the robot's joints.
@@ -254,7 +254,7 @@ class NetworkLink(ABC):
 
     @abstractmethod
     def _preflight(self) -> None:
-        """Check that the robot is fit to move, and find out whether it is the virtual one."""
+        """Check states and other programs, and find out whether it is the virtual robot."""
 
     @abstractmethod
     def _shut(self) -> None:

@@ -22,8 +22,8 @@ STATE_RATE_HZ = 500.0
 RATE_SHARE = 0.6
 """Least share of those that must arrive: a link may lose a third and the robot still walks."""
 GRAVITY = 9.81
-GRAVITY_SLACK = 1.5
-"""Between the mean specific force of a robot at rest and gravity [m/s^2]."""
+GRAVITY_SLACK = 1.0
+"""Between the median specific force of a robot at rest and gravity [m/s^2]."""
 ATTITUDE_SLACK = 0.2
 """Between "up" by the accelerometer and by the attitude filter [rad]."""
 NORM_SLACK = 0.02
@@ -110,7 +110,8 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
     if not abs(norm - 1.0) <= NORM_SLACK:
         yield f"the attitude's quaternion has the length {norm:.3f}, expected 1; nobody fills it."
         return
-    force = np.mean([state.accelerometer for state in states], axis=0)
+    # The median, so that one knock on the table does not decide.
+    force = np.median([state.accelerometer for state in states], axis=0)
     size = float(np.linalg.norm(force))
     if not abs(size - GRAVITY) <= GRAVITY_SLACK:
         yield (
