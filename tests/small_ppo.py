@@ -18,7 +18,6 @@ ROBOTS = 32
 STEPS = 4
 ACTIONS = 12
 SIZES = {"measured": 105, "jump": 1, "critic": 96, "critic_jump": 12, "target": 7}
-SIZES |= {"demonstration": 13}
 
 
 @pytest.fixture
@@ -31,12 +30,11 @@ def one_thread() -> Iterator[None]:
 
 
 def observe(rows: int = ROBOTS) -> TensorDict:
-    """Random groups; the jump input, the contacts and whether anything is shown are 0 or 1."""
+    """Random groups of the right sizes; the jump input and the contacts are 0 or 1."""
     groups = {name: torch.randn(rows, size) for name, size in SIZES.items()}
     groups["measured"] = 3.0 * groups["measured"] + 1.0
     groups["jump"] = torch.randint(0, 2, (rows, 1)).float()
     groups["target"][:, :4] = (groups["target"][:, :4] > 0.0).float()
-    groups["demonstration"][:, -1:] = (groups["demonstration"][:, -1:] > 0.0).float()
     return TensorDict(groups, batch_size=[rows])
 
 

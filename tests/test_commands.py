@@ -18,7 +18,6 @@ pytestmark = pytest.mark.train
 import torch
 
 import small_env
-from pronk.policy.stride import MOST_S
 from pronk.train.mdp.commands import MotionCommand, motion_command
 from pronk.train.phases import enter_phase, phase
 
@@ -191,33 +190,6 @@ def test_jump_input_is_held_for_a_random_interval(env: Any, command: MotionComma
         assert max(spans) - min(spans) > 0.85 * (high - low)
 
 
-def test_in_a_script_the_jump_input_may_wait_for_the_stride(
-    env: Any, command: MotionCommand, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A robot whose knees change over is told at once, one that stands after the longest wait."""
-    enter_phase(env, phase("jump_a"))
-    command.reset(EVERYBODY)
-    monkeypatch.setattr(command, "scripted", True)
-    monkeypatch.setattr(command, "waits", True)
-    env.sim.data.qpos[:, 7 + 2 :: 3] = 1.6
-    knee = env.sim.data.qpos[:, 7 + 2]
-    knee[::2] = 1.5
-    command.compute(DT)
-    command.asked[:] = True
-    command.compute(DT)
-    assert not command.jump.any()
-    knee[::2] = 1.7
-    command.compute(DT)
-    assert torch.equal(command.jump, EVERYBODY % 2 == 0)
-    later = watch(command, round(0.3 / DT))
-    assert later[-1].all()
-    # Two steps of the wait were over before.
-    assert (later[:, 1::2].argmax(axis=0) + 2 == round(MOST_S / DT)).all()
-    command.asked[:] = False
-    command.compute(DT)
-    assert not command.jump.any()
-
-
 # --- Who is left alone ----------------------------------------------------------------------------
 
 
@@ -318,7 +290,7 @@ def test_target_in_jump_mode_is_a_leap(
     assert leap[2] == pytest.approx([0.0, -0.675])
     assert leap[3] == [0.0, 0.0]
     # Who was told to jump while .5 m/s too fast is asked for that on top: -.5 becomes -1.175.
-    monkeypatch.setattr(command.tracker, "pace", torch.full((N,), 0.5))
+    monkeypatch.setattr(command.tracker, "lead", torch.full((N,), 0.5))
     leap = command.target[:4].tolist()
     assert leap[0] == pytest.approx([2.85, 0.0])
     assert leap[1] == pytest.approx([-1.88, 1.41])
@@ -457,7 +429,6 @@ def test_a_robot_set_down_beyond_a_gap_has_cleared_it(env: Any, command: MotionC
 
     for _ in range(12):  # so that it is not hasty
         assert not step().any()
-    command.tracker.pace[:] = 0.0  # as if it had run as told
     left = command.motion.foot_position.clone()
     assert command.motion.contact.all()
     qpos[:, 1] += 0.8

@@ -16,6 +16,8 @@ from pronk.errors import PronkError
 
 torch = pytest.importorskip("torch")
 
+from pronk.robots.mini_cheetah import constants as c
+from pronk.robots.mini_cheetah.model import standing_height
 from pronk.train.mdp.jump import JumpSettings, JumpTracker
 
 pytestmark = pytest.mark.train
@@ -32,16 +34,18 @@ SETTINGS = JumpSettings(
     stroke=0.5,
     crouch=0.1875,
     gap=0.75,
+    fall=8.0,
+    fall_s=8 * DT,
+    likeness_width=0.0625,
     haste=1e6,
-    sloth=1e6,
 )
-"""Not even the first step after the command is hasty, and no running start too fast or slow."""
+"""Not even the first step after the command is hasty, and no running start too fast."""
 WAITS = replace(SETTINGS, ready_s=8 * DT)
-CALM = replace(WAITS, haste=0.5, sloth=0.8)
+CALM = replace(WAITS, haste=0.5)
 EVENTS = ("gain", "rise", "reach", "gap", "hop")
 TRACES = (
     *EVENTS,
-    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest"),
+    *("mode", "since", "best", "lowest", "stroke", "lead", "farthest", "widest", "likeness"),
     *("liftoffs", "airborne"),
 )
 
@@ -60,12 +64,14 @@ class Step:
     height: float = 0.3
     speed: float = 0.0
     miss: float = 0.0
+    turn: float = 0.0
     along: float = 0.0
     excess: float = 0.0
     ground: tuple[bool, ...] = (True, False, False, False)
     """Which feet touch it, if not in the air."""
     feet: Feet = STANCE
     way: tuple[float, float] = (0.0, 0.0)
+    stretch: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
     @property
     def contact(self) -> list[bool]:
@@ -98,10 +104,12 @@ def play(
             height=torch.tensor([step.height for step in steps]),
             vertical=torch.tensor([step.speed for step in steps]),
             miss=torch.tensor([step.miss for step in steps]),
+            turn=torch.tensor([step.turn for step in steps]),
             along=torch.tensor([step.along for step in steps]),
             excess=torch.tensor([step.excess for step in steps]),
             feet=torch.tensor([step.feet for step in steps]),
             direction=torch.tensor([step.way for step in steps]),
+            stretch=torch.tensor([step.stretch for step in steps]),
             dt=DT,
         )
         for name in TRACES:
@@ -147,15 +155,26 @@ def test_kernel_of_the_lift_off_velocity(speed: float, width: float, worth: floa
 
 
 @pytest.mark.parametrize(
-    ("miss", "width", "worth"), [(0.0, 0.3, 1.0), (0.3, 0.3, 0.803265), (1.0, 0.1, 0.5)]
+    ("miss", "turn", "width", "worth"),
+    [
+        (0.0, 0.0, 0.3, 1.0),
+        (0.3, 0.0, 0.3, 0.803265),
+        (0.0, 0.8, 0.3, 0.803265),
+        (0.3, 0.8, 0.3, 0.683940),
+        (1.0, 0.0, 0.1, 0.5),
+    ],
 )
-def test_half_the_worth_is_for_going_where_the_command_says(
-    miss: float, width: float, worth: float
+def test_half_the_worth_is_for_going_where_the_command_says_and_level(
+    miss: float, turn: float, width: float, worth: float
 ) -> None:
-    """1/2 + exp(-(miss / width)^2 / 2) / 2: one width off costs half of 1 - exp(-1/2)."""
+    """1/2 + exp(-(miss / width)^2 / 2 - (turn / .8)^2 / 2) / 2.
+
+    One width off costs half of 1 - exp(-1/2), two half of 1 - exp(-1).
+    """
     before = script("011", "000")
-    liftoff = Step(jump=True, air=True, speed=2.5, miss=miss)
-    seen = alone([*before, liftoff], width=0.7, asked=replace(SETTINGS, aim_width=width))
+    liftoff = Step(jump=True, air=True, speed=2.5, miss=miss, turn=turn)
+    asked = replace(SETTINGS, aim_width=width, turn_width=0.8)
+    seen = alone([*before, liftoff], width=0.7, asked=asked)
     assert seen["gain"][-1] == pytest.approx(worth, rel=1e-5)
 
 
@@ -469,16 +488,51 @@ def test_a_running_start_above_the_command_clears_no_gap() -> None:
     assert landing(fast) == pytest.approx({4: 0.25 - 2 * 0.5 * DT})
 
 
-@pytest.mark.parametrize(("excess", "widths"), [(0.5, 1.0), (1.0, 2.0), (-0.8, 1.0), (-1.2, 1.5)])
-def test_a_running_start_off_the_command_takes_worth_from_a_jump(
-    excess: float, widths: float
-) -> None:
-    """By a kernel of what it is too fast or slow as the command comes; later it may be faster."""
+def test_a_running_start_above_the_command_takes_worth_from_a_jump() -> None:
+    """By a kernel of what it is too fast as the command comes; slower, or faster later, by none."""
     told, waits = "1" * 9, "0" * 8 + "1"
-    for pace, worth in ((excess, math.exp(-(widths**2) / 2)), (0.0, 1.0)):
+    for excess, worth in ((0.5, math.exp(-0.5)), (1.0, math.exp(-2.0)), (-1.0, 1.0), (0.0, 1.0)):
         first, *others = script(told, waits, {8: 2.5})
-        steps = [replace(first, excess=pace), *(replace(step, excess=0.7) for step in others)]
+        steps = [replace(first, excess=excess), *(replace(step, excess=0.7) for step in others)]
         assert alone(steps, asked=CALM)["gain"][-1] == pytest.approx(worth)
+
+
+def test_a_countermovement_falls_brakes_and_pushes() -> None:
+    """8 m/s^2 down for 1/8 s, 1/16 m; then 3.5 m/s up in 1/8 s: at rest after 2/7 of that."""
+    times = [0.0, 0.0625, 0.125, 0.125 + 0.125 * 2 / 7, 0.25]
+    rests = 0.0625 + 0.5 * 1.0 * 0.125 * 2 / 7
+    rises = 0.5 * 2.5 * 0.125 * 5 / 7
+    asked = SETTINGS.countermovement(torch.tensor(times))
+    expected = [0.0, -0.015625, -0.0625, -rests, rises - rests]
+    assert asked.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_legs_of_a_countermovement_lie_within_what_a_leg_can_do() -> None:
+    """Between a trunk on its knees and a straight leg."""
+    asked = JumpSettings().countermovement(torch.linspace(0.0, JumpSettings().prompt_s, 100))
+    standing = standing_height() - c.FOOT_RADIUS
+    assert float(asked.min()) + standing + c.FOOT_RADIUS == pytest.approx(0.2, abs=0.01)
+    assert 0.3 < float(asked[-1]) + standing < 0.95 * (c.THIGH_LENGTH + c.SHANK_LENGTH)
+
+
+def test_likeness_is_paid_from_the_command_to_the_first_leap() -> None:
+    """Told in step 2. A stride (in the air at 4, 5) goes on, the leap at 7 ends it."""
+    asked = [-4 * (DT * i) ** 2 for i in range(1, 7)]
+    legs = {i + 2: (way,) * 4 for i, way in enumerate(asked)}
+    legs[4] = (asked[2] - 0.0625,) * 4
+    legs[6] = (asked[4] + 0.0625, asked[4] - 0.125, asked[4], asked[4])
+    told = [
+        replace(step, stretch=legs.get(i, step.stretch))
+        for i, step in enumerate(script("0011111111", "0000110110", {6: 2.0, 7: 2.0}))
+    ]
+    two = (math.exp(-0.5) + math.exp(-2.0) + 2.0) / 4.0
+    expected = [0, 0, 1, 1, math.exp(-0.5), 1, two, 0, 0, 0]
+    assert alone(told)["likeness"] == pytest.approx(expected, abs=1e-6)
+    # Who never leaps is paid up to `prompt_s`, and again from the next command on.
+    waits = alone(script("1" * 20 + "000000000" + "1", "0" * 30))["likeness"]
+    assert all(value > 0.0 for value in waits[:16])
+    assert waits[16:29] == [0] * 13
+    assert waits[29] == waits[0]
 
 
 def test_the_next_command_begins_at_its_own_height() -> None:
@@ -519,6 +573,11 @@ def test_times_in_another_order_are_refused() -> None:
         JumpSettings(ready_s=0.4, prompt_s=0.3)
 
 
+def test_a_fall_that_goes_on_beyond_the_lift_off_is_refused() -> None:
+    with pytest.raises(PronkError, match=r"fall_s 0\.3, but prompt_s 0\.28; the fall must be over"):
+        JumpSettings(fall_s=0.3)
+
+
 def test_who_is_ready_may_be_prompt_at_once() -> None:
     asked = JumpSettings(ready_s=8 * DT, prompt_s=8 * DT, late_s=16 * DT)
     for steps, worth in ((4, 0.25), (8, 1.0), (12, 0.75)):
@@ -548,7 +607,7 @@ class Account:
     highest: float = 0.0
     lowest: float = 0.0
     stroke: float = 0.0
-    pace: float = 0.0
+    lead: float = 0.0
     flown: float = 0.0
     farthest: float = 0.0
     stood: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, 0.0)] * 4)
@@ -560,7 +619,7 @@ class Account:
         new = now.jump and not self.told
         if new:
             self.age, self.scores, self.leaps, self.farthest, self.widest = 0, [], 0, 0.0, 0.0
-            self.pace, self.worth = now.excess, 0.0
+            self.lead, self.worth = max(now.excess, 0.0), 0.0
         if now.jump:
             self.settled = 0
         elif self.settled is not None and not now.air:
@@ -569,19 +628,22 @@ class Account:
                 self.settled = None
         mode = self.settled is not None
         self.age = self.age + 1 if mode else 0
-        lead = max(self.pace, 0.0)
         paid = dict.fromkeys(EVENTS, 0.0) | {"mode": float(mode)}
         if mode and now.air and not self.was_up:
             speed = max(self.speed, now.speed)
             off = (speed - s.liftoff_velocity) / self.width
-            off_pace = self.pace / (s.haste if self.pace > 0.0 else s.sloth)
-            self.worth = self.timely(self.age * DT) * math.exp(-(off_pace**2) / 2)
+            self.worth = self.timely(self.age * DT) * math.exp(-((self.lead / s.haste) ** 2) / 2)
             score = math.exp(-(off**2) / 2) * self.worth
             paid["gain"] = max(score - max(self.scores, default=0.0), 0.0)
             self.scores.append(score)
             if speed > s.leap:
                 paid["hop"] = float(self.leaps > 0)
                 self.leaps += 1
+        paid["likeness"] = 0.0
+        if mode and not self.leaps and self.age * DT <= s.prompt_s:
+            asked = self.sinking(self.age * DT)
+            offs = [(length - asked) / s.likeness_width for length in now.stretch]
+            paid["likeness"] = sum(math.exp(-(off**2) / 2) for off in offs) / 4
         low = max(now.height, s.crouch)
         if not mode or new:
             self.highest, self.lowest, self.stroke = now.height, low, 0.0
@@ -590,7 +652,7 @@ class Account:
             self.lowest = min(self.lowest, low)
         stroke = max(min(self.highest - self.lowest, s.stroke), 0.0)
         paid["rise"], self.stroke = stroke - self.stroke, stroke
-        gone = (now.along - lead) * self.worth * DT
+        gone = (now.along - self.lead) * self.worth * DT
         self.flown = self.flown + gone if mode and now.air and self.was_up else 0.0
         if self.flown > self.farthest:
             paid["reach"], self.farthest = self.flown - self.farthest, self.flown
@@ -601,12 +663,23 @@ class Account:
             gap = min(min(along[1]) - max(along[0]) - self.brought, s.gap) * self.worth
             if gap > self.widest:
                 paid["gap"], self.widest = gap - self.widest, gap
-        self.brought = self.brought + lead * DT if now.air else 0.0
+        self.brought = self.brought + self.lead * DT if now.air else 0.0
         for i, touches in enumerate(now.contact):
             if touches:
                 self.stood[i] = now.feet[i]
         self.told, self.was_up, self.speed = now.jump, now.air, now.speed
         return paid
+
+    def sinking(self, age: float) -> float:
+        """How much longer legs are in a countermovement at that time: its speed, summed up."""
+        s, steps = self.settings, 1000
+        total = 0.0
+        for i in range(steps):
+            at = (i + 0.5) / steps * age
+            part = (at - s.fall_s) / (s.prompt_s - s.fall_s)
+            pushes = (1.0 - part) * -s.fall * s.fall_s + part * s.liftoff_velocity
+            total += (-s.fall * at if at <= s.fall_s else pushes) * age / steps
+        return total
 
     def timely(self, age: float) -> float:
         """What a lift-off at that time after the command is worth."""
@@ -633,6 +706,8 @@ def scripts(draw: st.DrawFn) -> list[Step]:
     speed = draw(st.lists(st.integers(-96, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     along = draw(st.lists(st.integers(-32, 128).map(lambda i: i / 32), min_size=60, max_size=60))
     excess = draw(st.lists(st.integers(-16, 32).map(lambda i: i / 32), min_size=60, max_size=60))
+    legs = st.tuples(*[st.integers(-16, 8).map(lambda i: i / 128)] * 4)
+    stretch = draw(st.lists(legs, min_size=60, max_size=60))
     way = draw(st.sampled_from([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)]))
     feet = wander(random.Random(draw(st.integers(0, 2**32 - 1))), way)
     return [
@@ -646,9 +721,10 @@ def scripts(draw: st.DrawFn) -> list[Step]:
             ground=ground,
             feet=points,
             way=way,
+            stretch=lengths,
         )
-        for j, a, h, v, u, e, (ground, points) in zip(
-            jump, air, height, speed, along, excess, feet, strict=False
+        for j, a, h, v, u, e, (ground, points), lengths in zip(
+            jump, air, height, speed, along, excess, feet, stretch, strict=False
         )
     ]
 

@@ -170,8 +170,26 @@ def test_what_was_measured_stays_when_physics_goes_on(env: Any) -> None:
     before = {name: value.clone() for name, value in vars(motion).items()}
     env.reset(env_ids=torch.tensor([0]))
     stir(env, 1)
-    for name in ("height", "gravity", "heading", "foot_position", "foot_height", "knee_height"):
+    for name in ("height", "gravity", "heading", "foot_position", "foot_height"):
         assert torch.equal(getattr(motion, name), before[name]), name
+    for name in ("knee_height", "leg_length"):
+        assert torch.equal(getattr(motion, name), before[name]), name
+
+
+def test_length_of_a_leg_is_that_of_the_model(env: Any) -> None:
+    """In the leg's plane: the foot lies beside it by as much as the knee does."""
+    stir(env, 3)
+    model, motion = env.sim.mj_model, motion_command(env).motion
+    reference = mujoco.MjData(model)
+    for i in range(N):
+        reference.qpos[7:] = motion.position[i]
+        mujoco.mj_kinematics(model, reference)
+        foot = [model.site(f"robot/{leg}_foot").id for leg in c.LEGS]
+        pitch = [model.joint(f"robot/{leg}_hip_pitch").id for leg in c.LEGS]
+        reach = np.linalg.norm(reference.site_xpos[foot] - reference.xanchor[pitch], axis=1)
+        length = np.sqrt(reach**2 - c.KNEE_Y**2)
+        np.testing.assert_allclose(motion.leg_length[i], length, atol=1e-6)
+    assert float(motion.leg_length.std()) > 1e-3, "legs that bend"
 
 
 def test_parts_other_than_feet_that_touch_are_counted(env: Any) -> None:

@@ -18,13 +18,12 @@ import torch
 from torch import Tensor
 
 import small_env
-from parts import where
 from pronk.policy import layout
 from pronk.robots import load_robot
 from pronk.robots.mini_cheetah import constants as c
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.draws import draws
-from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP, DEMONSTRATION
+from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
 from pronk.train.phases import enter_phase, phase
 
 Array = NDArray[np.float64]
@@ -69,7 +68,8 @@ def scripted(env: Any) -> Any:
 
 def part(vector: Tensor, sizes: dict[str, int], name: str) -> Tensor:
     """A named stretch of a vector."""
-    return vector[:, where(sizes, name)]
+    names = list(sizes)
+    return vector.split(list(sizes.values()), dim=1)[names.index(name)]
 
 
 def measured(observation: dict[str, Tensor], name: str) -> Tensor:
@@ -109,7 +109,6 @@ def test_groups_and_their_sizes(env: Any) -> None:
         "critic": (N, sum(CRITIC.values())),
         "critic_jump": (N, sum(CRITIC_JUMP.values())),
         "target": (N, layout.ESTIMATE_SIZE),
-        "demonstration": (N, sum(DEMONSTRATION.values())),
     }
     assert layout.MEASURED_SIZE == 105
     assert all(group.dtype == torch.float32 for group in observe(env).values())
@@ -360,7 +359,7 @@ def test_jump_input_and_what_the_critic_reads_of_a_jump(env: Any) -> None:
     tracker.mode[:] = torch.arange(N) < 3
     tracker.since[:] = torch.arange(N) * 0.02
     tracker.airborne[:] = torch.arange(N) == 1
-    names = ("best", "stroke", "worth", "pace", "flown", "farthest")
+    names = ("best", "stroke", "worth", "lead", "flown", "farthest")
     for i, name in enumerate(names):
         getattr(tracker, name)[:] = torch.arange(N) / N + i
     command._jump_left[:] = torch.arange(N) / 8 + 0.125

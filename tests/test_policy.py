@@ -116,7 +116,6 @@ def test_json_gives_the_same_contract_back(changes: dict[str, Any]) -> None:
         ),
         ({"jump": False}, "lift_off_velocity is 2.5"),
         ({"lift_off_velocity": None}, "lift_off_velocity is None"),
-        (WALK | {"waits_for_stride": True}, "waits_for_stride is True; it must be false"),
     ],
 )
 def test_a_contract_that_contradicts_itself_is_refused(changes: dict[str, Any], said: str) -> None:
@@ -155,11 +154,11 @@ def test_a_contract_that_cannot_be_read_is_refused(text: str, said: str) -> None
     assert one_sentence(str(refusal.value))
 
 
-def test_a_contract_older_than_the_wait_for_the_stride_has_none() -> None:
-    body = json.loads(to_json(contract(waits_for_stride=True)))
-    assert from_json(json.dumps(body), source="policy.onnx").waits_for_stride
-    del body["waits_for_stride"]
-    assert from_json(json.dumps(body), source="policy.onnx") == contract()
+def test_a_contract_whose_jumps_wait_for_the_stride_is_refused() -> None:
+    body = json.loads(to_json(contract()))
+    assert from_json(json.dumps(body | {"waits_for_stride": False}), source="a") == contract()
+    with pytest.raises(ArtefactError, match="waits_for_stride"):
+        from_json(json.dumps(body | {"waits_for_stride": True}), source="a")
 
 
 def test_a_contract_that_fits_is_accepted() -> None:
@@ -333,34 +332,6 @@ def test_steps_are_default_plus_scaled_action_of_the_history(jumper: Policy) -> 
         assert jumper.inference is not None
         np.testing.assert_allclose(jumper.inference.contact, output[None, 12:16], atol=1e-5)
         np.testing.assert_allclose(jumper.inference.linear_velocity, output[None, 16:], atol=1e-5)
-
-
-def test_the_network_hears_of_a_jump_when_the_legs_change_over(tmp_path: Path) -> None:
-    jumper = load_policy(write_policy(tmp_path, waits_for_stride=True))
-
-    def hears(knee: float, jump: bool) -> bool:
-        position = np.array(DEFAULT)
-        position[2] += knee
-        jumper.step(measurement(position=position), (0.0, 0.0, 0.0), jump)
-        return bool(fed[-1])
-
-    fed: list[float] = []
-    run = jumper._run
-    jumper._run = lambda read, jump: fed.append(float(jump[0, 0])) or run(read, jump)  # type: ignore
-    assert [hears(knee, True) for knee in (0.2, -0.1, -0.2, 0.1, -0.3)] == [False] * 3 + [True] * 2
-    assert not hears(0.3, False)
-    # One whose contract does not say so hears at once, as do those older than that word.
-    at_once = load_policy(write_policy(tmp_path))
-    at_once._run = jumper._run
-    at_once.step(measurement(), (0.0, 0.0, 0.0), True)
-    assert fed[-1] == 1.0
-    # A sibling has a stride of its own, and a reset begins a new one.
-    hears(-0.3, False)
-    jumper.sibling().step(measurement(), (0.0, 0.0, 0.0), True)
-    assert hears(0.1, True)
-    hears(-0.3, False)
-    jumper.reset()
-    assert not hears(0.1, True)
 
 
 def test_a_batch_is_its_rows(jumper: Policy) -> None:

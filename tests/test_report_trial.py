@@ -424,16 +424,6 @@ def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     assert trial.subjects[0].name in text
 
 
-def test_a_policy_that_waits_for_its_stride_is_said_to(tmp_path: Path) -> None:
-    made(tmp_path, ("matched", "naive"), CASES[:1], keep=False)
-    words = "told to jump as its legs change over"
-    assert words not in whole.write_report(tmp_path)[0].read_text(encoding="utf-8")
-    body = json.loads((tmp_path / "summary.json").read_text())
-    body["policies"][1]["contract"]["waits_for_stride"] = True
-    (tmp_path / "summary.json").write_text(json.dumps(body))
-    assert whole.write_report(tmp_path)[0].read_text(encoding="utf-8").count(words) == 1
-
-
 def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
     made(tmp_path, ("matched",), CASES[:1], keep=False)
     first = whole.write_report(tmp_path)[0].read_bytes()

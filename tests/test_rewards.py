@@ -19,7 +19,12 @@ from pronk.errors import PronkError
 from pronk.train.mdp.commands import MotionCommand, motion_command
 from pronk.train.mdp.motion import Motion
 from pronk.train.mdp.reward_sum import reward_sum
-from pronk.train.mdp.reward_table import PAPER_UNIT, ROWS, JumpWeights, with_jump_weights
+from pronk.train.mdp.reward_table import (
+    PAPER_UNIT,
+    ROWS,
+    JumpWeights,
+    with_jump_weights,
+)
 from pronk.train.phases import Phase, enter_phase, phase
 
 N = small_env.ROBOTS
@@ -86,6 +91,7 @@ def pretend(env: Any, **fields: Tensor) -> MotionCommand:
         "foot_position": torch.zeros(N, 4, 2),
         "foot_height": torch.zeros(N, 4),
         "knee_height": torch.full((N, 4), KNEE),
+        "leg_length": torch.full((N, 4), 0.28),
         "foot_velocity": torch.zeros(N, 4, 3),
         "foot_velocity_change": torch.zeros(N, 4, 3),
         "touching": torch.zeros(N),
@@ -215,7 +221,7 @@ CASES = [
 
 def test_every_term_has_a_case() -> None:
     own = {"termination", "sparse_jump", "rise", "reach", "gap", "hop", "action_rate"}
-    own |= {"stray_foot", "landing"}
+    own |= {"stray_foot", "landing", "countermovement"}
     assert {case.name for case in CASES} | own == set(ROWS)
 
 
@@ -282,6 +288,16 @@ def test_a_deep_landing_costs_who_has_jumped(env: Any) -> None:
     assert not ROWS["landing"].term(command, height=floor).any()
 
 
+def test_likeness_to_a_countermovement_is_paid_as_a_rate(env: Any) -> None:
+    command = pretend(env)
+    command.tracker.likeness[:] = 0.5
+    assert ROWS["countermovement"].term(command).tolist() == [0.5] * N
+    weighed = replace(ROWS["countermovement"], jump=6.0)
+    reward_sum(env).set_rows({**ROWS, "countermovement": weighed})
+    value = paid(env, "countermovement").tolist()
+    assert value == pytest.approx([3.0 if i == JUMPS else 0.0 for i in range(N)])
+
+
 def test_action_rate_by_hand(env: Any) -> None:
     command = pretend(env)
     env.action_manager.process_action(torch.full((N, 12), 0.5))
@@ -326,12 +342,11 @@ def test_an_event_is_worth_its_weight_once(
         rise=10.0,
         reach=6.0,
         gap=7.0,
+        countermovement=2.0,
         hop=0.5,
-        orientation=3.0,
         collision=5.0,
         knees=3.0,
         landing=0.0,
-        fall=10.0,
     )
     enter_phase(env, Phase(name="made up", iterations=1, jump=True, weights=weights))
     getattr(command.tracker, event)[:] = 0.0
@@ -478,14 +493,14 @@ def test_weights_of_events_and_of_our_own_terms() -> None:
         "rise",
         "reach",
         "gap",
+        "countermovement",
         "hop",
         "landing",
     ):
         assert (ROWS[name].walk, ROWS[name].jump) == (0.0, 0.0), "phase 1 knows no jump"
-    for name in ("action_rate", "slip", "trunk_height", "crouch", "knees"):
+    for name in ("action_rate", "roll_pitch_rate", "slip", "trunk_height", "crouch", "knees"):
         assert ROWS[name].walk < 0.0
         assert ROWS[name].walk <= ROWS[name].jump <= 0.0
-    assert ROWS["roll_pitch_rate"].jump < ROWS["roll_pitch_rate"].walk < 0.0
 
 
 def test_arguments_of_the_papers_terms() -> None:
@@ -520,23 +535,21 @@ def test_jump_weights_go_into_the_column_of_jump_mode() -> None:
         rise=3.0,
         reach=1.5,
         gap=0.75,
+        countermovement=5.0,
         hop=0.25,
-        orientation=6.0,
         collision=9.0,
         knees=4.0,
         landing=7.0,
-        fall=8.0,
     )
     rows = with_jump_weights(ROWS, weights)
     changed = {"dense_jump": -0.1, "sparse_jump": 2.0, "rise": 3.0, "reach": 1.5}
     changed |= {
         "gap": 0.75,
+        "countermovement": 5.0,
         "hop": -0.25,
-        "orientation": -6.0,
         "collision": -9.0,
         "knees": -4.0,
         "landing": -7.0,
-        "termination": -8.0,
     }
     assert {name: rows[name].jump for name in changed} == changed
     assert {name: rows[name].walk for name in changed} == {

@@ -176,7 +176,7 @@ def test_state_made_in_inference_mode() -> None:
         state = {
             name: {k: v.clone() for k, v in part.items()} if name.endswith("r_state_dict") else part
             for name, part in narrow.save().items()
-            if not name.startswith(("optimizer", "estimator", "following"))
+            if not name.startswith(("optimizer", "estimator"))
         }
     state = {**narrow.save(), **state}
     wide = build(jump=True)

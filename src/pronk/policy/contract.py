@@ -98,9 +98,6 @@ class Contract:
     """True if the network has the input "jump"."""
     lift_off_velocity: float | None
     """Upward velocity of the trunk wanted at lift-off [m/s]; None for a policy without jump."""
-    waits_for_stride: bool = False
-    """True if the input "jump" has to wait until the legs change over (`pronk.policy.stride`);
-    False for a policy that was told to jump at any moment of its stride, or never."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Phases, iterations, seed, run: how it came about."""
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -147,12 +144,6 @@ class Contract:
             "lift_off_velocity",
             self.lift_off_velocity,
             "a number for a policy that jumps and null for one that does not",
-        )
-        _demand(
-            self.jump or not self.waits_for_stride,
-            "waits_for_stride",
-            self.waits_for_stride,
-            "false for a policy that does not jump",
         )
 
 

@@ -41,7 +41,12 @@ def from_json(text: str, *, source: object) -> Contract:
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         got = body.get("schema") if isinstance(body, dict) else type(body).__name__
         raise ArtefactError(f"{source}: schema {got!r}; this pronk reads {SCHEMA!r}.")
-    body = {"waits_for_stride": False} | body  # files older than this field do not wait
+    # Some older files have this field: the jump input had to wait for a moment of the stride.
+    if body.pop("waits_for_stride", False) is not False:
+        raise ArtefactError(
+            f"{source}: waits_for_stride is set; this pronk passes jump commands on at "
+            "once. Train the policy again, or use one without this field."
+        )
     odd = (set(_READERS) | {"schema"}) ^ set(body)
     if odd:
         raise ArtefactError(
@@ -135,7 +140,6 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "command_ranges": lambda value: _mapping(value, _pair),
     "jump": _flag,
     "lift_off_velocity": lambda value: None if value is None else _number(value),
-    "waits_for_stride": _flag,
     "provenance": _mapping,
     "versions": lambda value: _mapping(value, _text),
 }

@@ -20,7 +20,6 @@ from pronk.policy.contract import Contract, measured_layout
 from pronk.policy.contract_json import METADATA_KEY, from_json
 from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
 from pronk.policy.observation import Floats, History, Measurement, finite
-from pronk.policy.stride import StrideGate
 
 WRITER = "`pronk train` writes one"
 _OUTPUTS = {"action": JOINTS, **ESTIMATE}
@@ -61,7 +60,6 @@ class Policy:
         self._default = np.asarray(contract.default_position)
         self._scale = np.asarray(contract.action_scale)
         self._history = History(contract.default_position)
-        self._gate = StrideGate(np.zeros(1), policy_rate_hz=contract.policy_rate_hz)
 
     def sibling(self) -> Self:
         """The same network with a past of its own: nothing it does is seen by this one."""
@@ -70,7 +68,6 @@ class Policy:
     def reset(self) -> None:
         """Begin anew: the next measurement is taken for the whole past, past actions for zero."""
         self._history.reset()
-        self._gate.reset()
         self.inference = None
 
     def step(
@@ -81,8 +78,7 @@ class Policy:
         Args:
             measurement: Of now.
             command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
-            jump: Whether a jump is asked for; if the contract says so, the network hears of it
-                when the legs change over (`pronk.policy.stride`).
+            jump: The jump input.
 
         Returns:
             Joint position targets in the order of the contract, absolute [rad]. (12,)
@@ -92,10 +88,7 @@ class Policy:
         """
         self._refuse_jump(jump)
         measured = self._history.observe(measurement, command)
-        told = np.array([jump])
-        if self.contract.waits_for_stride:
-            told = self._gate(np.asarray(measurement.position)[None], told)
-        self.inference = self._run(measured[None], told[None].astype(np.float32))
+        self.inference = self._run(measured[None], np.array([[jump]], dtype=np.float32))
         action = self.inference.action[0]
         self._history.acted(action)
         target: NDArray[np.float64] = self._default + self._scale * action

@@ -213,8 +213,7 @@ _REQUESTS = {
     "q": OperatorRequest.QUIT,
 }
 _JUMP_S = 0.5
-"""How long one press asks for a jump, as in training [s]: in less, the stride might not come to
-where a jump may begin (`pronk.policy.stride`)."""
+"""Length of the jump input of one press, as in training [s]."""
 _REPEAT_S = 0.8
 """A key counts as held for this long after it was heard: the longest usual delay before a keyboard
 repeats a key is 0.66 s."""

@@ -80,7 +80,7 @@ def env_cfg(
                 delay_steps=delay_steps(robot, gains, randomization),
             )
         },
-        commands={NAME: MotionCommandCfg(drive=NominalDrive.of(robot, gains), gains=gains.name)},
+        commands={NAME: MotionCommandCfg(drive=NominalDrive.of(robot, gains))},
         events={
             "start": EventTermCfg(
                 func=draw_start,

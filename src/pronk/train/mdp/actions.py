@@ -63,9 +63,8 @@ class HeldJointPosition(JointPositionAction):
         """Delay in this episode [physics steps]. Shape (N, 1)."""
         self.supply = Supply(self._entity)
         """What the drives are fed from."""
-        self.shown: tuple[Tensor, Tensor] | None = None
-        """Joint targets that robots are shown [rad], (N, joints), and the part of the way to them
-        that their own are led in the coming step, (N, 1); None: nobody is led."""
+        self.led: Tensor | None = None
+        """What a hand adds to the coming targets [rad], (N, joints); None: nothing."""
         everything = self._target_ids.tolist() == list(range(self._entity.num_joints))
         # A slice costs a view where a list of indices costs a kernel.
         self._joints: slice | Tensor = slice(None) if everything else self._target_ids
@@ -86,8 +85,8 @@ class HeldJointPosition(JointPositionAction):
             actions: The network's. Shape (N, joints).
         """
         super().process_actions(actions)
-        if self.shown is not None:
-            self._processed_actions.lerp_(*self.shown)
+        if self.led is not None:
+            self._processed_actions += self.led
         count = len(self._ages)
         self._newest = (self._newest + 1) % count
         self._ages = [0, *self._ages[:-1]]
@@ -125,8 +124,8 @@ class HeldJointPosition(JointPositionAction):
         super().reset(env_ids)
         which = slice(None) if env_ids is None else env_ids
         self.supply.rest(which)
-        if self.shown is not None:
-            self.shown[1][which] = 0.0
+        if self.led is not None:
+            self.led[which] = 0.0
         low, high = self.cfg.delay_steps
         if high == 0:
             return

@@ -15,13 +15,13 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk.policy.stride import StrideGate
+from pronk.robots.mini_cheetah.constants import TOTAL_MASS
 from pronk.robots.robot import Robot
-from pronk.train.gains import GainsName, TrainingGains
+from pronk.train.gains import TrainingGains
 from pronk.train.mdp.actions import HeldJointPosition
-from pronk.train.mdp.demonstration import demonstration
+from pronk.train.mdp.guidance import guidance
 from pronk.train.mdp.jump import JumpSettings, JumpTracker
-from pronk.train.mdp.motion import Motion, measure_motion
+from pronk.train.mdp.motion import STANDING_LEG, Motion, measure_motion
 from pronk.train.mdp.scene import FEET, FOOT_GEOMS
 from pronk.train.mdp.speed_ranges import Growth, SpeedRanges
 
@@ -81,8 +81,6 @@ class MotionCommandCfg(CommandTermCfg):
     """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not paid."""
-    gains: GainsName = "matched"
-    """Kind of gains that the jump they are shown was found with."""
     width: float = 1.0
     """Standard deviation of the lift-off kernel [m/s], see `JumpTracker`."""
     settings: JumpSettings = field(default_factory=JumpSettings)
@@ -105,8 +103,6 @@ class MotionCommand(CommandTerm):
         """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. Shape (N, 3)."""
         self.jump = torch.zeros(count, dtype=torch.bool, device=device)
         """Jump input. Shape (N,)."""
-        self.asked = torch.zeros_like(self.jump)
-        """Whether a script that `waits` asks for a jump. Shape (N,)."""
         data = env.scene["robot"].data
         self.default_position: Tensor = data.default_joint_pos
         """[rad]. (N, 12)"""
@@ -120,21 +116,14 @@ class MotionCommand(CommandTerm):
         """[N m]. (12,)"""
         self.scripted = False
         """True: nobody but the caller changes `velocity` and `jump`."""
-        self.waits = False
-        """Whether in a script `jump` follows `asked` when the stride comes to the moment
-        (`pronk.policy.stride`). In training it never waits: of the trainings that did, three,
-        none landed as many (docs/training.md)."""
         self.led = 0.0
-        """Part of the way to what they are shown that robots are led, 0 to 1; a phase sets it."""
-        self._demonstration = demonstration(cfg.gains).to(device)
-        self.shown = self.default_position.clone()
-        """Joint targets that robots are shown for the coming step [rad]. (N, 12)"""
-        self.showing = torch.zeros(count, dtype=torch.bool, device=device)
-        """Whether they are. (N,)"""
+        """Part of a countermovement's guidance that is given, 0 to 1; a phase sets it."""
+        self._guidance = guidance(
+            cfg.settings, self.stiffness, self.damping, TOTAL_MASS, env.step_dt
+        )
         self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
         self.ranges = SpeedRanges(cfg.growth, device)
         self._jump_left = torch.zeros(count, device=device)
-        self._gate = StrideGate(torch.zeros(count, device=device), policy_rate_hz=1.0 / env.step_dt)
         self._limits = torch.tensor(cfg.limits, device=device)
         moving = 1.0 - cfg.standing
         kinds = [min(cfg.one_axis * i / 3, moving) for i in (1, 2, 3)]
@@ -235,10 +224,12 @@ class MotionCommand(CommandTerm):
             height=motion.height,
             vertical=motion.velocity_world[:, 2],
             miss=torch.linalg.vector_norm(horizontal - target, dim=-1),
+            turn=torch.linalg.vector_norm(motion.angular_velocity[:, :2], dim=-1),
             along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
             excess=along - speed,
             feet=motion.foot_position,
             direction=self._direction(motion.heading),
+            stretch=motion.leg_length - STANDING_LEG,
             dt=self._env.step_dt,
         )
         if not self.scripted:
@@ -258,7 +249,6 @@ class MotionCommand(CommandTerm):
         """Fresh commands for robots that start anew; jumps under way are forgotten."""
         assert isinstance(env_ids, Tensor)
         self.tracker.reset(env_ids)
-        self._gate.reset(env_ids)
         if self._motion is not None:
             self._motion.forget(env_ids)
         if self.scripted:
@@ -279,9 +269,7 @@ class MotionCommand(CommandTerm):
             return
         if not self.scripted:
             self._pass(dt)
-        elif self.waits:
-            self.jump.copy_(self._gate(self._env.scene["robot"].data.joint_pos, self.asked))
-        self._show()
+        self._lead()
 
     def _pass(self, dt: float | Tensor) -> None:
         """Draw anew what has run out after a time."""
@@ -298,25 +286,20 @@ class MotionCommand(CommandTerm):
         self.jump = self.jump ^ turn
         self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
 
-    def _show(self) -> None:
-        """What robots are shown in the coming step, and how far they are led there."""
+    def _lead(self) -> None:
+        """Tell the action what a hand adds in the coming step."""
         action = self._env.action_manager.get_term("joint_position")
         assert isinstance(action, HeldJointPosition)
-        action.shown = None
-        if self.cfg.jump_fraction <= 0.0:
-            self.showing.zero_()
+        if self.led == 0.0:
+            action.led = None
             return
-        tracker, whole = self.tracker, self._demonstration.duration
+        tracker, last = self.tracker, len(self._guidance) - 1
         # The tracker hears of a new command when the step that it began is over.
         begins = self.jump & ~tracker.commanded
-        passed = tracker.since * ~begins
-        # Landing has to answer to what it comes to; nobody is shown how. Time is a sum of steps:
-        # what is a millisecond short of the end is at the end.
-        under_way = tracker.mode & ~tracker.landed & (passed < whole - 1e-3)
-        self.showing = begins | under_way
-        self.shown = self._demonstration.at(passed, self.velocity[:, :2])
-        if self.led > 0.0:
-            action.shown = (self.shown, self.led * self.showing[:, None])
+        steps = (tracker.since / self._env.step_dt).round().long().clamp_max(last)
+        on_the_ground = tracker.mode & (tracker.liftoffs == 0.0)
+        steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last))
+        action.led = self.led * self._guidance[steps]
 
     def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""

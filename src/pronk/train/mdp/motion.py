@@ -19,6 +19,9 @@ from pronk.robots.mini_cheetah import constants
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
+KNEES = slice(7 + constants.LEG_JOINTS.index("knee"), None, len(constants.LEG_JOINTS))
+"""Where a state's positions have the knees, after seven of the trunk."""
+
 
 @dataclass
 class Motion:
@@ -51,6 +54,8 @@ class Motion:
     """Lowest point of each foot over ground [m]. (N, 4)"""
     knee_height: Tensor
     """Axes of the knees over ground [m]. (N, 4)"""
+    leg_length: Tensor
+    """From the axis of each hip pitch to the foot, shanks of nominal length [m]. (N, 4)"""
     foot_velocity: Tensor
     """World frame [m/s]. (N, 4, 3)"""
     foot_velocity_change: Tensor
@@ -70,6 +75,20 @@ class Motion:
         """
         self.foot_velocity[env_ids] = 0.0
         self.torque[env_ids] = 0.0
+
+
+def leg_length(knee: Tensor) -> Tensor:
+    """From the axis of the hip pitch to the foot's centre, in the leg's plane [m].
+
+    Args:
+        knee: Angle of the knee [rad], 0 for a straight leg; any shape.
+    """
+    thigh, shank = constants.THIGH_LENGTH, constants.SHANK_LENGTH
+    return (thigh**2 + shank**2 + 2.0 * thigh * shank * torch.cos(knee)).sqrt()
+
+
+STANDING_LEG = float(leg_length(torch.tensor(constants.DEFAULT_POSITION["knee"]).double()))
+"""Length of a leg in the default pose [m]."""
 
 
 def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) -> Motion:
@@ -109,6 +128,7 @@ def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) 
         foot_position=foot[..., :2],
         foot_height=foot[..., 2] - constants.FOOT_RADIUS,
         knee_height=physics.xpos[:, shanks, 2],
+        leg_length=leg_length(qpos[:, KNEES]),
         foot_velocity=foot_velocity,
         foot_velocity_change=foot_velocity - (before.foot_velocity if before else 0.0),
         touching=(env.scene["limbs"].data.found > 0).sum(dim=-1, dtype=torch.float32),

@@ -57,7 +57,7 @@ CRITIC_JUMP = {
     "best": 1,
     "stroke": 1,
     "worth": 1,
-    "pace": 1,
+    "lead": 1,
     "flown": 1,
     "farthest": 1,
     "jumper": 1,
@@ -66,10 +66,6 @@ CRITIC_JUMP = {
 """Parts of what the critic reads of a jump, from phase 2 on. Commands come at random and are worth
 more than seconds of walking: whether one will come, and when, would else be the most of what
 separates one return from another, and hide what an action did."""
-
-DEMONSTRATION = {"action": 12, "showing": 1}
-"""Parts of what a policy learns to do as it is shown: the action that would do so, and whether it
-is shown anything in the coming step."""
 
 _BODY_WEIGHT = 12.0 * 9.81
 """Unit of the foot forces that the critic reads [N]."""
@@ -141,14 +137,6 @@ def critic(env: ManagerBasedRlEnv) -> Tensor:
     )
 
 
-def demonstration(env: ManagerBasedRlEnv) -> Tensor:
-    """The parts of `DEMONSTRATION`. (N, 13)."""
-    command, held = motion_command(env), env.action_manager.get_term("joint_position")
-    assert isinstance(held, HeldJointPosition)
-    action = (command.shown - command.default_position) / held.scale
-    return torch.cat([action, command.showing.float()[:, None]], dim=-1)
-
-
 def body(env: ManagerBasedRlEnv) -> list[Tensor]:
     """The parts of `CRITIC` that were drawn for each robot, in order. (N, size) each.
 
@@ -188,7 +176,7 @@ def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
             tracker.best[:, None],
             tracker.stroke[:, None],
             tracker.worth[:, None],
-            tracker.pace[:, None],
+            tracker.lead[:, None],
             tracker.flown[:, None],
             tracker.farthest[:, None],
             command.jumper.float()[:, None],
@@ -214,7 +202,7 @@ def _trunk_axes(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def groups(noise: Noise) -> dict[str, ObservationGroupCfg]:
-    """The groups `measured`, `jump`, `critic`, `critic_jump`, `target` and `demonstration`.
+    """The observation groups `measured`, `jump`, `critic`, `critic_jump` and `target`.
 
     Args:
         noise: Noise by measured part (`position`, `velocity`, `angular_velocity`, `gravity`); None
@@ -244,5 +232,4 @@ def groups(noise: Noise) -> dict[str, ObservationGroupCfg]:
         "critic": plain(critic),
         "critic_jump": plain(critic_jump),
         "target": plain(target),
-        "demonstration": plain(demonstration),
     }

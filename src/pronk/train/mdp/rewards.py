@@ -125,6 +125,14 @@ def gap(command: MotionCommand) -> Tensor:
     return command.per_event(command.tracker.gap)
 
 
+def countermovement(command: MotionCommand) -> Tensor:
+    """How alike the legs' lengths are to those of a jump that falls, brakes and pushes, 0 to 1.
+
+    From the command to the first lift-off, see `JumpSettings.countermovement`.
+    """
+    return command.tracker.likeness
+
+
 def hop(command: MotionCommand) -> Tensor:
     """1 per lift-off after the first of one command; an event."""
     return command.per_event(command.tracker.hop)
@@ -173,7 +181,8 @@ def landing(command: MotionCommand, height: float) -> Tensor:
     The height of a jump is counted from its lowest trunk, and that was where it landed.
     """
     tracker = command.tracker
-    return (height - command.motion.height).clamp_min(0.0) * (tracker.landed & tracker.mode)
+    landed = (tracker.liftoffs > 0.0) & ~tracker.airborne & tracker.mode
+    return (height - command.motion.height).clamp_min(0.0) * landed
 
 
 def crouch(command: MotionCommand, height: float) -> Tensor:

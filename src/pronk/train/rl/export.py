@@ -80,7 +80,6 @@ def contract_for(
         command_ranges={name: (-half, half) for name, half in limits},
         jump=lift_off_velocity is not None,
         lift_off_velocity=lift_off_velocity,
-        waits_for_stride=lift_off_velocity is not None,
         provenance=dict(provenance),
         versions={name: version for name, version in versions().items() if version is not None},
     )

@@ -1,15 +1,13 @@
 """PPO with the estimator beside it.
 
-An iteration is PPO's update, then some supervised steps of the estimator on the same rollout, some
-of the actor where it is shown what to do (`following.py`), then the statistics of the
-normalisation. In this order nothing that the actor's log-probabilities rest on changes before PPO
-has used them.
+An iteration is PPO's update, then some supervised steps of the estimator on the same rollout, then
+the statistics of the normalisation. In this order nothing that the actor's log-probabilities rest
+on changes before PPO has used them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +22,6 @@ from pronk.errors import PronkError
 from pronk.train.rl import adam
 from pronk.train.rl.actor import EstimatorActor, JumpCritic
 from pronk.train.rl.estimator import estimator_losses
-from pronk.train.rl.following import follow, lesson
 from pronk.train.rl.normalization import average
 
 TARGET_GROUP = "target"
@@ -45,15 +42,13 @@ class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
     """Weight of the contacts' cross entropy [nat]."""
     estimator_velocity_coef: float = 1.0
     """Weight of the velocity's mean squared error [m^2/s^2]."""
-    following_steps: int = 8
-    """Steps in an iteration of doing as one is shown, where that is learned."""
     symmetry_cfg: dict[str, Any] | None = None
     """Arguments of `rsl_rl.extensions.Symmetry`, but its environment; None for none."""
     class_name: str = "pronk.train.rl.ppo:EstimatorPPO"
 
     def __post_init__(self) -> None:
         """Refuse numbers outside their range."""
-        for name in ("estimator_epochs", "estimator_mini_batches", "following_steps"):
+        for name in ("estimator_epochs", "estimator_mini_batches"):
             if getattr(self, name) < 1:
                 raise PronkError(f"{name} is {getattr(self, name)}; expected 1 or more.")
         if not self.estimator_learning_rate > 0.0:
@@ -91,7 +86,6 @@ class EstimatorPPO(PPO):
         estimator_mini_batches: int = 8,
         estimator_contact_coef: float = 1.0,
         estimator_velocity_coef: float = 1.0,
-        following_steps: int = 8,
         **cfg: Any,
     ) -> None:
         """Called by rsl_rl.
@@ -105,7 +99,6 @@ class EstimatorPPO(PPO):
             estimator_mini_batches: See there.
             estimator_contact_coef: See there.
             estimator_velocity_coef: See there.
-            following_steps: See there.
             cfg: As `rsl_rl.algorithms.PPO` takes it.
 
         Raises:
@@ -125,13 +118,6 @@ class EstimatorPPO(PPO):
         self.estimator_mini_batches = estimator_mini_batches
         self.estimator_contact_coef = estimator_contact_coef
         self.estimator_velocity_coef = estimator_velocity_coef
-        self.following_steps = following_steps
-        self.following_rate = 0.0
-        """Learning rate of doing as one is shown; 0: not learned."""
-        self.before = deepcopy(actor)
-        """The actor when it began to follow, once it has."""
-        self.follows = False
-        """Whether it has begun."""
         # PPO has put the whole actor under its optimizer; the estimator is part of the actor.
         estimator = list(actor.estimator.parameters())
         mine = {id(parameter) for parameter in estimator}
@@ -140,24 +126,18 @@ class EstimatorPPO(PPO):
         self.estimator_optimizer = adam.on_device(
             torch.optim.Adam, estimator, lr=estimator_learning_rate
         )
-        self.following_optimizer = adam.on_device(
-            torch.optim.Adam, list(actor.mlp.parameters()), lr=0.0
-        )
 
     def update(self) -> dict[str, float]:
         """One iteration of learning on the stored rollout.
 
         Returns:
-            Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2],
-            and `following` where it is learned: mean squared distance from the actions shown.
+            Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2].
         """
         losses: dict[str, float] = super().update()
         if self._augments:
             del losses["symmetry"]
         # The storage is cleared by now, but only its cursor: the rollout is still there.
         losses.update(self._update_estimator())
-        if self.following_rate > 0.0:
-            losses["following"] = self._follow()
         observations = self.storage.observations
         self._raw_actor.learn_normalization(observations, self.gpu_world_size)
         self._raw_critic.learn_normalization(observations, self.gpu_world_size)
@@ -194,21 +174,6 @@ class EstimatorPPO(PPO):
         contact, velocity = torch.stack(seen).view(-1, 2).mean(dim=0).tolist()
         return {"estimator_contact": contact, "estimator_velocity": velocity}
 
-    def _follow(self) -> float:
-        if not self.follows:
-            self.follows = True
-            self.before.load_state_dict(self._raw_actor.state_dict())
-        for group in self.following_optimizer.param_groups:
-            group["lr"] = self.following_rate
-        return follow(
-            self._raw_actor,
-            self.following_optimizer,
-            lesson(self.before, self.storage.observations),
-            steps=self.following_steps,
-            reduce=self._average_gradients if self.gpu_world_size > 1 else None,
-            max_grad_norm=self.max_grad_norm,
-        )
-
     def _average_gradients(self, parameters: list[nn.Parameter]) -> None:
         """Over the processes, in one piece."""
         gradients = [p.grad for p in parameters if p.grad is not None]
@@ -229,11 +194,8 @@ class EstimatorPPO(PPO):
         return self._raw_critic
 
     def save(self) -> dict[str, Any]:
-        """State of the networks and all optimizers."""
+        """State of the networks and both optimizers."""
         state: dict[str, Any] = super().save()
-        state["following_optimizer_state_dict"] = self.following_optimizer.state_dict()
-        if self.follows:
-            state["before_state_dict"] = self.before.state_dict()
         state["estimator_optimizer_state_dict"] = self.estimator_optimizer.state_dict()
         return state
 
@@ -248,16 +210,12 @@ class EstimatorPPO(PPO):
         Args:
             loaded_dict: The state.
             load_cfg: What to take over (`actor`, `critic`, `optimizer`, `iteration`); None for
-                all. `optimizer` means all of them.
+                all. `optimizer` means both.
             strict: Refuse missing and unknown weights.
 
         Returns:
             Whether the runner should take over the iteration.
         """
         if load_cfg is None or load_cfg.get("optimizer"):
-            if "before_state_dict" in loaded_dict:
-                self.follows = True
-                self.before.load_state_dict(loaded_dict["before_state_dict"], strict=strict)
-            for name in ("estimator_optimizer", "following_optimizer"):
-                getattr(self, name).load_state_dict(loaded_dict[f"{name}_state_dict"])
+            self.estimator_optimizer.load_state_dict(loaded_dict["estimator_optimizer_state_dict"])
         return bool(super().load(loaded_dict, load_cfg, strict))

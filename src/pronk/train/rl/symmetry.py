@@ -27,7 +27,7 @@ from torch import Tensor
 from pronk.errors import PronkError
 from pronk.policy.layout import ESTIMATE, MEASURED
 from pronk.robots.mini_cheetah.constants import LEG_JOINTS, LEGS
-from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP, DEMONSTRATION
+from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
     "measured": {name: part.size for name, part in MEASURED.items()},
@@ -35,7 +35,6 @@ GROUPS: Mapping[str, Mapping[str, int]] = {
     "critic": CRITIC,
     "critic_jump": CRITIC_JUMP,
     "target": ESTIMATE,
-    "demonstration": DEMONSTRATION,
 }
 """Parts of every group of observations, in order, and their sizes."""
 
@@ -86,12 +85,11 @@ _KINDS: Mapping[str, _Kind] = {
     "best": _SCALAR,
     "stroke": _SCALAR,
     "worth": _SCALAR,
-    "pace": _SCALAR,
+    "lead": _SCALAR,
     "flown": _SCALAR,
     "farthest": _SCALAR,
     "jumper": _SCALAR,
     "jump_left": _SCALAR,
-    "showing": _SCALAR,
     "time_left": _SCALAR,
     "voltage": _SCALAR,
     "no_load": _SCALAR,

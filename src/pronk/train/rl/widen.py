@@ -26,8 +26,7 @@ from pronk.train.rl.jump_linear import JUMP_WEIGHT
 from pronk.train.rl.ppo import EstimatorPPO
 
 _NETWORKS = ("actor_state_dict", "critic_state_dict")
-_OPTIMIZERS = ("optimizer", "estimator_optimizer", "following_optimizer")
-_STATES = tuple(f"{name}_state_dict" for name in _OPTIMIZERS)
+_OPTIMIZERS = ("optimizer_state_dict", "estimator_optimizer_state_dict")
 
 
 def widen_state(
@@ -49,7 +48,7 @@ def widen_state(
         PronkError: The state is not one of phase 1, `wide` has no jump inputs, the networks differ
             in more than the jump inputs, or `action_std` is not above 0.
     """
-    missing = [key for key in (*_NETWORKS, *_STATES) if key not in narrow]
+    missing = [key for key in (*_NETWORKS, *_OPTIMIZERS) if key not in narrow]
     if missing:
         raise PronkError(
             f"the state to widen has no {', '.join(missing)}; expected what EstimatorPPO.save gives"
@@ -62,8 +61,8 @@ def widen_state(
     anew = set()
     if action_std is not None:
         anew = _set_action_std(state["actor_state_dict"], action_std)
-    for key, name in zip(_STATES, _OPTIMIZERS, strict=True):
-        state[key] = _widen_optimizer(narrow[key], _names(getattr(wide, name), wide), anew)
+    for key, optimizer in zip(_OPTIMIZERS, (wide.optimizer, wide.estimator_optimizer), strict=True):
+        state[key] = _widen_optimizer(narrow[key], _names(optimizer, wide), anew)
     return state
 
 

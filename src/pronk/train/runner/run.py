@@ -261,7 +261,6 @@ class _Run:
         """Set what changes within a phase, which the iteration alone decides."""
         done = self._part_of(phase, runner.current_learning_iteration)
         runner.alg.get_policy().limit_noise(phase.largest_noise(done))
-        runner.alg.following_rate = phase.following_at(done)
         if phase.changes:
             enter_phase(self.env.unwrapped, phase, done)
 

@@ -1,7 +1,7 @@
 """Set the parameters of the virtual Mini Cheetah so that a match lands on the paper's Table I.
 
-    python tools/calibrate_sim_params.py            # calibrate and write the shipped file
-    python tools/calibrate_sim_params.py --check    # only match the shipped file, print the table
+    python scripts/calibrate_sim_params.py            # calibrate and write the shipped file
+    python scripts/calibrate_sim_params.py --check    # only match the shipped file, print the table
 
 Two knobs a joint are turned by Newton's method, `torque_scale` and `viscous`; each evaluation is
 the paper's protocol: a chirp (0.1 to 25 Hz, 0.25 rad, 20 s) to the virtual robot with 17 / 0.4 on
@@ -96,7 +96,7 @@ ground:
 """
 
 HEADER = f"""\
-# What is true of the virtual Mini Cheetah. Written by: python tools/calibrate_sim_params.py
+# What is true of the virtual Mini Cheetah. Written by: python scripts/calibrate_sim_params.py
 #
 # Sources and reasons of the numbers of the joints (joint side unless said otherwise):
 #   torque_scale, viscous  turned until an honest match lands on the paper's Table I; the knees
