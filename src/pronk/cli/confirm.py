@@ -1,4 +1,4 @@
-"""What is asked of a person beside a real robot."""
+"""Confirmations by a person beside a real robot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def before_it_moves(robot: str, where: str) -> None:
 
 
 class Person:
-    """Somebody at the bench who fixes joints when told to, and says when it is done."""
+    """A person at the bench who clamps joints and confirms it."""
 
     def __init__(self) -> None:
         """Nothing is fixed yet."""
@@ -56,7 +56,7 @@ class Person:
             pass
         if not sys.stdin.readline():
             raise HardwareError(
-                "nobody is there to fix joints by hand; ask joints that need no clamp (--joints), "
-                "or run this from a terminal."
+                "nobody is there to fix joints by hand; sweep joints that need no clamp "
+                "(--joints), or run this from a terminal."
             )
         self._fixed = joints

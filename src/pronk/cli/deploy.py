@@ -155,7 +155,7 @@ def _operator(
 
 
 def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
-    """What is asked for, unattended.
+    """The commands of an unattended run.
 
     Raises:
         PronkError: It is no command, or none that the policy was trained for.

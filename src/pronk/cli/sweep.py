@@ -1,4 +1,4 @@
-"""`pronk sweep`: plan, check, ask, record."""
+"""`pronk sweep`: plan, check, excite, record."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
-"""What can be asked."""
+"""Excitation signals."""
 
 
 AMPLITUDES = (0.25, 0.125)
@@ -48,7 +48,7 @@ def sweep(
     yes: bool = False,
     json_file: console.JsonFile = None,
 ) -> None:
-    """Ask every joint: plan, check against the limits, ask, record.
+    """Excite every joint: plan, check against the limits, excite, record.
 
     Args:
         robot: Robot, for instance mini_cheetah.
@@ -62,14 +62,14 @@ def sweep(
         release: Make the robot's own controller let go of the joints.
         real_time: Ask for real-time scheduling (by wire).
         sim_params: Parameters of the virtual robot, instead of the shipped one.
-        joints: Joints to ask; repeat it. All if left out.
-        signal: What to ask.
+        joints: Joints to excite; repeat it. All if left out.
+        signal: Excitation signal.
         amplitude: Peak of the command in rad; repeat it for several.
-        repeats: Times each amplitude is asked.
+        repeats: Times each amplitude is repeated.
         seed: Of the virtual robot's noise.
         plan_only: Show what it would do to the robot and leave.
         overwrite: Replace logs that are already there.
-        yes: Do not ask before real hardware moves.
+        yes: No confirmation before real hardware moves.
         json_file: Also write the figures to this file.
     """
     from pronk.links.address import SIM, Address
@@ -113,7 +113,7 @@ def sweep(
                 sim_params=sim_params,
                 seed=seed,
                 overwrite=overwrite,
-                progress=report.bar("ask the virtual robot"),
+                progress=report.bar("excite the virtual robot"),
             )
         figures["logs"] = paths
         console.say(f"wrote {len(paths)} logs of the virtual robot to {out}")
@@ -129,7 +129,7 @@ def sweep(
                 release=release,
                 overwrite=overwrite,
                 real_time=real_time,
-                progress=report.bar(f"ask over {address.kind}"),
+                progress=report.bar(f"excite over {address.kind}"),
             )
         figures |= {
             "virtual": recorded.virtual,

@@ -27,18 +27,18 @@ def record_virtual(
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> list[Path]:
-    """Ask the virtual robot, legs side by side in processes of their own.
+    """Excite the joints of the virtual robot, legs side by side in processes of their own.
 
     On a rigid bench legs do not feel each other, so each process simulates one leg.
 
     Args:
         robot: The robot.
-        plan: What to ask; checked by the caller.
+        plan: What to excite; checked by the caller.
         out_dir: Folder for the logs.
         sim_params: sim_params file; the shipped one if None.
         seed: Of all noise; each leg takes its own from it.
         overwrite: Replace logs that are already there.
-        progress: Told the share done, 0 to 1.
+        progress: Called with the share done, 0 to 1.
 
     Returns:
         The logs, in the order of the robot's joints.
@@ -49,29 +49,29 @@ def record_virtual(
     # Read it here once, so that a bad file is one message and not one per process.
     load_sim_params(sim_params).check_joints(robot.joint_names, str(sim_params or "sim_params"))
     if len(plan.sets) != len(plan.joints):
-        raise PlanError("several joints asked at once: the virtual robot is asked one at a time.")
+        raise PlanError("several joints excited at once: the virtual robot excites one at a time.")
     jobs = []
     for index, leg in enumerate(legs_of(robot)):
-        asked = tuple(name for name in plan.joints if name.split("_")[0] == leg)
-        if asked:
-            jobs.append((leg, asked, seed * 1000 + index))
+        excited = tuple(name for name in plan.joints if name.split("_")[0] == leg)
+        if excited:
+            jobs.append((leg, excited, seed * 1000 + index))
     context = get_context("spawn")
     with (
         context.Manager() as manager,
         ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), mp_context=context) as pool,
     ):
-        told: queue.Queue[tuple[str, float]] = manager.Queue()
+        done_in: queue.Queue[tuple[str, float]] = manager.Queue()
         running = {
-            pool.submit(_record_leg, plan, leg, asked, out_dir, sim_params, s, overwrite, told)
-            for leg, asked, s in jobs
+            pool.submit(_record_leg, plan, leg, excited, out_dir, sim_params, s, overwrite, done_in)
+            for leg, excited, s in jobs
         }
         shares = {leg: 0.0 for leg, _, _ in jobs}
-        weight = {leg: len(asked) / len(plan.joints) for leg, asked, _ in jobs}
+        weight = {leg: len(excited) / len(plan.joints) for leg, excited, _ in jobs}
         done: list[Path] = []
         while running:
             finished, running = wait(running, timeout=0.2, return_when=FIRST_EXCEPTION)
-            while not told.empty():
-                leg, share = told.get()
+            while not done_in.empty():
+                leg, share = done_in.get()
                 shares[leg] = share
             if progress is not None:
                 progress(sum(weight[leg] * share for leg, share in shares.items()))
@@ -91,9 +91,9 @@ def _record_leg(
     sim_params: Path | None,
     seed: int,
     overwrite: bool,
-    told: queue.Queue[tuple[str, float]],
+    done_in: queue.Queue[tuple[str, float]],
 ) -> list[Path]:
-    """Ask one leg; runs in a process of its own."""
+    """Excite one leg; runs in a process of its own."""
     from pronk.runtime.sweep import record
     from pronk.virtual.robot import VirtualRobot
     from pronk.virtual.sim_params import load_sim_params
@@ -104,7 +104,7 @@ def _record_leg(
         plan.robot,
         plan,
         out_dir,
-        progress=lambda share, _: told.put((leg, share)),
+        progress=lambda share, _: done_in.put((leg, share)),
         joints=joints,
         overwrite=overwrite,
         metadata={"link": "virtual robot, in this program"},

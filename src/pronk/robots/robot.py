@@ -75,6 +75,9 @@ class Joint:
     """Mechanical limits [rad]."""
     default_position: float
     """Position in the default pose, also the pose of the sweep [rad]."""
+    folded_position: float | None = None
+    """Position of a robot that lies with its feet under its hips, ready to rise [rad]; None for one
+    that does not stand."""
     stiffness: float
     """Proportional gain on the real drive [N m/rad]."""
     damping: float

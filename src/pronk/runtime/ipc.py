@@ -28,7 +28,7 @@ _HEAD = struct.Struct("<QQQ")
 _SLOT = struct.Struct("<QI")
 """Of a slot: its number, the checksum of the rest."""
 _MAILBOX_SLOTS = 4
-"""The writer is always two slots or more from the one that a reader was told of."""
+"""The writer is always two slots or more from the one that is read."""
 
 
 class _Block:
@@ -171,7 +171,7 @@ class Mode(IntEnum):
     POLICY = 4
     """The policy decides."""
     HALT = 5
-    """The policy decides, told to stand still, before it sits down."""
+    """The policy decides, commanded to stand still, before it sits down."""
     SIT = 6
     """On the way down."""
     FAULT = 7
@@ -183,7 +183,7 @@ class Mode(IntEnum):
 
 
 class OperatorRequest(IntEnum):
-    """What the operator asks for."""
+    """Requests of the operator."""
 
     NONE = 0
     DAMP = 1
@@ -275,9 +275,9 @@ TICK = np.dtype(
         ("latency", "<f8"),
     ]
 )
-"""Servo to logger, every tick: what it saw, was asked and did. `blend` is the policy's share,
-`stiffness` the share of the drives' own, `action` the number of the policy's action in force (-1:
-none), `latency` from the state that a new action answers to its command on the wire (NaN: no new
+"""Servo to logger, every tick: the state, the desired and the sent targets. `blend` is the policy's
+share, `stiffness` the share of the drives' own, `action` the number of the policy's action in force
+(-1: none), `latency` from the state that a new action uses to its command on the wire (NaN: no new
 action)."""
 
 STEP = np.dtype(

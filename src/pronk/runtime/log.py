@@ -10,7 +10,7 @@ time is the wall clock.
     /deploy/sent         500 Hz: joint targets behind it, the decision, or damping
     /deploy/timing       500 Hz: lateness, age of the state, latency of a new action
     /deploy/observation  50 Hz: what the network read
-    /deploy/action       50 Hz: what it gave, and what the operator asked for
+    /deploy/action       50 Hz: its action, and the operator's command
     /deploy/event        mode changes, faults, refusals, what the operating system granted, and
                          whether the robot is virtual
     /deploy/end          last: the figures of the run; a log without it was cut
@@ -270,7 +270,7 @@ class DeployLogWriter:
             state[name] = record[name].tolist()
         self._put("state", begun, state)
         mode = Mode(int(record["mode"]))
-        asked = {
+        desired = {
             "t": begun,
             "tick": tick,
             "mode": int(mode),
@@ -280,7 +280,7 @@ class DeployLogWriter:
             "action": int(record["action"]),
             "state_sequence": int(record["action_state"]),
         }
-        self._put("desired", begun, asked)
+        self._put("desired", begun, desired)
         reason = Reason(int(record["reason"]))
         sent = {
             "t": float(record["done"]),
@@ -367,7 +367,7 @@ link for three at most [s]."""
 
 
 def write_log(plan: Plan, header: dict[str, Any], names: Names, talk: Connection) -> None:
-    """Body of the logger's process; ends when it is told to, or after the servo if nobody can.
+    """Body of the logger's process; ends on request, or after the servo.
 
     Args:
         plan: Of the run.
@@ -413,7 +413,7 @@ def _write(
     try:
         figures = orjson.loads(talk.recv_bytes())
     except (EOFError, OSError):
-        # Whoever should have told the figures is gone. The servo damps now: that is kept too.
+        # The parent is gone. The servo damps now: that is logged too.
         figures = {}
         until = time.monotonic() + _LAST_S
         while _moving(shared) and time.monotonic() < until:
@@ -540,7 +540,7 @@ class DeployLog:
     step_state_age: Array
     """(P,)"""
     command: Array
-    """Asked by the operator: forward, left [m/s], yaw rate [rad/s]. (P, 3)"""
+    """Commanded by the operator: forward, left [m/s], yaw rate [rad/s]. (P, 3)"""
     jump: NDArray[np.bool_]
     """(P,)"""
     observation: Array
@@ -593,7 +593,7 @@ def read_deploy_log(path: Path, *, only: Collection[str] | None = None) -> Deplo
     """Read a log; one that was cut anywhere gives what came before.
 
     The file's text is read chunk by chunk and never held as a whole. A minute's arrays take 25 MB,
-    of which those asked for are kept.
+    of which the requested ones are kept.
 
     Args:
         path: The log.

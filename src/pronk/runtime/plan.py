@@ -1,4 +1,4 @@
-"""What a deployment is made of: everything that its processes are told when they start."""
+"""The plan of one run, given to each of its processes at the start."""
 
 from __future__ import annotations
 

@@ -53,15 +53,15 @@ def serve_policy(plan: Plan, names: Names, end: Connection) -> None:
     policy = plan.policy
     assert policy is not None
     shared = Shared(names)
-    thinker = PolicyProcess(plan, shared, load_policy(policy))
-    signal.signal(signal.SIGTERM, lambda *_: thinker.stop())
+    process = PolicyProcess(plan, shared, load_policy(policy))
+    signal.signal(signal.SIGTERM, lambda *_: process.stop())
     for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
         shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))
     try:
-        thinker.run()
+        process.run()
     finally:
         with suppress(OSError):  # nobody is there any more
-            end.send_bytes(orjson.dumps(thinker.figures()))
+            end.send_bytes(orjson.dumps(process.figures()))
         end.close()
         shared.close()
 
@@ -174,7 +174,7 @@ class PolicyProcess:
 
     def _answer(self, record: np.void, deadline: float, begun: float) -> None:
         state = get_state(record)
-        velocity, jump = self._asked()
+        velocity, jump = self._commanded()
         now = time.monotonic()
         command, tick = self.runner.decide(state, (velocity, jump), now)
         inferred = time.monotonic()
@@ -204,7 +204,7 @@ class PolicyProcess:
         self.shared.steps.put(step)
         self._last_error = ""
 
-    def _asked(self) -> Commanded:
+    def _commanded(self) -> Commanded:
         """What the operator wants now: to stand still unless the policy is in charge.
 
         Never more than the policy was trained for.

@@ -28,6 +28,8 @@ ATTITUDE_SLACK = 0.2
 """Between "up" by the accelerometer and by the attitude filter [rad]."""
 NORM_SLACK = 0.02
 """Of the attitude's quaternion."""
+OVERRUN = 0.15
+"""Farthest that a joint may rest beyond its range: a Go2's calves do when it lies folded [rad]."""
 REST_SPEED = 1.0
 """Fastest that a joint of a robot at rest may turn [rad/s]."""
 BATTERY_SHARE = 0.85
@@ -139,7 +141,7 @@ def _joints(states: Sequence[State], robot: Robot, limits: Limits) -> Iterator[s
     last = states[-1]
     for i, joint in enumerate(robot.joints):
         q, v = float(last.position[i]), float(last.velocity[i])
-        low, high = limits.low[i] - limits.overrun, limits.high[i] + limits.overrun
+        low, high = limits.low[i] - OVERRUN, limits.high[i] + OVERRUN
         if not low <= q <= high:
             yield (
                 f"{joint.name} is at {q:.2f} rad, outside {limits.low[i]:.2f} to "

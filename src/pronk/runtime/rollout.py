@@ -1,4 +1,4 @@
-"""The runner: runs a policy on a machine, real or virtual, by whatever says what is asked.
+"""Run a policy on a machine, real or virtual, under commands that a source gives.
 
     flown = run_policy(machine, policy, robot, script.commanded, seconds=script.seconds)
 
@@ -33,7 +33,7 @@ from pronk.runtime.script import Commanded, Velocity
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Source = Callable[[float], Commanded]
-"""What is asked at a time since the policy took over [s]."""
+"""The command at a time since the policy took over [s]."""
 
 NEAR = 0.5
 """Furthest that a joint of a standing robot may be from its default position [rad]."""
@@ -106,7 +106,7 @@ class Tick:
     since: float
     """The same, since the policy took over [s]."""
     command: Velocity
-    """Asked: forward, left [m/s], yaw rate [rad/s]."""
+    """Commanded: forward, left [m/s], yaw rate [rad/s]."""
     jump: bool
     state: State
     """What it answers."""
@@ -141,23 +141,23 @@ class PolicyRunner:
         self._sequence = 0
         self._began: float | None = None
 
-    def decide(self, state: State, asked: Commanded, now: float) -> tuple[Command, Tick]:
+    def decide(self, state: State, commanded: Commanded, now: float) -> tuple[Command, Tick]:
         """One policy step; call it at `policy.contract.policy_rate_hz`.
 
         Args:
             state: The newest.
-            asked: Velocity command and jump input.
+            commanded: Velocity command and jump input.
             now: The machine's clock [s].
 
         Returns:
             What to send, and the record of it.
 
         Raises:
-            ArtefactError: Something is not finite, or a policy without jump is told to jump.
+            ArtefactError: Something is not finite, or a policy without jump is commanded to jump.
         """
         if self._began is None:
             self._began = now
-        velocity, jump = asked
+        velocity, jump = commanded
         target = self.policy.step(measurement(state), velocity, jump)
         inference = self.policy.inference
         assert inference is not None
@@ -197,7 +197,7 @@ def ticks(
         machine: Connected, in its default pose.
         policy: Whose contract fits the robot.
         robot: What the machine is.
-        source: What is asked, by the time since the first tick [s].
+        source: The command, by the time since the first tick [s].
         seconds: Time to run [s]; endless if infinite.
 
     Raises:
@@ -227,7 +227,7 @@ class Rollout:
     time: Array
     """Of each decision, since then [s]. (T,)"""
     command: Array
-    """Asked: forward, left [m/s], yaw rate [rad/s]. (T, 3)"""
+    """Commanded: forward, left [m/s], yaw rate [rad/s]. (T, 3)"""
     jump: Mask
     """(T,)"""
     state_sequence: NDArray[np.int64]
@@ -299,7 +299,7 @@ def run_policy(
         machine: Connected, in its default pose; left connected, the last targets in force.
         policy: Whose contract fits the robot.
         robot: What the machine is.
-        source: What is asked, by the time since the policy took over [s].
+        source: The command, by the time since the policy took over [s].
         seconds: Time to run [s].
         watch: Called with every tick.
 

@@ -186,7 +186,7 @@ class Deployment:
         return Mode.IDLE if record is None else Mode(int(record["mode"]))
 
     def events_seen(self) -> list[Event]:
-        """What the servo has told since the last call; all of it is kept in the summary too."""
+        """Events of the servo since the last call; the summary keeps them too."""
         found = [Event.of(record) for record in self.shared.events_seen.take()]
         self.summary.events_seen += found
         return found

@@ -135,8 +135,9 @@ class Limits:
     range is 0 to 5) [N m s/rad]."""
     margin: float = 0.05
     """Kept between targets and the mechanical limits [rad]."""
-    overrun: float = 0.1
-    """A joint this far beyond its mechanical limit is a fault: an encoder that slipped [rad]."""
+    overrun: float = 0.15
+    """A joint this far beyond its mechanical limit is a fault: an encoder that slipped. A Go2's
+    calves rest 0.1 beyond when it lies folded [rad]."""
     horizon_s: float = 0.02
     """One policy step: a joint that would leave its limits in it is not driven further out [s]."""
     change: float = 1.0
@@ -151,7 +152,7 @@ class Limits:
     temperature: float = 80.0
     """Of any motor, where it is measured [deg C]."""
     hold_s: float = 0.02
-    """With a state older than this nothing new is asked [s]."""
+    """With a state older than this the last target is held [s]."""
     damp_s: float = 0.05
     """With a state older than this the joints are damped [s]."""
     latch_s: float = 0.1
@@ -227,14 +228,14 @@ Mask = NDArray[np.bool_] | np.bool_
 _SLACK = 1e-9
 """Rounding that a limit forgives, relative to it."""
 _ABSURD = 1e6
-"""No measured or asked number of a robot is as large, in any unit used here."""
+"""No measured or requested number of a robot is as large, in any unit used here."""
 _NO_STIFFNESS = 1e-9
 """Stiffness below which a target moves nothing [N m/rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyInput:
-    """What the rules are asked about. Scalars have shape (...,)."""
+    """Input of the rules. Scalars have shape (...,)."""
 
     position: Array
     """Measured [rad]. (..., n)"""
@@ -385,8 +386,8 @@ def fit(
     Each limit leaves an interval for each joint's target: within the mechanical limits by a
     margin (and no further out than the joint is, if it would leave them within the horizon), near
     the last target, and where `kp (target - q) - kd v` stays within the torque. In what is common
-    to them the nearest to the asked target is taken. If the bus would have to give too much power
-    there, all torques are scaled down by one factor, the solution of a quadratic equation.
+    to them the nearest to the requested target is taken. If the bus would have to give too much
+    power there, all torques are scaled down by one factor, the solution of a quadratic equation.
 
     Args:
         q: Measured positions [rad]. (..., n)
@@ -452,7 +453,7 @@ def power(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limit
 
 
 def _given(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limits) -> Array:
-    """The torque asked, as far as back-EMF leaves voltage for it [N m]. (..., n)."""
+    """The torque requested, as far as back-EMF leaves voltage for it [N m]. (..., n)."""
     share = v / limits.no_load
     torque = kp * (target - q) - kd * v
     return np.minimum(

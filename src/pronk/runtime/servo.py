@@ -126,7 +126,7 @@ class Servo:
         self._stopping = True
 
     def run(self) -> None:
-        """Open the machine, tick until told to stop, damp, close."""
+        """Open the machine, tick until stopped, damp, close."""
         try:
             machine = self.plan.link(self._fix)
             self._open(machine)
@@ -306,7 +306,7 @@ class Servo:
         if self._state is not None:
             self._decide(machine, self._state, begun, link_error)
         else:
-            # Nothing to decide on, but the operator is heard, and told.
+            # Without a state there is nothing to decide; requests are read all the same.
             self._operator(begun)
             self._publish(None, begun, pace)
         pace.advance(time.monotonic())
@@ -447,7 +447,7 @@ class Servo:
     def _filter(
         self, desired: DesiredCommand, state: State, memory: FilterState, now: float, held: bool
     ) -> tuple[Command | None, FilterDecision, FilterState]:
-        """The filter's word on what is asked."""
+        """Pass the desired command through the filter."""
         if desired.command is None:
             quiet = FilterDecision(level=memory.level, reason=memory.reason)
             # Damping is always allowed; the next target is measured against where the joints are.

@@ -3,7 +3,7 @@
     Idle -> Preflight -> Damp -> Stand -> Policy -> Halt -> Sit -> Damp
                                    any fault -> Fault (damped) -> Damp -> ...
 
-The machine decides what is *asked*; the safety filter decides what is sent. It takes time, states
+The machine decides the desired command; the safety filter what is sent. It takes time, states
 and requests as arguments and has no clock of its own.
 """
 
@@ -209,7 +209,7 @@ class StateMachine:
         assert self._path is not None
         pose = self._path.target(t)
         if self._blending is None:
-            # Told to halt before it has answered, it may answer as before or as told.
+            # Halted before its first action, the policy may act for either mode.
             if action is None or action.entry < self._took_over:
                 if t - self.since > FIRST_ACTION_S:
                     late = FilterState(level=FilterAction.LATCH, reason=Reason.EXPIRED, since=t)

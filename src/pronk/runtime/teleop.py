@@ -31,7 +31,7 @@ class OperatorCommand:
     held: bool = False
     """Whether the dead-man button is held: without it the policy's robot is damped."""
     request: OperatorRequest = OperatorRequest.NONE
-    """Something new that is asked for."""
+    """A new request."""
 
 
 class Operator(Protocol):
@@ -62,13 +62,13 @@ class ScriptedOperator:
         """Take the scripts.
 
         Args:
-            scripts: What is asked while the policy is in charge, one after the other.
+            scripts: Commands while the policy is in charge, one after the other.
             pause_s: Of standing still between two [s].
         """
         self.scripts = tuple(scripts)
         self.pause_s = pause_s
         self._began: float | None = None
-        self._asked = Mode.ENDED
+        self._requested_in = Mode.ENDED
         self._over = False
         self.finished = False
         """True once all scripts have been run to their ends."""
@@ -113,9 +113,9 @@ class ScriptedOperator:
 
     def _once(self, request: OperatorRequest, mode: Mode) -> OperatorRequest:
         """A request, said once for each mode."""
-        if self._asked is mode and request is not OperatorRequest.QUIT:
+        if self._requested_in is mode and request is not OperatorRequest.QUIT:
             return OperatorRequest.NONE
-        self._asked = mode
+        self._requested_in = mode
         return request
 
 

@@ -13,10 +13,6 @@ from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
-FOLDED = {"hip_roll": 0.0, "hip_pitch": -1.25, "knee": 2.45}
-"""The pose of a robot that lies with its feet under its hips, ready to rise [rad]: the knees
-0.15 rad from their limit, the foot 2 cm behind the hip and 13 cm below it."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
@@ -34,7 +30,7 @@ class Timing:
     """In which the policy's targets take the place of the pose; 0 for the conditions of
     training."""
     halt_s: float = 1.0
-    """In which the policy is told to stand still before the robot sits down."""
+    """In which the policy is commanded to stand still before the robot sits down."""
     sit_s: float = 1.5
     """From the measured pose to the folded one."""
 
@@ -108,12 +104,13 @@ def folded_pose(robot: Robot) -> Array:
     Raises:
         RobotError: A robot without legs of this kind has none.
     """
-    if not set(robot.groups) <= set(FOLDED):
+    pose = [joint.folded_position for joint in robot.joints]
+    if any(position is None for position in pose):
         raise RobotError(
-            f"{robot.name} has no pose to lie in; its joint groups are {', '.join(robot.groups)}, "
-            f"expected {', '.join(FOLDED)}."
+            f"{robot.name} has no folded pose, so it cannot stand up; give each of its joints a "
+            "folded position."
         )
-    return np.array([FOLDED[joint.group] for joint in robot.joints])
+    return np.array(pose, dtype=float)
 
 
 def stand_up(robot: Robot, measured: Array, began: float, timing: Timing) -> Path:

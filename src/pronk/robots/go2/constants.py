@@ -33,6 +33,8 @@ TRUNK_HALF = (0.1881, 0.04675, 0.057)
 # --- Pose, limits and gains ---------------------------------------------------------------------
 
 DEFAULT_POSITION = {"hip_roll": 0.0, "hip_pitch": 0.9, "knee": -1.8}  # [mj], key `home` [rad]
+FOLDED_POSITION = {"hip_roll": 0.0, "hip_pitch": 1.36, "knee": -2.65}
+"""The lying pose of unitree_sdk2's example go2_stand_example.cpp (BSD-3) [rad]."""
 _RANGE = {"hip_roll": (-1.0472, 1.0472), "knee": (-2.7227, -0.83776)}  # [urdf] [rad]
 _FRONT_PITCH, _HIND_PITCH = (-1.5708, 3.4907), (-0.5236, 4.5379)  # [urdf] [rad]
 DRIVE_STIFFNESS, DRIVE_DAMPING = 20.0, 0.5  # [gym] [N m/rad], [N m s/rad]

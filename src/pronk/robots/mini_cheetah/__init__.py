@@ -20,6 +20,7 @@ def _joint(leg: str, name: str) -> Joint:
         drive=c.drive(name),
         range=c.RANGE[name],
         default_position=c.DEFAULT_POSITION[name],
+        folded_position=c.FOLDED_POSITION[name],
         stiffness=c.DRIVE_STIFFNESS,
         damping=c.DRIVE_DAMPING,
         band_hz=c.BAND_HZ[name],

@@ -46,6 +46,8 @@ TRUNK_HEIGHT = 0.10  # [CAD] bodyHeight
 DEFAULT_POSITION = {"hip_roll": 0.0, "hip_pitch": -0.8, "knee": 1.6}
 """[rad]. Thigh back, shank forward, foot under the hip: Cheetah-Software's stance, and the
 reference pose of the public training set-ups (-0.8, 1.62 there)."""
+FOLDED_POSITION = {"hip_roll": 0.0, "hip_pitch": -1.25, "knee": 2.45}
+"""[rad]. Knees 0.15 rad from their limit, the foot 2 cm behind the hip and 13 cm below it."""
 RANGE = {"hip_roll": (-1.6, 1.6), "hip_pitch": (-2.6, 2.6), "knee": (-2.6, 2.6)}
 """[rad] [urdf]."""
 STANDING_HEIGHT = 0.30  # [paper] S1 [m]

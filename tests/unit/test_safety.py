@@ -151,7 +151,7 @@ def turned(angle: float) -> np.ndarray:
         (state(), command(stiffness=KP - 20.0), Reason.GAINS),
         (state(), command(stiffness=KP + 100.0), Reason.GAINS),
         (state(), command(damping=KD + 5.0), Reason.GAINS),
-        (state(position=spoilt(POSE, 2.71)), command(), Reason.OVERRUN),
+        (state(position=spoilt(POSE, 2.76)), command(), Reason.OVERRUN),
         (state(orientation=turned(0.81)), command(), Reason.TILT),
         (state(orientation=turned(-3.0)), command(), Reason.TILT),
         (state(orientation=np.zeros(4)), command(), Reason.STATE_NOT_FINITE),

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.live
 
 pytest.importorskip("onnxruntime")
 
-PROGRAM = Path(__file__).with_name("deploy_alone.py")
+PROGRAM = Path(__file__).parent.parent / "deploy_alone.py"
 DAMPED_S = 0.9
 """A fault and an end damp for a second; what comes after the last tick is not in the log."""
 
