@@ -1,13 +1,10 @@
-"""A sweep of the training simulator itself, written down as a log.
-
-The truth of such a log is known exactly: the match must find it again. Used by the known-truth
-tests, by the comparison of engine detail and by the benchmark.
-"""
+"""Logs of a simulator's own sweeps, whose gains are known exactly."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,95 +35,77 @@ class Excitation:
 def synthetic_log(
     robot: Robot,
     joint: str,
-    asks: Sequence[Excitation],
+    excitations: Sequence[Excitation],
     stiffness: float,
     damping: float,
     *,
     rate_hz: float = 500.0,
     noise: Sequence[Array] | None = None,
-    armature: float | None = None,
-    frictionloss: float | None = None,
-    held_stiffness: Mapping[str, float] | None = None,
-    held_damping: Mapping[str, float] | None = None,
     simulator: JointRigs | None = None,
-    threads: int = 2,
+    **options: Any,
 ) -> SweepLog:
     """Sweep one joint of the training simulator with known gains.
 
     Args:
         robot: The robot; with a finer `timestep_s` (and more `decimation`) a finer simulator.
-        joint: The joint to ask.
-        asks: Signals, asked one after the other.
-        stiffness: Gain of the asked joint [N m/rad].
-        damping: Gain of the asked joint [N m s/rad].
+        joint: The joint to excite.
+        excitations: Signals, one after the other.
+        stiffness: Gain of the excited joint [N m/rad].
+        damping: Gain of the excited joint [N m s/rad].
         rate_hz: Rate of the log [Hz].
         noise: Added to the position of the joint [rad], one array a segment in the order of the
-            log (ask by ask, repeat by repeat), each at least as long as the segment.
-        armature: Rotor inertia of the asked joint [kg m^2]; the drive's if not given.
-        frictionloss: Dry friction of the asked joint [N m]; the drive's if not given.
-        held_stiffness: Gains of the joints that are held; the robot's if not given.
-        held_damping: Gains of the joints that are held; the robot's if not given.
+            log (signal by signal, repeat by repeat), each at least as long as the segment.
         simulator: Rigs of another simulator, which then also gives the timestep.
-        threads: Threads of the simulator.
+        options: Those of `pronk.simulators.mujoco.JointTestRig`.
 
     Returns:
-        A log of this joint alone, `stiffness` and `damping` being those of the robot's drive (what
-        a match would be told), not those simulated.
+        A log of this joint alone; its `stiffness` and `damping` are those of the robot's drive, not
+        those simulated.
     """
     if simulator is not None:
         robot = simulator.robot
-    asked = robot.joint(joint)
+    known = robot.joint(joint)
     pose = np.array([j.default_position for j in robot.joints])
-    centre = asked.default_position
+    centre = known.default_position
     tick = robot.timestep_s * robot.decimation
     per_tick = round(tick * rate_hz)
     rate = per_tick / tick
     commands, positions = [], []
     segments: list[Segment] = []
     begin = 0
-    for ask in asks:
-        rest = np.zeros(round(ask.settle_s / tick))
-        ticks = centre + np.concatenate([rest, ask.offsets, rest])
-        question = CommandTrace(
+    for one in excitations:
+        rest = np.zeros(round(one.settle_s / tick))
+        ticks = centre + np.concatenate([rest, one.offsets, rest])
+        trace = CommandTrace(
             joint=joint,
             start=0.0,
             timestep=robot.timestep_s,
             command=np.repeat(ticks, robot.decimation),
             pose=pose,
-            amplitude=float(np.abs(ask.offsets).max()),
+            amplitude=float(np.abs(one.offsets).max()),
         )
         if simulator is not None:
             rig = simulator.rig(joint)
-            answer = play(rig, question, np.array([stiffness]), np.array([damping]))[0]
+            position_at_steps = play(rig, trace, np.array([stiffness]), np.array([damping]))[0]
         else:
-            answer = simulate(
-                robot,
-                question,
-                stiffness,
-                damping,
-                armature=armature,
-                frictionloss=frictionloss,
-                held_stiffness=held_stiffness,
-                held_damping=held_damping,
-                threads=threads,
-            )[0]
+            position_at_steps = simulate(robot, trace, stiffness, damping, **options)[0]
         count = len(ticks) * per_tick
-        times = np.minimum(np.arange(count) / rate, question.time[-1])
-        position = make_interp_spline(question.time, answer, k=3)(times)
-        for repeat in range(ask.repeats):
+        times = np.minimum(np.arange(count) / rate, trace.time[-1])
+        position = make_interp_spline(trace.time, position_at_steps, k=3)(times)
+        for repeat in range(one.repeats):
             extra = 0.0 if noise is None else noise[len(segments)][:count]
             commands.append(np.repeat(ticks, per_tick))
             positions.append(position + extra)
             segments.append(
                 Segment(
-                    kind=ask.kind,
+                    kind=one.kind,
                     joints=(joint,),
                     start=begin / rate,
                     stop=(begin + count - 1) / rate,
-                    amplitude=question.amplitude,
+                    amplitude=trace.amplitude,
                     repeat=repeat,
-                    band_hz=ask.band_hz,
-                    clamped=asked.clamped,
+                    band_hz=one.band_hz,
+                    clamped=known.clamped,
                 )
             )
             begin += count
@@ -137,9 +116,9 @@ def synthetic_log(
         command=np.concatenate(commands)[:, None],
         position=np.concatenate(positions)[:, None],
         segments=tuple(segments),
-        stiffness=np.array([asked.stiffness]),
-        damping=np.array([asked.damping]),
+        stiffness=np.array([known.stiffness]),
+        damping=np.array([known.damping]),
         pose=np.array([centre]),
         virtual=True,
-        source=f"rehearsal of {joint}",
+        source=f"synthetic log of {joint}",
     )

@@ -145,16 +145,7 @@ def search(
     weighting: Literal["none", "coherence"] = "none",
     progress: Callable[[float], None] | None = None,
 ) -> list[GridSearch]:
-    """Simulate the whole grid for targets that share one simulation.
-
-    Args:
-        rig: The rig of the group's original joint.
-        group: Targets whose questions are the same after mirroring.
-        stiffness: Axis [N m/rad], shape (a,).
-        damping: Axis [N m s/rad], shape (b,).
-        weighting: Weights of the frequencies.
-        progress: Called with the share done, 0 to 1.
-    """
+    """Simulate the whole grid for targets that share one simulation; arguments as `errors`."""
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
     shape = (len(stiffness), len(damping))
     found = errors(rig, group, kp, kd, weighting, progress)

@@ -16,7 +16,7 @@ import copy
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Self
+from typing import Any, Self
 
 import mujoco
 import mujoco.rollout
@@ -286,7 +286,6 @@ class MujocoSimulator:
         robot: Robot,
         *,
         armature: float | None = None,
-        frictionloss: float | None = None,
         threads: int = 2,
         device: str = "cpu",
     ) -> None:
@@ -295,7 +294,6 @@ class MujocoSimulator:
         Args:
             robot: The robot.
             armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
-            frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
             threads: Threads of the simulator.
             device: Where large runs are simulated; see `DEVICES`.
 
@@ -309,7 +307,6 @@ class MujocoSimulator:
         self._new_rig = rig_on(device)
         self._device = device
         self._armature = armature
-        self._frictionloss = frictionloss
         self._threads = threads
         self._rigs: dict[str, JointTestRig] = {}
 
@@ -333,7 +330,6 @@ class MujocoSimulator:
                 self.robot,
                 original,
                 armature=self._armature,
-                frictionloss=self._frictionloss,
                 threads=self._threads,
             )
         return self._rigs[original]
@@ -421,18 +417,9 @@ class MujocoSimulator:
 
 
 def simulate(
-    robot: Robot,
-    trace: CommandTrace,
-    stiffness: ArrayLike,
-    damping: ArrayLike,
-    *,
-    armature: float | None = None,
-    frictionloss: float | None = None,
-    held_stiffness: Mapping[str, float] | None = None,
-    held_damping: Mapping[str, float] | None = None,
-    threads: int = 2,
+    robot: Robot, trace: CommandTrace, stiffness: ArrayLike, damping: ArrayLike, **options: Any
 ) -> Array:
-    """Position of the excited joint in the training simulator, for many gain pairs.
+    """Simulate one command in the training simulator with many gain pairs.
 
     The simulation begins at rest where gravity leaves the joint with its first command.
 
@@ -441,11 +428,7 @@ def simulate(
         trace: The command to repeat.
         stiffness: Gains of the excited joint [N m/rad], shape (b,) or a scalar.
         damping: Gains of the excited joint [N m s/rad], shape (b,) or a scalar.
-        armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
-        frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
-        held_stiffness: Gains of the joints that are held; the robot's if not given.
-        held_damping: Gains of the joints that are held; the robot's if not given.
-        threads: Threads of the simulator.
+        options: Those of `JointTestRig`.
 
     Returns:
         Position at the start of each step [rad], shape (b, steps), at `trace.time`.
@@ -454,13 +437,5 @@ def simulate(
         np.atleast_1d(np.asarray(stiffness, dtype=np.float64)),
         np.atleast_1d(np.asarray(damping, dtype=np.float64)),
     )
-    with JointTestRig(
-        robot,
-        robot.joint(trace.joint).original[0],
-        armature=armature,
-        frictionloss=frictionloss,
-        held_stiffness=held_stiffness,
-        held_damping=held_damping,
-        threads=threads,
-    ) as rig:
+    with JointTestRig(robot, robot.joint(trace.joint).original[0], **options) as rig:
         return play(rig, trace, kp, kd)

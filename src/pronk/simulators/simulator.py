@@ -211,15 +211,7 @@ class RolloutRig:
         count: Count,
         armature: float | None = None,
     ) -> None:
-        """Take a simulator and one of its joints.
-
-        Args:
-            simulator: The simulator.
-            robot: The robot, with the simulator's timestep.
-            joint: The joint to excite; the original of a mirrored family.
-            count: Where to count steps.
-            armature: Rotor inertia of the joint [kg m^2]; the simulator's if not given.
-        """
+        """Excite `joint`, an original, with its own armature [kg m^2] if one is given."""
         self.robot = robot
         self._simulator = simulator
         self._joint = joint
@@ -393,7 +385,8 @@ def _factory(choice: str) -> Any:
             ) from error
         found = getattr(module, name, None)
         if not callable(found):
-            offers = [n for n, v in vars(module).items() if isinstance(v, type) and n[0] != "_"]
+            own = [v for v in vars(module).values() if getattr(v, "__module__", "") == path.stem]
+            offers = [v.__name__ for v in own if isinstance(v, type)]
             raise PronkError(
                 f"simulator {choice}: {path} has no {name!r} that can be called; its classes are "
                 f"{', '.join(offers) or 'none'}."

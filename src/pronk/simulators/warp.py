@@ -76,34 +76,22 @@ class WarpTestRig(JointTestRig):
     """A rig whose large runs are stepped by MuJoCo Warp."""
 
     def __init__(
-        self,
-        robot: Robot,
-        joint: str,
-        *,
-        armature: float | None = None,
-        frictionloss: float | None = None,
-        threads: int = 2,
-        device: str = "cuda",
-        least: int = LEAST,
+        self, robot: Robot, joint: str, *, device: str = "cuda", least: int = LEAST, **options: Any
     ) -> None:
         """Compile the model and find the device.
 
         Args:
             robot: The robot.
             joint: The joint to excite; the original of a mirrored family.
-            armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
-            frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
-            threads: Threads of the simulator on the processor.
             device: `cuda`, or `warp-cpu` (slow; to compare the arithmetic without a GPU).
             least: Fewer simulations than this run on the processor.
+            options: Those of `JointTestRig`.
 
         Raises:
             PronkError: There is no such device.
         """
         self._device = find_device(device)
-        super().__init__(
-            robot, joint, armature=armature, frictionloss=frictionloss, threads=threads
-        )
+        super().__init__(robot, joint, **options)
         self._least = least
         self._worlds: _Worlds | None = None
 
