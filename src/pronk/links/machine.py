@@ -88,10 +88,10 @@ def damping_command(joints: int, damping: float = 1.0) -> Command:
 
 
 def check_command(command: Command, joints: int) -> None:
-    """See that drives can follow a command.
+    """Check that drives can follow a command.
 
     Raises:
-        HardwareError: Wrong shape, not finite, a negative gain, or a time that is none.
+        HardwareError: Wrong shape, not finite, a negative gain, or an impossible time.
     """
     for name in ("position", "stiffness", "damping"):
         values = np.asarray(getattr(command, name))

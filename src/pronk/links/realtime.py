@@ -1,4 +1,4 @@
-"""What the operating system grants a loop, and pacing by absolute deadlines.
+"""Real-time settings of the operating system, and pacing by absolute deadlines.
 
 Nothing here is needed for a loop to be right, only for it to be on time; so what is not granted is
 reported and the loop runs without it.
@@ -19,13 +19,13 @@ import numpy as np
 
 _LOCK_NOW_AND_LATER = 3
 """MCL_CURRENT | MCL_FUTURE of mlockall(2)."""
-_ROOM_FOR_PINNING = 4
+_LEAST_CORES = 4
 """Fewest cores of which one can be given away."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """What a process asks for."""
+    """Settings requested by a process."""
 
     priority: int | None = None
     """Of SCHED_FIFO, 1 to 99; None for ordinary scheduling."""
@@ -36,7 +36,7 @@ class Wanted:
 
 
 def enter(wanted: Wanted) -> tuple[str, ...]:
-    """Ask for what is wanted, for this process; returns one line for each answer.
+    """Request settings for this process; return one line for each reply.
 
     The garbage of what is loaded so far is collected and then left alone for good: a collection in
     the middle of a loop takes milliseconds.
@@ -50,18 +50,18 @@ def enter(wanted: Wanted) -> tuple[str, ...]:
 def _schedule(priority: int | None) -> Iterator[str]:
     if priority is None:
         return
-    if not hasattr(os, "sched_setscheduler"):
-        yield "real-time scheduling: this system has none; the loop may be late under load"
-        return
+    may = "the loop may be late under load"
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except AttributeError:
+        yield f"real-time scheduling: this system has none; {may}"
     except PermissionError:
         yield (
-            "real-time scheduling: refused; the loop may be late under load (grant it with "
-            "`rtprio 60` for your user in /etc/security/limits.conf)"
+            f"real-time scheduling: refused; {may} (grant it with `rtprio 60` for your user in "
+            "/etc/security/limits.conf)"
         )
     except OSError as error:
-        yield f"real-time scheduling: refused ({error.strerror}); the loop may be late under load"
+        yield f"real-time scheduling: refused ({error.strerror}); {may}"
     else:
         yield f"real-time scheduling: SCHED_FIFO {priority}"
 
@@ -69,16 +69,15 @@ def _schedule(priority: int | None) -> Iterator[str]:
 def _pin(core: int | None) -> Iterator[str]:
     if core is None:
         return
-    if not hasattr(os, "sched_getaffinity"):
-        yield "core of its own: this system does not pin processes"
-        return
-    cores = sorted(os.sched_getaffinity(0))
-    if len(cores) < _ROOM_FOR_PINNING:
-        yield f"core of its own: {len(cores)} cores are too few to give one away"
-        return
-    mine = cores[-1 - core % len(cores)]
     try:
+        cores = sorted(os.sched_getaffinity(0))
+        mine = cores[-1 - core % len(cores)]
+        if len(cores) < _LEAST_CORES:
+            yield f"core of its own: {len(cores)} cores are too few to give one away"
+            return
         os.sched_setaffinity(0, {mine})
+    except AttributeError:
+        yield "core of its own: this system does not pin processes"
     except OSError as error:
         yield f"core of its own: refused ({error.strerror})"
     else:
@@ -89,18 +88,18 @@ def _lock(wanted: bool) -> Iterator[str]:
     if not wanted:
         return
     try:
-        library = ctypes.CDLL(None, use_errno=True)
-        done = library.mlockall(_LOCK_NOW_AND_LATER)
+        done = ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_NOW_AND_LATER)
     except (OSError, AttributeError, TypeError):
         yield "memory: this system cannot lock it"
         return
-    if done == 0:
-        yield "memory: locked"
-        return
     name = os.strerror(ctypes.get_errno() or errno.EPERM)
     yield (
-        f"memory: not locked ({name}); a page fault may delay a tick (grant it with "
-        "`memlock unlimited` for your user in /etc/security/limits.conf)"
+        "memory: locked"
+        if done == 0
+        else (
+            f"memory: not locked ({name}); a page fault may delay a tick (grant it with "
+            "`memlock unlimited` for your user in /etc/security/limits.conf)"
+        )
     )
 
 

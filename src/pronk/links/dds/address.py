@@ -67,11 +67,7 @@ class DdsNetwork:
     """DDS domain; None for 0 where an interface is named, else pronk's own, 77."""
 
     def __post_init__(self) -> None:
-        """Fill in the domain.
-
-        Raises:
-            HardwareError: A domain that there is not, or a robot's without its interface.
-        """
+        """Fill in the domain; refuse one that there is not, and a robot's without its interface."""
         if self.domain is None:
             own = LOOPBACK_DOMAIN if self.interface is None else ROBOT_DOMAIN
             object.__setattr__(self, "domain", own)

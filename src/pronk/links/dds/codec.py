@@ -87,11 +87,7 @@ def joint_map(robot: Robot) -> JointMap:
 
 
 def encode_command(joints: JointMap, command: Command) -> bytes:
-    """The `LowCmd` that puts a command into force; it ends with its checksum.
-
-    Raises:
-        HardwareError: No drive could follow it.
-    """
+    """Encode a `LowCmd` with its checksum; refuse a command that no drive could follow."""
     check_command(command, _JOINTS)
     position, stiffness, damping = (
         np.asarray(getattr(command, name), dtype=np.float64)
@@ -212,14 +208,11 @@ class LowState:
         return bytes(message["imu_state"].tobytes() + message["motor_state"].tobytes())
 
     def state(self, *, time: float, sequence: int) -> State:
-        """In pronk's terms.
+        """Convert to pronk's terms, without temperatures where all of them read zero.
 
         Args:
             time: When it arrived, on the local clock [s].
             sequence: Its number.
-
-        Returns:
-            The state; without temperatures where all of them read zero.
 
         Raises:
             RefusedError: `not finite`, or `quaternion` (not of length 1).
@@ -252,11 +245,7 @@ class LowState:
 
 
 def decode_state(joints: JointMap, data: bytes) -> LowState:
-    """Decode a `LowState`.
-
-    Raises:
-        RefusedError: `header`, `length` or `checksum`.
-    """
+    """Decode a `LowState`; refuse a wrong `header`, `length` or `checksum`."""
     return LowState(joints=joints, message=unpack(messages.LowState, data))
 
 

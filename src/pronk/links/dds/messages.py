@@ -251,15 +251,7 @@ def checksum(image: bytes) -> int:
 
 
 def pack(message: Any, values: NDArray[Any]) -> bytes:
-    """Serialize a record, checksum put in.
-
-    Args:
-        message: The IDL type.
-        values: One record of its C image; padding must be zero. Shape (1,).
-
-    Returns:
-        Header and payload.
-    """
+    """Serialize one record (1,) of the C image, whose padding is zero, with header and checksum."""
     image = values.tobytes()
     image = image[:-4] + checksum(image).to_bytes(4, "little")
     data = np.frombuffer(image + b"\x00", dtype=np.uint8)
@@ -267,14 +259,7 @@ def pack(message: Any, values: NDArray[Any]) -> bytes:
 
 
 def unpack(message: Any, data: bytes) -> NDArray[Any]:
-    """A serialized message as a record of its C image.
-
-    Args:
-        message: The IDL type that it shall be.
-        data: What came, from the header on.
-
-    Returns:
-        One record, shape (1,), read-only.
+    """Read a serialized message as one read-only record (1,) of its C image.
 
     Raises:
         RefusedError: `header`, `length` or `checksum`.

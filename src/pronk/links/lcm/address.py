@@ -60,8 +60,7 @@ def multicast_interface(table: str) -> str | None:
     """The interface by which LCM's packets leave, or None.
 
     Args:
-        table: The system's routes as in /proc/net/route: addresses are hexadecimal, in the order
-            of a little-endian machine's bytes.
+        table: Routes as in /proc/net/route: hexadecimal, little-endian addresses.
     """
     group = int(ipaddress.IPv4Address(GROUP))
     best: tuple[int, int, str] | None = None
@@ -78,7 +77,7 @@ def multicast_interface(table: str) -> str | None:
 
 
 def open_lcm(url: str) -> Any:
-    """An LCM handle (`lcm.LCM`). One handle belongs to one thread.
+    """Open an LCM handle (`lcm.LCM`), which belongs to one thread.
 
     Raises:
         HardwareError: The package `lcm` is not installed, or the address cannot be opened.

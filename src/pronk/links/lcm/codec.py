@@ -134,11 +134,7 @@ LAYOUTS = {"cheetah": CHEETAH, "spi": CHEETAH, "wtw": WTW}
 
 
 def layout_of(name: str) -> Layout:
-    """Look a layout up.
-
-    Raises:
-        HardwareError: There is none of that name.
-    """
+    """Look a layout up; refuse a name that there is not."""
     if name not in LAYOUTS:
         raise HardwareError(f"no LCM layout {name!r}; there are {', '.join(LAYOUTS)}.")
     return LAYOUTS[name]
@@ -173,11 +169,7 @@ class Attitude:
 
 
 def encode_command(layout: Layout, command: Command) -> bytes:
-    """Encode a command.
-
-    Raises:
-        HardwareError: It is not for twelve joints, or no drive could follow it.
-    """
+    """Encode a command; refuse one that is not for twelve joints or that no drive could follow."""
     check_command(command, _JOINTS)
     stiffness, damping = layout.gain_fields
     fields: dict[str, Any] = {
@@ -295,11 +287,11 @@ def decode_attitude(layout: Layout, data: bytes) -> Attitude:
 
 
 def state_of(joints: Joints, attitude: Attitude, *, time: float, sequence: int) -> State:
-    """Join the two halves of a state; its bus voltage is NaN, which neither layout carries.
+    """Join the newest halves of a state; its bus voltage is NaN, which neither layout carries.
 
     Args:
-        joints: The newest.
-        attitude: The newest before it.
+        joints: Of this state.
+        attitude: The newest before them.
         time: When the joints' message arrived, on the local clock [s].
         sequence: Local count.
     """
@@ -327,12 +319,7 @@ def roll_pitch_yaw(orientation: Array) -> Array:
 
 
 def mode_request(mode: int, number: int) -> bytes:
-    """Encode the request that sets `control_mode`; the same bytes confirm it.
-
-    Args:
-        mode: As in `MODES`.
-        number: Of the request.
-    """
+    """Encode the request of this number that sets `control_mode`; the same bytes confirm it."""
     # The robot copies memory here: little-endian, unlike everything else on this wire.
     value = struct.pack("<d", mode).ljust(64, b"\0")
     return messages.CONTROL_PARAMETER.encode(
@@ -369,22 +356,14 @@ def clamp_message(names: tuple[str, ...], held: tuple[str, ...], number: int) ->
 
 
 def read_clamp_message(names: tuple[str, ...], data: bytes) -> tuple[int, tuple[str, ...]]:
-    """Number of the request, and the joints that are or shall be held.
-
-    Raises:
-        RefusedError: `fingerprint` or `length`.
-    """
+    """Number of the request, and the joints that are or shall be held."""
     fields = messages.VIRTUAL_ROBOT.decode(data)
     flags = zip(names, fields["clamped"].tolist(), strict=True)
     return int(fields["request"]), tuple(name for name, held in flags if held)
 
 
 def _within(message: Message, name: str, values: NDArray[Any], low: float, high: float) -> Array:
-    """Convert a field to float64, within bounds.
-
-    Raises:
-        RefusedError: `not finite` or `out of range`.
-    """
+    """Convert a field to float64; refuse what is not finite or out of bounds."""
     # Before the conversion, which warns of a signalling NaN; NaN is within nothing.
     if ((values >= low) & (values <= high)).all():
         return np.asarray(values, dtype=np.float64)

@@ -61,11 +61,7 @@ class Message:
     """Fields in LCM's own language, separated by semicolons: `float q[12]; int64_t id`."""
 
     def __post_init__(self) -> None:
-        """Check the table against the rule.
-
-        Raises:
-            HardwareError: A field cannot be read, or the fingerprint is not that of the fields.
-        """
+        """Refuse a field that cannot be read, and a fingerprint that is not that of the fields."""
         if self.computed_fingerprint != self.fingerprint:
             raise HardwareError(
                 f"{self.name}: the fields hash to {self.computed_fingerprint:#018x}, expected "
@@ -115,10 +111,7 @@ class Message:
         return self.dtype.itemsize
 
     def encode(self, **values: ArrayLike) -> bytes:
-        """The bytes of a message; fields that are not named are 0.
-
-        Args:
-            **values: By name of the field; scalars fill arrays.
+        """Encode a message; fields that are not named are 0, scalars fill arrays.
 
         Raises:
             HardwareError: A name is not that of a field.
@@ -135,10 +128,10 @@ class Message:
         return record.tobytes()
 
     def decode(self, data: bytes) -> NDArray[np.void]:
-        """The fields of a message, by name; numbers keep their wire types.
+        """Decode the fields of a message, by name; numbers keep their wire types.
 
         Raises:
-            RefusedError: Another fingerprint or another length. Counted as `fingerprint`, `length`.
+            RefusedError: `fingerprint` or `length`.
         """
         met = int.from_bytes(data[:8], "big")
         if len(data) < 8 or met != self.fingerprint:
