@@ -1,4 +1,4 @@
-"""The pilot on the virtual robot: what it reads, what it sends, and when."""
+"""A policy runs the virtual robot: its measurements, commands and times."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.rollout import (
     Tick,
     check_standing,
-    hold,
-    measurement,
     projected_gravity,
     run_policy,
     ticks,
@@ -74,16 +72,6 @@ def test_gravity_is_that_of_the_rotation() -> None:
     for rotation in Rotation.random(50, rng=rng):
         expected = rotation.inv().apply([0.0, 0.0, -1.0])
         assert projected_gravity(rotation.as_quat(scalar_first=True)) == pytest.approx(expected)
-
-
-def test_a_nose_up_trunk_feels_gravity_behind() -> None:
-    # x forward, y left, z up: a positive turn about y lowers the nose.
-    up = Rotation.from_euler("y", -30.0, degrees=True).as_quat(scalar_first=True)
-    gravity = projected_gravity(up)
-    assert gravity == pytest.approx([-0.5, 0.0, -np.sqrt(0.75)])
-    read = measurement(state(orientation=up))
-    assert read.projected_gravity == pytest.approx(gravity)
-    assert read.angular_velocity == pytest.approx([0.1, 0.2, 0.3])
 
 
 def test_commands_are_sent_on_time_with_the_drives_own_gains(policy: Policy) -> None:
@@ -175,14 +163,3 @@ def test_who_does_not_stand_is_not_flown() -> None:
         check_standing(ROBOT, state(orientation=lying))
     with pytest.raises(HardwareError, match="nan rad"):
         check_standing(ROBOT, state(position=np.full(12, np.nan)))
-
-
-def test_hold_is_the_default_pose() -> None:
-    command = hold(ROBOT)
-    assert command.position == pytest.approx(DEFAULT)
-    assert hold(ROBOT, DEFAULT + 0.1).position == pytest.approx(DEFAULT + 0.1)
-
-
-def test_no_time_makes_no_record(policy: Policy) -> None:
-    with pytest.raises(HardwareError, match="no decision"):
-        run_policy(standing(), policy, ROBOT, HOP.commanded, seconds=0.0)

@@ -17,7 +17,6 @@ from pronk.evaluation.criteria import cost_of_jumping, evaluation_checks
 from pronk.evaluation.jumps import JumpRules, Series, measure_jump
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Spread
-from pronk.evaluation.tables import evaluation_sheets
 from pronk.evaluation.training_sim.evaluation import (
     CommandResult,
     EstimatorResult,
@@ -353,20 +352,6 @@ def test_the_estimate_is_compared_with_the_target(observed: Observed) -> None:
 
 
 @pytest.mark.train
-def test_a_run_is_written_and_printed(observed: Observed, tmp_path: Path) -> None:
-    path = tmp_path / "evaluation.json"
-    save(path, observed.evaluation)
-    assert load_speed_errors(path) == pytest.approx(observed.evaluation.speed_errors())
-    sheets = evaluation_sheets(observed.evaluation)
-    assert [sheet.title.split(":")[0] for sheet in sheets] == [
-        "Walking",
-        "Jumping",
-        "Acceptance criteria",
-    ]
-    assert all(len(row) == len(sheet.columns) for sheet in sheets for row in sheet.rows)
-
-
-@pytest.mark.train
 def test_an_environment_of_training_is_refused() -> None:
     pytest.importorskip("mjlab")
     from types import SimpleNamespace
@@ -510,39 +495,3 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
     assert found.about["gains"] == {"name": "naive", "sha256": "", "virtual": False}
     assert found.about["device"]["device"] == "cpu"
     assert found.about["versions"]["mjlab"]
-
-
-@pytest.mark.train
-def test_one_robot_is_measured_many_times_with_noise_alone() -> None:
-    pytest.importorskip("mjlab")
-    from pronk.evaluation.training_sim.run import RANDOMIZATIONS
-    from pronk.robots import load_robot
-    from pronk.train.gains import training_gains
-    from pronk.train.mdp.randomization import delay_steps, events, noise
-
-    full, alone, none = (RANDOMIZATIONS[name] for name in ("full", "noise", "none"))
-    robot = load_robot("mini_cheetah")
-    gains = training_gains("naive", robot)
-    assert noise(alone) == noise(full)
-    assert delay_steps(robot, gains, alone) == delay_steps(robot, gains, full)
-    # Of all that can be drawn, bodies, gains and pushes are not.
-    assert list(events(robot, gains, alone)) == ["decimation"]
-    assert events(robot, gains, none) == {}
-
-
-@pytest.mark.train
-def test_a_policy_without_jump_input_is_not_evaluated_in_jumps(
-    trained: tuple[Path, Any], tmp_path: Path
-) -> None:
-    pytest.importorskip("mjlab")
-    from pronk.cli.evaluate import evaluate
-    from pronk.evaluation.training_sim.subject import blank_actor
-    from pronk.train.runner import checkpoint
-
-    path = tmp_path / "model_1.pt"
-    tree = {"algorithm": {"actor_state_dict": blank_actor(jump=False).state_dict()}}
-    checkpoint.save(path, checkpoint.Checkpoint(about={"phase": "walk"}, tree=tree))
-    with pytest.raises(PronkError, match="without the jump input; evaluate it with --what walk"):
-        evaluate(path, "naive", tmp_path / "evaluation.json", what="jump")
-    with pytest.raises(PronkError, match=r"expected a name that ends in \.json"):
-        evaluate(path, "naive", tmp_path / "evaluation.yaml")

@@ -16,8 +16,8 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import results
 from pronk.evaluation.metrics import measure
 from pronk.evaluation.processes import in_processes
-from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
-from pronk.evaluation.trial import Plan, draw, load_subjects, plan_jobs, prepare, run_trial
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case
+from pronk.evaluation.trial import Plan, draw, load_subjects, prepare, run_trial
 from pronk.files import sha256
 from pronk.runtime.script import STILL, Script
 from pronk.virtual import capture
@@ -98,26 +98,6 @@ def test_impossible_plans_are_refused(changes: dict[str, Any], what: str) -> Non
 
 
 # --- Running ------------------------------------------------------------------------------------
-
-
-def test_jumps_at_the_speed_of_the_rates_are_few_and_all_kept(hopper: Path, tmp_path: Path) -> None:
-    plan = replace(PLAN, jumps=3, rates=2)
-    subjects = load_subjects([hopper], ROBOT)
-    planned = plan_jobs(subjects, plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
-    assert [(row.case, row.number, bool(row.capture)) for row, _ in planned] == [
-        ("forward 1", 0, True),
-        ("forward 1", 1, False),
-        ("forward 1", 2, False),
-        (RATES.name, 0, True),
-        (RATES.name, 1, True),
-    ]
-    # They stand beside the paper's commands and change nothing of those.
-    alone = plan_jobs(
-        subjects, replace(plan, rates=0), robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path
-    )
-    assert planned[:3] == alone
-    with pytest.raises(PronkError, match="all different"):
-        replace(plan, cases=(RATES,))
 
 
 @pytest.fixture(scope="module")

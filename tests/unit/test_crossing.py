@@ -95,12 +95,6 @@ def test_sizes_grow_until_no_lead_does() -> None:
     assert (found.largest, found.ever) == (0.2, 0.3)
 
 
-def test_the_search_ends_at_the_most() -> None:
-    rows = climb({(size, lead): 3 for size in (0.1, 0.2, 0.3, 0.4) for lead in (0.0, 0.1)})
-    assert max(row.figures.size for row in rows) == 0.4
-    assert climbs(result(rows))[0].largest == 0.4
-
-
 def test_a_larger_gap_does_not_count_without_the_smaller() -> None:
     rows = climb({(0.1, 0.0): 0, (0.1, 0.1): 1})
     more = [

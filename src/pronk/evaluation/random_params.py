@@ -28,19 +28,14 @@ class Tolerance:
 
     half: float
     """Half-width of the draw."""
-    kind: Literal["relative", "absolute", "about"]
-    """`relative`: a share of the number; `absolute`: added to it; `about`: about `centre`,
-    whatever the number was."""
+    kind: Literal["relative", "about"]
+    """`relative`: a share of the number; `about`: about `centre`, whatever the number was."""
     why: str
     centre: float = 0.0
 
 
 def _relative(half: float, why: str) -> Tolerance:
     return Tolerance(half=half, kind="relative", why=why)
-
-
-def _absolute(half: float, why: str) -> Tolerance:
-    return Tolerance(half=half, kind="absolute", why=why)
 
 
 def _about(centre: float, half: float, why: str) -> Tolerance:
