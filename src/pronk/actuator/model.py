@@ -31,7 +31,7 @@ def pd_torque(
     stiffness: ArrayLike,
     damping: ArrayLike,
 ) -> Array:
-    """Torque the controller asks for, target velocity zero (paper M1 with reading A9) [N m].
+    """Controller torque for target velocity zero (paper M1 with reading A9) [N m].
 
     Args:
         command: Position command [rad].
@@ -42,11 +42,6 @@ def pd_torque(
     """
     error = np.subtract(command, position)
     return np.asarray(np.multiply(stiffness, error) - np.multiply(damping, velocity))
-
-
-def reflected_inertia(rotor_inertia: ArrayLike, gear_ratio: ArrayLike) -> Array:
-    """Rotor inertia as the joint feels it (armature), `rotor_inertia gear_ratio^2` [kg m^2]."""
-    return np.asarray(np.multiply(rotor_inertia, np.square(gear_ratio)))
 
 
 def stall_torque(
@@ -87,14 +82,29 @@ def no_load_speed(
     return bus_voltage / (emf_factor * gear_ratio * torque_constant)
 
 
-def back_emf(speed: ArrayLike, *, no_load_speed: float, bus_voltage: float) -> Array:
-    """Share of the bus voltage that rotation takes [V]: all of it at the no-load speed."""
-    return np.asarray(np.multiply(speed, bus_voltage / no_load_speed))
+def motor_constants(
+    *, stall_torque: float, no_load_speed: float, bus_voltage: float
+) -> tuple[float, float]:
+    """Constants of the gearless one-phase motor with this torque-speed line.
+
+    `K = V / no_load_speed`, `R = K V / stall_torque`, so that `torque = K (V - K speed) / R`.
+
+    Returns:
+        (K [N m/A] = [V s/rad], R [ohm]), joint side.
+    """
+    constant = bus_voltage / no_load_speed
+    return constant, constant * bus_voltage / stall_torque
 
 
-def corner_speed(*, stall_torque: float, no_load_speed: float, effort_limit: float) -> float:
-    """Speed up to which the drive can give its effort limit [rad/s]; 0 if it never can."""
-    return no_load_speed * max(0.0, 1.0 - effort_limit / stall_torque)
+def voltage_limits(
+    speed: ArrayLike, stall_torque: ArrayLike, no_load_speed: ArrayLike
+) -> tuple[Array, Array]:
+    """Least and greatest torque that the bus voltage can drive at a speed [N m].
+
+    `stall_torque (+-1 - speed / no_load_speed)`: bus voltage less back-EMF over the winding.
+    """
+    ratio = np.divide(speed, no_load_speed)
+    return np.multiply(stall_torque, -1.0 - ratio), np.multiply(stall_torque, 1.0 - ratio)
 
 
 def torque_limits(
@@ -107,7 +117,7 @@ def torque_limits(
 
     Bus voltage less back-EMF drives the current: `stall_torque (1 - speed / no_load_speed)` above
     and its mirror image below, both held within the effort limit. Beyond the no-load speed the
-    greatest torque is negative: back-EMF brakes whatever is asked.
+    greatest torque is negative: back-EMF brakes.
 
     Args:
         speed: Joint speed [rad/s].
@@ -118,9 +128,8 @@ def torque_limits(
     Returns:
         (low, high), each of the shape of `speed`.
     """
-    ratio = np.divide(speed, no_load_speed)
-    high = np.clip(stall_torque * (1.0 - ratio), -effort_limit, effort_limit)
-    low = np.clip(stall_torque * (-1.0 - ratio), -effort_limit, effort_limit)
+    low, high = voltage_limits(speed, stall_torque, no_load_speed)
+    low, high = (np.clip(limit, -effort_limit, effort_limit) for limit in (low, high))
     return np.asarray(low), np.asarray(high)
 
 
@@ -131,40 +140,9 @@ def clip_torque(
     no_load_speed: float,
     effort_limit: float,
 ) -> Array:
-    """The torque that comes out when `torque` is asked at `speed` (see `torque_limits`) [N m]."""
+    """Limit a commanded torque to what the drive can give at `speed` (`torque_limits`) [N m]."""
     low, high = torque_limits(speed, stall_torque, no_load_speed, effort_limit)
     return np.asarray(np.clip(torque, low, high))
-
-
-def friction_torque(
-    speed: ArrayLike,
-    *,
-    frictionloss: float,
-    viscous_damping: float = 0.0,
-    stribeck_torque: float = 0.0,
-    stribeck_speed: float = 1.0,
-    smoothing: float = 0.0,
-) -> Array:
-    """Friction of a moving joint, against the motion [N m].
-
-    Coulomb friction, more of it at creeping speed (Stribeck), and a viscous part:
-    `-(frictionloss + stribeck_torque exp(-(speed / stribeck_speed)^2)) sign(speed)
-    - viscous_damping speed`. A joint at rest gets 0 here; it stays at rest as long as the other
-    torques on it stay within `frictionloss + stribeck_torque`.
-
-    Args:
-        speed: Joint speed [rad/s].
-        frictionloss: Coulomb friction [N m].
-        viscous_damping: [N m s/rad]
-        stribeck_torque: Break-away friction less Coulomb friction [N m].
-        stribeck_speed: Speed scale on which the surplus dies away [rad/s].
-        smoothing: Half-width of the ramp that stands for the sign, tanh(speed / smoothing)
-            [rad/s]; 0 for the sign itself.
-    """
-    speed = np.asarray(speed, dtype=np.float64)
-    direction = np.tanh(speed / smoothing) if smoothing > 0.0 else np.sign(speed)
-    dry = frictionloss + stribeck_torque * np.exp(-np.square(speed / stribeck_speed))
-    return np.asarray(-dry * direction - viscous_damping * speed)
 
 
 def winding_loss(

@@ -29,6 +29,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, Robot
 
@@ -70,16 +71,16 @@ def bench_spec(
     armature: Values | None = None,
     frictionloss: Values | None = None,
 ) -> mujoco.MjSpec:
-    """One joint on the bench: what can move when it is asked, and nothing else.
+    """One joint on the bench: what moves when it is excited, and nothing else.
 
     The base is fixed, so only the joint's own `chain` feels it: other branches are removed,
     clamped joints are welded at their default position, the other joints of the chain are held
     by their own drives. Contacts are off, gravity is on. Geoms are left out (the bench is
-    computed, not drawn). Keyframe `default` is the default pose with the commands that ask for it.
+    computed, not drawn). Keyframe `default` is the default pose with the commands that hold it.
 
     Args:
         robot: Which robot.
-        joint_name: The joint that is asked.
+        joint_name: The excited joint.
         stiffness: Gain by joint name, instead of the one on the robot's drive [N m/rad].
         damping: Gain by joint name, instead of the one on the robot's drive [N m s/rad].
         armature: Reflected rotor inertia by joint name, instead of the drive's [kg m^2].
@@ -92,8 +93,7 @@ def bench_spec(
     spec = robot.build_spec()
     _set_options(spec, robot, mujoco.mjtIntegrator.mjINT_EULER)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    for geom in list(spec.geoms):
-        spec.delete(geom)
+    remove_geoms(spec)
     base = spec.body(robot.base_body)
     for base_joint in list(base.joints):
         spec.delete(base_joint)
@@ -111,6 +111,34 @@ def bench_spec(
     )
     _add_default_key(spec, robot, with_command=True)
     return spec
+
+
+def remove_geoms(spec: mujoco.MjSpec) -> None:
+    """Delete all geoms; bodies whose inertia comes from them keep it as an explicit one.
+
+    Raises:
+        RobotError: The model does not compile.
+    """
+    ignored = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    inferred = [body for body in spec.bodies[1:] if ignored or not body.explicitinertial]
+    if inferred:
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise RobotError(f"the model does not compile: {error}.") from None
+        for body in inferred:
+            body.mass = model.body_mass[body.id]
+            body.ipos = model.body_ipos[body.id]
+            body.iquat = model.body_iquat[body.id]
+            body.inertia = model.body_inertia[body.id]
+            body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.fullinertia = [np.nan] * 6
+            body.explicitinertial = True
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    for pair in list(spec.pairs):
+        spec.delete(pair)
+    for geom in list(spec.geoms):
+        spec.delete(geom)
 
 
 def add_drives(
@@ -222,8 +250,11 @@ def set_passive(
 
 def _electrical(drive: Drive) -> tuple[float, float]:
     """Motor constant [N m/A] and resistance [ohm] of the equivalent gearless DC motor."""
-    constant = drive.bus_voltage / drive.no_load_speed
-    return constant, constant * drive.bus_voltage / drive.stall_torque
+    return motor_constants(
+        stall_torque=drive.stall_torque,
+        no_load_speed=drive.no_load_speed,
+        bus_voltage=drive.bus_voltage,
+    )
 
 
 def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[float, float]:
@@ -269,8 +300,8 @@ def _remove_other_branches(
             spec.delete(child)
         elif strangers := joints - wanted:
             raise RobotError(
-                f"{', '.join(sorted(strangers))} can move when {joint_name} is asked; name them in "
-                "its chain (held by their drives) or among its clamped joints."
+                f"{', '.join(sorted(strangers))} can move when {joint_name} is excited; name them "
+                "in its chain (held by their drives) or among its clamped joints."
             )
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import mujoco
 
+from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive
 from pronk.virtual.sim_params import JointParams
@@ -49,8 +50,12 @@ class MotorConstants:
     @classmethod
     def of(cls, drive: Drive) -> MotorConstants:
         """The constants of a drive, as the drive itself believes them."""
-        constant = drive.bus_voltage / drive.no_load_speed
-        return cls(constant=constant, resistance=constant * drive.bus_voltage / drive.stall_torque)
+        constant, resistance = motor_constants(
+            stall_torque=drive.stall_torque,
+            no_load_speed=drive.no_load_speed,
+            bus_voltage=drive.bus_voltage,
+        )
+        return cls(constant=constant, resistance=resistance)
 
 
 def _discrete_lag(lag_s: float, timestep_s: float) -> float:

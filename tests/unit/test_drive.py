@@ -50,7 +50,6 @@ def test_robot_constants_follow_from_the_motor(name: str) -> None:
         free = drive.no_load_speed(**motor, emf_factor=2.0 if three_phase else 1.0)
         assert d.stall_torque == pytest.approx(stall)
         assert d.no_load_speed == pytest.approx(free)
-        assert d.armature == pytest.approx(drive.reflected_inertia(d.rotor_inertia, d.gear_ratio))
 
 
 def test_pd_torque_by_hand() -> None:
@@ -58,13 +57,8 @@ def test_pd_torque_by_hand() -> None:
     np.testing.assert_allclose(torque, [4.25, -0.8])
 
 
-def test_reflected_inertia_of_the_paper() -> None:
-    assert drive.reflected_inertia(72e-6, 9.33) == pytest.approx(0.006268, abs=1e-6)
-    assert drive.reflected_inertia(72e-6, 6.0) == pytest.approx(0.002592)
-
-
 def test_limits_at_stall_corner_no_load_and_beyond() -> None:
-    corner = drive.corner_speed(stall_torque=LINE[0], no_load_speed=LINE[1], effort_limit=LINE[2])
+    corner = 40.0 * (1.0 - 17.0 / 62.428)
     assert corner == pytest.approx(29.107, abs=1e-3)
     speed = np.array([0.0, corner, 35.0, 40.0, 42.0, 60.0])
     low, high = drive.torque_limits(speed, *LINE)
@@ -73,8 +67,7 @@ def test_limits_at_stall_corner_no_load_and_beyond() -> None:
     np.testing.assert_allclose(low, -17.0)
 
 
-def test_effort_limit_above_stall_has_no_corner() -> None:
-    assert drive.corner_speed(stall_torque=3.0, no_load_speed=6.0, effort_limit=4.0) == 0.0
+def test_effort_limit_above_stall_is_never_reached() -> None:
     _, high = drive.torque_limits(0.0, 3.0, 6.0, 4.0)
     assert high == 3.0
 
@@ -90,39 +83,13 @@ def test_clip_is_odd_bounded_and_idempotent(speed: float, torque: float) -> None
     assert drive.clip_torque(out, speed, *LINE) == out
 
 
-def test_back_emf_takes_the_bus_at_no_load() -> None:
-    emf = drive.back_emf([0.0, 20.0, -40.0], no_load_speed=40.0, bus_voltage=24.0)
-    np.testing.assert_allclose(emf, [0.0, 12.0, -24.0])
-
-
-def test_back_emf_and_resistance_give_the_torque_line() -> None:
-    # (V - emf) / V of the stall torque is what is left for torque.
+def test_motor_constants_give_the_torque_line() -> None:
+    constant, resistance = drive.motor_constants(
+        stall_torque=62.428, no_load_speed=40.0, bus_voltage=24.0
+    )
     speed = np.linspace(29.2, 40.0, 7)
-    emf = drive.back_emf(speed, no_load_speed=40.0, bus_voltage=24.0)
     _, high = drive.torque_limits(speed, *LINE)
-    np.testing.assert_allclose(high, LINE[0] * (24.0 - emf) / 24.0, atol=1e-12)
-
-
-def test_friction_by_hand() -> None:
-    kind = {"frictionloss": 0.2, "viscous_damping": 0.01}
-    np.testing.assert_allclose(
-        drive.friction_torque([-5.0, 0.0, 5.0], **kind), [0.25, 0.0, -0.25], atol=1e-15
-    )
-    # Stribeck: .2 + .1 / e at its own speed scale, .2 far above it.
-    stribeck = {**kind, "viscous_damping": 0.0, "stribeck_torque": 0.1, "stribeck_speed": 0.5}
-    np.testing.assert_allclose(
-        drive.friction_torque([0.5, 50.0], **stribeck), [-0.2 - 0.1 / np.e, -0.2]
-    )
-    smooth = drive.friction_torque(0.01, frictionloss=0.2, smoothing=0.01)
-    assert smooth == pytest.approx(-0.2 * np.tanh(1.0))
-
-
-@given(speed=st.floats(-60.0, 60.0), extra=st.floats(0.0, 1.0))
-def test_friction_never_feeds_motion(speed: float, extra: float) -> None:
-    torque = drive.friction_torque(
-        speed, frictionloss=0.2, viscous_damping=0.01, stribeck_torque=extra, smoothing=0.01
-    )
-    assert torque * speed <= 0.0
+    np.testing.assert_allclose(high, constant * (24.0 - constant * speed) / resistance, atol=1e-12)
 
 
 POWER = {**HIP, "stall_torque": 10.8 / 0.173}

@@ -125,7 +125,7 @@ def test_chain_that_leaves_out_a_moving_joint_is_refused() -> None:
     robot = replace(
         CHEETAH, joints=tuple(knee if j.name == "FR_knee" else j for j in CHEETAH.joints)
     )
-    with pytest.raises(RobotError, match="FR_hip_pitch can move when FR_knee is asked"):
+    with pytest.raises(RobotError, match=r"FR_hip_pitch .*FR_knee"):
         bench_spec(robot, "FR_knee")
 
 
