@@ -17,7 +17,7 @@ from pronk.match import result as result_file
 from pronk.match.diagnostics import command_delay
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.match.result import JointFit, MatchResult
-from pronk.report import figures, page, replay, style
+from pronk.report import figures, match_page, style
 from pronk.report.paper import published
 from pronk.response.response import FrequencyResponse
 from pronk.simulators.simulator import SimulatorInfo
@@ -202,7 +202,7 @@ def match() -> MatchResult:
 @pytest.fixture(scope="module")
 def html(match, tmp_path_factory) -> str:
     folder = written(tmp_path_factory.mktemp("match"), match)
-    return page.write_page(folder).read_text(encoding="utf-8")
+    return match_page.write_page(folder).read_text(encoding="utf-8")
 
 
 def pixels(figure: Figure) -> np.ndarray:
@@ -355,10 +355,10 @@ def test_drawing_leaves_the_settings_of_matplotlib_alone(match):
 
 def test_replay_shows_where_the_naive_simulation_is_furthest_off():
     one = a_replay()
-    window = replay.busiest_window(one, 1.0)
+    window = figures.busiest_window(one, 1.0)
     assert one.time[window][0] == pytest.approx(4.0, abs=0.1)
     assert one.time[window][-1] == pytest.approx(5.0, abs=0.1)
-    whole = replay.busiest_window(one, 100.0)
+    whole = figures.busiest_window(one, 100.0)
     assert whole == slice(0, len(one.time))
 
 
@@ -413,7 +413,7 @@ def test_page_is_small_enough_to_pass_on(html):
 
 
 def test_page_says_the_verdict_in_numbers(html, match):
-    says = page.verdict(match)
+    says = match_page.verdict(match)
     assert (says["matched"], says["joints"]) == (12, 12)
     expected = np.sqrt(np.mean([j.error_db**2 for j in match.joints.values()]))
     assert says["error_db"] == pytest.approx(expected)
@@ -429,18 +429,20 @@ def test_a_joint_without_match_is_counted_and_named(tmp_path):
     doubt = "no match: the best gains miss the measured response by 2 dB RMS"
     bad = JointFit(**{**vars(joint), "flags": (doubt,)})
     worse = MatchResult(gains=result.gains, joints={**result.joints, name: bad})
-    assert page.verdict(worse)["matched"] == 11
-    assert doubt in page.verdict(worse)["flags"][name]
+    assert match_page.verdict(worse)["matched"] == 11
+    assert doubt in match_page.verdict(worse)["flags"][name]
 
 
 def test_zero_armature_without_a_match_is_no_doubt_about_the_match(match):
-    assert all("zero armature" not in f for fs in page.verdict(match)["flags"].values() for f in fs)
+    assert all(
+        "zero armature" not in f for fs in match_page.verdict(match)["flags"].values() for f in fs
+    )
 
 
 def test_virtual_is_said_on_the_page_and_only_if_it_is(html, tmp_path):
     assert html.count("virtual robot") > 5
     assert "says nothing about a real robot" in html
-    real = page.write_page(written(tmp_path, synthetic(virtual=False, legs=1))).read_text(
+    real = match_page.write_page(written(tmp_path, synthetic(virtual=False, legs=1))).read_text(
         encoding="utf-8"
     )
     assert "virtual robot" not in real
@@ -459,7 +461,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     result = synthetic(legs=1)
     nasty = "<img src=x onerror=alert(1)>"
     gains = MatchedGains(**{**vars(result.gains), "logs": {nasty: "0" * 64}})
-    text = page.write_page(
+    text = match_page.write_page(
         written(tmp_path, MatchResult(gains=gains, joints=result.joints))
     ).read_text(encoding="utf-8")
     assert nasty not in text
@@ -473,7 +475,7 @@ def test_page_without_predictions_and_zero_armature_leaves_them_out(tmp_path):
         for name, j in result.joints.items()
     }
     folder = written(tmp_path, MatchResult(gains=result.gains, joints=bare), predictions=False)
-    text = page.write_page(folder).read_text(encoding="utf-8")
+    text = match_page.write_page(folder).read_text(encoding="utf-8")
     assert 'id="replay"' not in text
     assert 'id="armature"' not in text
     assert "nan" not in re.sub(r'src="[^"]*"', "", text).lower()
@@ -481,26 +483,26 @@ def test_page_without_predictions_and_zero_armature_leaves_them_out(tmp_path):
 
 def test_missing_and_damaged_artefacts_are_named(tmp_path):
     with pytest.raises(ArtefactError, match="no such folder"):
-        page.write_page(tmp_path / "nowhere")
+        match_page.write_page(tmp_path / "nowhere")
     with pytest.raises(ArtefactError, match=r"no gains\.yaml; `pronk match"):
-        page.write_page(tmp_path)
+        match_page.write_page(tmp_path)
     gains_file.save(tmp_path / "gains.yaml", synthetic(legs=1).gains)
     with pytest.raises(ArtefactError, match=r"match\.npz: no such file"):
-        page.write_page(tmp_path)
+        match_page.write_page(tmp_path)
     (tmp_path / "match.npz").write_bytes(b"not a zip")
     with pytest.raises(ArtefactError, match="not a match file of pronk"):
-        page.write_page(tmp_path)
-    assert not (tmp_path / page.PAGE_NAME).exists()
+        match_page.write_page(tmp_path)
+    assert not (tmp_path / match_page.PAGE_NAME).exists()
 
 
 def test_gains_under_another_name_are_found(tmp_path):
     folder = written(tmp_path, synthetic(legs=1))
     (folder / "gains.yaml").rename(folder / "tuesday.yaml")
     (folder / "other.yaml").write_text("just: something\n")
-    assert page.find_gains(folder).name == "tuesday.yaml"
+    assert match_page.find_gains(folder).name == "tuesday.yaml"
     gains_file.save(folder / "wednesday.yaml", synthetic(legs=1).gains)
     with pytest.raises(ArtefactError, match="several gains files"):
-        page.find_gains(folder)
+        match_page.find_gains(folder)
 
 
 # --- Delay beside the match ---------------------------------------------------------------------

@@ -12,11 +12,8 @@ import pytest
 from command_line import invoke
 from pronk.errors import LogError
 from pronk.links.machine import State
-from pronk.report import whole
-from pronk.report.deploy import data as deploy_data
-from pronk.report.deploy import part as deploy_part
-from pronk.report.deploy import words as deploy_words
-from pronk.report.deploy.delay import delay, shift
+from pronk.report import build, deploy_page
+from pronk.report.deploy_page import delay, shift
 from pronk.robots import load_robot
 from pronk.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
 from pronk.runtime.log import DeployLog, DeployLogWriter, read_deploy_log
@@ -120,13 +117,13 @@ def faulted(path: Path, *, end: bool = True) -> Path:
 
 
 def test_quantiles_are_those_of_the_sorted_values() -> None:
-    found = deploy_data.spread(np.r_[np.arange(1000, 0, -1), np.nan])
+    found = deploy_page.spread(np.r_[np.arange(1000, 0, -1), np.nan])
     assert (found.n, found.p50, found.p95, found.p99) == (1000, 500.0, 950.0, 990.0)
     assert (found.p99_9, found.largest) == (999.0, 1000.0)
-    few = deploy_data.spread(np.arange(50.0))
+    few = deploy_page.spread(np.arange(50.0))
     assert math.isnan(few.p99)
     assert few.p95 == 47.0
-    assert deploy_data.spread(np.array([])).n == 0
+    assert deploy_page.spread(np.array([])).n == 0
 
 
 @pytest.mark.parametrize("lag", [1, 2, 4])
@@ -146,8 +143,8 @@ def test_a_delay_beyond_training_is_a_doubt(tmp_path: Path) -> None:
     log = read_deploy_log(flown(tmp_path / "run.mcap", lag=5))
     found = delay(log, ROBOT)
     assert found.within is False
-    assert "BEYOND the 0 to 10 ms" in deploy_words.delaying(found)
-    assert deploy_words.doubtful(log, found)
+    assert "BEYOND the 0 to 10 ms" in deploy_page.delaying(found)
+    assert deploy_page.doubtful(log, found)
 
 
 def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> None:
@@ -160,28 +157,28 @@ def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> N
     found = delay(read_deploy_log(path), ROBOT)
     assert np.isnan(found.drives).all()
     assert found.longest == pytest.approx(0.003)
-    assert "without the drives: within" in deploy_words.delaying(found)
+    assert "without the drives: within" in deploy_page.delaying(found)
 
 
 def test_what_a_fault_leaves(tmp_path: Path) -> None:
     log = read_deploy_log(faulted(tmp_path / "run.mcap"))
-    found = deploy_data.stretches(log)
+    found = deploy_page.stretches(log)
     assert [one.mode for one in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
     np.testing.assert_allclose([one.seconds for one in found], 0.2, atol=1e-9)
-    moved, latched = deploy_data.interventions(log)
+    moved, latched = deploy_page.interventions(log)
     assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, FilterAction.LIMIT, 100)
     assert (moved.largest, moved.joint) == (pytest.approx(0.25), ROBOT.joint_names[5])
     assert (latched.reason, latched.ticks, latched.joint) == (Reason.TILT, 100, "")
-    np.testing.assert_allclose(deploy_data.tilt(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
-    joints = deploy_data.tracking(log)
+    np.testing.assert_allclose(deploy_page.tilt(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
+    joints = deploy_page.tracking(log)
     assert joints[0].standing == pytest.approx(0.01)
     assert math.isnan(joints[0].torque)  # all zeros: this robot tells none
-    assert deploy_data.until_fault(log) == 201
-    assert deploy_words.says(log) == (
+    assert deploy_page.until_fault(log) == 201
+    assert deploy_page.verdict(log) == (
         "Real mini_cheetah: a fault at 0.40 s, after 0.2 s of the policy: tilted."
     )
-    assert "100 of 100 commands on the wire were damping" in deploy_words.damping(log)
-    assert deploy_words.filtering(log).endswith("in 100 of 200 commands (50.0 %).")
+    assert "100 of 100 commands on the wire were damping" in deploy_page.damping(log)
+    assert deploy_page.filtering(log).endswith("in 100 of 200 commands (50.0 %).")
 
 
 def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
@@ -189,21 +186,21 @@ def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
     for k in (0, 1, 2, 5, 6, 10):
         writer.tick(record(k, POSE))
     writer.end(complete=True, figures={})
-    assert deploy_data.missed(read_deploy_log(tmp_path / "run.mcap")) == 5
+    assert deploy_page.missed(read_deploy_log(tmp_path / "run.mcap")) == 5
 
 
 def test_temperatures_where_there_are_any(tmp_path: Path) -> None:
-    assert deploy_data.temperatures(flown(tmp_path / "cold.mcap", count=5)) is None
+    assert deploy_page.temperatures(flown(tmp_path / "cold.mcap", count=5)) is None
     path = flown(tmp_path / "hot.mcap", count=5, temperature=np.arange(12.0) + 30.0)
-    found = deploy_data.temperatures(path)
+    found = deploy_page.temperatures(path)
     assert found is not None
     np.testing.assert_allclose(found[0], np.arange(5) * TICK_S)
     np.testing.assert_array_equal(found[1], np.tile(np.arange(12.0) + 30.0, (5, 1)))
 
 
 def page(path: Path) -> tuple[str, DeployLog]:
-    material = deploy_part.read(path)
-    return str(deploy_part.part(material, anchor="deploy").html), material.log
+    material = deploy_page.read(path)
+    return str(deploy_page.part(material, anchor="deploy").html), material.log
 
 
 def test_the_page_of_a_cut_log_says_so(tmp_path: Path) -> None:
@@ -241,7 +238,7 @@ def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     flown(tmp_path / "deep" / "b.mcap")
     (tmp_path / "other.mcap").write_bytes(b"no log of anything")
-    found = whole.find(tmp_path)
+    found = build.find(tmp_path)
     assert [one.source for one in found] == ["a.mcap", "deep/b.mcap"]
     assert [one.virtual for one in found] == [False, True]
     assert found[1].figures["delay"]["within"] is True
@@ -250,4 +247,4 @@ def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "other.mcap").write_bytes(b"no log of anything")
     with pytest.raises(LogError, match="not a log of a deployment"):
-        whole.find(tmp_path / "other.mcap")
+        build.find(tmp_path / "other.mcap")

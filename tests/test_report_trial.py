@@ -32,16 +32,21 @@ from pronk.evaluation.walk_metrics import WalkFigures
 from pronk.match import gains as gains_file
 from pronk.match import result as match_file
 from pronk.match.result import MatchResult
-from pronk.report import style, whole
-from pronk.report.trial import bodies as trial_bodies
-from pronk.report.trial import clips as trial_clips
-from pronk.report.trial import crossing as trial_crossing
-from pronk.report.trial import data as trial_data
-from pronk.report.trial import variation as trial_variation
-from pronk.report.trial.argument import bode_errors_db, joint_error_db, match_near
-from pronk.report.trial.cells import cells, scatter
-from pronk.report.trial.sweeps import Line, Panel, argument, lines
-from pronk.report.trial.traces import Trace, heights, rates, rms, torque_speed
+from pronk.report import build, extra_pages, style, trial_page
+from pronk.report.trial_figures import (
+    Line,
+    Panel,
+    Trace,
+    argument,
+    cells,
+    heights,
+    lines,
+    rates,
+    rms,
+    scatter,
+    torque_speed,
+)
+from pronk.report.trial_page import bode_errors_db, joint_error_db, match_near
 from pronk.robots import load_robot
 from pronk.virtual import capture as captures
 from pronk.virtual.capture import Capture
@@ -299,7 +304,7 @@ def trial(tree: Path) -> Results:
 
 @pytest.fixture(scope="module")
 def html(tree: Path) -> str:
-    page, _ = whole.write_report(tree)
+    page, _ = build.write_report(tree)
     return page.read_text(encoding="utf-8")
 
 
@@ -359,7 +364,16 @@ def test_the_page_is_whole_and_needs_nothing_else(html: str) -> None:
     assert {"trial", "walk", "crossing", "variation", "bodies", "match"} < set(checker.ids)
     # The trials of the bodies belong to their part.
     assert "trial1" not in checker.ids
-    for section in ("table", "bars", "scatter", "argument", "look", "gaps", "landings", "rates"):
+    for section in (
+        "table",
+        "criteria",
+        "scatter",
+        "argument",
+        "look",
+        "gaps",
+        "landings",
+        "rates",
+    ):
         assert f"trial-{section}" in checker.ids
     for section in ("heights", "drives", "more", "definitions", "run"):
         assert f"trial-{section}" in checker.ids
@@ -417,7 +431,7 @@ def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     body["sim_params"]["file"] = nasty
     body["policies"][0]["path"] = nasty
     (tmp_path / "summary.json").write_text(json.dumps(body))
-    page, _ = whole.write_report(tmp_path)
+    page, _ = build.write_report(tmp_path)
     text = page.read_text(encoding="utf-8")
     assert nasty not in text
     assert text.count("&lt;img src=x onerror=alert(1)&gt;") == 2
@@ -426,8 +440,8 @@ def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
 
 def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
     made(tmp_path, ("matched",), CASES[:1], keep=False)
-    first = whole.write_report(tmp_path)[0].read_bytes()
-    assert whole.write_report(tmp_path)[0].read_bytes() == first
+    first = build.write_report(tmp_path)[0].read_bytes()
+    assert build.write_report(tmp_path)[0].read_bytes() == first
 
 
 # --- Parts missing ------------------------------------------------------------------------------
@@ -435,7 +449,7 @@ def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
 
 def test_one_policy_without_captures_or_match_makes_a_page(tmp_path: Path) -> None:
     made(tmp_path, ("matched",), CASES[:2], keep=False)
-    page, found = whole.write_report(tmp_path)
+    page, found = build.write_report(tmp_path)
     assert [one.source for one in found] == ["summary.json"]
     checker = checked(page.read_text(encoding="utf-8"))
     for section in ("argument", "look", "rates", "heights"):
@@ -447,11 +461,11 @@ def test_one_policy_without_captures_or_match_makes_a_page(tmp_path: Path) -> No
 def test_captures_that_are_gone_are_counted(tmp_path: Path) -> None:
     trial = made(tmp_path, ("matched",), CASES[:1])
     (tmp_path / trial.rows[1].capture).unlink()
-    found = trial_data.see(trial, tmp_path)
+    found = trial_page.see(trial, tmp_path)
     assert found is not None
     assert found.missing == 1
     assert len(found.height["matched"]["forward 1"]) == 2
-    page, _ = whole.write_report(tmp_path)
+    page, _ = build.write_report(tmp_path)
     text = page.read_text(encoding="utf-8")
     assert "2 of 3 jumps, those whose captures were kept" in text
     assert "1 captures are missing from the folder." in text
@@ -461,7 +475,7 @@ def test_a_policy_that_never_jumps_makes_a_page_of_dashes(tmp_path: Path) -> Non
     trial = made(tmp_path, ("matched",), CASES[:2], keep=False)
     rows = tuple(replace(row, figures=JumpFigures(standing=True, fell=True)) for row in trial.rows)
     results.save(tmp_path, replace(trial, rows=rows))
-    page, _ = whole.write_report(tmp_path)
+    page, _ = build.write_report(tmp_path)
     text = " ".join(checked(page.read_text(encoding="utf-8")).text)
     assert "6 jumps asked with 2 commands, 0 jumped" in re.sub(r"\s+", " ", text)
     assert "nan" not in text.lower().replace("finance", "")
@@ -469,7 +483,7 @@ def test_a_policy_that_never_jumps_makes_a_page_of_dashes(tmp_path: Path) -> Non
 
 def test_a_match_alone_makes_a_page(tmp_path: Path) -> None:
     matched(tmp_path)
-    page, found = whole.write_report(tmp_path)
+    page, found = build.write_report(tmp_path)
     assert page.name == "report.html"
     assert found[0].figures["joints"] == 3
     checked(page.read_text(encoding="utf-8"))
@@ -478,7 +492,7 @@ def test_a_match_alone_makes_a_page(tmp_path: Path) -> None:
 def test_two_trials_are_two_parts_with_names_of_their_own(tmp_path: Path) -> None:
     made(tmp_path / "monday", ("matched",), CASES[:1], keep=False)
     made(tmp_path / "tuesday", ("naive",), CASES[:1], keep=False)
-    page, found = whole.write_report(tmp_path)
+    page, found = build.write_report(tmp_path)
     assert [one.source for one in found] == ["monday/summary.json", "tuesday/summary.json"]
     text = " ".join(checked(page.read_text(encoding="utf-8")).text)
     assert "Trial: monday" in text
@@ -507,23 +521,23 @@ def test_damage_is_one_sentence_and_no_page(
     tree: Path, tmp_path: Path, name: str, bytes_kept: int, said: str
 ) -> None:
     for path in tree.rglob("*"):
-        if path.is_file() and path.name != whole.NAME:
+        if path.is_file() and path.name != build.NAME:
             copy = tmp_path / path.relative_to(tree)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(path.read_bytes())
     damaged = tmp_path / name
     damaged.write_bytes(damaged.read_bytes()[:bytes_kept])
     with pytest.raises(ArtefactError, match=said) as refusal:
-        whole.write_report(tmp_path)
+        build.write_report(tmp_path)
     assert "\n" not in str(refusal.value)
-    assert not (tmp_path / whole.NAME).exists()
+    assert not (tmp_path / build.NAME).exists()
 
 
 def test_an_empty_folder_and_none_say_what_would_fill_them(tmp_path: Path) -> None:
     with pytest.raises(ArtefactError, match=r"nothing to report; .*pronk trial .*pronk match"):
-        whole.write_report(tmp_path)
+        build.write_report(tmp_path)
     with pytest.raises(ArtefactError, match="no such folder"):
-        whole.write_report(tmp_path / "nowhere")
+        build.write_report(tmp_path / "nowhere")
 
 
 def test_the_command_writes_the_page_and_its_figures(
@@ -548,8 +562,8 @@ def test_the_command_writes_the_page_and_its_figures(
 
 def test_cells_draw_mean_spread_and_the_paper(trial: Results) -> None:
     names = [case.name for case in CASES]
-    distance = trial_data.values(trial, "distance", names)
-    paper = trial_data.published("distance")
+    distance = trial_page.values(trial, "distance", names)
+    paper = trial_page.published("distance")
     axes = cells([("distance [m]", distance, paper)]).axes[0]
     points = {
         (round(float(y), 6), round(float(np.ptp(bar.get_segments()[0][:, 1])) / 2.0, 6))
@@ -567,13 +581,13 @@ def test_cells_draw_mean_spread_and_the_paper(trial: Results) -> None:
 
 
 def test_naive_stands_before_matched_as_in_the_paper(trial: Results) -> None:
-    assert trial_data.policies(trial) == ["naive", "matched"]
+    assert trial_page.policies(trial) == ["naive", "matched"]
     assert trial.subjects[0].name == "matched"
 
 
 def test_scatter_has_a_panel_a_command(trial: Results) -> None:
     names = [case.name for case in CASES]
-    height, distance = (trial_data.values(trial, what, names) for what in ("height", "distance"))
+    height, distance = (trial_page.values(trial, what, names) for what in ("height", "distance"))
     figure = scatter(height, distance, {}, {})
     assert [axes.get_title(loc="left") for axes in figure.axes] == names
     naive = next(line for line in figure.axes[0].lines if line.get_color() == style.NAIVE)
@@ -584,10 +598,10 @@ def test_scatter_has_a_panel_a_command(trial: Results) -> None:
 
 def test_ratios_are_naive_over_matched_whichever_came_first(tmp_path: Path) -> None:
     few = made(tmp_path / "few", cases=CASES[:2], keep=False)
-    assert not trial_data.naive_over_matched(few, "distance")
+    assert not trial_page.naive_over_matched(few, "distance")
     forth = made(tmp_path / "a", ("matched", "naive"), CASES[:2], keep=False, times=2)
     back = made(tmp_path / "b", ("naive", "matched"), CASES[:2], keep=False, times=2)
-    one, other = (trial_data.naive_over_matched(each, "distance") for each in (forth, back))
+    one, other = (trial_page.naive_over_matched(each, "distance") for each in (forth, back))
     assert [ratio.words for ratio in one] == [ratio.words for ratio in other]
     assert one[0].overall
     for ratio, same in zip(one, other, strict=True):
@@ -600,12 +614,12 @@ def test_ratios_are_naive_over_matched_whichever_came_first(tmp_path: Path) -> N
 
 
 def test_a_trace_begins_at_the_jump_input(trial: Results, tree: Path) -> None:
-    found = trial_data.see(trial, tree / "trial")
+    found = trial_page.see(trial, tree / "trial")
     assert found is not None
     trace = found.height["matched"]["forward 1"][0]
-    assert trace.time[0] == pytest.approx(-trial_data.BEFORE_S, abs=DT)
-    assert trace.time[-1] <= trial_data.AFTER_S + 1e-9
-    assert np.allclose(np.diff(trace.time), 1.0 / trial_data.TRACE_RATE_HZ)
+    assert trace.time[0] == pytest.approx(-trial_page.BEFORE_S, abs=DT)
+    assert trace.time[-1] <= trial_page.AFTER_S + 1e-9
+    assert np.allclose(np.diff(trace.time), 1.0 / trial_page.TRACE_RATE_HZ)
     flight = FLIGHTS["matched"][0] / 1000.0
     inside = (trace.time > 0.2 + DT) & (trace.time < 0.2 + flight - DT)
     t = trace.time[inside] - 0.2
@@ -616,7 +630,7 @@ def test_a_trace_begins_at_the_jump_input(trial: Results, tree: Path) -> None:
 def test_rates_are_those_of_the_acceleration_at_the_papers_speed_alone(
     trial: Results, tree: Path
 ) -> None:
-    found = trial_data.see(trial, tree / "trial")
+    found = trial_page.see(trial, tree / "trial")
     assert found is not None
     assert set(found.roll["naive"]) == {RATES.name}
     runs = found.roll["naive"][RATES.name]
@@ -632,7 +646,7 @@ def test_rates_are_those_of_the_acceleration_at_the_papers_speed_alone(
 
 
 def test_torque_over_speed_stands_in_the_drives_limits(trial: Results, tree: Path) -> None:
-    found = trial_data.see(trial, tree / "trial")
+    found = trial_page.see(trial, tree / "trial")
     assert found is not None
     hard = found.hardest
     assert hard is not None
@@ -659,8 +673,8 @@ def test_the_hardest_jump_has_the_least_margin(trial: Results) -> None:
     easy = replace(rows[0], figures=replace(rows[0].figures, torque_margin=(0.5,) * 12))
     hard = replace(rows[1], figures=replace(rows[1].figures, torque_margin=(0.9, *(0.1,) * 11)))
     missed = replace(rows[2], figures=JumpFigures(standing=True))
-    assert trial_data.hardest([easy, hard, missed]) is hard
-    assert trial_data.hardest([missed]) is None
+    assert trial_page.hardest([easy, hard, missed]) is hard
+    assert trial_page.hardest([missed]) is None
 
 
 def test_heights_draw_every_run_and_the_standing_height() -> None:
@@ -690,7 +704,7 @@ def test_lines_are_drawn_in_order_with_their_bars_and_marks() -> None:
 
 def test_crossings_become_shares_with_wilsons_interval() -> None:
     climb = climbs(crossed())[0]
-    line = trial_crossing.line(climb)
+    line = extra_pages.climb_line(climb)
     assert line.x.tolist() == [0.2, 0.4]
     assert line.y.tolist() == [0.8, 0.0]
     # Wilson with 4 of 5, z = 1.96.
@@ -702,29 +716,29 @@ def test_crossings_become_shares_with_wilsons_interval() -> None:
 
 def test_a_varied_body_by_hand() -> None:
     found = varied()
-    together = trial_variation.by_value(found, "trunk_mass_offset", "naive")
-    line = trial_variation.figure_line(together, "height")
+    together = extra_pages.by_value(found, "trunk_mass_offset", "naive")
+    line = extra_pages.figure_line(together, "height")
     assert line.x.tolist() == [0.0, 1.0]
     assert line.y == pytest.approx([0.4, 0.3])
     assert line.high - line.y == pytest.approx([0.01, 0.01])
-    assert trial_variation.success_line(together).y.tolist() == [1.0, 0.0]
-    drawn = trial_variation.panels(found)
+    assert extra_pages.success_line(together).y.tolist() == [1.0, 0.0]
+    drawn = extra_pages.variation_panels(found)
     assert [panel.marks for panel in drawn] == [(0.0,)] * 3
     assert list(drawn[0].lines) == ["naive", "matched"]
 
 
 def test_a_mean_over_commands_leaves_out_what_was_not_found() -> None:
-    assert trial_variation.known_mean([0.4, math.nan, 0.2]) == pytest.approx(0.3)
-    assert math.isnan(trial_variation.known_mean([math.nan]))
+    assert extra_pages.known_mean([0.4, math.nan, 0.2]) == pytest.approx(0.3)
+    assert math.isnan(extra_pages.known_mean([math.nan]))
 
 
 def test_bodies_stand_side_by_side(tmp_path: Path) -> None:
     found = embodied(tmp_path)
-    errors = trial_bodies.errors_db(found)
+    errors = extra_pages.errors_db(found)
     assert errors == pytest.approx(
         {"matched, body 1": 0.1, "naive, body 1": 0.6, "matched, body 2": 0.2, "naive, body 2": 1.2}
     )
-    distance = trial_bodies.by_body(found, "distance")
+    distance = extra_pages.by_body(found, "distance")
     assert set(distance) == set(errors)
     assert distance["naive, body 2"]["forward 1"] == pytest.approx([0.38, 0.40, 0.42])
     figure = argument(errors, {"distance [m]": distance}, named=False)
@@ -771,7 +785,7 @@ def test_the_nearest_match_above_a_trial_is_taken_and_none_above_the_root(tree: 
 
 
 def test_the_argument_draws_spread_over_error(trial: Results) -> None:
-    distance = trial_data.values(trial, "distance", ["forward 1", "forward 2"])
+    distance = trial_page.values(trial, "distance", ["forward 1", "forward 2"])
     axes = argument({"matched": 0.1, "naive": 0.6}, {"distance [m]": distance}).axes[0]
     joined = [line for line in axes.lines if line.get_color() == "#b0b0b0"]
     assert len(joined) == 2
@@ -785,7 +799,7 @@ def test_the_argument_draws_spread_over_error(trial: Results) -> None:
 
 
 def test_films_go_into_the_page_small_and_at_their_speed(tree: Path) -> None:
-    found = trial_clips.clips(tree / "trial")
+    found = trial_page.clips(tree / "trial")
     assert found
     assert [one.caption for one in found.moving] == ["matched forward 2, virtual robot"]
     assert len(found.strips) == 1
@@ -795,7 +809,7 @@ def test_films_go_into_the_page_small_and_at_their_speed(tree: Path) -> None:
     wide = [Image.new("RGB", (640, 400), (i * 60, 9, 9)) for i in range(4)]
     data = io.BytesIO()
     wide[0].save(data, "GIF", save_all=True, append_images=wide[1:], duration=[40, 60, 80, 100])
-    with Image.open(io.BytesIO(trial_clips.smaller(data.getvalue()))) as film:
+    with Image.open(io.BytesIO(trial_page.smaller(data.getvalue()))) as film:
         assert film.size == (320, 200)
         times = []
         for i in range(film.n_frames):
@@ -805,7 +819,7 @@ def test_films_go_into_the_page_small_and_at_their_speed(tree: Path) -> None:
 
 
 def test_a_folder_without_pictures_has_none(tmp_path: Path) -> None:
-    assert not trial_clips.clips(tmp_path)
+    assert not trial_page.clips(tmp_path)
 
 
 # --- The paper, item by item --------------------------------------------------------------------
@@ -829,7 +843,7 @@ def test_every_file_that_the_paper_page_names_exists() -> None:
     text = (DOCS / "paper.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:[a-z_]+/)*[a-z_]+\.py)", text))
     assert len(named) > 40
-    root = Path(whole.__file__).parents[1]
+    root = Path(build.__file__).parents[1]
     for name in named:
         assert (root / name).exists(), name
     for link in re.findall(r"\]\(([^)#]+)\)", text):

@@ -49,7 +49,7 @@ def demo(
         json_file: Also write the figures to this file.
     """
     from pronk.report import figures, style
-    from pronk.report.whole import write_report
+    from pronk.report.build import write_report
     from pronk.robots import load_robot
 
     if jumps < 1:

@@ -134,7 +134,7 @@ def write(result: MatchResult, out: Path, report: console.Reporter) -> Path:
     """Write the gains, `match.npz` and the page beside each other; return the page's path."""
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
-    from pronk.report.page import write_page
+    from pronk.report.match_page import write_page
 
     gains_file.save(out, result.gains)
     result_file.save(out.parent / "match.npz", result)
@@ -146,7 +146,7 @@ def write(result: MatchResult, out: Path, report: console.Reporter) -> Path:
 
 def figures_of(result: MatchResult) -> dict[str, Any]:
     """What `--json` gives of a match."""
-    from pronk.report.page import verdict
+    from pronk.report.match_page import verdict
 
     return verdict(result) | {
         "gains": {
@@ -177,7 +177,7 @@ def zero_of(result: MatchResult, name: str) -> float:
 
 def show(result: MatchResult) -> None:
     """Print the gains, with the paper's beside them where there are any."""
-    from pronk.report.page import doubts
+    from pronk.report.match_page import doubts
     from pronk.report.paper import published
 
     paper = published(result.gains.robot)

@@ -20,10 +20,10 @@ def report(
             of a deployment, .mcap.
         json_file: Also write the figures to this file.
     """
-    from pronk.report import whole
+    from pronk.report import build
 
     with console.progress() as shown:
-        page, found = whole.write_report(folder, shown)
+        page, found = build.write_report(folder, shown)
     console.wrote(page)
     console.write_json(
         json_file,

@@ -74,7 +74,7 @@ def trial(
     from pronk.evaluation.results import SUMMARY, TABLE
     from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, run_trial
     from pronk.files import sha256
-    from pronk.report.whole import write_report
+    from pronk.report.build import write_report
     from pronk.robots import load_robot
     from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
@@ -160,20 +160,19 @@ def more(
     from pronk.evaluation.crossing import CROSSING, CrossingPlan, add_crossings
     from pronk.evaluation.trial import Plan
     from pronk.evaluation.walk import WALK, add_walks
-    from pronk.report.trial import crossing as crossing_page
-    from pronk.report.trial import walk as walk_page
+    from pronk.report import extra_pages
 
     sheets: list[Sheet] = []
     files: list[Path] = []
     if "walk" in extras:
         walks = add_walks(policies, seed=seed, progress=report.bar("walking"), **common)
-        sheets += [on_virtual("walking", one) for one in walk_page.tables(walks)]
+        sheets += [on_virtual("walking", one) for one in extra_pages.walk_tables(walks)]
         files.append(Path(WALK.summary))
     if "crossing" in extras:
         crossed = add_crossings(
             policies, CrossingPlan(seed=seed), progress=report.bar("crossing"), **common
         )
-        sheets.append(on_virtual("crossing", crossing_page.table(crossed)))
+        sheets.append(on_virtual("crossing", extra_pages.table(crossed)))
         files.append(Path(CROSSING.summary))
     if "variation" in extras:
         plan = Plan(jumps=5, seed=seed)

@@ -19,6 +19,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from pronk import __version__
+from pronk.evaluation.tables import Sheet
 from pronk.report import style
 
 _IMAGE_TYPES = {".gif": "image/gif", ".png": "image/png", ".svg": "image/svg+xml"}
@@ -31,6 +32,19 @@ class Picture:
     src: str
     alt: str
     caption: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """A section: words, a picture, tables."""
+
+    anchor: str
+    title: str
+    lines: tuple[str, ...] = ()
+    picture: Picture | None = None
+    sheets: tuple[Sheet, ...] = ()
+    folded: tuple[Sheet, ...] = ()
+    """Tables that are closed at first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +109,7 @@ def fill(template: str, **values: Any) -> Markup:
         values: What it names; a name it lacks is an error.
     """
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pronk.report", "."),
+        loader=jinja2.PackageLoader("pronk.report", "templates"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -25,14 +25,9 @@ from pronk.evaluation.walk import WALK
 from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
-from pronk.report import page as match_page
-from pronk.report.deploy import part as deploy_part
+from pronk.report import deploy_page, match_page, trial_page
+from pronk.report.extra_pages import bodies_part, crossing_part, variation_part, walk_part
 from pronk.report.shell import Part, page
-from pronk.report.trial import part as trial_part
-from pronk.report.trial.bodies import bodies_part
-from pronk.report.trial.crossing import crossing_part
-from pronk.report.trial.variation import variation_part
-from pronk.report.trial.walk import walk_part
 from pronk.runtime.log import is_deploy_log
 
 NAME = "report.html"
@@ -76,11 +71,11 @@ def _named(root: Path, name: str, anchor: str) -> Iterator[tuple[Path, str, str,
 
 def _trials(root: Path, told: Callable[[float], None]) -> Iterator[Found]:
     for folder, source, anchor, added in _named(root, SUMMARY, "trial"):
-        material = trial_part.read(folder, root, told)
+        material = trial_page.read(folder, root, told)
         yield Found(
             source=source,
             virtual=material.trial.virtual,
-            draw=partial(trial_part.part, material, anchor=anchor, title=f"Trial{added}"),
+            draw=partial(trial_page.part, material, anchor=anchor, title=f"Trial{added}"),
             figures={"checks": [check.row() for check in trial_checks(material.trial)]},
         )
 
@@ -151,7 +146,7 @@ def _deployments(root: Path) -> Iterator[Found]:
     for i, path in enumerate(logs):
         source = path.name if root.is_file() else str(path.relative_to(root))
         try:
-            material = deploy_part.read(path)
+            material = deploy_page.read(path)
         except LogError:
             # A link that never opened leaves a log without a tick beside others that have some.
             if len(logs) == 1:
@@ -161,8 +156,8 @@ def _deployments(root: Path) -> Iterator[Found]:
         yield Found(
             source=source,
             virtual=material.log.virtual,
-            draw=partial(deploy_part.part, material, anchor=f"deploy{i or ''}", title=title),
-            figures=deploy_part.figures(material),
+            draw=partial(deploy_page.part, material, anchor=f"deploy{i or ''}", title=title),
+            figures=deploy_page.figures(material),
         )
 
 

@@ -1,1 +1,0 @@
-"""A deployment in the report."""

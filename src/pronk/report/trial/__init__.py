@@ -1,1 +1,0 @@
-"""The trial in the report."""
