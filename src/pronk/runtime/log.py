@@ -251,83 +251,51 @@ class DeployLogWriter:
 
     def tick(self, record: np.void) -> None:
         """One tick of the servo, a record of `TICK`."""
-        begun, tick = float(record["begun"]), int(record["tick"])
-        state = {
-            "t": float(record["time"]),
-            "sequence": int(record["sequence"]),
-            "bus_voltage": float(record["bus_voltage"]),
-            "robot_time": float(record["robot_time"]),
-        }
-        for name in (
-            "position",
-            "velocity",
-            "torque",
-            "gyro",
-            "accelerometer",
-            "orientation",
-            "temperature",
-        ):
-            state[name] = record[name].tolist()
-        self._put("state", begun, state)
-        mode = Mode(int(record["mode"]))
-        desired = {
-            "t": begun,
-            "tick": tick,
-            "mode": int(mode),
+        begun, mode = float(record["begun"]), Mode(int(record["mode"]))
+        reason = Reason(int(record["reason"]))
+        head = {"t": begun, "tick": int(record["tick"])}
+        state = _values(
+            record,
+            *("sequence", "bus_voltage", "robot_time", "position", "velocity", "torque"),
+            *("gyro", "accelerometer", "orientation", "temperature"),
+        )
+        self._put("state", begun, {"t": float(record["time"])} | state)
+        desired = _values(record, "mode", "blend", "action") | {
             "mode_name": mode.name,
             "position": record["desired"].tolist(),
-            "blend": float(record["blend"]),
-            "action": int(record["action"]),
             "state_sequence": int(record["action_state"]),
         }
-        self._put("desired", begun, desired)
-        reason = Reason(int(record["reason"]))
-        sent = {
+        self._put("desired", begun, head | desired)
+        sent = _values(record, "stiffness", "level", "reason") | {
             "t": float(record["done"]),
-            "tick": tick,
             "position": record["sent"].tolist(),
-            "stiffness": float(record["stiffness"]),
             "damped": bool(record["damped"]),
-            "level": int(record["level"]),
-            "reason": int(reason),
             "reason_name": reason.name,
         }
-        self._put("sent", begun, sent)
+        self._put("sent", begun, head | sent)
         timing = {
-            "t": begun,
-            "tick": tick,
             "lateness": begun - float(record["deadline"]),
             "work": float(record["done"]) - begun,
             "state_age": begun - float(record["time"]),
             "latency": float(record["latency"]),
         }
-        self._put("timing", begun, timing)
+        self._put("timing", begun, head | timing)
 
     def step(self, record: np.void) -> None:
         """One step of the policy, a record of `STEP`."""
-        begun, step = float(record["begun"]), int(record["sequence"])
-        observation = {
-            "t": begun,
-            "step": step,
-            "state_sequence": int(record["state_sequence"]),
-            "observation": record["observation"].tolist(),
-        }
-        self._put("observation", begun, observation)
-        action = {
-            "t": begun,
-            "step": step,
+        begun = float(record["begun"])
+        head = {"t": begun, "step": int(record["sequence"])}
+        observation = _values(record, "state_sequence", "observation")
+        self._put("observation", begun, head | observation)
+        names = ("command", "action", "target", "contact", "linear_velocity")
+        action = _values(record, *names) | {
             "live": bool(record["live"]),
-            "command": record["command"].tolist(),
             "jump": bool(record["jump"]),
-            "action": record["action"].tolist(),
-            "target": record["target"].tolist(),
-            "contact": record["contact"].tolist(),
-            "linear_velocity": record["linear_velocity"].tolist(),
             "lateness": begun - float(record["deadline"]),
             "decision": float(record["inferred"]) - float(record["observed"]),
             "state_age": begun - float(record["state_time"]),
         }
-        self._put("action", begun, action)
+        self._put("action", begun, head | action)
 
     def event(self, record: np.void) -> None:
         """Something that happened, a record of `EVENT`."""
@@ -355,6 +323,11 @@ class DeployLogWriter:
         stamp = round((t + self._wall) * 1e9)
         # NaN becomes null.
         self._writer.add_message(self._channels[topic], stamp, orjson.dumps(body), stamp)
+
+
+def _values(record: np.void, *names: str) -> dict[str, Any]:
+    """Fields of a record as plain numbers and lists."""
+    return {name: record[name].tolist() for name in names}
 
 
 READY = b"ready"

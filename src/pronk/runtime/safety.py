@@ -302,7 +302,6 @@ def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
     square = w * w + x * x + y * y + z * z
     # The trunk's z axis against the world's: the last entry of the rotation matrix.
     upright = 1.0 - 2.0 * (x * x + y * y) / np.maximum(square, 0.5)
-    ages = given.state_age + given.command_age + given.valid_for  # not a number if any is not
     hold = given.state_age > limits.hold_s
     target = np.where(hold[..., None], last, target)
     fitted, why, possible = fit(q, v, target, last, kp, kd, limits)
@@ -319,7 +318,9 @@ def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
         (
             Reason.COMMAND_NOT_FINITE,
             FilterAction.LATCH,
-            ~fine[..., measured:].all(axis=-1) | np.isnan(ages),
+            ~fine[..., measured:].all(axis=-1)
+            | np.isnan(given.command_age)
+            | np.isnan(given.valid_for),
         ),
         (
             Reason.GAINS,
