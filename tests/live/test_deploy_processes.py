@@ -219,7 +219,7 @@ def test_states_that_cannot_be_believed(
         int(k): row for k, row in zip(np.arange(len(found.target)), found.target, strict=True)
     }
     k = int(np.flatnonzero(followed)[0])
-    np.testing.assert_allclose(found.sent[k], target[int(found.action[k])])
+    np.testing.assert_allclose(found.sent[k], target[int(found.action_number[k])])
     # What the network read is what pronk's observation of the logged state is.
     assert found.observation.shape[1] == 105
     assert np.isfinite(found.latency[found.mode == Mode.POLICY]).sum() > 10
