@@ -82,7 +82,7 @@ def sweep(
     if virtual and (address.interface not in (None, "bench") or address.options or release):
         raise HardwareError(
             f"{address}: the virtual robot of a sweep is on the bench, without a wire; leave out "
-            "--interface and --release, and give --seed and --sim-params."
+            "--interface and --disable-onboard-controller; give --seed and --sim-params."
         )
     if not virtual and sim_params is not None:
         raise HardwareError("--sim-params is of --link sim; give it to `pronk simulate` instead.")
