@@ -424,8 +424,8 @@ def test_wrong_joint_names_list_the_robots(tmp_path: Path) -> None:
 
 
 def test_misspelled_options_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match="units"):
-        read_log(csv(tmp_path, *GOOD), units="rad")  # type: ignore[call-arg]
+    with pytest.raises(LogError, match="units"):
+        read_log(csv(tmp_path, *GOOD), units="rad")
 
 
 def test_files_that_are_not_there(tmp_path: Path) -> None:

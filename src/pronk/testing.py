@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
-from pronk.errors import HardwareError, PronkError
+from pronk.errors import HardwareError, LogError, PronkError
 from pronk.links.machine import Command, RefusedError, damping_command
 from pronk.links.stream_link import Codec, Transport
+from pronk.logs.joint_log import SweepLog
+from pronk.logs.readers import Reader
 from pronk.robots.robot import Robot
 from pronk.simulators.simulator import PARAMETERS, Simulator
 
@@ -75,6 +80,46 @@ def check_simulator(simulator: Simulator) -> None:
         changed = {**values, name: np.full((2, len(joints)), other[name])}
         effect = np.abs(simulator.rollout(command, changed) - out).max()
         _require(float(effect) > 1e-5, f"parameters: {name} has an effect")
+
+
+def check_reader(chosen: Reader, path: Path, *, robot: Robot | None = None, **options: Any) -> None:
+    """Check a log reader on a file that it should read.
+
+    The log has two samples or more, one command and one position a joint, finite and increasing
+    timestamps in seconds, its source and hash; reading twice gives the same log; a missing
+    and an empty file are refused with a LogError.
+
+    Args:
+        chosen: The reader.
+        path: A file of its format.
+        robot: Passed to the reader.
+        options: Passed to the reader.
+
+    Raises:
+        PronkError: A property fails; the message names it.
+    """
+    log = chosen.read(path, robot=robot, **options)
+    shape = (len(log.time), len(log.joints))
+    _require(isinstance(log, SweepLog), "read: a SweepLog is returned")
+    _require(shape[0] >= 2 and shape[1] >= 1, "read: two samples and one joint or more")
+    for name in ("command", "position"):
+        values = np.asarray(getattr(log, name))
+        _require(values.shape == shape, f"read: {name} has the shape (samples, joints)")
+        _require(bool(np.isfinite(values).all()), f"read: {name} is finite")
+    _require(bool((np.diff(log.time) > 0.0).all()), "read: timestamps increase")
+    _require(log.source == str(path), "read: source is the path")
+    _require(len(log.sha256) == 64, "read: sha256 of the file")
+    again = chosen.read(path, robot=robot, **options)
+    _require(np.array_equal(again.position, log.position), "read: repeatable")
+    with TemporaryDirectory() as folder:
+        missing, empty = Path(folder, f"missing{path.suffix}"), Path(folder, f"empty{path.suffix}")
+        empty.touch()
+        for wrong in (missing, empty):
+            try:
+                chosen.read(wrong, robot=robot, **options)
+            except LogError:
+                continue
+            _require(False, f"read: a file that is {wrong.stem} is refused with a LogError")
 
 
 def check_link(

@@ -11,7 +11,7 @@ import pytest
 
 from pronk.errors import HardwareError, PlanError
 from pronk.excitation.plan import SweepPlan, make_plan
-from pronk.excitation.signals import Chirp, Multisine
+from pronk.excitation.signals import Chirp
 from pronk.links.machine import Command, State
 from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import load_robot
@@ -276,18 +276,6 @@ def test_a_machine_of_another_robot_is_refused(tmp_path: Path) -> None:
     machine.robot = "so101"
     with pytest.raises(HardwareError, match="so101"):
         record(machine, ROBOT, plan_of("FR_knee"), tmp_path)
-
-
-def test_joints_excited_together_are_logged_together(tmp_path: Path) -> None:
-    signal = Multisine(length_s=2.0, low_hz=0.5, high_hz=10.0, periods=1, amplitude=0.1)
-    names = ["FR_hip_roll", "FR_hip_pitch"]
-    plan = make_plan(ROBOT, names, signal, simultaneous=True, amplitudes=(0.1,), repeats=1)
-    (path,) = record(Watched(), ROBOT, plan, tmp_path)
-    log = read_mcap(path)
-    assert log.segments[0].joints == tuple(names)
-    assert log.segments[0].period_s == 2.0
-    part = log.cut(log.segments[0])
-    assert (np.ptp(part.command[:, :2], axis=0) > 0.1).all()
 
 
 def test_the_leg_is_what_is_logged() -> None:

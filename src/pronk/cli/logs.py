@@ -34,7 +34,15 @@ class ReadingOptions:
     rate_hz: float | None = None
     """Rate that the log is expected to have; another one is an error."""
     log_format: Annotated[str | None, tyro.conf.arg(name="format")] = None
-    """mcap, csv, sage, pace or npz; from the name if left out."""
+    """mcap, csv, sage, pace, npz or a plugin's; from the name if left out."""
+    measured_topic: str | None = None
+    """rosbag2: topic of the measured JointState; /joint_states if left out."""
+    command_topic: str | None = None
+    """rosbag2: topic of the commands."""
+    command_field: str | None = None
+    """rosbag2: field of the positions in a command message, as in points.0.positions."""
+    reader_options: Annotated[tuple[str, ...], tyro.conf.arg(name="reader-option")] = ()
+    """NAME=VALUE for a reader of another package; repeat it."""
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `pronk.logs.readers.read_log`."""
@@ -47,6 +55,10 @@ class ReadingOptions:
             "scale": scale or None,
             "rate_hz": self.rate_hz,
             "format": self.log_format,
+            "measured_topic": self.measured_topic,
+            "command_topic": self.command_topic,
+            "command_field": self.command_field,
+            **dict(_pairs(self.reader_options, "--reader-option")),
         }
 
 

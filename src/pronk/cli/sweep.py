@@ -203,5 +203,3 @@ def show_plan(plan: SweepPlan) -> None:
             f"{float(row['bus_current_a']):.1f}",
         )
     console.show(made)
-    for warning in plan.warnings:
-        console.warn(warning)

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import PlanError
-from pronk.excitation.signals import Chirp, Multisine, Signal
+from pronk.excitation.signals import Chirp, Signal
 from pronk.excitation.worst_case import Forecast, Uncertainty, forecast
-from pronk.logs.correlation import correlation_note, uncorrelated_multisines
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -79,8 +78,6 @@ class SweepPlan:
     forecasts: tuple[Forecast, ...]
     """What the loudest question to each joint will do to it and to its neighbours, over every
     corner of the uncertainty; quieter ones of the same signal stay inside."""
-    warnings: tuple[str, ...] = ()
-    """What is allowed and still doubtful, in words."""
 
     @property
     def pose(self) -> Array:
@@ -219,7 +216,6 @@ def make_plan(
     amplitudes: Sequence[float] = (0.25, 0.125),
     repeats: int | Sequence[int] = 3,
     settle_s: float = 0.5,
-    simultaneous: bool = False,
     stiffness: Mapping[str, float] | None = None,
     damping: Mapping[str, float] | None = None,
     uncertainty: Uncertainty | None = None,
@@ -238,7 +234,6 @@ def make_plan(
         repeats: Times each amplitude is asked, one number for all or one each; three or more of
             the largest, which is the one matched, give honest intervals.
         settle_s: Rest after each question [s].
-        simultaneous: Ask all joints at once, with multisines on different harmonics.
         stiffness: Gains on the drives by joint, instead of the robot's [N m/rad].
         damping: Gains on the drives by joint, instead of the robot's [N m s/rad].
         uncertainty: How far the robot may be from its model.
@@ -272,11 +267,7 @@ def make_plan(
             )
     times = dict(zip(amplitudes, counts, strict=True))
     loudest = dict(sorted(times.items(), reverse=True))
-    asks = (
-        _together(robot, names, signal, loudest)
-        if simultaneous and len(names) > 1
-        else _one_by_one(robot, names, signal, loudest)
-    )
+    asks = _one_by_one(robot, names, signal, loudest)
     rate = robot.policy_rate_hz
     uncertainty = uncertainty or Uncertainty()
     cache: dict[bytes, list[Forecast]] = {}
@@ -286,7 +277,6 @@ def make_plan(
         if ask.repeat == 0 and ask.amplitude == max(loudest)
         for f in _forecast_ask(robot, ask, rate, kp, kd, uncertainty, cache)
     ]
-    note = correlation_note(asks[0].offsets(rate), asks[0].joints, rate)
     return SweepPlan(
         robot=robot,
         asks=asks,
@@ -296,7 +286,6 @@ def make_plan(
         damping=kd,
         uncertainty=uncertainty,
         forecasts=tuple(forecasts),
-        warnings=(note,) if note else (),
     )
 
 
@@ -312,33 +301,6 @@ def _one_by_one(
             signs=(robot.joint(name).original[1],),
         )
         for name in names
-        for amplitude, count in times.items()
-        for repeat in range(count)
-    )
-
-
-def _together(
-    robot: Robot, names: Sequence[str], signal: Signal, times: Mapping[float, int]
-) -> tuple[Ask, ...]:
-    if not isinstance(signal, Multisine):
-        raise PlanError(
-            f"a {signal.kind} sent to {len(names)} joints at once asks all of them the same; use a "
-            "Multisine, whose harmonics are dealt out, or ask one joint at a time."
-        )
-    clamped = tuple(dict.fromkeys(c for name in names for c in robot.joint(name).clamped))
-    if both := [name for name in names if name in clamped]:
-        raise PlanError(
-            f"{', '.join(both)} cannot be asked while clamped for another joint; ask the joints "
-            "that need a clamp in a sweep of their own."
-        )
-    each = uncorrelated_multisines(names, signal)
-    return tuple(
-        Ask(
-            joints=tuple(names),
-            signals=tuple(each[name].with_amplitude(amplitude) for name in names),
-            repeat=repeat,
-            clamped=clamped,
-        )
         for amplitude, count in times.items()
         for repeat in range(count)
     )

@@ -1,20 +1,16 @@
-"""Several joints at once: only with commands that have nothing to do with each other.
+"""Correlation of the commands of joints that move at the same time.
 
-Where two commands are alike, a joint's answer to its neighbour's command looks like an answer to
-its own, and the coherence stays near one while the response is wrong.
+With correlated commands, the motion that one joint causes in another looks like a response to the
+other's own command: the coherence stays near one while the response is wrong.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import correlate
-
-from pronk.errors import PlanError
-from pronk.excitation.signals import Multisine, odd_harmonics
 
 Array = NDArray[np.float64]
 
@@ -22,8 +18,8 @@ CORRELATION_LIMIT = 0.1
 """Highest absolute correlation of two simultaneous commands that passes without a warning."""
 
 _REACH_S = 0.5
-"""Lags that are searched [s]: longer than a joint remembers. A sine and a cosine do not correlate
-at lag zero, and are the same question all the same."""
+"""Lags that are searched [s]: longer than a joint's impulse response. A sine and a cosine do not
+correlate at lag zero."""
 
 
 def correlation(commands: Array, rate_hz: float) -> Array:
@@ -62,33 +58,6 @@ def correlation_note(commands: Array, joints: Sequence[str], rate_hz: float) -> 
         return ""
     return (
         f"the commands of {joints[j]} and {joints[i]} correlate to {alike[i, j]:.2f} (limit "
-        f"{CORRELATION_LIMIT:g}): a response may hold what one joint does to the other; ask one "
-        "joint at a time or use multisines on different harmonics"
+        f"{CORRELATION_LIMIT:g}): a response may contain the effect of one joint on the other; "
+        "excite one joint at a time or use multisines on different harmonics"
     )
-
-
-def uncorrelated_multisines(joints: Sequence[str], like: Multisine) -> dict[str, Multisine]:
-    """One multisine for each joint, on odd harmonics that no other joint uses.
-
-    The harmonics of one logarithmic grid are dealt out in turn, so every joint is asked over the
-    whole band. Over whole periods their correlation is zero at every lag.
-
-    Args:
-        joints: Names.
-        like: Band, amplitude, period and seed; its `lines` are what each joint gets at most.
-
-    Raises:
-        PlanError: There are fewer odd harmonics in the band than joints.
-    """
-    wanted = like.lines * len(joints)
-    shared = like.harmonics or odd_harmonics(like.low_hz, like.high_hz, like.length_s, wanted)
-    if len(shared) < len(joints):
-        raise PlanError(
-            f"{len(joints)} joints need {len(joints)} odd harmonics of "
-            f"{1.0 / like.length_s:g} Hz in {like.low_hz:g} to {like.high_hz:g} Hz, and there are "
-            f"{len(shared)}; lengthen the period."
-        )
-    return {
-        joint: replace(like, harmonics=tuple(shared[i :: len(joints)]), seed=like.seed + i)
-        for i, joint in enumerate(joints)
-    }

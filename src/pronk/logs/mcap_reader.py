@@ -19,6 +19,7 @@ from pronk.logs.joint_log import Segment, SweepLog
 from pronk.logs.mcap_format import END, HEADER, SAMPLE, SCHEMA, SEGMENT
 from pronk.logs.mcap_stream import DamagedError, Record, records
 from pronk.logs.rosbag_reader import read_joint_states
+from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -26,7 +27,7 @@ Array = NDArray[np.float64]
 def read_mcap(
     path: Path,
     *,
-    robot: str = "unknown",
+    robot: Robot | None = None,
     measured_topic: str | None = None,
     command_topic: str | None = None,
     command_field: str = "position",
@@ -37,7 +38,7 @@ def read_mcap(
 
     Args:
         path: The file.
-        robot: Name of the robot, for a file that does not say.
+        robot: The robot, for a file that does not name it.
         measured_topic: Topic of the measured sensor_msgs/msg/JointState (rosbag2 only).
         command_topic: Topic of the commands (rosbag2 only).
         command_field: Where in a command message the positions are, dots between names
@@ -61,7 +62,7 @@ def read_mcap(
         path,
         found,
         damage,
-        robot=robot,
+        robot="unknown" if robot is None else robot.name,
         measured_topic=measured_topic,
         command_topic=command_topic,
         command_field=command_field,

@@ -1,4 +1,4 @@
-"""Read a log, whatever wrote it."""
+"""Read a log of any known format; other packages add formats by entry points."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import inspect
 import multiprocessing
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_joints, check_radians
-from pronk.logs.columns import Names
 from pronk.logs.csv_reader import read_csv
 from pronk.logs.joint_log import SweepLog
 from pronk.logs.mcap_reader import read_mcap
@@ -22,17 +22,71 @@ from pronk.logs.sage_reader import is_sage, read_sage
 from pronk.logs.timing import check_claim, check_unit, examine
 from pronk.robots.robot import Robot
 
-_READERS: dict[str, Callable[..., SweepLog]] = {
-    "mcap": read_mcap,
-    "csv": read_csv,
-    "sage": read_sage,
-    "pace": read_pace,
-    "npz": read_npz,
-}
-FORMATS = tuple(_READERS)
-"""Formats that `read_log` knows."""
+GROUP = "pronk.readers"
+"""Entry points of readers from other packages; each is a function decorated with `reader`."""
 
-_SUFFIXES = {".mcap": "mcap", ".csv": "csv", ".pt": "pace", ".npz": "npz"}
+
+@dataclass(frozen=True, kw_only=True)
+class Reader:
+    """A log format: how a file is recognised and read."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    """Endings of file names, lower case, with the dot; empty for folders."""
+    read: Callable[..., SweepLog]
+    """`read(path, *, robot, **options)`; its keyword parameters are the options of the format."""
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of the options."""
+        parameters = inspect.signature(self.read).parameters
+        return tuple(name for name in parameters if name not in ("path", "robot"))
+
+
+def reader(name: str, *suffixes: str) -> Callable[[Callable[..., SweepLog]], Reader]:
+    """Declare a function as the reader of a format.
+
+    Args:
+        name: Of the format, as `--format` takes it.
+        suffixes: Endings of its files, such as `.csv`.
+    """
+    return lambda read: Reader(name=name, suffixes=suffixes, read=read)
+
+
+_BUILT_IN = (
+    reader("mcap", ".mcap")(read_mcap),
+    reader("csv", ".csv")(read_csv),
+    reader("sage")(read_sage),
+    reader("pace", ".pt")(read_pace),
+    reader("npz", ".npz")(read_npz),
+)
+
+
+def readers() -> dict[str, Reader]:
+    """Return the readers of pronk and of installed packages, by format.
+
+    Raises:
+        LogError: An entry point is not a reader, or takes the name or a suffix of another.
+    """
+    found = {each.name: each for each in _BUILT_IN}
+    taken = {suffix: each.name for each in _BUILT_IN for suffix in each.suffixes}
+    for point in entry_points(group=GROUP):
+        each = point.load()
+        if not isinstance(each, Reader):
+            raise LogError(
+                f"entry point {point.value} of {GROUP} is no reader; decorate a function with "
+                "pronk.logs.readers.reader."
+            )
+        if each.name in found or taken.keys() & set(each.suffixes):
+            raise LogError(
+                f"entry point {point.value} of {GROUP}: the format {each.name!r} or one of its "
+                f"suffixes {', '.join(each.suffixes)} is taken already."
+            )
+        found[each.name] = each
+        taken |= dict.fromkeys(each.suffixes, each.name)
+    return found
+
+
 _NO_LOGS = (".response.npz", ".prediction.npz", "match.npz")
 """What pronk writes beside logs."""
 _WORTH_PROCESSES = 4
@@ -44,92 +98,67 @@ def read_log(
     *,
     robot: Robot | None = None,
     format: str | None = None,
-    columns: Mapping[str, str] | None = None,
-    unit: str | None = None,
-    joint_names: Names | None = None,
-    time_unit: str | None = None,
     rate_hz: float | None = None,
-    drop_duplicates: bool | None = None,
-    scale: Mapping[str, float] | None = None,
-    measured_topic: str | None = None,
-    command_topic: str | None = None,
-    command_field: str | None = None,
+    **options: Any,
 ) -> SweepLog:
-    """Read a log: MCAP (pronk's or rosbag2), CSV, SAGE folder, PACE `.pt`, or NPZ.
+    """Read a log: MCAP (pronk's or rosbag2), CSV, SAGE folder, PACE `.pt`, NPZ, or a plugin's.
 
     Args:
         path: File or folder.
         robot: The robot, to check the joint names against, or to name columns that have no names.
-        format: One of `FORMATS`; told from the name if None.
-        columns: The file's name for each column (CSV; see `read_csv`).
-        unit: Unit of all angles, `rad` or `deg` (must be said for CSV).
-        joint_names: Names of the columns in order, or new names by the file's own.
-        time_unit: Unit of the timestamps: s, ms, us or ns.
-        rate_hz: Rate that the file is claimed to have; it is an error if the stamps disagree.
-        drop_duplicates: Drop rows that repeat the one before in full, and say so in the notes.
-        scale: Radians per unit of joints whose unit is unknown (SAGE's Jaw), by joint name.
-        measured_topic: Topic of the measured JointState (rosbag2).
-        command_topic: Topic of the commands (rosbag2).
-        command_field: Where in a command message the positions are (rosbag2).
+        format: One of `readers()`; from the name if None.
+        rate_hz: Rate that the file is expected to have; an error if the timestamps disagree.
+        options: Of the format: `columns`, `unit`, `joint_names`, `time_unit`, `drop_duplicates`
+            (CSV, NPZ and others), `scale` (SAGE), `measured_topic`, `command_topic`,
+            `command_field` (rosbag2); see the function that reads it.
 
     Returns:
-        The log; `notes` say what was found.
+        The log; `notes` list what was found.
 
     Raises:
-        LogError: The file cannot be read or believed; the message says how to mend it.
+        LogError: The file cannot be read or is not plausible; the message names the remedy.
         RobotError: The robot has no such joint; the message lists those it has.
     """
     path = Path(path)
-    kind = format or _sniff(path)
-    if kind not in _READERS:
-        raise LogError(f"{path}: format {kind!r}; expected one of {', '.join(FORMATS)}.")
+    known = readers()
+    kind = format or _sniff(path, known)
+    if kind not in known:
+        raise LogError(f"{path}: format {kind!r}; expected one of {', '.join(known)}.")
     if kind == "mcap" and path.is_dir():
         path = _only_mcap(path)
-    given: dict[str, Any] = {
-        "columns": columns,
-        "unit": unit,
-        "joint_names": joint_names,
-        "time_unit": time_unit,
-        "rate_hz": rate_hz,
-        "drop_duplicates": drop_duplicates,
-        "scale": scale,
-        "measured_topic": measured_topic,
-        "command_topic": command_topic,
-        "command_field": command_field,
-    }
-    given = {name: value for name, value in given.items() if value is not None}
-    claimed = given.pop("rate_hz", None) if kind == "mcap" else None
-    accepted = inspect.signature(_READERS[kind]).parameters
-    if wrong := [name for name in given if name not in accepted]:
-        takes = ", ".join(name for name in accepted if name not in ("path", "robot"))
+    given = {name: value for name, value in options.items() if value is not None}
+    takes = known[kind].options
+    if "rate_hz" in takes and rate_hz is not None:
+        given["rate_hz"] = rate_hz
+    if wrong := [name for name in given if name not in takes]:
         raise LogError(
-            f"{path}: {', '.join(wrong)} means nothing for the format {kind}; it takes {takes}."
+            f"{path}: {', '.join(wrong)} means nothing for the format {kind}; it takes "
+            f"{', '.join(takes)}."
         )
     try:
-        return _read(path, kind, robot, given, claimed)
+        return _read(path, known[kind], robot, given, rate_hz)
     except PronkError as error:
         # Names from the file itself may hold line breaks; a message is one sentence.
         raise type(error)(" ".join(str(error).split())) from error.__cause__
 
 
 def _read(
-    path: Path, kind: str, robot: Robot | None, given: dict[str, Any], claimed: float | None
+    path: Path, chosen: Reader, robot: Robot | None, given: dict[str, Any], rate_hz: float | None
 ) -> SweepLog:
     """Read by one reader, and check what all logs must pass."""
-    who: Any = robot
-    if kind == "mcap":
-        who = robot.name if robot is not None else "unknown"
-    log = _READERS[kind](path, robot=who, **given)
-    if kind == "mcap":
+    log = chosen.read(path, robot=robot, **given)
+    if not isinstance(log, SweepLog):
+        raise LogError(f"{path}: the reader {chosen.name} returned {type(log).__name__}.")
+    if "rate_hz" not in chosen.options:
         timing = examine(log.time)
         check_unit(log.time, str(path), "s")
-        if claimed is not None:
-            check_claim(timing, str(path), claimed)
+        if rate_hz is not None:
+            check_claim(timing, str(path), rate_hz)
         log = replace(log, notes=(*log.notes, timing.words()))
     if robot is not None:
         if log.robot not in (robot.name, "unknown"):
             raise LogError(
-                f"{path}: recorded on {log.robot}, and {robot.name} is asked for; name the right "
+                f"{path}: recorded on {log.robot}, but the robot is {robot.name}; name the right "
                 "robot."
             )
         check_joints(log, robot)
@@ -144,15 +173,16 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
     Raises:
         LogError: Nothing was named, or a folder holds no log.
     """
+    suffixes = _suffixes(readers())
     found: list[Path] = []
     for path in map(Path, paths):
         if not path.is_dir() or is_sage(path) or (path / "metadata.yaml").is_file():
             found.append(path)
             continue
-        inside = sorted(p for p in path.iterdir() if is_sage(p) or _may_be_log(p))
+        inside = sorted(p for p in path.iterdir() if is_sage(p) or _may_be_log(p, suffixes))
         if not inside:
             raise LogError(
-                f"{path}: no logs in this folder; expected {', '.join(_SUFFIXES)} or SAGE folders."
+                f"{path}: no logs in this folder; expected {', '.join(suffixes)} or SAGE folders."
             )
         found += inside
     if not found:
@@ -187,11 +217,15 @@ def _read_with(path: Path, options: Mapping[str, Any]) -> SweepLog:
     return read_log(path, **options)
 
 
-def _may_be_log(path: Path) -> bool:
-    return path.suffix.lower() in _SUFFIXES and not path.name.endswith(_NO_LOGS)
+def _suffixes(known: Mapping[str, Reader]) -> dict[str, str]:
+    return {suffix: each.name for each in known.values() for suffix in each.suffixes}
 
 
-def _sniff(path: Path) -> str:
+def _may_be_log(path: Path, suffixes: Mapping[str, str]) -> bool:
+    return path.suffix.lower() in suffixes and not path.name.endswith(_NO_LOGS)
+
+
+def _sniff(path: Path, known: Mapping[str, Reader]) -> str:
     """Format from the name of a file or the content of a folder."""
     if not path.exists():
         raise LogError(f"{path}: no such file or folder.")
@@ -204,11 +238,12 @@ def _sniff(path: Path) -> str:
             f"{path}: a folder, but no SAGE recording (control.csv, state_motor.csv, "
             "joint_list.txt) and no MCAP file in it."
         )
-    kind = _SUFFIXES.get(path.suffix.lower())
+    suffixes = _suffixes(known)
+    kind = suffixes.get(path.suffix.lower())
     if kind is None:
         raise LogError(
             f"{path}: the ending {path.suffix!r} names no known format; expected "
-            f"{', '.join(_SUFFIXES)} or a SAGE folder, or say format= one of {', '.join(FORMATS)}."
+            f"{', '.join(suffixes)} or a SAGE folder, or a format, one of {', '.join(known)}."
         )
     return kind
 

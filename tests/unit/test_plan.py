@@ -9,7 +9,7 @@ import pytest
 
 from pronk.errors import PlanError, RobotError
 from pronk.excitation.plan import SweepPlan, make_plan
-from pronk.excitation.signals import Chirp, Multisine
+from pronk.excitation.signals import Chirp
 from pronk.excitation.worst_case import Uncertainty, forecast
 from pronk.robots import load_robot
 
@@ -158,25 +158,6 @@ def test_a_pose_outside_the_range_fits_no_amplitude() -> None:
     plan = make_plan(replace(ROBOT, joints=joints), ["FR_knee"], SHORT, repeats=1)
     with pytest.raises(PlanError, match="no amplitude fits"):
         plan.check()
-
-
-def test_several_joints_at_once_take_turns_in_the_harmonics() -> None:
-    names = ["FR_hip_roll", "FR_hip_pitch", "HL_hip_roll"]
-    signal = Multisine(length_s=4.0, periods=2, high_hz=10.0)
-    plan = make_plan(ROBOT, names, signal, simultaneous=True, amplitudes=(0.1,), repeats=2)
-    assert [ask.joints for ask in plan.asks] == [tuple(names)] * 2
-    assert plan.warnings == ()
-    assert plan.sets == (tuple(names),)
-    # Two in one leg are simulated together, and every leg has its forecast.
-    assert {f.joint for f in plan.forecasts if f.amplitude > 0.0} == set(names)
-    plan.check()
-
-
-def test_joints_that_cannot_be_asked_together() -> None:
-    with pytest.raises(PlanError, match="use a Multisine"):
-        make_plan(ROBOT, ["FR_knee", "FL_knee"], Chirp(), simultaneous=True)
-    with pytest.raises(PlanError, match="clamped for another"):
-        make_plan(ROBOT, ["FR_knee", "FR_hip_roll"], Multisine(), simultaneous=True)
 
 
 def test_each_amplitude_may_have_repeats_of_its_own() -> None:

@@ -438,5 +438,5 @@ def test_degrees_said_to_be_radians_are_refused_when_read(tmp_path: Path) -> Non
 
 def test_a_log_of_another_robot_is_refused(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", replace(example(), robot="so101"))
-    with pytest.raises(LogError, match="recorded on so101, and mini_cheetah is asked for"):
+    with pytest.raises(LogError, match=r"so101.*mini_cheetah"):
         read_log(tmp_path / "a.mcap", robot=load_robot("mini_cheetah"))

@@ -192,9 +192,9 @@ def test_a_killed_recorder_leaves_a_valid_log(tmp_path: Path) -> None:
     code = f"""
         import time
         from pathlib import Path
-        from pronk.sweep.log import Segment
-        from pronk.sweep.mcap_format import LogHeader
-        from pronk.sweep.mcap_writer import McapLogWriter
+        from pronk.logs.joint_log import Segment
+        from pronk.logs.mcap_format import LogHeader
+        from pronk.logs.mcap_writer import McapLogWriter
         header = LogHeader(robot="mini_cheetah", joints=("knee",))
         writer = McapLogWriter(Path({str(path)!r}), header)
         writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))

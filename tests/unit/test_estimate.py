@@ -27,7 +27,7 @@ from pronk.response.analytic import second_order, simulate_second_order
 from pronk.response.grid import Grid, grid_over, held_mean
 from pronk.response.spectra import layout, segment_spectra, sums
 
-SO101 = Path(__file__).resolve().parents[2] / "shared" / "data" / "so101"
+SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 
 
 def errors(

@@ -6,13 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson
 
 from pronk.errors import PlanError
 from pronk.excitation.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
-from pronk.logs.correlation import correlation, correlation_note, uncorrelated_multisines
+from pronk.logs.correlation import correlation, correlation_note
 
 ALL: tuple[Signal, ...] = (Chirp(), LogChirp(), Multisine(), SineSteps())
 
@@ -160,22 +160,6 @@ def test_misspelled_settings_are_refused() -> None:
         Chirp(stop_herz=3.0)  # type: ignore[call-arg]
 
 
-@settings(max_examples=15, deadline=None)
-@given(joints=st.integers(2, 8), seed=st.integers(0, 1000))
-def test_multisines_of_several_joints_share_no_line(joints: int, seed: int) -> None:
-    names = [f"j{i}" for i in range(joints)]
-    signals = uncorrelated_multisines(names, Multisine(seed=seed, periods=2))
-    lines = [number for signal in signals.values() for number in signal.harmonic_numbers]
-    assert len(lines) == len(set(lines))
-    # Over whole periods the correlation is zero at every lag.
-    periods = np.stack([signal.one_period() for signal in signals.values()], axis=1)
-    spectra = np.fft.fft(periods, axis=0)
-    cross = np.fft.ifft(spectra[:, 0] * np.conj(spectra[:, 1]))
-    assert np.abs(cross).max() < 1e-12 * (periods[:, 0] ** 2).sum()
-    sent = np.stack([signal.samples() for signal in signals.values()], axis=1)
-    assert correlation_note(sent, names, 50.0) == ""
-
-
 def test_a_shifted_copy_is_found_though_it_does_not_correlate_at_lag_zero() -> None:
     time = np.arange(2000) / 50.0
     pair = np.stack([np.sin(2 * np.pi * time), np.cos(2 * np.pi * time)], axis=1)
@@ -194,8 +178,3 @@ def test_a_still_command_correlates_with_nothing() -> None:
 def test_independent_noise_passes() -> None:
     noise = np.random.default_rng(0).normal(size=(6000, 4))
     assert correlation_note(noise, list("abcd"), 50.0) == ""
-
-
-def test_too_many_joints_for_the_harmonics() -> None:
-    with pytest.raises(PlanError, match="lengthen the period"):
-        uncorrelated_multisines(list("abcdef"), Multisine(low_hz=1.0, high_hz=1.5, length_s=2.0))
