@@ -202,11 +202,9 @@ def along(displacement: Array, orientation: Array, command: Sequence[float]) -> 
 
 
 def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
-    """Return the flight phases that have ended, in their order.
+    """Return the flight phases of `least` samples or more that have ended, in their order.
 
-    Args:
-        contact: Feet on the ground. (T, 4)
-        least: Shortest flight phase [samples].
+    `contact`: feet on the ground. (T, 4)
     """
     airborne = ~np.asarray(contact, dtype=bool).any(axis=-1)
     edges = np.flatnonzero(np.diff(airborne.astype(np.int8), prepend=0))
@@ -220,10 +218,7 @@ def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
 def jump_flights(series: Series, on: int | None, rules: JumpRules) -> JumpFlights:
     """Sort the flight phases by whether they belong to the jump input.
 
-    Args:
-        series: The robot.
-        on: First sample with the jump input; None without one.
-        rules: Of the definitions.
+    It is on from sample `on`, or never if None.
     """
     z = series.position[:, 2]
     phases = flights(series.contact, least=series.steps(rules.flight_s))

@@ -54,7 +54,7 @@ def in_processes(
             done.append(work(job))
             tell(len(done) / len(jobs))
         return done
-    # Forking a process that has threads is asking for deadlocks.
+    # A fork of a process that has threads can deadlock.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
         futures: list[Future[R]] = [pool.submit(work, job) for job in jobs]

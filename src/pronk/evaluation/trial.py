@@ -112,14 +112,7 @@ def case_rng(seed: int, case: Case, number: int) -> np.random.Generator:
 
 
 def draw(plan: Plan, case: Case, number: int, robot: Robot) -> tuple[Script, Start, int]:
-    """Draw the script, the start and the noise seed of one jump.
-
-    Args:
-        plan: Widths of the draws.
-        case: The command.
-        number: Of the jump, from 0.
-        robot: Its policy rate and joints.
-    """
+    """Draw the script, the start and the noise seed of one jump, numbered from 0."""
     rng = case_rng(plan.seed, case, number)
     ticks = int(rng.integers(round(plan.spread_s * robot.policy_rate_hz) + 1))
     yaw = float(rng.uniform(-plan.yaw, plan.yaw))
@@ -180,12 +173,7 @@ def _policy(path: Path, sha256: str) -> Policy:
 
 
 def build(job: Job, offset: float = 1.0) -> VirtualRobot:
-    """Build the virtual robot of a job, not connected yet.
-
-    Args:
-        job: The run.
-        offset: Share of the start's joint offsets.
-    """
+    """Build the virtual robot of a job, not connected, at a share of its joint offsets."""
     start = job.start
     if start.joint_offset is not None:
         start = replace(start, joint_offset=tuple(offset * each for each in start.joint_offset))
@@ -273,17 +261,7 @@ def planned_run(
 ) -> tuple[Row, Job]:
     """Return one run as a row without figures, and as a job.
 
-    Args:
-        subject: The policy.
-        case: The command.
-        number: Of the run, from 0.
-        drawn: Script, start and noise seed.
-        robot: The robot of the policy.
-        sim_params: Of the virtual robot.
-        rules: Of the definitions.
-        ground: Under the robot; None for that of the parameters.
-        keep: Folder, and the capture's file in it; None to keep none.
-        measure: From capture to figures.
+    `drawn` has script, start and noise seed; `keep` folder and name of the capture's file.
     """
     script, start, seed = drawn
     row = Row(
