@@ -301,7 +301,7 @@ def test_nobody_at_the_keyboard_and_nobody_who_confirms(policy: Path) -> None:
 
 
 def test_a_script_beyond_what_was_trained_for_is_refused(policy: Path) -> None:
-    # Before anybody is asked whether a real robot may move.
+    # Before the confirmation that a real robot may move.
     words = (str(policy), "--link", "dds", "--interface", "nowhere0", "--script", "0,-1.5")
     _, output, error = run_command(*words)
     assert error.startswith("pronk: ")

@@ -125,7 +125,7 @@ def test_a_link_that_cannot_be_opened_says_why() -> None:
         assert run.servo.figures()["virtual"] is None
 
 
-def test_without_any_state_the_operator_is_told_and_heard(faults: FaultyLink) -> None:
+def test_without_any_state_requests_are_read(faults: FaultyLink) -> None:
     faults.freeze.set()
     with flown(faults) as run:
         # Whoever waits for the servo's first word gets it, and a sentence with it.
@@ -135,11 +135,11 @@ def test_without_any_state_the_operator_is_told_and_heard(faults: FaultyLink) ->
         record = run.shared.state.read()
         assert record is not None
         assert Mode(int(record["mode"])) in (Mode.PREFLIGHT, Mode.IDLE)
-        # No robot moves, whatever is wished; leaving is granted at once.
+        # No robot moves, whatever is requested; leaving is granted at once.
         run.until(lambda: len(run.texts("mode")) == 1, OperatorRequest.STAND)
-        asked = time.monotonic()
+        since = time.monotonic()
         run.leave()
-        assert time.monotonic() - asked < 5.0
+        assert time.monotonic() - since < 5.0
     assert run.texts("mode") == ["IDLE", "ENDED"]
     assert not faults.wire.read_text()
 

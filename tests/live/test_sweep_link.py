@@ -162,7 +162,7 @@ def once_written(path: Path, what: Callable[[], None]) -> threading.Thread:
     return thread
 
 
-def test_a_knee_is_asked_over_lcm(port: int, tmp_path: Path) -> None:
+def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
     plan = plan_of("FR_knee")
     with Ear(port) as ear:
         recorded = swept(ROBOT, plan, tmp_path, port)
@@ -297,7 +297,7 @@ def test_the_interrupt_key_damps_and_keeps_the_log(port: int, tmp_path: Path) ->
 # --- The person at a real bench -----------------------------------------------------------------
 
 
-def test_a_person_is_asked_for_clamps_and_no_more_than_needed(
+def test_a_person_clamps_joints_when_requested(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reading, writing = os.pipe()
@@ -327,7 +327,7 @@ def test_real_hardware_asks_for_its_name(
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n"))
     words = ["sweep", "mini_cheetah", "--link", "lcm", "--interface", "lo", "--joints", "FR_knee"]
     assert cli.run([*words, "--out", str(tmp_path / "x")]) == 2
-    told = capsys.readouterr()
-    assert "A real mini_cheetah at lcm://lo is about to move" in told.out
-    assert "nothing was moved" in told.err
+    output = capsys.readouterr()
+    assert "A real mini_cheetah at lcm://lo is about to move" in output.out
+    assert "nothing was moved" in output.err
     assert not (tmp_path / "x").exists()

@@ -353,7 +353,7 @@ def test_a_policy_that_never_answers_is_a_fault() -> None:
 
 
 @pytest.mark.parametrize("answers", [0, 1])
-def test_told_to_sit_at_once_the_policy_is_still_heard(answers: int) -> None:
+def test_commanded_to_sit_at_once_the_policy_still_acts(answers: int) -> None:
     run = Run(halt_s=1.0).standing()
     run.tick(0.0, OperatorRequest.WALK)
     walking = run.machine_state.entry
@@ -373,7 +373,7 @@ def test_told_to_sit_at_once_the_policy_is_still_heard(answers: int) -> None:
     assert (run.machine_state.mode, run.memory.faulted) == (Mode.SIT, False)
 
 
-def test_an_objection_keeps_the_policy_out_and_is_told() -> None:
+def test_an_objection_keeps_the_policy_out() -> None:
     run = Run().standing()
     run.objection = "too slow."
     run.tick(0.0, OperatorRequest.WALK)
@@ -492,9 +492,11 @@ def test_a_script_stands_walks_sits_and_leaves() -> None:
         OperatorRequest.NONE,
     ]
     assert operator.command(1.0, Mode.STAND).request is OperatorRequest.WALK
-    told = {t: operator.command(10.0 + t, Mode.POLICY) for t in (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)}
-    assert all(stick.held for stick in told.values())
-    assert [stick.jump for stick in told.values()] == [
+    commands = {
+        t: operator.command(10.0 + t, Mode.POLICY) for t in (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)
+    }
+    assert all(stick.held for stick in commands.values())
+    assert [stick.jump for stick in commands.values()] == [
         False,
         False,
         True,
@@ -504,12 +506,12 @@ def test_a_script_stands_walks_sits_and_leaves() -> None:
         True,
     ]
     forward = (1.0, 0.0, 0.0)
-    assert [told[t].command == forward for t in (0, 1.5, 2.2, 2.7, 4.5)] == [
+    assert [commands[t].command == forward for t in (0, 1.5, 2.2, 2.7, 4.5)] == [
         False,
         *[True] * 3,
         False,
     ]
-    assert told[6.5].command == (0.0, -1.0, 0.0)
+    assert commands[6.5].command == (0.0, -1.0, 0.0)
     assert not operator.finished
     assert operator.command(20.1, Mode.POLICY).request is OperatorRequest.SIT
     assert operator.finished
@@ -596,7 +598,7 @@ def test_a_gamepad(tmp_path: Path) -> None:
     def say(value: int, kind: int, number: int) -> None:
         os.write(wire, struct.pack("<IhBB", 0, value, kind, number))
 
-    say(0, 0x81, 4)  # what was held when it was opened is told first, and is no press
+    say(0, 0x81, 4)  # what was held when it was opened is commands first, and is no press
     say(1, 0x81, 3)
     stick = pad.command(0.0, Mode.STAND)
     assert (stick.held, stick.request) == (False, OperatorRequest.NONE)

@@ -9,7 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asked_joint import (
+from pronk.errors import LogError, PronkError
+from pronk.logs.joint_log import Segment, SweepLog
+from pronk.response import Estimator, FrequencyResponse, estimate, fit_delay
+from pronk.response.analytic import second_order, simulate_second_order
+from pronk.response.grid import Grid, grid_over, held_mean
+from pronk.response.spectra import layout, segment_spectra, sums
+from synthetic_joint import (
     AMPLITUDE,
     JOINTS,
     KNEE,
@@ -20,12 +26,6 @@ from asked_joint import (
     multisine_command,
     steps_command,
 )
-from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import Segment, SweepLog
-from pronk.response import Estimator, FrequencyResponse, estimate, fit_delay
-from pronk.response.analytic import second_order, simulate_second_order
-from pronk.response.grid import Grid, grid_over, held_mean
-from pronk.response.spectra import layout, segment_spectra, sums
 
 SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from asked_joint import AMPLITUDE, KNEE, chirp_command, linear_joint
 from pronk.response import Estimator, FrequencyResponse, H1Operator
 from pronk.response.analytic import simulate_second_order
 from pronk.response.grid import grid_over, held_mean
 from pronk.response.spectra import layout, segment_spectra, sums
+from synthetic_joint import AMPLITUDE, KNEE, chirp_command, linear_joint
 
 RATE = 200.0
 SETTINGS = Estimator(max_hz=20.0)

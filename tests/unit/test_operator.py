@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asked_joint import (
+from pronk.errors import LogError, PronkError
+from pronk.logs.joint_log import SweepLog
+from pronk.response import Estimator, H1Operator, estimate, operators
+from pronk.response.analytic import simulate_second_order
+from pronk.response.operator import combine
+from synthetic_joint import (
     HIP,
     KNEE,
     LIVELY,
@@ -15,11 +20,6 @@ from asked_joint import (
     multisine_command,
     steps_command,
 )
-from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import SweepLog
-from pronk.response import Estimator, H1Operator, estimate, operators
-from pronk.response.analytic import simulate_second_order
-from pronk.response.operator import combine
 
 
 def applied(log: SweepLog, settings: Estimator) -> tuple[np.ndarray, np.ndarray]:

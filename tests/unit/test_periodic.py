@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asked_joint import (
+from pronk.errors import LogError
+from pronk.logs.joint_log import SweepLog
+from pronk.response import Estimator, distortion, estimate
+from pronk.response.analytic import second_order
+from pronk.response.periodic import read_periods
+from synthetic_joint import (
     KNEE,
     friction_joint,
     linear_joint,
@@ -13,11 +18,6 @@ from asked_joint import (
     multisine_command,
     steps_command,
 )
-from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
-from pronk.response import Estimator, distortion, estimate
-from pronk.response.analytic import second_order
-from pronk.response.periodic import read_periods
 
 
 def multisine(answer, *, questions: int = 1, noise: float = 0.0, **kw) -> SweepLog:  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""The policy's process: rehearsals, and what its steps write, with the shipped policy."""
+"""The policy's process: warm_ups, and what its steps write, with the shipped policy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DECIDED = ("observation", "action", "target", "contact", "linear_velocity", "com
 
 
 @contextmanager
-def thinking() -> Iterator[PolicyProcess]:
+def running() -> Iterator[PolicyProcess]:
     shared = Shared()
     try:
         plan = Plan(link=Link(robot="mini_cheetah"), policy=POLICY)
@@ -58,42 +58,42 @@ def states(count: int) -> list[State]:
     ]
 
 
-def tell(thinker: PolicyProcess, state: State, mode: Mode, entry: int) -> None:
+def publish(process: PolicyProcess, state: State, mode: Mode, entry: int) -> None:
     """What servo and operator say before a step."""
     record, stick = np.zeros((), dtype=STATE), np.zeros((), dtype=OPERATOR)
     put_state(record, state, 0.0)
     record["mode"], record["entry"] = mode, entry
-    thinker.shared.state.write(record)
+    process.shared.state.write(record)
     stick["command"], stick["jump"] = (1.0, -0.3, 99.0), state.sequence % 3 == 0
-    thinker.shared.operator.write(stick)
+    process.shared.operator.write(stick)
 
 
-def decided(thinker: PolicyProcess, rehearsals: int, seen: list[State]) -> list[bytes]:
-    """Every bit that the steps of `WAY` wrote, with so many rehearsals before each."""
+def decided(process: PolicyProcess, warm_ups: int, seen: list[State]) -> list[bytes]:
+    """Every bit that the steps of `WAY` wrote, with so many warm_ups before each."""
     pace, entry, found = Pace(50.0), 0, []
     for k, (state, mode) in enumerate(zip(seen, WAY, strict=True)):
         entry += k > 0 and mode is not WAY[k - 1]
-        tell(thinker, state, mode, entry)
-        for _ in range(rehearsals + k if rehearsals else 0):
-            thinker.warm_up()
-        thinker.step(pace)
-        action = thinker.shared.actions.read()
-        (step,) = thinker.shared.steps.take()
+        publish(process, state, mode, entry)
+        for _ in range(warm_ups + k if warm_ups else 0):
+            process.warm_up()
+        process.step(pace)
+        action = process.shared.actions.read()
+        (step,) = process.shared.steps.take()
         assert action is not None
         assert (action["sequence"], action["state_sequence"]) == (k, k)
         found.append(action["position"].tobytes() + b"".join(step[n].tobytes() for n in DECIDED))
-    assert thinker.figures()["network"]["n"] == len(WAY)
+    assert process.figures()["network"]["n"] == len(WAY)
     return found
 
 
-def test_rehearsals_change_no_bit_of_what_is_decided() -> None:
+def test_warm_ups_change_no_bit_of_what_is_decided() -> None:
     seen = states(len(WAY))
-    with thinking() as plain, thinking() as rehearsed:
+    with running() as plain, running() as rehearsed:
         expected = decided(plain, 0, seen)
         assert decided(rehearsed, 1, seen) == expected
     assert len(set(expected)) == len(expected)
     # That would have been seen: with the policy itself instead of its sibling it is another.
-    with thinking() as wrong:
+    with running() as wrong:
         wrong.warm_up = lambda: wrong.runner.decide(seen[0], ((0.0, 0.0, 0.0), False), 0.0)  # type: ignore[assignment,method-assign]
         assert decided(wrong, 1, seen) != expected
 
@@ -108,32 +108,32 @@ def test_a_sibling_is_the_same_policy_with_another_past() -> None:
     assert policy.network_s > 0.0
 
 
-def test_the_policy_is_never_asked_for_more_than_it_was_trained_for() -> None:
-    with thinking() as thinker:
-        tell(thinker, states(1)[0], Mode.POLICY, 1)
-        thinker.step(Pace(50.0))
-        (step,) = thinker.shared.steps.take()
-        most = list(thinker.runner.policy.contract.command_ranges.values())[2][1]
+def test_the_policy_is_never_commanded_beyond_what_it_was_trained_for() -> None:
+    with running() as process:
+        publish(process, states(1)[0], Mode.POLICY, 1)
+        process.step(Pace(50.0))
+        (step,) = process.shared.steps.take()
+        most = list(process.runner.policy.contract.command_ranges.values())[2][1]
         np.testing.assert_allclose(step["command"], (1.0, -0.3, most))
 
 
 def test_a_state_that_is_none_gives_no_order_and_one_complaint() -> None:
     spoilt = State(**vars(states(1)[0]) | {"velocity": np.full(12, np.nan)})
-    with thinking() as thinker:
+    with running() as process:
         for _ in range(3):
-            tell(thinker, spoilt, Mode.POLICY, 1)
-            thinker.step(Pace(50.0))
-        assert thinker.shared.actions.read() is None
-        (last_error,) = thinker.shared.policy_events.take()
+            publish(process, spoilt, Mode.POLICY, 1)
+            process.step(Pace(50.0))
+        assert process.shared.actions.read() is None
+        (last_error,) = process.shared.policy_events.take()
         assert b"velocity" in bytes(last_error["text"])
         # The next good state is answered.
-        tell(thinker, states(1)[0], Mode.POLICY, 1)
-        thinker.step(Pace(50.0))
-        assert thinker.shared.actions.read() is not None
+        publish(process, states(1)[0], Mode.POLICY, 1)
+        process.step(Pace(50.0))
+        assert process.shared.actions.read() is not None
 
 
 @pytest.mark.parametrize("took", [0.0, 3e-4, 3e-3])
-def test_rehearsals_lie_in_the_last_two_milliseconds(took: float) -> None:
+def test_warm_ups_lie_in_the_last_two_milliseconds(took: float) -> None:
     begun: list[float] = []
 
     def act() -> None:

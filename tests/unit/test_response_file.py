@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asked_joint import KNEE, chirp_command, linear_joint, make_log, multisine_command
 from pronk.errors import ArtefactError
 from pronk.response import FrequencyResponse, estimate, load, save
+from synthetic_joint import KNEE, chirp_command, linear_joint, make_log, multisine_command
 
 
 def responses() -> list[FrequencyResponse]:

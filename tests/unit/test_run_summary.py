@@ -32,7 +32,7 @@ def test_a_notice_is_what_the_servo_said() -> None:
     assert Event.of(long).text == "?" * TEXT
 
 
-def test_faults_and_refusals_are_told_apart() -> None:
+def test_faults_and_refusals_are_kept_apart() -> None:
     summary = RunSummary(
         events_seen=[notice("mode", "DAMP"), notice("refused", "lying"), notice("fault", "tilted")]
     )

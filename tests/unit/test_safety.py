@@ -101,8 +101,8 @@ def test_an_old_state_holds_then_damps_then_latches(
 
 def test_hold_sends_the_last_target() -> None:
     last = POSE + 0.2
-    asked = command(position=POSE + 0.4, made=0.03)
-    sent, _, memory = filtered(state(), asked, FilterState(last=last), LIMITS, 0.03)
+    desired = command(position=POSE + 0.4, made=0.03)
+    sent, _, memory = filtered(state(), desired, FilterState(last=last), LIMITS, 0.03)
     assert sent is not None
     np.testing.assert_array_equal(sent.position, last)
     assert memory.last is not None
@@ -302,7 +302,7 @@ def wild(rng: np.random.Generator, count: int) -> SafetyInput:
     )
     orientation /= np.linalg.norm(orientation, axis=-1, keepdims=True)
     position = spread(many, POSE, 0.5)
-    asked = SafetyInput(
+    given = SafetyInput(
         position=position,
         velocity=spread(many, 0.0, 5.0),
         orientation=orientation,
@@ -319,22 +319,22 @@ def wild(rng: np.random.Generator, count: int) -> SafetyInput:
         last=position + spread(many, 0.0, 0.3),
         held=rng.random(count) < 0.95,
     )
-    for values in (asked.position, asked.velocity, asked.gyro, asked.target, asked.last):
+    for values in (given.position, given.velocity, given.gyro, given.target, given.last):
         struck = rng.random(values.shape) < 0.001
         values[struck] = rng.choice([math.nan, math.inf, -math.inf, 1e300], struck.sum())
-    return asked
+    return given
 
 
-def broken(asked: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
+def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, np.ndarray]:
     """Which rows that were sent break which limit; written anew, not the filter's own code."""
     slack = 1e-6
-    q, v, kp, kd = asked.position, asked.velocity, asked.stiffness, asked.damping
+    q, v, kp, kd = given.position, given.velocity, given.stiffness, given.damping
     torque = kp * (target - q) - kd * v
     top = limits.stall * (1.0 - v / limits.no_load)
     bottom = -limits.stall * (1.0 + v / limits.no_load)
     given = np.clip(torque, bottom, top)
     power = (np.maximum(given * v, 0.0) + limits.loss * given**2).sum(axis=-1)
-    w, x, y, z = asked.orientation.T
+    w, x, y, z = given.orientation.T
     upright = w * w - x * x - y * y + z * z
     ahead = q + limits.horizon_s * v
     out = (ahead > limits.high - limits.margin) & (target > q + slack)
@@ -348,16 +348,16 @@ def broken(asked: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
             | (target > limits.high - limits.margin + slack)
             | (out & inside)
         ).any(axis=-1),
-        "change": (np.abs(target - asked.last) > limits.change + slack).any(axis=-1),
+        "change": (np.abs(target - given.last) > limits.change + slack).any(axis=-1),
         "torque": (np.abs(torque) > limits.torque + slack).any(axis=-1),
         "power": power > limits.power_w * (1.0 + slack),
         "tilt": upright < math.cos(limits.tilt) - slack,
         "speed": (np.abs(v) > limits.speed).any(axis=-1),
-        "temperature": (asked.temperature > limits.temperature).any(axis=-1),
-        "age": asked.state_age > limits.damp_s,
-        "expiry": asked.command_age > np.minimum(asked.valid_for, limits.expiry_s),
-        "lag": asked.lag > limits.lag,
-        "dead man": ~asked.held,
+        "temperature": (given.temperature > limits.temperature).any(axis=-1),
+        "age": given.state_age > limits.damp_s,
+        "expiry": given.command_age > np.minimum(given.valid_for, limits.expiry_s),
+        "lag": given.lag > limits.lag,
+        "dead man": ~given.held,
         "gains": ((kp < 0) | (kp > limits.stiffness) | (kd < 0) | (kd > limits.damping)).any(-1),
     }
 
@@ -367,19 +367,19 @@ def test_a_million_states_and_commands_break_no_limit() -> None:
     chunk, met, passed = 5_000, np.zeros(len(Reason), dtype=int), np.zeros(5, dtype=int)
     limits = Limits.of(ROBOT, power_w=2000.0)
     for _ in range(200):
-        asked = wild(rng, chunk)
-        found = apply_rules(asked, limits)
+        given = wild(rng, chunk)
+        found = apply_rules(given, limits)
         met += np.bincount(found.reason, minlength=len(Reason))
         passed += np.bincount(found.level, minlength=5)
         sent = found.level < FilterAction.DAMP
         with np.errstate(invalid="ignore", over="ignore"):
-            for name, wrong in broken(asked, found.target, limits).items():
+            for name, wrong in broken(given, found.target, limits).items():
                 assert not (wrong & sent).any(), name
-        # A command that is passed is the one that was asked for, to the last bit.
+        # A command that is passed is the one that was requested, to the last bit.
         same = found.level == FilterAction.PASS
-        np.testing.assert_array_equal(found.target[same], asked.target[same])
+        np.testing.assert_array_equal(found.target[same], given.target[same])
         held = found.level == FilterAction.HOLD
-        assert (asked.state_age[held] > limits.hold_s).all()
+        assert (given.state_age[held] > limits.hold_s).all()
     # Every rule had its say, and enough went through for the test to mean something.
     silent = {Reason(i) for i in np.flatnonzero(met == 0)}
     assert silent <= {Reason.CLOCK, Reason.STATE_LOST, Reason.ENDED, Reason.LINK, Reason.OVERLOAD}

@@ -1,4 +1,4 @@
-"""Logs of joints whose answer is known in closed form, for the tests of the room `response`."""
+"""Logs of joints whose response is known in closed form."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def chirp_command(
     wave = chirp(tick, 0.1, duration, 25.0, method=method, phi=-90)
     share = np.minimum(time / duration, 1.0)
     hz = 0.1 + 24.9 * share if kind == "chirp" else 0.1 * 250.0**share
-    asked = tick < duration - 1e-9
-    return time, np.where(asked, AMPLITUDE * wave, 0.0), np.where(asked, hz, np.nan)
+    excited = tick < duration - 1e-9
+    return time, np.where(excited, AMPLITUDE * wave, 0.0), np.where(excited, hz, np.nan)
 
 
 def multisine_command(
