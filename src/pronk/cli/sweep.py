@@ -79,12 +79,16 @@ def sweep(
     virtual = link.partition(":")[0] == SIM
     options = {"layout": layout, "port": port, "domain": domain}
     address = Address.parse(link, interface, **options)
-    if virtual and (address.interface not in (None, "bench") or address.options or release):
+    if virtual and (address.interface not in (None, "bench") or release):
         raise HardwareError(
             f"{address}: the virtual robot of a sweep is on the bench, without a wire; leave out "
             "--interface and --disable-onboard-controller; give --seed and --sim-params."
         )
-    if not virtual and sim_params is not None:
+    if virtual:
+        seed = int(address.options.get("seed", seed))
+        params = address.options.get("params")
+        sim_params = sim_params if params is None else Path(str(params))
+    elif sim_params is not None:
         raise HardwareError("--sim-params is of --link sim; give it to `pronk simulate` instead.")
     names = [part for entry in joints or () for part in entry.split(",") if part]
     with console.progress() as report:
