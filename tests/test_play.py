@@ -61,18 +61,18 @@ def test_page_and_gamepad_add_up_within_the_ranges() -> None:
     assert stick.commanded(0.04)[0] == (-1.5, 0.2, -1.0)
 
 
-def asked_jump(stick: Stick, start: float, ticks: int) -> list[bool]:
+def commanded_jump(stick: Stick, start: float, ticks: int) -> list[bool]:
     return [stick.commanded(start + k / 50.0)[1] for k in range(ticks)]
 
 
 def test_a_jump_lasts_as_long_as_in_the_trial_however_often_one_presses() -> None:
     stick = Stick(ranges=RANGES)
-    assert not any(asked_jump(stick, 0.0, 10))
+    assert not any(commanded_jump(stick, 0.0, 10))
     stick.jump()
     length = round(JUMP_S * 50)
-    assert asked_jump(stick, 1.0, 5) == [True] * 5
+    assert commanded_jump(stick, 1.0, 5) == [True] * 5
     stick.jump()
-    assert asked_jump(stick, 1.1, length) == [True] * (length - 5) + [False] * 5
+    assert commanded_jump(stick, 1.1, length) == [True] * (length - 5) + [False] * 5
 
 
 def test_a_button_counts_when_it_goes_down() -> None:
@@ -88,14 +88,14 @@ def test_a_button_counts_when_it_goes_down() -> None:
     assert not stick.commanded(0.0)[1]
 
 
-def test_who_cannot_jump_is_never_told_to() -> None:
+def test_who_cannot_jump_is_never_commanded_to() -> None:
     stick = Stick(ranges=RANGES, jumps=False)
     stick.jump()
     stick.feel(Pad(jump=True))
-    assert not any(asked_jump(stick, 0.0, 50))
+    assert not any(commanded_jump(stick, 0.0, 50))
 
 
-def test_without_a_gamepad_nothing_is_asked() -> None:
+def test_without_a_gamepad_nothing_is_commanded() -> None:
     pad = Gamepad()
     try:
         if pad.name is not None:
@@ -147,7 +147,7 @@ def test_a_jump_is_read_as_it_was() -> None:
 
 
 def test_a_stride_is_no_jump() -> None:
-    # v^2 / 2g is 2.5 cm: less than the 3 cm that `pronk.evaluation.jumps` asks for.
+    # v^2 / 2g is 2.5 cm: less than the 3 cm that `pronk.evaluation.jumps` requires.
     assert flown(0.7).hops == []
 
 
@@ -182,13 +182,13 @@ def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_hopper(tmp_path_factory.mktemp("hopper") / "policy.onnx")
 
 
-def test_the_robot_hops_when_told_and_no_faster_than_real_time(hopper: Path) -> None:
+def test_the_robot_hops_on_command_and_no_faster_than_real_time(hopper: Path) -> None:
     stick, album = Stick(ranges=RANGES), Album()
-    told = []
+    calls = []
 
     def until(simulated: float) -> bool:
-        if simulated >= 0.1 and not told:
-            told.append(simulated)
+        if simulated >= 0.1 and not calls:
+            calls.append(simulated)
             stick.jump()
         return simulated >= 1.0
 

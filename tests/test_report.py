@@ -48,11 +48,11 @@ def joint_match(name, leg, *, virtual=True, amplitudes=(0.25, 0.125), grid=21, s
     inertia, stiffness, damping, band_hz = GROUPS[name]
     stiffness *= 1.0 + 0.02 * (leg - 1.5)
     omega = 2.0 * np.pi * np.arange(0.25, 22.6, 0.25)
-    truth = second_order(omega, stiffness, damping, inertia)
+    expected = second_order(omega, stiffness, damping, inertia)
     responses = []
     for amplitude in amplitudes:
         noise = 0.01 * (rng.normal(size=(3, omega.size)) + 1j * rng.normal(size=(3, omega.size)))
-        repeats = truth * np.exp(-1j * omega * 0.002) + noise * 0.25 / amplitude
+        repeats = expected * np.exp(-1j * omega * 0.002) + noise * 0.25 / amplitude
         coherence = 1.0 - 0.3 * (omega / omega[-1]) ** 3
         responses.append(
             FrequencyResponse(
@@ -95,9 +95,9 @@ def joint_match(name, leg, *, virtual=True, amplitudes=(0.25, 0.125), grid=21, s
         damping=damping,
         covariance=np.array([[0.09, 0.0015], [0.0015, 1e-4]]),
         band_hz=band_hz,
-        matched=truth,
+        matched=expected,
         naive=naive,
-        error_db=error_db(first.response, truth, band),
+        error_db=error_db(first.response, expected, band),
         naive_error_db=error_db(first.response, naive, band),
         zero_armature_error_db=2.9 if name == "knee" else float("nan"),
         zero_armature=second_order(omega, 27.0, 0.62, 0.0012) if name == "knee" else None,
@@ -394,7 +394,7 @@ def test_page_has_its_sections_verdict_first(html):
         "replay",
         "identifiability",
         "use",
-        "asked",
+        "excitation",
         "timings",
     }
     for target in re.findall(r'href="#([a-z]+)"', html):
@@ -426,11 +426,11 @@ def test_a_joint_without_match_is_counted_and_named(tmp_path):
     result = synthetic()
     name = "HL_knee"
     joint = result.joints[name]
-    doubt = "no match: the best gains miss the measured response by 2 dB RMS"
-    bad = JointFit(**{**vars(joint), "flags": (doubt,)})
+    warning = "no match: the best gains miss the measured response by 2 dB RMS"
+    bad = JointFit(**{**vars(joint), "flags": (warning,)})
     worse = MatchResult(gains=result.gains, joints={**result.joints, name: bad})
     assert match_page.verdict(worse)["matched"] == 11
-    assert doubt in match_page.verdict(worse)["flags"][name]
+    assert warning in match_page.verdict(worse)["flags"][name]
 
 
 def test_zero_armature_without_a_match_is_no_doubt_about_the_match(match):

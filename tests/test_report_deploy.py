@@ -70,13 +70,13 @@ def targets(count: int) -> np.ndarray:
 
 def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
     """A run whose torques obey the drives' law with targets sent `lag` ticks earlier."""
-    asked = targets(count)
+    desired = targets(count)
     writer = DeployLogWriter(path, HEADER)
     say(writer, 0.0, "robot", VIRTUAL)
     for k in range(count):
-        torque = KP * (asked[max(k - lag, 0)] - POSE)
+        torque = KP * (desired[max(k - lag, 0)] - POSE)
         answered = {"latency": 0.003} if k % 10 == 0 else {}
-        writer.tick(record(k, asked[k], torque=torque, **answered, **changes))
+        writer.tick(record(k, desired[k], torque=torque, **answered, **changes))
         if k % 10 == 0:
             step = np.zeros((), dtype=STEP)
             step["sequence"], step["begun"], step["live"] = k // 10, k * TICK_S, 1
@@ -139,12 +139,12 @@ def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
     assert whole_delay.longest == pytest.approx(0.003 + found[1])
 
 
-def test_a_delay_beyond_training_is_a_doubt(tmp_path: Path) -> None:
+def test_a_delay_beyond_training_is_a_warning(tmp_path: Path) -> None:
     log = read_deploy_log(flown(tmp_path / "run.mcap", lag=5))
     found = delay(log, ROBOT)
     assert found.within is False
     assert "BEYOND the 0 to 10 ms" in deploy_page.delaying(found)
-    assert deploy_page.doubtful(log, found)
+    assert deploy_page.has_problem(log, found)
 
 
 def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> None:
@@ -209,8 +209,8 @@ def test_the_page_of_a_cut_log_says_so(tmp_path: Path) -> None:
     html, log = page(path)
     assert not log.complete
     assert "The log was cut" in html
-    assert 'class="verdict doubt"' in html
-    assert html.count("data:image/") == 5
+    assert 'class="verdict warning"' in html
+    assert html.count("data:image/") == 4
 
 
 def test_the_page_of_a_refusal(tmp_path: Path) -> None:

@@ -78,13 +78,13 @@ def seen(flight: int, scale: float) -> Capture:
 
 def subject(name: str, **contract: Any) -> Subject:
     stiffness, damping = GAINS.get(name, GAINS["matched"])
-    told = {
+    fields = {
         "gains": name,
         "joint_names": ROBOT.joint_names,
         "stiffness": stiffness * 4,
         "damping": damping * 4,
     }
-    return Subject(name=name, path=f"{name}.onnx", sha256=name[0] * 64, contract=told | contract)
+    return Subject(name=name, path=f"{name}.onnx", sha256=name[0] * 64, contract=fields | contract)
 
 
 def made(
@@ -322,18 +322,18 @@ class Checker(HTMLParser):
         self.text: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        told = {name: value or "" for name, value in attrs}
+        fields = {name: value or "" for name, value in attrs}
         if tag not in self.VOID:
             self.open.append(tag)
-        if "id" in told:
-            self.ids.append(told["id"])
+        if "id" in fields:
+            self.ids.append(fields["id"])
         if tag == "a":
-            self.links.append(told["href"])
+            self.links.append(fields["href"])
         if tag == "img":
-            self.pictures.append(told)
+            self.pictures.append(fields)
         for name in ("src", "href"):
-            if name in told:
-                assert told[name].startswith(("data:", "#")), told[name]
+            if name in fields:
+                assert fields[name].startswith(("data:", "#")), fields[name]
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open, f"</{tag}> closes nothing"
@@ -477,7 +477,7 @@ def test_a_policy_that_never_jumps_makes_a_page_of_dashes(tmp_path: Path) -> Non
     results.save(tmp_path, replace(trial, rows=rows))
     page, _ = build.write_report(tmp_path)
     text = " ".join(checked(page.read_text(encoding="utf-8")).text)
-    assert "6 jumps asked with 2 commands, 0 jumped" in re.sub(r"\s+", " ", text)
+    assert "6 jumps commanded with 2 commands, 0 jumped" in re.sub(r"\s+", " ", text)
     assert "nan" not in text.lower().replace("finance", "")
 
 

@@ -21,12 +21,11 @@ from pronk import opengl
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.jump_events import JumpEvents, jump_events
 from pronk.evaluation.pictures import film as films
-from pronk.evaluation.pictures import overlay, video, videos
+from pronk.evaluation.pictures import overlay, video
 from pronk.evaluation.pictures.film import FPS, Film, plan
 from pronk.evaluation.pictures.frames import HEIGHT, WIDTH
 from pronk.evaluation.pictures.render import in_gif
-from pronk.evaluation.pictures.stage import FOV_DEG, TAPE_M, Tape
-from pronk.evaluation.pictures.view import View
+from pronk.evaluation.pictures.stage import FOV_DEG, TAPE_M, Tape, View
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.trial import Plan as TrialPlan
 from pronk.evaluation.trial import run_trial
@@ -91,7 +90,7 @@ def test_marks_are_those_of_the_jump() -> None:
     expected = (MARKS.on, MARKS.off, MARKS.liftoff, MARKS.touchdown)
     assert found == pytest.approx(expected, abs=1.01 / RATE)
     late = Script(command=(1.0, 0.0, 0.0), run_s=1.0)
-    assert jump_events(captured(), late) is None, "it lifted off before it was told"
+    assert jump_events(captured(), late) is None, "it lifted off before the jump input"
 
 
 def test_real_time_is_shown_in_equal_steps() -> None:
@@ -121,7 +120,7 @@ def test_frames_show_the_capture() -> None:
     assert film.qpos[:, 3:7] == pytest.approx(source.orientation[rows])
     assert film.qpos[:, 7:] == pytest.approx(source.joint_position[rows])
     assert film.height == pytest.approx(source.position[rows, 2])
-    assert (film.asked == ((film.time >= 0.8) & (film.time < 1.3))).all()
+    assert (film.jumping == ((film.time >= 0.8) & (film.time < 1.3))).all()
 
 
 def test_the_camera_follows_smoothly() -> None:
@@ -150,7 +149,7 @@ def test_a_robot_that_stands_is_seen_by_its_heading() -> None:
     film = planned(capture=captured(speed=0.0, yaw=0.7), marks=None, start=0.0, end=0.5)
     assert film.direction == pytest.approx(0.7)
     assert film.labels == ()
-    assert not film.asked.any()
+    assert not film.jumping.any()
 
 
 def test_the_strip_has_the_moments_of_the_jump() -> None:
@@ -239,11 +238,11 @@ def test_files_are_painted(backend: str, tmp_path: Path) -> None:
     if lack := video.no_encoder():
         pytest.skip(lack)
     film = planned(start=0.95, end=1.15)
-    told: list[str] = []
+    messages: list[str] = []
     shares: list[float] = []
-    made = video.record(film, tmp_path, "jump", tell=told.append, progress=shares.append)
+    made = video.record(film, tmp_path, "jump", tell=messages.append, progress=shares.append)
     assert [path.name for path in made] == ["jump.mp4", "jump.gif", "jump.png"]
-    assert not told
+    assert not messages
     assert shares == pytest.approx((np.arange(film.frames) + 1) / film.frames)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["jump.gif", "jump.mp4", "jump.png"]
 
@@ -293,11 +292,11 @@ def without_gl(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
 
 
 def test_without_gl_one_line_names_the_package(without_gl: None, tmp_path: Path) -> None:
-    told: list[str] = []
-    assert video.record(planned(), tmp_path / "out", "jump", tell=told.append) == ()
-    assert len(told) == 1
-    assert "`apt-get install libosmesa6`" in told[0]
-    assert "\n" not in told[0]
+    messages: list[str] = []
+    assert video.record(planned(), tmp_path / "out", "jump", tell=messages.append) == ()
+    assert len(messages) == 1
+    assert "`apt-get install libosmesa6`" in messages[0]
+    assert "\n" not in messages[0]
     assert not (tmp_path / "out").exists()
 
 
@@ -327,7 +326,7 @@ def test_the_environment_names_one_backend(monkeypatch: pytest.MonkeyPatch) -> N
     assert "MUJOCO_GL" not in video.environment("")
 
 
-def test_only_the_painter_needs_the_opengl_that_is_asked_for(
+def test_only_the_painter_needs_the_opengl_that_is_requested(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """MuJoCo itself cannot be imported with an unknown or a missing one."""
@@ -347,7 +346,7 @@ def test_only_the_painter_needs_the_opengl_that_is_asked_for(
     assert str(missing) in done.stderr.replace("\n", "")
     opengl.keep_out()
     assert os.environ["MUJOCO_GL"] == "disable"
-    assert opengl.asked() == "nonsense"
+    assert opengl.requested() == "nonsense"
 
 
 # --- Of a trial ---------------------------------------------------------------------------------
@@ -368,7 +367,7 @@ def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> Non
         sim_params=load_sim_params(),
         out=tmp_path / "trial",
     )
-    (stem, hop), (_, still) = videos.films_of(found, tmp_path / "trial")
+    (stem, hop), (_, still) = video.films_of(found, tmp_path / "trial")
     assert stem == f"{found.subjects[0].name}_forward_1".replace(" ", "_")
     assert hop.title == "forward 1 m/s"
     assert hop.virtual
@@ -376,14 +375,14 @@ def test_a_trial_gives_a_film_for_each_policy_and_command(tmp_path: Path) -> Non
     row = found.rows[0]
     assert hop.marks.liftoff - hop.marks.on == pytest.approx(row.figures.delay, abs=0.002)
     assert hop.marks.touchdown - hop.marks.liftoff == pytest.approx(row.figures.duration, abs=0.002)
-    assert (hop.rate == 1.0 / videos.SLOW).any()
+    assert (hop.rate == 1.0 / video.SLOW).any()
     assert still.marks is None
     assert still.note.endswith(", no jump")
-    assert not list(videos.films_of(found, tmp_path / "trial", cases=("back 2",)))
+    assert not list(video.films_of(found, tmp_path / "trial", cases=("back 2",)))
 
 
 def test_a_trial_without_gl_goes_on_and_says_so_once(without_gl: None, tmp_path: Path) -> None:
-    told: list[str] = []
+    messages: list[str] = []
     nothing: Any = None
-    assert videos.record_all(nothing, tmp_path, tmp_path / "out", tell=told.append) == ()
-    assert len(told) == 1
+    assert video.record_all(nothing, tmp_path, tmp_path / "out", tell=messages.append) == ()
+    assert len(messages) == 1

@@ -9,18 +9,18 @@ from __future__ import annotations
 import os
 
 _MUJOCO = "MUJOCO_GL"
-_ASKED = "PRONK_GL"
+_REQUESTED = "PRONK_GL"
 _NONE = "disable"
 """MuJoCo's word for no OpenGL."""
 
 
 def keep_out() -> None:
-    """Let MuJoCo load no OpenGL in this process and those it starts; `asked` still tells which."""
+    """Keep OpenGL out of this process and its children; `requested` still returns the choice."""
     if chosen := os.environ.get(_MUJOCO):
-        os.environ.setdefault(_ASKED, chosen)
+        os.environ.setdefault(_REQUESTED, chosen)
         os.environ[_MUJOCO] = _NONE
 
 
-def asked() -> str:
+def requested() -> str:
     """The value of MUJOCO_GL that the user has set, in small letters; empty if none."""
-    return os.environ.get(_ASKED, os.environ.get(_MUJOCO, "")).lower()
+    return os.environ.get(_REQUESTED, os.environ.get(_MUJOCO, "")).lower()

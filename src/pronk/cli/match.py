@@ -177,7 +177,7 @@ def zero_of(result: MatchResult, name: str) -> float:
 
 def show(result: MatchResult) -> None:
     """Print the gains, with the paper's beside them where there are any."""
-    from pronk.report.match_page import doubts
+    from pronk.report.match_page import failure_flags
     from pronk.report.paper import published
 
     paper = published(result.gains.robot)
@@ -197,7 +197,7 @@ def show(result: MatchResult) -> None:
         known = paper.joints.get(name) if paper else None
         console.row(
             made,
-            name + (" *" if doubts(result, name) else ""),
+            name + (" *" if failure_flags(result, name) else ""),
             f"{gains.stiffness:.2f}",
             _interval(gains.stiffness_ci95, 2),
             f"{gains.damping:.3f}",
@@ -217,7 +217,7 @@ def show(result: MatchResult) -> None:
         )
     console.show(groups)
     for name in result.gains.joints:
-        for flag in doubts(result, name):
+        for flag in failure_flags(result, name):
             console.say(f"* {name}: {flag}")
 
 

@@ -62,7 +62,7 @@ def play(
         with WebPage(robot, body.ground, stick, title=title, host=host, port=port) as page:
             console.say(f"the virtual robot stands at {page.address}; Ctrl-C ends it")
             if host != "127.0.0.1":
-                console.warn(f"bound to {host}: whoever reaches this machine can play")
+                console.warn(f"bound to {host}: everyone who reaches this machine can play")
             if pad is not None and pad.name is not None:
                 console.say(
                     f"gamepad: {pad.name} (left stick walks, right stick turns, A jumps, "

@@ -216,7 +216,7 @@ def painted(
     Returns:
         The files.
     """
-    from pronk.evaluation.pictures.videos import SLOW, record_all
+    from pronk.evaluation.pictures.video import SLOW, record_all
     from pronk.evaluation.trial import VIDEOS
 
     return record_all(

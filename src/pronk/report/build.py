@@ -69,9 +69,9 @@ def _named(root: Path, name: str, anchor: str) -> Iterator[tuple[Path, str, str,
         yield folder, str((folder / name).relative_to(root)), f"{anchor}{i or ''}", added
 
 
-def _trials(root: Path, told: Callable[[float], None]) -> Iterator[Found]:
+def _trials(root: Path, progress: Callable[[float], None]) -> Iterator[Found]:
     for folder, source, anchor, added in _named(root, SUMMARY, "trial"):
-        material = trial_page.read(folder, root, told)
+        material = trial_page.read(folder, root, progress)
         yield Found(
             source=source,
             virtual=material.trial.virtual,
@@ -161,12 +161,12 @@ def _deployments(root: Path) -> Iterator[Found]:
         )
 
 
-def find(root: Path, told: Callable[[float], None] = lambda share: None) -> list[Found]:
+def find(root: Path, progress: Callable[[float], None] = lambda share: None) -> list[Found]:
     """Everything in the folder tree that can be drawn, read and in the order of the page.
 
     Args:
         root: The folder, or the log of one deployment.
-        told: Told the share of a trial's captures that is read, 0 to 1.
+        progress: Called with the share of a trial's captures that is read, 0 to 1.
 
     Raises:
         ArtefactError: No such folder, nothing in it, or something damaged.
@@ -179,10 +179,10 @@ def find(root: Path, told: Callable[[float], None] = lambda share: None) -> list
             f"{root}: no such folder; give one that `pronk match --out` or `pronk trial --out` "
             "wrote to, or the log of a deployment."
         )
-    # Captures are the slowest to read: what is small and damaged is told of first.
+    # Captures are the slowest to read: what is small is read first.
     matches, extras = list(_matches(root)), list(_extras(root))
     deployments = list(_deployments(root))
-    found = [*_trials(root, told), *extras, *deployments, *matches]
+    found = [*_trials(root, progress), *extras, *deployments, *matches]
     if not found:
         raise ArtefactError(
             f"{root}: nothing to report; neither {SUMMARY} (`pronk trial POLICY --out DIR`) nor "
@@ -200,7 +200,7 @@ def write_report(
     Args:
         root: The folder, which gets `report.html`, or the log of one deployment, which gets a page
             of its name beside it.
-        progress: Told the stage, `read` or `draw`, and the share of it that is done, 0 to 1.
+        progress: Called with the stage, `read` or `draw`, and the share of it that is done, 0 to 1.
 
     Raises:
         ArtefactError: As `find`.

@@ -84,7 +84,7 @@ class Tracking:
     standing: float
     """RMS on the way up and standing [rad]."""
     torque: float
-    """RMS as the robot tells it [N m]; NaN where it tells none."""
+    """RMS as the robot reports it [N m]; NaN where it reports none."""
     torque_largest: float
     """[N m]"""
     speed_largest: float
@@ -270,7 +270,7 @@ class Delay:
     answer: Spread
     """From a state to the first command that answers it, while the policy decided."""
     drives: tuple[float, float]
-    """From a command on the wire to its torque, bounds; NaN where it could not be told."""
+    """From a command on the wire to its torque, bounds; NaN where it could not be estimated."""
 
     @property
     def whole(self) -> tuple[float, float]:
@@ -325,11 +325,11 @@ def shift(log: DeployLog, robot: Robot) -> tuple[float, float]:
     lefts = []
     for by in _SHIFTS:
         target = log.sent[np.searchsorted(wire, t - by, side="right") - 1]
-        asked = kp * (target - q) - kd * v
-        there = np.isfinite(given) & (np.abs(asked) < gentle)  # false where damped
+        desired = kp * (target - q) - kd * v
+        there = np.isfinite(given) & (np.abs(desired) < gentle)  # false where damped
         if there.sum() < _LEAST or np.var(given[there]) == 0.0:
             return _UNKNOWN
-        lefts.append(np.mean((given - asked)[there] ** 2) / np.var(given[there]))
+        lefts.append(np.mean((given - desired)[there] ** 2) / np.var(given[there]))
     left = np.array(lefts)
     good = _SHIFTS[left <= _AS_GOOD * left.min()]
     if 1.0 - left.min() < _EXPLAINED or good[-1] == _SHIFTS[-1]:
@@ -338,11 +338,7 @@ def shift(log: DeployLog, robot: Robot) -> tuple[float, float]:
 
 
 _LEAST_MS = 1e-3
-"""What is shorter is drawn there: a microsecond, about what the clock tells."""
-_PER_DECADE = 20
-_SHARES = (("p50", "50 %"), ("p99", "99 %"), ("p99_9", "99.9 %"))
-_DASHES = ("-", (0, (5, 2)), (0, (1, 1.5)))
-_LIMITS = (("hold_s", "held"), ("damp_s", "damped"), ("latch_s", "latched"))
+"""What is shorter is drawn there: a microsecond, about the resolution of the clock."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -393,79 +389,6 @@ def times(log: DeployLog) -> tuple[TimeLimit, ...]:
         ),
     )
     return tuple(one for one in found if np.isfinite(one.values).any())
-
-
-def histograms(log: DeployLog, trained: tuple[float, float] | None) -> Figure:
-    """Histograms of all times, counts and times on logarithmic axes.
-
-    Args:
-        log: Of the run.
-        trained: Command delays that the policy was trained for [s].
-    """
-    found = times(log)
-    rows = -(-len(found) // 2)
-    with style.styled():
-        drawn = Figure(figsize=(style.PAGE_WIDTH_IN, 2.25 * rows + 0.3), layout="constrained")
-        grid = drawn.subplots(rows, 2, sharex=True, squeeze=False).ravel()
-        for axes, one in zip(grid, found, strict=False):
-            _histogram(axes, one)
-            if one.name == "state to command" and trained is not None:
-                low, high = (1e3 * edge for edge in trained)
-                axes.axvspan(max(low, _LEAST_MS), high, color=style.BAND, zorder=0)
-                axes.text(
-                    0.02, 0.95, f"trained for {low:g} to {high:g} ms", transform=axes.transAxes,
-                    ha="left", va="top", fontsize=8.5, color="#6b5d20",
-                )  # fmt: skip
-            if one.name.startswith("age"):
-                _limits(axes, log)
-        for axes in grid[len(found) :]:
-            axes.set_visible(False)
-        for axes in grid[max(len(found) - 2, 0) : len(found)]:
-            axes.set_xlabel("[ms]")
-            axes.tick_params(labelbottom=True)
-        longest = max(float(np.nanmax(one.values)) for one in found)
-        grid[0].set_xlim(_LEAST_MS, max(2e3 * longest, 2e2))
-        grid[0].set_xscale("log")
-        grid[0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        grid[0].xaxis.set_minor_formatter(NullFormatter())
-    return drawn
-
-
-def _histogram(axes: Axes, one: TimeLimit) -> None:
-    values = np.maximum(1e3 * one.values[np.isfinite(one.values)], _LEAST_MS)
-    decades = int(np.ceil(np.log10(max(values.max() / _LEAST_MS, 10.0)))) + 1
-    edges = _LEAST_MS * 10.0 ** (np.arange(decades * _PER_DECADE + 1) / _PER_DECADE)
-    axes.hist(values, bins=list(edges), color=style.MEASURED_WIDE, histtype="stepfilled")
-    axes.set_yscale("log")
-    axes.set_ylim(bottom=0.7)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    at = spread(one.values)
-    for (key, words), dash in zip(_SHARES, _DASHES, strict=True):
-        value = 1e3 * float(getattr(at, key))
-        if np.isfinite(value):
-            axes.axvline(
-                max(value, _LEAST_MS),
-                color=style.MATCHED,
-                linewidth=1.3,
-                linestyle=dash,
-                label=f"{words}: {value:{'.0f' if value >= 100.0 else '.3g'}} ms",
-            )
-    axes.set_title(f"{one.name}, n = {at.n}")
-    axes.legend(loc="upper right", fontsize=8, frameon=True, edgecolor="none", framealpha=0.85)
-
-
-def _limits(axes: Axes, log: DeployLog) -> None:
-    """Ages at which the filter holds, damps and latches."""
-    limits = log.header.get("limits", {})
-    for key, words in _LIMITS:
-        if key in limits:
-            at = 1e3 * float(limits[key])
-            axes.axvline(at, color=style.NAIVE, linewidth=1.0)
-            axes.text(
-                at * 0.95, 0.03, words, transform=axes.get_xaxis_transform(), rotation=90,
-                ha="right", va="bottom", fontsize=7.5, color="#8a3d00",
-            )  # fmt: skip
 
 
 def over_time(log: DeployLog, ends: tuple[float, ...]) -> Figure:
@@ -529,7 +452,7 @@ _QUIET = "#ececec"
 _JUMP = "#fbe3a3"
 _FAULT = style.NAIVE
 _SHOWN_MOVED = 1e-6
-"""Smaller differences of what was asked and sent are not drawn [rad]."""
+"""Smaller differences of desired and sent targets are not drawn [rad]."""
 _LETTER = 0.0075
 """Width of a letter in a mode's bar, as a share of the axis."""
 WINDOW_S = 1.2
@@ -555,7 +478,7 @@ def jumps(log: DeployLog) -> tuple[tuple[float, float], ...]:
 
 
 def overview(log: DeployLog, heat: tuple[Array, Array] | None) -> Figure:
-    """The whole run: modes, speeds asked and estimated, tilt, bus voltage, motor temperatures.
+    """The whole run: modes, speeds commanded and estimated, tilt, bus voltage, motor temperatures.
 
     Args:
         log: Of the run.
@@ -601,7 +524,7 @@ def overview(log: DeployLog, heat: tuple[Array, Array] | None) -> Figure:
 
 
 def _modes(axes: Axes, log: DeployLog) -> None:
-    """A bar for each mode, with its name where there is room."""
+    """A bar for each mode, with its name where it fits."""
     found = stretches(log)
     whole = sum(stretch.seconds for stretch in found)
     for stretch in found:
@@ -624,7 +547,7 @@ def _modes(axes: Axes, log: DeployLog) -> None:
 
 
 def _speeds(panels: dict[str, Axes], log: DeployLog) -> None:
-    """What was asked for, and what the estimator and the gyro say."""
+    """Excitation for, and what the estimator and the gyro say."""
     t, tick = seconds(log, log.step_time), seconds(log, log.time)
     live = log.step_live
     for i, (name, words) in enumerate(
@@ -638,8 +561,8 @@ def _speeds(panels: dict[str, Axes], log: DeployLog) -> None:
             estimate = np.where(live, log.linear_velocity[:, i], np.nan)
             axes.plot(t, estimate, color=style.MEASURED_WIDE, linewidth=1.6)
         if len(t):
-            asked = np.where(live, log.command[:, i], np.nan)
-            axes.step(t, asked, where="post", color=style.MATCHED, linewidth=1.4)
+            commanded = np.where(live, log.command[:, i], np.nan)
+            axes.step(t, commanded, where="post", color=style.MATCHED, linewidth=1.4)
         axes.axhline(0.0, color="#bbbbbb", linewidth=0.7)
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, -0.5), max(high, 0.5))
@@ -648,7 +571,7 @@ def _speeds(panels: dict[str, Axes], log: DeployLog) -> None:
 
 def _keys(log: DeployLog, limit: float | None) -> list[Line2D | Patch]:
     keys: list[Line2D | Patch] = [
-        Line2D([], [], color=style.MATCHED, label="asked by the operator"),
+        Line2D([], [], color=style.MATCHED, label="operator command"),
         Line2D([], [], color=style.MEASURED_WIDE, label="the policy's estimate; turning: gyro"),
     ]
     if jumps(log):
@@ -666,11 +589,11 @@ def window(log: DeployLog) -> tuple[float, float, str]:
     The time before the first fault; else about the first jump input; else the middle of the time
     in which the policy decided, or of the whole run.
     """
-    ends, asked = faults(log), jumps(log)
+    ends, desired = faults(log), jumps(log)
     if ends:
         return max(ends[0] - 0.8 * WINDOW_S, 0.0), ends[0] + 0.2 * WINDOW_S, "about the first fault"
-    if asked:
-        return asked[0][0] - 0.15, asked[0][0] - 0.15 + WINDOW_S, "about the first jump input"
+    if desired:
+        return desired[0][0] - 0.15, desired[0][0] - 0.15 + WINDOW_S, "about the first jump input"
     live = np.flatnonzero(flying(log))
     times = seconds(log, log.time[live] if len(live) else log.time)
     middle = 0.5 * float(times[0] + times[-1])
@@ -716,7 +639,7 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure | None:
             Line2D([], [], color=style.MATCHED, linewidth=1.2, label="target sent"),
         ]
         if moved:
-            keys.append(Line2D([], [], **_ASKED, label="target asked, where the filter moved it"))
+            keys.append(Line2D([], [], **_DESIRED, label="desired, where filtered"))
         if shown:
             keys.append(Patch(color=_JUMP, label="jump input"))
         if any(begin <= at <= end for at in faults(log)):
@@ -725,7 +648,7 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure | None:
     return drawn
 
 
-_ASKED: dict[str, Any] = {"color": _FAULT, "linestyle": (0, (2, 1)), "linewidth": 1.2}
+_DESIRED: dict[str, Any] = {"color": _FAULT, "linestyle": (0, (2, 1)), "linewidth": 1.2}
 
 
 def _joint(axes: Axes, log: DeployLog, i: int, there: NDArray[np.bool_]) -> None:
@@ -736,12 +659,11 @@ def _joint(axes: Axes, log: DeployLog, i: int, there: NDArray[np.bool_]) -> None
         color=style.MEASURED_WIDE,
         linewidth=2.6,
     )
-    asked, sent = log.desired[there, i], in_force(log)[there, i]
+    desired, sent = log.desired[there, i], in_force(log)[there, i]
     now = log.sent[there, i]
     with np.errstate(invalid="ignore"):
-        axes.step(
-            t, np.where(np.abs(asked - now) > _SHOWN_MOVED, asked, np.nan), where="post", **_ASKED
-        )
+        moved = np.where(np.abs(desired - now) > _SHOWN_MOVED, desired, np.nan)
+        axes.step(t, moved, where="post", **_DESIRED)
     axes.step(t, sent, where="pre", color=style.MATCHED, linewidth=1.0)
 
 
@@ -849,7 +771,7 @@ def tracking_sheet(log: DeployLog, robot: Robot | None) -> Sheet:
         rows=tuple(rows),
         notes=(
             "error: the target in force less the measured position. All but the first column: "
-            "while the policy decided. Torques as the robot tells them, of the drives' effort "
+            "while the policy decided. Torques as the robot reports them, of the drives' effort "
             "limits; speeds of those at which the filter sees a fault.",
         ),
     )
@@ -886,7 +808,7 @@ def events_sheet(log: DeployLog) -> Sheet:
         at = float(seconds(log, event.time))
         rows.append((f"{at:.3f}", event.kind, event.text))
     return Sheet(
-        title=f"Everything that was said ({len(rows)} lines)",
+        title=f"Events ({len(rows)} lines)",
         columns=("time [s]", "kind", "text"),
         rows=tuple(rows),
         notes=("Before the first tick times are negative.",),
@@ -902,7 +824,7 @@ def machine(log: DeployLog) -> str:
     return f"real {name}" if REAL in said else f"{name} (the log does not say whether virtual)"
 
 
-def doubtful(log: DeployLog, delay: Delay) -> bool:
+def has_problem(log: DeployLog, delay: Delay) -> bool:
     """Whether something is not as it should be: faults, refusals, a cut log, too long a delay."""
     bad = any(event.kind in ("fault", "refused") for event in log.events)
     return bad or not log.complete or delay.within is False
@@ -924,8 +846,8 @@ def verdict(log: DeployLog) -> str:
     if not flown:
         return f"{head}: no fault; the policy was never in charge."
     count = len(jumps(log))
-    asked = f", {count} jump{'s' if count != 1 else ''} asked for" if count else ""
-    return f"{head}: the policy decided for {flown:.1f} s{asked}, no fault."
+    commanded = f", {count} jump{'s' if count != 1 else ''} commanded" if count else ""
+    return f"{head}: the policy decided for {flown:.1f} s{commanded}, no fault."
 
 
 def verdict_lines(log: DeployLog, delay: Delay) -> Iterator[str]:
@@ -949,7 +871,7 @@ def verdict_lines(log: DeployLog, delay: Delay) -> Iterator[str]:
         yield f"{left_out} of {whole} ticks were left out because their time had passed."
     dropped = sum(log.figures.get("servo", {}).get("dropped", {}).values())
     if dropped:
-        yield f"{dropped} records found no room on their way to the log; figures here lack them."
+        yield f"{dropped} records were dropped on their way to the log; figures here lack them."
     if not log.complete:
         why = f" ({log.damage})" if log.damage else ""
         yield f"The log was cut{why}: what came later is not in it."
@@ -978,7 +900,7 @@ def filtering(log: DeployLog) -> str:
     wanted = np.isfinite(log.desired).any(axis=1)
     moved = int((wanted & np.isin(log.level, (FilterAction.LIMIT, FilterAction.HOLD))).sum())
     if not wanted.any():
-        return "No target was asked of the safety filter."
+        return "The safety filter got no target."
     if not moved:
         return f"The safety filter let all {wanted.sum()} commands through as they were."
     return (
@@ -1098,7 +1020,7 @@ def part(material: Material, *, anchor: str, title: str = "Deployment") -> Part:
         at=f"{anchor}-" if anchor else "",
         says=verdict(log),
         lines=list(verdict_lines(log, material.delay)),
-        doubt=doubtful(log, material.delay),
+        warning=has_problem(log, material.delay),
         blocks=list(_blocks(material)),
         log=f"{Path(log.source).name}: {len(log.time)} ticks of the servo, {len(log.step_time)} "
         f"steps of the policy, over {log.header.get('link', 'an unknown link')}"
@@ -1122,7 +1044,7 @@ def _blocks(material: Material) -> Iterator[Block]:
         ),
         picture=shell.picture(
             overview(log, material.heat),
-            "Modes, speeds asked and estimated, tilt and battery over the run",
+            "Modes, speeds commanded and estimated, tilt and battery over the run",
             dense=True,
         ),
         folded=(events_sheet(log),),
@@ -1131,22 +1053,13 @@ def _blocks(material: Material) -> Iterator[Block]:
     yield _delay_block(material)
     yield Block(
         anchor="times",
-        title="Late, old, slow",
-        lines=("Counts and times on logarithmic axes.",),
-        picture=shell.picture(
-            histograms(log, material.delay.trained),
-            "Histograms of lateness, ages of states and times from state to command",
-        ),
-        sheets=(times_sheet(log),),
-    )
-    yield Block(
-        anchor="when",
-        title="When it was late",
+        title="Timing",
         picture=shell.picture(
             over_time(log, faults(log)),
             "Lateness, age of the state and state to command over the run",
             dense=True,
         ),
+        sheets=(times_sheet(log),),
     )
     yield _filter_block(log)
 
@@ -1160,7 +1073,7 @@ def _joints_block(material: Material) -> Block:
         title="Joints",
         lines=(
             f"{end - begin:.1f} s {words}. These drives are springs: a target away from the joint "
-            "is how the policy asks for torque, so an error is not a fault. While standing up and "
+            "is how the policy commands torque, so an error is not a fault. While standing up and "
             "standing it is what weight and friction leave.",
         ),
         picture=None
@@ -1182,8 +1095,8 @@ def _delay_block(material: Material) -> Block:
         )
     elif found.answer.n:
         lines.append(
-            "What the drives add could not be told: the run is too short, the robot tells no "
-            "torques, or targets and the gains of the drives do not explain them."
+            "What the drives add could not be estimated: the run is too short, the robot "
+            "reports no torques, or targets and the gains of the drives do not explain them."
         )
     return Block(
         anchor="delay",

@@ -35,7 +35,7 @@ def part(
     says: str,
     origin: Results | Bodies,
     lines: Iterable[str] = (),
-    doubt: bool = False,
+    warning: bool = False,
     definitions: Iterable[Figure] = (),
 ) -> Part:
     """Put a part together.
@@ -47,7 +47,7 @@ def part(
         says: The verdict, one sentence.
         origin: Where the numbers come from.
         lines: Below the verdict.
-        doubt: The verdict is not what was hoped for.
+        warning: Some result is not as expected.
         definitions: Of its figures.
     """
     versions = ", ".join(f"{name} {version}" for name, version in origin.versions.items())
@@ -58,7 +58,7 @@ def part(
         at=f"{anchor}-" if anchor else "",
         says=says,
         lines=list(lines),
-        doubt=doubt,
+        warning=warning,
         blocks=blocks,
         definitions=list(definitions),
         origin=f"Measured on the {place(origin)}, seed {origin.seed}, body {body}; policies: "
@@ -165,7 +165,7 @@ def walk_part(walks: Results, *, anchor: str, title: str = "Walking") -> Part:
         says=f"{first}, {where}: {fell} of {n} walks ended in a fall.",
         origin=walks,
         lines=lines,
-        doubt=fell > 0,
+        warning=fell > 0,
         definitions=WALK_FIGURES.values(),
     )
 
@@ -470,7 +470,7 @@ def _bodies_summary(bodies: Bodies) -> Sheet:
         errors = {one.gains: one.rms_db for one in body.errors}
         for name in policies(body.trial):
             own = [cell for cell in body.trial.cells if cell.policy == name]
-            asked, landed = sum(cell.n for cell in own), sum(cell.succeeded for cell in own)
+            commanded, landed = sum(cell.n for cell in own), sum(cell.succeeded for cell in own)
             stds = {
                 figure: [cell.figures[figure].std for cell in own]
                 for figure in ("height", "distance")
@@ -480,7 +480,7 @@ def _bodies_summary(bodies: Bodies) -> Sheet:
                 (
                     f"{body.name}: {name}",
                     number(errors.get(f"{_OF_POLICY}{name}", math.nan), 2),
-                    f"{landed}/{asked}",
+                    f"{landed}/{commanded}",
                     number(best),
                     *(number(sum(each) / len(each)) for each in stds.values()),
                     _passed(body) if name == body.trial.subjects[0].name else "-",
@@ -584,15 +584,15 @@ def bodies_part(bodies: Bodies, *, anchor: str, title: str = "Bodies never seen"
             )
         )
     landed = sum(c.succeeded for b in bodies.bodies for c in b.trial.cells)
-    asked = sum(c.n for b in bodies.bodies for c in b.trial.cells)
+    commanded = sum(c.n for b in bodies.bodies for c in b.trial.cells)
     return part(
         blocks,
         anchor=anchor,
         title=title,
-        says=f"{count} other {where}s: {landed} of {asked} jumps landed well.",
+        says=f"{count} other {where}s: {landed} of {commanded} jumps landed well.",
         origin=bodies,
         lines=(
-            "Each was drawn within stated tolerances, asked by its own sweep and matched anew; its "
+            "Each was drawn within stated tolerances, swept and matched anew; its "
             f"folder ({', '.join(body.folder for body in bodies.bodies)}) has a page of its own: "
             "pronk report FOLDER.",
         ),

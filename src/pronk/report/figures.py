@@ -36,9 +36,9 @@ def measured_words(virtual: bool) -> str:
 
 
 def _worth(response: FrequencyResponse) -> NDArray[np.bool_]:
-    """Frequencies worth drawing: those that were asked and answered."""
-    asked = (response.coherence >= _MIN_COHERENCE) & (response.frequency_hz > 0.0)
-    return asked if asked.any() else response.frequency_hz > 0.0
+    """Frequencies worth drawing: those that were excited and have a response."""
+    excited = (response.coherence >= _MIN_COHERENCE) & (response.frequency_hz > 0.0)
+    return excited if excited.any() else response.frequency_hz > 0.0
 
 
 def _hidden(response: FrequencyResponse, values: Array) -> Array:
@@ -67,19 +67,19 @@ def _gain(axes: Axes, response: FrequencyResponse, curve: ComplexArray, **look: 
     axes.plot(response.frequency_hz, _hidden(response, style.decibel(curve)), **look)
 
 
-def _gain_limits(joint: JointFit, *, room: float = 0.0) -> tuple[float, float]:
+def _gain_limits(joint: JointFit, *, margin: float = 0.0) -> tuple[float, float]:
     """Limits of the gain axis that hold every curve where the measurement is worth reading.
 
     Args:
         joint: Its measured, matched and naive gains are to be seen.
-        room: More of it above and below, for a curve that may run out of the picture [dB].
+        margin: More of it above and below, for a curve that may run out of the picture [dB].
     """
     response = joint.responses[0]
     inside = _worth(response)
     curves = (response.gain, np.abs(joint.matched), np.abs(joint.naive))
     values = np.concatenate([style.decibel(curve[inside]) for curve in curves])
     values = values[np.isfinite(values)]
-    return float(max(values.min(), -60.0)) - 2.0 - room, float(values.max()) + 2.0 + room
+    return float(max(values.min(), -60.0)) - 2.0 - margin, float(values.max()) + 2.0 + margin
 
 
 def bode(joint: JointFit, *, title: str | None = None, coherence: bool = True) -> Figure:
@@ -222,7 +222,7 @@ def overview(result: MatchResult) -> Figure:
             )
             limits[name] = _gain_limits(joint)
         for row in rows:
-            # The words at the lower left need room under the curves.
+            # The words at the lower left need space under the curves.
             low = max(min(limits[name][0] for name in row), -45.0)
             high = max(limits[name][1] for name in row)
             panels[row[0]].set_ylim(low - 0.12 * (high - low), high)
@@ -256,7 +256,7 @@ def zero_armature(joint: JointFit) -> Figure:
         _draw_measured_gain(axes, response)
         _gain(axes, response, joint.zero_armature, **style.ZERO_LINE)
         _gain(axes, response, joint.matched, **style.MATCHED_LINE)
-        axes.set_ylim(*_gain_limits(joint, room=6.0))
+        axes.set_ylim(*_gain_limits(joint, margin=6.0))
         axes.set_ylabel("gain [dB]")
         axes.set_xlabel("frequency [Hz]")
         axes.set_title(f"{style.joint_words(joint.joint)}: with and without rotor inertia")
@@ -621,8 +621,8 @@ def replay(replay: JointPrediction, *, virtual: bool, seconds: float = 1.5) -> F
         top.plot(time, replay.naive[window], **style.NAIVE_LINE)
         top.plot(time, replay.matched[window], **style.MATCHED_LINE)
         top.set_ylabel(f"position [{replay.unit}]")
-        asked = "log" if replay.signal == "unknown" else replay.signal.replace("_", " ")
-        top.set_title(f"{style.joint_words(replay.joint)}: a {asked} replayed")
+        signal = "log" if replay.signal == "unknown" else replay.signal.replace("_", " ")
+        top.set_title(f"{style.joint_words(replay.joint)}: a {signal} replayed")
         bottom.axhline(0.0, color="#666666", linewidth=0.8)
         bottom.plot(time, replay.naive[window] - measured, **style.NAIVE_LINE)
         bottom.plot(time, replay.matched[window] - measured, **style.MATCHED_LINE)

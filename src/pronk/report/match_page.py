@@ -75,7 +75,7 @@ def drive_gains(gains: MatchedGains) -> dict[str, tuple[float, float]]:
     return {joint.name: (joint.stiffness, joint.damping) for joint in joints}
 
 
-def doubts(result: MatchResult, name: str) -> list[str]:
+def failure_flags(result: MatchResult, name: str) -> list[str]:
     """The flags that speak against the match of a joint; that about zero armature speaks for it."""
     joint = result.joints.get(name)
     flags = (*result.gains.joints[name].flags, *(joint.flags if joint is not None else ()))
@@ -84,7 +84,7 @@ def doubts(result: MatchResult, name: str) -> list[str]:
 
 def is_match(result: MatchResult, name: str) -> bool:
     """True unless a flag of the joint says that there is no match."""
-    return not any(flag.startswith("no match") for flag in doubts(result, name))
+    return not any(flag.startswith("no match") for flag in failure_flags(result, name))
 
 
 def rms(values: list[float]) -> float:
@@ -105,11 +105,11 @@ def verdict(result: MatchResult) -> dict[str, Any]:
         "naive_error_db": rms([joint.naive_error_db for joint in joints.values()]),
         "error_db": rms([joint.error_db for joint in joints.values()]),
         "worst": max(errors, key=lambda name: errors[name], default=""),
-        "flags": {name: found for name in joints if (found := doubts(result, name))},
+        "flags": {name: found for name in joints if (found := failure_flags(result, name))},
     }
 
 
-def _asked(result: MatchResult) -> list[dict[str, Any]]:
+def _excitations(result: MatchResult) -> list[dict[str, Any]]:
     rows = []
     for name, joint in result.joints.items():
         first = joint.responses[0]
@@ -262,7 +262,7 @@ def part(
         gains_name=gains_name,
         joints=result.joints,
         verdict=verdict(result),
-        asked=_asked(result),
+        excitations=_excitations(result),
         members=members,
         scales=_scales(result.gains, members),
         drive=drive_gains(result.gains),

@@ -1,8 +1,8 @@
 """What every page of pronk shares: one frame, one look, pictures that lie in the page itself.
 
 A page is a list of parts. Each part is made from artefacts by its own module and template; the
-shell gives them a head, a table of contents and a foot. A page holds everything it shows and asks
-no network for anything.
+shell gives them a head, a table of contents and a foot. A page holds everything it shows and needs
+no network.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def signs(text: str) -> str:
 
 
 def fill(template: str, **values: Any) -> Markup:
-    """A template of this room, filled in; what comes from `values` is escaped.
+    """A filled-in template; what comes from `values` is escaped.
 
     Args:
         template: Its file name.

@@ -362,10 +362,10 @@ def lines(
 
 def _name_ends(axes: Axes, x: float, ends: Sequence[tuple[float, str]]) -> None:
     """Write what each line is at its right end, no word over another."""
-    room = 0.06 * axes.get_ylim()[1]
-    y = -room
+    margin = 0.06 * axes.get_ylim()[1]
+    y = -margin
     for end, words in sorted(ends):
-        y = max(end, y + room)
+        y = max(end, y + margin)
         axes.annotate(
             words,
             (x, y),
@@ -636,7 +636,7 @@ def rms(runs: Sequence[Trace]) -> float:
 def torque_speed(
     robot: Robot, velocity: Array, torque: Array, *, look_of: str, words: str
 ) -> Figure:
-    """What one jump asks of the drives, beside what a drive can give, one panel a joint group.
+    """What one jump needs of the drives, beside what a drive can give, one panel a joint group.
 
     Args:
         robot: Whose drives.

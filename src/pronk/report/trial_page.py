@@ -164,14 +164,14 @@ def _captures(trial: Results, folder: Path) -> Iterator[tuple[Row, Path]]:
 
 
 def see(
-    trial: Results, folder: Path, *, told: Callable[[float], None] = lambda share: None
+    trial: Results, folder: Path, *, progress: Callable[[float], None] = lambda share: None
 ) -> Seen | None:
     """Read the captures of a trial; None if it kept none, or none is there any more.
 
     Args:
         trial: Whose table names them.
         folder: Where they are.
-        told: Told the share of them that is read.
+        progress: Called with the share of them that is read.
 
     Raises:
         ArtefactError: A capture is damaged.
@@ -191,7 +191,7 @@ def see(
             found[what][row.policy].setdefault(row.case, []).append(trace)
         if row is worst:
             jump = _hardest(row, seen)
-        told((i + 1) / len(present))
+        progress((i + 1) / len(present))
     return Seen(**found, hardest=jump, missing=len(kept) - len(present))
 
 
@@ -241,8 +241,8 @@ def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
 
 def errors_db(result: MatchResult, subject: Subject) -> dict[str, float]:
     """Error of a policy's training gains for each joint of a match [dB]; NaN if it is unknown."""
-    told = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
-    gains = {name: (stiffness, damping) for name, stiffness, damping in zip(*told, strict=False)}
+    fields = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
+    gains = {name: (stiffness, damping) for name, stiffness, damping in zip(*fields, strict=False)}
     return {
         name: joint_error_db(joint, *gains.get(name, (np.nan, np.nan)))
         for name, joint in result.joints.items()
@@ -283,7 +283,7 @@ def match_near(folder: Path, root: Path) -> MatchResult | None:
             try:
                 return result_file.load(near / "match.npz", gains_file.load(find_gains(near)))
             except ArtefactError:
-                # The page says so where the match itself is shown.
+                # The page reports it where the match itself is shown.
                 return None
         if near == root:
             return None
@@ -427,13 +427,15 @@ class Material:
     """Of the sweep that lies nearest, for the error of the policies' training gains."""
 
 
-def read(folder: Path, root: Path, told: Callable[[float], None] = lambda share: None) -> Material:
+def read(
+    folder: Path, root: Path, progress: Callable[[float], None] = lambda share: None
+) -> Material:
     """Read a trial and what lies beside it.
 
     Args:
         folder: Of the trial.
         root: No match is looked for above it.
-        told: Told the share of the captures that is read.
+        progress: Called with the share of the captures that is read.
 
     Raises:
         ArtefactError: The trial, a capture or a picture is damaged.
@@ -443,7 +445,7 @@ def read(folder: Path, root: Path, told: Callable[[float], None] = lambda share:
         trial=trial,
         clips=clips(folder),
         match=match_near(folder, root),
-        seen=see(trial, folder, told=told),
+        seen=see(trial, folder, progress=progress),
     )
 
 
@@ -494,7 +496,7 @@ class Total:
 
     @property
     def share(self) -> float:
-        """Of all jumps that were asked for, those that landed well."""
+        """Of all commanded jumps, those that landed well."""
         return self.succeeded / self.n
 
     @property
@@ -634,9 +636,9 @@ def _by_policy(trial: Results, name: str) -> Sheet:
 
 def _groups(subject: Subject) -> list[dict[str, Any]]:
     """Gains that a policy was trained with, once for each group of joints."""
-    told = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
+    fields = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
     found: dict[str, dict[str, Any]] = {}
-    for name, stiffness, damping in zip(*told, strict=False):
+    for name, stiffness, damping in zip(*fields, strict=False):
         leg = style.leg_of(name)
         group = name.removeprefix(f"{leg}_") if leg else name
         found.setdefault(group, {"group": group, "stiffness": stiffness, "damping": damping})

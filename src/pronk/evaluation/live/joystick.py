@@ -1,4 +1,4 @@
-"""The stick of `pronk play`: what a person asks of a robot, by page or gamepad, at any moment."""
+"""The stick of `pronk play`: the operator command from page or gamepad."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def live(deflection: float) -> float:
 
 @dataclass
 class Stick:
-    """What is asked. Pages write it from threads of their own; the pilot reads it."""
+    """Operator command. Pages write it from threads of their own; the pilot reads it."""
 
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest command, by the names in `COMMANDS`."""
@@ -52,27 +52,27 @@ class Stick:
     _lock: Lock = field(default_factory=Lock)
 
     def set_velocity(self, velocity: Velocity) -> None:
-        """Ask for a velocity: forward, left [m/s], yaw rate [rad/s]."""
+        """Command a velocity: forward, left [m/s], yaw rate [rad/s]."""
         with self._lock:
             self._velocity = velocity
 
     def jump(self) -> None:
-        """Ask for a jump at the next tick; one that is under way is not asked again."""
+        """Command a jump at the next tick, unless one is under way."""
         with self._lock:
             self._wanted = self.jumps
 
     def reset(self) -> None:
-        """Ask to be set down anew."""
+        """Request a reset of the robot."""
         with self._lock:
             self._reset = True
 
     def take_reset(self) -> bool:
-        """Whether that was asked since the last call; forgets it, and any jump."""
+        """Whether a reset was requested since the last call; clears it, and any jump."""
         with self._lock:
-            asked, self._reset = self._reset, False
-            if asked:
+            requested, self._reset = self._reset, False
+            if requested:
                 self._wanted, self._until = False, -math.inf
-            return asked
+            return requested
 
     def feel(self, pad: Pad) -> None:
         """Take a gamepad's state; a button counts when it goes down."""
@@ -84,7 +84,7 @@ class Stick:
             self._pad = pad
 
     def commanded(self, t: float) -> Commanded:
-        """What is asked at a time since the policy took over [s]. Implements `pilot.Source`.
+        """Command at a time since the policy took over [s]. Implements `pilot.Source`.
 
         Page and gamepad add up, within the ranges; full deflection is the end of a range.
         """

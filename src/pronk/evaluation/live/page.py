@@ -197,7 +197,7 @@ class WebPage:
         self._sliders = []
         for name, label in zip(COMMANDS, _LABELS, strict=True):
             low, high = stick.ranges[name]
-            # A slider needs room to slide; a command that was never trained has none.
+            # A command that was never trained gets no slider.
             slider = gui.add_slider(
                 label,
                 min=low,

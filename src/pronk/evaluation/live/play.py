@@ -90,11 +90,11 @@ def play(
         robot: Structure.
         policy: Whose contract fits the robot.
         sim_params: Body of the virtual robot.
-        stick: What is asked.
+        stick: Operator command.
         page: Where it is shown.
         gamepad: Read once a policy step.
         seed: Of all noise.
-        until: Told the simulated time [s]; true ends the game.
+        until: Called with the simulated time [s]; true ends the game.
 
     Raises:
         ArtefactError: The contract does not fit.

@@ -49,7 +49,7 @@ class Film:
 
     robot: str
     title: str
-    """What was asked."""
+    """The command."""
     note: str
     """What else has to be known, for instance which policy."""
     virtual: bool
@@ -75,7 +75,7 @@ class Film:
     """Where the camera looks [m]. (F, 3)"""
     height: Array
     """Of the trunk's origin over the floor [m]. (F,)"""
-    asked: Mask
+    jumping: Mask
     """The jump input is on. (F,)"""
     labels: tuple[str, ...]
     """Of the P poses of the strip, empty for one on the way; no pose without a jump."""
@@ -109,7 +109,7 @@ def plan(
     Args:
         capture: What was seen.
         robot: Whom, by name.
-        title: What was asked.
+        title: The command.
         note: What else has to be known.
         virtual: Whether it was the virtual robot.
         marks: Of the jump; None for a robot that only walks.
@@ -139,9 +139,9 @@ def plan(
     moments, labels = _poses(capture, marks) if marks else (_samples(capture, np.zeros(0)), ())
     zero = _sample(capture, marks.liftoff if marks else begin)
     direction = _direction(capture, marks, begin, finish)
-    asked = np.zeros(len(time), dtype=bool)
+    jumping = np.zeros(len(time), dtype=bool)
     if marks:
-        asked = (time >= marks.on) & (time < marks.off)
+        jumping = (time >= marks.on) & (time < marks.off)
     return Film(
         robot=robot,
         title=title,
@@ -158,7 +158,7 @@ def plan(
         qpos=_qpos(capture, shown),
         look=_look(capture)[shown],
         height=capture.position[shown, 2].copy(),
-        asked=asked,
+        jumping=jumping,
         labels=labels,
         pose_time=capture.time[moments] - (marks.liftoff if marks else 0.0),
         pose_qpos=_qpos(capture, moments),
@@ -244,7 +244,7 @@ def _poses(capture: Capture, marks: JumpEvents) -> tuple[NDArray[np.intp], tuple
     return np.array([k for k, _ in named], dtype=np.intp), tuple(label for _, label in named)
 
 
-_ARRAYS = ("time", "rate", "qpos", "look", "height", "asked", "pose_time", "pose_qpos")
+_ARRAYS = ("time", "rate", "qpos", "look", "height", "jumping", "pose_time", "pose_qpos")
 
 
 def save(path: Path, film: Film) -> None:

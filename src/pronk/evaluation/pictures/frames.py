@@ -1,6 +1,6 @@
 """Frames and strips of a film, painted offscreen by MuJoCo.
 
-Whoever imports this has chosen the GL backend (MUJOCO_GL) before mujoco was first imported;
+The GL backend (MUJOCO_GL) must be chosen before mujoco is first imported;
 `pronk.evaluation.pictures.video` does so in a process of its own.
 """
 
@@ -18,8 +18,7 @@ from PIL import Image
 
 from pronk.evaluation.pictures import overlay
 from pronk.evaluation.pictures.film import Film
-from pronk.evaluation.pictures.stage import STUDIO_HEIGHT_M, Tape, outdoors, studio
-from pronk.evaluation.pictures.view import View
+from pronk.evaluation.pictures.stage import STUDIO_HEIGHT_M, Tape, View, outdoors, studio
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 

@@ -13,8 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from pronk.evaluation.pictures.film import Film
 
 if TYPE_CHECKING:
-    from pronk.evaluation.pictures.stage import Tape
-    from pronk.evaluation.pictures.view import View
+    from pronk.evaluation.pictures.stage import Tape, View
 
 _INK = (24, 28, 34)
 _PAPER = (255, 255, 255)
@@ -51,7 +50,7 @@ def draw_words(image: Image.Image, film: Film, frame: int) -> None:
     x = _tag(draw, words, (pad, bottom), scale)
     if film.rate[frame] < 1.0:
         x = _tag(draw, f"1/{1.0 / film.rate[frame]:g} speed", (x + pad / 2, bottom), scale)
-    if film.asked[frame]:
+    if film.jumping[frame]:
         _tag(draw, "jump!", (x + pad / 2, bottom), scale, ground=(*_ACCENT, 235), ink=_PAPER)
     _trace(draw, film, frame, (image.width - pad, bottom), scale)
 

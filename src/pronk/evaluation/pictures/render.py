@@ -111,7 +111,7 @@ def write_gif(path: Path, images: list[Image.Image]) -> None:
 def render(
     film: Film, *, mp4: Path | None, gif: Path | None, strip: Path | None, width: int, height: int
 ) -> None:
-    """Paint a film into whichever files are asked for, each whole or not at all."""
+    """Paint a film into whichever files are named, each whole or not at all."""
     if strip is not None:
         with written_whole(strip) as aside:
             frames.strip(film).save(aside, format="PNG", optimize=True)
@@ -159,13 +159,13 @@ def main(arguments: list[str]) -> int:
         parser.add_argument(name, type=Path)
     parser.add_argument("--width", type=int, default=frames.WIDTH)
     parser.add_argument("--height", type=int, default=frames.HEIGHT)
-    asked = vars(parser.parse_args(arguments))
-    path = asked.pop("film")
+    options = vars(parser.parse_args(arguments))
+    path = options.pop("film")
     try:
         if path is None:
             probe()
         else:
-            render(films.load(path), **asked)
+            render(films.load(path), **options)
     except Exception as error:
         sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
         return 1

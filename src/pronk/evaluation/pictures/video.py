@@ -1,25 +1,29 @@
-"""Video of a capture: an MP4, a small GIF, and a strip of still frames.
+"""Videos of captures and trials: an MP4, a small GIF, and a strip of still frames.
 
 Painting happens in a process of its own (`render`): the GL backend must be chosen before mujoco is
-imported, and a GL that crashes must not take a trial along. A machine without GPU or display paints
-with Mesa's software renderer, about 0.1 s a frame.
+imported, and a crash of OpenGL does not end the trial.
 """
 
 from __future__ import annotations
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Container, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
 from pronk import opengl
 from pronk.errors import PronkError
+from pronk.evaluation.jump_events import jump_events
 from pronk.evaluation.pictures import film as films
-from pronk.evaluation.pictures.film import Film
+from pronk.evaluation.pictures.film import Film, plan
+from pronk.evaluation.results import Results, Row
+from pronk.virtual import capture as captures
 
 WIDTH, HEIGHT = 640, 400
 """Of an MP4 [px]; both even."""
@@ -67,7 +71,7 @@ def find_gl() -> str:
         VideoError: None does.
     """
     candidates = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
-    if chosen := opengl.asked():
+    if chosen := opengl.requested():
         candidates = [chosen] + [name for name in candidates if name != chosen]
     for name in candidates:
         try:
@@ -124,7 +128,7 @@ def shoot(
         strip: The poses of the jump side by side, PNG.
         width: Of the video [px], even.
         height: Of the video [px], even.
-        progress: Told the share that is done, 0 to 1.
+        progress: Called with the share that is done, 0 to 1.
 
     Raises:
         VideoError: This machine cannot, or painting failed.
@@ -148,12 +152,12 @@ def shoot(
 
 def _paint(words: list[str], backend: str, progress: Callable[[float], None] | None) -> None:
     """Run the process that paints."""
-    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", _MODULE, *words],
             env=environment(backend),
             stdout=subprocess.PIPE,
-            stderr=complaints,
+            stderr=errors,
             text=True,
         )
         try:
@@ -167,8 +171,8 @@ def _paint(words: list[str], backend: str, progress: Callable[[float], None] | N
             process.kill()
             process.wait()
         if status:
-            complaints.seek(0)
-            said = [line.strip() for line in complaints if line.strip()]
+            errors.seek(0)
+            said = [line.strip() for line in errors if line.strip()]
             last = said[-1].rstrip(".") if said else f"the process ended with {status}"
             raise VideoError(
                 f"painting with MUJOCO_GL={backend or 'its default'} failed ({last}); another one "
@@ -190,8 +194,8 @@ def record(
         film: From `pronk.evaluation.pictures.film.plan`.
         folder: Where to.
         stem: Name of the files, without an ending.
-        tell: Told in one sentence what cannot be written, and what is missing for it.
-        progress: Told the share that is done, 0 to 1.
+        tell: Called with one sentence: what cannot be written, and what is missing for it.
+        progress: Called with the share that is done, 0 to 1.
 
     Returns:
         The files that were written; none where nothing can be painted.
@@ -211,3 +215,111 @@ def record(
         tell(str(error))
         return ()
     return tuple(path for path in (video, gif, picture) if path is not None)
+
+
+SLOW = 4.0
+"""How many times slower than real time a flight is shown."""
+_BEFORE_S = 0.8
+_AFTER_S = 2.5
+"""Around the jump input, for a robot that did not jump."""
+
+
+def films_of(
+    found: Results, folder: Path, *, cases: Container[str] | None = None, slow: float = SLOW
+) -> Iterator[tuple[str, Film]]:
+    """Plan a film of each policy with each command.
+
+    A robot that did not jump is shown as it did not.
+
+    Args:
+        found: The trial.
+        folder: Where its captures are.
+        cases: Names of the commands that are shown; all if None.
+        slow: How many times slower than real time the flight is shown.
+
+    Yields:
+        A name for the files, and the film.
+
+    Raises:
+        ArtefactError: A capture is missing or damaged.
+    """
+    for subject in found.subjects:
+        for case in found.cases:
+            if cases is not None and case.name not in cases:
+                continue
+            kept = next((row for row in found.of(subject.name, case.name) if row.capture), None)
+            if kept is not None:
+                yield _stem(kept), _film(found, kept, folder, slow)
+
+
+def record_all(
+    found: Results,
+    folder: Path,
+    out: Path,
+    *,
+    tell: Callable[[str], None],
+    cases: Container[str] | None = None,
+    slow: float = SLOW,
+    at_once: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[Path, ...]:
+    """Write MP4, GIF and strip of each of `films_of`, as far as this machine can.
+
+    Args:
+        found: The trial.
+        folder: Where its captures are.
+        out: Where the files go.
+        tell: Called with one sentence: what cannot be written, and what is missing for it.
+        cases: Names of the commands that are shown; all if None.
+        slow: How many times slower than real time the flight is shown.
+        at_once: How many films are painted at once; not more than there are cores.
+        progress: Called with the share that is done, 0 to 1.
+
+    Returns:
+        The files that were written; none where nothing can be painted.
+    """
+    if lack := no_gl():
+        tell(lack)
+        return ()
+    planned = list(films_of(found, folder, cases=cases, slow=slow))
+    shares = [0.0] * len(planned)
+
+    def paint(index: int) -> tuple[tuple[Path, ...], list[str]]:
+        stem, film = planned[index]
+        errors: list[str] = []
+
+        def share(part: float) -> None:
+            shares[index] = part
+            if progress is not None:
+                progress(sum(shares) / len(shares))
+
+        return record(film, out, stem, tell=errors.append, progress=share), errors
+
+    with ThreadPoolExecutor(max(1, at_once)) as threads:
+        painted = list(threads.map(paint, range(len(planned))))
+    # What one film lacks the others lack too: report it once.
+    for text in dict.fromkeys(text for _, errors in painted for text in errors):
+        tell(text)
+    return tuple(path for paths, _ in painted for path in paths)
+
+
+def _film(found: Results, row: Row, folder: Path, slow: float) -> Film:
+    seen = captures.load(folder / row.capture)
+    marks = jump_events(seen, row.script, began=row.began)
+    on = row.began + row.script.on
+    return plan(
+        seen,
+        robot=found.robot,
+        title=row.case if "," in row.case else f"{row.case} m/s",
+        note=f"policy: {row.policy}" + ("" if marks else ", no jump"),
+        virtual=found.virtual,
+        marks=marks,
+        start=None if marks else on - _BEFORE_S,
+        end=None if marks else on + _AFTER_S,
+        slow=slow,
+    )
+
+
+def _stem(row: Row) -> str:
+    """A name for files, without what a shell or a link would trip over."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{row.policy}_{row.case}")
