@@ -36,7 +36,9 @@ def match(
         result = run(trials, seed, one_bar)
     console.show(table(result))
     console.write_json(json_file, orjson.loads(result.to_json()))
-    console.following("pronk bench match --trials 20   # steadier coverage, about 20 s a log")
+    console.following(
+        "python -m benchmarks match --trials 20   # steadier coverage, about 20 s a log"
+    )
 
 
 def grid(
@@ -58,7 +60,7 @@ def grid(
     console.show(table(result))
     derived = {"steps_per_second": result.steps_per_second, "ratio": result.ratio}
     console.write_json(json_file, asdict(result) | derived)
-    console.following("pronk bench engine   # what the simulator's step does to a joint")
+    console.following("python -m benchmarks engine   # what the simulator's step does to a joint")
 
 
 def engine(
@@ -87,7 +89,7 @@ def engine(
             for gap in gaps
         },
     )
-    console.following("pronk bench coverage   # whether the intervals hold what they say")
+    console.following("python -m benchmarks coverage   # coverage of the intervals")
 
 
 def coverage(
@@ -110,7 +112,7 @@ def coverage(
         rows = run(trials, seed, report)
     console.show(table(rows))
     console.write_json(json_file, {one.joint: asdict(one) for one in rows})
-    console.following("pronk bench match   # the same question to mujoco.sysid and CMA-ES")
+    console.following("python -m benchmarks match   # the same logs in mujoco.sysid and CMA-ES")
 
 
 def tick(

@@ -1,4 +1,4 @@
-"""`pronk bench coverage`: how often the 95 % intervals hold the truth.
+"""`python -m benchmarks coverage`: how often the 95 % intervals hold the known gains.
 
 Each trial is a log of known truth with noise of its own, coloured at 2 Hz; everything after the
 noise is what a real log goes through, but that all trials share one clean simulation and one

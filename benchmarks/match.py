@@ -1,4 +1,4 @@
-"""`pronk bench match`: pronk and its peers on the same logs with known truth.
+"""`python -m benchmarks match`: pronk and its peers on the same logs with known gains.
 
 Every tool gets the same logs, the same bench model (armature and friction in it), the same two
 free parameters and the same start; the bounds of the peers are the edges of pronk's grid. Rows

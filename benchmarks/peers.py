@@ -62,7 +62,7 @@ class Estimate:
 
 def _missing(package: str) -> PronkError:
     return PronkError(
-        f"`pronk bench match` compares with {package}, which is not installed (or lacks a "
+        f"`python -m benchmarks match` compares with {package}, which is not installed (or lacks a "
         "dependency of its own); install it with `pip install pronk[bench]`."
     )
 

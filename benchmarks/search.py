@@ -1,4 +1,4 @@
-"""`pronk bench grid`: the paper's grid on twelve joints, its speed and whether it finds the truth.
+"""`python -m benchmarks grid`: the grid on twelve joints, its speed and the gains that it finds.
 
 The peer is a bare `mujoco.rollout` loop over the same model, commands and threads, run right
 before and right after each part of the grid, so that a machine that speeds up or slows down does

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pronk.errors import RobotError
-from pronk.match.ellipsoid import enclosing
 from pronk.match.gains import JointGains
-from pronk.match.ranges import characteristic_frequency, coverage, group_gains
+from pronk.match.ranges import characteristic_frequency, coverage, enclosing, group_gains
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
