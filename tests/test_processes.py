@@ -10,26 +10,18 @@ import pytest
 
 pytest.importorskip("torch")
 
-from pronk.train.runner.processes import gathered, in_any
+from pronk.train.runner.processes import in_any
 
 pytestmark = pytest.mark.train
 
 PROGRAM = """
 import sys, torch
-from pronk.train.experiment.processes import gathered, in_any
+from pronk.train.runner.processes import in_any
 rank, meeting = int(sys.argv[1]), sys.argv[2]
 torch.distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=2)
 two = {"size": 2, "device": "cpu"}
 assert in_any(rank == 1, **two)
 assert not in_any(False, **two)
-state = {"rank": rank, "deep": {"value": torch.full((2,), float(rank))}, "none": None}
-found = gathered(state, size=2, rank=rank)
-if rank == 0:
-    assert [entry["rank"] for entry in found] == [0, 1]
-    assert [entry["deep"]["value"].tolist() for entry in found] == [[0.0, 0.0], [1.0, 1.0]]
-    assert found[1]["none"] is None
-else:
-    assert found == []
 torch.distributed.destroy_process_group()
 """
 
@@ -37,12 +29,10 @@ torch.distributed.destroy_process_group()
 def test_one_process_asks_nobody() -> None:
     assert in_any(True, size=1, device="cpu")
     assert not in_any(False, size=1, device="cpu")
-    state = {"a": 1}
-    assert gathered(state, size=1, rank=0) == [state]
 
 
 @pytest.mark.slow
-def test_two_processes_leave_together_and_the_first_has_it_all(tmp_path: Path) -> None:
+def test_two_processes_stop_together(tmp_path: Path) -> None:
     meeting = (tmp_path / "meeting").as_uri()
     processes = [
         subprocess.Popen(

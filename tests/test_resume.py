@@ -1,4 +1,4 @@
-"""A resumed run is the same run: bit for bit on Warp's CPU device, also after kill -9."""
+"""A run resumes from its last checkpoint, also after kill -9."""
 
 from __future__ import annotations
 
@@ -17,21 +17,14 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 
-import mujoco
 import torch
 from mjlab.utils.os import get_checkpoint_path
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import small_run
 from pronk.errors import ArtefactError, PronkError
+from pronk.train.mdp.commands import motion_command
 from pronk.train.runner import checkpoint
-from pronk.train.runner.state import (
-    INTEGRATION,
-    environment_state,
-    random_state,
-    restore_environment,
-    restore_random,
-)
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 
@@ -80,19 +73,17 @@ def differences(a: Any, b: Any, name: str = "") -> list[str]:
     return [] if a == b or (a != a and b != b) else [name]
 
 
-def test_the_resumed_run_is_the_uninterrupted_one(whole: Any, other: Any) -> None:
-    other.load(checkpoint.numbered(whole.folder, 2))
-    # mjlab's own `train --agent.resume` asks for this whenever it trains.
+def test_a_resumed_run_has_networks_optimizers_and_counters(whole: Any, other: Any) -> None:
+    path = checkpoint.numbered(whole.folder, 2)
+    found = checkpoint.load(path)
+    other.load(path)
+    assert differences(other.alg.save(), found.tree["algorithm"]) == []
+    assert float(other.alg.learning_rate) == found.tree["learning_rate"]
+    assert motion_command(other.env.unwrapped).ranges.grown == found.tree["speed_ranges"]
     other.learn(2, init_at_random_ep_len=True)
-    ended, resumed = (checkpoint.load(checkpoint.numbered(r.folder, 4)) for r in (whole, other))
-    # Weights, optimizers, statistics, estimator, environment, generators and counters at once.
-    assert differences(ended.tree, resumed.tree) == []
-    for name in ("iteration", "phase", "envs", "env_steps"):
-        assert ended.about[name] == resumed.about[name]
-    assert ended.about["env_steps"] == 4 * small_run.STEPS * small_run.ROBOTS
-    assert whole.figures.keys() == other.figures.keys()
-    learned = {key for key in whole.figures if not key.startswith("Perf/")}
-    assert all(whole.figures[key] == other.figures[key] for key in learned)
+    ended = checkpoint.load(checkpoint.numbered(other.folder, 4)).about
+    assert ended["iteration"] == 4
+    assert ended["env_steps"] == 4 * small_run.STEPS * small_run.ROBOTS
 
 
 def test_tensorboard_has_every_iteration(whole: Any) -> None:
@@ -108,97 +99,8 @@ def test_mjlab_finds_the_checkpoints(whole: Any) -> None:
     assert found == checkpoint.latest(whole.folder)
 
 
-def test_something_was_learned_and_drawn_in_between(whole: Any) -> None:
-    """So that equality above says something."""
-    half, ended = (checkpoint.load(checkpoint.numbered(whole.folder, n)).tree for n in (2, 4))
-    changed = differences(half, ended)
-    weights = [
-        f"/algorithm/actor_state_dict/{name}" for name, _ in whole.alg.actor.named_parameters()
-    ]
-    assert set(weights) <= set(changed)
-    for part in (
-        "/algorithm/actor_state_dict/obs_normalizer._mean",
-        "/algorithm/estimator_optimizer_state_dict/state/0/exp_avg",
-        "/ranks/0/random/torch",
-        "/ranks/0/environment/physics/data/qpos",
-        "/ranks/0/environment/observation_manager/_obs_buffer/measured",
-        "/ranks/0/environment/counter/episode_length_buf",
-    ):
-        assert part in changed
-
-
-def test_a_step_after_restoring_is_the_step_not_interrupted(whole: Any, other: Any) -> None:
-    env, its = whole.env.unwrapped, other.env.unwrapped
-    state, drawn = environment_state(env), random_state("cpu")
-    actions = [torch.randn(small_run.ROBOTS, 12) for _ in range(25)]
-
-    def steps(env: Any) -> list[Any]:
-        restore_random(drawn, "cpu")
-        made = []
-        for action in actions:
-            observations, reward, terminated, truncated, _ = env.step(action)
-            ended = (terminated | truncated).clone()
-            made.append([dict(observations), reward.clone(), ended, environment_state(env)])
-        return made
-
-    restore_environment(its, state)
-    assert differences(environment_state(its), state) == []
-    expected = steps(env)
-    assert differences(steps(its), expected) == []
-    assert any(bool(step[2].any()) for step in expected)  # over resets, too
-
-
-def test_tensors_stay_where_they_are(whole: Any, other: Any) -> None:
-    """CUDA graphs and fused drives go on reading the memory they were built with."""
-    env = other.env.unwrapped
-    drive = env.scene["robot"].actuators[0]
-    tensors = {
-        "drive": drive.stiffness,
-        "counter": env.episode_length_buf,
-        "mass": env.sim.model.body_mass[:],
-        "position": env.sim.data.qpos[:],
-    }
-    before = {name: tensor.data_ptr() for name, tensor in tensors.items()}
-    restore_environment(env, environment_state(whole.env.unwrapped))
-    after = {
-        "drive": drive.stiffness,
-        "counter": env.episode_length_buf,
-        "mass": env.sim.model.body_mass[:],
-        "position": env.sim.data.qpos[:],
-    }
-    assert {name: tensor.data_ptr() for name, tensor in after.items()} == before
-    assert torch.equal(drive.stiffness, whole.env.unwrapped.scene["robot"].actuators[0].stiffness)
-
-
-def test_the_whole_integration_state_is_saved(whole: Any) -> None:
-    """MuJoCo says how many numbers that is; a field it adds would be missed here."""
-    sim = whole.env.unwrapped.sim
-    state = environment_state(whole.env.unwrapped)
-    saved = [
-        state[f"physics/data/{name}"] for name in INTEGRATION if f"physics/data/{name}" in state
-    ]
-    size = mujoco.mj_stateSize(sim.mj_model, mujoco.mjtState.mjSTATE_INTEGRATION)
-    assert sum(tensor[0].numel() for tensor in saved) == size
-
-
-def test_refuses_the_state_of_another_environment(whole: Any) -> None:
-    env = whole.env.unwrapped
-    state = environment_state(env)
-    length = "counter/episode_length_buf"
-    with pytest.raises(ArtefactError, match="of 3 environments, this run has 16"):
-        restore_environment(env, {**state, length: state[length][:3]})
-    lost = "command_manager/_terms/motion/velocity"
-    with pytest.raises(ArtefactError, match=f"lacks what this environment has \\({lost}"):
-        restore_environment(env, {k: v for k, v in state.items() if k != lost})
-    with pytest.raises(ArtefactError, match=r"holds what this environment lacks \(term/x"):
-        restore_environment(env, {**state, "term/x": 1.0})
-    with pytest.raises(ArtefactError, match=r"velocity is torch.float64 \(16, 3\)"):
-        restore_environment(env, {**state, lost: state[lost].double()})
-
-
 def test_playing_takes_the_actor_and_leaves_the_rest(whole: Any, other: Any) -> None:
     """As mjlab's `play` loads a checkpoint."""
-    random = random_state("cpu")
     critic = other.alg.critic.state_dict()["mlp.0.weight"].clone()
     with torch.no_grad():
         for parameter in other.alg.actor.parameters():
@@ -210,7 +112,6 @@ def test_playing_takes_the_actor_and_leaves_the_rest(whole: Any, other: Any) -> 
     assert differences(dict(other.alg.actor.state_dict()), actor) == []
     assert torch.equal(other.alg.critic.state_dict()["mlp.0.weight"], critic)
     assert other.current_learning_iteration == iteration
-    assert differences(random_state("cpu"), random) == []
 
 
 def test_refuses_networks_of_another_shape(whole: Any, tmp_path: Path) -> None:

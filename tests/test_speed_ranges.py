@@ -13,8 +13,7 @@ torch = pytest.importorskip("torch")
 
 import small_env
 from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.speed_ranges import Growth, SpeedRanges, grown
-from pronk.train.runner.state import environment_state
+from pronk.train.mdp.speed_ranges import Growth, SpeedRanges
 
 pytestmark = pytest.mark.train
 
@@ -98,11 +97,12 @@ def test_ranges_grow_in_an_environment_that_is_told_what_its_robots_do(env: Any)
         assert (float(command.ranges.kept) > before + 0.02) is not scripted
 
 
-def test_ranges_of_a_saved_environment(env: Any) -> None:
-    motion_command(env).ranges.grown.fill_(1234.0)
-    assert grown(environment_state(env)) == 1234.0
-    with pytest.raises(ArtefactError, match="knows no speed ranges; it is of another version"):
-        grown({"counter/common_step_counter": 3})
+def test_ranges_continue_from_a_checkpoint() -> None:
+    ranges = SpeedRanges(Growth(), "cpu")
+    ranges.resume({"speed_ranges": torch.tensor(1234.0)})
+    assert ranges.grown == 1234.0
+    with pytest.raises(ArtefactError, match="speed_ranges"):
+        ranges.resume({})
 
 
 @pytest.mark.parametrize(

@@ -149,7 +149,7 @@ class Core(PathFinder):
         return None if hidden else super().find_spec(name, path, target)
 
 sys.meta_path = [Core if finder is PathFinder else finder for finder in sys.meta_path]
-from pronk import cli
+from pronk.cli import main as cli
 sys.exit(cli.run(sys.argv[1:]))
 """
     words = ["train", "walk", "--gains", "naive", "--out", str(tmp_path / "run")]

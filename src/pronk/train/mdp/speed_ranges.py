@@ -76,22 +76,17 @@ class SpeedRanges:
         law = self._growth
         self.grown += ((self.kept - law.lose) / (law.keep - law.lose)).clamp(0.0, 1.0)
 
-    def resume(self, environment: Mapping[str, Any]) -> None:
-        """Go on from where the ranges of a saved environment were, as `grown` reads it."""
-        self.grown.copy_(grown(environment))
+    def resume(self, tree: Mapping[str, Any]) -> None:
+        """Continue with the ranges of a checkpoint.
 
+        Args:
+            tree: Of the checkpoint; "speed_ranges" is `grown`.
 
-def grown(environment: Mapping[str, Any]) -> Tensor:
-    """How far the ranges of a saved environment have grown, as `SpeedRanges.grown` counts. ().
-
-    Args:
-        environment: From `pronk.train.runner.state.environment_state`.
-
-    Raises:
-        ArtefactError: It is of another version of pronk.
-    """
-    for name, value in environment.items():
-        if name.endswith("/ranges/grown"):
-            assert isinstance(value, Tensor)
-            return value
-    raise ArtefactError("the checkpoint knows no speed ranges; it is of another version of pronk.")
+        Raises:
+            ArtefactError: It is of another version of pronk.
+        """
+        if "speed_ranges" not in tree:
+            raise ArtefactError(
+                "the checkpoint has no speed_ranges; it is of another version of pronk."
+            )
+        self.grown.copy_(tree["speed_ranges"])

@@ -87,22 +87,6 @@ class Episodes:
             figures["Train/mean_episode_length"] = total[1] / total[2]
         return figures
 
-    def state(self) -> dict[str, Any]:
-        """For a checkpoint, between two iterations."""
-        return {
-            "returns": self.returns,
-            "lengths": self.lengths,
-            "ended": list(self.ended),
-            "non_finite": self.non_finite,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state`."""
-        self.returns.copy_(state["returns"])
-        self.lengths.copy_(state["lengths"])
-        self.ended = deque(state["ended"])
-        self.non_finite = state["non_finite"]
-
     def _logged(self) -> dict[str, float]:
         """Mean of every figure over the steps that gave it, with one copy from the device."""
         values = [value for _, value in self._logs]

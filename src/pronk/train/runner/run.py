@@ -2,9 +2,8 @@
 
 One environment serves all phases, since building it and compiling its kernels takes a minute.
 Every phase has a runner of its own, which takes over networks, optimizers and counters from the
-one before. A resumed run builds the runner of the phase it was in, loads the checkpoint and is
-from there on the same run: what is drawn between two phases is drawn from generators that the
-checkpoint holds.
+one before. A resumed run builds the runner of the phase it was in and loads networks, optimizers
+and counters from the last checkpoint; its robots start anew.
 
 Iterations are counted through all phases, so that curves and checkpoints stand in one row.
 """
@@ -37,7 +36,6 @@ from pronk.train.runner.resolve import run_contract, run_gains, run_phases, run_
 from pronk.train.runner.run_folder import RunFolder
 from pronk.train.runner.runner import PronkRunner
 from pronk.train.runner.settings import TrainSettings, WatchSettings
-from pronk.train.runner.state import random_state, restore_random
 from pronk.train.tasks import env_cfg, rl_cfg
 
 _COMPARED = 4096
@@ -114,13 +112,16 @@ class _Run:
         self.env = self._build()
         runner: PhaseRunner | None = None
         for phase in self.phases[first:]:
-            fresh = runner is None and last is None
+            fresh = runner is None
             if runner is None and last is not None:
                 # A checkpoint is of one configuration, which changes within a phase.
                 done = self._part_of(phase, checkpoint.about(last)["iteration"])
                 enter_phase(self.env.unwrapped, phase, done)
                 runner = self._runner(phase)
                 runner.load(last)
+                # Draws other than those of the beginning.
+                seed = self.settings.seed + self.rank
+                torch.manual_seed(seed + runner.current_learning_iteration)
             else:
                 enter_phase(self.env.unwrapped, phase)
                 runner = self._successor(runner, phase)
@@ -214,9 +215,8 @@ class _Run:
         elif self.settings.start:
             found = checkpoint.load(self._start())
             state, rate = found.tree["algorithm"], found.tree["learning_rate"]
-            walked = found.tree["ranks"][0]["environment"]
             # Speed ranges do not begin anew.
-            motion_command(self.env.unwrapped).ranges.resume(walked)
+            motion_command(self.env.unwrapped).ranges.resume(found.tree)
             narrow = True
         else:
             runner.alg.set_estimator_rate(phase.estimator_rate)
@@ -309,12 +309,9 @@ class _Run:
         contract = run_contract(
             self.settings, self.gains, phase, run=self.folder.path.resolve().name
         )
-        # What is drawn here must not shift what the next phase draws.
-        before = random_state(self.device)
         export_policy(actor, contract, path)
         seen = runner.alg.storage.observations.flatten(0, 1)[:_COMPARED]
         difference = verify(path, actor, {name: seen[name] for name in ("measured", "jump")})
-        restore_random(before, self.device)
         if difference is not None and not difference <= TOLERANCE:
             self.console.print(
                 f"{path} differs from PyTorch by {difference:.1e}, more than {TOLERANCE:g}",

@@ -1,8 +1,7 @@
 """The training run: rollouts and updates, saved so that it can be killed and resumed.
 
-mjlab's and rsl_rl's runner, with four things done otherwise: a checkpoint holds everything the
-run depends on and is never unpickled; a resumed run is the same run, iteration by iteration; no
-environment step waits for the device on the runner's account; progress is one line.
+mjlab's and rsl_rl's runner, with three things changed: a checkpoint is never unpickled;
+environment steps do not wait for the device; progress is one line.
 """
 
 from __future__ import annotations
@@ -24,15 +23,9 @@ from pronk.train.mdp.commands import motion_command
 from pronk.train.rl.rollout import roll_out
 from pronk.train.runner import checkpoint
 from pronk.train.runner.checkpoint import Checkpoint
-from pronk.train.runner.processes import gathered, in_any
+from pronk.train.runner.processes import in_any
 from pronk.train.runner.progress import Episodes, ProgressLine
 from pronk.train.runner.provenance import versions
-from pronk.train.runner.state import (
-    environment_state,
-    random_state,
-    restore_environment,
-    restore_random,
-)
 from pronk.train.runner.stop import stop_signals
 
 OnIteration = Callable[["PronkRunner"], None]
@@ -99,7 +92,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         Args:
             num_learning_iterations: How many iterations more.
             init_at_random_ep_len: Spread the episodes of a new run in time, so that they do not
-                all end together. A run under way or resumed is left as it is.
+                all end together. A run under way is left as it is.
             on_iteration: Called with the runner after every iteration; may `save` or `stop`.
 
         Raises:
@@ -247,12 +240,6 @@ class PronkRunner(MjlabOnPolicyRunner):
             PronkError: A weight is not finite.
         """
         algorithm = self._check_finite()
-        mine = {
-            "environment": environment_state(self.env.unwrapped),
-            "random": random_state(self.device),
-            "episodes": self._episodes.state(),
-        }
-        ranks = gathered(mine, size=self.gpu_world_size, rank=self.gpu_global_rank)
         if self.gpu_global_rank != 0:
             return
         about = {
@@ -263,13 +250,14 @@ class PronkRunner(MjlabOnPolicyRunner):
             "processes": self.gpu_world_size,
             "env_steps": self.env_steps,
             "seconds": self.seconds,
+            "non_finite": self.non_finite,
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
             "versions": versions(),
         }
         tree = {
             "algorithm": algorithm,
             "learning_rate": self.alg.learning_rate,
-            "ranks": ranks,
+            "speed_ranges": motion_command(self.env.unwrapped).ranges.grown,
             "infos": dict(infos or {}),
         }
         checkpoint.save(Path(path), Checkpoint(about=about, tree=tree))
@@ -287,10 +275,8 @@ class PronkRunner(MjlabOnPolicyRunner):
 
         Args:
             path: The checkpoint.
-            load_cfg: None to resume: everything, the environment and the random generators
-                included. Else what the algorithm shall take over (`actor`, `critic`, `optimizer`,
-                `iteration`), and nothing else but the count of policy steps, which curricula
-                go by.
+            load_cfg: None to resume: networks, optimizers and counters; robots start anew. Else
+                what the algorithm shall take over (`actor`, `critic`, `optimizer`, `iteration`).
             strict: Refuse missing and unknown weights.
             map_location: As mjlab calls it; tensors go where they belong in any case.
 
@@ -315,11 +301,9 @@ class PronkRunner(MjlabOnPolicyRunner):
             ) from error
         if iteration:
             self.current_learning_iteration = found.about["iteration"]
+        motion_command(self.env.unwrapped).ranges.resume(found.tree)
         if load_cfg is None:
             self._resume(found)
-        else:
-            environment = found.tree["ranks"][0]["environment"]
-            motion_command(self.env.unwrapped).ranges.resume(environment)
         return dict(found.tree["infos"])
 
     def _resume(self, found: Checkpoint) -> None:
@@ -327,11 +311,8 @@ class PronkRunner(MjlabOnPolicyRunner):
         self.alg.learning_rate = found.tree["learning_rate"]
         self.env_steps = found.about["env_steps"]
         self.seconds = found.about["seconds"]
-        mine = found.tree["ranks"][self.gpu_global_rank]
-        restore_environment(self.env.unwrapped, mine["environment"])
-        self._episodes.restore(mine["episodes"])
-        restore_random(mine["random"], self.device)
-        self._under_way = True
+        if self.gpu_global_rank == 0:
+            self._episodes.non_finite = found.about["non_finite"]
         self._saved = self.current_learning_iteration
 
     def _save_numbered(self) -> None:
