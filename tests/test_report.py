@@ -433,7 +433,7 @@ def test_a_joint_without_match_is_counted_and_named(tmp_path):
     assert warning in match_page.verdict(worse)["flags"][name]
 
 
-def test_zero_armature_without_a_match_is_no_doubt_about_the_match(match):
+def test_zero_armature_without_a_match_is_no_failure_flag(match):
     assert all(
         "zero armature" not in f for fs in match_page.verdict(match)["flags"].values() for f in fs
     )
