@@ -84,7 +84,7 @@ class Policy:
             Joint position targets in the order of the contract, absolute [rad]. (12,)
 
         Raises:
-            ArtefactError: Something is not finite, or a policy without jump is told to jump.
+            ArtefactError: Something is not finite, or the jump input is set for a policy without one.
         """
         self._refuse_jump(jump)
         measured = self._history.observe(measurement, command)
@@ -102,16 +102,16 @@ class Policy:
             jump: The jump input, 0 or 1; None is 0 for all. (N, 1)
 
         Raises:
-            ArtefactError: A shape is wrong, something is not finite, or a policy without jump is
-                told to jump.
+            ArtefactError: A shape is wrong, something is not finite, or the jump input is set
+                for a policy without one.
         """
         count = len(np.atleast_1d(measured))
         read = finite('the input "measured"', measured, (count, MEASURED_SIZE))
-        asked = finite(
+        jumps = finite(
             'the input "jump"', np.zeros((count, 1)) if jump is None else jump, (count, 1)
         )
-        self._refuse_jump(bool(asked.any()))
-        return self._run(read, asked)
+        self._refuse_jump(bool(jumps.any()))
+        return self._run(read, jumps)
 
     def _run(self, measured: Floats, jump: Floats) -> Inference:
         """The network, for inputs that have been checked."""
