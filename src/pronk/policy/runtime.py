@@ -84,7 +84,7 @@ class Policy:
             Joint position targets in the order of the contract, absolute [rad]. (12,)
 
         Raises:
-            ArtefactError: Something is not finite, or the jump input is set for a policy without one.
+            ArtefactError: Something is not finite, or jump is set without a jump input.
         """
         self._refuse_jump(jump)
         measured = self._history.observe(measurement, command)
