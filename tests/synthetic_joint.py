@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import chirp
 
+from analytic import simulate_second_order
 from pronk.logs.joint_log import Segment, SweepLog
-from pronk.response.analytic import simulate_second_order
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analytic import second_order, simulate_second_order
 from pronk.errors import LogError, PronkError
 from pronk.logs.joint_log import Segment, SweepLog
 from pronk.response import Estimator, FrequencyResponse, estimate, fit_delay
-from pronk.response.analytic import second_order, simulate_second_order
 from pronk.response.grid import Grid, grid_over, held_mean
 from pronk.response.spectra import layout, segment_spectra, sums
 from synthetic_joint import (
@@ -196,17 +196,6 @@ def test_amplitudes_come_largest_first_and_repeats_together() -> None:
         estimate(log, "other")
 
 
-def test_h1_over_h2_is_the_coherence_and_hv_lies_between() -> None:
-    log = make_log(
-        [chirp_command("chirp", 200.0)] * 3, linear_joint(**KNEE), kind="chirp", noise=3e-3
-    )
-    h1, h2, hv = (estimate(log, "knee", Estimator(method=m))[0] for m in ("H1", "H2", "Hv"))
-    use = h1.coherence > 0.0
-    assert np.allclose((h1.gain / h2.gain)[use], h1.coherence[use])
-    assert np.allclose((h1.gain * h2.gain)[use], (hv.gain**2)[use])
-    assert np.allclose(np.angle(h1.response / h2.response)[use], 0.0, atol=1e-9)
-
-
 def test_coherence_of_noise_alone_is_one_over_the_averages() -> None:
     """The effective number of averages is the one that the coherence really rests on."""
     rate, settings = 200.0, Estimator(max_hz=20.0)
@@ -231,8 +220,6 @@ def test_a_single_noisy_repeat_is_not_coherent_by_construction() -> None:
 
 
 def test_settings_are_checked() -> None:
-    with pytest.raises(PronkError, match=r"'h1'; expected one of H1, H2, Hv"):
-        Estimator(method="h1")
     with pytest.raises(PronkError, match=r"'haning'; expected one of hann"):
         Estimator(window="haning")
     with pytest.raises(PronkError, match="overlap is 1"):

@@ -7,7 +7,6 @@ import pytest
 from scipy.signal import lfilter
 
 from pronk.response import Estimator, FrequencyResponse, H1Operator
-from pronk.response.analytic import simulate_second_order
 from pronk.response.grid import grid_over, held_mean
 from pronk.response.spectra import layout, segment_spectra, sums
 from synthetic_joint import AMPLITUDE, KNEE, chirp_command, linear_joint
@@ -84,7 +83,7 @@ def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> Non
     excited = segment_spectra(held_mean(time, command, grid), where, SETTINGS)
     clean = linear_joint(**KNEE)(command, RATE)
     known = sums(excited, segment_spectra(clean, where, SETTINGS), where).response(
-        "H1", where.omega, RATE
+        where.omega, RATE
     )
     hits = []
     for _ in range(150):
@@ -94,7 +93,7 @@ def test_a_single_repeat_is_covered_by_the_coherence_formula(colour: str) -> Non
             else coloured(rng, (len(time),), 8e-3)
         )
         s = sums(excited, segment_spectra(clean + noise, where, SETTINGS), where)
-        estimate = s.response("H1", where.omega, RATE)
+        estimate = s.response(where.omega, RATE)
         response = FrequencyResponse(
             joint="knee",
             amplitude=AMPLITUDE,

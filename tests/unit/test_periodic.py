@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from analytic import second_order
 from pronk.errors import LogError
 from pronk.logs.joint_log import SweepLog
 from pronk.response import Estimator, distortion, estimate
-from pronk.response.analytic import second_order
 from pronk.response.periodic import read_periods
 from synthetic_joint import (
     KNEE,

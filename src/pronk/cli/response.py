@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -11,10 +11,6 @@ from pronk.cli import console, logs
 
 if TYPE_CHECKING:
     from pronk.response.response import FrequencyResponse
-
-
-Method = Literal["H1", "H2", "Hv"]
-"""Estimator."""
 
 
 COHERENT = 0.95
@@ -25,7 +21,6 @@ def response(
     paths: tyro.conf.Positional[tuple[Path, ...]],
     robot: str | None = None,
     out: Path | None = None,
-    method: Method = "H1",
     plots: bool = True,
     reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
     json_file: console.JsonFile = None,
@@ -36,7 +31,6 @@ def response(
         paths: Logs, or folders of logs.
         robot: Robot, where the log does not say.
         out: Folder for what is written; beside the log if left out.
-        method: H1: noise on the position alone.
         plots: Draw Bode plots.
         json_file: Also write the figures to this file.
         reading: How logs are read.
@@ -46,7 +40,7 @@ def response(
     from pronk.robots import load_robot
 
     read = logs.read(paths, reading, load_robot(robot) if robot else None)
-    settings = Estimator(method=method)
+    settings = Estimator()
     rows: list[dict[str, Any]] = []
     written: list[Path] = []
     with console.progress() as report:

@@ -17,9 +17,8 @@ from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import SweepLog
 from pronk.match.settings import MatchSettings
 from pronk.response.estimate import estimate, log_rate, questions
-from pronk.response.estimator import Estimator
+from pronk.response.estimate import operator as build_operator
 from pronk.response.operator import H1Operator
-from pronk.response.periodic import multisine_operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import CommandTrace, command_trace
@@ -187,7 +186,7 @@ def measured_joints(
     found: list[MeasuredJoint] = []
     warnings: list[str] = []
     for repeats, response in zip(parts, measured, strict=True):
-        operator = _operator(repeats[0], joint, settings.estimator, rate_hz)
+        operator = build_operator(repeats[0], joint, settings.estimator, rate_hz)
         try:
             found.append(target(repeats[0], operator, response, robot, settings, band_hz=band_hz))
         except IdentifiabilityError as error:
@@ -197,14 +196,6 @@ def measured_joints(
             warnings.append(f"the response at {response.amplitude:.3g} rad is left out: {error}")
     found[0] = replace(found[0], warnings=tuple(warnings))
     return found
-
-
-def _operator(part: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
-    """The estimate of one question as a matrix; repeats need one between them."""
-    segment, command = part.segments[0], part.command[:, part.column(joint)]
-    if segment.kind == "multisine" and segment.period_s is not None:
-        return multisine_operator(part.time, command, segment.period_s, estimator, rate_hz=rate_hz)
-    return H1Operator.build(part.time, command, estimator, rate_hz=rate_hz)
 
 
 def target(

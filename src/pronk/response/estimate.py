@@ -101,7 +101,7 @@ def _check_moved(part: SweepLog, joint: str) -> None:
 def _averaged(
     parts: Sequence[SweepLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
-    """H1, H2 or Hv over the segments of all repeats."""
+    """H1 over the segments of all repeats."""
     each: list[Sums] = []
     omega = np.empty(0)
     padded = []
@@ -121,11 +121,11 @@ def _averaged(
         joint=joint,
         amplitude=amplitude,
         omega=omega,
-        response=whole.response(estimator.method, omega, rate_hz),
+        response=whole.response(omega, rate_hz),
         coherence=whole.coherence(),
         averages=whole.averages(),
-        repeats=np.array([one.response(estimator.method, omega, rate_hz) for one in each]),
-        estimator=estimator.method,
+        repeats=np.array([one.response(omega, rate_hz) for one in each]),
+        estimator="H1",
         window=f"{estimator.words()}, {ends}, mean of each segment removed",
         segment_s=estimator.segment_s,
         virtual=parts[0].virtual,
@@ -177,48 +177,45 @@ def estimate(
     return found
 
 
+def operator(part: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
+    """Return the estimate of one question as a matrix; equal repeats share it.
+
+    Args:
+        part: A log of one segment.
+        joint: The joint.
+        estimator: Settings.
+        rate_hz: Rate of the analysis grid, from `log_rate`.
+
+    Raises:
+        PronkError: Sine steps, which have no common grid.
+    """
+    segment, command = part.segments[0], part.command[:, part.column(joint)]
+    if segment.kind == "sine_steps":
+        raise PronkError(
+            f"{part.source or 'log'}: sine steps cannot be matched through one matrix; "
+            "match a chirp or a multisine and keep the steps to check it."
+        )
+    if segment.kind == "multisine" and segment.period_s is not None:
+        return multisine_operator(part.time, command, segment.period_s, estimator, rate_hz=rate_hz)
+    return H1Operator.build(part.time, command, estimator, rate_hz=rate_hz)
+
+
 def operators(
     log: SweepLog, joint: str, estimator: Estimator | None = None
 ) -> list[list[H1Operator]]:
-    """The estimate of every question as a matrix, in the order of `estimate`.
-
-    Args:
-        log: The log.
-        joint: The joint.
-        estimator: Settings; the defaults if not given.
-
-    Returns:
-        One list per response of `estimate`, with one operator per repeat (`operator.combine`
-        puts their responses together).
-
-    Raises:
-        LogError: As `estimate`.
-        PronkError: The estimator is not H1, or a question is sine steps, which have no common grid.
-    """
-    settings = estimator or Estimator()
+    """Return the `operator` of every repeat of every response of `estimate`."""
     groups = questions(log, joint)
     rate_hz = log_rate([part for parts in groups for part in parts])
-    built = []
-    for parts in groups:
-        column = parts[0].column(joint)
-        row = []
-        for part in parts:
-            segment, command = part.segments[0], part.command[:, column]
-            if segment.kind == "sine_steps":
-                raise PronkError(
-                    f"{log.source or 'log'}: sine steps cannot be matched through one matrix; "
-                    "match a chirp or a multisine and keep the steps to check it."
-                )
-            if segment.kind == "multisine" and segment.period_s is not None:
-                row.append(
-                    multisine_operator(
-                        part.time, command, segment.period_s, settings, rate_hz=rate_hz
-                    )
-                )
-            else:
-                row.append(H1Operator.build(part.time, command, settings, rate_hz=rate_hz))
-        built.append(row)
-    return built
+    settings = estimator or Estimator()
+    return [[operator(part, joint, settings, rate_hz) for part in parts] for parts in groups]
 
 
-__all__ = ["Estimator", "analysis_rate", "estimate", "log_rate", "operators", "questions"]
+__all__ = [
+    "Estimator",
+    "analysis_rate",
+    "estimate",
+    "log_rate",
+    "operator",
+    "operators",
+    "questions",
+]

@@ -10,7 +10,6 @@ from scipy.signal import get_window
 
 from pronk.errors import PronkError
 
-METHODS = ("H1", "H2", "Hv")
 WINDOWS = ("hann", "hamming", "blackman", "boxcar")
 
 _NYQUIST_SHARE = 0.9
@@ -27,8 +26,6 @@ class Estimator:
     settings they use the band alone.
     """
 
-    method: str = "H1"
-    """H1 (noise on the position: the command is known exactly), H2 or Hv."""
     segment_s: float = 8.0
     """Length of a segment [s]; its inverse is the spacing of the frequencies.
 
@@ -50,10 +47,6 @@ class Estimator:
         Raises:
             PronkError: With what was got and what there is to choose from.
         """
-        if self.method not in METHODS:
-            raise PronkError(
-                f"Estimator.method is {self.method!r}; expected one of {', '.join(METHODS)}."
-            )
         if self.window not in WINDOWS:
             raise PronkError(
                 f"Estimator.window is {self.window!r}; expected one of {', '.join(WINDOWS)}."

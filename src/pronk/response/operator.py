@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import PronkError
 from pronk.response.estimator import Estimator
 from pronk.response.grid import Grid, grid_over, held_mean, hold, pull_back
 from pronk.response.spectra import layout, rests, segment_spectra
@@ -63,11 +62,6 @@ class H1Operator:
             PronkError: The estimator is not H1.
             LogError: The question is shorter than two segments.
         """
-        if estimator.method != "H1":
-            raise PronkError(
-                f"Estimator.method is {estimator.method!r}; only H1 is linear in the position, so "
-                "match with H1."
-            )
         grid = grid_over(time, rate_hz)
         held = held_mean(time, command, grid)
         at_rest = rests(held, grid.rate_hz) if padded is None else padded

@@ -41,7 +41,7 @@ class FrequencyResponse:
     repeats: ComplexArray
     """Response of each repeat by itself, shape (repeats, f): the unit of uncertainty."""
     estimator: str
-    """H1, H2, Hv or periodic."""
+    """H1 or periodic."""
     window: str
     """Window and overlap in words, for the page."""
     segment_s: float

@@ -175,18 +175,10 @@ class Sums:
             spread=self.spread + other.spread,
         )
 
-    def response(self, method: str, omega: Array, rate_hz: float) -> ComplexArray:
-        """Response by H1 = Suy / Suu, H2 = Syy / Syu or Hv, the geometric mean of both."""
-        tiny = np.finfo(np.float64).tiny
-        h1 = self.uy / np.maximum(self.uu, tiny)
-        if method == "H1":
-            raw = h1
-        elif method == "H2":
-            raw = self.yy * self.uy / np.maximum(np.abs(self.uy) ** 2, tiny)
-        else:
-            size = np.sqrt(self.yy / np.maximum(self.uu, tiny))
-            raw = size * self.uy / np.maximum(np.abs(self.uy), tiny)
-        return np.asarray(raw / hold(omega, rate_hz))
+    def response(self, omega: Array, rate_hz: float) -> ComplexArray:
+        """Response by H1 = Suy / Suu, from the held command; the noise is on the position."""
+        h1 = self.uy / np.maximum(self.uu, np.finfo(np.float64).tiny)
+        return np.asarray(h1 / hold(omega, rate_hz))
 
     def coherence(self) -> Array:
         """Magnitude-squared coherence; 0 where the frequency was not asked, shape (f,).
