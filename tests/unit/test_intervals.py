@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from analytic import simulate_second_order
 from pronk.response import Estimator, FrequencyResponse, H1Operator
 from pronk.response.grid import grid_over, held_mean
 from pronk.response.spectra import layout, segment_spectra, sums
