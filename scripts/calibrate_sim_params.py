@@ -83,7 +83,7 @@ BODY = """\
 trunk:                            # no two robots weigh the same, and none what its CAD says
   mass_offset: 0.25               # kg over the nominal 12: cables, markers, guards
   com_offset: [0.006, -0.003, 0.004]  # m; the battery is not where the drawing has it
-  inertia_scale: [1.06, 0.96, 0.98]   # a shell that was scaled, not weighed (constants.py)
+  inertia_scale: [1.06, 0.96, 0.98]   # a shell that was scaled, not weighed (mini_cheetah.xml)
 attitude:                         # of a MEMS unit with its own filter, data sheet class VN-100:
   bias: [0.006, -0.004, 0.0]      # 0.5 deg static (mounting and accelerometer)
   noise: 0.009                    # 0.5 deg RMS more in motion ...

@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from pronk.robots.mini_cheetah.constants import FOOT_RADIUS
+from pronk.robots.legged import legged
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
+
+BODY = legged("mini_cheetah")
 
 DT = 1e-3
 G = 9.81
@@ -59,7 +61,7 @@ def seen_jump(*, up: float = 2.0, speed: float = 1.0, yaw: float = 0.0) -> Captu
     plane = x[:, None, None] * ahead + FEET[:, :1] * ahead + FEET[:, 1:] * left
     lift = np.where(flying, np.sin(np.pi * np.clip(flight / (down - off), 0.0, 1.0)), 0.0)
     low = np.maximum(0.0, z - Z_OFF) * flying + TUCKED * lift
-    foot_z = np.repeat((FOOT_RADIUS + low)[:, None], 4, axis=1)
+    foot_z = np.repeat((BODY.foot_radius + low)[:, None], 4, axis=1)
     return Capture(
         time=time,
         position=np.column_stack([x[:, None] * ahead, z]),

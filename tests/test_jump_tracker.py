@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pronk.errors import PronkError
+from pronk.robots.legged import legged
+
+BODY = legged("mini_cheetah")
 
 torch = pytest.importorskip("torch")
 
-from pronk.robots.mini_cheetah import constants as c
-from pronk.robots.mini_cheetah.model import standing_height
 from pronk.train.mdp.jump import JumpSettings, JumpTracker
 
 pytestmark = pytest.mark.train
@@ -510,9 +511,9 @@ def test_a_countermovement_falls_brakes_and_pushes() -> None:
 def test_legs_of_a_countermovement_lie_within_what_a_leg_can_do() -> None:
     """Between a trunk on its knees and a straight leg."""
     asked = JumpSettings().countermovement(torch.linspace(0.0, JumpSettings().prompt_s, 100))
-    standing = standing_height() - c.FOOT_RADIUS
-    assert float(asked.min()) + standing + c.FOOT_RADIUS == pytest.approx(0.2, abs=0.01)
-    assert 0.3 < float(asked[-1]) + standing < 0.95 * (c.THIGH_LENGTH + c.SHANK_LENGTH)
+    standing = BODY.standing_height - BODY.foot_radius
+    assert float(asked.min()) + standing + BODY.foot_radius == pytest.approx(0.2, abs=0.01)
+    assert 0.3 < float(asked[-1]) + standing < 0.95 * (BODY.thigh_length + BODY.shank_length)
 
 
 def test_likeness_is_paid_from_the_command_to_the_first_leap() -> None:

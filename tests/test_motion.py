@@ -10,13 +10,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pronk.robots.legged import legged
+
+BODY = legged("mini_cheetah")
+
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
 import torch
 
 import small_env
-from pronk.robots.mini_cheetah import constants as c
 from pronk.train.mdp.commands import motion_command
 
 Array = NDArray[np.float64]
@@ -51,9 +54,9 @@ def test_motion_is_what_mujoco_says(env: Any) -> None:
     env.step(torch.rand(N, 12))
     motion = motion_command(env).motion
     model = env.sim.mj_model
-    foot = [model.site(f"robot/{leg}_foot").id for leg in c.LEGS]
-    ball = [model.geom(f"robot/{leg}_foot_collision").id for leg in c.LEGS]
-    knee = [model.joint(f"robot/{leg}_knee").id for leg in c.LEGS]
+    foot = [model.site(f"robot/{leg}_foot").id for leg in BODY.legs]
+    ball = [model.geom(f"robot/{leg}_foot_collision").id for leg in BODY.legs]
+    knee = [model.joint(f"robot/{leg}_knee").id for leg in BODY.legs]
     seen = set()
     for i in range(N):
         reference = mujoco.MjData(model)
@@ -117,7 +120,7 @@ def test_a_robot_that_stands_is_carried_by_its_feet(env: Any) -> None:
     motion = motion_command(env).motion
     assert motion.contact.all()
     assert not motion.touching.any()
-    weight = c.TOTAL_MASS * 9.81
+    weight = BODY.total_mass * 9.81
     # The sensor gives the force of the foot on the floor.
     upwards = -env.scene["feet"].data.force[..., 2].sum(dim=-1)
     assert upwards.tolist() == pytest.approx([weight] * N, rel=0.05)
@@ -184,10 +187,10 @@ def test_length_of_a_leg_is_that_of_the_model(env: Any) -> None:
     for i in range(N):
         reference.qpos[7:] = motion.position[i]
         mujoco.mj_kinematics(model, reference)
-        foot = [model.site(f"robot/{leg}_foot").id for leg in c.LEGS]
-        pitch = [model.joint(f"robot/{leg}_hip_pitch").id for leg in c.LEGS]
+        foot = [model.site(f"robot/{leg}_foot").id for leg in BODY.legs]
+        pitch = [model.joint(f"robot/{leg}_hip_pitch").id for leg in BODY.legs]
         reach = np.linalg.norm(reference.site_xpos[foot] - reference.xanchor[pitch], axis=1)
-        length = np.sqrt(reach**2 - c.KNEE_Y**2)
+        length = np.sqrt(reach**2 - 0.004**2)
         np.testing.assert_allclose(motion.leg_length[i], length, atol=1e-6)
     assert float(motion.leg_length.std()) > 1e-3, "legs that bend"
 
@@ -211,7 +214,7 @@ def test_parts_other_than_feet_that_touch_are_counted(env: Any) -> None:
     env.cfg.decimation = 1
     model = env.sim.mj_model
     parts = {model.geom("robot/trunk_collision").id}
-    parts |= {model.geom(f"robot/{leg}_{x}_collision").id for leg in c.LEGS for x in LIMBS}
+    parts |= {model.geom(f"robot/{leg}_{x}_collision").id for leg in BODY.legs for x in LIMBS}
     expected = []
     for i in legs:
         reference = mujoco.MjData(model)

@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
+from pronk.robots.legged import legged
+
+BODY = legged("mini_cheetah")
+
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
@@ -20,7 +24,6 @@ from torch import Tensor
 import small_env
 from pronk.policy import layout
 from pronk.robots import load_robot
-from pronk.robots.mini_cheetah import constants as c
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.draws import draws
 from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
@@ -233,7 +236,7 @@ def test_all_but_the_measurements_is_exact(noisy: Any) -> None:
 def contacts(env: Any) -> Array:
     """Feet that touch the floor in the present state, by MuJoCo's collision. (N, 4)"""
     model = env.sim.mj_model
-    feet = [model.geom(f"robot/{leg}_foot_collision").id for leg in c.LEGS]
+    feet = [model.geom(f"robot/{leg}_foot_collision").id for leg in BODY.legs]
     found = np.zeros((N, 4))
     for i, q in enumerate(env.sim.data.qpos):
         reference = mujoco.MjData(model)
@@ -293,9 +296,9 @@ def test_parts_of_the_critic(env: Any) -> None:
         "no_load": 1.0,
         "drop": 0.0,
         "friction": env.sim.mj_model.geom("robot/FR_foot_collision").friction[0],
-        "base_mass": c.TRUNK.mass,
+        "base_mass": BODY.base_mass,
         "delay": 0.0,
-        "shank_length": c.SHANK_LENGTH,
+        "shank_length": BODY.shank_length,
         "stiffness": 17.0,
         "damping": 0.4,
     }
@@ -331,7 +334,7 @@ def test_the_critic_knows_what_was_drawn() -> None:
 def foot_heights(env: Any, qpos: Array) -> Array:
     """Of the feet's centres, by MuJoCo."""
     model = env.sim.mj_model
-    sites = [model.site(f"robot/{leg}_foot").id for leg in c.LEGS]
+    sites = [model.site(f"robot/{leg}_foot").id for leg in BODY.legs]
     found = []
     for q in qpos:
         reference = mujoco.MjData(model)
@@ -347,7 +350,7 @@ def test_critic_of_a_robot_that_stands(env: Any) -> None:
         seen = env.step(torch.tensor([0.0, 0.2, -0.7] * 4).expand(N, 12))[0]["critic"]
     force = part(seen, CRITIC, "foot_force").sum(dim=1)
     assert force.tolist() == pytest.approx([1.0] * N, abs=0.15)
-    close(part(seen, CRITIC, "foot_height"), c.FOOT_RADIUS, atol=0.005)
+    close(part(seen, CRITIC, "foot_height"), BODY.foot_radius, atol=0.005)
     close(part(seen, CRITIC, "foot_contact"), 1.0)
     close(part(seen, CRITIC, "height"), 0.29, atol=0.04)
 

@@ -20,11 +20,13 @@ from scipy.stats import chisquare, kstest
 from pronk.errors import PronkError, RobotError
 from pronk.match.gains import GroupGains
 from pronk.robots import load_robot
-from pronk.robots.mini_cheetah import constants as c
+from pronk.robots.legged import legged
 from pronk.robots.model import bench_spec
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
 from pronk.train.gains import TrainingGains, training_gains
+
+BODY = legged("mini_cheetah")
 
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
@@ -222,7 +224,7 @@ def test_training_answers_the_chirp_that_was_matched(joint: str, delay: int) -> 
 def test_drives_of_every_group() -> None:
     drives = actuators(CHEETAH, MATCHED)
     assert [drive.target_names_expr for drive in drives] == [
-        tuple(f"{leg}_{group}" for leg in c.LEGS) for group in CHEETAH.groups
+        tuple(f"{leg}_{group}" for leg in BODY.legs) for group in CHEETAH.groups
     ]
     knee = drives[2]
     assert (knee.stiffness, knee.damping) == (21.5, 0.55)
@@ -267,7 +269,7 @@ def test_law_of_the_drives_is_that_of_mjlab() -> None:
 def test_drives_that_are_not_the_robots_are_refused() -> None:
     with pytest.raises(PronkError, match="gains of so101 were given for the drives of mini_ch"):
         actuators(CHEETAH, replace(MATCHED, robot="so101"))
-    weak = replace(CHEETAH.joint("FR_knee"), drive=c.drive("hip_roll"))
+    weak = replace(CHEETAH.joint("FR_knee"), drive=CHEETAH.joint("FR_hip_roll").drive)
     joints = tuple(weak if j.name == "FR_knee" else j for j in CHEETAH.joints)
     with pytest.raises(RobotError, match="group knee have different drives"):
         actuators(replace(CHEETAH, joints=joints), MATCHED)
@@ -290,7 +292,7 @@ def test_draws_are_uniform_over_their_ranges(env: Any) -> None:
         env.event_manager.apply(mode="startup")
         rounds.append(drawing.draws(env))
     found = {name: np.concatenate([draw[name] for draw in rounds]) for name in rounds[0]}
-    trunk = c.TRUNK.mass
+    trunk = BODY.base_mass
     assert_uniform(found["friction"], 0.05, 3.0)
     assert_uniform(found["base_mass"], trunk - 0.4, trunk + 1.6)
     assert_uniform(found["shank_length"], 0.18, 0.20)
@@ -327,7 +329,7 @@ def test_contacts_have_the_friction_of_the_foot(env: Any) -> None:
     contact = env.sim.wp_data.contact
     n = int(env.sim.wp_data.nacon.numpy()[0])
     geoms, world = contact.geom.numpy()[:n], contact.worldid.numpy()[:n]
-    feet = [index(env, "geom", f"{leg}_foot_collision") for leg in c.LEGS]
+    feet = [index(env, "geom", f"{leg}_foot_collision") for leg in BODY.legs]
     touching = np.isin(geoms, feet).any(axis=1)
     assert touching.sum() > ROBOTS
     sliding = contact.friction.numpy()[:n][touching]
@@ -342,11 +344,11 @@ def test_inertia_of_the_trunk_grows_with_its_mass(env: Any) -> None:
     drawn = drawing.draws(env)["base_mass"]
     model = env.sim.mj_model
     inertia = env.sim.model.body_inertia[:, trunk].numpy()
-    expected = np.outer(drawn / c.TRUNK.mass, model.body_inertia[trunk])
+    expected = np.outer(drawn / BODY.base_mass, model.body_inertia[trunk])
     np.testing.assert_allclose(inertia, expected, rtol=1e-5)
     # Derived constants follow, and no other body changes.
     whole = env.sim.model.body_subtreemass[:, trunk].numpy()
-    np.testing.assert_allclose(whole, drawn + c.TOTAL_MASS - c.TRUNK.mass, rtol=1e-5)
+    np.testing.assert_allclose(whole, drawn + BODY.total_mass - BODY.base_mass, rtol=1e-5)
     others = [i for i in range(model.nbody) if i != trunk]
     masses = env.sim.model.body_mass.numpy()[:, others]
     np.testing.assert_array_equal(masses, np.tile(np.float32(model.body_mass[others]), (ROBOTS, 1)))
@@ -354,14 +356,14 @@ def test_inertia_of_the_trunk_grows_with_its_mass(env: Any) -> None:
 
 def test_foot_is_where_the_length_of_its_shank_puts_it(env: Any) -> None:
     data = env.sim.data
-    for leg, length in zip(c.LEGS, drawing.draws(env)["shank_length"].T, strict=True):
+    for leg, length in zip(BODY.legs, drawing.draws(env)["shank_length"].T, strict=True):
         thigh, shank = (index(env, "body", f"{leg}_{part}") for part in ("thigh", "shank"))
         foot = index(env, "geom", f"{leg}_foot_collision")
         capsule = index(env, "geom", f"{leg}_shank_collision")
         site = index(env, "site", f"{leg}_foot")
         # Default pose: thigh .8 rad back, shank .8 rad forward, both from the vertical.
         drop = (data.xpos[:, thigh, 2] - data.geom_xpos[:, foot, 2]).numpy()
-        np.testing.assert_allclose(drop, (c.THIGH_LENGTH + length) * math.cos(0.8), atol=1e-5)
+        np.testing.assert_allclose(drop, (BODY.thigh_length + length) * math.cos(0.8), atol=1e-5)
         np.testing.assert_allclose(data.site_xpos[:, site], data.geom_xpos[:, foot], atol=1e-6)
         # The capsule of the shank begins 2 cm below the knee and ends 3 cm above the foot.
         centre = (data.geom_xpos[:, capsule] - data.xpos[:, shank]).norm(dim=-1).numpy()
@@ -589,8 +591,8 @@ def test_none_is_the_nominal_robot() -> None:
     found = drawing.draws(env)
     nominal = {
         "friction": 0.8,
-        "base_mass": c.TRUNK.mass,
-        "shank_length": c.SHANK_LENGTH,
+        "base_mass": BODY.base_mass,
+        "shank_length": BODY.shank_length,
         "stiffness": 17.0,
         "damping": 0.4,
         "delay": 0.0,

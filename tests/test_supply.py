@@ -16,7 +16,6 @@ from mjlab.envs import ManagerBasedRlEnv
 import small_env
 from pronk.actuator.model import clip_torque, stall_torque
 from pronk.robots import load_robot
-from pronk.robots.mini_cheetah import constants as c
 from pronk.train.mdp.randomization import Randomization
 from pronk.train.mdp.supply import Supply
 from pronk.train.tasks import env_cfg
@@ -24,7 +23,7 @@ from pronk.train.tasks import env_cfg
 pytestmark = pytest.mark.train
 
 ROBOT = load_robot("mini_cheetah")
-RATED = c.BUS_VOLTAGE
+RATED = 24.0
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +58,8 @@ def test_voltage_is_that_of_the_power_drawn(env: Any, torque: float, speed: floa
     # As a brushed motor with K = 2 gear kt, and the resistance that gives the law's stall torque.
     power = 0.0
     for joint in ROBOT.joints:
-        constant = c.EMF_FACTOR * joint.drive.gear_ratio * c.TORQUE_CONSTANT
-        winding = c.RESISTANCE * c.EMF_FACTOR / c.TORQUE_FACTOR
+        constant = 2.0 * joint.drive.gear_ratio * 0.05
+        winding = 0.173 * 2.0 / 1.5
         power += torque * speed + winding * (torque / constant) ** 2
     volts = float(supply.voltage[1, 0]) * RATED
     assert volts == pytest.approx(25.0 - 0.08 * power / volts, rel=1e-4)
@@ -82,8 +81,8 @@ def test_torque_is_that_of_a_drive_at_the_lower_voltage(env: Any) -> None:
         joint = ROBOT.joint(drive.target_names[0]).drive
         expected = stall_torque(
             gear_ratio=joint.gear_ratio,
-            torque_constant=c.TORQUE_CONSTANT,
-            resistance=c.RESISTANCE,
+            torque_constant=0.05,
+            resistance=0.173,
             bus_voltage=18.0,
         )
         assert drive.saturation_effort[1].tolist() == pytest.approx([expected] * 4, rel=1e-5)

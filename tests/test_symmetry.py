@@ -8,8 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pronk.robots import load_robot
-from pronk.robots.mini_cheetah.constants import LEGS
+from pronk.robots.legged import legged
 from pronk.robots.model import free_spec
+
+BODY = legged("mini_cheetah")
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("mjlab")
@@ -125,8 +127,8 @@ def standing_on_a_plane() -> mujoco.MjModel:
 def truth(model: mujoco.MjModel, data: mujoco.MjData, action: Array) -> Array:
     """The critic's vector, with the robot's own velocity as the command."""
     to_trunk = data.body("trunk").xmat.reshape(3, 3).T
-    force = np.zeros(len(LEGS))
-    feet = [model.geom(f"{leg}_foot_collision").id for leg in LEGS]
+    force = np.zeros(len(BODY.legs))
+    feet = [model.geom(f"{leg}_foot_collision").id for leg in BODY.legs]
     wrench = np.zeros(6)
     for i, contact in enumerate(data.contact):
         mujoco.mj_contactForce(model, data, i, wrench)
@@ -146,7 +148,7 @@ def truth(model: mujoco.MjModel, data: mujoco.MjData, action: Array) -> Array:
         "height": data.qpos[2:3],
         "foot_contact": (force > 0.0).astype(float),
         "foot_force": force,
-        "foot_height": np.array([data.site(f"{leg}_foot").xpos[2] for leg in LEGS]),
+        "foot_height": np.array([data.site(f"{leg}_foot").xpos[2] for leg in BODY.legs]),
     }
     # What is drawn: a robot that is its own mirror image.
     drawn = list(CRITIC)[len(parts) :]

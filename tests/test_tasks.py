@@ -12,6 +12,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from pronk.robots.legged import legged
+
+BODY = legged("mini_cheetah")
+
 pytest.importorskip("mjlab")
 pytestmark = pytest.mark.train
 
@@ -26,7 +30,6 @@ from mjlab.tasks.registry import (
 
 import small_env
 from pronk.robots import load_robot
-from pronk.robots.mini_cheetah import constants as c
 from pronk.train.mdp.commands import NAME, motion_command
 from pronk.train.mdp.scene import FOOT_CONTACT
 from pronk.train.phases import phase
@@ -165,7 +168,7 @@ def test_zero_action_stays_up_and_feet_do_not_sink() -> None:
     for _ in range(60):
         _, _, terminated, truncated, _ = env.step(torch.zeros(N, 12))
         assert not (terminated | truncated).any()
-        lowest.append(float(env.sim.data.site_xpos[:, feet, 2].min()) - c.FOOT_RADIUS)
+        lowest.append(float(env.sim.data.site_xpos[:, feet, 2].min()) - BODY.foot_radius)
     # An episode may begin with feet in the floor, or in the air.
     assert min(lowest[20:]) > -0.006
     assert min(lowest) > -0.02
@@ -181,7 +184,7 @@ def test_the_feet_alone_are_firm(env: Any) -> None:
     )
     model = env.sim.mj_model
     assert usual.geom_solref[0, 0] > FOOT_CONTACT[0] >= 2.0 * model.opt.timestep
-    feet = {model.geom(f"robot/{leg}_foot_collision").id for leg in c.LEGS}
+    feet = {model.geom(f"robot/{leg}_foot_collision").id for leg in BODY.legs}
     assert len(feet) == 4
     expected = [FOOT_CONTACT if i in feet else usual.geom_solref[0] for i in range(model.ngeom)]
     np.testing.assert_array_equal(model.geom_solref, expected)

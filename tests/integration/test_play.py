@@ -29,9 +29,11 @@ from pronk.evaluation.live.page import WebPage, free_port, readout
 from pronk.evaluation.live.play import play
 from pronk.evaluation.live.readout import Gauge
 from pronk.policy.runtime import load_policy
-from pronk.robots.mini_cheetah.model import standing_height
+from pronk.robots.legged import legged
 from pronk.virtual.capture import Capture
 from pronk.virtual.sim_params import load_sim_params
+
+BODY = legged("mini_cheetah")
 
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
 GRAVITY = 9.81
@@ -132,7 +134,7 @@ def flown(speed: float) -> Gauge:
     for time_ in np.arange(0.0, 1.2, 0.002):
         t = time_ - 0.3
         airborne = 0.0 <= t <= 2.0 * speed / GRAVITY
-        z = standing_height() + (speed * t - 0.5 * GRAVITY * t * t if airborne else 0.0)
+        z = BODY.standing_height + (speed * t - 0.5 * GRAVITY * t * t if airborne else 0.0)
         vz = speed - GRAVITY * t if airborne else 0.0
         gauge.see(sample(float(time_), z, vz, airborne=airborne))
     return gauge
@@ -141,7 +143,7 @@ def flown(speed: float) -> Gauge:
 def test_a_jump_is_read_as_it_was() -> None:
     (hop,) = flown(2.0).hops
     assert hop.vertical == pytest.approx(2.0, abs=0.03)
-    assert hop.apex == pytest.approx(standing_height() + 4.0 / (2.0 * GRAVITY), abs=1e-3)
+    assert hop.apex == pytest.approx(BODY.standing_height + 4.0 / (2.0 * GRAVITY), abs=1e-3)
     assert hop.duration == pytest.approx(4.0 / GRAVITY, abs=0.005)
     assert hop.distance == pytest.approx(1.5 * hop.duration)
 
@@ -195,7 +197,7 @@ def test_the_robot_hops_on_command_and_no_faster_than_real_time(hopper: Path) ->
     played = play(ROBOT, load_policy(hopper), load_sim_params(), stick, album, until=until)
     assert played.simulated_s == pytest.approx(1.0)
     assert played.wall_s >= 0.97
-    assert album.heights[0] == pytest.approx(standing_height(), abs=0.06)
+    assert album.heights[0] == pytest.approx(BODY.standing_height, abs=0.06)
     assert max(album.heights) > album.heights[0] + 0.05
     assert len(album.heights) == 51
 

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.robots.mini_cheetah.model import standing_height
+from pronk.robots.legged import legged
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -68,7 +68,7 @@ class JumpRules:
     """Largest tilt of an upright robot [deg]."""
     grace_s: float = 0.5
     """Time after the start in which flights are not counted: the robot is set down."""
-    standing_height: float = field(default_factory=standing_height)
+    standing_height: float = field(default_factory=lambda: legged("mini_cheetah").standing_height)
     """Of the trunk, in the default pose [m]."""
     rise: float = RISE
     """Over standing height, what a high flight exceeds [m]."""

@@ -36,10 +36,12 @@ from pronk.evaluation.jumps import (
     heading,
     measure_jump,
 )
-from pronk.robots.mini_cheetah.constants import FOOT_RADIUS
+from pronk.robots.legged import legged
 from pronk.robots.robot import Robot
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
+
+BODY = legged("mini_cheetah")
 
 Array = NDArray[np.float64]
 
@@ -246,7 +248,10 @@ def measure(
     figures |= _run(capture, script, run + series.steps(SETTLE_S), on, mass=mass)
     figures |= _loads(capture, robot, on, end)
     if main is not None:
-        low = capture.foot_position[main.liftoff : main.touchdown, :, 2].min(axis=1) - FOOT_RADIUS
+        low = (
+            capture.foot_position[main.liftoff : main.touchdown, :, 2].min(axis=1)
+            - BODY.foot_radius
+        )
         quarter = len(low) // 4
         figures |= {
             "clearance": float(low.max()),

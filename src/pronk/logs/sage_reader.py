@@ -21,12 +21,32 @@ from pronk.logs.columns import Columns, Names, import_columns
 from pronk.logs.csv_reader import read_rows, read_text
 from pronk.logs.joint_log import SweepLog
 from pronk.robots.robot import Robot
-from pronk.robots.so101.constants import SAGE_JOINTS, SAGE_UNITS
 
 Array = NDArray[np.float64]
 
 FILES = ("control.csv", "state_motor.csv", "joint_list.txt")
 """What makes a folder a SAGE recording; `event.csv` is read where it is there."""
+
+SAGE_JOINTS = {
+    "Rotation": "shoulder_pan",
+    "Pitch": "shoulder_lift",
+    "Elbow": "elbow_flex",
+    "Wrist_Pitch": "wrist_flex",
+    "Wrist_Roll": "wrist_roll",
+    "Jaw": "gripper",
+}
+"""Names in [sage] recordings to joint names of the SO-101."""
+SAGE_UNITS = {name: "unknown" if name == "Jaw" else "rad" for name in SAGE_JOINTS}
+"""Jaw is on a 0 to 1 scale whose travel in radians is not recorded: not an angle."""
+SAGE_MAPPING = {name: (1.0, 0.0) for name in SAGE_JOINTS if name != "Jaw"}
+"""(sign, offset): joint position [rad] = sign * recorded position + offset.
+
+Evidence for +1: in all four recordings about their pose the three joints that carry weight sit
+beside their mean command in the direction gravity pulls them in the [cad] model, and in
+proportion: +.038, +.037, +.010 rad for gravity torques of +.49, +.40, +.10 N m (Pitch, Elbow,
+Wrist_Pitch; 11 to 13 N m/rad), the other two within .003 rad. No recording determines the sign of
+Rotation and Wrist_Roll, which gravity does not load in this pose, nor small zero offsets: those
+are +1 and 0 by default, not by measurement. Recorded torques are magnitudes and have no sign."""
 
 
 def is_sage(path: Path) -> bool:

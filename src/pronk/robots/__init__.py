@@ -1,36 +1,63 @@
-"""What a robot is: joints, drives, limits, default pose and its MuJoCo model.
+"""What a robot is: joints, drives, limits, poses and its MuJoCo model.
 
-One folder per robot, one constants file in it with a source beside every number.
+A robot is a folder with `robot.yaml` and the MJCF or URDF that it names.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
+from importlib.metadata import entry_points
+from pathlib import Path
 
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, Joint, Robot
 
 ROBOT_NAMES: tuple[str, ...] = ("mini_cheetah", "go2", "so101")
-"""The robots that `load_robot` knows."""
+"""The robots that pronk brings."""
+_FILES = (".yaml", ".yml")
+_MODELS = (".xml", ".mjcf", ".urdf")
 
 
-def load_robot(name: str) -> Robot:
-    """The robot called `name`.
+def load_robot(name: str | Path) -> Robot:
+    """Load a robot.
+
+    Args:
+        name: A shipped robot, a path to a `robot.yaml` or its folder, to an MJCF or a URDF, or an
+            entry point of the group `pronk.robots` (a function that returns such a path).
 
     Raises:
-        RobotError: There is none; the message lists those there are.
+        RobotError: There is none, or its files are inconsistent.
     """
-    if name == "mini_cheetah":
-        from pronk.robots.mini_cheetah import MINI_CHEETAH
+    path = Path(name)
+    if str(name) in ROBOT_NAMES:
+        path = Path(__file__).parent / str(name) / "robot.yaml"
+    elif not path.exists():
+        found = [point for point in entry_points(group="pronk.robots") if point.name == str(name)]
+        if not found:
+            raise RobotError(
+                f"there is no robot {str(name)!r}; the robots are {', '.join(ROBOT_NAMES)}, or "
+                "give the path of a robot.yaml, an MJCF or a URDF."
+            )
+        path = Path(found[0].load()())
+    if path.is_dir():
+        path = path / "robot.yaml"
+    if path.suffix not in _FILES + _MODELS:
+        raise RobotError(f"{path}: expected a robot.yaml, or a model ending in .xml or .urdf.")
+    try:
+        return _load(path.resolve(), path.stat().st_mtime_ns)
+    except OSError:
+        raise RobotError(f"{path}: no such file.") from None
 
-        return MINI_CHEETAH
-    if name == "go2":
-        from pronk.robots.go2 import GO2
 
-        return GO2
-    if name == "so101":
-        from pronk.robots.so101 import SO101
+@lru_cache
+def _load(path: Path, _changed: int) -> Robot:
+    if path.suffix in _MODELS:
+        from pronk.robots.bare import robot_of_model
 
-        return SO101
-    raise RobotError(f"there is no robot {name!r}; the robots are {', '.join(ROBOT_NAMES)}.")
+        return robot_of_model(path)
+    from pronk.robots.load import read_robot
+
+    return read_robot(path)
 
 
 __all__ = ["ROBOT_NAMES", "Drive", "Joint", "Robot", "load_robot"]

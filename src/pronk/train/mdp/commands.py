@@ -15,7 +15,7 @@ import torch
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
-from pronk.robots.mini_cheetah.constants import TOTAL_MASS
+from pronk.robots.legged import legged
 from pronk.robots.robot import Robot
 from pronk.train.gains import TrainingGains
 from pronk.train.mdp.actions import HeldJointPosition
@@ -27,6 +27,8 @@ from pronk.train.mdp.speed_ranges import Growth, SpeedRanges
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
+
+BODY = legged("mini_cheetah")
 
 NAME = "motion"
 """The command term's name in every environment."""
@@ -119,7 +121,7 @@ class MotionCommand(CommandTerm):
         self.led = 0.0
         """Part of a countermovement's guidance that is given, 0 to 1; a phase sets it."""
         self._guidance = guidance(
-            cfg.settings, self.stiffness, self.damping, TOTAL_MASS, env.step_dt
+            cfg.settings, self.stiffness, self.damping, BODY.total_mass, env.step_dt
         )
         self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
         self.ranges = SpeedRanges(cfg.growth, device)

@@ -11,9 +11,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pronk.robots.mini_cheetah import constants as c
+from pronk.robots.legged import legged
 from pronk.train.mdp.jump import JumpSettings
 from pronk.train.mdp.motion import STANDING_LEG
+
+BODY = legged("mini_cheetah")
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -27,7 +29,7 @@ def leg_angles(length: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         length: From the axis of the hip pitch to the foot [m]; beyond a straight leg's as that.
     """
-    thigh, shank = c.THIGH_LENGTH, c.SHANK_LENGTH
+    thigh, shank = BODY.thigh_length, BODY.shank_length
     cosine = (length.square() - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = torch.arccos(cosine.clamp(-1.0, 1.0))
     return -torch.atan2(shank * knee.sin(), thigh + shank * knee.cos()), knee
@@ -55,7 +57,7 @@ def guidance(
     """
     # Each target is for the end of its step.
     time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)
-    default = torch.tensor([c.DEFAULT_POSITION[name] for name in c.LEG_JOINTS]).double()
+    default = torch.tensor([BODY.default_position[name] for name in BODY.leg_joints]).double()
 
     def angles(at: Tensor) -> Tensor:
         pitch, knee = leg_angles(STANDING_LEG + settings.countermovement(at))
@@ -66,7 +68,7 @@ def guidance(
     force = (0.25 * mass * (upwards + GRAVITY)).clamp_min(0.0)
     torque = torch.zeros_like(pose)
     # The force passes through the hip; the knee is behind it and would bend.
-    torque[:, 2] = force * c.THIGH_LENGTH * pose[:, 1].sin()
+    torque[:, 2] = force * BODY.thigh_length * pose[:, 1].sin()
     offset, torque, rate = (value.repeat(1, 4) for value in (pose - default, torque, rate))
     added = offset + (torque + damping.double().cpu() * rate) / stiffness.double().cpu()
     return torch.cat((added, torch.zeros_like(added[:1]))).float().to(stiffness.device)

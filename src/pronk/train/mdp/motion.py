@@ -14,12 +14,14 @@ from mjlab.entity.data import compute_velocity_from_cvel
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from torch import Tensor
 
-from pronk.robots.mini_cheetah import constants
+from pronk.robots.legged import legged
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-KNEES = slice(7 + constants.LEG_JOINTS.index("knee"), None, len(constants.LEG_JOINTS))
+BODY = legged("mini_cheetah")
+
+KNEES = slice(7 + BODY.leg_joints.index("knee"), None, len(BODY.leg_joints))
 """Where a state's positions have the knees, after seven of the trunk."""
 
 
@@ -83,11 +85,11 @@ def leg_length(knee: Tensor) -> Tensor:
     Args:
         knee: Angle of the knee [rad], 0 for a straight leg; any shape.
     """
-    thigh, shank = constants.THIGH_LENGTH, constants.SHANK_LENGTH
+    thigh, shank = BODY.thigh_length, BODY.shank_length
     return (thigh**2 + shank**2 + 2.0 * thigh * shank * torch.cos(knee)).sqrt()
 
 
-STANDING_LEG = float(leg_length(torch.tensor(constants.DEFAULT_POSITION["knee"]).double()))
+STANDING_LEG = float(leg_length(torch.tensor(BODY.default_position["knee"]).double()))
 """Length of a leg in the default pose [m]."""
 
 
@@ -126,7 +128,7 @@ def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) 
         contact=ground.found > 0,
         force=torch.linalg.vector_norm(ground.force, dim=-1),
         foot_position=foot[..., :2],
-        foot_height=foot[..., 2] - constants.FOOT_RADIUS,
+        foot_height=foot[..., 2] - BODY.foot_radius,
         knee_height=physics.xpos[:, shanks, 2],
         leg_length=leg_length(qpos[:, KNEES]),
         foot_velocity=foot_velocity,

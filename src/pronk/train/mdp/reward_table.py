@@ -14,8 +14,10 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from pronk.errors import PronkError
-from pronk.robots.mini_cheetah.model import standing_height
+from pronk.robots.legged import legged
 from pronk.train.mdp import rewards
+
+BODY = legged("mini_cheetah")
 
 PAPER_UNIT = 20.0
 """One unit of ours is this many of the paper's."""
@@ -111,9 +113,9 @@ ROWS: Mapping[str, Row] = {
     "action_rate": Row(rewards.action_rate, -0.02, -0.005),
     "roll_pitch_rate": Row(rewards.roll_pitch_rate, -0.02, -0.02),
     "slip": Row(rewards.slip, -0.1, 0.0),
-    "trunk_height": Row(rewards.trunk_height, -1500.0, 0.0, {"height": standing_height()}),
+    "trunk_height": Row(rewards.trunk_height, -1500.0, 0.0, {"height": BODY.standing_height}),
     # A trot dips by 2 cm. A jump pays for its stroke, and a robot that is always low saves the way.
-    "crouch": Row(rewards.crouch, -500.0, 0.0, {"height": standing_height() - 0.02}),
+    "crouch": Row(rewards.crouch, -500.0, 0.0, {"height": BODY.standing_height - 0.02}),
     # Stopping from -2 m/s, a policy came down on a hind knee. Its skin is 2 cm below its axis.
     "knees": Row(rewards.knees, -3.0, -3.0, {"height": 0.06}),
     # Jumps alike to 7 mm in the air differed by 25 mm in how deep they landed, .16 to .23 m.

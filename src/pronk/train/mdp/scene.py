@@ -12,16 +12,17 @@ from mjlab.sensor import ContactMatch, ContactSensorCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
 
-from pronk.robots.mini_cheetah import constants
-from pronk.robots.mini_cheetah.model import standing_height
+from pronk.robots.legged import legged
 from pronk.robots.robot import Robot
 
-FEET = tuple(f"{leg}_foot" for leg in constants.LEGS)
+BODY = legged("mini_cheetah")
+
+FEET = tuple(f"{leg}_foot" for leg in BODY.legs)
 """Foot sites, in the order of every tensor of feet (FR, FL, HR, HL)."""
-FOOT_GEOMS = tuple(f"{leg}_foot_collision" for leg in constants.LEGS)
+FOOT_GEOMS = tuple(f"{leg}_foot_collision" for leg in BODY.legs)
 _LIMB_GEOMS = (
     "trunk_collision",
-    *(f"{leg}_{link}_collision" for leg in constants.LEGS for link in ("thigh", "shank")),
+    *(f"{leg}_{link}_collision" for leg in BODY.legs for link in ("thigh", "shank")),
 )
 
 
@@ -41,7 +42,7 @@ def robot_entity(robot: Robot, actuators: tuple[DcMotorActuatorCfg, ...]) -> Ent
     return EntityCfg(
         spec_fn=partial(_on_firm_feet, robot),
         init_state=EntityCfg.InitialStateCfg(
-            pos=(0.0, 0.0, standing_height()),
+            pos=(0.0, 0.0, BODY.standing_height),
             joint_pos={joint.name: joint.default_position for joint in robot.joints},
             joint_vel={".*": 0.0},
         ),

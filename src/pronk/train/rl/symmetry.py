@@ -26,8 +26,10 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.policy.layout import ESTIMATE, MEASURED
-from pronk.robots.mini_cheetah.constants import LEG_JOINTS, LEGS
+from pronk.robots.legged import legged
 from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
+
+BODY = legged("mini_cheetah")
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
     "measured": {name: part.size for name, part in MEASURED.items()},
@@ -38,7 +40,7 @@ GROUPS: Mapping[str, Mapping[str, int]] = {
 }
 """Parts of every group of observations, in order, and their sizes."""
 
-ACTION = {"action": len(LEGS) * len(LEG_JOINTS)}
+ACTION = {"action": len(BODY.legs) * len(BODY.leg_joints)}
 """Parts of the action."""
 
 
@@ -52,17 +54,21 @@ class _Kind:
 
 def _across(leg: str) -> int:
     """Where the leg on the other side stands."""
-    return LEGS.index(leg[0] + {"R": "L", "L": "R"}[leg[1]])
+    return BODY.legs.index(leg[0] + {"R": "L", "L": "R"}[leg[1]])
 
 
 _SCALAR = _Kind((0,), (1.0,))
 _VECTOR = _Kind((0, 1, 2), (1.0, -1.0, 1.0))
 _TURNING = _Kind((0, 1, 2), (-1.0, 1.0, -1.0))
 _COMMAND = _Kind((0, 1, 2), (1.0, -1.0, -1.0))
-_FEET = _Kind(tuple(_across(leg) for leg in LEGS), (1.0,) * len(LEGS))
+_FEET = _Kind(tuple(_across(leg) for leg in BODY.legs), (1.0,) * len(BODY.legs))
 _JOINTS = _Kind(
-    tuple(_across(leg) * len(LEG_JOINTS) + i for leg in LEGS for i in range(len(LEG_JOINTS))),
-    tuple(-1.0 if joint == "hip_roll" else 1.0 for _ in LEGS for joint in LEG_JOINTS),
+    tuple(
+        _across(leg) * len(BODY.leg_joints) + i
+        for leg in BODY.legs
+        for i in range(len(BODY.leg_joints))
+    ),
+    tuple(-1.0 if joint == "hip_roll" else 1.0 for _ in BODY.legs for joint in BODY.leg_joints),
 )
 
 _KINDS: Mapping[str, _Kind] = {

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 
+import pronk.robots
 from pronk.errors import RobotError
+from pronk.logs import sage_reader as so101
 from pronk.robots import ROBOT_NAMES, load_robot
-from pronk.robots.inertia import Inertia, joined
-from pronk.robots.mini_cheetah import constants as cheetah
+from pronk.robots.legged import legged
 from pronk.robots.model import free_spec
-from pronk.robots.so101 import constants as so101
+
+CHEETAH = legged("mini_cheetah")
 
 
 @pytest.fixture(scope="module")
@@ -81,8 +86,8 @@ def test_nothing_drawn_or_touching_adds_mass(model: mujoco.MjModel) -> None:
 
 def test_it_stands_thirty_centimetres_tall_on_feet_below_its_hips(model: mujoco.MjModel) -> None:
     data = posed(model)
-    assert data.body("trunk").xpos[2] == pytest.approx(cheetah.STANDING_HEIGHT, abs=0.005)  # S1
-    for leg in cheetah.LEGS:
+    assert data.body("trunk").xpos[2] == pytest.approx(0.30, abs=0.005)  # S1
+    for leg in CHEETAH.legs:
         hip, knee, foot = (
             data.body(f"{leg}_hip").xpos,
             data.body(f"{leg}_shank").xpos,
@@ -90,7 +95,7 @@ def test_it_stands_thirty_centimetres_tall_on_feet_below_its_hips(model: mujoco.
         )
         assert abs(foot[0] - hip[0]) < 0.015
         assert knee[0] < hip[0] - 0.1, "knees bend backward"
-        assert foot[2] == pytest.approx(cheetah.FOOT_RADIUS, abs=1e-12), "feet touch the floor"
+        assert foot[2] == pytest.approx(CHEETAH.foot_radius, abs=1e-12), "feet touch the floor"
         side = 1.0 if leg.endswith("L") else -1.0
         assert side * foot[1] == pytest.approx(0.049 + 0.062 + 0.004)
 
@@ -127,47 +132,12 @@ def test_only_feet_legs_and_trunk_touch_a_floor_and_never_each_other() -> None:
     data = posed(model)
     touching = {model.geom(g).name for pair in data.contact.geom for g in pair}
     expected = {"floor", "trunk_collision"}
-    expected |= {f"{leg}_{part}_collision" for leg in cheetah.LEGS for part in ("thigh", "shank")}
-    expected |= {f"{leg}_foot_collision" for leg in cheetah.LEGS}
+    expected |= {f"{leg}_{part}_collision" for leg in CHEETAH.legs for part in ("thigh", "shank")}
+    expected |= {f"{leg}_foot_collision" for leg in CHEETAH.legs}
     assert touching == expected
     assert all("floor" in {model.geom(g).name for g in pair} for pair in data.contact.geom)
     foot = [c for c in data.contact if "FR_foot_collision" in {model.geom(g).name for g in c.geom}]
     assert {c.dim for c in foot} == {3}
-
-
-def test_thigh_product_is_the_largest_feasible() -> None:
-    assert cheetah.THIGH.triangle_margin() >= 0.0
-    xx, yy, zz, xy, xz, yz = cheetah.THIGH.products
-    with pytest.raises(RobotError, match="triangle inequality"):
-        Inertia(mass=1.0, com=(0.0, 0.0, 0.0), products=(xx, yy, zz, xy + 0.1e-6, xz, yz))
-    cad = (xx, yy, zz, cheetah.THIGH_XY_CAD, xz, yz)
-    with pytest.raises(RobotError, match="triangle inequality"):
-        Inertia(mass=1.0, com=(0.0, 0.0, 0.0), products=cad)
-
-
-def test_trunk_is_not_the_ten_times_error_of_the_public_urdfs() -> None:
-    _, yy, _, *_ = cheetah.TRUNK.products
-    # CAD .0362 for 3.3 kg; about twice the mass and 1.1 times the length: .0362 * 2 * 1.22 ~ .088.
-    assert 0.07 < yy < 0.10
-
-
-def test_joined_spheres_by_hand() -> None:
-    # Two points of 1 kg at y = +-1, each with .1 of its own: Iyy .2, the others 2.2.
-    ball = (0.1, 0.1, 0.1, 0.0, 0.0, 0.0)
-    both = joined([Inertia(mass=1.0, com=(0.0, y, 0.0), products=ball) for y in (-1.0, 1.0)])
-    assert both.mass == 2.0
-    np.testing.assert_allclose(both.com, 0.0)
-    np.testing.assert_allclose(both.products, [2.2, 0.2, 2.2, 0.0, 0.0, 0.0])
-
-
-def test_mirroring_twice_changes_nothing() -> None:
-    assert cheetah.ABAD.mirrored().mirrored() == cheetah.ABAD
-    assert cheetah.ABAD.mirrored() != cheetah.ABAD
-
-
-def test_massless_body_is_refused() -> None:
-    with pytest.raises(RobotError, match="positive"):
-        Inertia(mass=0.0, com=(0.0, 0.0, 0.0), products=(1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
 
 
 def test_so101_frames_are_normalized_and_reach_as_far_as_the_arm() -> None:
@@ -210,3 +180,33 @@ def test_sage_names_map_onto_the_joints_and_the_jaw_is_no_angle() -> None:
     assert tuple(so101.SAGE_JOINTS.values()) == load_robot("so101").joint_names
     assert so101.SAGE_UNITS["Jaw"] == "unknown"
     assert "Jaw" not in so101.SAGE_MAPPING
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
+def test_wrong_symmetry_is_refused(name: str, tmp_path: Path) -> None:
+    folder = Path(pronk.robots.__file__).parent / name
+    text = (folder / "robot.yaml").read_text()
+    (tmp_path / f"{name}.xml").write_text((folder / f"{name}.xml").read_text())
+    changed = re.sub(r"negated: .*", "negated: []", text)
+    (tmp_path / "robot.yaml").write_text(changed)
+    with pytest.raises(RobotError, match="FL_hip_roll"):
+        load_robot(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("drive: knee", "drive: ankle", "ankle"),
+        ("*_knee", "*_ankle", "knee"),
+        ("gear_ratio: 9.33", "gear_ratio: -1.0", "gear_ratio"),
+        ("base_body: trunk", "base_body: chest", "chest"),
+        ("  default:", "  home:", "default"),
+        ("model: mini_cheetah.xml", "model: other.xml", "other.xml"),
+    ],
+)
+def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_path: Path) -> None:
+    folder = Path(pronk.robots.__file__).parent / "mini_cheetah"
+    (tmp_path / "mini_cheetah.xml").write_text((folder / "mini_cheetah.xml").read_text())
+    (tmp_path / "robot.yaml").write_text((folder / "robot.yaml").read_text().replace(old, new))
+    with pytest.raises(RobotError, match=named):
+        load_robot(tmp_path / "robot.yaml")

@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from pronk.robots.go2 import GO2
-from pronk.robots.go2 import constants as c
+from pronk.robots import load_robot
 from pronk.robots.model import bench_spec, free_spec
+
+GO2 = load_robot("go2")
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +40,11 @@ def test_feet_are_under_the_hips_and_on_the_floor(model: mujoco.MjModel) -> None
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
     mujoco.mj_forward(model, data)
-    for leg in c.LEGS:
+    for leg in ("FR", "FL", "RR", "RL"):
         foot, hip = data.site(f"{leg}_foot").xpos, data.body(f"{leg}_thigh").xpos
         assert foot[0] == pytest.approx(hip[0], abs=0.003)
         assert foot[1] == pytest.approx(hip[1], abs=1e-9)
-        assert foot[2] == pytest.approx(c.FOOT_RADIUS, abs=1e-9)
+        assert foot[2] == pytest.approx(0.022, abs=1e-9)
 
 
 def test_drives_have_the_published_limits() -> None:

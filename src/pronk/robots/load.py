@@ -1,0 +1,364 @@
+"""Read a robot from its `robot.yaml`, or from a bare MJCF or URDF.
+
+`robot.yaml` (schema `pronk/robot/1`) names the model beside it and holds what a model does not:
+drives, gains, groups, poses, what is clamped in a bench test, and which joints mirror each other.
+Ranges, axes, inertias and kinematic chains come from the model. Joint patterns are those of a shell
+(`*_knee`). A claimed mirror symmetry is verified with the model's mass matrix and bias forces.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import mujoco
+import numpy as np
+import yaml
+from msgspec import Meta
+
+from pronk.actuator.model import no_load_speed, stall_torque
+from pronk.errors import RobotError
+from pronk.robots.robot import Drive, Joint, Robot
+
+SCHEMA = "pronk/robot/1"
+_MIRROR_TOLERANCE = 1e-9
+"""Largest relative difference of inertia and bias forces of joints that mirror each other."""
+_TORQUE_FACTOR, _EMF_FACTOR = {1: 1.0, 3: 1.5}, {1: 1.0, 3: 2.0}
+_Positive = Annotated[float, Meta(gt=0.0)]
+_Least = Annotated[float, Meta(ge=0.0)]
+_Band = tuple[_Positive, _Positive]
+
+
+class DriveEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A drive: its torque-speed line or the motor's constants, from which the line follows."""
+
+    effort_limit: _Positive
+    bus_voltage: _Positive = 24.0
+    gear_ratio: _Positive = 1.0
+    rotor_inertia: _Least | None = None
+    armature: _Least | None = None
+    stall_torque: _Positive | None = None
+    no_load_speed: _Positive | None = None
+    torque_constant: _Positive | None = None
+    joint_torque_constant: _Positive | None = None
+    resistance: _Positive | None = None
+    phases: int = 3
+    frictionloss: _Least = 0.0
+    viscous_damping: _Least = 0.0
+
+    def drive(self, source: str) -> Drive:
+        """Make the drive.
+
+        Raises:
+            RobotError: The torque-speed line is not given, in one way or the other.
+        """
+        gear, volts = self.gear_ratio, self.bus_voltage
+        if self.phases not in _TORQUE_FACTOR:
+            raise RobotError(f"{source}: phases is {self.phases}; expected 1 (brushed) or 3.")
+        if self.armature is not None and self.rotor_inertia is not None:
+            raise RobotError(f"{source}: give rotor_inertia or armature, not both.")
+        torque_factor, emf_factor = _TORQUE_FACTOR[self.phases], _EMF_FACTOR[self.phases]
+        rotor = (self.armature or 0.0) / gear**2
+        constant, resistance = self.torque_constant, self.resistance
+        stall, free = self.stall_torque, self.no_load_speed
+        if self.joint_torque_constant is not None and resistance is not None:
+            constant = self.joint_torque_constant / gear
+            stall = torque_factor * self.joint_torque_constant * volts / resistance
+            free = volts / (emf_factor * self.joint_torque_constant)
+        elif constant is not None and resistance is not None:
+            stall = stall_torque(
+                gear_ratio=gear,
+                torque_constant=constant,
+                resistance=resistance,
+                bus_voltage=volts,
+                torque_factor=torque_factor,
+            )
+            free = no_load_speed(
+                gear_ratio=gear, torque_constant=constant, bus_voltage=volts, emf_factor=emf_factor
+            )
+        elif stall is not None and free is not None:
+            constant = volts / (emf_factor * gear * free)
+            resistance = torque_factor * gear * constant * volts / stall
+        else:
+            raise RobotError(
+                f"{source}: the torque-speed line is missing; give stall_torque and no_load_speed, "
+                "or torque_constant and resistance."
+            )
+        return Drive(
+            gear_ratio=gear,
+            rotor_inertia=rotor if self.rotor_inertia is None else self.rotor_inertia,
+            stall_torque=stall,
+            no_load_speed=free,
+            effort_limit=self.effort_limit,
+            frictionloss=self.frictionloss,
+            viscous_damping=self.viscous_damping,
+            bus_voltage=volts,
+            resistance=resistance,
+            torque_constant=constant,
+        )
+
+
+class GroupEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Joints that are built alike, their drive, gains and test rig."""
+
+    joints: str | None = None
+    """Pattern of joint names; the group's own name if left out."""
+    drive: str | None = None
+    stiffness: _Positive | None = None
+    damping: _Positive | None = None
+    band_hz: _Band | None = None
+    clamped: tuple[str, ...] = ()
+    """Patterns of joints of the same limb that are fixed while one of these is excited."""
+
+
+class SymmetryEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Limbs that mirror another: prefix of joint names to the prefix of the original."""
+
+    mirror: dict[str, str] = msgspec.field(default_factory=dict)
+    negated: tuple[str, ...] = ()
+    """Joints whose coordinate has the opposite sign of the original's."""
+
+
+class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Content of a `robot.yaml`."""
+
+    schema: str
+    name: str
+    model: str
+    drives: dict[str, DriveEntry]
+    groups: dict[str, GroupEntry]
+    poses: dict[str, dict[str, float]] = {}
+    defaults: GroupEntry = GroupEntry()
+    symmetry: SymmetryEntry = SymmetryEntry()
+    base_body: str | None = None
+    policy_rate_hz: _Positive = 50.0
+    timestep_s: _Positive = 0.005
+    decimation: Annotated[int, Meta(ge=1)] = 4
+    grid_stiffness: _Band = (13.0, 27.0)
+    grid_damping: _Band = (0.1, 0.7)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model without actuators: builds a fresh specification at each call; can be pickled."""
+
+    xml: str
+
+    def __call__(self) -> mujoco.MjSpec:
+        """Build the specification."""
+        return mujoco.MjSpec.from_string(self.xml)
+
+
+@lru_cache
+def read_model(path: Path) -> Model:
+    """Read an MJCF or URDF; angles become radians, inertias explicit; meshes, drives are left out.
+
+    Raises:
+        RobotError: The file is missing or does not compile.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.fusestatic = False
+        if not spec.compiler.degree and not (
+            spec.actuators or spec.meshes or spec.frames or spec.sensors
+        ):
+            spec.compile()
+            return Model(path.read_text(encoding="utf-8"))
+        model = spec.compile()
+        for body in spec.bodies[1:]:
+            if body.explicitinertial:
+                continue
+            body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
+            body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+            body.explicitinertial = True
+        for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]:
+            spec.delete(geom)
+        for part in (spec.pairs, spec.sensors, spec.keys, spec.actuators, spec.skins, spec.meshes):
+            for element in list(part):
+                spec.delete(element)
+        for element in (*spec.materials, *spec.textures):
+            spec.delete(element)
+        spec.compile()
+        return Model(spec.to_xml())
+    except (ValueError, OSError) as error:
+        text = " ".join(str(error).split()).rstrip(".")
+        raise RobotError(f"{path}: not a model that MuJoCo can read ({text}).") from None
+
+
+def read_robot(path: Path) -> Robot:
+    """Read a `robot.yaml`.
+
+    Raises:
+        RobotError: The file is missing, has another schema, or disagrees with its model.
+    """
+    try:
+        body = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise RobotError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from None
+    if not isinstance(body, dict) or body.get("schema") != SCHEMA:
+        raise RobotError(f"{path}: not a robot file; its schema must be {SCHEMA!r}.")
+    try:
+        file = msgspec.convert(body, RobotFile)
+    except msgspec.ValidationError as error:
+        raise RobotError(f"{path}: {str(error).rstrip('.')}.") from None
+    return make_robot(file, read_model(path.parent / file.model), str(path))
+
+
+def make_robot(file: RobotFile, build: Model, source: str) -> Robot:
+    """Join a robot file with its model.
+
+    Raises:
+        RobotError: Something is missing or inconsistent; names the entry.
+    """
+    model = build().compile()
+    hinges = [
+        model.joint(i).name
+        for i in range(model.njnt)
+        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
+    ]
+    base = file.base_body or default_base(model)
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base) < 0:
+        raise RobotError(f"{source}: base_body {base!r} is not a body of the model.")
+    limbs = {
+        name: _limb(model, model.joint(name).bodyid[0], model.body(base).id) for name in hinges
+    }
+    if "default" not in file.poses:
+        raise RobotError(f"{source}: poses.default is missing.")
+    group_of: dict[str, str] = {}
+    for name, group in file.groups.items():
+        found = fnmatch.filter(hinges, group.joints or name)
+        if not found:
+            raise RobotError(
+                f"{source}: groups.{name} matches no hinge joint of the model; those are "
+                f"{', '.join(hinges)}."
+            )
+        for joint in found:
+            if joint in group_of:
+                raise RobotError(
+                    f"{source}: {joint} is in the groups {group_of[joint]} and {name}."
+                )
+            group_of[joint] = name
+    if missing := [name for name in hinges if name not in group_of]:
+        raise RobotError(f"{source}: {', '.join(missing)} is in no group; add one that matches it.")
+    joints = []
+    for name in hinges:
+        own, shared = file.groups[group_of[name]], file.defaults
+        where = f"{source}: groups.{group_of[name]}"
+
+        def entry(field: str, own: Any = own, shared: Any = shared, where: str = where) -> Any:
+            value = getattr(own, field)
+            value = getattr(shared, field) if value is None else value
+            if value is None:
+                raise RobotError(f"{where}.{field} is missing.")
+            return value
+
+        if (drive := entry("drive")) not in file.drives:
+            raise RobotError(
+                f"{where}.drive is {drive!r}; the drives are {', '.join(file.drives)}."
+            )
+        limb = [other for other in hinges if limbs[other] == limbs[name]]
+        patterns = own.clamped or shared.clamped
+        clamped = tuple(other for other in limb if any(fnmatch.fnmatch(other, p) for p in patterns))
+        low, high = model.joint(name).range
+        limited = bool(model.jnt_limited[model.joint(name).id])
+        prefix = next((p for p in file.symmetry.mirror if name.startswith(f"{p}_")), None)
+        mirror = None
+        if prefix is not None:
+            original = file.symmetry.mirror[prefix] + name[len(prefix) :]
+            mirror = (original, -1.0 if name in file.symmetry.negated else 1.0)
+        joints.append(
+            Joint(
+                name=name,
+                group=group_of[name],
+                drive=file.drives[drive].drive(f"{source}: drives.{drive}"),
+                range=(float(low), float(high)) if limited else (-math.pi, math.pi),
+                default_position=_position(file.poses, "default", name, group_of[name], source),
+                folded_position=_position(file.poses, "folded", name, group_of[name], source)
+                if "folded" in file.poses
+                else None,
+                stiffness=entry("stiffness"),
+                damping=entry("damping"),
+                band_hz=entry("band_hz"),
+                clamped=clamped,
+                chain=tuple(other for other in limb if other not in clamped),
+                mirror=mirror,
+            )
+        )
+    robot = Robot(
+        name=file.name,
+        joints=tuple(joints),
+        build_spec=build,
+        base_body=base,
+        policy_rate_hz=file.policy_rate_hz,
+        timestep_s=file.timestep_s,
+        decimation=file.decimation,
+        grid_stiffness=file.grid_stiffness,
+        grid_damping=file.grid_damping,
+    )
+    _verify_mirrors(robot, model, source)
+    return robot
+
+
+def default_base(model: mujoco.MjModel) -> str:
+    """Name the body with the free joint, or the world where nothing is free."""
+    for i in range(model.njnt):
+        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE:
+            return str(model.body(model.jnt_bodyid[i]).name)
+    return "world"
+
+
+def _limb(model: mujoco.MjModel, body: int, base: int) -> int:
+    """The child of the base under which a body is."""
+    while model.body_parentid[body] not in (base, 0):
+        body = int(model.body_parentid[body])
+    return int(body)
+
+
+def _position(
+    poses: Mapping[str, Mapping[str, float]], pose: str, joint: str, group: str, source: str
+) -> float:
+    values = poses[pose]
+    if joint not in values and group not in values:
+        raise RobotError(f"{source}: poses.{pose} has no entry for {joint} or its group {group}.")
+    return float(values.get(joint, values.get(group, 0.0)))
+
+
+def _verify_mirrors(robot: Robot, model: mujoco.MjModel, source: str) -> None:
+    """Compare mass matrix and bias forces of each limb with those of its original."""
+    mirrored = [joint for joint in robot.joints if joint.mirror]
+    if not mirrored:
+        return
+    data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    dof = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in robot.joints}
+    # The same pose about the default one, and the same speeds, in the originals' coordinates.
+    for joint in robot.joints:
+        original, sign = joint.original
+        k = robot.joint_names.index(original)
+        model_joint = model.joint(joint.name)
+        offset = 0.2 * math.sin(1.0 + k)
+        data.qpos[model_joint.qposadr[0]] = joint.default_position + sign * offset
+        data.qvel[dof[joint.name]] = sign * math.cos(1.0 + k)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, full)
+    scale = max(np.abs(full[d, d]) for d in dof.values())
+    force = max(np.abs(data.qfrc_bias[d]) for d in dof.values())
+    for joint in mirrored:
+        original, sign = joint.original
+        error = abs(data.qfrc_bias[dof[joint.name]] - sign * data.qfrc_bias[dof[original]]) / force
+        for other in joint.chain:
+            first, other_sign = robot.joint(other).original
+            own = full[dof[joint.name], dof[other]]
+            theirs = sign * other_sign * full[dof[original], dof[first]]
+            error = max(error, abs(own - theirs) / scale)
+        if not error <= _MIRROR_TOLERANCE:
+            raise RobotError(
+                f"{source}: {joint.name} does not mirror {original} with sign {sign:+.0f}: inertia "
+                f"or gravity differ by {error:.2g} of the largest; correct symmetry.mirror or "
+                "symmetry.negated, or leave them out."
+            )
