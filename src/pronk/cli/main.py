@@ -32,6 +32,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "play": ("pronk.cli.play:play", "Steer the virtual robot in a browser."),
     "deploy": ("pronk.cli.deploy:deploy", "Run a policy on a robot or the virtual robot."),
     "simulate": ("pronk.cli.simulate:simulate", "Run the virtual robot as a process of its own."),
+    "robot": ("pronk.cli.robot:robot", "Write or check the robot.yaml of a model."),
     "report": ("pronk.cli.report:report", "Write one HTML page of matches, trials, deployments."),
     "demo": ("pronk.cli.demo:demo", "Sweep, match and jump on the virtual robot."),
 }

@@ -91,7 +91,7 @@ def simulate(
     watchdog = Watchdog(action=silence, after_s=silence_after)
     machine = VirtualRobot(
         known,
-        load_sim_params(sim_params),
+        load_sim_params(sim_params, known),
         seed=seed,
         base=base,
         capture_rate_hz=1000.0 if capture else None,

@@ -43,16 +43,17 @@ def record_virtual(
     Returns:
         The logs, in the order of the robot's joints.
     """
-    from pronk.virtual.plant import legs_of
+    from pronk.virtual.plant import leg_of, legs_of
     from pronk.virtual.sim_params import load_sim_params
 
     # Read it here once, so that a bad file is one message and not one per process.
-    load_sim_params(sim_params).check_joints(robot.joint_names, str(sim_params or "sim_params"))
+    hidden = load_sim_params(sim_params, robot)
+    hidden.check_joints(robot.joint_names, str(sim_params or "sim_params"))
     if len(plan.sets) != len(plan.joints):
         raise PlanError("several joints excited at once: the virtual robot excites one at a time.")
     jobs = []
     for index, leg in enumerate(legs_of(robot)):
-        excited = tuple(name for name in plan.joints if name.split("_")[0] == leg)
+        excited = tuple(name for name in plan.joints if leg_of(robot, name) == leg)
         if excited:
             jobs.append((leg, excited, seed * 1000 + index))
     context = get_context("spawn")
@@ -98,7 +99,8 @@ def _record_leg(
     from pronk.virtual.robot import VirtualRobot
     from pronk.virtual.sim_params import load_sim_params
 
-    machine = VirtualRobot(plan.robot, load_sim_params(sim_params), seed=seed, legs=(leg,))
+    hidden = load_sim_params(sim_params, plan.robot)
+    machine = VirtualRobot(plan.robot, hidden, seed=seed, legs=(leg,))
     return record(
         machine,
         plan.robot,

@@ -94,13 +94,13 @@ def group_drives(gains: MatchedGains, robot: Robot) -> list[GroupDrive]:
     return out
 
 
-def mjlab_text(gains: MatchedGains) -> str:
+def mjlab_text(gains: MatchedGains, robot: Robot) -> str:
     """Python source for mjlab: `ACTUATORS`, a tuple of configs, and `EVENTS`, a dict of events.
 
     The events draw absolute gains for every environment (D3, D4); they address the actuators by
     their place in `ACTUATORS`, so keep the order.
     """
-    drives = group_drives(gains, load_robot(gains.robot))
+    drives = group_drives(gains, robot)
     actuators, events = [], []
     for index, drive in enumerate(drives):
         delay = (
@@ -155,9 +155,9 @@ def mjlab_text(gains: MatchedGains) -> str:
     )
 
 
-def events_text(gains: MatchedGains) -> str:
+def events_text(gains: MatchedGains, robot: Robot) -> str:
     """The randomization as YAML: absolute ranges for mjlab's `dr.pd_gains`, one entry a group."""
-    drives = group_drives(gains, load_robot(gains.robot))
+    drives = group_drives(gains, robot)
     body = {
         f"{drive.group}_gains": {
             "func": "mjlab.envs.mdp.dr.pd_gains",
@@ -173,7 +173,7 @@ def events_text(gains: MatchedGains) -> str:
     return _comment(_header(gains), "# ") + "\n" + yaml.safe_dump(body, sort_keys=False)
 
 
-def mjcf_text(gains: MatchedGains) -> str:
+def mjcf_text(gains: MatchedGains, robot: Robot) -> str:
     """The whole robot as MJCF with a native `dcmotor` for every joint.
 
     Its torque is the PD law with the groups' gains, clipped by the torque-speed line and the
@@ -182,7 +182,6 @@ def mjcf_text(gains: MatchedGains) -> str:
     that were not matched have the robot's published gains. MuJoCo knows no delay of a position
     command in its drives; a matched delay is named in the comment.
     """
-    robot = load_robot(gains.robot)
     drives = group_drives(gains, robot)
     by_joint = {joint: drive for drive in drives for joint in drive.joints}
     friction = {name: drive.frictionloss for name, drive in by_joint.items()}
@@ -207,12 +206,12 @@ def mjcf_text(gains: MatchedGains) -> str:
     return f"<!--\n{comment}\n-->\n{spec.to_xml()}"
 
 
-def isaaclab_text(gains: MatchedGains) -> str:
+def isaaclab_text(gains: MatchedGains, robot: Robot) -> str:
     """Python source for Isaac Lab: `ACTUATORS`, a dict of `DCMotorCfg` by group.
 
     Isaac Lab runs PhysX; its first line is a warning that the gains must be matched there anew.
     """
-    drives = group_drives(gains, load_robot(gains.robot))
+    drives = group_drives(gains, robot)
     entries = []
     for drive in drives:
         entries.append(
@@ -247,7 +246,7 @@ def isaaclab_text(gains: MatchedGains) -> str:
     )
 
 
-EXPORTS: Mapping[str, Callable[[MatchedGains], str]] = {
+EXPORTS: Mapping[str, Callable[[MatchedGains, Robot], str]] = {
     "mjlab": mjlab_text,
     "mjcf": mjcf_text,
     "isaaclab": isaaclab_text,
@@ -256,12 +255,13 @@ EXPORTS: Mapping[str, Callable[[MatchedGains], str]] = {
 """What `export_text` can write."""
 
 
-def export_text(gains: MatchedGains, target: str) -> str:
+def export_text(gains: MatchedGains, target: str, robot: Robot | None = None) -> str:
     """The gains as text for one simulator.
 
     Args:
         gains: Matched gains.
         target: One of `EXPORTS`.
+        robot: The robot; by the name in the gains if None.
 
     Raises:
         PronkError: The target is unknown, or the gains hold no group.
@@ -269,7 +269,7 @@ def export_text(gains: MatchedGains, target: str) -> str:
     """
     if target not in EXPORTS:
         raise PronkError(f"no export to {target!r}; expected one of {', '.join(EXPORTS)}.")
-    return EXPORTS[target](gains)
+    return EXPORTS[target](gains, robot or load_robot(gains.robot))
 
 
 def _header(gains: MatchedGains) -> str:

@@ -171,8 +171,16 @@ class Plant:
 
 
 def legs_of(robot: Robot) -> tuple[str, ...]:
-    """Names of the robot's legs, the first part of its joints' names, in file order."""
-    return tuple(dict.fromkeys(joint.name.split("_")[0] for joint in robot.joints))
+    """Names of the robot's limbs in file order; see `leg_of`."""
+    return tuple(dict.fromkeys(leg_of(robot, joint.name) for joint in robot.joints))
+
+
+def leg_of(robot: Robot, name: str) -> str:
+    """Name the limb of a joint: the first part that its joints' names share, or its first joint."""
+    joint = robot.joint(name)
+    limb = [n for n in robot.joint_names if n in (name, *joint.chain, *joint.clamped)]
+    first = {each.split("_")[0] for each in limb}
+    return first.pop() if len(first) == 1 else limb[0]
 
 
 def _drop_legs(spec: Any, robot: Robot, kept: set[str]) -> None:
@@ -299,7 +307,7 @@ def build_plant(
             "written for that robot."
         )
     sim_params.check_joints(robot.joint_names)
-    joints = tuple(joint for joint in robot.joints if joint.name.split("_")[0] in legs)
+    joints = tuple(joint for joint in robot.joints if leg_of(robot, joint.name) in legs)
     spec = robot.build_spec()
     spec.option.timestep = timestep_s
     for key in list(spec.keys):

@@ -301,7 +301,7 @@ def open_sim(
         **common: Of links with a wire; of no effect.
     """
     base: Any = interface or "ground"
-    return VirtualRobot(robot, load_sim_params(params), seed=seed, base=base)
+    return VirtualRobot(robot, load_sim_params(params, robot), seed=seed, base=base)
 
 
 def _check_base(

@@ -1,0 +1,91 @@
+"""`pronk robot`: write the robot.yaml of a model, or check one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from pronk.cli import console
+from pronk.errors import RobotError
+
+Action = Literal["new", "check"]
+"""What to do."""
+
+
+def robot(
+    action: tyro.conf.Positional[Action],
+    path: tyro.conf.Positional[Path],
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a filled-in robot.yaml for an MJCF or URDF, or check a robot.
+
+    Args:
+        action: new: write a robot.yaml; check: say what is missing or inconsistent.
+        path: MJCF or URDF for new; robot.yaml, its folder, or a model for check.
+        out: The file to write; robot.yaml beside the model if left out.
+        overwrite: Replace a file that is already there.
+    """
+    if action == "new":
+        _new(path, out, overwrite)
+    else:
+        _check(path)
+
+
+def _new(path: Path, out: Path | None, overwrite: bool) -> None:
+    from pronk.files import write_text
+    from pronk.robots.bare import yaml_of_model
+
+    target = out or path.with_name("robot.yaml")
+    if target.exists() and not overwrite:
+        raise RobotError(f"{target} is already there; give another --out, or --overwrite.")
+    if target.parent.resolve() != path.parent.resolve():
+        raise RobotError(f"--out {target}: the robot.yaml belongs beside its model {path}.")
+    write_text(target, yaml_of_model(path))
+    console.wrote(target)
+    console.following(f"pronk robot check {target}")
+
+
+def _check(path: Path) -> None:
+    from pronk.robots import load_robot
+    from pronk.robots.model import bench_spec
+
+    found = load_robot(path)
+    table = console.table(
+        f"{found.name}: {len(found.joints)} joints",
+        "joint",
+        "group",
+        "range [rad]",
+        "default [rad]",
+        "effort limit [N m]",
+        "chain",
+        "clamped",
+    )
+    problems = []
+    for joint in found.joints:
+        bench_spec(found, joint.name).compile()
+        low, high = joint.range
+        console.row(
+            table,
+            joint.name,
+            joint.group,
+            f"{low:.2f} to {high:.2f}",
+            f"{joint.default_position:.2f}",
+            f"{joint.drive.effort_limit:.3g}",
+            " ".join(joint.chain),
+            " ".join(joint.clamped),
+        )
+        if not low < joint.default_position < high:
+            problems.append(f"poses.default of {joint.name} is outside of its range")
+        if not joint.drive.armature:
+            problems.append(f"the rotor inertia (armature) of {joint.name} is 0")
+        if not joint.drive.frictionloss:
+            problems.append(f"the dry friction (frictionloss) of {joint.name} is 0")
+    if abs(found.timestep_s * found.decimation * found.policy_rate_hz - 1.0) > 1e-9:
+        problems.append("timestep_s * decimation * policy_rate_hz is not 1")
+    console.show(table)
+    for problem in problems:
+        console.warn(problem)
+    console.say("nothing is inconsistent" if not problems else f"{len(problems)} to check")

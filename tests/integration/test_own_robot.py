@@ -1,0 +1,121 @@
+"""A robot from files alone: sweep on the virtual robot, match, predict, export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+import pronk.robots
+from pronk.cli.main import run
+from pronk.robots import load_robot
+
+PENDULUM = """
+<mujoco model="pendulum">
+  <worldbody>
+    <body name="rod" pos="0 0 1">
+      <joint name="swing" axis="0 1 0" range="-120 120" armature="0.02" frictionloss="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.5"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+ARM = """
+<robot name="arm">
+  <link name="base"/>
+  <link name="upper">
+    <inertial><origin xyz="0 0 -0.15"/><mass value="1.0"/>
+      <inertia ixx="0.01" iyy="0.01" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <link name="lower">
+    <inertial><origin xyz="0 0 -0.1"/><mass value="0.5"/>
+      <inertia ixx="0.004" iyy="0.004" izz="0.0005" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="shoulder" type="revolute">
+    <parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="40" velocity="10"/>
+    <dynamics damping="0.05" friction="0.2"/>
+  </joint>
+  <joint name="elbow" type="revolute">
+    <parent link="upper"/><child link="lower"/><origin xyz="0 0 -0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="20" velocity="10"/>
+    <dynamics damping="0.02" friction="0.1"/>
+  </joint>
+</robot>
+"""
+
+
+def model_of(kind: str, folder: Path) -> Path:
+    """Write a model file as a user has it."""
+    if kind == "arm":
+        path = folder / "arm.urdf"
+        path.write_text(ARM)
+        return path
+    path = folder / f"{kind}.xml"
+    if kind == "pendulum":
+        path.write_text(PENDULUM)
+    else:
+        spec = load_robot("mini_cheetah").build_spec()
+        spec.compile()
+        path.write_text(spec.to_xml())
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "joint"), [("pendulum", "swing"), ("arm", "elbow"), ("cheetah", "FR_knee")]
+)
+def test_sweep_match_predict_export(
+    kind: str, joint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = model_of(kind, tmp_path)
+    robot, gains, logs = tmp_path / "robot.yaml", tmp_path / "gains.yaml", tmp_path / "logs"
+    written = tmp_path / "matched.xml"
+    for line in (
+        ["robot", "new", str(model)],
+        ["robot", "check", str(robot)],
+        ["sweep", str(robot), "--out", str(logs), "--joints", joint, "--amplitude", "0.15"],
+        ["match", str(logs), "--robot", str(robot), "--out", str(gains), "--quick"],
+        ["predict", str(logs), "--robot", str(robot), "--gains", str(gains)],
+        ["export", str(gains), "--robot", str(robot), "--to", "mjcf", "--out", str(written)],
+    ):
+        assert run(line) == 0, (line, capsys.readouterr())
+    matched = yaml.safe_load(gains.read_text())
+    drive = load_robot(robot).joint(joint)
+    # The virtual robot gives a tenth more torque than its drive believes.
+    found = matched["joints"][joint]["stiffness"]
+    assert 0.7 * drive.stiffness < found < 1.6 * drive.stiffness
+
+
+@pytest.mark.parametrize("kind", ["pendulum", "arm", "cheetah"])
+def test_bare_model_is_a_robot(kind: str, tmp_path: Path) -> None:
+    bare = load_robot(model_of(kind, tmp_path))
+    for joint in bare.joints:
+        assert joint.name in joint.chain
+        assert joint.stiffness > 0.0
+        assert joint.drive.effort_limit > 0.0
+    if kind == "cheetah":
+        assert bare.joint_names == load_robot("mini_cheetah").joint_names
+
+
+def test_new_robot_does_not_replace_a_file(tmp_path: Path) -> None:
+    model = model_of("pendulum", tmp_path)
+    assert run(["robot", "new", str(model)]) == 0
+    assert run(["robot", "new", str(model)]) == 2
+    assert run(["robot", "new", str(model), "--overwrite"]) == 0
+
+
+def test_check_names_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["robot", "check", str(tmp_path / "none.yaml")]) == 2
+    assert "none.yaml" in capsys.readouterr().err
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<mujoco><worldbody>")
+    assert run(["robot", "check", str(broken)]) == 2
+    assert "broken.xml" in capsys.readouterr().err
+
+
+def test_shipped_robots_pass_the_check() -> None:
+    for name in pronk.robots.ROBOT_NAMES:
+        assert run(["robot", "check", name]) == 0
