@@ -164,12 +164,15 @@ def read_model(path: Path) -> Model:
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        spec.compiler.fusestatic = False
-        if not spec.compiler.degree and not (
-            spec.actuators or spec.meshes or spec.frames or spec.sensors
-        ):
+        text = path.read_text(encoding="utf-8")
+        compiler = spec.compiler
+        # An MJCF that needs nothing resolved keeps all digits of its numbers.
+        if not (
+            path.suffix == ".urdf" or "<include" in text or compiler.degree or compiler.fusestatic
+        ) and not (spec.actuators or spec.meshes or spec.frames or spec.sensors):
             spec.compile()
-            return Model(path.read_text(encoding="utf-8"))
+            return Model(text)
+        compiler.fusestatic = False
         model = spec.compile()
         for body in spec.bodies[1:]:
             if body.explicitinertial:
@@ -187,8 +190,8 @@ def read_model(path: Path) -> Model:
         spec.compile()
         return Model(spec.to_xml())
     except (ValueError, OSError) as error:
-        text = " ".join(str(error).split()).rstrip(".")
-        raise RobotError(f"{path}: not a model that MuJoCo can read ({text}).") from None
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
 
 
 def read_robot(path: Path) -> Robot:
