@@ -119,3 +119,19 @@ def test_check_names_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_shipped_robots_pass_the_check() -> None:
     for name in pronk.robots.ROBOT_NAMES:
         assert run(["robot", "check", name]) == 0
+
+
+def test_installed_robot_is_found_by_its_entry_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model_of("pendulum", tmp_path)
+    package = tmp_path / "site"
+    info = package / "my_robots-1.0.dist-info"
+    info.mkdir(parents=True)
+    (package / "my_robots.py").write_text(
+        f"def pendulum(): return {str(tmp_path / 'pendulum.xml')!r}"
+    )
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_robots\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[pronk.robots]\nmy_pendulum = my_robots:pendulum\n")
+    monkeypatch.syspath_prepend(str(package))
+    assert load_robot("my_pendulum").joint_names == ("swing",)

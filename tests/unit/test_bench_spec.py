@@ -71,12 +71,12 @@ def explicit_law(
     positions, clipped = [], 0
     for target in command:
         positions.append(data.qpos.copy())
-        asked = pd_torque(target, data.qpos, data.qvel, stiffness=stiffness, damping=damping)
+        wanted = pd_torque(target, data.qpos, data.qvel, stiffness=stiffness, damping=damping)
         for i, drive in enumerate(drives):
             data.ctrl[i] = clip_torque(
-                asked[i], data.qvel[i], drive.stall_torque, drive.no_load_speed, drive.effort_limit
+                wanted[i], data.qvel[i], drive.stall_torque, drive.no_load_speed, drive.effort_limit
             )
-        clipped += bool(np.any(data.ctrl != asked))
+        clipped += bool(np.any(data.ctrl != wanted))
         mujoco.mj_step(model, data)
     return np.array(positions), clipped / len(command)
 

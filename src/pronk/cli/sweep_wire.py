@@ -56,7 +56,7 @@ def record_wire(
     rate = Plan.servo_rate_hz
     metadata = {"link": str(address), "servo_rate_hz": f"{rate:g}"}
     task = SweepTask(plan=plan, out_dir=out_dir, overwrite=overwrite, metadata=metadata)
-    link = Link(robot=robot.name, address=address, release=release, fresh=fresh)
+    link = Link(robot=robot.source or robot.name, address=address, release=release, fresh=fresh)
     whole: list[str] = []
 
     def tell(event: Event) -> None:

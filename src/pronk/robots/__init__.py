@@ -5,6 +5,7 @@ A robot is a folder with `robot.yaml` and the MJCF or URDF that it names.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -44,9 +45,11 @@ def load_robot(name: str | Path) -> Robot:
     if path.suffix not in _FILES + _MODELS:
         raise RobotError(f"{path}: expected a robot.yaml, or a model ending in .xml or .urdf.")
     try:
-        return _load(path.resolve(), path.stat().st_mtime_ns)
+        robot = _load(path.resolve(), path.stat().st_mtime_ns)
     except OSError:
         raise RobotError(f"{path}: no such file.") from None
+    shipped = str(name) in ROBOT_NAMES
+    return replace(robot, source=str(name) if shipped else str(path.resolve()))
 
 
 @lru_cache

@@ -64,7 +64,7 @@ class Drive:
 
 @dataclass(frozen=True, kw_only=True)
 class Joint:
-    """One actuated joint and how it is asked on the bench."""
+    """One actuated joint and how it is excited on the bench."""
 
     name: str
     """`LEG_JOINT`, for instance FR_hip_roll."""
@@ -85,9 +85,9 @@ class Joint:
     band_hz: tuple[float, float]
     """Frequencies at which the match compares magnitudes [Hz]."""
     clamped: tuple[str, ...] = ()
-    """Joints fixed mechanically while this one is asked; the rest are held by their drives."""
+    """Joints fixed mechanically while this one is excited; the rest are held by their drives."""
     chain: tuple[str, ...] = ()
-    """Joints that can move when this one is asked on a fixed base, itself included, root first."""
+    """Joints that can move when this one is excited on a fixed base, itself too, root first."""
     mirror: tuple[str, float] | None = None
     """The joint whose mechanism this one mirrors and the sign between their coordinates.
 
@@ -111,6 +111,8 @@ class Robot:
     """Builds a fresh, free-floating (or, for an arm, fixed) model without actuators."""
     base_body: str
     """Body that the bench holds still."""
+    source: str = ""
+    """What `load_robot` reads it from: a shipped name or a path."""
     policy_rate_hz: float = 50.0
     timestep_s: float = 0.005
     """Physics step of the training simulator."""
