@@ -411,7 +411,7 @@ def test_friction_at_the_turning_points_is_not_saturation() -> None:
     [
         (np.zeros(4000), SWING, "did not move"),
         (np.where(SWING > 0.0, 0.0015, 0.0), SWING, "did not move"),
-        (SWING, np.zeros(4000), "was not asked"),
+        (SWING, np.zeros(4000), "was not excited"),
         (np.clip(SWING, -0.05, 1.0), SWING, "saturated"),
         (np.clip(SWING, -1.0, 0.1), SWING, "saturated"),
         (np.rad2deg(SWING), np.rad2deg(SWING), "probably in degrees"),

@@ -192,7 +192,7 @@ def test_amplitudes_come_largest_first_and_repeats_together() -> None:
     assert [r.amplitude for r in found] == [0.25, 0.125]
     assert [len(r.repeats) for r in found] == [3, 2]
     assert np.array_equal(found[0].omega, found[1].omega)
-    with pytest.raises(LogError, match="other was not asked; knee were"):
+    with pytest.raises(LogError, match="other was not excited"):
         estimate(log, "other")
 
 

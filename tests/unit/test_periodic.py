@@ -84,7 +84,7 @@ def test_noise_and_distortion_are_told_apart() -> None:
 
 def _output(noise: float) -> np.ndarray:
     read = read_periods(multisine(linear_joint(**KNEE), noise=noise), "knee", Estimator())
-    return read.position.mean(axis=0)[read.asked]
+    return read.position.mean(axis=0)[read.excited]
 
 
 def test_too_few_periods_and_missing_facts_are_refused() -> None:

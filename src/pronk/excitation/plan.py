@@ -1,7 +1,7 @@
-"""The plan of a sweep: which questions, in which order, and what they will do to the robot.
+"""The plan of a sweep: its excitations, their order, and the worst case before anything moves.
 
 Nothing moves before `SweepPlan.check` has passed. It refuses what could exceed a limit of the
-robot in any corner of what is not known of it, and says which amplitude would fit.
+robot in any corner of the robot's uncertainty, and names the amplitude that would fit.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Ask:
     clamped: tuple[str, ...] = ()
     """Joints fixed mechanically meanwhile."""
     signs: tuple[float, ...] = ()
-    """Sign of each joint's command. Mirror-image joints are asked mirrored, so that the match
+    """Sign of each joint's command. Mirror-image joints are excited mirrored, so that the match
     simulates each family once; all positive if empty."""
 
     def offsets(self, rate_hz: float) -> Array:
@@ -62,7 +62,7 @@ class Ask:
 
 @dataclass(frozen=True, kw_only=True)
 class SweepPlan:
-    """Questions in the order in which they will be asked. Build it with `make_plan`."""
+    """Excitations in the order of the sweep. Build it with `make_plan`."""
 
     robot: Robot
     asks: tuple[Ask, ...]
@@ -86,12 +86,12 @@ class SweepPlan:
 
     @property
     def sets(self) -> tuple[tuple[str, ...], ...]:
-        """Joints that are asked together, in order; one log file each."""
+        """Joints that are excited together, in order; one log file each."""
         return tuple(dict.fromkeys(ask.joints for ask in self.asks))
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Joints that are asked, in order."""
+        """Excited joints, in order."""
         return tuple(dict.fromkeys(name for joints in self.sets for name in joints))
 
     def ask_duration_s(self, ask: Ask) -> float:
@@ -101,8 +101,8 @@ class SweepPlan:
     @property
     def duration_s(self) -> float:
         """Time of the whole sweep on the machine's clock [s]."""
-        asked = sum(self.ask_duration_s(ask) for ask in self.asks)
-        return asked + len(self.sets) * (POSE_RAMP_S + 2.0 * self.settle_s)
+        excited = sum(self.ask_duration_s(ask) for ask in self.asks)
+        return excited + len(self.sets) * (POSE_RAMP_S + 2.0 * self.settle_s)
 
     def rows(self) -> list[dict[str, float | str]]:
         """The forecasts as a table: a row per joint, worst case over the uncertainty."""
@@ -140,8 +140,8 @@ class SweepPlan:
         for worst in self.forecasts:
             if not worst.breaches():
                 continue
-            # The forecasts are of the loudest question, which is asked first.
-            ask = next(ask for ask in self.asks if ask.joints == worst.asked)
+            # The forecasts are of the largest amplitude, which comes first.
+            ask = next(ask for ask in self.asks if ask.joints == worst.excited)
             words = worst.breaches()[0]
             fits = self._fit(ask)
             way_out = (
@@ -150,7 +150,7 @@ class SweepPlan:
                 else "no amplitude fits, so choose other joints or another pose"
             )
             raise PlanError(
-                f"{', '.join(ask.joints)}: asked with {ask.amplitude:g} rad, {worst.joint} could "
+                f"{', '.join(ask.joints)}: excited with {ask.amplitude:g} rad, {worst.joint} could "
                 f"{words} (inertia, gains and friction uncertain by "
                 f"{100 * self.uncertainty.inertia:.0f}, {100 * self.uncertainty.stiffness:.0f} and "
                 f"{100 * self.uncertainty.friction:.0f} %); {way_out}."
@@ -231,7 +231,7 @@ def make_plan(
         joints: Names; all of them if None.
         signal: What to ask; its own amplitude is replaced. The paper's chirp if None.
         amplitudes: Peaks of the command [rad]; two or more show friction.
-        repeats: Times each amplitude is asked, one number for all or one each; three or more of
+        repeats: Repeats of each amplitude, one number for all or one each; three or more of
             the largest, which is the one matched, give honest intervals.
         settle_s: Rest after each question [s].
         stiffness: Gains on the drives by joint, instead of the robot's [N m/rad].
@@ -243,7 +243,7 @@ def make_plan(
 
     Raises:
         RobotError: A joint is unknown.
-        PlanError: Nothing would be asked, or joints cannot be asked together.
+        PlanError: The plan is empty, or joints cannot be excited together.
     """
     names = robot.joint_names if joints is None else tuple(dict.fromkeys(joints))
     for name in (*names, *(stiffness or {}), *(damping or {})):
@@ -322,35 +322,35 @@ def _forecast_ask(
     found: list[Forecast] = []
     left = list(ask.joints)
     while left:
-        # The longest chain first: it holds the others of its leg that are asked as well.
+        # The longest chain first: it contains the other excited joints of its leg.
         lead = max(left, key=lambda name: len(set(_chain(robot, name)) & set(left)))
         own = _chain(robot, lead)
-        asked = [name for name in left if name in own]
+        excited = [name for name in left if name in own]
         left = [name for name in left if name not in own]
         originals = _chain(robot, robot.joint(lead).original[0])
         sign = {
             name: robot.joint(name).original[1] * robot.joint(first).original[1]
             for name, first in zip(own, originals, strict=True)
         }
-        twin = dict(zip(own, originals, strict=True))
-        question = {twin[name]: sign[name] * offsets[name] for name in asked}
-        gains = [{twin[name]: g[name] for name in own} for g in (kp, kd)]
+        mirror = dict(zip(own, originals, strict=True))
+        command = {mirror[name]: sign[name] * offsets[name] for name in excited}
+        gains = [{mirror[name]: g[name] for name in own} for g in (kp, kd)]
         key = repr((sorted(gains[0].items()), sorted(gains[1].items()))).encode() + b"".join(
-            name.encode() + wave.tobytes() for name, wave in sorted(question.items())
+            name.encode() + wave.tobytes() for name, wave in sorted(command.items())
         )
         if key not in cache:
             cache[key] = list(
                 forecast(
                     robot,
-                    question,
+                    command,
                     rate_hz=rate_hz,
                     stiffness=gains[0],
                     damping=gains[1],
                     uncertainty=uncertainty,
                 ).values()
             )
-        back = {first: name for name, first in twin.items()}
+        back = {first: name for name, first in mirror.items()}
         for f in cache[key]:
             name = back[f.joint]
-            found.append(replace(f.mirrored(robot, name, sign[name]), asked=ask.joints))
+            found.append(replace(f.mirrored(robot, name, sign[name]), excited=ask.joints))
     return found

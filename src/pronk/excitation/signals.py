@@ -1,4 +1,4 @@
-"""Signals: the questions a joint can be asked, as command offsets about the pose.
+"""Excitation signals of a joint, as command offsets about the pose.
 
 A signal is sampled at the ticks of the policy (50 Hz) and each sample is held until the next
 tick. Every signal is ramped in and out by half a cosine and its last sample is zero, so that the
@@ -36,7 +36,7 @@ class Signal(ABC):
     """Length of the ramp at each end [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be asked.
+        """Refuse impossible settings.
 
         Raises:
             PlanError: A number is not finite, not positive or out of order.
@@ -51,7 +51,7 @@ class Signal(ABC):
     @property
     @abstractmethod
     def band_hz(self) -> tuple[float, float]:
-        """Lowest and highest frequency asked [Hz]."""
+        """Lowest and highest excited frequency [Hz]."""
 
     @property
     def period_s(self) -> float | None:
@@ -144,7 +144,7 @@ class Chirp(Signal):
 
     @property
     def band_hz(self) -> tuple[float, float]:
-        """Lowest and highest frequency asked [Hz]."""
+        """Lowest and highest excited frequency [Hz]."""
         return self.start_hz, self.stop_hz
 
     def _time(self, rate_hz: float) -> Array:
@@ -224,19 +224,19 @@ class Multisine(Signal):
 
     @property
     def harmonic_numbers(self) -> tuple[int, ...]:
-        """Odd harmonics that are asked, increasing."""
+        """Excited odd harmonics, increasing."""
         if self.harmonics:
             return tuple(sorted(set(self.harmonics)))
         return odd_harmonics(self.low_hz, self.high_hz, self.length_s, self.lines)
 
     @property
     def lines_hz(self) -> Array:
-        """Frequencies that are asked [Hz], increasing."""
+        """Excited frequencies [Hz], increasing."""
         return np.asarray(np.array(self.harmonic_numbers) / self.length_s)
 
     @property
     def band_hz(self) -> tuple[float, float]:
-        """Lowest and highest frequency asked [Hz]."""
+        """Lowest and highest excited frequency [Hz]."""
         return float(self.lines_hz[0]), float(self.lines_hz[-1])
 
     @property
@@ -336,7 +336,7 @@ class SineSteps(Signal):
 
     @property
     def band_hz(self) -> tuple[float, float]:
-        """Lowest and highest frequency asked [Hz]."""
+        """Lowest and highest excited frequency [Hz]."""
         return min(self.frequencies_hz), max(self.frequencies_hz)
 
     def windows(self, rate_hz: float = POLICY_RATE_HZ) -> tuple[tuple[int, int, float], ...]:

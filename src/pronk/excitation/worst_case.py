@@ -1,7 +1,7 @@
 """What a question will do to the robot, computed before anything moves.
 
 The question is put to the bench model with the gains of the real drives, once for every corner of
-what is not known of the robot. What must not happen in any corner, does not get asked.
+what is not known of the robot. A plan that exceeds a limit in any corner is refused.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Forecast:
     """
 
     joint: str
-    asked: tuple[str, ...] = ()
+    excited: tuple[str, ...] = ()
     """Joints of the question: this one, or neighbours of it."""
     amplitude: float
     """Peak of the command [rad]; 0 for a joint that is only held."""
@@ -164,12 +164,12 @@ def forecast(
     Raises:
         PlanError: No chain holds all of the joints, or the simulation diverges.
     """
-    asked = next((n for n in offsets if set(offsets) <= set(robot.joint(n).chain or (n,))), None)
-    if asked is None:
+    lead = next((n for n in offsets if set(offsets) <= set(robot.joint(n).chain or (n,))), None)
+    if lead is None:
         raise PlanError(
-            f"{', '.join(offsets)} cannot be asked together: one is clamped while another moves."
+            f"{', '.join(offsets)} cannot be excited together: one is clamped while another moves."
         )
-    joint = robot.joint(asked)
+    joint = robot.joint(lead)
     chain = joint.chain or (joint.name,)
     spec = bench_spec(
         robot,
@@ -192,8 +192,8 @@ def forecast(
     position, velocity = _roll(models, order, steps)
     if not (np.isfinite(position).all() and np.abs(velocity).max() < 1e4):
         raise PlanError(
-            f"{asked}: the simulation of the question diverges; its gains "
-            f"({stiffness[asked]:g} N m/rad, {damping[asked]:g} N m s/rad) are not stable."
+            f"{lead}: the simulation of the excitation diverges; its gains "
+            f"({stiffness[lead]:g} N m/rad, {damping[lead]:g} N m s/rad) are not stable."
         )
     forecasts = {}
     for i, name in enumerate(order):
@@ -266,7 +266,7 @@ def _extremes(
     joint = robot.joint(name)
     drive = joint.drive
     low, high = torque_limits(velocity, drive.stall_torque, drive.no_load_speed, drive.effort_limit)
-    # A drive that can give nothing at this speed is over its limit whatever is asked.
+    # A drive that can give nothing at this speed exceeds its limit with any command.
     room = np.maximum(np.where(torque >= 0.0, high, -low), 1e-6)
     given = np.clip(torque, low, high)
     power = electrical_power(

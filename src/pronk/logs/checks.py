@@ -40,7 +40,7 @@ class Motion:
 
     travel: float
     """Greatest less least position [rad]."""
-    asked: float
+    commanded: float
     """Greatest less least command [rad]."""
     step: float
     """Smallest change of position that occurs: the encoder's step, or noise [rad]."""
@@ -58,16 +58,16 @@ def motion(log: SweepLog, joint: str) -> Motion:
     column = log.column(joint)
     position, command = log.position[:, column], log.command[:, column]
     levels = np.unique(position)
-    travel, asked = float(np.ptp(position)), float(np.ptp(command))
+    travel, commanded = float(np.ptp(position)), float(np.ptp(command))
     at_end = 0.0
-    if travel > 0.0 and asked > 0.0:
+    if travel > 0.0 and commanded > 0.0:
         for outward in (1.0, -1.0):
             out = outward * position
             near = out >= out.max() - _NEAR_END * travel
-            at_end += _stopped(log.time, near, outward * command, _MOVES_ON * asked)
+            at_end += _stopped(log.time, near, outward * command, _MOVES_ON * commanded)
     return Motion(
         travel=travel,
-        asked=asked,
+        commanded=commanded,
         step=float(np.diff(levels).min()) if len(levels) > 1 else 0.0,
         at_end=at_end / float(log.time[-1] - log.time[0]),
     )
@@ -86,7 +86,7 @@ def _stopped(time: Array, near: NDArray[np.bool_], command: Array, outward: floa
 
 
 def check_motion(log: SweepLog, joint: str) -> Motion:
-    """Refuse a joint that was not asked, did not move, or lies at an end of its travel.
+    """Refuse a joint that was not excited, did not move, or lies at an end of its travel.
 
     Returns:
         How it moved.
@@ -97,13 +97,13 @@ def check_motion(log: SweepLog, joint: str) -> Motion:
     where = log.source or "log"
     found = motion(log, joint)
     unit = log.unit(joint) if log.unit(joint) != "unknown" else "of an unknown unit"
-    if found.asked == 0.0:
-        raise LogError(f"{where}: {joint} was not asked; its command stands still.")
-    if found.travel < _UNMOVED * found.asked or (
-        found.travel <= _FEW_STEPS * found.step and found.travel < 0.5 * found.asked
+    if found.commanded == 0.0:
+        raise LogError(f"{where}: {joint} was not excited; its command is constant.")
+    if found.travel < _UNMOVED * found.commanded or (
+        found.travel <= _FEW_STEPS * found.step and found.travel < 0.5 * found.commanded
     ):
         raise LogError(
-            f"{where}: {joint} did not move: its command travels {found.asked:.3g} {unit}, its "
+            f"{where}: {joint} did not move: its command travels {found.commanded:.3g} {unit}, its "
             f"position {found.travel:.3g}; check that its drive was enabled, the joint free, and "
             "the columns named right."
         )

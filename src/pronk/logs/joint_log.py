@@ -1,4 +1,4 @@
-"""SweepLog: what was asked of the joints and what they answered, in memory.
+"""JointLog: commanded and measured motion of joints, in memory.
 
 Files are read and written next door (`readers.py`, `mcap_writer.py`); this module only says what a
 log is and what must be true of one.
@@ -25,7 +25,7 @@ class Segment:
     kind: str
     """One of `SIGNAL_KINDS`; `unknown` for imported logs that do not say."""
     joints: tuple[str, ...]
-    """Joints that were asked (several only with uncorrelated signals)."""
+    """Excited joints (several only with uncorrelated signals)."""
     start: float
     """First instant, on the clock of `SweepLog.time` [s]."""
     stop: float
@@ -35,7 +35,7 @@ class Segment:
     repeat: int = 0
     """Number of this repeat of the same question, from 0."""
     band_hz: tuple[float, float] = (0.0, 0.0)
-    """Lowest and highest frequency asked [Hz]."""
+    """Lowest and highest excited frequency [Hz]."""
     period_s: float | None = None
     """Period of a periodic signal [s]; None for chirps."""
     clamped: tuple[str, ...] = ()

@@ -4,10 +4,10 @@ Each message is a line of JSON with its schema in the file, so that Foxglove and
 them as they are:
 
 - `/sweep/header`, once, first: robot, joints, gains, pose, units, whether the robot is virtual;
-- `/sweep/segment`, before the samples it speaks of: a cut log still knows what was asked;
+- `/sweep/segment`, before its samples, so that a cut log still has it;
 - `/sweep/sample`, one per measured state: command in force, answer, instantaneous frequency;
 
-and `/sweep/end`, last: whether everything was asked, and if not, why.
+and `/sweep/end`, last: whether the sweep is complete, and if not, why.
 """
 
 from __future__ import annotations

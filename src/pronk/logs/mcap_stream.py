@@ -19,7 +19,7 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 MOST_BYTES = 2 * 2**30
-"""Largest size that all chunks of a file may unpack to, unless told otherwise [bytes]."""
+"""Largest size that all chunks of a file may unpack to by default [bytes]."""
 _MOST_CHUNK = 256 * 2**20
 """Largest size of one unpacked chunk [bytes]; writers use 1 to 8 MiB."""
 

@@ -1,7 +1,7 @@
 """What the position holds that a linear joint would not: the friction detector.
 
-A linear joint asked at f answers at f. Dry friction is odd in the velocity, so it answers at 3 f as
-well, the more the smaller the motion; even distortion (gravity, a bent cable) does not show there.
+A linear joint excited at f responds at f. Dry friction is odd in the velocity, so it responds at
+3 f as well, the more the smaller the motion; even distortion (gravity, a bent cable) does not.
 For the knee of the Mini Cheetah at 0.25 rad the ratio is 0.0001 without friction and 0.0033 for
 every 0.05 N m of it, inversely to the amplitude. A multisine shows odd and even distortion at the
 odd and even lines that it left silent.
@@ -95,7 +95,7 @@ def third_harmonic(log: SweepLog, joint: str, band_hz: tuple[float, float] = LOW
 
     Args:
         log: One question (`SweepLog.cut`).
-        joint: The joint asked.
+        joint: The excited joint.
         band_hz: Frequencies looked at [Hz].
 
     Returns:
@@ -124,15 +124,15 @@ def third_harmonic(log: SweepLog, joint: str, band_hz: tuple[float, float] = LOW
 class Distortion:
     """Size of what the position holds beside the linear response, RMS over lines.
 
-    All relative to the RMS of the position over the lines asked.
+    All relative to the RMS of the position over the excited lines.
     """
 
     even: float
-    """At even lines that were not asked, noise taken off; NaN if there are none."""
+    """At even lines that were not excited, noise taken off; NaN if there are none."""
     odd: float
-    """At odd lines that were not asked, noise taken off; NaN if there are none."""
+    """At odd lines that were not excited, noise taken off; NaN if there are none."""
     noise: float
-    """Noise of the average over periods at the lines asked."""
+    """Noise of the average over periods at the excited lines."""
 
 
 def distortion(log: SweepLog, joint: str, estimator: Estimator) -> Distortion:
@@ -140,21 +140,21 @@ def distortion(log: SweepLog, joint: str, estimator: Estimator) -> Distortion:
 
     Args:
         log: One question (`SweepLog.cut`).
-        joint: The joint asked.
+        joint: The excited joint.
         estimator: Gives the band.
 
     Raises:
         LogError: As `read_periods`.
     """
     read = read_periods(log, joint, estimator)
-    asked = read.asked
+    excited = read.excited
     mean = read.position.mean(axis=0)
     count = len(read.position)
     variance = (np.abs(read.position - mean) ** 2).sum(axis=0) / (count * (count - 1))
-    reference = float(np.mean(np.abs(mean[asked]) ** 2))
-    low, high = np.flatnonzero(asked)[[0, -1]]
-    between = np.arange(len(asked))
-    silent = ~asked & (between >= low) & (between <= high)
+    reference = float(np.mean(np.abs(mean[excited]) ** 2))
+    low, high = np.flatnonzero(excited)[[0, -1]]
+    between = np.arange(len(excited))
+    silent = ~excited & (between >= low) & (between <= high)
 
     def share(which: NDArray[np.bool_]) -> float:
         if not which.any():
@@ -165,5 +165,5 @@ def distortion(log: SweepLog, joint: str, estimator: Estimator) -> Distortion:
     return Distortion(
         even=share(silent & (read.lines % 2 == 0)),
         odd=share(silent & (read.lines % 2 == 1)),
-        noise=float(np.sqrt(np.mean(variance[asked]) / reference)),
+        noise=float(np.sqrt(np.mean(variance[excited]) / reference)),
     )

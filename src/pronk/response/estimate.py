@@ -27,7 +27,7 @@ _UNMOVED = 0.01
 
 
 def questions(log: SweepLog, joint: str) -> list[list[SweepLog]]:
-    """The questions a joint was asked, one log each, gathered into repeats.
+    """Split a log into the excitations of one joint, gathered into repeats.
 
     Questions of the same kind, amplitude, period, band and clamping are repeats of one another.
     A log without segments is one question of unknown kind; an amplitude that is not known is read
@@ -37,7 +37,7 @@ def questions(log: SweepLog, joint: str) -> list[list[SweepLog]]:
         Groups of repeats, largest amplitude first.
 
     Raises:
-        LogError: There is no such joint, it was never asked, or its command stands still.
+        LogError: There is no such joint, it was not excited, or its command is constant.
     """
     column = log.column(joint)
     where = log.source or "log"
@@ -50,8 +50,8 @@ def questions(log: SweepLog, joint: str) -> list[list[SweepLog]]:
             )
         ]
     if not segments:
-        asked = sorted({name for segment in log.segments for name in segment.joints})
-        raise LogError(f"{where}: {joint} was not asked; {', '.join(asked)} were.")
+        excited = sorted({name for segment in log.segments for name in segment.joints})
+        raise LogError(f"{where}: {joint} was not excited; {', '.join(excited)} were.")
     groups: dict[tuple[object, ...], list[SweepLog]] = {}
     for segment in segments:
         part = log.cut(segment)
@@ -90,11 +90,11 @@ def log_rate(parts: Sequence[SweepLog]) -> float:
 def _check_moved(part: SweepLog, joint: str) -> None:
     column = part.column(joint)
     moved = float(np.ptp(part.position[:, column]))
-    asked = float(np.ptp(part.command[:, column]))
-    if moved < _UNMOVED * asked:
+    commanded = float(np.ptp(part.command[:, column]))
+    if moved < _UNMOVED * commanded:
         raise LogError(
             f"{part.source or 'log'}: {joint} moved {moved:.3g} while its command travelled "
-            f"{asked:.3g}; check that its drive was enabled and the joint free."
+            f"{commanded:.3g}; check that its drive was enabled and the joint free."
         )
 
 
@@ -148,10 +148,10 @@ def estimate(
         estimator: Settings; the defaults if not given.
 
     Returns:
-        One response per amplitude (and per kind, if several were asked), largest amplitude first.
+        One response per amplitude (and per kind, if there are several), largest amplitude first.
 
     Raises:
-        LogError: The joint is unknown, was not asked, or did not move; or a question is too short.
+        LogError: The joint is unknown, was not excited, or did not move; or a segment is too short.
     """
     settings = estimator or Estimator()
     groups = questions(log, joint)

@@ -66,10 +66,10 @@ class H1Operator:
         held = held_mean(time, command, grid)
         at_rest = rests(held, grid.rate_hz) if padded is None else padded
         where = layout(grid, estimator, padded=at_rest)
-        asked = segment_spectra(held, where, estimator)
-        uu = np.asarray((np.abs(asked) ** 2).sum(axis=0))
+        excited = segment_spectra(held, where, estimator)
+        uu = np.asarray((np.abs(excited) ** 2).sum(axis=0))
         scale = 1.0 / np.maximum(uu, np.finfo(np.float64).tiny)
-        conjugate = np.conj(asked) * (scale / hold(where.omega, grid.rate_hz))
+        conjugate = np.conj(excited) * (scale / hold(where.omega, grid.rate_hz))
         samples = np.arange(len(where.window)) / grid.rate_hz
         kernel = where.window[:, None] * np.exp(-1j * np.outer(samples, where.omega))
         # Taking the mean of a segment away is taking the mean of the kernel away.

@@ -1,8 +1,8 @@
 """Multisines, read line by line.
 
 Whole periods need no window and leak nothing, so the transform of a period is exact at the lines
-that were asked. The scatter from period to period is noise; what stands at lines that nobody
-asked, above that noise, is nonlinear distortion (`distortion.py`). After Pintelon and Schoukens,
+that were excited. The scatter from period to period is noise; what stands at lines that were not
+excited, above that noise, is nonlinear distortion (`distortion.py`). After Pintelon and Schoukens,
 *System Identification: A Frequency Domain Approach*, 2nd ed.: best linear approximation, even and
 odd detection lines.
 """
@@ -25,9 +25,9 @@ from pronk.response.response import FrequencyResponse
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_ASKED = 0.02
-"""Share of the largest line (amplitude) above which a line counts as asked: above what jitter of a
-tenth of a sample leaves at silent lines, far below the tilt of pronk's multisines (0.07)."""
+_EXCITED = 0.02
+"""Share of the largest line (amplitude) above which a line counts as excited: above what jitter of
+a tenth of a sample leaves at silent lines, far below the tilt of pronk's multisines (0.07)."""
 _SAME_PERIOD = 0.1
 """Largest RMS difference, as a share of the command, between periods that count as equal."""
 _ENOUGH_REPEATS = 3
@@ -41,7 +41,7 @@ class Periods:
     grid: Grid
     """Whole periods from the first that counts."""
     omega: Array
-    """Every line in the band, asked or not [rad/s], shape (l,)."""
+    """Every line in the band, excited or not [rad/s], shape (l,)."""
     lines: NDArray[np.intp]
     """Their numbers (1 is the inverse of the period), shape (l,)."""
     command: ComplexArray
@@ -50,10 +50,10 @@ class Periods:
     """Shape (p, l)."""
 
     @property
-    def asked(self) -> NDArray[np.bool_]:
+    def excited(self) -> NDArray[np.bool_]:
         """Lines that the command holds, shape (l,)."""
         size = np.abs(self.command).mean(axis=0)
-        return np.asarray(size >= _ASKED * size.max())
+        return np.asarray(size >= _EXCITED * size.max())
 
 
 def _steady(command: Array, samples: int) -> tuple[int, int]:
@@ -115,7 +115,7 @@ def read_periods(
 
     Args:
         log: One question (`SweepLog.cut`), whose segment gives the period.
-        joint: The joint asked.
+        joint: The excited joint.
         estimator: Gives the band.
         rate_hz: Rate of the analysis grid; about that of the timestamps if not given.
 
@@ -211,7 +211,7 @@ def estimate_multisine(
 
     Args:
         parts: The questions, one log each (`SweepLog.cut`).
-        joint: The joint asked.
+        joint: The excited joint.
         amplitude: Peak of the command [rad].
         estimator: Gives the band.
         rate_hz: Rate of the analysis grid, adjusted to a whole number of samples a period.
@@ -220,18 +220,18 @@ def estimate_multisine(
         LogError: Too few periods, or questions with different lines.
     """
     read = [read_periods(part, joint, estimator, rate_hz=rate_hz) for part in parts]
-    asked = read[0].asked
+    excited = read[0].excited
     for other in read[1:]:
-        if len(other.asked) != len(asked) or not (other.asked == asked).all():
+        if len(other.excited) != len(excited) or not (other.excited == excited).all():
             raise LogError(
                 f"{parts[0].source or 'log'}: the multisines of {joint} ask different lines; give "
                 "repeats the same period and band."
             )
-    omega = read[0].omega[asked]
+    omega = read[0].omega[excited]
     period = float(parts[0].segments[0].period_s or 0.0)
     return combined(
-        [r.command[:, asked] for r in read],
-        [r.position[:, asked] for r in read],
+        [r.command[:, excited] for r in read],
+        [r.position[:, excited] for r in read],
         hold(omega, read[0].grid.rate_hz),
         omega=omega,
         joint=joint,
@@ -260,8 +260,8 @@ def multisine_operator(
     lines = _lines(grid, samples, estimator)
     u = np.fft.rfft(held_mean(time, command, grid).reshape(-1, samples), axis=1)[:, lines] / samples
     size = np.abs(u).mean(axis=0)
-    asked = size >= _ASKED * size.max()
-    lines, u = lines[asked], u[:, asked]
+    excited = size >= _EXCITED * size.max()
+    lines, u = lines[excited], u[:, excited]
     omega = 2.0 * np.pi * lines * grid.rate_hz / samples
     kernel = np.exp(-2j * np.pi * np.outer(np.arange(samples), lines) / samples) / samples
     excitation = np.asarray((np.abs(u) ** 2).sum(axis=0))

@@ -49,7 +49,7 @@ class FrequencyResponse:
     delay_s: float = 0.0
     """Command delay from the slope of the phase beyond the fitted joint [s]; NaN if not fitted."""
     third_harmonic: float = float("nan")
-    """Response at three times the asked frequency over that at it: the friction detector."""
+    """Response at three times the excited frequency over that at it: the friction detector."""
     virtual: bool = False
     source: str = ""
 

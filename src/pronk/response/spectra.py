@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _SILENT = 1e-4
-"""Share of the largest excitation (power) below which a frequency counts as not asked."""
+"""Share of the largest excitation (power) below which a frequency counts as not excited."""
 
 
 _LEAKED = 0.3
@@ -181,7 +181,7 @@ class Sums:
         return np.asarray(h1 / hold(omega, rate_hz))
 
     def coherence(self) -> Array:
-        """Magnitude-squared coherence; 0 where the frequency was not asked, shape (f,).
+        """Magnitude-squared coherence; 0 where the frequency was not excited, shape (f,).
 
         Every segment counts, also those in which a chirp is elsewhere: they bring the noise (and
         the harmonics) at this frequency and nothing else. Coherence is then the share of the
@@ -190,9 +190,9 @@ class Sums:
         """
         tiny = np.finfo(np.float64).tiny
         raw = np.abs(self.uy) ** 2 / np.maximum(self.uu * self.yy, tiny)
-        return np.where(self.asked(), np.clip(raw, 0.0, 1.0), 0.0)
+        return np.where(self.excited(), np.clip(raw, 0.0, 1.0), 0.0)
 
-    def asked(self) -> NDArray[np.bool_]:
+    def excited(self) -> NDArray[np.bool_]:
         """Frequencies that the command holds by more than the leakage of others, shape (f,)."""
         beside = np.pad(self.uu, 1)
         leaked = self.uu < _LEAKED * np.maximum(beside[:-2], beside[2:])

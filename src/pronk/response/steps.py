@@ -45,9 +45,9 @@ class Steps:
     omega: Array
     """[rad/s], increasing, shape (f,)."""
     command: ComplexArray
-    """At the frequency asked, per block, shape (b, f)."""
+    """At the excited frequency, per block, shape (b, f)."""
     position: ComplexArray
-    """At the frequency asked, per block, shape (b, f)."""
+    """At the excited frequency, per block, shape (b, f)."""
     factor: ComplexArray
     """Grid factor of each step (`grid.hold`), shape (f,)."""
     third: Array
@@ -87,7 +87,7 @@ def read_steps(log: SweepLog, joint: str, estimator: Estimator, rate_hz: float) 
 
     Args:
         log: One question (`SweepLog.cut`) with its instantaneous frequency.
-        joint: The joint asked.
+        joint: The excited joint.
         estimator: Gives the band.
         rate_hz: About the rate of the grid; each step takes a whole number of samples a period.
 
@@ -167,7 +167,7 @@ def estimate_steps(
 
     Args:
         parts: The questions, one log each (`SweepLog.cut`).
-        joint: The joint asked.
+        joint: The excited joint.
         amplitude: Peak of the command [rad].
         estimator: Gives the band.
         rate_hz: About the rate of the analysis grid.
