@@ -19,7 +19,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.actuator.model import winding_loss
+from pronk.actuator.model import voltage_limits, winding_loss
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
 from pronk.robots.robot import Robot
@@ -455,11 +455,8 @@ def power(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limit
 
 def _given(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limits) -> Array:
     """The torque requested, as far as back-EMF leaves voltage for it [N m]. (..., n)."""
-    share = v / limits.no_load
-    torque = kp * (target - q) - kd * v
-    return np.minimum(
-        np.maximum(torque, limits.stall * (-1.0 - share)), limits.stall * (1.0 - share)
-    )
+    low, high = voltage_limits(v, limits.stall, limits.no_load)
+    return np.minimum(np.maximum(kp * (target - q) - kd * v, low), high)
 
 
 def _work_and_loss(v: Array, torque: Array, limits: Limits) -> tuple[Array, Array]:
