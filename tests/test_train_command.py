@@ -79,7 +79,7 @@ def walking_policy(path: Path, phase: str = "walk") -> Path:
             "--ranges-from b.yaml|--gains naive",
         ),
         (("walk", "--gains", "naive", "--ranges-from", "b.yaml"), "b.yaml|no such file"),
-        (("jump", "--gains", "naive"), "--from|pronk train all"),
+        (("jump", "--gains", "naive"), "--init-checkpoint|pronk train all"),
         (
             ("walk", "--gains", "naive", "--init-checkpoint", "x"),
             "--init-checkpoint x|jump|random weights",
@@ -206,7 +206,7 @@ def test_resuming_with_other_gains_or_another_walk_is_refused(capsys, tmp_path):
     other = settings(task="jump", iterations=jump, start=str(start), start_sha256="1" * 64)
     folder.write_config(other, {})
     said = refused(capsys, "jump", "--init-checkpoint", start, "--out", folder.path, "--resume")
-    assert "--from is" in said
+    assert "--init-checkpoint is" in said
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2", "schema: pronk/gains/1", "schema: {a: b"])

@@ -270,7 +270,7 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
 def test_ctrl_c_ends_the_game_cleanly(hopper: Path, tmp_path: Path) -> None:
     pytest.importorskip("mjviser")
     figures = tmp_path / "figures.json"
-    words = ["play", str(hopper), "--port", "18770", "--gamepad", "False", "--json", str(figures)]
+    words = ["play", str(hopper), "--port", "18770", "--no-gamepad", "--json", str(figures)]
     process = subprocess.Popen(
         [sys.executable, "-u", "-m", "pronk.cli.main", *words],
         stdout=subprocess.PIPE,

@@ -97,7 +97,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_json(path: Path | None, figures: dict[str, Any]) -> None:
-    """Write a command's figures, if a file was asked for."""
+    """Write a command's figures, if a file was requested."""
     if path is None:
         return
     from pronk.files import write_text

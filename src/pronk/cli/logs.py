@@ -92,7 +92,7 @@ def read(paths: Sequence[Path], reading: ReadingOptions, robot: Robot | None) ->
     return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **options)
 
 
-def asked_joints(log: SweepLog) -> tuple[str, ...]:
+def excited_joints(log: SweepLog) -> tuple[str, ...]:
     """Joints that a log asks: those of its segments, or those whose command moves.
 
     Raises:
@@ -100,14 +100,14 @@ def asked_joints(log: SweepLog) -> tuple[str, ...]:
     """
     named = {name for segment in log.segments for name in segment.joints}
     moving = (log.command.max(axis=0) - log.command.min(axis=0)) > 0.0
-    asked = tuple(
+    excited = tuple(
         name
         for name, moves in zip(log.joints, moving, strict=True)
         if (name in named if log.segments else moves)
     )
-    if not asked:
-        raise LogError(f"{log.source or 'log'}: no command moves, so no joint was asked anything.")
-    return asked
+    if not excited:
+        raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
+    return excited
 
 
 def home(log: SweepLog, out: Path | None) -> tuple[Path, str]:

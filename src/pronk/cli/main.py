@@ -135,6 +135,17 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> C
     call.__signature__ = inspect.signature(command, eval_str=True)  # type: ignore[attr-defined]
     call.__doc__ = command.__doc__
     call.__annotations__ = inspect.get_annotations(command, eval_str=True)
+    for name, kind in call.__annotations__.items():
+        if kind == bool | None:  # tyro wants a value there: --x True.
+            option = name.replace("_", "-")
+            flags = {f"--{option}": "True", f"--no-{option}": "False"}
+            arguments = [
+                word
+                for given_word in arguments
+                for word in (
+                    (f"--{option}", flags[given_word]) if given_word in flags else (given_word,)
+                )
+            ]
     config = (tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes)
     messages = io.StringIO()
     try:

@@ -25,7 +25,7 @@ def response(
     reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
     json_file: console.JsonFile = None,
 ) -> None:
-    """Estimate the frequency response of every joint that was asked.
+    """Estimate the frequency response of every joint that was excited.
 
     Args:
         paths: Logs, or folders of logs.
@@ -46,19 +46,19 @@ def response(
     with console.progress() as report:
         done = report.bar("estimate")
         for i, log in enumerate(read):
-            asked = logs.asked_joints(log)
+            excited = logs.excited_joints(log)
             found: list[FrequencyResponse] = []
-            for k, joint in enumerate(asked):
+            for k, joint in enumerate(excited):
                 found += estimate(log, joint, settings)
-                done((i + (k + 1) / (len(asked) + 1)) / len(read))
+                done((i + (k + 1) / (len(excited) + 1)) / len(read))
             folder, stem = logs.home(log, out)
             path = folder / f"{stem}.response.npz"
             save(path, found)
             written.append(path)
             if plots:
-                for joint in asked:
+                for joint in excited:
                     mine = [r for r in found if r.joint == joint]
-                    name = stem if asked == (stem,) else f"{stem}.{joint}"
+                    name = stem if excited == (stem,) else f"{stem}.{joint}"
                     written.append(
                         style.save(figures.answers(mine), folder / f"{name}.response.svg")
                     )

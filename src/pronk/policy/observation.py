@@ -73,7 +73,7 @@ class History:
         Raises:
             ArtefactError: The command has another size or is not finite; nothing was taken.
         """
-        asked = finite("the command", command, (3,))
+        commanded = finite("the command", command, (3,))
         position = np.asarray(measurement.position, np.float32) - self._default
         self._position = _pushed(self._position, position)
         self._velocity = _pushed(self._velocity, np.asarray(measurement.velocity, np.float32))
@@ -83,7 +83,7 @@ class History:
             "joint_position": self._position,
             "joint_velocity": self._velocity,
             "action": self._actions,
-            "command": asked,
+            "command": commanded,
         }
         return np.concatenate([np.asarray(parts[name], np.float32).ravel() for name in MEASURED])
 

@@ -1,4 +1,4 @@
-"""What the paper's robot was told as it jumped (arXiv 2404.15096, Table III)."""
+"""Velocity commands of the paper's jumps (arXiv 2404.15096, Table III)."""
 
 JUMPS: dict[str, tuple[float, float, float]] = {
     "forward 1": (1.0, 0.0, 0.0),

@@ -1,6 +1,7 @@
 """TrainingGains: the gains that training draws about, from `gains.yaml` or the naive ones.
 
-Naive is what a user trains with who has not asked the robot: the gains of the real drive, put
+Naive is what a user trains with without a measurement of the robot: the gains of the real drive,
+put
 into the simulator as they are (paper S4, reading A20). Everything else stays the same, so that
 two policies differ by their nominal gains and by nothing else.
 """
@@ -84,7 +85,7 @@ def training_gains(choice: str | Path, robot: Robot, *, like: Path | None = None
     if str(choice) != NAIVE:
         if like is not None:
             raise PronkError(
-                f"ranges like {like} were asked for with the gains of {choice}; "
+                f"ranges like {like} were requested with the gains of {choice}; "
                 "they go with the choice 'naive' only, a gains.yaml has its own."
             )
         path = Path(choice)

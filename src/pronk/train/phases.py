@@ -1,7 +1,8 @@
 """The phases of training: walk, then jump with a strong hint, then with a weak one (P1, P2).
 
 Phase 1 walks. The networks are then widened by the jump input, and in phase 2 half of the robots
-are told to jump now and then. In 2a equal feet are rewarded strongly, which is what makes a trot
+are commanded to jump now and then. In 2a equal feet are rewarded strongly, which is what makes a
+trot
 leave the ground with all feet at once; in 2b a tenth of that is left (Table II).
 """
 
@@ -153,7 +154,8 @@ PHASES: tuple[Phase, ...] = (
     # And then done alike every time: an actor that explores on (its standard deviation .59 after
     # 560 iterations, .42 before the first jump) walks worse and scatters. Landing as it goes
     # backwards, a robot stands until its thighs are on the ground, a centimetre of way at 5 a
-    # second: 6 of 20 such landings were well. Asked for before there is a jump, it might teach that
+    # second: 6 of 20 such landings were well. Commanded for before there is a jump, it might teach
+    # that
     # there be none, so it comes to cost more; 60, 40 and 100 made 280 of 300 landings well, of
     # three seeds, but the first fell to .11 m and lost .8 of 2.4 m/s. What jumps are worth falls:
     # with as much as at first walking came to be .18 m/s too fast, turning .2 rad/s too slow; led,

@@ -2,7 +2,7 @@
 
 mjlab finds this module by its entry point, so its own `train`, `play` and `list-envs` know
 `Pronk-Walk-MiniCheetah` and `Pronk-Jump-MiniCheetah`. `pronk train` builds the same
-configurations with the gains that were asked for.
+configurations with the gains that were requested.
 """
 
 from __future__ import annotations

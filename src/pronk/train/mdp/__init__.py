@@ -1,1 +1,1 @@
-"""What is simulated, told, seen, drawn and paid: the environment that a policy is trained in."""
+"""Simulation, commands, observations, randomization and rewards of the training environment."""

@@ -1,4 +1,4 @@
-"""What the robot is told: velocities, redrawn now and then, and the jump input.
+"""Commands: velocities, redrawn at intervals, and the jump input.
 
 Checklist C1 to C4. Speed ranges grow from a part of the full range to the whole: with +-3 m/s
 from the first step a policy learns to stand, since the tracking reward has no slope so far away
@@ -80,7 +80,7 @@ class MotionCommandCfg(CommandTermCfg):
     jump_off_s: tuple[float, float] = (1.0, 2.5)
     """Time between jump inputs [s]."""
     leap: float = 0.6
-    """In jump mode the horizontal speed asked for is this much higher [m/s], for commands below
+    """In jump mode the horizontal speed commanded is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not paid."""
     width: float = 1.0
@@ -155,7 +155,7 @@ class MotionCommand(CommandTerm):
     def target(self) -> Tensor:
         """Horizontal velocity that is rewarded: the command, in jump mode with `leap`. (N, 2).
 
-        What a robot ran too fast when the jump command came is asked for on top.
+        What a robot ran too fast when the jump command came is requested on top.
         """
         horizontal = self.velocity[:, :2]
         speed = torch.linalg.vector_norm(horizontal, dim=-1)
@@ -174,7 +174,7 @@ class MotionCommand(CommandTerm):
 
     @property
     def standing(self) -> Tensor:
-        """Asked to stand still: no velocity and no jump. Bool, (N,)."""
+        """Commanded to stand still: no velocity and no jump. Bool, (N,)."""
         return (self.velocity.square().sum(dim=-1) < 1e-4) & ~self.tracker.mode
 
     @property
@@ -216,10 +216,10 @@ class MotionCommand(CommandTerm):
     def _follow(self, motion: Motion) -> None:
         """Tell the tracker what the robots did in the step just simulated."""
         horizontal, target = motion.velocity_heading, self.target
-        asked = self.velocity[:, :2]
-        speed = torch.linalg.vector_norm(asked, dim=-1)
+        commanded = self.velocity[:, :2]
+        speed = torch.linalg.vector_norm(commanded, dim=-1)
         # The part towards the command, which `target` lies along; zero without one.
-        along = (horizontal * asked).sum(dim=-1) / speed.clamp_min(1e-6)
+        along = (horizontal * commanded).sum(dim=-1) / speed.clamp_min(1e-6)
         self.tracker.advance(
             jump=self.jump,
             contact=motion.contact,
@@ -235,10 +235,10 @@ class MotionCommand(CommandTerm):
             dt=self._env.step_dt,
         )
         if not self.scripted:
-            self.ranges.advance(horizontal - asked, ~self.tracker.mode)
+            self.ranges.advance(horizontal - commanded, ~self.tracker.mode)
 
     def _direction(self, heading: Tensor) -> Tensor:
-        """Unit vector of the velocity asked for, world frame, or zero. (N, 2).
+        """Unit vector of the velocity commanded, world frame, or zero. (N, 2).
 
         Args:
             heading: Unit vector of where the trunk heads, world frame. (N, 2)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class PositionDriveCfg(DcMotorActuatorCfg):
-    """mjlab's DC motor behind a PD law, of which positions alone are asked."""
+    """mjlab's DC motor behind a PD law, of which positions alone are commanded."""
 
     def build(
         self, entity: Entity, target_ids: list[int], target_names: list[str]
@@ -63,10 +63,10 @@ class PositionDrive(DcMotorActuator[PositionDriveCfg]):
         stall, limit, back_emf = (
             params[name] for name in ("saturation_effort", "force_limit", "back_emf")
         )
-        asked = params["stiffness"] * (cmd.position_target - cmd.pos)
-        asked = torch.addcmul(asked, params["damping"], cmd.vel, value=-1.0)
+        commanded = params["stiffness"] * (cmd.position_target - cmd.pos)
+        commanded = torch.addcmul(commanded, params["damping"], cmd.vel, value=-1.0)
         # Without the back-EMF both ends of the line are at the stall torque, whatever the speed.
-        torque = torch.addcmul(asked, back_emf, cmd.vel).clamp(-stall, stall)
+        torque = torch.addcmul(commanded, back_emf, cmd.vel).clamp(-stall, stall)
         return torch.addcmul(torque, back_emf, cmd.vel, value=-1.0).clamp(-limit, limit)
 
 

@@ -41,8 +41,9 @@ class JumpSettings:
     .12 s from .26 s on, four policies found the jump late or, one of them, never."""
     haste: float = 0.3
     """Standard deviation of the kernel that takes worth from a jump for what its running start was
-    faster than told [m/s]. Paid for its height alone, speed is braked away for it: policies came to
-    run at 2.2 to 2.5 m/s when told 2."""
+    faster than commanded [m/s]. Paid for its height alone, speed is braked away for it: policies
+    came to
+    run at 2.2 to 2.5 m/s when commanded 2."""
     leap: float = 1.0
     """A lift-off slower than this is a stride: no hop, and not the end of the crouch [m/s]."""
     settle_s: float = 0.3
@@ -148,7 +149,7 @@ class JumpTracker:
         self.rise = zeros()
         """What `stroke` gained in the last step [m]."""
         self.lead = zeros()
-        """How much faster than told it went when this command came [m/s]."""
+        """How much faster than commanded it went when this command came [m/s]."""
         self.worth = zeros()
         """What the time of the last lift-off makes of all that its flight is paid for."""
         self.flown = zeros()
@@ -205,12 +206,13 @@ class JumpTracker:
             contact: Foot contacts, bool, shape (N, 4).
             height: Trunk over ground [m].
             vertical: Vertical velocity of the trunk [m/s].
-            miss: Distance of its horizontal velocity from the one asked for [m/s].
+            miss: Distance of its horizontal velocity from the one commanded [m/s].
             turn: Roll and pitch rate of the trunk together [rad/s].
-            along: Part of its horizontal velocity in the direction asked for [m/s].
+            along: Part of its horizontal velocity in the direction commanded [m/s].
             excess: How much more it is than the velocity command [m/s].
             feet: Horizontal positions of the feet, world frame [m], shape (N, 4, 2).
-            direction: Unit vector of where it is asked to go, world frame, or zero, shape (N, 2).
+            direction: Unit vector of where it is commanded to go, world frame, or zero, shape (N,
+            2).
             stretch: How much longer each leg is than in the default pose [m], shape (N, 4).
             dt: Duration of the step [s].
         """
@@ -218,7 +220,7 @@ class JumpTracker:
         airborne = ~contact.any(dim=-1)
         begins = jump & ~self.commanded
         keep = ~begins
-        # Paid for as well, it taught to run at 2.3 m/s when told 2, a jump might come.
+        # Paid for as well, it taught to run at 2.3 m/s when commanded 2, a jump might come.
         self.lead = torch.where(begins, excess.clamp_min(0.0), self.lead)
         self.settling = torch.where(
             jump,

@@ -1,4 +1,4 @@
-"""Reward terms: pure functions of what the robots were told and did, shape (N,) each.
+"""Reward terms: pure functions of commands and motion, shape (N,) each.
 
 The first group are the terms of the table that the paper's source carries commented out, in its
 order, each read as the checklist says (A2 to A7, A23). Signs are in the weights: a penalty gives
@@ -60,9 +60,9 @@ def torque_limits(command: MotionCommand) -> Tensor:
     The PD's gains are the nominal ones.
     """
     motion = command.motion
-    asked = command.stiffness * (command.position_target - motion.position)
-    asked = torch.addcmul(asked, command.damping, motion.velocity, value=-1.0)
-    return (asked.abs() - command.effort_limit).clamp_min(0.0).sum(dim=-1)
+    commanded = command.stiffness * (command.position_target - motion.position)
+    commanded = torch.addcmul(commanded, command.damping, motion.velocity, value=-1.0)
+    return (commanded.abs() - command.effort_limit).clamp_min(0.0).sum(dim=-1)
 
 
 def position_limits(command: MotionCommand) -> Tensor:
@@ -116,12 +116,12 @@ def rise(command: MotionCommand) -> Tensor:
 
 
 def reach(command: MotionCommand) -> Tensor:
-    """New ground covered in flight within this command [m], where it was told to go; an event."""
+    """New ground covered in flight along the command [m], within this jump command; an event."""
     return command.per_event(command.tracker.reach)
 
 
 def gap(command: MotionCommand) -> Tensor:
-    """Ground newly cleared by all feet within this command [m], where told to go; an event."""
+    """Ground newly cleared by all feet within this command [m], where commanded to go; an event."""
     return command.per_event(command.tracker.gap)
 
 
@@ -155,7 +155,7 @@ def slip(command: MotionCommand) -> Tensor:
 
 
 def trunk_height(command: MotionCommand, height: float) -> Tensor:
-    """relu(z - height)^2 of the trunk [m^2]: nobody hops who was not told to."""
+    """relu(z - height)^2 of the trunk [m^2]: hops without a command."""
     return (command.motion.height - height).clamp_min(0.0).square()
 
 

@@ -20,7 +20,7 @@ class Growth:
     """From a part of the ranges to the whole.
 
     Ranges that grew with the clock left one run in ten behind: it kept its velocities by .54 when
-    they began to grow, by .36 at the end, and walked 1 m/s when told 2.
+    they began to grow, by .36 at the end, and walked 1 m/s when commanded 2.
     """
 
     start: float = 0.35
@@ -68,7 +68,7 @@ class SpeedRanges:
 
         Args:
             error: Of the horizontal velocity [m/s]. (N, 2)
-            walks: Robots that count: who jumps is asked for something else. Bool, (N,)
+            walks: Robots that count: who jumps is requested something else. Bool, (N,)
         """
         # A robot whose physics went wrong keeps nothing.
         kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * walks

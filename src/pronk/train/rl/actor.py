@@ -58,7 +58,7 @@ class JumpCriticCfg(RslRlModelCfg):
 
 
 class JumpModel(MLPModel):
-    """An MLP over a normalised group and, if asked, a raw jump group behind it."""
+    """An MLP over a normalised group and, if requested, a raw jump group behind it."""
 
     group: ClassVar[str]
     """The group that is normalised."""

@@ -1,1 +1,1 @@
-"""A training run: what was asked, what it does, what it leaves, how it goes on."""
+"""A training run: settings, loop, files, resume."""

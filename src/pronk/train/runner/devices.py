@@ -65,24 +65,24 @@ def parse_gpu_ids(text: str) -> list[int] | Literal["all"]:
     return [int(word) for word in words]
 
 
-def find_devices(asked: str = "auto", gpu_ids: str | None = None) -> Devices:
+def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> Devices:
     """The GPUs or the processor to train on.
 
     Args:
-        asked: One of `CHOICES`.
+        requested: One of `CHOICES`.
         gpu_ids: Which of the visible GPUs, as typed; the first alone if None. Nothing on `cpu`.
 
     Raises:
         PronkError: There is no such GPU.
     """
-    if asked not in CHOICES:
-        raise PronkError(f"device {asked!r}; expected one of {', '.join(CHOICES)}.")
+    if requested not in CHOICES:
+        raise PronkError(f"device {requested!r}; expected one of {', '.join(CHOICES)}.")
     ids = None if gpu_ids is None else parse_gpu_ids(gpu_ids)
-    if asked == "cpu":
+    if requested == "cpu":
         return Devices(device="cpu")
     found = visible_gpus()
     if not found:
-        if asked == "cuda" or ids is not None:
+        if requested == "cuda" or ids is not None:
             raise PronkError(
                 "no GPU was found (PyTorch sees none; CUDA_VISIBLE_DEVICES is "
                 f"{os.environ.get('CUDA_VISIBLE_DEVICES', 'not set')}); expected one with a CUDA "
@@ -93,7 +93,7 @@ def find_devices(asked: str = "auto", gpu_ids: str | None = None) -> Devices:
 
 
 def chosen(found: Sequence[str], ids: Sequence[int] | Literal["all"] | None) -> tuple[str, ...]:
-    """The GPUs that were asked for.
+    """The GPUs that were requested.
 
     Args:
         found: What is visible, as `CUDA_VISIBLE_DEVICES` has it.

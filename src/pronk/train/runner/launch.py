@@ -34,7 +34,7 @@ def begin_run(
         Its provenance.
 
     Raises:
-        PronkError: What was asked for is impossible; then nothing is written.
+        PronkError: What was requested is impossible; then nothing is written.
     """
     from pronk.train.runner.resolve import resolved, run_gains
 
@@ -123,7 +123,8 @@ class _Handlers:
         """Made in the process that gathers them."""
         terminal, file = _Terminal(), logging.FileHandler(self._path, encoding="utf-8")
         # What a process prints to standard error arrives as errors. Libraries log for themselves
-        # down to the last detail. Levels are not asked where the words are gathered, filters are.
+        # down to the last detail. Levels have no effect where the messages are gathered; filters
+        # do.
         terminal.addFilter(lambda record: record.levelno >= logging.ERROR)
         file.addFilter(lambda record: record.levelno >= logging.INFO)
         return [terminal, file]

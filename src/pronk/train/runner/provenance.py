@@ -1,4 +1,4 @@
-"""Where a policy comes from: what was installed, asked and measured, beside every run.
+"""Where a policy comes from: what was installed, requested and measured, beside every run.
 
 `provenance.json` is for people and for the tables; nothing is computed from it. A run that was
 interrupted and resumed has one entry in `sessions` for each time it was started.

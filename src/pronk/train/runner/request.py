@@ -1,4 +1,4 @@
-"""What a user asked for, made into the settings of a run: a new one, or one that is resumed."""
+"""What a user requested, made into the settings of a run: a new one, or one that is resumed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What was asked for. None: not asked, so a default or, resumed, what the run has."""
+    """What was requested. None: not requested, so a default or, resumed, what the run has."""
 
     task: str
     gains: str | None = None
@@ -80,32 +80,32 @@ class Request:
         return Path(self.gains)
 
     def named(self) -> dict[str, Any]:
-        """The settings that were asked for by name and need no GPU to be told.
+        """The settings that were requested by name and need no GPU to be given.
 
         Raises:
             ArtefactError: The gains cannot be read, or are of another robot or simulator; or there
                 is no such checkpoint.
         """
-        asked: dict[str, Any] = {"task": self.task}
+        requested: dict[str, Any] = {"task": self.task}
         for name in ("envs", "seed", "ellipsoid"):
             if getattr(self, name) is not None:
-                asked[name] = getattr(self, name)
+                requested[name] = getattr(self, name)
         if self.gains is not None:
             gains = training_gains(self.gains, load_robot(ROBOT), like=self.like)
-            asked |= {"gains": gains.name, "gains_sha256": gains.sha256}
+            requested |= {"gains": gains.name, "gains_sha256": gains.sha256}
         elif self.like is not None:
-            asked |= {"gains": NAIVE, "gains_sha256": _hash(self.like)}
+            requested |= {"gains": NAIVE, "gains_sha256": _hash(self.like)}
         if self.start is not None:
             path = walking_checkpoint(self.start)
-            asked |= {"start": str(path.resolve()), "start_sha256": _hash(path)}
-        return asked
+            requested |= {"start": str(path.resolve()), "start_sha256": _hash(path)}
+        return requested
 
 
 def new_settings(request: Request) -> tuple[TrainSettings, Devices]:
     """Settings of a run that begins.
 
     Raises:
-        PronkError: Something that a new run needs was not asked for, or what was asked for is
+        PronkError: Something that a new run needs was not requested, or what was requested is
             impossible, here or at all.
     """
     if request.gains is None:
@@ -118,7 +118,7 @@ def new_settings(request: Request) -> tuple[TrainSettings, Devices]:
             "jump needs --init-checkpoint: the folder of a walking run, or one of its checkpoints; "
             "`pronk train all` does both."
         )
-    asked = request.named()
+    requested = request.named()
     require_extra()
     devices = find_devices(request.device or "auto", request.gpu_ids)
     # What is imported next may look at the GPUs.
@@ -133,13 +133,13 @@ def new_settings(request: Request) -> tuple[TrainSettings, Devices]:
         name: request.iterations.get(name, defaults[name]) for name in PHASES_OF[request.task]
     }
     settings = TrainSettings(
-        **asked, iterations=iterations, device=devices.device, gpus=devices.count
+        **requested, iterations=iterations, device=devices.device, gpus=devices.count
     )
     return settings, devices
 
 
 def resumed_settings(request: Request, folder: RunFolder) -> tuple[TrainSettings, Devices]:
-    """Settings of the run in a folder, if nothing else was asked for.
+    """Settings of the run in a folder, if nothing else was requested.
 
     Raises:
         ArtefactError: There is no run in the folder.
@@ -147,14 +147,14 @@ def resumed_settings(request: Request, folder: RunFolder) -> tuple[TrainSettings
             missing.
     """
     stored = folder.settings()
-    asked = request.named() | {
+    requested = request.named() | {
         f"iterations of {name}": count for name, count in request.iterations.items()
     }
     has = asdict(stored) | {
         f"iterations of {name}": count for name, count in stored.iterations.items()
     }
-    asked.pop("start", None)
-    for name, value in asked.items():
+    requested.pop("start", None)
+    for name, value in requested.items():
         if value != has[name]:
             _refuse(name, value, has[name], folder)
     require_extra()
@@ -168,9 +168,9 @@ def resumed_settings(request: Request, folder: RunFolder) -> tuple[TrainSettings
     return stored, devices
 
 
-def _refuse(name: str, asked: object, stored: object, folder: RunFolder) -> NoReturn:
+def _refuse(name: str, requested: object, stored: object, folder: RunFolder) -> NoReturn:
     raise PronkError(
-        f"--resume: {_OPTIONS.get(name, name)} is {asked}, but the run in {folder.path} has "
+        f"--resume: {_OPTIONS.get(name, name)} is {requested}, but the run in {folder.path} has "
         f"{'none' if stored == '' else stored}; leave it out to continue that run, or give a new "
         "--out."
     )

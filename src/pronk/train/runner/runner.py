@@ -61,13 +61,13 @@ class PronkRunner(MjlabOnPolicyRunner):
         self.provenance: dict[str, Any] = {}
         """What else a checkpoint shall say about itself: seeds, hash of the gains, ..."""
         self.watched: dict[str, Callable[[], float]] = {}
-        """Figures of the curriculum by name, asked for once an iteration."""
+        """Figures of the curriculum by name, requested once an iteration."""
         self.console = Console(stderr=True)
         """Where progress goes."""
         self.figures: dict[str, float] = {}
         """Figures of the last iteration, by TensorBoard's names."""
         self.stopped = ""
-        """Why the run was asked to stop; empty if it was not."""
+        """Why the run was requested to stop; empty if it was not."""
         self.env_steps = 0
         """Environment steps so far, of all processes."""
         self.seconds = 0.0
@@ -178,7 +178,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         return int(self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size)
 
     def _synchronize(self) -> None:
-        """Wait for the device once a rollout, so that its time is told from the update's."""
+        """Wait for the device once a rollout, so that its time is given from the update's."""
         if torch.device(self.device).type == "cuda":
             torch.cuda.synchronize(self.device)
 

@@ -1,6 +1,6 @@
-"""What a training run is asked to do: everything that decides what comes out of it.
+"""Settings of a training run: everything that its result depends on.
 
-A run that is resumed must be asked the same; what only says how it is watched (logger, save
+A run that is resumed must be requested the same; what only says how it is watched (logger, save
 interval, wall-clock cap) is `WatchSettings` and may differ.
 """
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and `kill` ask a run to end; asked twice they end it."""
+"""Ctrl-C and `kill` end a run at the next checkpoint; the second one ends it at once."""
 
 from __future__ import annotations
 
