@@ -26,7 +26,7 @@ from pronk.logs.readers import reader
 
 
 @reader("turns", ".turns")
-def read_turns(path, *, robot=None, joint="knee", sign="1"):
+def read_turns(path, *, robot=None, joint="knee", sign: float = 1.0):
     """Read one joint."""
     try:
         data = path.read_bytes()
@@ -34,7 +34,7 @@ def read_turns(path, *, robot=None, joint="knee", sign="1"):
         time, command, position = rows.T
     except (OSError, ValueError) as error:
         raise LogError(f"{path}: no log in turns ({error}).") from None
-    scale = 2.0 * np.pi * float(sign)
+    scale = 2.0 * np.pi * sign
     return SweepLog(
         robot="unknown" if robot is None else robot.name,
         joints=(joint,),
@@ -69,7 +69,7 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_reader_of_another_package_is_found_and_conforms(recording: Path) -> None:
     assert "turns" in readers()
     check_reader(readers()["turns"], recording)
-    log = read_log(recording, joint="elbow", sign="-1")
+    log = read_log(recording, joint="elbow", sign=-1.0)
     assert log.joints == ("elbow",)
     assert np.abs(log.command).max() == pytest.approx(2.0 * np.pi * 0.04, rel=1e-3)
     with pytest.raises(LogError, match="columns"):
@@ -77,7 +77,16 @@ def test_a_reader_of_another_package_is_found_and_conforms(recording: Path) -> N
 
 
 def test_the_command_line_reads_it(recording: Path, tmp_path: Path) -> None:
-    words = ["response", recording, "--reader-option", "joint=elbow", "--out", tmp_path / "out"]
+    words = [
+        "response",
+        recording,
+        "--reader-option",
+        "joint=elbow",
+        "--reader-option",
+        "sign=-1",
+        "--out",
+        tmp_path / "out",
+    ]
     done = invoke([*words, "--no-plots"])
     assert done.exit_code == 0, done.stderr
     assert "elbow" in done.stdout
@@ -89,3 +98,11 @@ def test_the_topics_of_a_bag_are_options(tmp_path: Path) -> None:
     done = invoke(["response", path, "--unit", "rad", "--command-topic", "/command"])
     assert done.exit_code == 2
     assert "command_topic" in done.stderr
+
+
+def test_a_broken_package_leaves_the_other_formats(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "site" / "turns_reader.py").write_text("import no_such_module")
+    with pytest.warns(UserWarning, match="turns_reader"):
+        assert "turns" not in readers()

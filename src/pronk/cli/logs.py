@@ -48,6 +48,7 @@ class ReadingOptions:
         """Keyword arguments of `pronk.logs.readers.read_log`."""
         scale = {name: _float("--scale", value) for name, value in _pairs(self.scale, "--scale")}
         return {
+            **dict(_pairs(self.reader_options, "--reader-option")),
             "unit": self.unit,
             "time_unit": self.time_unit,
             "columns": dict(_pairs(self.columns, "--columns")) or None,
@@ -58,7 +59,6 @@ class ReadingOptions:
             "measured_topic": self.measured_topic,
             "command_topic": self.command_topic,
             "command_field": self.command_field,
-            **dict(_pairs(self.reader_options, "--reader-option")),
         }
 
 

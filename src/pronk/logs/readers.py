@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import inspect
 import multiprocessing
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_joints, check_radians
@@ -71,7 +74,15 @@ def readers() -> dict[str, Reader]:
     found = {each.name: each for each in _BUILT_IN}
     taken = {suffix: each.name for each in _BUILT_IN for suffix in each.suffixes}
     for point in entry_points(group=GROUP):
-        each = point.load()
+        try:
+            each = point.load()
+        except Exception as error:  # Code of another package may fail in any way.
+            warnings.warn(
+                f"the log reader {point.value} cannot be loaded ({type(error).__name__}: {error}); "
+                "reinstall or remove its package.",
+                stacklevel=2,
+            )
+            continue
         if not isinstance(each, Reader):
             raise LogError(
                 f"entry point {point.value} of {GROUP} is no reader; decorate a function with "
@@ -135,11 +146,29 @@ def read_log(
             f"{path}: {', '.join(wrong)} means nothing for the format {kind}; it takes "
             f"{', '.join(takes)}."
         )
+    given = _converted(path, known[kind], given)
     try:
         return _read(path, known[kind], robot, given, rate_hz)
     except PronkError as error:
         # Names from the file itself may hold line breaks; a message is one sentence.
         raise type(error)(" ".join(str(error).split())) from error.__cause__
+
+
+def _converted(path: Path, chosen: Reader, given: dict[str, Any]) -> dict[str, Any]:
+    """Convert options given as text to the types that a reader declares, where it does."""
+    parameters = inspect.signature(chosen.read, eval_str=True).parameters
+    found = dict(given)
+    for name, value in given.items():
+        kind = parameters[name].annotation
+        if isinstance(value, str) and kind in (int, float, bool):
+            try:
+                found[name] = msgspec.convert(value, kind, strict=False)
+            except msgspec.ValidationError:
+                raise LogError(
+                    f"{path}: option {name} of the format {chosen.name} is {value!r}; expected "
+                    f"{kind.__name__}."
+                ) from None
+    return found
 
 
 def _read(
