@@ -332,8 +332,8 @@ def broken(given: SafetyInput, target: np.ndarray, limits: Limits) -> dict[str, 
     torque = kp * (target - q) - kd * v
     top = limits.stall * (1.0 - v / limits.no_load)
     bottom = -limits.stall * (1.0 + v / limits.no_load)
-    given = np.clip(torque, bottom, top)
-    power = (np.maximum(given * v, 0.0) + limits.loss * given**2).sum(axis=-1)
+    applied = np.clip(torque, bottom, top)
+    power = (np.maximum(applied * v, 0.0) + limits.loss * applied**2).sum(axis=-1)
     w, x, y, z = given.orientation.T
     upright = w * w - x * x - y * y + z * z
     ahead = q + limits.horizon_s * v

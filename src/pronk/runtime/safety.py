@@ -252,7 +252,7 @@ class SafetyInput:
     state_age: Array
     """Since the newest state was measured [s]."""
     target: Array
-    """SafetyInput [rad]. (..., n)"""
+    """Requested position [rad]. (..., n)"""
     stiffness: Array
     """[N m/rad] (..., n)"""
     damping: Array
