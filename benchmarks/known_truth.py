@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
@@ -168,7 +168,7 @@ class KnownTruth:
         )
         return delayed(position, self.scenario.delay_s, self.robot.timestep_s)
 
-    def log(self, rng: np.random.Generator) -> SweepLog:
+    def log(self, rng: np.random.Generator) -> JointLog:
         """One log: the same chirp `repeats` times, with noise of its own on each sample."""
         robot, scenario = self.robot, self.scenario
         joint = robot.joint(JOINT)
@@ -199,7 +199,7 @@ class KnownTruth:
             )
             for k in range(self.repeats)
         )
-        return SweepLog(
+        return JointLog(
             robot=robot.name,
             joints=(JOINT,),
             time=np.arange(len(command), dtype=np.float64) * robot.timestep_s,

@@ -26,7 +26,7 @@ from benchmarks.known_truth import JOINT, SCENARIOS, KnownTruth, Scenario, Truth
 from benchmarks.peers import Estimate, fit_cma, fit_sysid, import_cma, import_sysid
 from benchmarks.result import BenchResult, Row, row, table
 from pronk.errors import PronkError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
@@ -35,7 +35,7 @@ from pronk.robots.robot import Robot
 __all__ = ["BenchResult", "Row", "fit_pronk", "run", "table", "tools"]
 
 Progress = Callable[[str, float], None]
-Fit = Callable[[SweepLog], Estimate]
+Fit = Callable[[JointLog], Estimate]
 
 TRIALS = 5
 """Logs of each scenario. All tools together take about 20 s a log on two cores."""
@@ -163,7 +163,7 @@ def tools(
     return chosen
 
 
-def fit_pronk(log: SweepLog, *, robot: Robot, method: Any, threads: int) -> Estimate:
+def fit_pronk(log: JointLog, *, robot: Robot, method: Any, threads: int) -> Estimate:
     """Match a log the way `pronk match` does, and read its intervals.
 
     Args:

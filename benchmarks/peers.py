@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from benchmarks.replay import Replay
 from pronk.errors import PronkError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -94,7 +94,7 @@ def import_cma() -> Any:
 
 
 def fit_sysid(
-    log: SweepLog,
+    log: JointLog,
     joint: str,
     robot: Robot,
     *,
@@ -185,7 +185,7 @@ def _delayed_residual(sysid: Any, column: int, bounds: tuple[float, float]) -> A
 
 
 def fit_cma(
-    log: SweepLog,
+    log: JointLog,
     joint: str,
     robot: Robot,
     *,

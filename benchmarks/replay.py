@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots.model import bench_spec, set_drive_gains
 from pronk.robots.robot import Robot
 
@@ -42,7 +42,7 @@ class Replay:
     """Full physics state at rest where each repeat was met, shape (repeats, state)."""
 
     @classmethod
-    def of(cls, log: SweepLog, joint: str, robot: Robot) -> Replay:
+    def of(cls, log: JointLog, joint: str, robot: Robot) -> Replay:
         """Read a log.
 
         Args:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
@@ -43,7 +43,7 @@ def synthetic_log(
     noise: Sequence[Array] | None = None,
     simulator: JointRigs | None = None,
     **options: Any,
-) -> SweepLog:
+) -> JointLog:
     """Sweep one joint of the training simulator with known gains.
 
     Args:
@@ -109,7 +109,7 @@ def synthetic_log(
                 )
             )
             begin += count
-    return SweepLog(
+    return JointLog(
         robot=robot.name,
         joints=(joint,),
         time=np.arange(begin) / rate,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import chirp
 
 from analytic import simulate_second_order
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 
 Array = NDArray[np.float64]
 
@@ -103,7 +103,7 @@ def make_log(
     period: float | None = None,
     jitter: float = 0.0,
     seed: int = 0,
-) -> SweepLog:
+) -> JointLog:
     """One log from several questions (time, command, frequency or None), a repeat each.
 
     `jitter` moves each timestamp by up to that share of an interval. The machine of such a log
@@ -142,7 +142,7 @@ def make_log(
         )
         start += float(time[-1]) + 0.5
     stacked = [np.concatenate(column) for column in zip(*columns, strict=True)]
-    return SweepLog(
+    return JointLog(
         robot="bench",
         joints=("knee",),
         time=stacked[0],

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from pronk.errors import LogError, PronkError, RobotError
 from pronk.logs.csv_reader import write_csv
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_writer import write_mcap
 from pronk.logs.npz_reader import write_npz
 from pronk.logs.readers import read_log, read_logs
@@ -37,9 +37,9 @@ quick = settings(
 )
 
 
-def small_log() -> SweepLog:
+def small_log() -> JointLog:
     time = np.arange(60) / 500.0
-    return SweepLog(
+    return JointLog(
         robot="mini_cheetah",
         joints=("FR_knee",),
         time=time,
@@ -55,7 +55,7 @@ def check_sentence(error: PronkError, path: Path) -> None:
     assert text.rstrip().endswith(".")
 
 
-def reads_or_says_why(path: Path, **options: Any) -> SweepLog | None:
+def reads_or_says_why(path: Path, **options: Any) -> JointLog | None:
     """A log, or one sentence; anything else escapes and fails the test."""
     try:
         return read_log(path, **options)

@@ -27,7 +27,7 @@ from benchmarks.peers import Estimate, fit_cma, fit_sysid
 from benchmarks.replay import Replay
 from benchmarks.result import row
 from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 
@@ -43,7 +43,7 @@ def robot() -> Robot:
 
 
 @pytest.fixture(scope="module")
-def quiet(robot: Robot) -> SweepLog:
+def quiet(robot: Robot) -> JointLog:
     return KnownTruth(robot, QUIET, **SHORT).log(np.random.default_rng(0))
 
 
@@ -93,7 +93,7 @@ def test_impossible_scenarios_are_refused() -> None:
         Scenario(name="x", words="", noise_corner_hz=0.0)
 
 
-def test_sysid_finds_the_truth_without_noise(robot: Robot, quiet: SweepLog) -> None:
+def test_sysid_finds_the_truth_without_noise(robot: Robot, quiet: JointLog) -> None:
     found = fit_sysid(quiet, JOINT, robot, bounds=BOUNDS, start=START)
     assert found.stiffness == pytest.approx(Truth().stiffness, rel=1e-3)
     assert found.damping == pytest.approx(Truth().damping, rel=1e-3)
@@ -101,14 +101,14 @@ def test_sysid_finds_the_truth_without_noise(robot: Robot, quiet: SweepLog) -> N
     assert found.delay_s is None
 
 
-def test_cma_finds_the_truth_without_noise(robot: Robot, quiet: SweepLog) -> None:
+def test_cma_finds_the_truth_without_noise(robot: Robot, quiet: JointLog) -> None:
     found = fit_cma(quiet, JOINT, robot, bounds=BOUNDS, start=START, population=12)
     assert found.stiffness == pytest.approx(Truth().stiffness, rel=1e-3)
     assert found.damping == pytest.approx(Truth().damping, rel=1e-3)
     assert found.interval is None
 
 
-def test_pronk_finds_the_truth_without_noise(robot: Robot, quiet: SweepLog) -> None:
+def test_pronk_finds_the_truth_without_noise(robot: Robot, quiet: JointLog) -> None:
     found = fit_pronk(quiet, robot=robot, method="quick", threads=2)
     assert found.stiffness == pytest.approx(Truth().stiffness, rel=5e-3)
     assert found.damping == pytest.approx(Truth().damping, rel=1e-2)
@@ -125,7 +125,7 @@ def test_peers_with_their_delay_find_a_delay_of_whole_steps(robot: Robot) -> Non
     assert stepped.stiffness == pytest.approx(Truth().stiffness, rel=0.01)
 
 
-def test_replay_refuses_what_it_cannot_replay(robot: Robot, quiet: SweepLog) -> None:
+def test_replay_refuses_what_it_cannot_replay(robot: Robot, quiet: JointLog) -> None:
     jittered = replace(quiet, time=quiet.time * 1.001)
     with pytest.raises(LogError, match="physics step"):
         Replay.of(jittered, JOINT, robot)

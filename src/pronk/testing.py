@@ -12,7 +12,7 @@ import numpy as np
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.links.machine import Command, RefusedError, damping_command
 from pronk.links.stream_link import Codec, Transport
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import Reader
 from pronk.robots.robot import Robot
 from pronk.simulators.simulator import PARAMETERS, Simulator
@@ -100,7 +100,7 @@ def check_reader(chosen: Reader, path: Path, *, robot: Robot | None = None, **op
     """
     log = chosen.read(path, robot=robot, **options)
     shape = (len(log.time), len(log.joints))
-    _require(isinstance(log, SweepLog), "read: a SweepLog is returned")
+    _require(isinstance(log, JointLog), "read: a JointLog is returned")
     _require(shape[0] >= 2 and shape[1] >= 1, "read: two samples and one joint or more")
     for name in ("command", "position"):
         values = np.asarray(getattr(log, name))

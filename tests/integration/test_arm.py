@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.readers import read_log
 from pronk.match import gains as gains_file
 from pronk.match.arm import drives_of, fit_arm, match_arm
@@ -38,7 +38,7 @@ KNOWN = {
 }
 
 
-def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) -> SweepLog:
+def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) -> JointLog:
     """Every joint on lines of its own; positions are not there yet."""
     time = np.arange(0.0, seconds, 0.02)
     random = np.random.default_rng(1)
@@ -50,7 +50,7 @@ def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) ->
         phase = random.uniform(0.0, 2.0 * np.pi, len(hz))
         signal = np.sin(2.0 * np.pi * time[:, None] * hz + phase).sum(axis=1)
         command[:, i] = start[i] + amplitude * ramp * signal / np.abs(signal).max()
-    return SweepLog(
+    return JointLog(
         robot="so101",
         joints=JOINTS,
         time=time,
@@ -59,7 +59,7 @@ def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) ->
     )
 
 
-def recorded_with(log: SweepLog, known: dict[str, JointDrive]) -> SweepLog:
+def recorded_with(log: JointLog, known: dict[str, JointDrive]) -> JointLog:
     """What an arm with these drives and 12-bit encoders would have recorded."""
     with ChainSimulation(ARM, [log]) as bench:
         position = bench.run([known])[0][0]
@@ -136,7 +136,7 @@ def test_sweep_is_believed_up_to_where_it_breaks() -> None:
     position = np.where(hz < 2.5, command, noise)
     assert trusted_frequency(time, command, position) == pytest.approx(2.5, abs=0.3)
     assert trusted_frequency(time, command, command) == np.inf
-    log = SweepLog(
+    log = JointLog(
         robot="so101",
         joints=("elbow_flex",),
         time=time,

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.excitation.signals import Chirp
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match.drive import match_drives
 from pronk.robots import load_robot
 
@@ -19,7 +19,7 @@ KNOWN = {"damping": 0.33, "armature": 0.0055, "frictionloss": 0.3}
 LATE_S = 0.004
 
 
-def sweep(joint: str, amplitudes: tuple[float, ...] = (0.25, 0.125)) -> SweepLog:
+def sweep(joint: str, amplitudes: tuple[float, ...] = (0.25, 0.125)) -> JointLog:
     """Known drive, two amplitudes of three repeats, 0.2 mrad of noise, 4 ms late."""
     rng = np.random.default_rng(3)
     asks = [

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.mcap_format import END, HEADER, SAMPLE, SEGMENT, LogHeader
 from pronk.logs.mcap_reader import read_mcap
 from pronk.logs.mcap_writer import McapLogWriter, write_mcap
@@ -28,12 +28,12 @@ from pronk.logs.readers import read_log
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
 
 
-def example(n: int = 2000, joints: int = 3) -> SweepLog:
+def example(n: int = 2000, joints: int = 3) -> JointLog:
     rng = np.random.default_rng(1)
     seconds = np.arange(n) / 500.0 + rng.uniform(0.0, 1e-5, n)
     frequency = np.linspace(0.1, 25.0, n)
     frequency[: n // 10] = np.nan
-    return SweepLog(
+    return JointLog(
         robot="mini_cheetah",
         joints=tuple(f"j{i}" for i in range(joints)),
         time=seconds,
@@ -65,7 +65,7 @@ def example(n: int = 2000, joints: int = 3) -> SweepLog:
     )
 
 
-def assert_same(a: SweepLog, b: SweepLog) -> None:
+def assert_same(a: JointLog, b: JointLog) -> None:
     for name in ARRAYS:
         one, other = getattr(a, name), getattr(b, name)
         assert (one is None) == (other is None), name
@@ -88,7 +88,7 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 def test_any_log_survives(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     n, width = data.draw(st.integers(2, 40)), data.draw(st.integers(1, 4))
     values = st.floats(-1e6, 1e6, allow_nan=False)
-    log = SweepLog(
+    log = JointLog(
         robot=data.draw(st.text(max_size=20)),
         joints=tuple(
             data.draw(st.lists(st.text(min_size=1), min_size=width, max_size=width, unique=True))
@@ -127,17 +127,17 @@ def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[SweepLog, bytes, Path]:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointLog, bytes, Path]:
     folder = tmp_path_factory.mktemp("cut")
     log = example()
     write_mcap(folder / "whole.mcap", log)
     return log, (folder / "whole.mcap").read_bytes(), folder
 
 
-Whole = tuple[SweepLog, bytes, Path]
+Whole = tuple[JointLog, bytes, Path]
 
 
-def read_or_one_sentence(path: Path) -> SweepLog | None:
+def read_or_one_sentence(path: Path) -> JointLog | None:
     try:
         return read_log(path)
     except LogError as error:

@@ -21,7 +21,7 @@ import hashlib
 import numpy as np
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import reader
 
 
@@ -35,7 +35,7 @@ def read_turns(path, *, robot=None, joint="knee", sign: float = 1.0):
     except (OSError, ValueError) as error:
         raise LogError(f"{path}: no log in turns ({error}).") from None
     scale = 2.0 * np.pi * sign
-    return SweepLog(
+    return JointLog(
         robot="unknown" if robot is None else robot.name,
         joints=(joint,),
         time=time,

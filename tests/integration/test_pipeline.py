@@ -12,7 +12,7 @@ import pytest
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError, LogError, PronkError, RobotError
 from pronk.excitation.signals import Chirp, Multisine
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.pipeline import match_logs
@@ -28,7 +28,7 @@ QUICK = MatchSettings(
 KNOWN = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": (21.8, 0.541)}
 
 
-def log_of(joint: str, known: tuple[float, float], *, seed: int = 0, **more: object) -> SweepLog:
+def log_of(joint: str, known: tuple[float, float], *, seed: int = 0, **more: object) -> JointLog:
     rng = np.random.default_rng(seed)
     asks = [
         Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples(), repeats=3)

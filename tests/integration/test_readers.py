@@ -14,7 +14,7 @@ import pronk
 from pronk.errors import LogError, RobotError
 from pronk.logs.checks import check_motion, motion
 from pronk.logs.csv_reader import write_csv
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.mcap_writer import write_mcap
 from pronk.logs.npz_reader import write_npz
 from pronk.logs.readers import read_log, read_logs
@@ -32,11 +32,11 @@ ARM = (
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the shared recordings are not here")
 
 
-def example(n: int = 500) -> SweepLog:
+def example(n: int = 500) -> JointLog:
     """Two joints of a leg at 500 Hz."""
     time = np.arange(n) / 500.0
     command = np.stack([0.2 * np.sin(6.0 * time), np.full(n, 0.5)], axis=1)
-    return SweepLog(
+    return JointLog(
         robot="mini_cheetah",
         joints=("FR_hip_roll", "FR_knee"),
         time=time,
@@ -379,8 +379,8 @@ def test_an_epoch_clock_begins_at_zero(tmp_path: Path) -> None:
 # --- motion -------------------------------------------------------------------------------------
 
 
-def moved(position: np.ndarray, command: np.ndarray, rate: float = 200.0) -> SweepLog:
-    return SweepLog(
+def moved(position: np.ndarray, command: np.ndarray, rate: float = 200.0) -> JointLog:
+    return JointLog(
         robot="mini_cheetah",
         joints=("FR_knee",),
         time=np.arange(len(command)) / rate,

@@ -33,7 +33,7 @@ from pronk.links.lcm.address import url_of
 from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
 from pronk.links.machine import Command
 from pronk.links.state_checks import Freshness
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_reader import read_mcap
 from pronk.robots import Robot, load_robot
 from pronk.runtime.run import Recorded
@@ -142,7 +142,7 @@ def await_(what: Callable[[], bool], seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
-def written(path: Path) -> SweepLog | None:
+def written(path: Path) -> JointLog | None:
     """What can be read of a log that is being written; None before its first half second."""
     try:
         return read_mcap(path)

@@ -11,7 +11,7 @@ import pytest
 
 from analytic import second_order, simulate_second_order
 from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.response import Estimator, FrequencyResponse, estimate, fit_delay
 from pronk.response.grid import Grid, grid_over, held_mean
 from pronk.response.spectra import layout, segment_spectra, sums
@@ -92,7 +92,7 @@ def test_measured_timestamps_are_believed(jitter: float) -> None:
     gain, phase, bins = errors(response, KNEE)
     assert (gain < 0.01, phase < 0.5, bins) == (True, True, 191)
     # The same rows with invented, even timestamps are off by more than that.
-    even = SweepLog(
+    even = JointLog(
         robot="bench",
         joints=("knee",),
         time=np.arange(len(log.time)) / 500.0 * (1.0 + 0.02 * jitter),
@@ -177,7 +177,7 @@ def test_amplitudes_come_largest_first_and_repeats_together() -> None:
             repeat=segment.repeat,
         )
 
-    log = SweepLog(
+    log = JointLog(
         robot="bench",
         joints=("knee", "other"),
         time=np.r_[small.time, large.time + later],
@@ -247,7 +247,7 @@ def test_logs_that_hold_no_answer_are_refused() -> None:
         estimate(short, "hip")
 
 
-def so101(recording: str) -> SweepLog:
+def so101(recording: str) -> JointLog:
     folder = SO101 / recording
 
     def read(name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -258,7 +258,7 @@ def so101(recording: str) -> SweepLog:
 
     (time, command), (_, position) = read("control.csv"), read("state_motor.csv")
     joints = tuple((folder / "joint_list.txt").read_text().split())
-    return SweepLog(robot="so101", joints=joints, time=time, command=command, position=position)
+    return JointLog(robot="so101", joints=joints, time=time, command=command, position=position)
 
 
 @pytest.mark.skipif(not SO101.exists(), reason="the SO-101 recordings are not here")

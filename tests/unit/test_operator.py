@@ -7,7 +7,7 @@ import pytest
 
 from analytic import simulate_second_order
 from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.response import Estimator, H1Operator, estimate, operators
 from pronk.response.operator import combine
 from synthetic_joint import (
@@ -22,7 +22,7 @@ from synthetic_joint import (
 )
 
 
-def applied(log: SweepLog, settings: Estimator) -> tuple[np.ndarray, np.ndarray]:
+def applied(log: JointLog, settings: Estimator) -> tuple[np.ndarray, np.ndarray]:
     """Responses of each repeat and of all, by the operators."""
     (row,) = operators(log, "knee", settings)
     parts = [log.cut(segment) for segment in log.segments]

@@ -7,7 +7,7 @@ import pytest
 
 from analytic import second_order
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.response import Estimator, distortion, estimate
 from pronk.response.periodic import read_periods
 from synthetic_joint import (
@@ -20,7 +20,7 @@ from synthetic_joint import (
 )
 
 
-def multisine(answer, *, questions: int = 1, noise: float = 0.0, **kw) -> SweepLog:  # type: ignore[no-untyped-def]
+def multisine(answer, *, questions: int = 1, noise: float = 0.0, **kw) -> JointLog:  # type: ignore[no-untyped-def]
     return make_log(
         [(*multisine_command(500.0, seed=s, **kw), None) for s in range(questions)],
         answer,

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.predict import predict
 from pronk.match.prediction import r2, rmse
@@ -49,7 +49,7 @@ def gains(names: tuple[str, ...], **extra: float) -> MatchedGains:
     )
 
 
-def chirp_log(late_ticks: int = 0) -> SweepLog:
+def chirp_log(late_ticks: int = 0) -> JointLog:
     """Two joints, one after the other, recorded in the training simulator."""
     seconds, rate = 4.0, 500
     time = np.arange(round(2 * seconds * rate)) / rate
@@ -69,7 +69,7 @@ def chirp_log(late_ticks: int = 0) -> SweepLog:
         segments.append(
             Segment(kind="chirp", joints=(name,), start=start, stop=stop, amplitude=0.2)
         )
-    log = SweepLog(
+    log = JointLog(
         robot=ROBOT.name,
         joints=names,
         time=time,

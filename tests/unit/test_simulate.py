@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import LogError
 from pronk.excitation.signals import Chirp
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Robot
@@ -122,12 +122,12 @@ def test_armature_and_friction_can_be_given() -> None:
     assert np.abs(simulate(ROBOT, trace, 20.0, 0.5, frictionloss=1.0) - plain).max() > 0.02
 
 
-def log_of(time: np.ndarray, command: np.ndarray, **more: object) -> SweepLog:
+def log_of(time: np.ndarray, command: np.ndarray, **more: object) -> JointLog:
     segment = Segment(
         kind="chirp", joints=("FR_knee",), start=time[0], stop=time[-1], amplitude=0.25
     )
     position = 0.5 * command
-    return SweepLog(
+    return JointLog(
         robot="mini_cheetah",
         joints=("FR_knee",),
         time=time,

@@ -13,7 +13,7 @@ import tyro
 from pronk.errors import LogError, PronkError
 
 if TYPE_CHECKING:
-    from pronk.logs.joint_log import SweepLog
+    from pronk.logs.joint_log import JointLog
     from pronk.robots.robot import Robot
 
 
@@ -79,7 +79,7 @@ def _float(option: str, text: str) -> float:
         raise PronkError(f"{option}: {text!r} is not a number.") from None
 
 
-def read(paths: Sequence[Path], reading: ReadingOptions, robot: Robot | None) -> list[SweepLog]:
+def read(paths: Sequence[Path], reading: ReadingOptions, robot: Robot | None) -> list[JointLog]:
     """Read every log that some paths stand for, on all cores.
 
     Raises:
@@ -92,7 +92,7 @@ def read(paths: Sequence[Path], reading: ReadingOptions, robot: Robot | None) ->
     return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **options)
 
 
-def excited_joints(log: SweepLog) -> tuple[str, ...]:
+def excited_joints(log: JointLog) -> tuple[str, ...]:
     """Joints that a log asks: those of its segments, or those whose command moves.
 
     Raises:
@@ -110,12 +110,12 @@ def excited_joints(log: SweepLog) -> tuple[str, ...]:
     return excited
 
 
-def home(log: SweepLog, out: Path | None) -> tuple[Path, str]:
+def home(log: JointLog, out: Path | None) -> tuple[Path, str]:
     """Folder and stem of what is written about a log: beside it, or in `out`."""
     source = Path(log.source or "log")
     return (out if out is not None else source.parent), source.stem
 
 
-def summary(logs: Sequence[SweepLog]) -> Mapping[str, str]:
+def summary(logs: Sequence[JointLog]) -> Mapping[str, str]:
     """Name and hash of each log, for `--json`."""
     return {log.source: log.sha256 for log in logs}

@@ -42,7 +42,7 @@ from pronk.evaluation.tables import Sheet, number
 from pronk.evaluation.trial import Plan, load_subjects, run_trial, versions
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.files import sha256
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import read_logs
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
@@ -269,7 +269,7 @@ def match_body(
     repeats: int = 3,
     processes: int = 1,
     progress: Callable[[str, float], None] = lambda stage, share: None,
-) -> tuple[MatchedGains, list[SweepLog]]:
+) -> tuple[MatchedGains, list[JointLog]]:
     """Excite all joints of a virtual robot with the paper's chirp, and match them.
 
     The match reads the logs and nothing else. A folder that has the robot's gains is read.
@@ -334,7 +334,7 @@ def gains_of(subject: Subject) -> dict[str, tuple[float, float]]:
 
 
 def gains_errors(
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     robot: Robot,
     gains: Mapping[str, Pairs],
     *,
@@ -381,7 +381,7 @@ def gains_errors(
 
 
 def _errors(
-    robot: Robot, logs: Sequence[SweepLog], matched: MatchedGains, subjects: Sequence[Subject]
+    robot: Robot, logs: Sequence[JointLog], matched: MatchedGains, subjects: Sequence[Subject]
 ) -> tuple[GainsError, ...]:
     """The errors of the gains of the policies, of the robot's drives, and of its own match."""
     groups = matched.groups

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ class Motion:
     outward."""
 
 
-def motion(log: SweepLog, joint: str) -> Motion:
+def motion(log: JointLog, joint: str) -> Motion:
     """How a joint moved over a log.
 
     Raises:
@@ -85,7 +85,7 @@ def _stopped(time: Array, near: NDArray[np.bool_], command: Array, outward: floa
     return total
 
 
-def check_motion(log: SweepLog, joint: str) -> Motion:
+def check_motion(log: JointLog, joint: str) -> Motion:
     """Refuse a joint that was not excited, did not move, or lies at an end of its travel.
 
     Returns:
@@ -117,7 +117,7 @@ def check_motion(log: SweepLog, joint: str) -> Motion:
     return found
 
 
-def check_radians(log: SweepLog, joint: str) -> None:
+def check_radians(log: JointLog, joint: str) -> None:
     """Refuse a joint in radians that turns as only degrees would.
 
     Raises:
@@ -139,7 +139,7 @@ def check_radians(log: SweepLog, joint: str) -> None:
     )
 
 
-def check_joints(log: SweepLog, robot: Robot) -> None:
+def check_joints(log: JointLog, robot: Robot) -> None:
     """Refuse a log that names joints the robot does not have.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What every importer does with the columns it found: check them, and make a SweepLog of them."""
+"""What every importer does with the columns it found: check them, and make a JointLog of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.logs.correlation import correlation_note
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.timing import TIME_UNITS, check_claim, check_increasing, check_unit, examine
 from pronk.robots.robot import Robot
 
@@ -58,7 +58,7 @@ def import_columns(
     rate_hz: float | None = None,
     drop_duplicates: bool = False,
     scale: Mapping[str, float] | None = None,
-) -> SweepLog:
+) -> JointLog:
     """Check columns of a foreign file and make a log of them.
 
     Args:
@@ -127,7 +127,7 @@ def import_columns(
     command = scaled(columns.command, factors)
     if note := _correlation(time, command, joints, timing.rate_hz):
         notes.append(note)
-    return SweepLog(
+    return JointLog(
         robot=robot.name if robot is not None else robot_name,
         joints=joints,
         time=time,

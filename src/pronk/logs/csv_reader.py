@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.files import sha256, write_text
 from pronk.logs.columns import Columns, import_columns
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def read_csv(
     time_unit: str = "s",
     rate_hz: float | None = None,
     drop_duplicates: bool = False,
-) -> SweepLog:
+) -> JointLog:
     """Read a CSV file.
 
     Columns are called `time`, `command.JOINT`, `position.JOINT`, and if there are any
@@ -192,7 +192,7 @@ def _numbers(path: Path, header: list[str], rows: list[list[str]], name: str) ->
     return values
 
 
-def write_csv(path: Path, log: SweepLog) -> None:
+def write_csv(path: Path, log: JointLog) -> None:
     """Write the columns of a log as `read_csv` reads them (unit='rad'), whole or not at all."""
     names, values = ["time"], [log.time[:, None]]
     for quantity in QUANTITIES:

@@ -27,7 +27,7 @@ class Segment:
     joints: tuple[str, ...]
     """Excited joints (several only with uncorrelated signals)."""
     start: float
-    """First instant, on the clock of `SweepLog.time` [s]."""
+    """First instant, on the clock of `JointLog.time` [s]."""
     stop: float
     """Last instant, settling included [s]."""
     amplitude: float
@@ -56,7 +56,7 @@ class Segment:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepLog:
+class JointLog:
     """A recording of commands and positions, one column per joint.
 
     Positions are absolute joint angles in the robot's convention; `pose` is what the signals were
@@ -175,7 +175,7 @@ class SweepLog:
         """Mean sample rate over the whole log [Hz]."""
         return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
 
-    def cut(self, segment: Segment) -> SweepLog:
+    def cut(self, segment: Segment) -> JointLog:
         """The part of the log inside one segment, as a log of its own (same clock)."""
         inside = (self.time >= segment.start - 1e-9) & (self.time <= segment.stop + 1e-9)
         if int(inside.sum()) < 2:

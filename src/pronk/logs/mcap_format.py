@@ -61,7 +61,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class LogHeader:
-    """What is known of a log before its first sample. Fields as in SweepLog."""
+    """What is known of a log before its first sample. Fields as in JointLog."""
 
     robot: str
     joints: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""SweepLog read from MCAP: pronk's own, up to wherever it was cut or damaged, or a rosbag2's."""
+"""JointLog read from MCAP: pronk's own, up to wherever it was cut or damaged, or a rosbag2's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.mcap_format import END, HEADER, SAMPLE, SCHEMA, SEGMENT
 from pronk.logs.mcap_stream import DamagedError, Record, records
 from pronk.logs.rosbag_reader import read_joint_states
@@ -31,7 +31,7 @@ def read_mcap(
     measured_topic: str | None = None,
     command_topic: str | None = None,
     command_field: str = "position",
-) -> SweepLog:
+) -> JointLog:
     """Read a log of pronk, or the JointState messages of a rosbag2 MCAP.
 
     A file that was cut anywhere gives the log of what came before, with `complete` False.
@@ -84,7 +84,7 @@ def _gather(path: Path, stream: IO[bytes], size: int) -> tuple[list[Record], str
     return found, ""
 
 
-def _from_pronk(path: Path, found: Iterable[Record], damage: str) -> SweepLog:
+def _from_pronk(path: Path, found: Iterable[Record], damage: str) -> JointLog:
     try:
         return _assemble(path, found, damage)
     except LogError:
@@ -96,7 +96,7 @@ def _from_pronk(path: Path, found: Iterable[Record], damage: str) -> SweepLog:
         ) from None
 
 
-def _assemble(path: Path, found: Iterable[Record], damage: str) -> SweepLog:
+def _assemble(path: Path, found: Iterable[Record], damage: str) -> JointLog:
     header: dict[str, Any] = {}
     segments: list[Segment] = []
     samples: list[bytes] = []
@@ -143,7 +143,7 @@ def _assemble(path: Path, found: Iterable[Record], damage: str) -> SweepLog:
     command, position = matrix("command"), matrix("position")
     if command is None or position is None:
         raise LogError(f"{path}: its samples hold no command or no position.")
-    return SweepLog(
+    return JointLog(
         robot=str(header["robot"]),
         joints=tuple(header["joints"]),
         time=time,

@@ -1,4 +1,4 @@
-"""SweepLog written as MCAP, as it happens.
+"""JointLog written as MCAP, as it happens.
 
 Chunks are short and flushed as they fill, so that a power cut costs half a second, never the log.
 """
@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from numpy.typing import NDArray
 
 from pronk.files import written_whole
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.mcap_format import END, HEADER, SAMPLE, SCHEMA, SCHEMAS, SEGMENT, LogHeader
 
 Array = NDArray[np.float64]
@@ -140,7 +140,7 @@ def reason_of(error: BaseException | None) -> str:
     return "" if error is None else f"{type(error).__name__}: {error}".rstrip(": ")
 
 
-def write_mcap(path: Path, log: SweepLog) -> None:
+def write_mcap(path: Path, log: JointLog) -> None:
     """Write a log that is already there, whole or not at all."""
 
     def listed(values: Array | None) -> list[float] | None:

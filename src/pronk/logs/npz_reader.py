@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.files import sha256, written_whole
 from pronk.logs.columns import Columns, Names, import_columns
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ _MOST_BYTES = 2**30
 """Largest size that the arrays may unpack to [bytes]."""
 
 
-def write_npz(path: Path, log: SweepLog) -> None:
+def write_npz(path: Path, log: JointLog) -> None:
     """Write a log, whole or not at all."""
     header = {
         "schema": SCHEMA,
@@ -65,7 +65,7 @@ def read_npz(
     rate_hz: float | None = None,
     drop_duplicates: bool = False,
     scale: Mapping[str, float] | None = None,
-) -> SweepLog:
+) -> JointLog:
     """Read what `write_npz` wrote, or the arrays `time`, `command`, `position` of another tool.
 
     Args:
@@ -181,7 +181,7 @@ def _check_size(path: Path, name: str, file: IO[bytes], size: int) -> None:
         raise LogError(f"{path}: {name} promises shape {shape}, more than the file holds.")
 
 
-def _own(path: Path, arrays: dict[str, NDArray[Any]]) -> SweepLog:
+def _own(path: Path, arrays: dict[str, NDArray[Any]]) -> JointLog:
     """A file of `write_npz`."""
     try:
         header = orjson.loads(str(arrays["header"]))
@@ -194,7 +194,7 @@ def _own(path: Path, arrays: dict[str, NDArray[Any]]) -> SweepLog:
             if body["amplitude"] is None:
                 body["amplitude"] = math.nan
             segments.append(Segment(**body))
-        return SweepLog(
+        return JointLog(
             robot=str(header["robot"]),
             joints=tuple(str(name) for name in header["joints"]),
             segments=tuple(segments),

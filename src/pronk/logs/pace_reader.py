@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import Columns, Names, import_columns
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -208,7 +208,7 @@ def read_pace(
     rate_hz: float | None = None,
     drop_duplicates: bool = False,
     scale: Mapping[str, float] | None = None,
-) -> SweepLog:
+) -> JointLog:
     """Read a PACE recording: `time` (n,), `dof_pos` and `des_dof_pos` (n, joints).
 
     Args:

@@ -17,7 +17,7 @@ import msgspec
 from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_joints, check_radians
 from pronk.logs.csv_reader import read_csv
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_reader import read_mcap
 from pronk.logs.npz_reader import read_npz
 from pronk.logs.pace_reader import read_pace
@@ -36,7 +36,7 @@ class Reader:
     name: str
     suffixes: tuple[str, ...]
     """Endings of file names, lower case, with the dot; empty for folders."""
-    read: Callable[..., SweepLog]
+    read: Callable[..., JointLog]
     """`read(path, *, robot, **options)`; its keyword parameters are the options of the format."""
 
     @property
@@ -46,7 +46,7 @@ class Reader:
         return tuple(name for name in parameters if name not in ("path", "robot"))
 
 
-def reader(name: str, *suffixes: str) -> Callable[[Callable[..., SweepLog]], Reader]:
+def reader(name: str, *suffixes: str) -> Callable[[Callable[..., JointLog]], Reader]:
     """Declare a function as the reader of a format.
 
     Args:
@@ -111,7 +111,7 @@ def read_log(
     format: str | None = None,
     rate_hz: float | None = None,
     **options: Any,
-) -> SweepLog:
+) -> JointLog:
     """Read a log: MCAP (pronk's or rosbag2), CSV, SAGE folder, PACE `.pt`, NPZ, or a plugin's.
 
     Args:
@@ -173,10 +173,10 @@ def _converted(path: Path, chosen: Reader, given: dict[str, Any]) -> dict[str, A
 
 def _read(
     path: Path, chosen: Reader, robot: Robot | None, given: dict[str, Any], rate_hz: float | None
-) -> SweepLog:
+) -> JointLog:
     """Read by one reader, and check what all logs must pass."""
     log = chosen.read(path, robot=robot, **given)
-    if not isinstance(log, SweepLog):
+    if not isinstance(log, JointLog):
         raise LogError(f"{path}: the reader {chosen.name} returned {type(log).__name__}.")
     if "rate_hz" not in chosen.options:
         timing = examine(log.time)
@@ -219,7 +219,7 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
     return found
 
 
-def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any) -> list[SweepLog]:
+def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any) -> list[JointLog]:
     """Read several logs; a folder that is not itself a log stands for the logs in it.
 
     Args:
@@ -242,7 +242,7 @@ def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any
         ]
 
 
-def _read_with(path: Path, options: Mapping[str, Any]) -> SweepLog:
+def _read_with(path: Path, options: Mapping[str, Any]) -> JointLog:
     return read_log(path, **options)
 
 

@@ -1,4 +1,4 @@
-"""JointState recordings of ROS 2 (rosbag2 in MCAP) as a SweepLog.
+"""JointState recordings of ROS 2 (rosbag2 in MCAP) as a JointLog.
 
 A bag does not say which topic is the command, and guessing would swap question and answer
 without a trace, so the command topic must be named.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_stream import Record
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ def read_joint_states(
     measured_topic: str | None,
     command_topic: str | None,
     command_field: str,
-) -> SweepLog:
+) -> JointLog:
     """Join the measured states of one topic with the commands of another.
 
     Stamps in the headers are used where both topics have them, times of reception otherwise: two
@@ -104,7 +104,7 @@ def read_joint_states(
     start = time[known][0]
     velocity = _matrix(path, measured_topic, "velocity", [m for _, m in states], joints)
     torque = _matrix(path, measured_topic, "effort", [m for _, m in states], joints)
-    return SweepLog(
+    return JointLog(
         robot=robot,
         joints=joints,
         time=time[known] - start,

@@ -19,7 +19,7 @@ from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import Columns, Names, import_columns
 from pronk.logs.csv_reader import read_rows, read_text
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ def read_sage(
     rate_hz: float | None = None,
     drop_duplicates: bool = False,
     scale: Mapping[str, float] | None = None,
-) -> SweepLog:
+) -> JointLog:
     """Read a SAGE folder.
 
     The command in force at a state is the last one at or before its timestamp. The joints of the

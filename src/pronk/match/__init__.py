@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match.pipeline import match_logs
 from pronk.match.predict import predict
 from pronk.match.result import MatchResult
@@ -27,7 +27,7 @@ __all__ = ["MatchResult", "MatchSettings", "match_logs", "predict"]
 class _Package(ModuleType):
     """Make `pronk.match(logs, robot)` call `match_logs`."""
 
-    def __call__(self, logs: Sequence[SweepLog], robot: Robot, **options: Any) -> MatchResult:
+    def __call__(self, logs: Sequence[JointLog], robot: Robot, **options: Any) -> MatchResult:
         return match_logs(logs, robot, **options)
 
 

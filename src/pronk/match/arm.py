@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match import parameters as search
 from pronk.match.gains import MatchedGains
 from pronk.match.identifiability import EXPERIMENTS
@@ -204,7 +204,7 @@ def trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
 
 
 def fit_arm(
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     robot: Robot,
     *,
     parameters: Sequence[str] | Mapping[str, Sequence[str]] = DRIVE_MODE,
@@ -298,7 +298,7 @@ def _joints(
     return out
 
 
-def _blocks(logs: Sequence[SweepLog]) -> NDArray[np.int64]:
+def _blocks(logs: Sequence[JointLog]) -> NDArray[np.int64]:
     """Number of the block of every sample of all recordings, shape (rows,)."""
     out, first = [], 0
     for log in logs:
@@ -324,7 +324,7 @@ def _refuse(fit: ArmFit) -> None:
 
 
 def match_arm(
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     robot: Robot,
     *,
     mode: Literal["gains", "drive"] = "gains",
@@ -378,7 +378,7 @@ def drives_of(robot: Robot, gains: MatchedGains) -> dict[str, JointDrive]:
 
 
 def _fit_what_is_identified(
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     robot: Robot,
     names: tuple[str, ...],
     threads: int,
@@ -413,7 +413,7 @@ def _fit_what_is_identified(
 
 
 def _joint_fits(
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     robot: Robot,
     fit: ArmFit,
     held: Mapping[str, tuple[str, ...]],
@@ -489,7 +489,7 @@ def _flags(joint: ArmJoint, held: tuple[str, ...]) -> tuple[str, ...]:
     return (*flags, *joint.flags)
 
 
-def _response(log: SweepLog, joint: str, position: Array) -> FrequencyResponse:
+def _response(log: JointLog, joint: str, position: Array) -> FrequencyResponse:
     """Response of a simulated position, through the same estimator as the recording's."""
     positions = log.position.copy()
     positions[:, log.column(joint)] = position

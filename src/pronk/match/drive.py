@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match.identifiability import EXPERIMENTS, bench_experiment, require_identifiable
 from pronk.match.measured_joint import (
     DB,
@@ -49,7 +49,7 @@ _NOISE_MIN = 0.01
 
 
 def match_drives(
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     robot: Robot,
     *,
     free: Sequence[str] = DRIVE_MODE,

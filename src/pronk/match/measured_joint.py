@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
 from pronk.response.estimate import estimate, log_rate, questions
 from pronk.response.estimate import operator as build_operator
@@ -117,14 +117,14 @@ class MeasuredJoint:
             return np.asarray(DB * (np.log(np.abs(simulated)) - np.log(measured)))
 
 
-def logs_by_joint(logs: Sequence[SweepLog], robot: Robot) -> dict[str, list[SweepLog]]:
+def logs_by_joint(logs: Sequence[JointLog], robot: Robot) -> dict[str, list[JointLog]]:
     """Which logs ask which joint, joints in the robot's order.
 
     Raises:
         LogError: No log asks any joint.
         RobotError: A log asks a joint that the robot has not.
     """
-    where: dict[str, list[SweepLog]] = {}
+    where: dict[str, list[JointLog]] = {}
     for log in logs:
         names = {name for segment in log.segments for name in segment.joints}
         # Without segments, the excited joints are those whose command moves.
@@ -140,7 +140,7 @@ def logs_by_joint(logs: Sequence[SweepLog], robot: Robot) -> dict[str, list[Swee
     return {name: where[name] for name in robot.joint_names if name in where}
 
 
-def gains_on_drive(log: SweepLog, joint: str, robot: Robot) -> tuple[float, float]:
+def gains_on_drive(log: JointLog, joint: str, robot: Robot) -> tuple[float, float]:
     """Stiffness and damping on the real drive: the log's if it has them, else the robot's."""
     known, column = robot.joint(joint), log.column(joint)
     return (
@@ -150,7 +150,7 @@ def gains_on_drive(log: SweepLog, joint: str, robot: Robot) -> tuple[float, floa
 
 
 def measured_joints(
-    log: SweepLog,
+    log: JointLog,
     joint: str,
     robot: Robot,
     settings: MatchSettings,
@@ -199,7 +199,7 @@ def measured_joints(
 
 
 def target(
-    part: SweepLog,
+    part: JointLog,
     operator: H1Operator,
     measured: FrequencyResponse,
     robot: Robot,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match.arm import match_arm
 from pronk.match.diagnostics import (
     amplitude_flags,
@@ -74,7 +74,7 @@ class _Found:
 
 
 def match_logs(
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     robot: Robot,
     *,
     mode: Literal["gains", "drive"] = "gains",
@@ -122,7 +122,7 @@ def match_logs(
 
 
 def _match_gains(
-    logs: Sequence[SweepLog], robot: Robot, chosen: MatchSettings, progress: Progress | None
+    logs: Sequence[JointLog], robot: Robot, chosen: MatchSettings, progress: Progress | None
 ) -> MatchResult:
     """The paper's search, its refinement and intervals, joint by joint."""
     clock = _Clock(progress)
@@ -182,7 +182,7 @@ class _Clock:
 
 
 def _collect(
-    logs: Sequence[SweepLog], robot: Robot, settings: MatchSettings, clock: _Clock
+    logs: Sequence[JointLog], robot: Robot, settings: MatchSettings, clock: _Clock
 ) -> dict[str, _Measured]:
     """Responses of every joint excited, in the robot's order."""
     where = logs_by_joint(logs, robot)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.arm import drives_of
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.measured_joint import gains_on_drive
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 def predict(
-    log: SweepLog,
+    log: JointLog,
     robot: Robot,
     gains: MatchedGains,
     *,
@@ -66,7 +66,7 @@ def predict(
         return _joint_by_joint(log, rigs, gains)
 
 
-def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
+def _arm(log: JointLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
     """The whole arm at once."""
     matched = drives_of(robot, gains)
     with ChainSimulation(robot, [log], threads=threads) as rig:
@@ -100,7 +100,7 @@ def _arm(log: SweepLog, robot: Robot, gains: MatchedGains, threads: int) -> Pred
     return _prediction(log, out, excluded)
 
 
-def _joint_by_joint(log: SweepLog, rigs: JointRigs, gains: MatchedGains) -> Prediction:
+def _joint_by_joint(log: JointLog, rigs: JointRigs, gains: MatchedGains) -> Prediction:
     """One joint after the other, segment by segment."""
     robot = rigs.robot
     out, excluded = [], {}
@@ -134,7 +134,7 @@ def _joint_by_joint(log: SweepLog, rigs: JointRigs, gains: MatchedGains) -> Pred
 
 
 def _replay(
-    part: SweepLog,
+    part: JointLog,
     segment: Segment,
     name: str,
     rigs: JointRigs,
@@ -181,13 +181,13 @@ def _delayed(trace: CommandTrace, delay: float) -> CommandTrace:
     return replace(trace, command=held_mean(trace.time, trace.command, edges))
 
 
-def _on_drive(log: SweepLog, robot: Robot, name: str) -> JointDrive:
+def _on_drive(log: JointLog, robot: Robot, name: str) -> JointDrive:
     """The published drive, with the gains that were on it."""
     stiffness, damping = gains_on_drive(log, name, robot)
     return replace(JointDrive.published(robot, name), stiffness=stiffness, damping=damping)
 
 
-def _single(log: SweepLog) -> tuple[Segment, ...]:
+def _single(log: JointLog) -> tuple[Segment, ...]:
     """The whole log as one segment of those whose command moves."""
     moving = np.ptp(log.command, axis=0) > 0.0
     names = tuple(name for name, moves in zip(log.joints, moving, strict=True) if moves)
@@ -211,7 +211,7 @@ def _without_gains(name: str) -> str:
 
 
 def _prediction(
-    log: SweepLog, joints: list[JointPrediction], excluded: dict[str, str]
+    log: JointLog, joints: list[JointPrediction], excluded: dict[str, str]
 ) -> Prediction:
     if not joints:
         reasons = " ".join(excluded.values()) or "no joint is excited in it."

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pronk.errors import RobotError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Robot
@@ -100,7 +100,7 @@ def group_gains(
 def matched_gains(
     robot: Robot,
     joints: Mapping[str, JointGains],
-    logs: Sequence[SweepLog],
+    logs: Sequence[JointLog],
     info: SimulatorInfo,
 ) -> MatchedGains:
     """The artefact: gains of the joints, what training draws from, and what they rest on.

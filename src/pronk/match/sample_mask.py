@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def trusted_frequency(time: Array, command: Array, position: Array) -> float:
     return float(hz[first + fallen[0]]) if last >= _WIDE * hz[first] else float("inf")
 
 
-def trusted_samples(log: SweepLog, joint: str) -> tuple[NDArray[np.bool_], float]:
+def trusted_samples(log: JointLog, joint: str) -> tuple[NDArray[np.bool_], float]:
     """Samples at which the command has nothing above its trusted frequency.
 
     Args:

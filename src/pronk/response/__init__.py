@@ -3,7 +3,7 @@
 import sys
 from types import ModuleType
 
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.response.delay import DelayFit, fit_delay
 from pronk.response.distortion import Distortion, distortion, third_harmonic
 from pronk.response.estimate import estimate, operators
@@ -31,7 +31,7 @@ class _Package(ModuleType):
     """Make `pronk.response(log, joint)` call `estimate`."""
 
     def __call__(
-        self, log: SweepLog, joint: str, estimator: Estimator | None = None
+        self, log: JointLog, joint: str, estimator: Estimator | None = None
     ) -> list[FrequencyResponse]:
         return estimate(log, joint, estimator)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.response.estimator import Estimator
 from pronk.response.grid import analysis_rate
 from pronk.response.periodic import read_periods
@@ -88,13 +88,13 @@ def third_harmonic_chirp(
     return rms[3] / rms[1] if rms[1] > 0.0 else float("nan")
 
 
-def third_harmonic(log: SweepLog, joint: str, band_hz: tuple[float, float] = LOW_BAND_HZ) -> float:
+def third_harmonic(log: JointLog, joint: str, band_hz: tuple[float, float] = LOW_BAND_HZ) -> float:
     """Third harmonic of the answer to one question.
 
     Sine steps are read exactly, chirps by demodulation.
 
     Args:
-        log: One question (`SweepLog.cut`).
+        log: One question (`JointLog.cut`).
         joint: The excited joint.
         band_hz: Frequencies looked at [Hz].
 
@@ -135,11 +135,11 @@ class Distortion:
     """Noise of the average over periods at the excited lines."""
 
 
-def distortion(log: SweepLog, joint: str, estimator: Estimator) -> Distortion:
+def distortion(log: JointLog, joint: str, estimator: Estimator) -> Distortion:
     """Nonlinear distortion of the answer to one multisine.
 
     Args:
-        log: One question (`SweepLog.cut`).
+        log: One question (`JointLog.cut`).
         joint: The excited joint.
         estimator: Gives the band.
 

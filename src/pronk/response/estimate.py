@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError, PronkError
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.response.delay import fit_delay
 from pronk.response.distortion import third_harmonic
 from pronk.response.estimator import Estimator
@@ -26,7 +26,7 @@ _UNMOVED = 0.01
 """Share of the command's travel below which a joint did not move."""
 
 
-def questions(log: SweepLog, joint: str) -> list[list[SweepLog]]:
+def questions(log: JointLog, joint: str) -> list[list[JointLog]]:
     """Split a log into the excitations of one joint, gathered into repeats.
 
     Questions of the same kind, amplitude, period, band and clamping are repeats of one another.
@@ -52,7 +52,7 @@ def questions(log: SweepLog, joint: str) -> list[list[SweepLog]]:
     if not segments:
         excited = sorted({name for segment in log.segments for name in segment.joints})
         raise LogError(f"{where}: {joint} was not excited; {', '.join(excited)} were.")
-    groups: dict[tuple[object, ...], list[SweepLog]] = {}
+    groups: dict[tuple[object, ...], list[JointLog]] = {}
     for segment in segments:
         part = log.cut(segment)
         command = part.command[:, column]
@@ -76,7 +76,7 @@ def questions(log: SweepLog, joint: str) -> list[list[SweepLog]]:
     return sorted(groups.values(), key=lambda parts: -parts[0].segments[0].amplitude)
 
 
-def log_rate(parts: Sequence[SweepLog]) -> float:
+def log_rate(parts: Sequence[JointLog]) -> float:
     """One rate of the analysis grid for all questions, so that they share their frequencies [Hz].
 
     The mean rate inside the questions, to four significant digits; what was logged, or not, between
@@ -87,7 +87,7 @@ def log_rate(parts: Sequence[SweepLog]) -> float:
     return float(f"{steps / span:.4g}")
 
 
-def _check_moved(part: SweepLog, joint: str) -> None:
+def _check_moved(part: JointLog, joint: str) -> None:
     column = part.column(joint)
     moved = float(np.ptp(part.position[:, column]))
     commanded = float(np.ptp(part.command[:, column]))
@@ -99,7 +99,7 @@ def _check_moved(part: SweepLog, joint: str) -> None:
 
 
 def _averaged(
-    parts: Sequence[SweepLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
+    parts: Sequence[JointLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
     """H1 over the segments of all repeats."""
     each: list[Sums] = []
@@ -134,7 +134,7 @@ def _averaged(
 
 
 def estimate(
-    log: SweepLog, joint: str, estimator: Estimator | None = None
+    log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[FrequencyResponse]:
     """Responses of one joint, from its held command to its position.
 
@@ -177,7 +177,7 @@ def estimate(
     return found
 
 
-def operator(part: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
+def operator(part: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
     """Return the estimate of one question as a matrix; equal repeats share it.
 
     Args:
@@ -201,7 +201,7 @@ def operator(part: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -
 
 
 def operators(
-    log: SweepLog, joint: str, estimator: Estimator | None = None
+    log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[list[H1Operator]]:
     """Return the `operator` of every repeat of every response of `estimate`."""
     groups = questions(log, joint)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.response.estimator import Estimator
 from pronk.response.grid import Grid, analysis_rate, held_mean, hold, interpolate
 from pronk.response.operator import H1Operator
@@ -109,12 +109,12 @@ def _lines(grid: Grid, samples: int, estimator: Estimator) -> NDArray[np.intp]:
 
 
 def read_periods(
-    log: SweepLog, joint: str, estimator: Estimator, *, rate_hz: float | None = None
+    log: JointLog, joint: str, estimator: Estimator, *, rate_hz: float | None = None
 ) -> Periods:
     """Spectra of the steady periods of one multisine.
 
     Args:
-        log: One question (`SweepLog.cut`), whose segment gives the period.
+        log: One question (`JointLog.cut`), whose segment gives the period.
         joint: The excited joint.
         estimator: Gives the band.
         rate_hz: Rate of the analysis grid; about that of the timestamps if not given.
@@ -202,7 +202,7 @@ def combined(
 
 
 def estimate_multisine(
-    parts: Sequence[SweepLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
+    parts: Sequence[JointLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
     """Response at the lines of a multisine, averaged over periods and questions.
 
@@ -210,7 +210,7 @@ def estimate_multisine(
     part of the scatter), one per period otherwise.
 
     Args:
-        parts: The questions, one log each (`SweepLog.cut`).
+        parts: The questions, one log each (`JointLog.cut`).
         joint: The excited joint.
         amplitude: Peak of the command [rad].
         estimator: Gives the band.

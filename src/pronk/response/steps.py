@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import get_window
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.response.estimator import Estimator
 from pronk.response.grid import Grid, held_mean, hold, interpolate
 from pronk.response.periodic import combined
@@ -82,11 +82,11 @@ def _steady(time: Array, command: Array, span: float, hz: float, rate_hz: float)
     return int(even[0]) + settle, end if end == periods else end - settle
 
 
-def read_steps(log: SweepLog, joint: str, estimator: Estimator, rate_hz: float) -> Steps:
+def read_steps(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> Steps:
     """Read every step of one question inside the band.
 
     Args:
-        log: One question (`SweepLog.cut`) with its instantaneous frequency.
+        log: One question (`JointLog.cut`) with its instantaneous frequency.
         joint: The excited joint.
         estimator: Gives the band.
         rate_hz: About the rate of the grid; each step takes a whole number of samples a period.
@@ -158,7 +158,7 @@ def read_steps(log: SweepLog, joint: str, estimator: Estimator, rate_hz: float) 
 
 
 def estimate_steps(
-    parts: Sequence[SweepLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
+    parts: Sequence[JointLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
     """Response at the frequencies of sine steps, averaged over periods and questions.
 
@@ -166,7 +166,7 @@ def estimate_steps(
     periods otherwise.
 
     Args:
-        parts: The questions, one log each (`SweepLog.cut`).
+        parts: The questions, one log each (`JointLog.cut`).
         joint: The excited joint.
         amplitude: Peak of the command [rad].
         estimator: Gives the band.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import SweepLog
+from pronk.logs.joint_log import JointLog
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import held_mean
@@ -66,7 +66,7 @@ class JointDrive:
 Drives = Mapping[str, JointDrive]
 
 
-def excited_joints(log: SweepLog, robot: Robot) -> tuple[tuple[str, ...], dict[str, str]]:
+def excited_joints(log: JointLog, robot: Robot) -> tuple[tuple[str, ...], dict[str, str]]:
     """Which joints of a log can be simulated, and why the others cannot.
 
     Returns:
@@ -97,7 +97,7 @@ def excited_joints(log: SweepLog, robot: Robot) -> tuple[tuple[str, ...], dict[s
     return tuple(excited), excluded
 
 
-def moves_together(log: SweepLog) -> bool:
+def moves_together(log: JointLog) -> bool:
     """True if several joints of a log move at once, so that the whole arm must be simulated."""
     if log.segments:
         return any(
@@ -113,7 +113,7 @@ def moves_together(log: SweepLog) -> bool:
 class ChainSimulation:
     """The chain with the commands of one or more logs, for many sets of drives."""
 
-    def __init__(self, robot: Robot, logs: Sequence[SweepLog], *, threads: int = 2) -> None:
+    def __init__(self, robot: Robot, logs: Sequence[JointLog], *, threads: int = 2) -> None:
         """Compile the model and take in the logs.
 
         Args:
@@ -203,7 +203,7 @@ class ChainSimulation:
             out.append(columns)
         return out
 
-    def _track(self, log: SweepLog) -> _Track:
+    def _track(self, log: JointLog) -> _Track:
         start = np.array([self.robot.joint(name).default_position for name in self.chain])
         command = np.tile(start, (len(log.time), 1))
         for name in self.chain:
@@ -248,7 +248,7 @@ class ChainSimulation:
 class _Track:
     """One log as the simulator needs it."""
 
-    log: SweepLog
+    log: JointLog
     start: Array
     """First measured position of the chain [rad], shape (chain,)."""
     command: Array

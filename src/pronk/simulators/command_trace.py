@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.logs.joint_log import Segment, SweepLog
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ def held_mean(time: Array, command: Array, edges: Array) -> Array:
 
 
 def command_trace(
-    log: SweepLog, segment: Segment, joint: str, robot: Robot, *, until: float | None = None
+    log: JointLog, segment: Segment, joint: str, robot: Robot, *, until: float | None = None
 ) -> CommandTrace:
     """Command of one segment of a log at every physics step.
 
@@ -228,7 +228,7 @@ def _early_ticks(values: Array) -> int:
     return 0 if rest < 2 else -(-(rest + 2) // 5) * 5 - rest
 
 
-def _pose(log: SweepLog, joint: str, robot: Robot) -> Array:
+def _pose(log: JointLog, joint: str, robot: Robot) -> Array:
     """Pose of every joint of the robot.
 
     The log's; where it has none, the first command of each of its joints, and the default
