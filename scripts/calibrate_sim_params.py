@@ -108,7 +108,7 @@ HEADER = f"""\
 #   rotor_inertia          63e-6 kg m^2 +- 3 %, motor side: Cheetah-Software's figure, where the
 #                          simulator believes the paper's 72e-6 (reading A11)
 #   belt_stiffness         rotor and link ring at about 130 Hz (hips: gears) and 160 Hz (knee: belt
-#                          through the thigh), above all that is asked; 4 % of critical damping
+#                          through the thigh), above the band; 4 % of critical damping
 #   coulomb                0.13 to 0.17 N m +- 20 %; the simulator has 0.2 (Cheetah-Software)
 #   breakaway              1.15 to 1.35 times that
 #   stribeck_speed         about 0.15 rad/s (1 to 1.4 rad/s at the motor)
@@ -160,7 +160,7 @@ def target(name: str) -> np.ndarray:
     return np.array([stiffness[LEGS.index(leg)], damping[LEGS.index(leg)]])
 
 
-def asked(
+def matched(
     sim_params: SimParams, name: str, method: str = "quick"
 ) -> tuple[np.ndarray, float, float]:
     """Matched (stiffness, damping) of one joint, its error and the naive error [dB RMS]."""
@@ -181,7 +181,7 @@ def calibrated(sim_params: SimParams, name: str) -> JointParams:
     wanted = target(name)
     for turn in range(ROUNDS):
         joint = sim_params.joints[name]
-        got, error, naive = asked(sim_params, name)
+        got, error, naive = matched(sim_params, name)
         cells = (got - wanted) / CELL
         print(
             f"{name:14s} round {turn}: torque {joint.torque_scale:.4f} viscous {joint.viscous:.4f}"
@@ -236,7 +236,7 @@ def main() -> None:
     if arguments.check:
         sim_params = load_sim_params(arguments.out)
         for name in sim_params.joints:
-            got, error, naive = asked(sim_params, name, "grid")
+            got, error, naive = matched(sim_params, name, "grid")
             cells = (got - target(name)) / CELL
             print(
                 f"{name:14s} {got[0]:6.2f} {got[1]:.4f}  {cells[0]:+.2f} {cells[1]:+.2f} cells off"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -47,3 +49,8 @@ def test_every_command_of_the_documentation_exists() -> None:
 
 def test_the_readme_is_at_most_900_words() -> None:
     assert len(README.split()) <= 900
+
+
+def test_the_tables_of_robots_and_formats_are_up_to_date() -> None:
+    script = [sys.executable, str(ROOT / "scripts" / "readme_tables.py"), "--check"]
+    assert subprocess.run(script, check=False).returncode == 0
