@@ -6,9 +6,9 @@ import io
 import json
 
 import pytest
-from pronk.cli.bench_train import train
 from rich.console import Console
 
+from benchmarks.__main__ import train
 from benchmarks.train import in_turn, run
 from benchmarks.train_result import Rate, Scaling, TaskSpeed, TrainBench, ratio, stage_table, table
 from benchmarks.train_stages import REST, StageCost, Stages, costs, counted

@@ -278,6 +278,7 @@ def _fix_base(spec: Any, robot: Robot, sim_params: SimParams) -> None:
                 axis=axis,
                 stiffness=[sim_params.machine.stand_stiffness, 0, 0],
                 damping=[sim_params.machine.stand_damping, 0, 0],
+                limited=mujoco.mjtLimited.mjLIMITED_FALSE,
             )
 
 
