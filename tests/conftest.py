@@ -22,6 +22,5 @@ for number, usual in (
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        for folder in ("slow", "live"):
-            if folder in Path(item.path).parts[-3:-1]:
-                item.add_marker(folder)
+        if (folder := Path(item.path).parent.name) in ("slow", "live"):
+            item.add_marker(folder)
