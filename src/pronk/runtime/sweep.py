@@ -76,16 +76,14 @@ class SweepTask:
 
     def excitations(self, index: int) -> list[Ask]:
         """What goes into one log."""
-        return [ask for ask in self.plan.asks if ask.joints == self.sets[index]]
+        joints = self.sets[index]
+        return [ask for ask in self.plan.asks if ask.joints == joints]
 
     @property
     def seconds(self) -> float:
         """Of all excitations [s]."""
-        return sum(
-            self.plan.ask_duration_s(ask)
-            for index in range(len(self.sets))
-            for ask in self.excitations(index)
-        )
+        sets = self.sets
+        return sum(self.plan.ask_duration_s(ask) for ask in self.plan.asks if ask.joints in sets)
 
     def check(self) -> None:
         """Refuse a task that cannot be carried out, before anything moves.
@@ -381,6 +379,7 @@ class SweepController:
         self.task, self.plan, self.machine = task, task.plan, machine
         self.progress = progress
         self.tick = 1.0 / self.plan.rate_hz
+        self._seconds = task.seconds
         self.target = state.position.copy()
         self.strict = task.limits(machine.torque_kind, **(limits or {}))
         q, low, high = state.position, self.strict.low, self.strict.high
@@ -522,7 +521,7 @@ class SweepController:
                 done += self.plan.ask_duration_s(ask)
             yield from self._clamp(())
             self.end("")
-            self.progress(done / self.task.seconds, f"wrote {path.name}")
+            self.progress(done / self._seconds, f"wrote {path.name}")
 
     def _rest(self, seconds: float, segment: int = -1) -> Iterator[SweepStep]:
         for _ in range(round(seconds / self.tick)):
@@ -582,7 +581,7 @@ class SweepController:
             target[columns] += offset
             yield SweepStep(target=target, frequency=float(frequency[k]), segment=number)
             if k % _PROGRESS_TICKS == 0:
-                self.progress(min((done + k * self.tick) / self.task.seconds, 1.0), what)
+                self.progress(min((done + k * self.tick) / self._seconds, 1.0), what)
         for _ in range(round(self.plan.settle_s / self.tick)):
             yield SweepStep(target=self.plan.pose, segment=number)
 
