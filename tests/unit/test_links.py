@@ -7,7 +7,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 
 import numpy as np
 import pytest
@@ -248,13 +248,20 @@ def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     point = EntryPoint("serial", f"{__name__}:serial", addresses.GROUP)
-    monkeypatch.setattr(addresses, "entry_points", lambda group: [point])
+    monkeypatch.setattr(addresses, "entry_points", lambda group: EntryPoints([point]))
     monkeypatch.setattr(EntryPoint, "load", lambda self: serial)
     machine = Address.parse("serial://ttyUSB0?speed=115200").machine(ROBOT)
     assert isinstance(machine, StreamLink)
     assert machine.counts == {"speed": 115200}
     assert "serial" in addresses.link_names()
     check_link(ROBOT, Serial(), [message(0.0), message(0.1)], Loop)
+
+
+def test_a_link_whose_package_is_broken_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("serial", "no_such_package:serial", addresses.GROUP)
+    monkeypatch.setattr(addresses, "entry_points", lambda group: EntryPoints([point]))
+    with pytest.raises(PronkError, match="no_such_package:serial"):
+        Address.parse("serial://ttyUSB0")
 
 
 @pytest.mark.parametrize("wrong", ["decode", "encode", "local"])

@@ -19,6 +19,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 
 import msgspec
 
+from pronk import plugins
 from pronk.errors import HardwareError
 from pronk.links.machine import Machine
 from pronk.links.network_link import ClampOperator
@@ -37,7 +38,7 @@ _COMMON = ("robot", "interface", "clamp_operator", "release", "exclusive_s", "fr
 
 def link_names() -> tuple[str, ...]:
     """Names of all links, those of installed packages included."""
-    return (*BUILT_IN, *sorted(point.name for point in entry_points(group=GROUP)))
+    return (*BUILT_IN, *sorted(entry_points(group=GROUP).names))
 
 
 def find_link(name: str) -> Callable[..., Machine]:
@@ -48,10 +49,10 @@ def find_link(name: str) -> Callable[..., Machine]:
     """
     target = BUILT_IN.get(name)
     if target is None:
-        for point in entry_points(group=GROUP):
-            if point.name == name:
-                return point.load()  # type: ignore[no-any-return]
-        raise HardwareError(f"no link {name!r}; the links are {', '.join(link_names())}.")
+        known = entry_points(group=GROUP)
+        if name not in known.names:
+            raise HardwareError(f"no link {name!r}; the links are {', '.join(link_names())}.")
+        return plugins.load(known[name])  # type: ignore[no-any-return]
     module, _, attribute = target.partition(":")
     return getattr(import_module(module), attribute)  # type: ignore[no-any-return]
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from pronk import plugins
 from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_joints, check_radians
 from pronk.logs.csv_reader import read_csv
@@ -75,13 +76,9 @@ def readers() -> dict[str, Reader]:
     taken = {suffix: each.name for each in _BUILT_IN for suffix in each.suffixes}
     for point in entry_points(group=GROUP):
         try:
-            each = point.load()
-        except Exception as error:  # Code of another package may fail in any way.
-            warnings.warn(
-                f"the log reader {point.value} cannot be loaded ({type(error).__name__}: {error}); "
-                "reinstall or remove its package.",
-                stacklevel=2,
-            )
+            each = plugins.load(point)
+        except PronkError as error:  # The other formats can still be read.
+            warnings.warn(str(error), stacklevel=2)
             continue
         if not isinstance(each, Reader):
             raise LogError(

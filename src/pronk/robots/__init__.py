@@ -10,6 +10,7 @@ from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from pronk import plugins
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, Joint, Robot
 
@@ -33,13 +34,13 @@ def load_robot(name: str | Path) -> Robot:
     if str(name) in ROBOT_NAMES:
         path = Path(__file__).parent / str(name) / "robot.yaml"
     elif not path.exists():
-        found = [point for point in entry_points(group="pronk.robots") if point.name == str(name)]
-        if not found:
+        known = entry_points(group="pronk.robots")
+        if str(name) not in known.names:
             raise RobotError(
                 f"there is no robot {str(name)!r}; the robots are {', '.join(ROBOT_NAMES)}, or "
                 "give the path of a robot.yaml, an MJCF or a URDF."
             )
-        path = Path(found[0].load()())
+        path = Path(plugins.load(known[str(name)])())
     if path.is_dir():
         path = path / "robot.yaml"
     if path.suffix not in _FILES + _MODELS:

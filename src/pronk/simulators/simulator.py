@@ -18,6 +18,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk import plugins
 from pronk.errors import PronkError
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import CommandTrace, original_pose
@@ -392,10 +393,10 @@ def _factory(choice: str) -> Any:
                 f"{', '.join(offers) or 'none'}."
             )
         return found
-    known = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
-    if choice not in known:
+    known = entry_points(group=ENTRY_POINTS)
+    if choice not in known.names:
         raise PronkError(
             f"simulator {choice!r}; expected FILE.py:NAME or one of "
-            f"{', '.join(['mujoco', *sorted(known)])}."
+            f"{', '.join(['mujoco', *sorted(known.names)])}."
         )
-    return known[choice].load()
+    return plugins.load(known[choice])
