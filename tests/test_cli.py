@@ -91,6 +91,12 @@ def test_misspelled_command_and_option_are_one_sentence(capsys):
     assert "pronk match --help" in said
 
 
+def test_a_value_that_was_a_command_once_is_no_renamed_option(capsys):
+    said = refused(capsys, "match", "bench", "--robot", "twin", "--grids", "3")
+    assert "--grids" in said
+    assert "simulate" not in said
+
+
 def test_version(capsys):
     from pronk import __version__
 

@@ -138,13 +138,9 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> C
     for name, kind in call.__annotations__.items():
         if kind == bool | None:  # tyro wants a value there: --x True.
             option = name.replace("_", "-")
-            flags = {f"--{option}": "True", f"--no-{option}": "False"}
+            values = {f"--{option}": "True", f"--no-{option}": "False"}
             arguments = [
-                word
-                for given_word in arguments
-                for word in (
-                    (f"--{option}", flags[given_word]) if given_word in flags else (given_word,)
-                )
+                f"--{option}={values[word]}" if word in values else word for word in arguments
             ]
     config = (tyro.conf.UseAppendAction, tyro.conf.OmitArgPrefixes)
     messages = io.StringIO()
@@ -162,7 +158,7 @@ def _sentence(box: str, arguments: list[str], program: str) -> str:
     """Make one sentence of the message that tyro prints in a box."""
     words = " ".join(arguments)
     for old, hint in RENAMED.items():
-        if re.search(rf"(?:^| ){re.escape(old)}(?:[ =]|$)", words):
+        if old.startswith("-") and re.search(rf"(?:^| ){re.escape(old)}(?:[ =]|$)", words):
             return hint
     lines = [re.sub(r"[│╭╮╰╯─]", " ", line).strip() for line in box.splitlines()]
     text = " ".join(line for line in lines if line)
