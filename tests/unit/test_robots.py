@@ -202,6 +202,8 @@ def test_wrong_symmetry_is_refused(name: str, tmp_path: Path) -> None:
         ("base_body: trunk", "base_body: chest", "chest"),
         ("  default:", "  home:", "default"),
         ("model: mini_cheetah.xml", "model: other.xml", "other.xml"),
+        ("base_body: trunk", "base_body: trunk\npolicy_rate_hz: 100.0", "policy_rate_hz"),
+        ("base_body: trunk", "base_body: trunk\ndecimation: 7", "decimation"),
     ],
 )
 def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_path: Path) -> None:

@@ -219,6 +219,12 @@ def make_robot(file: RobotFile, build: Model, source: str) -> Robot:
     Raises:
         RobotError: Something is missing or inconsistent; names the entry.
     """
+    ticks = file.timestep_s * file.decimation * file.policy_rate_hz
+    if abs(ticks - 1.0) > 1e-9:
+        raise RobotError(
+            f"{source}: timestep_s * decimation * policy_rate_hz is {ticks:.6g}; expected 1, one "
+            "command for `decimation` steps of the simulator."
+        )
     model = build().compile()
     hinges = [
         model.joint(i).name
