@@ -6,7 +6,7 @@ network in ONNX Runtime within), in three ways:
 
 - back to back, a thousand times, all in the caches;
 - at ticks 20 ms apart, woken by an absolute deadline;
-- the same after the rehearsals that `pronk deploy` makes (`pronk.runtime.warmup`).
+- the same after the rehearsals that `pronk deploy` makes (`pronk.runtime.policy_process`).
 
 Ticks of both kinds take turns in one loop, so that both meet the same computer. Quantiles are the
 upper edges of the bins of `Histogram`, 4.7 % wide.
@@ -34,10 +34,9 @@ from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace, Wanted, enter, sleep_until
 from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
-from pronk.runtime.policy_process import WARM_UP, standing
+from pronk.runtime.policy_process import WARM_UP, standing, warm_up_until
 from pronk.runtime.rollout import PolicyRunner
 from pronk.runtime.script import STILL
-from pronk.runtime.warmup import warm_up_until
 
 RATE_HZ = 50.0
 HOGS = 2

@@ -11,12 +11,11 @@ from pathlib import Path
 
 from pronk.links.address import Address
 from pronk.runtime.ipc import Event
-from pronk.runtime.link import Link
-from pronk.runtime.plan import Plan
+from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import run
 from pronk.runtime.script import Script
+from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import ScriptedOperator
-from pronk.runtime.trajectories import Timing
 
 QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
 PATIENT = {"damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}

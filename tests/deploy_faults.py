@@ -13,7 +13,7 @@ import numpy as np
 from pronk.errors import HardwareError
 from pronk.links.address import Address
 from pronk.links.machine import Command, State
-from pronk.runtime.link import Link, Paced
+from pronk.runtime.plan import Link, Paced
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from pronk.errors import LogError, PronkError, RobotError
 from pronk.logs.csv_reader import write_csv
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_writer import write_mcap
+from pronk.logs.mcap_log import write_mcap
 from pronk.logs.npz_reader import write_npz
 from pronk.logs.readers import read_log, read_logs
 from pronk.robots import load_robot

@@ -20,9 +20,16 @@ from mcap.writer import Writer
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.logs.mcap_format import END, HEADER, SAMPLE, SEGMENT, LogHeader
-from pronk.logs.mcap_reader import read_mcap
-from pronk.logs.mcap_writer import McapLogWriter, write_mcap
+from pronk.logs.mcap_log import (
+    END,
+    HEADER,
+    SAMPLE,
+    SEGMENT,
+    LogHeader,
+    McapLogWriter,
+    read_mcap,
+    write_mcap,
+)
 from pronk.logs.readers import read_log
 
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
@@ -193,8 +200,8 @@ def test_a_killed_recorder_leaves_a_valid_log(tmp_path: Path) -> None:
         import time
         from pathlib import Path
         from pronk.logs.joint_log import Segment
-        from pronk.logs.mcap_format import LogHeader
-        from pronk.logs.mcap_writer import McapLogWriter
+        from pronk.logs.mcap_log import LogHeader
+        from pronk.logs.mcap_log import McapLogWriter
         header = LogHeader(robot="mini_cheetah", joints=("knee",))
         writer = McapLogWriter(Path({str(path)!r}), header)
         writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))

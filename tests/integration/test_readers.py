@@ -15,7 +15,7 @@ from pronk.errors import LogError, RobotError
 from pronk.logs.checks import check_motion, motion
 from pronk.logs.csv_reader import write_csv
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.logs.mcap_writer import write_mcap
+from pronk.logs.mcap_log import write_mcap
 from pronk.logs.npz_reader import write_npz
 from pronk.logs.readers import read_log, read_logs
 from pronk.logs.timing import check_claim, check_unit, examine

@@ -48,7 +48,7 @@ def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
         orientation=changes.pop("orientation", np.array([1.0, 0.0, 0.0, 0.0])),
         temperature=changes.pop("temperature", None),
     )
-    put_state(one, state, 0.0)
+    put_state(one, state)
     one["tick"], one["deadline"] = number, number * TICK_S
     one["begun"], one["done"] = number * TICK_S + 1e-4, number * TICK_S + 4e-4
     one["mode"], one["latency"] = Mode.POLICY, np.nan

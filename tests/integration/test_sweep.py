@@ -13,7 +13,7 @@ from pronk.errors import HardwareError, PlanError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
 from pronk.links.machine import Command, State
-from pronk.logs.mcap_reader import read_mcap
+from pronk.logs.mcap_log import read_mcap
 from pronk.robots import load_robot
 from pronk.runtime.safety import filtered
 from pronk.runtime.sweep import logged_joints, record
@@ -258,7 +258,7 @@ def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:
 def test_a_log_in_the_way_is_not_lost(tmp_path: Path) -> None:
     kept = tmp_path / "FR_knee.mcap"
     kept.write_bytes(b"a day's work")
-    with pytest.raises(HardwareError, match="already there"):
+    with pytest.raises(HardwareError, match="FR_knee"):
         record(Watched(), ROBOT, plan_of("FR_knee"), tmp_path)
     assert kept.read_bytes() == b"a day's work"
 

@@ -26,8 +26,8 @@ from pronk.runtime.log import is_deploy_log, read_deploy_log
 from pronk.runtime.plan import Plan
 from pronk.runtime.run import Deployment
 from pronk.runtime.safety import Reason
+from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import OperatorCommand
-from pronk.runtime.trajectories import Timing
 from pronk.virtual.capture import load as load_capture
 
 pytestmark = pytest.mark.live

@@ -31,8 +31,8 @@ from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.log import read_deploy_log
 from pronk.runtime.plan import Plan
 from pronk.runtime.run import Deployment
+from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import OperatorCommand
-from pronk.runtime.trajectories import Timing
 from pronk.virtual.server import hold_of
 
 pytestmark = pytest.mark.live

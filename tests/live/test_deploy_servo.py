@@ -19,11 +19,10 @@ from deploy_faults import FaultyLink
 from pronk.errors import HardwareError
 from pronk.links.address import Address
 from pronk.links.machine import Machine
-from pronk.runtime.ipc import OPERATOR, Mode, OperatorRequest, Shared
-from pronk.runtime.link import Link
-from pronk.runtime.plan import Plan
+from pronk.runtime.ipc import OPERATOR, TICK, Mode, OperatorRequest, Shared
+from pronk.runtime.plan import Link, Plan
 from pronk.runtime.servo import Servo
-from pronk.runtime.trajectories import Timing
+from pronk.runtime.state_machine import Timing
 
 pytestmark = pytest.mark.live
 
@@ -167,13 +166,12 @@ def test_a_link_that_breaks_does_not_make_time_run_ahead(faults: FaultyLink) -> 
 
 
 @pytest.mark.parametrize("log", [None, Path("run.mcap")])
-def test_nothing_is_lost_where_nothing_is_kept(
-    faults: FaultyLink, log: Path | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Nobody empties the queue here: it is full at once.
-    monkeypatch.setattr("pronk.runtime.ipc._TICKS", 4)
+def test_nothing_is_lost_where_nothing_is_kept(faults: FaultyLink, log: Path | None) -> None:
     with flown(faults, log=log) as run:
         run.mode(Mode.DAMP)
+        # No process empties the queue here; fill it.
+        while run.shared.ticks.put(np.zeros((), TICK)):
+            pass
         run.until(lambda: run.shared.ticks.dropped > 0)
         dropped = run.servo.figures()["dropped"]
         assert (dropped == {}) if log is None else (dropped["ticks"] > 0)
@@ -186,7 +184,7 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     with flown(link, capture=folder / "seen.npz") as run:
         run.mode(Mode.DAMP)
     (why,) = run.texts("lost")
-    assert why.startswith("what the cameras saw was not kept: ")
+    assert "Not a directory" in why or "exists" in why
     assert run.texts("mode")[-1] == "ENDED"
     assert run.servo._machine is not None
     with pytest.raises(HardwareError, match="connect"):

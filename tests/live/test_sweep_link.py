@@ -34,7 +34,7 @@ from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
 from pronk.links.machine import Command
 from pronk.links.state_checks import Freshness
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_reader import read_mcap
+from pronk.logs.mcap_log import read_mcap
 from pronk.robots import Robot, load_robot
 from pronk.runtime.run import Recorded
 from pronk.virtual.server import hold_of

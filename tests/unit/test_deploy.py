@@ -7,8 +7,9 @@ import os
 import pty
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing import get_context
+from multiprocessing import get_context, shared_memory
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +22,19 @@ import pronk.runtime.log
 from pronk.errors import HardwareError, LogError, RobotError
 from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace
-from pronk.logs.mcap_stream import MOST_BYTES, DamagedError, records
+from pronk.logs.mcap import MOST_BYTES, DamagedError, records
 from pronk.robots import load_robot
 from pronk.runtime.ipc import (
     EVENT,
     STEP,
     TICK,
+    Event,
     Mailbox,
     Mode,
     OperatorRequest,
     Ring,
+    Shared,
+    block,
     event,
     get_state,
     put_state,
@@ -39,9 +43,17 @@ from pronk.runtime.log import DeployLogWriter, is_deploy_log, read_deploy_log
 from pronk.runtime.preflight import delay_objection, refusals
 from pronk.runtime.safety import FilterAction, FilterState, Limits, Reason, fault
 from pronk.runtime.script import Script
-from pronk.runtime.state_machine import FIRST_ACTION_S, PolicyAction, StateMachine
+from pronk.runtime.state_machine import (
+    FIRST_ACTION_S,
+    PolicyAction,
+    StateMachine,
+    Timing,
+    folded_pose,
+    minimum_jerk,
+    sit_down,
+    stand_up,
+)
 from pronk.runtime.teleop import Gamepad, Keyboard, OperatorCommand, ScriptedOperator, TimeLimit
-from pronk.runtime.trajectories import Timing, folded_pose, minimum_jerk, sit_down, stand_up
 
 ROBOT = load_robot("mini_cheetah")
 LIMITS = Limits.of(ROBOT)
@@ -75,21 +87,30 @@ def pair(number: int) -> np.ndarray:
     return record
 
 
-def _scribble(name: str, count: int) -> None:
-    mailbox = Mailbox(PAIR, name)
-    for number in range(count):
-        mailbox.write(pair(number))
-    mailbox.close()
-
-
-def test_a_mailbox_never_shows_half_a_record() -> None:
-    mailbox = Mailbox(PAIR)
+@contextmanager
+def shared_block(slots: int) -> Iterator[np.ndarray]:
+    """A block in shared memory."""
+    kind = block(PAIR, slots)
+    memory = shared_memory.SharedMemory(create=True, size=kind.itemsize)
     try:
+        yield np.ndarray((), kind, memory.buf)
+    finally:
+        memory.unlink()
+
+
+def _write_many(memory: np.ndarray, count: int) -> None:
+    for number in range(count):
+        Mailbox(memory).write(pair(number))
+
+
+def test_a_mailbox_never_gives_half_a_record() -> None:
+    with shared_block(4) as memory:
+        mailbox = Mailbox(memory)
         assert mailbox.read() is None
-        writer = get_context("fork").Process(target=_scribble, args=(mailbox.name, 40_000))
+        writer = get_context("fork").Process(target=_write_many, args=(memory, 20_000))
         writer.start()
         seen, reads = -1, 0
-        while seen < 39_999:
+        while seen < 19_999:
             record = mailbox.read()
             if record is None:
                 continue
@@ -99,37 +120,40 @@ def test_a_mailbox_never_shows_half_a_record() -> None:
             reads += 1
         writer.join()
         assert reads > 10
-    finally:
-        mailbox.close()
 
 
 def test_a_half_written_slot_is_not_read() -> None:
-    ring = Ring(PAIR, 4)
-    try:
+    with shared_block(4) as memory:
+        ring = Ring(memory)
         ring.put(pair(1))
-        ring._buffer[-100] ^= 1  # in the last slot: another record's
+        memory["slots"]["record"]["b"][3] += 1  # another record's slot
         assert [int(r["a"]) for r in ring.take()] == [1]
         ring.put(pair(2))
-        ring._buffer[24 + ring._stride + 40] ^= 1  # in the middle of record 2
+        memory["slots"]["record"]["b"][1, 40] += 1
         assert ring.take() == []
-    finally:
-        ring.close()
 
 
 def test_a_full_ring_drops_the_new_and_counts_them() -> None:
-    ring = Ring(PAIR, 3)
-    other = Ring(PAIR, 3, ring.name)
-    try:
+    with shared_block(3) as memory:
+        ring, other = Ring(memory), Ring(memory)
         assert [ring.put(pair(i)) for i in range(5)] == [True] * 3 + [False] * 2
         assert other.dropped == 2
         assert [int(r["a"]) for r in other.take(2)] == [0, 1]
         assert ring.put(pair(9))
         assert [int(r["a"]) for r in other.take()] == [2, 9]
         assert other.take() == []
-    finally:
-        other.close()
-        ring.close()
-        ring.close()
+
+
+def test_shared_memory_is_attached_by_name_and_removed_once() -> None:
+    shared = Shared()
+    other = Shared(shared.name)
+    shared.events.put(event(1.0, "notice", "x"))
+    assert [Event.of(each).text for each in other.events.take()] == ["x"]
+    other.close()
+    shared.close()
+    shared.close()
+    with pytest.raises(FileNotFoundError):
+        Shared(shared.name)
 
 
 def test_a_state_survives_the_way_through_memory() -> None:
@@ -142,12 +166,12 @@ def test_a_state_survives_the_way_through_memory() -> None:
         robot_time=5.0,
     )
     record = np.zeros((), dtype=TICK)
-    put_state(record, one, 10.0)
+    put_state(record, one)
     back = get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
-    assert (back.time, back.sequence, back.robot_time) == (13.0, 7, 5.0)
+    assert (back.time, back.sequence, back.robot_time) == (3.0, 7, 5.0)
     for name in ("position", "temperature", "orientation", "accelerometer"):
         np.testing.assert_array_equal(getattr(back, name), getattr(one, name))
-    put_state(record, state(), 0.0)
+    put_state(record, state())
     back = get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
     assert back.temperature is None
     assert back.robot_time is None
@@ -635,7 +659,7 @@ PER_TICK = {f"/deploy/{topic}" for topic in ("state", "desired", "sent", "timing
 
 def record(number: int, **changes: Any) -> np.void:
     one = np.zeros((), dtype=TICK)
-    put_state(one, state(time=number / 500, sequence=number), 0.0)
+    put_state(one, state(time=number / 500, sequence=number))
     one["tick"], one["begun"], one["deadline"] = number, number / 500 + 1e-4, number / 500
     one["done"], one["latency"] = number / 500 + 4e-4, np.nan
     one["desired"] = one["sent"] = POSE
@@ -754,10 +778,10 @@ def test_a_log_of_an_hour_may_be_read(tmp_path: Path, monkeypatch: pytest.Monkey
     ticks = [len(each.data) for batch in batches for each in batch if each.topic in PER_TICK]
     assert len(ticks) == 400
     an_hour = 3600 * 500 * sum(ticks) / 100
-    assert MOST_BYTES < an_hour < pronk.runtime.log._MOST_BYTES
+    assert MOST_BYTES < an_hour < pronk.runtime.log.MOST_BYTES
     # That is the bound that holds for it.
     unpacked = sum(len(each.data) for batch in batches for each in batch)
-    monkeypatch.setattr("pronk.runtime.log._MOST_BYTES", unpacked // 2)
+    monkeypatch.setattr("pronk.runtime.log.MOST_BYTES", unpacked // 2)
     with pytest.raises(LogError, match="cut before the first tick"):
         read_deploy_log(path)
     with path.open("rb") as file, pytest.raises(DamagedError, match="more than 0 MiB"):
@@ -779,7 +803,7 @@ def test_messages_of_another_kind_are_refused(changes: dict[str, Any], tmp_path:
     writer = DeployLogWriter(path, HEADER)
     writer.tick(record(0))
     body = {name: np.asarray(value).tolist() for name, value in vars(state()).items()}
-    writer._put("state", 0.0, {"t": 0.0, **body, **changes})
+    writer.put("state", 0.0, {"t": 0.0, **body, **changes})
     writer.end(complete=True, figures={})
     with pytest.raises(LogError, match="its messages are not those of"):
         read_deploy_log(path)

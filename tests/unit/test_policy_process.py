@@ -17,10 +17,8 @@ from pronk.links.machine import State
 from pronk.links.realtime import Pace
 from pronk.policy.runtime import load_policy
 from pronk.runtime.ipc import OPERATOR, STATE, Mode, Shared, put_state
-from pronk.runtime.link import Link
-from pronk.runtime.plan import Plan
-from pronk.runtime.policy_process import PolicyProcess, standing
-from pronk.runtime.warmup import LEAD_S, warm_up_until
+from pronk.runtime.plan import Link, Plan
+from pronk.runtime.policy_process import LEAD_S, PolicyProcess, standing, warm_up_until
 
 pytest.importorskip("onnxruntime")
 
@@ -61,7 +59,7 @@ def states(count: int) -> list[State]:
 def publish(process: PolicyProcess, state: State, mode: Mode, entry: int) -> None:
     """What servo and operator say before a step."""
     record, stick = np.zeros((), dtype=STATE), np.zeros((), dtype=OPERATOR)
-    put_state(record, state, 0.0)
+    put_state(record, state)
     record["mode"], record["entry"] = mode, entry
     process.shared.state.write(record)
     stick["command"], stick["jump"] = (1.0, -0.3, 99.0), state.sequence % 3 == 0

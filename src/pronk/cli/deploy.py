@@ -80,10 +80,10 @@ def deploy(
     """
     from pronk.links.address import SIM, Address
     from pronk.policy.runtime import load_policy
-    from pronk.runtime.link import Link as Opener
+    from pronk.runtime.plan import Link as Opener
     from pronk.runtime.plan import Plan
     from pronk.runtime.run import run
-    from pronk.runtime.trajectories import Timing
+    from pronk.runtime.state_machine import Timing
 
     contract = load_policy(policy).contract
     if link.partition(":")[0] == SIM:

@@ -48,8 +48,7 @@ def record_wire(
         PronkError: The robot may not be moved or the filter stopped it, or a process was killed;
             what was recorded until then stays.
     """
-    from pronk.runtime.link import Link
-    from pronk.runtime.plan import Plan
+    from pronk.runtime.plan import Link, Plan
     from pronk.runtime.run import run_sweep
     from pronk.runtime.sweep import SweepTask
 
@@ -67,7 +66,7 @@ def record_wire(
 
     job = Plan(link=link, sweep=task, real_time=real_time, limits=limits or {})
     try:
-        return run_sweep(job, clamp_operator=confirm.Person(), tell=tell, progress=progress)
+        return run_sweep(job, clamp_operator=confirm.Person(), notify=tell, progress=progress)
     except BaseException:
         cut = [path.name for path in task.paths if path.exists() and path.name not in whole]
         if whole or cut:

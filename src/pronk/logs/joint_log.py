@@ -1,6 +1,6 @@
 """JointLog: commanded and measured motion of joints, in memory.
 
-Files are read and written next door (`readers.py`, `mcap_writer.py`); this module only says what a
+Files are read and written next door (`readers.py`, `mcap_log.py`); this module only says what a
 log is and what must be true of one.
 """
 

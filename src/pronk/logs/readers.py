@@ -19,7 +19,7 @@ from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_joints, check_radians
 from pronk.logs.csv_reader import read_csv
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_reader import read_mcap
+from pronk.logs.mcap_log import read_mcap
 from pronk.logs.npz_reader import read_npz
 from pronk.logs.pace_reader import read_pace
 from pronk.logs.sage_reader import is_sage, read_sage

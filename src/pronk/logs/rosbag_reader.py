@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_stream import Record
+from pronk.logs.mcap import Record
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import PronkError
 from pronk.evaluation.tables import Sheet
-from pronk.logs.mcap_stream import DamagedError, records
+from pronk.logs.mcap import DamagedError, records
 from pronk.report import shell, style
 from pronk.report.shell import Block, Part, number
 from pronk.robots import load_robot

@@ -1,16 +1,13 @@
-"""Shared memory between the processes of a run: records, mailboxes and queues.
+"""Shared memory between the processes of a run: mailboxes and queues of NumPy records.
 
-A mailbox holds the last value of something; a ring is a bounded queue. Both are plain shared memory
-without locks, so that a process that is killed or stopped at any moment cannot block another. Every
-slot carries a number and a checksum: a reader detects a half-written slot on any processor.
-
-One process writes a `Mailbox` or puts into a `Ring`; any may read the mailbox, one takes from the
-ring. Times are CLOCK_MONOTONIC in seconds, the same for all processes of a computer.
+A mailbox holds the newest record of one writer; a ring is a bounded queue with one writer and one
+reader. They have no locks, so that a process that is killed at any moment cannot block another.
+Every slot carries a number and a checksum: a reader detects a half-written slot on any processor.
+Times are CLOCK_MONOTONIC in seconds, the same for all processes of a computer.
 """
 
 from __future__ import annotations
 
-import struct
 import zlib
 from dataclasses import dataclass
 from enum import IntEnum
@@ -23,38 +20,25 @@ from numpy.typing import NDArray
 from pronk.links.machine import State
 from pronk.policy.layout import JOINTS, MEASURED_SIZE
 
-_HEAD = struct.Struct("<QQQ")
-"""Of a block: count written, count taken, count dropped."""
-_SLOT = struct.Struct("<QI")
-"""Of a slot: its number, the checksum of the rest."""
-_MAILBOX_SLOTS = 4
-"""The writer is always two slots or more from the one that is read."""
+Record = np.ndarray[Any, Any] | np.void
 
 
-class _Block:
-    """A named piece of shared memory with equal slots."""
+def block(record: np.dtype[Any], slots: int) -> np.dtype[Any]:
+    """The memory of a mailbox or ring: records written, taken and dropped, and the slots."""
+    slot = [("number", "<u8"), ("checksum", "<u8"), ("record", record)]
+    slot_type = np.dtype(slot, align=True)
+    return np.dtype([("counts", "<u8", 3), ("slots", slot_type, slots)], align=True)
 
-    def __init__(self, dtype: np.dtype[Any], slots: int, name: str | None) -> None:
-        self.dtype = dtype
-        self.slots = slots
-        self._stride = -(-(_SLOT.size + dtype.itemsize) // 8) * 8
-        size = _HEAD.size + slots * self._stride
-        self._owner = name is None
-        if name is None:
-            self._memory = shared_memory.SharedMemory(create=True, size=size)
-        else:
-            # A child has its maker's resource tracker, so nothing is removed when it ends.
-            self._memory = shared_memory.SharedMemory(name=name)
-        buffer = self._memory.buf
-        assert buffer is not None
-        self._buffer: memoryview = buffer
-        # Views of eight aligned bytes: written and read at once.
-        self._counts = np.frombuffer(buffer, dtype=np.uint64, count=3)
 
-    @property
-    def name(self) -> str:
-        """What another process attaches by."""
-        return self._memory.name
+class _Slots:
+    """Numbered records in a piece of shared memory of the type `block`."""
+
+    def __init__(self, memory: NDArray[Any]) -> None:
+        self._counts = memory["counts"]
+        self._number, self._checksum, self._records = (
+            memory["slots"][name] for name in ("number", "checksum", "record")
+        )
+        self.size = len(self._records)
 
     @property
     def written(self) -> int:
@@ -63,119 +47,97 @@ class _Block:
 
     @property
     def dropped(self) -> int:
-        """Records that found no room."""
+        """Records that did not fit."""
         return int(self._counts[2])
 
     def close(self) -> None:
-        """Let go; the maker also removes it. Twice does no harm."""
-        if not hasattr(self, "_counts"):
-            return
-        del self._counts, self._buffer
-        self._memory.close()
-        if self._owner:
-            self._memory.unlink()
+        """Release the memory; closing twice has no effect."""
+        vars(self).clear()
 
-    def _store(self, number: int, data: bytes) -> None:
-        start = _HEAD.size + number % self.slots * self._stride
-        body = start + _SLOT.size
-        _SLOT.pack_into(self._buffer, start, 0, 0)
-        self._buffer[body : body + len(data)] = data
-        _SLOT.pack_into(self._buffer, start, number + 1, zlib.crc32(data, number + 1 & 0xFFFFFFFF))
+    def _store(self, record: Record) -> None:
+        number = self.written
+        place = number % self.size
+        self._number[place] = 0
+        self._records[place] = record
+        self._checksum[place] = zlib.crc32(record.tobytes(), number + 1 & 0xFFFFFFFF)
+        self._number[place] = number + 1
+        self._counts[0] = number + 1
 
-    def _load(self, number: int) -> bytes | None:
+    def _load(self, number: int) -> np.void | None:
         """Record `number`, or None if its slot holds another or is half written."""
-        start = _HEAD.size + number % self.slots * self._stride
-        body = start + _SLOT.size
-        data = bytes(self._buffer[body : body + self.dtype.itemsize])
-        found, checksum = _SLOT.unpack_from(self._buffer, start)
-        fits = found == number + 1 and zlib.crc32(data, number + 1 & 0xFFFFFFFF) == checksum
-        return data if fits else None
-
-    def _record(self, data: bytes) -> np.void:
-        record: np.void = np.frombuffer(data, dtype=self.dtype)[0]
+        place = number % self.size
+        data = self._records[place].tobytes()
+        checksum = zlib.crc32(data, number + 1 & 0xFFFFFFFF)
+        if self._number[place] != number + 1 or self._checksum[place] != checksum:
+            return None
+        record: np.void = np.frombuffer(data, dtype=self._records.dtype)[0]
         return record
 
 
-class Mailbox(_Block):
+class Mailbox(_Slots):
     """The newest record of one writer."""
 
-    def __init__(self, dtype: np.dtype[Any], name: str | None = None) -> None:
-        """Make one, or attach to the one called `name`."""
-        super().__init__(dtype, _MAILBOX_SLOTS, name)
-
-    @classmethod
-    def attached(cls, dtype: np.dtype[Any], name: str) -> Self:
-        """The mailbox that another process made."""
-        return cls(dtype, name)
-
-    def write(self, record: np.ndarray[Any, Any] | np.void) -> None:
-        """Put a record of the mailbox's dtype in place of the last."""
-        number = self.written
-        self._store(number, record.tobytes())
-        self._counts[0] = number + 1
+    def write(self, record: Record) -> None:
+        """Replace the record."""
+        self._store(record)
 
     def read(self) -> np.void | None:
-        """The newest record; None before the first, or if a writer outran every try."""
+        """The newest record; None before the first, or if the writer is too fast to be read."""
         for _ in range(8):
             written = self.written
             if not written:
                 return None
-            data = self._load(written - 1)
-            if data is not None:
-                return self._record(data)
+            record = self._load(written - 1)
+            if record is not None:
+                return record
         return None
 
 
-class Ring(_Block):
-    """A bounded queue. What does not fit is dropped and counted; the writer never waits."""
+class Ring(_Slots):
+    """A bounded queue. Records that do not fit are dropped and counted; the writer never waits."""
 
-    def __init__(self, dtype: np.dtype[Any], slots: int, name: str | None = None) -> None:
-        """Make one with room for `slots` records, or attach to the one called `name`."""
-        super().__init__(dtype, slots, name)
-
-    def put(self, record: np.ndarray[Any, Any] | np.void) -> bool:
-        """Add a record of the ring's dtype; False if there was no room."""
-        number = self.written
-        if number - int(self._counts[1]) >= self.slots:
+    def put(self, record: Record) -> bool:
+        """Add a record; False if it did not fit."""
+        fits = self.written - int(self._counts[1]) < self.size
+        if fits:
+            self._store(record)
+        else:
             self._counts[2] += np.uint64(1)
-            return False
-        self._store(number, record.tobytes())
-        self._counts[0] = number + 1
-        return True
+        return fits
 
     def take(self, most: int = 1000) -> list[np.void]:
-        """Remove and return the oldest records, `most` at a time; [] if there are none."""
+        """Remove and return the oldest records, `most` at a time."""
         taken = int(self._counts[1])
         found: list[np.void] = []
         while taken < self.written and len(found) < most:
-            data = self._load(taken)
-            if data is None:
-                break  # not yet visible in full; it is there the next time
-            found.append(self._record(data))
+            record = self._load(taken)
+            if record is None:
+                break  # not yet visible in full
+            found.append(record)
             taken += 1
             self._counts[1] = taken
         return found
 
 
 class Mode(IntEnum):
-    """What the servo is doing."""
+    """State of the servo."""
 
     IDLE = 0
     """Connected or not; nothing is sent."""
     PREFLIGHT = 1
-    """Looking at the states; nothing is sent."""
+    """States are checked; nothing is sent."""
     DAMP = 2
     """Joints damped, waiting."""
     STAND = 3
-    """On the way up, and standing there."""
+    """Standing up, and standing."""
     POLICY = 4
-    """The policy decides."""
+    """The policy runs."""
     HALT = 5
-    """The policy decides, commanded to stand still, before it sits down."""
+    """The policy runs with a zero command before the robot sits down."""
     SIT = 6
-    """On the way down."""
+    """Sitting down."""
     FAULT = 7
-    """Joints damped by a fault."""
+    """Joints damped after a fault."""
     SWEEP = 9
     """Joints are excited one after another."""
     ENDED = 8
@@ -190,115 +152,65 @@ class OperatorRequest(IntEnum):
     """At once."""
     STAND = 2
     WALK = 3
-    """Let the policy decide."""
+    """Start the policy."""
     SIT = 4
     """Stop, sit down, damp."""
     RESET = 5
-    """The cause of a latched fault is gone."""
+    """Clear a latched fault whose cause is gone."""
     CLAMPED = 7
-    """The joints of a sweep are clamped as reported."""
+    """The joints of a sweep are clamped as requested."""
     QUIT = 6
-    """Damp and leave."""
+    """Damp and end."""
 
 
-_STATE: list[Any] = [
-    ("sequence", "<i8"),
-    ("time", "<f8"),
-    ("position", "<f8", JOINTS),
-    ("velocity", "<f8", JOINTS),
-    ("torque", "<f8", JOINTS),
-    ("gyro", "<f8", 3),
-    ("accelerometer", "<f8", 3),
-    ("orientation", "<f8", 4),
-    ("bus_voltage", "<f8"),
-    ("robot_time", "<f8"),
-    ("temperature", "<f8", JOINTS),
-]
+def _fields(kind: str, names: str, *shape: int) -> list[Any]:
+    """Fields of a record that have the same type and shape."""
+    return [(name, f"<{kind}", shape) for name in names.split()]
 
-STATE = np.dtype(
-    [
-        *_STATE,
-        ("now", "<f8"),
-        ("start", "<f8"),
-        ("mode", "<i8"),
-        ("entry", "<i8"),
-        ("progress", "<f8"),
-    ]
-)
-"""Servo to all, every tick: the newest state, the time of tick 0, the mode and how often it has
-changed."""
+
+_STATE = _fields("i8", "sequence") + _fields("f8", "time bus_voltage robot_time")
+_STATE += _fields("f8", "position velocity torque temperature", JOINTS)
+_STATE += _fields("f8", "gyro accelerometer", 3) + _fields("f8", "orientation", 4)
+
+STATE = np.dtype(_STATE + _fields("f8", "now start progress") + _fields("i8", "mode entry"))
+"""Servo to all, every tick: the newest state, the time of tick 0 (`start`), the mode, the number of
+mode changes (`entry`) and the share of a sweep that is done (`progress`)."""
 
 ACTIONS = np.dtype(
-    [
-        ("sequence", "<i8"),
-        ("state_sequence", "<i8"),
-        ("state_time", "<f8"),
-        ("made", "<f8"),
-        ("valid_for", "<f8"),
-        ("entry", "<i8"),
-        ("position", "<f8", JOINTS),
-    ]
+    _fields("i8", "sequence state_sequence entry")
+    + _fields("f8", "state_time made valid_for")
+    + _fields("f8", "position", JOINTS)
 )
-"""Policy to servo: joint targets; `entry` is that of the record they answer."""
+"""Policy to servo: joint targets, and the `entry` of the state record they were computed from."""
 
 OPERATOR = np.dtype(
-    [
-        ("time", "<f8"),
-        ("request", "<i8"),
-        ("requests", "<i8"),
-        ("held", "<i8"),
-        ("command", "<f8", 3),
-        ("jump", "<i8"),
-        ("seconds", "<f8"),
-    ]
+    _fields("f8", "time")
+    + _fields("i8", "request requests held jump")
+    + _fields("f8", "command", 3)
 )
-"""Operator to servo and policy: the last request and how many there were, dead-man button, velocity
-command and jump input."""
+"""Operator to servo and policy: the last request and their count, dead-man button, velocity command
+and jump input."""
 
 TICK = np.dtype(
-    [
-        *_STATE,
-        ("tick", "<i8"),
-        ("deadline", "<f8"),
-        ("begun", "<f8"),
-        ("done", "<f8"),
-        ("mode", "<i8"),
-        ("blend", "<f8"),
-        ("desired", "<f8", JOINTS),
-        ("sent", "<f8", JOINTS),
-        ("stiffness", "<f8"),
-        ("damped", "<i8"),
-        ("level", "<i8"),
-        ("reason", "<i8"),
-        ("action", "<i8"),
-        ("action_state", "<i8"),
-        ("latency", "<f8"),
-    ]
+    _STATE
+    + _fields("i8", "tick mode damped level reason action action_state")
+    + _fields("f8", "deadline begun done blend stiffness latency")
+    + _fields("f8", "desired sent", JOINTS)
 )
-"""Servo to logger, every tick: the state, the desired and the sent targets. `blend` is the policy's
-share, `stiffness` the share of the drives' own, `action` the number of the policy's action in force
-(-1: none), `latency` from the state that a new action uses to its command on the wire (NaN: no new
-action)."""
+"""Servo to logger, every tick: the state, the targets before (`desired`) and after (`sent`) the
+safety filter. `blend` is the policy's share of the target, `stiffness` that of the drives',
+`action` the number of the policy's action in force (-1: none), `latency` the time from the state of
+a new action to its command on the wire (NaN: no new action)."""
 
 STEP = np.dtype(
-    [
-        ("sequence", "<i8"),
-        ("deadline", "<f8"),
-        ("begun", "<f8"),
-        ("observed", "<f8"),
-        ("inferred", "<f8"),
-        ("done", "<f8"),
-        ("state_sequence", "<i8"),
-        ("state_time", "<f8"),
-        ("live", "<i8"),
-        ("command", "<f8", 3),
-        ("jump", "<i8"),
-        ("observation", "<f4", MEASURED_SIZE),
-        ("action", "<f4", JOINTS),
-        ("target", "<f8", JOINTS),
-        ("contact", "<f4", 4),
-        ("linear_velocity", "<f4", 3),
-    ]
+    _fields("i8", "sequence state_sequence live jump")
+    + _fields("f8", "deadline begun observed inferred done state_time")
+    + _fields("f8", "command", 3)
+    + _fields("f8", "target", JOINTS)
+    + _fields("f4", "observation", MEASURED_SIZE)
+    + _fields("f4", "action", JOINTS)
+    + _fields("f4", "contact", 4)
+    + _fields("f4", "linear_velocity", 3)
 )
 """Policy to logger, every step."""
 
@@ -308,184 +220,92 @@ class SampleKind(IntEnum):
 
     SAMPLE = 0
     OPEN = 1
-    """A log begins; `number` is its place in the task, `text` the torque's kind."""
+    """A log begins; `number` is its index in the task, `text` the kind of torque."""
     SEGMENT = 2
-    """An excitation begins; `number` is its place in the log."""
+    """An excitation begins; `number` is its index in the log."""
     END = 3
-    """The log ends; `text` says why, empty if it is whole."""
+    """The log ends; `text` is the reason, empty if it is complete."""
 
 
-SAMPLE = np.dtype(
-    [
-        ("kind", "<i8"),
-        ("number", "<i8"),
-        ("time", "<f8"),
-        ("command", "<f8", JOINTS),
-        ("position", "<f8", JOINTS),
-        ("velocity", "<f8", JOINTS),
-        ("torque", "<f8", JOINTS),
-        ("frequency", "<f8"),
-        ("virtual", "<i8"),
-        ("text", "S240"),
-    ]
+TEXT = 240
+"""Longest text of a record."""
+
+
+def sample_dtype(joints: int) -> np.dtype[Any]:
+    """Record of a sweep, in the order of its log; `kind` is a `SampleKind`.
+
+    `number` of a sample is the index of its excitation, -1 between excitations.
+    """
+    return np.dtype(
+        _fields("i8", "kind number virtual")
+        + _fields("f8", "time frequency")
+        + _fields("f8", "command position velocity torque", joints)
+        + _fields(f"S{TEXT}", "text")
+    )
+
+
+SAMPLE = sample_dtype(JOINTS)
+"""Servo to logger during a sweep."""
+EVENT = np.dtype(
+    _fields("f8", "time") + _fields("i8", "reason level") + [("kind", "S16"), ("text", f"S{TEXT}")]
 )
-"""Servo to logger during a sweep, in the order of the log; `number` of a sample is that of its
-excitation, -1 between."""
-
+"""Servo or policy to logger and operator: something happened; `kind` as in `Event`."""
 VIRTUAL, REAL = "the virtual robot", "a real robot"
 """Text of the event `robot`."""
-TEXT = 240
-EVENT = np.dtype(
-    [("time", "<f8"), ("kind", "S16"), ("reason", "<i8"), ("level", "<i8"), ("text", f"S{TEXT}")]
-)
-"""Servo or policy to logger and operator: something happened."""
 
 
 def event(
     time: float, kind: str, text: str, *, reason: int = 0, level: int = 0
 ) -> np.ndarray[Any, Any]:
-    """An event's record; the text is cut to what fits."""
+    """Make a record of `EVENT`; the text is cut to `TEXT` characters."""
     record = np.zeros((), dtype=EVENT)
     record["time"], record["kind"], record["reason"], record["level"] = time, kind, reason, level
     record["text"] = text.encode("ascii", "replace")[:TEXT]
     return record
 
 
-def put_state(record: np.ndarray[Any, Any], state: State, offset: float) -> None:
-    """Write a state into a record that begins with one.
+_SENSORS: tuple[str, ...] = ("sequence", "position", "velocity", "torque", "gyro")
+_SENSORS += ("accelerometer", "orientation", "bus_voltage")
 
-    Args:
-        record: Of `STATE` or `TICK`.
-        state: On the machine's clock.
-        offset: CLOCK_MONOTONIC less the machine's clock [s].
-    """
-    for name in (
-        "sequence",
-        "position",
-        "velocity",
-        "torque",
-        "gyro",
-        "accelerometer",
-        "orientation",
-        "bus_voltage",
-    ):
+
+def put_state(record: NDArray[Any], state: State) -> None:
+    """Write a state on CLOCK_MONOTONIC into a record that begins with one."""
+    for name in _SENSORS:
         record[name] = getattr(state, name)
-    record["time"] = state.time + offset
+    record["time"] = state.time
     record["robot_time"] = np.nan if state.robot_time is None else state.robot_time
     record["temperature"] = np.nan if state.temperature is None else state.temperature
 
 
 def get_state(record: np.void) -> State:
-    """The state in a record, on CLOCK_MONOTONIC."""
-    known = not np.isnan(record["temperature"]).all()
-    robot_time = float(record["robot_time"])
+    """Read the state in a record, on CLOCK_MONOTONIC."""
+    values = {name: record[name] for name in _SENSORS}
+    robot_time, temperature = float(record["robot_time"]), record["temperature"]
     return State(
+        **values | {"sequence": int(record["sequence"])},
         time=float(record["time"]),
-        sequence=int(record["sequence"]),
-        position=record["position"],
-        velocity=record["velocity"],
-        torque=record["torque"],
-        gyro=record["gyro"],
-        accelerometer=record["accelerometer"],
-        bus_voltage=float(record["bus_voltage"]),
-        orientation=record["orientation"],
         robot_time=None if np.isnan(robot_time) else robot_time,
-        temperature=record["temperature"] if known else None,
+        temperature=None if np.isnan(temperature).all() else temperature,
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that the servo tells the operator."""
+    """An event of the servo, as the operator's program receives it."""
 
     time: float
     """CLOCK_MONOTONIC [s]."""
     kind: str
-    """`mode`, `fault`, `refused`, `notice`, `lost`, `system` or `robot`."""
+    """`mode`, `fault`, `refused`, `notice`, `lost`, `system`, `robot`, `clamp` or `log`."""
     text: str
     level: int
     """A `FilterAction`."""
 
     @classmethod
     def of(cls, record: np.void) -> Self:
-        """The notice in a record of `pronk.runtime.ipc.EVENT`."""
-        return cls(
-            time=float(record["time"]),
-            kind=bytes(record["kind"]).decode("ascii"),
-            text=bytes(record["text"]).decode("ascii"),
-            level=int(record["level"]),
-        )
-
-
-_TICKS, _STEPS, _EVENTS = 2048, 256, 256
-"""Room of the queues to the logger: four seconds."""
-
-
-@dataclass(frozen=True)
-class Names:
-    """Of the shared memory."""
-
-    state: str
-    actions: str
-    operator: str
-    ticks: str
-    steps: str
-    events: str
-    policy_events: str
-    samples: str
-    events_seen: str
-
-
-class Shared:
-    """The shared memory of a deployment, made by its first process and attached by the others."""
-
-    def __init__(self, names: Names | None = None) -> None:
-        """Make it, or attach to what has these names."""
-
-        def called(which: str) -> str | None:
-            return None if names is None else str(getattr(names, which))
-
-        self.state = Mailbox(STATE, called("state"))
-        """Servo to all."""
-        self.actions = Mailbox(ACTIONS, called("actions"))
-        """Policy to servo."""
-        self.operator = Mailbox(OPERATOR, called("operator"))
-        """Operator to servo and policy."""
-        self.ticks = Ring(TICK, _TICKS, called("ticks"))
-        """Servo to logger."""
-        self.steps = Ring(STEP, _STEPS, called("steps"))
-        """Policy to logger."""
-        self.events = Ring(EVENT, _EVENTS, called("events"))
-        """Servo to logger."""
-        self.samples = Ring(SAMPLE, _TICKS, called("samples"))
-        """Servo to logger, during a sweep."""
-        self.policy_events = Ring(EVENT, _EVENTS, called("policy_events"))
-        """Policy to logger."""
-        self.events_seen = Ring(EVENT, _EVENTS, called("events_seen"))
-        """Servo to operator."""
-
-    @property
-    def names(self) -> Names:
-        """For the processes that attach."""
-        return Names(**{name: block.name for name, block in self._blocks().items()})
-
-    def dropped(self) -> dict[str, int]:
-        """Records that found no room on their way to the logger."""
-        queues = {
-            "ticks": self.ticks,
-            "steps": self.steps,
-            "events": self.events,
-            "samples": self.samples,
-        }
-        return {name: ring.dropped for name, ring in queues.items()}
-
-    def close(self) -> None:
-        """Let go of everything."""
-        for block in self._blocks().values():
-            block.close()
-
-    def _blocks(self) -> dict[str, Any]:
-        return dict(vars(self))
+        """Read a record of `EVENT`."""
+        kind, text = (bytes(record[name]).decode("ascii") for name in ("kind", "text"))
+        return cls(time=float(record["time"]), kind=kind, text=text, level=int(record["level"]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -498,5 +318,68 @@ class PolicyAction:
     made: float
     valid_for: float
     entry: int
-    """Of the mode that it was made for."""
+    """`StateMachine.entry` that it was computed for."""
     position: NDArray[np.float64]
+
+
+_MAILBOXES = {"state": STATE, "actions": ACTIONS, "operator": OPERATOR}
+_RINGS = {"ticks": (TICK, 2048), "samples": (SAMPLE, 2048), "steps": (STEP, 256)} | dict.fromkeys(
+    ("events", "policy_events", "events_seen"), (EVENT, 256)
+)
+"""Queues with their sizes: four seconds of ticks."""
+_MEMORY = np.dtype(
+    # The writer of a mailbox is always two slots or more from the one that is read.
+    [(name, block(record, 4)) for name, record in _MAILBOXES.items()]
+    + [(name, block(record, slots)) for name, (record, slots) in _RINGS.items()],
+    align=True,
+)
+
+
+class Shared:
+    """The shared memory of a run, made by its first process and attached by the others."""
+
+    def __init__(self, name: str | None = None) -> None:
+        """Make it, or attach to the one of this name."""
+        self._owner = name is None
+        # A child shares its parent's resource tracker, so nothing is removed when it ends.
+        self._memory = (
+            shared_memory.SharedMemory(create=True, size=_MEMORY.itemsize)
+            if name is None
+            else shared_memory.SharedMemory(name=name)
+        )
+        self.name = self._memory.name
+        """Other processes attach by it."""
+        memory: NDArray[Any] = np.ndarray((), dtype=_MEMORY, buffer=self._memory.buf)
+        self.state = Mailbox(memory["state"])
+        """Servo to all: `STATE`."""
+        self.actions = Mailbox(memory["actions"])
+        """Policy to servo: `ACTIONS`."""
+        self.operator = Mailbox(memory["operator"])
+        """Operator to servo and policy: `OPERATOR`."""
+        self.ticks = Ring(memory["ticks"])
+        """Servo to logger: `TICK`."""
+        self.samples = Ring(memory["samples"])
+        """Servo to logger, during a sweep: `SAMPLE`."""
+        self.steps = Ring(memory["steps"])
+        """Policy to logger: `STEP`."""
+        self.events = Ring(memory["events"])
+        """Servo to logger: `EVENT`."""
+        self.policy_events = Ring(memory["policy_events"])
+        """Policy to logger: `EVENT`."""
+        self.events_seen = Ring(memory["events_seen"])
+        """Servo to operator: `EVENT`."""
+
+    def dropped(self) -> dict[str, int]:
+        """Records that did not fit into the queues to the logger."""
+        names = ("ticks", "steps", "events", "samples")
+        return {name: getattr(self, name).dropped for name in names}
+
+    def close(self) -> None:
+        """Release the memory; the process that made it also removes it."""
+        for slots in vars(self).values():
+            if isinstance(slots, _Slots):
+                slots.close()
+        self._memory.close()
+        if self._owner:
+            self._memory.unlink()
+            self._owner = False

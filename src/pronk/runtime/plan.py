@@ -1,22 +1,110 @@
-"""The plan of one run, given to each of its processes at the start."""
+"""The plan of one run, given to each of its processes at the start, and the machine it opens."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 from pronk.errors import HardwareError
-from pronk.links.realtime import Wanted
+from pronk.links.address import Address
+from pronk.links.machine import Machine, State, TorqueKind
+from pronk.links.network_link import ClampOperator
+from pronk.links.realtime import Wanted, sleep_until
+from pronk.links.state_checks import Freshness
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.runtime.link import Opener
 from pronk.runtime.safety import Limits
+from pronk.runtime.state_machine import Timing
 from pronk.runtime.sweep import SweepTask
-from pronk.runtime.trajectories import Timing
+from pronk.virtual.robot import VirtualRobot
 
 SERVO_PRIORITY, POLICY_PRIORITY = 60, 50
-"""Of SCHED_FIFO: the servo before the policy, both below the kernel's own threads' 99."""
+"""Of SCHED_FIFO: the servo before the policy, both below the kernel's own threads at 99."""
+
+
+class Opener(Protocol):
+    """Makes a machine, not yet connected. It is pickled and sent to the servo's process."""
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot that it opens."""
+
+    def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
+        """Make the machine; `clamp_operator` clamps joints on a real bench."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """A robot at an address. Implements `Opener`."""
+
+    robot: str
+    address: Address = field(default_factory=Address)
+    release: bool = False
+    """Disable the robot's own controller first."""
+    fresh: Freshness | None = None
+    """How fresh states must be at first; the usual if None."""
+
+    def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
+        """Make the machine, not yet connected; the virtual robot in real time.
+
+        Raises:
+            HardwareError: The link's library is not installed.
+        """
+        machine = self.address.machine(
+            load_robot(self.robot),
+            clamp_operator=clamp_operator,
+            release=self.release,
+            fresh=self.fresh,
+        )
+        return Paced(machine) if isinstance(machine, VirtualRobot) else machine
+
+    def __str__(self) -> str:
+        return str(self.address)
+
+
+class Paced:
+    """The virtual robot in real time, on CLOCK_MONOTONIC. Implements `Machine`.
+
+    `wait` first lets the physics run to the given time and then sleeps until that time comes.
+    Nothing can be sent in between, so the result is the same as if both passed together, and the
+    time that the physics takes does not delay the loop.
+    """
+
+    virtual = True
+
+    def __init__(self, inner: VirtualRobot) -> None:
+        """Wrap a virtual robot that is not connected yet."""
+        self.inner = inner
+        self.robot = inner.robot
+        self.torque_kind: TorqueKind = inner.torque_kind
+        self.send, self.clamp = inner.send, inner.clamp
+        self.damp, self.close = inner.damp, inner.close
+        self._offset = 0.0
+
+    def now(self) -> float:
+        """CLOCK_MONOTONIC [s]."""
+        return time.monotonic()
+
+    def connect(self) -> None:
+        """Start both clocks."""
+        self.inner.connect()
+        self._offset = time.monotonic() - self.inner.now()
+
+    def latest(self) -> State:
+        """The newest state."""
+        return self._shifted(self.inner.latest())
+
+    def wait(self, until: float) -> list[State]:
+        """Let time pass to `until` [s]; return the states measured meanwhile."""
+        states = self.inner.wait(until - self._offset)
+        sleep_until(until)
+        return [self._shifted(state) for state in states]
+
+    def _shifted(self, state: State) -> State:
+        return replace(state, time=state.time + self._offset)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,26 +118,21 @@ class Plan:
     log: Path | None = None
     """MCAP file; None for no log."""
     capture: Path | None = None
-    """What the cameras around the virtual robot saw, written at the end; None for nothing."""
+    """File for the trajectory of the virtual robot, written at the end; None for none."""
     limits: Mapping[str, float] = field(default_factory=dict)
     """Other values for the scalar fields of `Limits`."""
     timing: Timing = field(default_factory=Timing)
     servo_rate_hz: float = 500.0
     action_valid_s: float = 0.05
-    """How long an action of the policy is repeated: two steps and a half [s]."""
+    """How long an action of the policy is repeated: two and a half steps [s]."""
     operator_timeout_s: float = 0.3
     """How long the operator's program may be silent [s]."""
     ignore_latency: bool = False
-    """Let the policy take over whatever the latency."""
+    """Start the policy even if the measured latency exceeds its training range."""
     real_time: bool = True
-    """Ask for real-time scheduling, a core and locked memory."""
+    """Request real-time scheduling, a core and locked memory."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run.
-
-        Raises:
-            HardwareError: Names the field.
-        """
         if (self.policy is None) == (self.sweep is None):
             raise HardwareError("a run needs either a policy or a sweep.")
         for name in ("servo_rate_hz", "action_valid_s", "operator_timeout_s"):
@@ -58,7 +141,7 @@ class Plan:
 
     @property
     def robot(self) -> Robot:
-        """What the link's machine is."""
+        """The robot of the link."""
         return load_robot(self.link.robot) if self.sweep is None else self.sweep.plan.robot
 
     def safety(self) -> Limits:
@@ -68,5 +151,5 @@ class Plan:
         return Limits.of(self.robot, **self.limits)
 
     def wanted(self, priority: int, core: int) -> Wanted:
-        """What a process asks of the operating system."""
+        """What a process requests of the operating system."""
         return Wanted(priority=priority, core=core) if self.real_time else Wanted(lock=False)

@@ -1,12 +1,14 @@
 """The policy's process: at 50 Hz from the newest state to an action for the servo.
 
-It decides from the moment the robot is damped, heard or not: so the network is warm, and the
-latency is known, before the policy's turn comes. Every change of mode begins a new past for it,
-except that it comes to a halt as it was.
+It steps from the moment the robot is damped, whether its actions are used or not: so the network is
+warm, and the latency is known, before the policy starts. Every change of mode resets the policy's
+history, except from `POLICY` to `HALT`.
 
-Just before each step it decides a few times for nothing, with a sibling of the policy that has a
-past of its own: so the step that counts finds all it needs in the caches, and no bit of what it
-decides is another (`pronk.runtime.warmup`).
+Just before each step the process runs a second instance of the policy for warm-up. A policy's
+network reads 2.8 MB of weights, more than a core's second cache holds. Between two steps, 20 ms
+apart, they leave the caches, and a step takes five times as long as it does back to back. One
+warm-up step recovers half of that, 2 ms of them all but a few hundredths of a millisecond.
+`python -m benchmarks tick` measures it.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
@@ -23,57 +26,90 @@ import orjson
 
 from pronk.errors import PronkError
 from pronk.links.machine import State
-from pronk.links.realtime import Histogram, Pace, enter
+from pronk.links.realtime import Histogram, Pace, enter, sleep_until
 from pronk.links.terminal import leave
 from pronk.policy.contract import Contract
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy
-from pronk.runtime.ipc import ACTIONS, STEP, Mode, Names, Shared, event, get_state
+from pronk.runtime.ipc import ACTIONS, STEP, Mode, Shared, event, get_state
 from pronk.runtime.plan import POLICY_PRIORITY, Plan
 from pronk.runtime.rollout import PolicyRunner, measurement
 from pronk.runtime.script import STILL, Commanded
-from pronk.runtime.warmup import warm_up_until
 
 WARM_UP = 20
-"""Rehearsals before the first step."""
+"""Warm-up steps before the first step."""
+LEAD_S = 2e-3
+"""Begin of the warm-up before a deadline: a tenth of a policy's step [s]."""
+_FIRST_S = 1e-3
+"""Time allowed for the first warm-up step [s]."""
+_SHARE = 0.5
+"""Time allowed for the next, as a share of what the last one took."""
+_SPIN_S = 0.2e-3
+"""Shorter waits are spun; a sleep ends up to so much late [s]."""
 _PHASE_S = 0.4e-3
-"""After the servo's tick, when its record are there: nothing waits for the next tick [s]."""
+"""After the servo's tick, when its state is there: nothing waits for the next tick [s]."""
 _LIVE = (Mode.POLICY, Mode.HALT)
 
 
-def serve_policy(plan: Plan, names: Names, end: Connection) -> None:
-    """Body of the policy process.
+def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
+    """Wait for a deadline, and repeat something in the last 2 ms before it.
+
+    Nothing is begun in less than half of the time that it took before, because each repeat is
+    quicker than the one before. Returns at once if the deadline has passed.
 
     Args:
-        plan: What to do.
-        names: Of the shared memory.
-        end: Where the figures of the run go when it is over, as JSON.
+        deadline: Time of CLOCK_MONOTONIC [s].
+        act: Repeated; without lasting effect.
+
+    Returns:
+        Number of repeats.
+    """
+    sleep_until(deadline - LEAD_S)
+    count, needed, now = 0, _FIRST_S, time.monotonic()
+    while now + needed < deadline:
+        act()
+        count += 1
+        done = time.monotonic()
+        needed, now = _SHARE * (done - now), done
+    sleep_until(deadline - _SPIN_S)
+    while time.monotonic() < deadline:
+        pass
+    return count
+
+
+def serve_policy(plan: Plan, name: str, end: Connection) -> None:
+    """Body of the policy's process.
+
+    Args:
+        plan: The run.
+        name: Of the shared memory.
+        end: Sends the figures of the run when it is over, JSON.
     """
     leave()
-    policy = plan.policy
-    assert policy is not None
-    shared = Shared(names)
-    process = PolicyProcess(plan, shared, load_policy(policy))
+    assert plan.policy is not None
+    shared = Shared(name)
+    process = PolicyProcess(plan, shared, load_policy(plan.policy))
     signal.signal(signal.SIGTERM, lambda *_: process.stop())
     for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
         shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))
     try:
         process.run()
     finally:
-        with suppress(OSError):  # nobody is there any more
+        with suppress(OSError):  # the parent has ended
             end.send_bytes(orjson.dumps(process.figures()))
         end.close()
         shared.close()
 
 
 def standing(contract: Contract) -> State:
-    """A robot that stands in its default pose."""
+    """The state of a robot that stands in its default pose."""
+    count = len(contract.joint_names)
     return State(
         time=0.0,
         sequence=0,
         position=np.array(contract.default_position),
-        velocity=np.zeros(len(contract.joint_names)),
-        torque=np.zeros(len(contract.joint_names)),
+        velocity=np.zeros(count),
+        torque=np.zeros(count),
         gyro=np.zeros(3),
         accelerometer=np.array([0.0, 0.0, 9.81]),
         bus_voltage=0.0,
@@ -81,13 +117,13 @@ def standing(contract: Contract) -> State:
 
 
 class PolicyProcess:
-    """The loop and what it counts."""
+    """The loop and its figures."""
 
     def __init__(self, plan: Plan, shared: Shared, policy: Policy) -> None:
         """Warm the network up.
 
         Raises:
-            ArtefactError: The policy is not for this robot, or gives no numbers.
+            ArtefactError: The policy is not for this robot, or its output is not finite.
         """
         self.plan = plan
         self.shared = shared
@@ -130,14 +166,14 @@ class PolicyProcess:
             if mode is Mode.ENDED:
                 return
             if self._pace is None:
-                # On the servo's own grid, so that record are always as young.
+                # On the servo's grid, so that states always have the same age.
                 self._pace = Pace(self.rate_hz, float(record["start"]) + _PHASE_S)
                 self._pace.advance(time.monotonic())
             warm_up_until(self._pace.deadline, self.warm_up)
             self.step(self._pace)
 
     def warm_up(self) -> None:
-        """Decide for nothing: always the first step of a robot that stands."""
+        """Run the first step of a robot that stands, with the second instance of the policy."""
         self._stand_in.reset()
         self._stand_in.decide(self._standing, (STILL, False), 0.0)
 
@@ -153,7 +189,7 @@ class PolicyProcess:
         }
 
     def step(self, pace: Pace) -> None:
-        """The step whose deadline has come: from the newest record to an action."""
+        """Compute an action from the newest state."""
         begun = time.monotonic()
         self.lateness.add(begun - pace.deadline)
         deadline = pace.deadline
@@ -166,13 +202,13 @@ class PolicyProcess:
                 self._entry = entry
             self._mode = mode
             try:
-                self._answer(record, deadline, begun)
+                self._act(record, deadline, begun)
             except PronkError as error:
-                # No action: the servo's filter says what is wrong and lets the last one expire.
+                # Without an action the last one expires in the servo's filter.
                 self._report_error(str(error))
         pace.advance(time.monotonic())
 
-    def _answer(self, record: np.void, deadline: float, begun: float) -> None:
+    def _act(self, record: np.void, deadline: float, begun: float) -> None:
         state = get_state(record)
         velocity, jump = self._commanded()
         now = time.monotonic()
@@ -205,18 +241,15 @@ class PolicyProcess:
         self._last_error = ""
 
     def _commanded(self) -> Commanded:
-        """What the operator wants now: to stand still unless the policy is in charge.
-
-        Never more than the policy was trained for.
-        """
-        stick = self.shared.operator.read()
-        if stick is None or self._mode is not Mode.POLICY:
+        """The operator's command within the ranges of training; zero unless the policy is live."""
+        record = self.shared.operator.read()
+        if record is None or self._mode is not Mode.POLICY:
             return STILL, False
-        forward, left, yaw = np.clip(stick["command"], self._least, self._most).tolist()
-        return (forward, left, yaw), bool(stick["jump"]) and self._jumps
+        forward, left, yaw = np.clip(record["command"], self._least, self._most).tolist()
+        return (forward, left, yaw), bool(record["jump"]) and self._jumps
 
     def _report_error(self, text: str) -> None:
-        """Once for each new last_error."""
+        """Send an event, unless the last error was the same."""
         if text != self._last_error:
             self._last_error = text
             self.shared.policy_events.put(event(time.monotonic(), "policy", text))

@@ -1,4 +1,4 @@
-"""A deployment: its processes, and the operator's end of them."""
+"""A run of a policy or a sweep: its processes, and the operator's end of them."""
 
 from __future__ import annotations
 
@@ -38,28 +38,28 @@ _END_S = 10.0
 
 @dataclass(kw_only=True)
 class RunSummary:
-    """How a deployment went."""
+    """Figures and events of a run."""
 
     servo: dict[str, Any] = field(default_factory=dict)
-    """Figures of the servo; empty if it was killed."""
+    """Of the servo; empty if it was killed."""
     policy: dict[str, Any] = field(default_factory=dict)
-    """Figures of the policy's process; empty if it was killed."""
+    """Of the policy's process; empty if it was killed."""
     events_seen: list[Event] = field(default_factory=list)
     log_error: str = ""
     """Why the log could not be written to its end."""
     interrupted: bool = False
-    """Whether somebody ended it by a signal: the interrupt key, or the end of the terminal."""
+    """Whether a signal ended it: the interrupt key, or the end of the terminal."""
     trained_delay_s: tuple[float, float] = (0.0, 0.0)
     """Command delays that the policy was trained for [s]."""
 
     @property
     def faults(self) -> list[str]:
-        """What damped the robot."""
+        """Faults that damped the robot."""
         return [notice.text for notice in self.events_seen if notice.kind == "fault"]
 
     @property
     def refusals(self) -> list[str]:
-        """Why the robot was not moved."""
+        """Results of the pre-flight checks and of opening the link."""
         return [notice.text for notice in self.events_seen if notice.kind == "refused"]
 
     def delay_words(self) -> str:
@@ -88,13 +88,7 @@ class RunSummary:
 
 
 class Deployment:
-    """Runs the processes of a plan. A context manager; leaving it damps, then ends them all.
-
-    Attributes:
-        servo: The servo's process.
-        policy: The policy's.
-        logger: The logger's; None without a log.
-    """
+    """Runs the processes of a plan. A context manager; leaving it damps, then ends them all."""
 
     def __init__(self, plan: Plan) -> None:
         """Check what can be checked before any process starts.
@@ -117,7 +111,7 @@ class Deployment:
         self.servo: BaseProcess
         self.policy: BaseProcess | None = None
         self.logger: BaseProcess | None = None
-        self._stick = np.zeros((), dtype=OPERATOR)
+        self._record = np.zeros((), dtype=OPERATOR)
         self._open = False
         self._interrupts = Interrupts()
 
@@ -130,22 +124,22 @@ class Deployment:
         plan, context = self.plan, get_context("spawn")
         with unheard():
             self.shared = Shared()
-        names = self.shared.names
+        name = self.shared.name
         trained = self.summary.trained_delay_s
         self.write(OperatorCommand())
         self._servo_end, servo_end = context.Pipe(duplex=False)
         self._policy_end, policy_end = context.Pipe(duplex=False)
         self.servo = context.Process(
-            target=serve, args=(plan, names, trained, servo_end), name="pronk servo"
+            target=serve, args=(plan, name, trained, servo_end), name="pronk servo"
         )
         if plan.policy is not None:
             self.policy = context.Process(
-                target=serve_policy, args=(plan, names, policy_end), name="pronk policy"
+                target=serve_policy, args=(plan, name, policy_end), name="pronk policy"
             )
         if plan.log is not None or plan.sweep is not None:
             talk, self._logger_end = context.Pipe()
             self.logger = context.Process(
-                target=write_log, args=(plan, self._header, names, talk), name="pronk log"
+                target=write_log, args=(plan, self._header, name, talk), name="pronk log"
             )
         self._interrupts.__enter__()
         self._open = True
@@ -157,7 +151,7 @@ class Deployment:
                     self.logger.start()
             if self.logger is not None:
                 self._await_logger(self.logger)
-            # Last: what it does from its first tick on has a listener.
+            # Last, so that its first tick is logged.
             with unheard():
                 self.servo.start()
             for end in (servo_end, policy_end):
@@ -174,7 +168,6 @@ class Deployment:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Damp and end."""
         self.close()
 
     @property
@@ -191,41 +184,41 @@ class Deployment:
         self.summary.events_seen += found
         return found
 
-    def write(self, stick: OperatorCommand) -> None:
-        """Tell servo and policy what the operator wants. To be called at 50 Hz or so.
+    def write(self, command: OperatorCommand) -> None:
+        """Send the operator's command to servo and policy; call it at about 50 Hz.
 
         Raises:
-            KeyboardInterrupt: Somebody wants to end it; only ever here, and not while it closes.
+            KeyboardInterrupt: A signal requests the end; raised only here, and not while closing.
         """
         if self._open:
             self._interrupts.check()
-        record = self._stick
-        if stick.request is not OperatorRequest.NONE:
-            record["request"] = stick.request
+        record = self._record
+        if command.request is not OperatorRequest.NONE:
+            record["request"] = command.request
             record["requests"] += 1
         record["time"] = time.monotonic()
-        record["held"], record["jump"] = stick.held, stick.jump
-        record["command"] = stick.command
+        record["held"], record["jump"] = command.held, command.jump
+        record["command"] = command.command
         self.shared.operator.write(record)
 
     def run(
         self,
         operator: Operator,
-        tell: Callable[[Event], None] = lambda event: None,
+        notify: Callable[[Event], None] = lambda event: None,
         progress: Callable[[float], None] = lambda share: None,
     ) -> RunSummary:
-        """Let an operator have the stick until they leave or the servo ends.
+        """Send the operator's commands until the servo ends.
 
         Args:
-            operator: Says what is wanted, 50 times a second.
-            tell: Called with every event of the servo.
+            operator: Called 50 times a second.
+            notify: Called with every event of the servo.
             progress: Called with the share of a sweep that is done, 0 to 1.
         """
         wake = time.monotonic()
         while True:
             for notice in self.events_seen():
                 operator.notified(notice.kind, notice.text)
-                tell(notice)
+                notify(notice)
             mode = self.mode
             if mode is Mode.ENDED:
                 break
@@ -242,7 +235,7 @@ class Deployment:
             wake = max(wake + 1.0 / _RATE_HZ, time.monotonic())
             time.sleep(max(0.0, wake - time.monotonic()))
         for notice in self.events_seen():
-            tell(notice)
+            notify(notice)
         return self.summary
 
     def close(self) -> None:
@@ -271,7 +264,7 @@ class Deployment:
             self._interrupts.__exit__(None, None, None)
 
     def _stop_servo(self) -> None:
-        """Ask it to damp and end, and keep asking: an operator who falls silent is a fault too."""
+        """Request the end; commands continue meanwhile, because their absence is a fault."""
         until = time.monotonic() + _END_S
         self.write(OperatorCommand(request=OperatorRequest.QUIT))
         while self.servo.is_alive() and time.monotonic() < until:
@@ -308,9 +301,9 @@ class Deployment:
             self.write(OperatorCommand())
             if logger.exitcode is not None or time.monotonic() > until:
                 raise LogError(f"{self.plan.log}: the process that writes the log did not start.")
-        answer = self._logger_end.recv_bytes()
-        if answer != READY:
-            raise LogError(answer.decode())
+        reply = self._logger_end.recv_bytes()
+        if reply != READY:
+            raise LogError(reply.decode())
 
     def _await_servo(self) -> None:
         until = time.monotonic() + _START_S
@@ -319,7 +312,9 @@ class Deployment:
             self.servo.join(0.05)
             self.events_seen()
             if self.servo.exitcode is not None:
-                why = " ".join(self.summary.refusals) or "its process ended without a word"
+                why = (
+                    " ".join(self.summary.refusals) or "its process ended without an error message"
+                )
                 raise HardwareError(f"the link {self.plan.link.robot} was not opened: {why}")
             if time.monotonic() > until:
                 raise HardwareError(
@@ -328,7 +323,7 @@ class Deployment:
 
 
 def _received(end: Connection) -> dict[str, Any]:
-    """What a process said when it ended; nothing if it could not."""
+    """The figures that a process sent when it ended; {} if it was killed."""
     try:
         if end.poll(1.0):
             found: dict[str, Any] = orjson.loads(end.recv_bytes())
@@ -338,14 +333,14 @@ def _received(end: Connection) -> dict[str, Any]:
     return {}
 
 
-def run(plan: Plan, operator: Operator, tell: Callable[[Event], None]) -> RunSummary:
+def run(plan: Plan, operator: Operator, notify: Callable[[Event], None]) -> RunSummary:
     """Run a deployment from beginning to end.
 
     Raises:
         PronkError: It could not start.
     """
     with Deployment(plan) as deployment:
-        summary = deployment.run(operator, tell)
+        summary = deployment.run(operator, notify)
     if not summary.servo:
         raise PronkError("the servo's process was killed; the robot's own watchdog had to stop it.")
     return summary
@@ -381,7 +376,7 @@ def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """What a sweep in real time left."""
+    """The result of a sweep in real time."""
 
     logs: list[Path]
     virtual: bool
@@ -390,7 +385,7 @@ class Recorded:
 
     @property
     def words(self) -> str:
-        """Whose logs they are."""
+        """Which robot the logs are of."""
         return "the virtual robot" if self.virtual else "a robot that is not the virtual one"
 
 
@@ -398,7 +393,7 @@ def run_sweep(
     plan: Plan,
     *,
     clamp_operator: ClampOperator,
-    tell: Callable[[Event], None] = lambda event: None,
+    notify: Callable[[Event], None] = lambda event: None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Recorded:
     """Carry out a sweep on a machine in real time.
@@ -406,23 +401,23 @@ def run_sweep(
     Args:
         plan: With a sweep.
         clamp_operator: Clamps joints on a real bench; called in a thread of its own.
-        tell: Called with every event.
+        notify: Called with every event.
         progress: Called with the share done, 0 to 1.
 
     Raises:
         PronkError: The robot may not be moved, the filter stopped the sweep, or a process was
-            killed. What was recorded until then stays, a log that reads and says why it ended.
+            killed. What was recorded until then stays readable, with the reason.
         KeyboardInterrupt: The run was interrupted; the joints were damped.
     """
     assert plan.sweep is not None
     operator = BenchOperator(clamp_operator)
     with Deployment(plan) as deployment:
-        summary = deployment.run(operator, tell, progress)
+        summary = deployment.run(operator, notify, progress)
     servo = summary.servo
     if not servo:
         raise HardwareError(
             "the servo's process was killed; only the robot's own watchdog damps the joints now: "
-            "see to them before anything else."
+            "secure them before anything else."
         )
     if summary.interrupted:
         raise KeyboardInterrupt

@@ -1,8 +1,8 @@
 """The servo: the one process that owns the machine and the only writer to it.
 
-At 500 Hz, on absolute deadlines: collect states, ask the state machine what is wanted, let the
-safety filter have the last word, send. It neither thinks nor writes files; what it saw and did goes
-into a queue that never makes it wait. Whatever ends it, the joints are damped first.
+At 500 Hz, on absolute deadlines: collect states, take the desired command from the state machine,
+pass it through the safety filter, send. It runs no network and writes no files; what it measured
+and sent goes into a queue that never makes it wait. Whatever ends it, the joints are damped first.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from pronk.runtime.ipc import (
     TICK,
     VIRTUAL,
     Mode,
-    Names,
     OperatorRequest,
     PolicyAction,
     Shared,
@@ -49,38 +48,38 @@ from pronk.runtime.safety import (
     filtered,
 )
 from pronk.runtime.state_machine import PREFLIGHT_S, VALID_S, DesiredCommand, StateMachine
-from pronk.runtime.sweep import SweepController, SweepRing, SweepTask
+from pronk.runtime.sweep import SweepController, SweepTask
 
 _SWITCH_S = 0.5e-3
 """Longest that a thread of the link keeps the loop waiting [s]."""
-_THINKING = (Mode.STAND, Mode.POLICY, Mode.HALT)
-"""Modes in which the policy's latency is measured; while standing it decides, but is not heard."""
+_DECIDING = (Mode.STAND, Mode.POLICY, Mode.HALT)
+"""Modes in which the policy's latency is measured; while standing its actions are not used."""
 
 
-def serve(plan: Plan, names: Names, trained: tuple[float, float], end: Connection) -> None:
-    """Body of the servo process.
+def serve(plan: Plan, name: str, trained: tuple[float, float], end: Connection) -> None:
+    """Body of the servo's process.
 
     Args:
-        plan: What to do.
-        names: Of the shared memory.
+        plan: The run.
+        name: Of the shared memory.
         trained: Command delays that the policy was trained for [s].
-        end: Where the figures of the run go when it is over, as JSON.
+        end: Sends the figures of the run when it is over, JSON.
     """
     leave()  # the operator's process decides
-    shared = Shared(names)
+    shared = Shared(name)
     servo = Servo(plan, shared, trained)
     signal.signal(signal.SIGTERM, lambda *_: servo.stop())
     try:
         servo.run()
     finally:
-        with suppress(OSError):  # nobody is there any more
+        with suppress(OSError):  # the parent has ended
             end.send_bytes(orjson.dumps(servo.figures()))
         end.close()
         shared.close()
 
 
 class Servo:
-    """The loop and what it counts."""
+    """The loop and its figures."""
 
     def __init__(self, plan: Plan, shared: Shared, trained: tuple[float, float]) -> None:
         """Read the plan; nothing is opened yet."""
@@ -98,7 +97,7 @@ class Servo:
         self.memory = FilterState()
         self.lateness = Histogram()
         self.latency = Histogram()
-        """From a state to the command that answers it."""
+        """From a state to the command computed from it."""
         self.age = Histogram()
         """Of the newest state at each tick."""
         self.interventions: dict[str, int] = {}
@@ -106,7 +105,7 @@ class Servo:
         self.states = 0
         self.lost = 0
         self.repeated = 0
-        """States whose numbers were those of the one before, to the last bit."""
+        """States equal to the one before to the last bit."""
         self._machine: Machine | None = None
         self._pace: Pace | None = None
         self._state: State | None = None
@@ -181,28 +180,14 @@ class Servo:
         """Take the policy's newest action; whether there is a new one."""
         record = self.shared.actions.read()
         if record is None or (
-            self.action is not None and int(record["sequence"]) == self.action.sequence
+            self.action is not None and record["sequence"] == self.action.sequence
         ):
             return False
-        self.action = PolicyAction(
-            sequence=int(record["sequence"]),
-            state_sequence=int(record["state_sequence"]),
-            state_time=float(record["state_time"]),
-            made=float(record["made"]),
-            valid_for=float(record["valid_for"]),
-            entry=int(record["entry"]),
-            position=np.array(record["position"]),
-        )
+        values = {name: record[name].tolist() for name in record.dtype.names or ()}
+        self.action = PolicyAction(**values | {"position": record["position"]})
         return True
 
-    def _report(
-        self,
-        kind: str,
-        text: str,
-        *,
-        reason: Reason = Reason.NONE,
-        level: FilterAction = FilterAction.PASS,
-    ) -> None:
+    def _report(self, kind: str, text: str, *, reason: int = 0, level: int = 0) -> None:
         """Send an event to logger and operator."""
         record = event(time.monotonic(), kind, text, reason=reason, level=level)
         self.shared.events.put(record)
@@ -215,7 +200,7 @@ class Servo:
         """Write the newest state and the mode for the other processes; zeros without a state."""
         record = self._state_record
         if state is not None:
-            put_state(record, state, 0.0)
+            put_state(record, state)
         record["now"], record["start"] = now, pace.start
         record["progress"] = self._progress
         record["mode"], record["entry"] = self.machine_state.mode, self.machine_state.entry
@@ -233,17 +218,11 @@ class Servo:
     ) -> None:
         """Put a tick into the logger's queue.
 
-        Args:
-            number: Of the tick.
-            state: The newest, on CLOCK_MONOTONIC.
-            times: Deadline, begin and end of the tick, on the same clock [s].
-            desired: Requested of the filter.
-            sent: What the filter passed on; None for damping.
-            decision: The filter's.
-            latency: From a state to the command that uses it [s]; NaN without a new action.
+        `times` are its deadline, begin and end on CLOCK_MONOTONIC [s], `latency` is from a state to
+        the command that uses it [s], NaN without a new action.
         """
         tick, action = self._tick_record, self.action
-        put_state(tick, state, 0.0)
+        put_state(tick, state)
         tick["tick"] = number
         tick["deadline"], tick["begun"], tick["done"] = times
         tick["mode"], tick["blend"] = self.machine_state.mode, desired.blend
@@ -258,7 +237,7 @@ class Servo:
         self.shared.ticks.put(tick)
 
     def _open(self, machine: Machine) -> None:
-        # Before the link starts threads: they inherit what is granted, and so can never hold the
+        # Before the link starts threads: they inherit the priority, and so never hold the
         # interpreter's lock while something less urgent runs.
         for line in enter(self.plan.wanted(SERVO_PRIORITY, 0)):
             self._report("system", line)
@@ -306,7 +285,7 @@ class Servo:
         if self._state is not None:
             self._decide(machine, self._state, begun, link_error)
         else:
-            # Without a state there is nothing to decide; requests are read all the same.
+            # Without a state nothing is decided, but requests are read.
             self._operator(begun)
             self._publish(None, begun, pace)
         pace.advance(time.monotonic())
@@ -348,7 +327,7 @@ class Servo:
             self._report_mode()
         action = self.action
         latency = np.nan
-        if fresh and action is not None and self.machine_state.mode in _THINKING:
+        if fresh and action is not None and self.machine_state.mode in _DECIDING:
             latency = done - action.state_time
             self.latency.add(max(0.0, latency))
         if self.plan.sweep is not None:
@@ -362,8 +341,7 @@ class Servo:
             state = replace(state, time=state.time + self._offset)
             if self._state is not None:
                 if _same(state, self._state):
-                    # Data that stand still behind a clock that goes on: let the last real state
-                    # grow old.
+                    # Repeated data with new stamps: the last real state must grow old.
                     self.repeated += 1
                     continue
                 self.lost += max(0, state.sequence - self._state.sequence - 1)
@@ -396,7 +374,7 @@ class Servo:
         self._sweep = SweepController(
             task,
             self._machine,
-            SweepRing(self.shared.samples),
+            self.shared.samples.put,
             state=self._state,
             real_time=True,
             progress=self._note_progress,
@@ -434,7 +412,7 @@ class Servo:
             self._sweep.end(self.faults[-1] if self.faults else parent)
 
     def _fix(self, joints: tuple[str, ...]) -> None:
-        """Have a person clamp joints; returns when it is done. Runs in a thread of its own."""
+        """Have the operator clamp joints and wait; runs in a thread of its own."""
         self._clamped.clear()
         self._report("clamp", ", ".join(joints))
         self._clamped.wait()
@@ -450,7 +428,7 @@ class Servo:
         """Pass the desired command through the filter."""
         if desired.command is None:
             quiet = FilterDecision(level=memory.level, reason=memory.reason)
-            # Damping is always allowed; the next target is measured against where the joints are.
+            # Damping is always allowed; the next target is limited to near the measured position.
             return None, quiet, replace(memory, last=None)
         needed = self.machine_state.mode is Mode.POLICY
         sent, decision, memory = filtered(
@@ -468,7 +446,7 @@ class Servo:
         return sent, decision, memory
 
     def _act(self, machine: Machine, desired: DesiredCommand, sent: Command | None) -> str:
-        """Write to the machine; what the link objects to, or ""."""
+        """Write to the machine; returns the link's error, or ""."""
         if desired.silent:
             return ""
         try:
@@ -485,7 +463,7 @@ class Servo:
         self._report("fault", text, reason=memory.reason, level=memory.level)
 
     def _close(self, machine: Machine) -> None:
-        """Leave the joints damped, whatever happened before, and keep what the cameras saw."""
+        """Leave the joints damped, whatever happened before."""
         self._end_sweep()
         quiet = self.machine_state.mode in (Mode.IDLE, Mode.PREFLIGHT)
         try:
@@ -506,7 +484,7 @@ class Servo:
                     self._publish(self._state, time.monotonic(), self._pace)
 
     def _keep(self, machine: Machine) -> None:
-        """Save what the cameras saw; a disk that is full harms nothing else."""
+        """Save the trajectory of the virtual robot; an error is reported, not raised."""
         inner = getattr(machine, "inner", None)
         if self.plan.capture is None or inner is None:
             return
@@ -515,11 +493,11 @@ class Servo:
         try:
             save(self.plan.capture, inner.capture())
         except (OSError, PronkError) as error:
-            self._report("lost", f"what the cameras saw was not kept: {error}")
+            self._report("lost", f"the trajectory was not written: {error}")
 
 
 def _same(one: State, other: State) -> bool:
-    """Whether two states are the same to the last bit, which no live sensors' are."""
+    """Whether two states are equal to the last bit, which states of live sensors never are."""
     return all(
         np.array_equal(getattr(one, name), getattr(other, name))
         for name in ("gyro", "accelerometer", "position", "velocity")

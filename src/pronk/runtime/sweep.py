@@ -1,10 +1,10 @@
 """Sweeps: excite each joint with its signals and log the response, under the safety filter.
 
-Commands change at the policy's rate on the machine's own clock; every state the machine measures is
-logged with the command in force. `SweepController` decides the commands. `record` runs it on a
-machine whose clock waits (the virtual robot in this process); on a machine in real time the servo
-runs it (`pronk.runtime.servo`). In both, every command passes the safety filter, and whatever goes
-wrong, the joints are left damped and the log up to then stays readable.
+Commands change at the policy's rate on the machine's own clock; every measured state is logged with
+the command in force. `SweepController` gives the commands. `record` runs it on a machine whose
+clock waits (the virtual robot in this process); on a machine in real time the servo runs it
+(`pronk.runtime.servo`). In both, every command passes the safety filter, and whatever happens, the
+joints are left damped and the log up to then stays readable.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,9 @@ from pronk.errors import HardwareError
 from pronk.excitation.plan import POSE_RAMP_S, Ask, SweepPlan
 from pronk.links.machine import Command, Machine, State, TorqueKind
 from pronk.logs.joint_log import Segment
-from pronk.logs.mcap_format import LogHeader
-from pronk.logs.mcap_writer import McapLogWriter, reason_of
+from pronk.logs.mcap_log import LogHeader, McapLogWriter, reason_of
 from pronk.robots.robot import Robot
-from pronk.runtime.ipc import SAMPLE, Ring, SampleKind
+from pronk.runtime.ipc import TEXT, Record, SampleKind, sample_dtype
 from pronk.runtime.safety import FilterState, Limits, filtered
 
 Array = NDArray[np.float64]
@@ -34,12 +33,12 @@ Progress = Callable[[float, str], None]
 """Called with the share that is done, 0 to 1, and what is being done."""
 
 _SAG = 0.05
-"""How much farther than it lay a joint may go on the way to its pose [rad]."""
+"""How much farther out than at first a joint may be on the way to its pose [rad]."""
 _SOFT_SPEED = 0.5
 """Fastest mean speed on the way to the pose [rad/s]."""
 _AT_POSE = 0.15
-"""Farthest a joint may rest from its command before it is clamped or excited [rad]: a leg that sags
-farther under its own weight, or hangs on something, is not the one that was planned for."""
+"""Farthest that a joint may rest from its command before it is clamped or excited [rad]; the plan
+does not hold for a leg that sags farther or is blocked."""
 _STIFFEN_S = 1.0
 """Time in which stiffness grows on a machine in real time [s]."""
 _PROGRESS_TICKS = 25
@@ -75,7 +74,7 @@ class SweepTask:
         return [self.out_dir / f"{self.prefix}{_file_name(names)}.mcap" for names in self.sets]
 
     def excitations(self, index: int) -> list[Ask]:
-        """What goes into one log."""
+        """Excitations of one log."""
         joints = self.sets[index]
         return [ask for ask in self.plan.asks if ask.joints == joints]
 
@@ -103,21 +102,15 @@ class SweepTask:
         for path in self.paths:
             if path.exists() and not self.overwrite:
                 raise HardwareError(
-                    f"{path} is already there; give another folder, remove it, or overwrite it."
+                    f"{path} exists; give another folder, remove it, or overwrite it."
                 )
         self.plan.check()
 
-    def columns(self, index: int) -> NDArray[np.intp]:
-        """Joints of one log among the robot's."""
-        names = self.plan.robot.joint_names
-        logged = logged_joints(self.plan.robot, self.sets[index])
-        return np.array([names.index(name) for name in logged], dtype=np.intp)
-
-    def header(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> LogHeader:
-        """Of one log."""
+    def open_log(self, index: int, *, virtual: bool, torque_kind: str) -> McapLogWriter:
+        """Begin one log."""
         plan, columns = self.plan, self.columns(index)
         logged = logged_joints(plan.robot, self.sets[index])
-        return LogHeader(
+        header = LogHeader(
             robot=plan.robot.name,
             joints=logged,
             stiffness=plan.stiffness[columns].tolist(),
@@ -132,6 +125,13 @@ class SweepTask:
                 **self.metadata,
             },
         )
+        return McapLogWriter(self.paths[index], header)
+
+    def columns(self, index: int) -> NDArray[np.intp]:
+        """Joints of one log among the robot's."""
+        names = self.plan.robot.joint_names
+        logged = logged_joints(self.plan.robot, self.sets[index])
+        return np.array([names.index(name) for name in logged], dtype=np.intp)
 
     def segment(self, index: int, number: int, start: float) -> Segment:
         """One excitation of a log, by its number in it; `start` on the machine's clock [s]."""
@@ -150,10 +150,10 @@ class SweepTask:
         )
 
     def limits(self, torque_kind: TorqueKind, **changed: float) -> Limits:
-        """The filter's: the robot's ranges, no-load speeds and effort limits without tolerance.
+        """Limits of the filter: ranges, no-load speeds and effort limits without tolerance.
 
-        The plan's worst case keeps within them, so the filter changes no command of a valid plan:
-        it needs neither a margin nor a look ahead. The trunk is fixed, so its tilt is not limited.
+        The plan's worst case keeps within them, so the filter changes no command of a valid plan;
+        margin and horizon are zero. The trunk is fixed, so its tilt is not limited.
 
         Args:
             torque_kind: A measured torque must keep within the effort limits too.
@@ -176,77 +176,44 @@ class SweepTask:
         return replace(limits, speed=np.array([j.drive.no_load_speed for j in robot.joints]))
 
 
-class SweepSink(Protocol):
-    """Takes what a sweep measures, in order."""
-
-    def open(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> None:
-        """Begin the log of a set of joints."""
-
-    def segment(self, number: int, start: float) -> None:
-        """Begin an excitation."""
-
-    def sample(
-        self,
-        time: float,
-        command: Array,
-        position: Array,
-        velocity: Array,
-        torque: Array,
-        frequency: float,
-        segment: int,
-    ) -> None:
-        """One measured state with the command in force, all joints of the robot."""
-
-    def end(self, *, complete: bool, reason: str = "") -> None:
-        """End the log; ending twice has no effect."""
-
-
 class SweepLogs:
-    """Writes the logs of a task. Implements `SweepSink`."""
+    """Writes the logs of a task from its records (`sample_dtype`)."""
 
     def __init__(self, task: SweepTask) -> None:
-        """Nothing is opened yet."""
+        """Open nothing yet."""
         self.task = task
         self._writer: McapLogWriter | None = None
         self._index = 0
         self._columns: NDArray[np.intp] = np.arange(0)
         self._torque = True
 
-    def open(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> None:
-        """Open the log of a set of joints."""
-        self._index, self._columns = index, self.task.columns(index)
-        self._torque = torque_kind != "absent"
-        header = self.task.header(index, virtual=virtual, torque_kind=torque_kind)
-        self._writer = McapLogWriter(self.task.paths[index], header)
-
-    def segment(self, number: int, start: float) -> None:
-        """Announce an excitation, before its samples."""
-        if self._writer is not None:
-            self._writer.segment(self.task.segment(self._index, number, start))
-
-    def sample(
-        self,
-        time: float,
-        command: Array,
-        position: Array,
-        velocity: Array,
-        torque: Array,
-        frequency: float,
-        segment: int,
-    ) -> None:
-        """Write one measured state."""
-        if self._writer is None:
+    def replay(self, record: Record) -> None:
+        """Write one record."""
+        kind, time, number = int(record["kind"]), float(record["time"]), int(record["number"])
+        writer, columns = self._writer, self._columns
+        if kind == SampleKind.OPEN:
+            torque_kind = bytes(record["text"].item()).decode("ascii")
+            self._index, self._columns = number, self.task.columns(number)
+            self._torque = torque_kind != "absent"
+            virtual = bool(record["virtual"])
+            self._writer = self.task.open_log(number, virtual=virtual, torque_kind=torque_kind)
+        elif writer is None:
             return
-        columns = self._columns
-        self._writer.sample(
-            time,
-            command[columns],
-            position[columns],
-            velocity[columns],
-            torque[columns] if self._torque else None,
-            frequency,
-            segment,
-        )
+        elif kind == SampleKind.SEGMENT:
+            writer.segment(self.task.segment(self._index, number, time))
+        elif kind == SampleKind.END:
+            reason = bytes(record["text"].item()).decode("ascii")
+            self.end(complete=not reason, reason=reason)
+        else:
+            writer.sample(
+                time,
+                record["command"][columns],
+                record["position"][columns],
+                record["velocity"][columns],
+                record["torque"][columns] if self._torque else None,
+                float(record["frequency"]),
+                number,
+            )
 
     def end(self, *, complete: bool, reason: str = "") -> None:
         """End the log; ending twice has no effect."""
@@ -258,78 +225,6 @@ class SweepLogs:
         """Hand what was written to the operating system."""
         if self._writer is not None:
             self._writer.flush()
-
-    def replay(self, record: np.void) -> None:
-        """Take one record of a `SweepRing`."""
-        kind, time = SampleKind(int(record["kind"])), float(record["time"])
-        if kind is SampleKind.OPEN:
-            torque: TorqueKind = bytes(record["text"]).decode("ascii")  # type: ignore[assignment]
-            virtual = bool(record["virtual"])
-            self.open(int(record["number"]), virtual=virtual, torque_kind=torque)
-        elif kind is SampleKind.SEGMENT:
-            self.segment(int(record["number"]), time)
-        elif kind is SampleKind.END:
-            reason = bytes(record["text"]).decode("ascii")
-            self.end(complete=not reason, reason=reason)
-        else:
-            self.sample(
-                time,
-                record["command"],
-                record["position"],
-                record["velocity"],
-                record["torque"],
-                float(record["frequency"]),
-                int(record["number"]),
-            )
-
-
-class SweepRing:
-    """Puts what a sweep measures into the queue to the logger. Implements `SweepSink`."""
-
-    def __init__(self, ring: Ring) -> None:
-        """A ring of `SAMPLE`."""
-        self._ring = ring
-        self._record = np.zeros((), dtype=SAMPLE)
-        self._open = False
-
-    def open(self, index: int, *, virtual: bool, torque_kind: TorqueKind) -> None:
-        """Have a log opened."""
-        self._record["virtual"] = virtual
-        self._open = True
-        self._put(SampleKind.OPEN, number=index, text=torque_kind)
-
-    def segment(self, number: int, start: float) -> None:
-        """Have an excitation announced."""
-        self._put(SampleKind.SEGMENT, number=number, time=start)
-
-    def sample(
-        self,
-        time: float,
-        command: Array,
-        position: Array,
-        velocity: Array,
-        torque: Array,
-        frequency: float,
-        segment: int,
-    ) -> None:
-        """Have one measured state written."""
-        record = self._record
-        record["command"], record["position"] = command, position
-        record["velocity"], record["torque"] = velocity, torque
-        record["frequency"] = frequency
-        self._put(SampleKind.SAMPLE, number=segment, time=time)
-
-    def end(self, *, complete: bool, reason: str = "") -> None:
-        """Have the log ended; ending twice has no effect."""
-        if self._open:
-            self._put(SampleKind.END, text="" if complete else reason or "ended early")
-        self._open = False
-
-    def _put(self, kind: SampleKind, *, number: int = 0, time: float = 0.0, text: str = "") -> None:
-        record = self._record
-        record["kind"], record["number"], record["time"] = kind, number, time
-        record["text"] = text.encode("ascii", "replace")[: record["text"].dtype.itemsize]
-        self._ring.put(record)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,18 +242,18 @@ class SweepStep:
 
 
 class SweepController:
-    """The commands of a sweep, tick by tick, and the log of what came of them.
+    """The commands of a sweep, tick by tick, and the log of the response.
 
     For each set of joints: free all clamps, move softly to the pose, clamp what the excitation
-    needs clamped, excite, rest. The other joints are held at the pose with the plan's gains, and
-    all joints of the same leg are logged.
+    needs, excite, rest. The other joints are held at the pose with the plan's gains, and all joints
+    of the same leg are logged.
     """
 
     def __init__(
         self,
         task: SweepTask,
         machine: Machine,
-        sink: SweepSink,
+        sink: Callable[[Record], object],
         *,
         state: State,
         real_time: bool,
@@ -369,8 +264,8 @@ class SweepController:
 
         Args:
             task: What to do.
-            machine: Clamps joints, and says what it is.
-            sink: Takes the log.
+            machine: Clamps joints.
+            sink: Takes the log's records (`sample_dtype`).
             state: The newest.
             real_time: Stiffen the joints first, and hold them while a person clamps others.
             progress: Called about twice a second of machine time.
@@ -390,6 +285,9 @@ class SweepController:
         )
         """Of the filter: as far out as the joints lay at first, until they are at the pose."""
         self._sink = sink
+        record = np.zeros((), dtype=sample_dtype(len(self.plan.robot.joints)))
+        record["virtual"] = machine.virtual
+        self._record: NDArray[Any] = record
         self._real_time = real_time
         self._state = state
         self._step = SweepStep(target=self.target, stiffness=0.0 if real_time else 1.0)
@@ -452,7 +350,7 @@ class SweepController:
         """Note what the filter let through at `t` [s]."""
         entry = (t, position, self._step.frequency, self._step.segment)
         last = self._sent[-1] if self._sent else None
-        if last is None or last[3] != entry[3] or last[2] != entry[2] or _differ(last[1], position):
+        if last is None or last[2:] != entry[2:] or not np.array_equal(last[1], position):
             self._sent.append(entry)
 
     def take(self, states: Sequence[State]) -> None:
@@ -463,23 +361,30 @@ class SweepController:
             self._state = states[-1]
 
     def end(self, reason: str) -> None:
-        """Log what is waiting and end an open log; why, empty if the sweep is whole."""
+        """Log what is waiting and end an open log; `reason` is empty if the log is complete."""
         if self._logging:
             self._log(np.inf)
-            self._sink.end(complete=not reason, reason=reason)
+            self._put(SampleKind.END, text=reason)
         self._logging = False
+
+    def _put(self, kind: SampleKind, *, number: int = 0, time: float = 0.0, text: str = "") -> None:
+        record = self._record
+        record["kind"], record["number"], record["time"] = kind, number, time
+        record["text"] = text.encode("ascii", "replace")[:TEXT]
+        self._sink(record)
 
     def _log(self, until: float) -> None:
         """Log the waiting states whose command is known: those before the next tick.
 
-        A state that the machine measured at a tick carries the command that goes out at that
-        tick. Its timestamp jitters about the tick, so states less than half their own spacing
-        before it count as at it: the command is logged at the nearest state, not at the next.
+        A state measured at a tick carries the command that goes out at that tick. Its timestamp
+        jitters about the tick, so states less than half their own spacing before it count as at it:
+        the command is logged at the nearest state, not at the next.
         """
         if not self._logging:
             self._waiting.clear()
             return
         edge = until - self._half
+        record = self._record
         for state in self._waiting:
             # A number that is not finite ends the sweep, and would make the log unreadable.
             if state.time >= edge or not np.isfinite([state.position, state.velocity]).all():
@@ -487,15 +392,10 @@ class SweepController:
             _, command, frequency, segment = next(
                 (s for s in reversed(self._sent) if s[0] - self._half <= state.time), self._sent[0]
             )
-            self._sink.sample(
-                state.time,
-                command,
-                state.position,
-                state.velocity,
-                state.torque,
-                frequency,
-                segment,
-            )
+            record["command"], record["position"] = command, state.position
+            record["velocity"], record["torque"] = state.velocity, state.torque
+            record["frequency"] = frequency
+            self._put(SampleKind.SAMPLE, number=segment, time=state.time)
         self._waiting = [state for state in self._waiting if state.time >= edge]
 
     # --- the sequence -----------------------------------------------------------------------------
@@ -504,11 +404,11 @@ class SweepController:
         ticks = round(_STIFFEN_S / self.tick) if self._real_time else 0
         for k in range(1, ticks + 1):
             yield SweepStep(target=self.target, stiffness=k / ticks)
-        done, machine, pose = 0.0, self.machine, self.plan.pose
+        done, pose = 0.0, self.plan.pose
         for index, path in enumerate(self.task.paths):
             excitations = self.task.excitations(index)
             self._waiting.clear()
-            self._sink.open(index, virtual=machine.virtual, torque_kind=machine.torque_kind)
+            self._put(SampleKind.OPEN, number=index, text=self.machine.torque_kind)
             self._logging = True
             yield from self._clamp(())
             yield from self._move(pose)
@@ -528,7 +428,7 @@ class SweepController:
             yield SweepStep(target=self.target, segment=segment)
 
     def _move(self, goal: Array) -> Iterator[SweepStep]:
-        """Half a cosine from where the joints are commanded to be to the goal."""
+        """Half a cosine from the present target to the goal."""
         start = self.target
         seconds = max(POSE_RAMP_S, float(np.abs(goal - start).max()) / _SOFT_SPEED)
         ticks = round(seconds / self.tick)
@@ -537,7 +437,7 @@ class SweepController:
             yield SweepStep(target=start + (goal - start) * share)
 
     def _clamp(self, joints: tuple[str, ...]) -> Iterator[SweepStep]:
-        """Have joints fixed mechanically; in real time they are held while a person does it."""
+        """Clamp joints; in real time they are held meanwhile."""
         if not self._real_time:
             self.machine.clamp(joints)
             return
@@ -557,7 +457,7 @@ class SweepController:
             raise failed[0]
 
     def _check_at_pose(self) -> None:
-        """Refuse to go on from elsewhere; from here on the joints stay within their ranges."""
+        """Refuse to go on from another pose; from here on the strict limits hold."""
         away = np.abs(self._state.position - self.plan.pose)
         i = int(np.argmax(away))
         if not away[i] <= _AT_POSE:
@@ -574,7 +474,7 @@ class SweepController:
         frequency = ask.frequency(rate)
         # An excitation begins one tick after the last one's rest, so that no sample is in both.
         yield SweepStep(target=self.plan.pose)
-        self._sink.segment(number, self.now)
+        self._put(SampleKind.SEGMENT, number=number, time=self.now)
         what = f"{', '.join(ask.joints)}: {ask.amplitude:g} rad, repeat {ask.repeat + 1}"
         for k, offset in enumerate(ask.offsets(rate)):
             target = self.plan.pose.copy()
@@ -642,7 +542,7 @@ def record(
             SweepController(
                 task,
                 machine,
-                SweepLogs(task),
+                SweepLogs(task).replay,
                 state=machine.latest(),
                 real_time=False,
                 progress=progress or (lambda share, what: None),
@@ -700,7 +600,3 @@ def logged_joints(robot: Robot, excited: Sequence[str]) -> tuple[str, ...]:
 
 def _file_name(joints: Sequence[str]) -> str:
     return joints[0] if len(joints) == 1 else f"together_{joints[0]}_and_{len(joints) - 1}_more"
-
-
-def _differ(one: Array, other: Array) -> bool:
-    return not np.array_equal(one, other)

@@ -1,27 +1,85 @@
-"""The messages of an MCAP file, as far as it can be trusted.
+"""MCAP files: JSON messages written as they come, and messages read as far as the file is sound.
 
-The `mcap` library reads records; this module opens the chunks itself, because a log from
-elsewhere may be cut anywhere, and may claim to unpack to more than there is memory.
+Every topic has its JSON Schema in the file, so that Foxglove and PlotJuggler show it. The `mcap`
+library reads records; this module opens the chunks itself, because a file may be cut anywhere and
+may claim to unpack to more than there is memory.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import IO
+from pathlib import Path
+from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
+import orjson
 import zstandard
 from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, IndexType, Writer
+
+NUMBER: dict[str, Any] = {"type": "number"}
+INTEGER: dict[str, Any] = {"type": "integer"}
+STRING: dict[str, Any] = {"type": "string"}
+BOOLEAN: dict[str, Any] = {"type": "boolean"}
+NUMBERS: dict[str, Any] = {"type": "array", "items": NUMBER}
+STRINGS: dict[str, Any] = {"type": "array", "items": STRING}
 
 MOST_BYTES = 2 * 2**30
 """Largest size that all chunks of a file may unpack to by default [bytes]."""
 _MOST_CHUNK = 256 * 2**20
 """Largest size of one unpacked chunk [bytes]; writers use 1 to 8 MiB."""
+
+
+class McapWriter:
+    """Writes JSON messages. What was flushed stays readable whatever comes after."""
+
+    def __init__(self, path: Path, topics: Mapping[str, Mapping[str, Any]]) -> None:
+        """Open `path`, which is replaced.
+
+        Args:
+            path: The file; its folder is made.
+            topics: Topic to the properties of its messages, as JSON Schema has them.
+
+        Raises:
+            OSError: The file cannot be made.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._stream: IO[bytes] = path.open("wb")
+        self._writer = Writer(
+            self._stream, compression=CompressionType.ZSTD, index_types=IndexType.ALL
+        )
+        self._writer.start(profile="", library="pronk")
+        self._channels: dict[str, int] = {}
+        for topic, properties in topics.items():
+            name = "pronk." + topic.removeprefix("/").replace("/", ".")
+            schema = {"title": name, "type": "object", "properties": properties}
+            schema_id = self._writer.register_schema(name, "jsonschema", orjson.dumps(schema))
+            self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
+
+    def metadata(self, values: Mapping[str, str]) -> None:
+        """Write named strings about the file."""
+        self._writer.add_metadata("pronk", dict(values))
+
+    def put(self, topic: str, time: float, body: Mapping[str, Any]) -> None:
+        """Write a message; `time` is its log time [s]. NaN and infinity become null."""
+        stamp = max(0, round(time * 1e9))
+        data = orjson.dumps(body, option=orjson.OPT_SERIALIZE_NUMPY)
+        self._writer.add_message(self._channels[topic], stamp, data, stamp)
+
+    def flush(self) -> None:
+        """Finish the chunk and hand everything to the operating system."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.close()
 
 
 class DamagedError(Exception):
@@ -74,7 +132,7 @@ def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[li
                     channel = channels.get(item.channel_id)
                     if channel is None:
                         raise DamagedError(
-                            f"a message on channel {item.channel_id}, which is not there"
+                            f"a message on channel {item.channel_id}, which is not declared"
                         )
                     batch.append(
                         Record(
@@ -95,7 +153,7 @@ def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[li
     except (EndOfFile, RecordLengthLimitExceeded, struct.error):
         raise DamagedError("it ends in the middle of a record") from None
     except Exception as error:
-        # The library fails on a damaged record in every way there is.
+        # The library raises many types on a damaged record.
         words = " ".join(str(error).split())[:120]
         raise DamagedError(f"{type(error).__name__} {words}".rstrip()) from None
 
