@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import tyro
 
 from pronk.cli import console
+from pronk.errors import PronkError
 
 
 def play(
@@ -33,47 +36,49 @@ def play(
     """
     from dataclasses import asdict
 
-    from pronk.errors import PronkError
-    from pronk.evaluation.live.gamepad import Gamepad
-    from pronk.evaluation.live.joystick import Stick
     from pronk.evaluation.live.page import WebPage, modules
+    from pronk.evaluation.live.play import Joystick
     from pronk.evaluation.live.play import play as run
     from pronk.policy.contract import check
     from pronk.policy.runtime import load_policy
     from pronk.robots import load_robot
+    from pronk.runtime.teleop import Gamepad
     from pronk.virtual.sim_params import load_sim_params
 
     modules()
     robot = load_robot("mini_cheetah")
-    loaded, body = load_policy(policy), load_sim_params(sim_params)
+    loaded, params = load_policy(policy), load_sim_params(sim_params)
     check(loaded.contract, robot)
-    stick = Stick(ranges=loaded.contract.command_ranges, jumps=loaded.contract.jump)
-    pad = None if gamepad is False else Gamepad()
+    ranges = loaded.contract.command_ranges
     title = (
         f"## The virtual robot\nNot a real one. {robot.name}, policy `{policy.name}` "
         f"({loaded.contract.gains} gains), in real time."
     )
-    try:
-        if gamepad and pad is not None and pad.name is None:
-            raise PronkError(
-                "--gamepad, but no gamepad was found; plug one into this machine, which must have "
-                "a display, or leave the option out."
-            )
-        with WebPage(robot, body.ground, stick, title=title, host=host, port=port) as page:
-            console.say(f"the virtual robot stands at {page.address}; Ctrl-C ends it")
-            if host != "127.0.0.1":
-                console.warn(f"bound to {host}: everyone who reaches this machine can play")
-            if pad is not None and pad.name is not None:
-                console.say(
-                    f"gamepad: {pad.name} (left stick walks, right stick turns, A jumps, "
-                    "Start sets down anew)"
-                )
-            played = run(robot, loaded, body, stick, page, gamepad=pad, seed=seed)
-    finally:
+    devices = sorted(Path("/dev/input").glob("js*"))
+    devices = [path for path in devices if os.access(path, os.R_OK) and gamepad is not False]
+    if gamepad and not devices:
+        raise PronkError(
+            "--gamepad: there is no gamepad that can be read in /dev/input; plug one in, or leave "
+            "the option out."
+        )
+    with ExitStack() as stack:
+        pad = stack.enter_context(closing(Gamepad(devices[0], ranges))) if devices else None
+        joystick = Joystick(ranges=ranges, jumps=loaded.contract.jump, gamepad=pad)
+        page = stack.enter_context(
+            WebPage(robot, params.ground, joystick, title=title, host=host, port=port)
+        )
+        console.say(f"the virtual robot stands at {page.address}; Ctrl-C ends it")
+        if host != "127.0.0.1":
+            console.warn(f"bound to {host}: everyone who reaches this machine can play")
         if pad is not None:
-            pad.close()
+            console.say(
+                f"gamepad: {devices[0]} (left stick walks, right stick turns, RB jumps, START "
+                "sets down anew)"
+            )
+        played = run(robot, loaded, params, joystick, page, seed=seed)
+    factor = played.simulated_s / max(played.wall_s, 1e-9)
     console.say(
         f"{played.simulated_s:.0f} s of the virtual robot in {played.wall_s:.0f} s "
-        f"({played.factor:.2f} x real time), {len(played.hops)} jumps"
+        f"({factor:.2f} x real time), {len(played.hops)} jumps"
     )
     console.write_json(json_file, asdict(played))

@@ -223,7 +223,7 @@ def painted(
         found,
         out,
         out / VIDEOS,
-        tell=console.warn,
+        warn=console.warn,
         cases=cases,
         slow=slow or SLOW,
         at_once=at_once,

@@ -1,163 +1,241 @@
-"""The virtual robot in real time, a person at the stick.
+"""The virtual robot in real time under the commands of a person.
 
-Where nothing waits for the wall's clock, it runs 3.1 times faster than real time without a page,
-2.4 with one, and 3.0 with one and a client that takes its 27 messages a second (12 s at 1 m/s each,
-two cores shared with other work). Paced it keeps real time: 0.99, setting down included.
+Without waiting for the clock it runs 3.1 times faster than real time without a page and 2.4 times
+with one (12 s at 1 m/s each, two cores shared with other work).
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from threading import Lock
 from typing import Protocol
 
-from pronk.evaluation.live.gamepad import Gamepad
-from pronk.evaluation.live.joystick import Stick
-from pronk.evaluation.live.readout import Gauge, Hop
+import numpy as np
+
+from pronk.evaluation.jumps import JumpRules, cosine_of_tilt
+from pronk.evaluation.metrics import FALLEN_COSINE, FALLEN_HEIGHT
 from pronk.links.machine import State
+from pronk.policy.contract import COMMANDS
 from pronk.policy.runtime import Policy
 from pronk.robots.robot import Robot
+from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.rollout import ticks
+from pronk.runtime.script import STILL, Commanded, Script, Velocity
+from pronk.runtime.teleop import Operator
 from pronk.virtual.capture import Capture
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams
 
-_SEE_S = 0.004
-"""From look to look at the robot; a lift-off speed is off by less than 4 cm/s for it."""
+JUMP_S = Script(command=STILL).jump_s
+"""How long the jump input lasts, as in the trial [s]."""
+_SAMPLE_S = 0.004
+"""Between two samples of the robot; a lift-off speed is off by less than 4 cm/s for it."""
 _LATE_S = 0.25
 """Delay that is not made up for: the robot then runs late instead of faster than real time."""
-_WINDOW_S = 2.0
-"""Over which the real-time factor is taken."""
+
+
+@dataclass
+class Joystick:
+    """Operator command of the page, which writes it from threads of its own, and of a gamepad."""
+
+    ranges: Mapping[str, tuple[float, float]]
+    """Smallest and largest command, by the names in `COMMANDS`."""
+    jumps: bool = True
+    """Whether the policy has a jump input."""
+    gamepad: Operator | None = None
+    """Its velocity is added to the page's; it is read once a policy step."""
+    _velocity: Velocity = STILL
+    _jump: bool = False
+    _until: float = -math.inf
+    _reset: bool = False
+    _lock: Lock = field(default_factory=Lock)
+
+    def set_velocity(self, velocity: Velocity) -> None:
+        """Command a velocity: forward, left [m/s], yaw rate [rad/s]."""
+        with self._lock:
+            self._velocity = velocity
+
+    def jump(self) -> None:
+        """Command a jump at the next tick, unless one is under way."""
+        with self._lock:
+            self._jump = self.jumps
+
+    def reset(self) -> None:
+        """Request a reset of the robot."""
+        with self._lock:
+            self._reset = True
+
+    def take_reset(self) -> bool:
+        """Whether a reset was requested since the last call; clears it, and any jump."""
+        with self._lock:
+            requested, self._reset = self._reset, False
+            if requested:
+                self._jump, self._until = False, -math.inf
+            return requested
+
+    def commanded(self, t: float) -> Commanded:
+        """Command at a time since the policy took over [s]: page plus gamepad, within the ranges.
+
+        The gamepad's jump input is as long as its own timing makes it.
+        """
+        added, pressed = STILL, False
+        if self.gamepad is not None:
+            pad = self.gamepad.command(time.monotonic(), Mode.POLICY)
+            added, pressed = pad.command, pad.jump and self.jumps
+            if pad.request is OperatorRequest.RESET:
+                self.reset()
+        with self._lock:
+            if self._jump and t >= self._until:
+                self._until = t + JUMP_S
+            self._jump = False
+            forward, left, yaw = (
+                min(self.ranges[name][1], max(self.ranges[name][0], a + b))
+                for name, a, b in zip(COMMANDS, self._velocity, added, strict=True)
+            )
+            return (forward, left, yaw), pressed or t < self._until - 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hop:
+    """A flight that lifted the trunk."""
+
+    vertical: float
+    """Upward speed of the trunk at lift-off [m/s]."""
+    apex: float
+    """Highest trunk over the floor [m]."""
+    duration: float
+    """[s]"""
+    distance: float
+    """Of the trunk from lift-off to touchdown [m]."""
+
+
+@dataclass
+class Gauge:
+    """Height, speed and jumps of a running robot, by the rules of `pronk.evaluation.jumps`."""
+
+    rules: JumpRules = field(default_factory=JumpRules)
+    hops: list[Hop] = field(default_factory=list)
+    height: float = math.nan
+    """Of the trunk over the floor [m]."""
+    speed: float = math.nan
+    """Horizontal [m/s]."""
+    fallen: bool = False
+    _flight: Capture | None = None
+    _apex: float = -math.inf
+
+    def add(self, sample: Capture) -> None:
+        """Take in a capture of one sample, of the present moment."""
+        self.height = float(sample.position[0, 2])
+        self.speed = float(np.hypot(*sample.velocity[0, :2]))
+        upright = cosine_of_tilt(sample.orientation[0]) >= FALLEN_COSINE
+        self.fallen = not upright or self.height < FALLEN_HEIGHT
+        airborne = not sample.contact.any() and not bool(sample.other_contact[0])
+        if airborne:
+            if self._flight is None:
+                self._flight, self._apex = sample, -math.inf
+            self._apex = max(self._apex, self.height)
+        elif self._flight is not None:
+            up, self._flight = self._flight, None
+            duration = float(sample.time[0] - up.time[0])
+            if duration >= self.rules.long_s and self._apex > self.rules.high:
+                way = sample.position[0, :2] - up.position[0, :2]
+                hop = Hop(
+                    vertical=float(up.velocity[0, 2]),
+                    apex=self._apex,
+                    duration=duration,
+                    distance=float(np.hypot(*way)),
+                )
+                self.hops.append(hop)
+
+    def reset(self) -> None:
+        """Forget a flight under way."""
+        self._flight = None
 
 
 class Page(Protocol):
     """What shows the robot to a person."""
 
-    def show(self, sample: Capture) -> None:
-        """Draw the robot as it is now; called once a policy step."""
-
-    def tell(self, gauge: Gauge, factor: float) -> None:
-        """Write figures, and simulated seconds per second; called once a policy step."""
+    def show(self, sample: Capture, gauge: Gauge, factor: float) -> None:
+        """Draw robot, figures and simulated seconds per second; called once a policy step."""
 
 
-class Watched(VirtualRobot):
-    """A virtual robot that somebody looks at while it runs."""
+class _Sampled(VirtualRobot):
+    """A virtual robot that is sampled while it runs."""
 
-    seen: Callable[[Capture], None] | None = None
+    sampled: Callable[[Capture], None] | None = None
 
     def wait(self, until: float) -> list[State]:
-        """As the robot's own; looks at it every 4 ms on the way."""
         states: list[State] = []
         while (now := self.now()) < until:
-            states += super().wait(min(until, now + _SEE_S))
-            if self.seen is not None:
-                self.seen(self.snapshot())
+            states += super().wait(min(until, now + _SAMPLE_S))
+            if self.sampled is not None:
+                self.sampled(self.snapshot())
         return states
 
 
 @dataclass(frozen=True, kw_only=True)
 class Played:
-    """What there was to see."""
+    """Figures of a run."""
 
     simulated_s: float
     wall_s: float
     resets: int
     hops: tuple[Hop, ...]
 
-    @property
-    def factor(self) -> float:
-        """Simulated seconds per second."""
-        return self.simulated_s / self.wall_s if self.wall_s > 0.0 else 0.0
-
 
 def play(
     robot: Robot,
     policy: Policy,
     sim_params: SimParams,
-    stick: Stick,
+    joystick: Joystick,
     page: Page,
     *,
-    gamepad: Gamepad | None = None,
     seed: int = 0,
     until: Callable[[float], bool] = lambda simulated: False,
 ) -> Played:
-    """Run the robot in real time until Ctrl-C.
-
-    A fallen robot goes on being simulated until somebody resets it.
+    """Run the robot in real time until Ctrl-C; a fallen one goes on until it is reset.
 
     Args:
         robot: Structure.
-        policy: Whose contract fits the robot.
-        sim_params: Body of the virtual robot.
-        stick: Operator command.
+        policy: Its contract fits the robot.
+        sim_params: Parameters of the virtual robot.
+        joystick: Operator command.
         page: Where it is shown.
-        gamepad: Read once a policy step.
         seed: Of all noise.
-        until: Called with the simulated time [s]; true ends the game.
+        until: Called with the simulated time [s]; true ends the run.
 
     Raises:
         ArtefactError: The contract does not fit.
         HardwareError: The robot cannot stand.
-        RobotError: The parameters are not of this robot.
+        RobotError: The parameters are of another robot.
     """
-    gauge, pace = Gauge(), Pace()
-    machine = Watched(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
+    gauge = Gauge()
+    machine = _Sampled(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
     began, simulated, resets, over = time.perf_counter(), 0.0, 0, False
     try:
         while not over:
-            machine.seen = None
+            machine.sampled = None
             machine.connect()
-            machine.seen = gauge.see
-            gauge.forget()
-            pace.start()
-            before = simulated
-            for tick in ticks(machine, policy, robot, stick.commanded):
+            machine.sampled = gauge.add
+            gauge.reset()
+            before, start, late = simulated, time.perf_counter(), 0.0
+            for tick in ticks(machine, policy, robot, joystick.commanded):
                 simulated = before + tick.since
-                if gamepad is not None:
-                    stick.feel(gamepad.read())
-                page.show(machine.snapshot())
-                page.tell(gauge, pace.factor)
-                over = until(simulated)
-                again = stick.take_reset()
+                wall = time.perf_counter() - start
+                page.show(machine.snapshot(), gauge, tick.since / wall if tick.since else 1.0)
+                over, again = until(simulated), joystick.take_reset()
                 if over or again:
                     resets += again
                     break
-                pace.keep(tick.since)
+                ahead = start + late + tick.since - time.perf_counter()
+                time.sleep(max(0.0, ahead))
+                late -= ahead if ahead < -_LATE_S else 0.0
     except KeyboardInterrupt:
-        pass  # how a person ends the game
+        pass  # the usual end
     finally:
         machine.close()
-    return Played(
-        simulated_s=simulated,
-        wall_s=time.perf_counter() - began,
-        resets=resets,
-        hops=tuple(gauge.hops),
-    )
-
-
-class Pace:
-    """Keeps simulated time with the wall's clock."""
-
-    def __init__(self) -> None:
-        self.factor = 1.0
-        """Simulated seconds per second, of late."""
-        self.start()
-
-    def start(self) -> None:
-        """The simulated clock is at zero now."""
-        self._zero = time.perf_counter()
-        self._mark = (self._zero, 0.0)
-
-    def keep(self, simulated: float) -> None:
-        """Sleep until it is time for a moment of the simulation [s]."""
-        ahead = self._zero + simulated - time.perf_counter()
-        if ahead > 0.0:
-            time.sleep(ahead)
-        elif ahead < -_LATE_S:
-            self._zero -= ahead
-        now = time.perf_counter()
-        wall, then = self._mark
-        if now - wall >= _WINDOW_S:
-            self.factor = (simulated - then) / (now - wall)
-            self._mark = (now, simulated)
+    wall_s = time.perf_counter() - began
+    return Played(simulated_s=simulated, wall_s=wall_s, resets=resets, hops=tuple(gauge.hops))

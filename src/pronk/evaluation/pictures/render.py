@@ -1,171 +1,230 @@
-"""The process that paints.
+"""The process that renders a film offscreen by MuJoCo.
 
-    python -m pronk.evaluation.pictures.render FILM [--mp4 F] [--gif F] [--strip F]
+    python -m pronk.evaluation.pictures.render [FILM [FILE.mp4|FILE.gif|FILE.png ...]]
 
-Started by `video`, which chooses the GL backend for it (MUJOCO_GL). It writes one line to standard
-output for each frame, `k/n`; one line to standard error says what went wrong.
-Without a film it paints one small picture, to see whether this machine can.
+`video` starts it with a GL backend (MUJOCO_GL), which must be chosen before mujoco is imported.
+It prints the share that is done, and on failure one line to standard error. Without a film it
+renders one small image, as a check of the backend.
 """
 
 from __future__ import annotations
 
-import argparse
+import math
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from pronk.errors import PronkError
-from pronk.evaluation.pictures import film as films
-from pronk.evaluation.pictures import frames
-from pronk.evaluation.pictures.film import FPS, Film
-from pronk.files import written_whole
+from pronk.evaluation.pictures import overlay
+from pronk.evaluation.pictures.film import FPS, SCHEMA, Film
+from pronk.evaluation.pictures.overlay import DISTANCE, ELEVATION, FOV_DEG, TAPE_HALF_M
+from pronk.files import load_artefact, written_whole
+from pronk.robots import load_robot
 
+Array = NDArray[np.float64]
+
+WIDTH, HEIGHT = 640, 400
+"""Of a frame [px]."""
+STRIP_WIDTH = 270
+"""Of a pose in a strip [px]."""
 GIF_WIDTH = 360
 """[px]"""
-_GIF_BEFORE_S = 0.6
-_GIF_AFTER_S = 0.8
+_GIF_BEFORE_S, _GIF_AFTER_S = 0.6, 0.8
+"""Around the jump."""
 _GIF_SKIP = 2
-"""A GIF takes one frame of so many."""
-_GIF_COLOURS = 80
-_PALETTE_FRAMES = 5
+"""A GIF has one frame of so many."""
+_OVERSAMPLE = 2
+"""Pixels rendered for each pixel of the image, each way."""
+_DRAWN = {"contype": 0, "conaffinity": 0, "group": 2}
+"""A geom for drawing only."""
+
+_WORLD = f"""
+<mujoco>
+  <statistic extent="1" center="0 0 .3"/>
+  <visual>
+    <global fovy="{FOV_DEG}" offwidth="{WIDTH * _OVERSAMPLE}" offheight="{HEIGHT * _OVERSAMPLE}"/>
+    <quality offsamples="0" shadowsize="2048" numslices="20" numstacks="10"/>
+    <headlight ambient=".38 .38 .4" diffuse=".22 .22 .22" specular="0 0 0"/>
+    <map zfar="60" shadowclip="1.6" fogstart="5" fogend="14"/>
+    <rgba haze=".87 .9 .93 1"/>
+  </visual>
+  <asset>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1=".47 .6 .74" rgb2=".87 .9 .93"
+      width="128" height="768"/>
+    <texture name="floor" type="2d" builtin="checker" mark="edge" rgb1=".43 .46 .49"
+      rgb2=".46 .49 .52" markrgb=".36 .39 .42" width="512" height="512"/>
+    <material name="floor" texture="floor" texrepeat="1 1" texuniform="true" specular=".05"
+      shininess=".1"/>
+  </asset>
+  <worldbody>
+    <light name="sun" type="directional" mode="trackcom" diffuse=".62 .61 .58"
+      specular=".25 .25 .25"/>
+    <geom name="floor" type="plane" size="0 0 .5" material="floor" contype="0" conaffinity="0"
+      group="2"/>
+  </worldbody>
+</mujoco>
+"""
+"""Floor with squares of 1 m, sky and sun."""
 
 
-class Encoder:
-    """Writes frames into an MP4 (H.264, 4:2:0, which every browser plays)."""
+def stage(film: Film) -> Any:
+    """Build the robot on its ground, with a tape every 20 cm (paper E7), for drawing only.
 
-    def __init__(self, path: Path, size: tuple[int, int]) -> None:
-        """Start ffmpeg.
+    Returns:
+        mujoco.MjModel
+    """
+    spec = mujoco.MjSpec.from_string(_WORLD)
+    spec.geom("floor").pos = (0.0, 0.0, film.ground.floor)
+    right = np.array([math.sin(film.azimuth), -math.cos(film.azimuth), 0.0])
+    ahead = np.array([math.cos(film.azimuth), math.sin(film.azimuth), 0.0])
+    sun = spec.light("sun")
+    sun.dir = 0.18 * right + 0.32 * ahead + (0.0, 0.0, -1.0)
+    sun.pos = -3.0 * np.array(sun.dir)
+    boxes = [
+        {"size": box.half_size, "pos": box.center, "rgba": (0.62, 0.55, 0.45, 1.0)}
+        for box in film.ground.terrain
+    ] or [
+        {
+            "size": (0.012 if mark % 5 == 0 else 0.006, TAPE_HALF_M, 0.0005),
+            "pos": place + np.array([0.0, 0.0, 0.0008]),
+            "quat": (math.cos(0.5 * film.direction), 0.0, 0.0, math.sin(0.5 * film.direction)),
+            "rgba": (0.93, 0.93, 0.9, 1.0) if mark else (1.0, 0.55, 0.1, 1.0),
+        }
+        for mark, place in overlay.tape_points(film, 0.0).items()
+    ]
+    for box in boxes:
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **box, **_DRAWN)
+    spec.attach(load_robot(film.robot).build_spec(), prefix="", frame=spec.worldbody.add_frame())
+    return spec.compile()
 
-        Args:
-            path: The file.
-            size: Width and height [px].
-        """
-        import imageio_ffmpeg
 
-        parameters = ["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"]
-        self._writer = imageio_ffmpeg.write_frames(
-            str(path),
-            size,
-            fps=FPS,
-            codec="libx264",
-            quality=None,
-            macro_block_size=2,
-            ffmpeg_log_level="error",
-            output_params=[*parameters, "-threads", "1"],
-        )
-        self._writer.send(None)
-
-    def __enter__(self) -> Self:
-        """Begin."""
-        return self
-
-    def write(self, image: Image.Image) -> None:
-        """Add a frame."""
-        self._writer.send(image.tobytes())
-
-    def __exit__(self, *_: object) -> None:
-        """Finish the file."""
-        self._writer.close()
+def images(film: Film) -> Iterator[Image.Image]:
+    """Render the film's frames, then the poses of its strip, without text."""
+    model = stage(film)
+    data = mujoco.MjData(model)
+    joints = load_robot(film.robot).joint_names
+    columns = np.array([model.joint(name).qposadr[0] for name in joints])
+    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    camera.distance, camera.elevation = DISTANCE, math.degrees(ELEVATION)
+    camera.azimuth = math.degrees(film.azimuth)
+    option.geomgroup[:] = [1, 1, 1, 0, 0, 0]
+    beside = film.pose_qpos[:, :3].copy()
+    beside[:, 2] = film.look[:, 2].mean()
+    poses, looks = np.vstack([film.qpos, film.pose_qpos]), np.vstack([film.look, beside])
+    with closing(mujoco.Renderer(model, HEIGHT * _OVERSAMPLE, WIDTH * _OVERSAMPLE)) as renderer:
+        for pose, look in zip(poses, looks, strict=True):
+            data.qpos[:7], data.qpos[columns] = pose[:7], pose[7:]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_camlight(model, data)
+            camera.lookat[:] = look
+            renderer.update_scene(data, camera, option)
+            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = 1
+            yield Image.fromarray(renderer.render()).reduce(_OVERSAMPLE)
 
 
 def in_gif(film: Film) -> range:
-    """Which frames a GIF shows: the jump and a little around it, every second one."""
-    first, last = 0, film.frames
-    if film.marks:
-        around = (film.time >= film.marks.liftoff - _GIF_BEFORE_S) & (
-            film.time <= film.marks.touchdown + _GIF_AFTER_S
+    """Frames of the GIF: the jump and a little around it, every second one."""
+    first, last = 0, len(film.time)
+    if film.events:
+        around = (film.time >= film.events.liftoff - _GIF_BEFORE_S) & (
+            film.time <= film.events.touchdown + _GIF_AFTER_S
         )
-        first, last = int(around.argmax()), film.frames - int(around[::-1].argmax())
+        first, last = int(around.argmax()), last - int(around[::-1].argmax())
     return range(first, last, _GIF_SKIP)
 
 
-def write_gif(path: Path, images: list[Image.Image]) -> None:
-    """Write an animation that loops.
-
-    Args:
-        path: The file.
-        images: RGB, all of one size.
-    """
-    # One palette for all, without dither: what stands still is then not stored again.
-    width, height = images[0].size
-    chosen = images[:: max(1, len(images) // _PALETTE_FRAMES)]
+def write_gif(path: Path, frames: list[Image.Image]) -> None:
+    """Write an animation that loops, with one palette and no dither: what stands still is small."""
+    width, height = frames[0].size
+    chosen = frames[:: max(1, len(frames) // 5)]
     montage = Image.new("RGB", (width, height * len(chosen)))
     for row, image in enumerate(chosen):
         montage.paste(image, (0, row * height))
-    palette = montage.quantize(_GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
-    first, *rest = [i.quantize(palette=palette, dither=Image.Dither.NONE) for i in images]
-    first.save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=rest,
-        duration=round(1000.0 * _GIF_SKIP / FPS),
-        loop=0,
-    )
+    palette = montage.quantize(80, Image.Quantize.MAXCOVERAGE)
+    first, *rest = [i.quantize(palette=palette, dither=Image.Dither.NONE) for i in frames]
+    duration = round(1000.0 * _GIF_SKIP / FPS)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
 
 
-def render(
-    film: Film, *, mp4: Path | None, gif: Path | None, strip: Path | None, width: int, height: int
-) -> None:
-    """Paint a film into whichever files are named, each whole or not at all."""
-    if strip is not None:
-        with written_whole(strip) as aside:
-            frames.strip(film).save(aside, format="PNG", optimize=True)
-    if mp4 is None and gif is None:
-        return
-    kept = set(in_gif(film)) if gif is not None else set()
-    images = []
+def render(film: Film, files: dict[str, Path]) -> None:
+    """Render a film into files by suffix (.mp4, .gif, .png), each whole or not at all."""
+    count, poses = len(film.time), len(film.labels)
+    strip = Image.new("RGB", (STRIP_WIDTH * max(1, poses), HEIGHT))
+    kept = set(in_gif(film)) if ".gif" in files else set()
+    animation = []
     with ExitStack() as stack:
-        encoder: Encoder | None = None
-        if mp4 is not None:
-            aside = stack.enter_context(written_whole(mp4))
-            encoder = stack.enter_context(Encoder(aside, (width, height)))
-        for frame in frames.frames(film, width=width, height=height):
-            if encoder is not None:
-                encoder.write(frame.worded(film, width))
-            if frame.index in kept:
-                images.append(frame.worded(film, GIF_WIDTH))
-            sys.stdout.write(f"{frame.index + 1}/{film.frames}\n")
-            sys.stdout.flush()
-    if gif is not None:
-        with written_whole(gif) as aside:
-            write_gif(aside, images)
+        aside = {end: stack.enter_context(written_whole(path)) for end, path in files.items()}
+        movie: Any = None
+        if ".mp4" in files:
+            import imageio_ffmpeg
+
+            # H.264 in 4:2:0, which every browser plays.
+            options = ["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"]
+            movie = imageio_ffmpeg.write_frames(
+                str(aside[".mp4"]),
+                (WIDTH, HEIGHT),
+                fps=FPS,
+                codec="libx264",
+                quality=None,
+                macro_block_size=2,
+                ffmpeg_log_level="error",
+                output_params=[*options, "-threads", "1"],
+            )
+            stack.enter_context(closing(movie)).send(None)
+        for index, image in enumerate(images(film)):
+            if index >= count:
+                left = (WIDTH - STRIP_WIDTH) // 2
+                pose = image.crop((left, 0, left + STRIP_WIDTH, HEIGHT))
+                strip.paste(pose, ((index - count) * STRIP_WIDTH, 0))
+                continue
+            if index in kept:
+                size = (GIF_WIDTH, GIF_WIDTH * HEIGHT // WIDTH)
+                animation.append(image.resize(size, Image.Resampling.BOX))
+                overlay.draw_frame(animation[-1], film, index)
+            if movie is not None:
+                overlay.draw_frame(image, film, index)
+                movie.send(image.tobytes())
+            print((index + 1) / count, flush=True)  # noqa: T201
+        if ".gif" in files:
+            write_gif(aside[".gif"], animation)
+        if ".png" in files:
+            overlay.draw_strip(strip, film)
+            strip.save(aside[".png"], "PNG", optimize=True)
 
 
-def probe() -> None:
-    """Paint one small picture."""
-    model = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><light/><geom size='1'/></worldbody></mujoco>"
-    )
-    renderer: Any = mujoco.Renderer(model, 32, 32)
+def check_gl() -> None:
+    """Render one small image.
+
+    Raises:
+        PronkError: It is black.
+    """
+    world = "<mujoco><worldbody><light/><geom size='1'/></worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(world)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer.update_scene(data)
-    painted = renderer.render()
-    renderer.close()
-    if not painted.any():
-        raise PronkError("the picture is black.")
+    renderer: Any
+    with closing(mujoco.Renderer(model, 32, 32)) as renderer:
+        renderer.update_scene(data)
+        if not renderer.render().any():
+            raise PronkError("the image is black.")
 
 
-def main(arguments: list[str]) -> int:
-    """Run one command line of the module and return its exit status."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("film", type=Path, nargs="?")
-    for name in ("--mp4", "--gif", "--strip"):
-        parser.add_argument(name, type=Path)
-    parser.add_argument("--width", type=int, default=frames.WIDTH)
-    parser.add_argument("--height", type=int, default=frames.HEIGHT)
-    options = vars(parser.parse_args(arguments))
-    path = options.pop("film")
+def main(paths: list[Path]) -> int:
+    """Render the first path, a film, into the others; return the exit status."""
     try:
-        if path is None:
-            probe()
+        if not paths:
+            check_gl()
         else:
-            render(films.load(path), **options)
+            film = load_artefact(paths[0], Film, SCHEMA, what="a film", writer="pronk trial")
+            render(film, {path.suffix: path for path in paths[1:]})
     except Exception as error:
         sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
         return 1
@@ -173,4 +232,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main([Path(word) for word in sys.argv[1:]]))
