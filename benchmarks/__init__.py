@@ -1,1 +1,1 @@
-"""Benchmarks beside peers: python -m benchmarks.NAME."""
+"""Benchmarks of pronk, run from a checkout: `python -m benchmarks NAME`."""

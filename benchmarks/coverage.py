@@ -1,23 +1,21 @@
 """`python -m benchmarks coverage`: how often the 95 % intervals hold the known gains.
 
-Each trial is a log of known truth with noise of its own, coloured at 2 Hz; everything after the
-noise is what a real log goes through, but that all trials share one clean simulation and one
-operator, which is exact because the H1 estimate is linear in the position.
+Each trial is a log of known gains with noise of its own, coloured at 2 Hz; everything after the
+noise is what a real log goes through. All trials share one clean simulation and one operator,
+which is exact because the H1 estimate is linear in the position.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
-from rich.table import Table
-from rich.text import Text
-from scipy.signal import lfilter
 from scipy.stats import binom
 
-from benchmarks.synthetic_log import Excitation, synthetic_log
+from benchmarks.runner import Progress, table
+from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
+from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
 from pronk.match.measured_joint import measured_joints
@@ -33,51 +31,41 @@ ROBOT = "mini_cheetah"
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
 NOISE_RAD = 0.003
 NOISE_CORNER_HZ = 2.0
-LOG_RATE_HZ = 500.0
-_BATCH = 50
-_REST_S = 0.5
+RATE_HZ = 500.0
+BATCH = 50
+REST_S = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Coverage:
-    """Trials of one joint."""
+    """Trials of one joint; pairs are of stiffness and damping."""
 
     joint: str
-    truth: tuple[float, float]
+    known: tuple[float, float]
     trials: int
-    repeats: int
     covered: tuple[int, int]
-    """Trials whose interval of stiffness, of damping, holds the truth."""
+    """Trials whose interval holds the known value."""
     bias_percent: tuple[float, float]
     deviation_percent: tuple[float, float]
     half_width_percent: tuple[float, float]
     """Mean half-width of the interval."""
 
 
-def coloured(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """AR(1) noise with its corner at 2 Hz, sampled at 500 Hz [rad], shape (..., samples)."""
-    pole = np.exp(-2.0 * np.pi * NOISE_CORNER_HZ / LOG_RATE_HZ)
-    settle = 1000
-    white = rng.standard_normal((*shape[:-1], shape[-1] + settle))
-    noise = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white, axis=-1)
-    return np.asarray(NOISE_RAD * noise[..., settle:])
-
-
 def run(
-    trials: int = 200,
-    seed: int = 0,
-    progress: Callable[[str, float], None] | None = None,
+    trials: int,
+    seed: int,
+    progress: Progress,
     *,
     repeats: int = 3,
     length_s: float = 20.0,
     threads: int = 2,
-) -> tuple[Coverage, ...]:
+) -> list[Coverage]:
     """Trials for one joint of each group.
 
     Args:
         trials: Logs of each joint.
         seed: Of the noise.
-        progress: Told the stage and the share done, 0 to 1.
+        progress: Called with the stage and the share done.
         repeats: Chirps in each log.
         length_s: Length of the chirp [s].
         threads: Threads of the simulator.
@@ -87,98 +75,85 @@ def run(
     """
     if trials < 1 or repeats < 2:
         raise PronkError(f"{trials} trials of {repeats} repeats; expected at least 1 of 2.")
-    told = progress or (lambda _stage, _share: None)
-    return tuple(
-        _joint(
-            name,
-            trials,
-            np.random.default_rng([seed, k]),
-            repeats,
-            length_s,
-            threads,
-            lambda share, k=k: told("trials", (k + share) / len(JOINTS)),  # type: ignore[misc]
-        )
-        for k, name in enumerate(JOINTS)
-    )
-
-
-def _joint(
-    name: str,
-    trials: int,
-    rng: np.random.Generator,
-    repeats: int,
-    length_s: float,
-    threads: int,
-    told: Callable[[float], None],
-) -> Coverage:
     robot, settings = load_robot(ROBOT), MatchSettings(threads=threads)
     paper = published(ROBOT)
     assert paper is not None
-    truth = paper.joints[name]
-    chirp = Excitation(
-        offsets=Chirp(length_s=length_s).samples(), repeats=repeats, settle_s=_REST_S
-    )
-    samples = round((length_s + 2.0 * _REST_S + 1.0) * LOG_RATE_HZ)
-    log = synthetic_log(robot, name, [chirp], *truth, noise=list(coloured(rng, (repeats, samples))))
-    noisy = measured_joints(log, name, robot, settings)[0]
-    quiet = synthetic_log(robot, name, [replace(chirp, repeats=1)], *truth)
-    clean = measured_joints(quiet, name, robot, settings)[0].measured.response
-    operator = operators(log, name, settings.estimator)[0][0]
-    gains, low, high = (np.empty((trials, 2)) for _ in range(3))
-    with MujocoSimulator(robot, threads=threads) as simulator:
-        for begin in range(0, trials, _BATCH):
-            count = min(_BATCH, trials - begin)
-            shaken = operator.apply(coloured(rng, (count, repeats, len(operator.time))))
-            goals = [
-                replace(
-                    noisy,
-                    measured=replace(noisy.measured, response=answer.mean(axis=0), repeats=answer),
-                )
-                for answer in clean + shaken
-            ]
-            for k, fit in enumerate(refine(simulator, goals, [truth] * count), start=begin):
-                bounds = interval(fit)
-                gains[k] = fit.stiffness, fit.damping
-                for i in range(2):
-                    low[k, i], high[k, i] = bounds.around(gains[k, i], i)
-            told((begin + count) / trials)
-    true = np.array(truth)
-    inside = ((low <= true) & (true <= high)).sum(axis=0)
-    bias = 100.0 * (gains.mean(axis=0) / true - 1.0)
-    deviation = 100.0 * gains.std(axis=0, ddof=1) / true
-    width = 50.0 * (high - low).mean(axis=0) / true
-    return Coverage(
-        joint=name,
-        truth=truth,
-        trials=trials,
-        repeats=repeats,
-        covered=(int(inside[0]), int(inside[1])),
-        bias_percent=(float(bias[0]), float(bias[1])),
-        deviation_percent=(float(deviation[0]), float(deviation[1])),
-        half_width_percent=(float(width[0]), float(width[1])),
-    )
+    chirp = Excitation(offsets=Chirp(length_s=length_s).samples(), repeats=repeats, settle_s=REST_S)
+    samples = round((length_s + 2.0 * REST_S + 1.0) * RATE_HZ)
+    noise = partial(coloured_noise, deviation=NOISE_RAD, corner_hz=NOISE_CORNER_HZ, rate_hz=RATE_HZ)
+    found = []
+    for index, name in enumerate(JOINTS):
+        rng, known = np.random.default_rng([seed, index]), paper.joints[name]
+        log = synthetic_log(
+            robot, name, [chirp], *known, noise=list(noise(rng, (repeats, samples)))
+        )
+        noisy = measured_joints(log, name, robot, settings)[0]
+        quiet = synthetic_log(robot, name, [replace(chirp, repeats=1)], *known)
+        clean = measured_joints(quiet, name, robot, settings)[0].measured.response
+        operator = operators(log, name, settings.estimator)[0][0]
+        gains, low, high = (np.empty((trials, 2)) for _ in range(3))
+        with MujocoSimulator(robot, threads=threads) as simulator:
+            for begin in range(0, trials, BATCH):
+                count = min(BATCH, trials - begin)
+                errors = operator.apply(noise(rng, (count, repeats, len(operator.time))))
+                goals = []
+                for response in clean + errors:
+                    each = replace(noisy.measured, response=response.mean(axis=0), repeats=response)
+                    goals.append(replace(noisy, measured=each))
+                for k, fit in enumerate(refine(simulator, goals, [known] * count), start=begin):
+                    bounds = interval(fit)
+                    gains[k] = fit.stiffness, fit.damping
+                    for i in range(2):
+                        low[k, i], high[k, i] = bounds.around(gains[k, i], i)
+                progress("trials", (index + (begin + count) / trials) / len(JOINTS))
+        expected = np.array(known)
+
+        def pair(values: np.ndarray) -> tuple[float, float]:
+            return float(values[0]), float(values[1])
+
+        inside = ((low <= expected) & (expected <= high)).sum(axis=0)
+        found.append(
+            Coverage(
+                joint=name,
+                known=known,
+                trials=trials,
+                covered=(int(inside[0]), int(inside[1])),
+                bias_percent=pair(100.0 * (gains.mean(axis=0) / expected - 1.0)),
+                deviation_percent=pair(100.0 * gains.std(axis=0, ddof=1) / expected),
+                half_width_percent=pair(50.0 * (high - low).mean(axis=0) / expected),
+            )
+        )
+    return found
 
 
-def table(rows: tuple[Coverage, ...]) -> Table:
-    """A row a joint, stiffness / damping."""
-    made = Table(title=Text("95 % intervals under coloured noise (stiffness / damping)"))
-    made.title_justify = made.caption_justify = "left"
-    made.add_column("joint")
-    for column in ("hold the truth", "bias [%]", "scatter [%]", "half-width [%]"):
-        made.add_column(Text(column), justify="right")
-    for one in rows:
-        made.add_row(
+def coverage(trials: int = 200, seed: int = 0, json_file: console.JsonFile = None) -> None:
+    """How often the 95 % intervals hold the known gains under coloured noise.
+
+    Args:
+        trials: Logs of each joint.
+        seed: Of the noise.
+        json_file: Also write the figures to this file.
+    """
+    repeats = 3
+    with console.progress() as report:
+        found = run(trials, seed, report, repeats=repeats)
+    rows = [
+        (
             one.joint,
             "{} / {} of {}".format(*one.covered, one.trials),
             "{:+.3f} / {:+.3f}".format(*one.bias_percent),
             "{:.3f} / {:.3f}".format(*one.deviation_percent),
             "{:.3f} / {:.3f}".format(*one.half_width_percent),
         )
-    if rows:
-        chance = binom(rows[0].trials, 0.95).interval(0.95)
-        made.caption = Text(
-            f"{rows[0].trials} logs a joint of {rows[0].repeats} chirps each, noise "
-            f"{1e3 * NOISE_RAD:g} mrad coloured at {NOISE_CORNER_HZ:g} Hz; an exact interval would "
-            f"hold {chance[0]:.0f} to {chance[1]:.0f} (95 % of such benches)"
-        )
-    return made
+        for one in found
+    ]
+    low, high = binom(trials, 0.95).interval(0.95)
+    caption = (
+        f"{trials} logs a joint of {repeats} chirps each, noise {1e3 * NOISE_RAD:g} mrad coloured "
+        f"at {NOISE_CORNER_HZ:g} Hz; an exact interval would hold {low:.0f} to {high:.0f} "
+        "(95 % of such benchmarks)"
+    )
+    title = "95 % intervals under coloured noise (stiffness / damping)"
+    columns = ("joint", "hold the known value", "bias [%]", "scatter [%]", "half-width [%]")
+    console.show(table(title, columns, rows, caption))
+    console.write_json(json_file, {one.joint: asdict(one) for one in found})

@@ -1,22 +1,21 @@
-"""The peers: mujoco.sysid, and a CMA-ES fit in the time domain in the manner of PACE.
+"""The peers of a match: mujoco.sysid, and a CMA-ES fit in the time domain in the manner of PACE.
 
-Both get what pronk gets: the log, the bench model with armature and friction in it, the same two
-free parameters inside the same bounds, and the same start. Both are used through their public
-interface, with their defaults. Each can also be given the delay parameter that it has of its own,
-since their authors would use it where they suspect a delay.
+Both are used through their public interface with their defaults, and can also be given the delay
+parameter that they have of their own.
 
 - `mujoco.sysid` (in MuJoCo, Apache-2.0): nonlinear least squares on the positions, intervals from
   the Jacobian at the optimum with residuals taken for independent.
 - PACE (leggedrobotics/pace-sim2real) runs CMA-ES on the mean squared position error of 4,096
   simulations at once, on a GPU in Isaac Lab, and fits other parameters (armature, friction, bias
-  and a delay in whole steps; gains are taken for known). What is run here is its manner: CMA-ES
-  from the `cma` package, bounds mapped to [-1, 1], sigma 0.5, mean squared position error, a stop
-  at a small relative spread of the population; but a population of 32, this MuJoCo model on the
-  CPU, and the two gains as the parameters. It says nothing of PACE's own speed.
+  and a delay in whole steps). What is run here is its manner: CMA-ES from the `cma` package,
+  bounds mapped to [-1, 1], sigma 0.5, mean squared position error, a stop at a small relative
+  spread of the population; but a population of 32, this MuJoCo model on the CPU, and the two gains
+  as the parameters. It does not show PACE's own speed.
 """
 
 from __future__ import annotations
 
+import copy
 import io
 import time
 from dataclasses import dataclass
@@ -27,12 +26,14 @@ import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.replay import Replay
-from pronk.errors import PronkError
+from pronk.errors import LogError, PronkError
 from pronk.logs.joint_log import JointLog
+from pronk.robots.model import bench_spec, set_drive_gains
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
+Bounds = tuple[tuple[float, float], tuple[float, float]]
+"""Lowest and highest stiffness, lowest and highest damping."""
 
 POPULATION = 32
 """PACE: as many as simulated environments, 4,096."""
@@ -42,17 +43,19 @@ GENERATIONS = 200
 """Most generations (PACE)."""
 SPREAD = 1e-4
 """Stop when the costs of a generation spread by less than this share of their mean."""
+SAME = 1e-9
+"""Commands and sample intervals that differ by less are the same [rad, s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What one tool made of one log."""
+    """Result of one tool for one log."""
 
     stiffness: float
     """[N m/rad]"""
     damping: float
     """[N m s/rad]"""
-    interval: tuple[tuple[float, float], tuple[float, float]] | None
+    interval: Bounds | None
     """95 % intervals of stiffness and of damping; None if the tool has none."""
     seconds: float
     """Wall time of the fit [s]."""
@@ -60,37 +63,102 @@ class Estimate:
     """Delay, where it was fitted [s]."""
 
 
-def _missing(package: str) -> PronkError:
-    return PronkError(
-        f"`python -m benchmarks match` compares with {package}, which is not installed (or lacks a "
-        "dependency of its own); install it with `pip install pronk[bench]`."
-    )
-
-
-def import_sysid() -> Any:
-    """The package mujoco.sysid.
+def import_peers() -> tuple[Any, Any]:
+    """The packages mujoco.sysid and cma.
 
     Raises:
-        PronkError: It cannot be imported; its dependencies are an extra of MuJoCo.
-    """
-    try:
-        from mujoco import sysid
-    except ImportError as error:
-        raise _missing(f"mujoco.sysid ({error.name})") from None
-    return sysid
-
-
-def import_cma() -> Any:
-    """The package cma.
-
-    Raises:
-        PronkError: It is not installed.
+        PronkError: One of them, or a dependency of it, is not installed.
     """
     try:
         import cma
-    except ImportError:
-        raise _missing("CMA-ES from the package cma") from None
-    return cma
+        from mujoco import sysid
+    except ImportError as error:
+        raise PronkError(
+            "`python -m benchmarks match` compares with mujoco.sysid and with CMA-ES from the "
+            f"package cma, but {error.name} is not installed; `pip install pronk[bench]` brings it."
+        ) from None
+    return sysid, cma
+
+
+class Replay:
+    """A log as time-domain tools need it: commands and positions at the physics steps."""
+
+    def __init__(self, log: JointLog, joint: str, robot: Robot) -> None:
+        """Read a log; joints that are held stand at their default position.
+
+        Args:
+            log: Sampled at the physics steps; its segments have one and the same command.
+            joint: The excited joint.
+            robot: Gives the bench model.
+
+        Raises:
+            LogError: The log is not sampled so, or its repeats differ in their commands.
+        """
+        self.robot, self.joint = robot, joint
+        self.spec = bench_spec(robot, joint)
+        self.spec.add_sensor(
+            name=joint,
+            type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            objname=joint,
+        )
+        self.model = self.spec.compile()
+        self.column = int(self.model.joint(joint).qposadr[0])
+        parts = [log.cut(segment) for segment in log.segments if joint in segment.joints]
+        if not parts:
+            raise LogError(f"{log.source}: no segment excites {joint}.")
+        commands = [part.command[:, part.column(joint)] for part in parts]
+        for part, command in zip(parts, commands, strict=True):
+            if np.abs(np.diff(part.time) - robot.timestep_s).max() > SAME:
+                raise LogError(
+                    f"{log.source}: sampled every {np.diff(part.time).mean():.6f} s; the peers "
+                    f"replay row by row and need exactly the physics step of {robot.timestep_s} s."
+                )
+            if len(command) != len(commands[0]) or np.abs(command - commands[0]).max() > SAME:
+                raise LogError(f"{log.source}: the repeats of {joint} differ in their commands.")
+        names = [self.model.actuator(i).name for i in range(self.model.nu)]
+        held = [robot.joint(name).default_position for name in names]
+        self.control = np.tile(held, (len(commands[0]), 1))
+        """Command of every drive at each step [rad], shape (steps, drives)."""
+        self.control[:, names.index(joint)] = commands[0]
+        self.position = np.array([part.position[:, part.column(joint)] for part in parts])
+        """Measured positions of the joint [rad], shape (repeats, steps)."""
+        # At rest until the command first changes: the mean of what was measured by then.
+        still = max(int(np.argmax(commands[0] != commands[0][0])), 1)
+        data = mujoco.MjData(self.model)
+        full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        self.initial = np.empty((len(parts), mujoco.mj_stateSize(self.model, full)))
+        """Full physics state at rest where each repeat begins, shape (repeats, state)."""
+        for row, start in zip(self.initial, self.position[:, :still].mean(axis=1), strict=True):
+            for i in range(self.model.nq):
+                data.qpos[i] = robot.joint(self.model.joint(i).name).default_position
+            data.qpos[self.column] = start
+            mujoco.mj_getState(self.model, data, row, full)
+        self.time = np.arange(len(self.control)) * robot.timestep_s
+        """Of each step since the first [s], shape (steps,)."""
+
+    def with_gains(self, stiffness: float, damping: float) -> Any:
+        """A copy of the compiled model with other gains on the joint's drive."""
+        model = copy.copy(self.model)
+        set_drive_gains(model, self.joint, self.robot.joint(self.joint).drive, stiffness, damping)
+        return model
+
+    def positions(self, gains: Array, pool: Any, datas: list[Any]) -> Array:
+        """Simulated positions of many gain pairs, from the mean initial state of the repeats.
+
+        Args:
+            gains: Stiffness and damping, shape (b, 2 or more).
+            pool: A `mujoco.rollout.Rollout`.
+            datas: One `MjData` a thread of the pool.
+
+        Returns:
+            At the start of each step [rad], shape (b, steps).
+        """
+        models = [self.with_gains(float(pair[0]), float(pair[1])) for pair in gains]
+        begin = np.tile(self.initial.mean(axis=0), (len(models), 1))
+        control = np.broadcast_to(self.control, (len(models), *self.control.shape))
+        _, sensor = pool.rollout(models, datas, begin, np.ascontiguousarray(control))
+        return np.asarray(sensor[:, :, self.model.sensor(self.joint).adr[0]])
 
 
 def fit_sysid(
@@ -98,7 +166,7 @@ def fit_sysid(
     joint: str,
     robot: Robot,
     *,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
+    bounds: Bounds,
     start: tuple[float, float],
     delay_bounds_s: tuple[float, float] | None = None,
     threads: int = 2,
@@ -107,30 +175,26 @@ def fit_sysid(
 
     Args:
         log: The log, sampled at the physics steps; each repeat is one sequence.
-        joint: The joint that was asked.
+        joint: The excited joint.
         robot: Gives the bench model.
-        bounds: Lowest and highest stiffness, lowest and highest damping.
+        bounds: Of the gains.
         start: Stiffness and damping to begin with.
         delay_bounds_s: Fit a measurement delay between these as well [s].
         threads: Threads of the simulator.
-
-    Raises:
-        PronkError: mujoco.sysid is not installed.
     """
-    sysid = import_sysid()
+    sysid, _ = import_peers()
     before = time.perf_counter()
-    replay = Replay.of(log, joint, robot)
+    replay = Replay(log, joint, robot)
     # Observed as a state: mujoco.rollout's sensors are one step older than their timestamps.
     signal = f"{joint}_qpos"
     mapping = {signal: (sysid.SignalType.MjStateQPos, np.arange(1))}
-    control = sysid.TimeSeries(replay.time, replay.control)
     count = len(replay.position)
     sequences = sysid.ModelSequences(
         joint,
         replay.spec,
         [f"repeat {k}" for k in range(count)],
         list(replay.initial),
-        [control] * count,
+        [sysid.TimeSeries(replay.time, replay.control)] * count,
         [sysid.TimeSeries(replay.time, one[:, None], mapping) for one in replay.position],
     )
     parameters = sysid.ParameterDict()
@@ -138,9 +202,18 @@ def fit_sysid(
         parameters.add(sysid.Parameter(name, value, low, high))
 
     def build(values: Any, _spec: Any) -> Any:
-        return replay.with_gains(
-            float(values["stiffness"].value[0]), float(values["damping"].value[0])
-        )
+        return replay.with_gains(*(float(values[k].value[0]) for k in ("stiffness", "damping")))
+
+    def delayed(
+        values: Any, _sensors: Any, measured: Any, _model: Any, _all: bool, *, state: Any, **_: Any
+    ) -> tuple[Any, Any, Any]:
+        column = 1 + replay.column  # a state is time, positions, velocities
+        predicted = sysid.TimeSeries(state[:, 0], state[:, [column]], measured.signal_mapping)
+        inside = sysid.apply_delayed_ts_window(measured, predicted, *(delay_bounds_s or ()))
+        delay = float(values["delay"].value[0])
+        late = sysid.apply_resample_and_delay(predicted, inside.times, delay)
+        difference = sysid.weighted_diff(late.data, inside.data)
+        return sysid.normalize_residual(difference, inside.data), late, inside
 
     # The log is at the physics steps already. (Resampled, a float's last digit can add a sample,
     # and the staircase of the command is then interpolated between its steps.)
@@ -149,39 +222,20 @@ def fit_sysid(
         arguments["enabled_observations"] = [(signal, sysid.SignalType.MjStateQPos)]
     else:
         parameters.add(sysid.Parameter("delay", float(np.mean(delay_bounds_s)), *delay_bounds_s))
-        column = 1 + replay.column  # a state is time, positions, velocities
-        arguments["modify_residual"] = _delayed_residual(sysid, column, delay_bounds_s)
+        arguments["modify_residual"] = delayed
     residual = sysid.build_residual_fn(models_sequences=[sequences], build_model=build, **arguments)
-    # Its default optimizer writes its progress to standard output; take it aside.
+    # Its default optimizer writes its progress to standard output.
     found, result = sysid.optimize(parameters, residual, verbose=False, output=io.StringIO())
     at_optimum, _, _ = residual(result.x, found)
     _, half = sysid.calculate_intervals(at_optimum, result.jac)
-    seconds = time.perf_counter() - before
     kp, kd = float(result.x[0]), float(result.x[1])
     return Estimate(
         stiffness=kp,
         damping=kd,
         interval=((kp - half[0], kp + half[0]), (kd - half[1], kd + half[1])),
-        seconds=seconds,
+        seconds=time.perf_counter() - before,
         delay_s=float(result.x[2]) if delay_bounds_s is not None else None,
     )
-
-
-def _delayed_residual(sysid: Any, column: int, bounds: tuple[float, float]) -> Any:
-    """A residual callback for mujoco.sysid with the state's `column` later by its `delay`."""
-
-    def residual(
-        values: Any, _sensors: Any, measured: Any, _model: Any, _all: bool, *, state: Any, **_: Any
-    ) -> tuple[Any, Any, Any]:
-        predicted = sysid.TimeSeries(state[:, 0], state[:, [column]], measured.signal_mapping)
-        inside = sysid.apply_delayed_ts_window(measured, predicted, *bounds)
-        late = sysid.apply_resample_and_delay(
-            predicted, inside.times, float(values["delay"].value[0])
-        )
-        difference = sysid.weighted_diff(late.data, inside.data)
-        return sysid.normalize_residual(difference, inside.data), late, inside
-
-    return residual
 
 
 def fit_cma(
@@ -189,7 +243,7 @@ def fit_cma(
     joint: str,
     robot: Robot,
     *,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
+    bounds: Bounds,
     start: tuple[float, float],
     delay_steps: int | None = None,
     population: int = POPULATION,
@@ -199,24 +253,20 @@ def fit_cma(
     """Fit stiffness and damping by CMA-ES on the mean squared position error.
 
     Args:
-        log: The log, sampled at the physics steps; its repeats must share one command, which is
-            then simulated once a candidate.
-        joint: The joint that was asked.
+        log: The log, sampled at the physics steps.
+        joint: The excited joint.
         robot: Gives the bench model.
-        bounds: Lowest and highest stiffness, lowest and highest damping.
+        bounds: Of the gains.
         start: Stiffness and damping of the first mean.
         delay_steps: Fit a delay of 0 to this many whole physics steps as well, truncated as PACE
             truncates it.
         population: Simulations a generation.
         seed: Of the search; not 0, which `cma` takes for the clock.
         threads: Threads of the simulator.
-
-    Raises:
-        PronkError: cma is not installed.
     """
-    cma = import_cma()
+    _, cma = import_peers()
     before = time.perf_counter()
-    replay = Replay.of(log, joint, robot)
+    replay = Replay(log, joint, robot)
     # The mean of the repeats has the same best fit as all of them, at a cost less by a constant;
     # the constant is put back for the relative spread.
     mean = replay.position.mean(axis=0)
@@ -227,6 +277,12 @@ def fit_cma(
     if delay_steps is not None:
         lows, highs = np.append(lows, 0.0), np.append(highs, delay_steps + 1.0)
         first = np.append(first, 0.5 * (delay_steps + 1.0))
+
+    def steps_late(candidates: Array) -> NDArray[np.int64]:
+        if delay_steps is None:
+            return np.zeros(len(candidates), dtype=np.int64)
+        return np.minimum(candidates[:, 2].astype(np.int64), delay_steps)
+
     options = {
         "bounds": [-1.0, 1.0],
         "popsize": population,
@@ -234,9 +290,8 @@ def fit_cma(
         "verbose": -9,
         "maxiter": GENERATIONS,
     }
-    search = cma.CMAEvolutionStrategy(
-        list(2.0 * (first - lows) / (highs - lows) - 1.0), SIGMA, options
-    )
+    unit_start = list(2.0 * (first - lows) / (highs - lows) - 1.0)
+    search = cma.CMAEvolutionStrategy(unit_start, SIGMA, options)
     datas = [mujoco.MjData(replay.model) for _ in range(threads)]
     with mujoco.rollout.Rollout(nthread=threads) as pool:
         while not search.stop():
@@ -244,28 +299,18 @@ def fit_cma(
             candidates = lows + 0.5 * (np.array(unit) + 1.0) * (highs - lows)
             position = replay.positions(candidates, pool, datas)
             costs = np.full(len(candidates), constant)
-            for row, lag in enumerate(_steps_late(candidates, delay_steps)):
+            for row, lag in enumerate(steps_late(candidates)):
                 error = mean[lag:] - position[row, : steps - lag]
                 costs[row] += error @ error / (steps - lag)
             search.tell(unit, list(costs))
             if np.ptp(costs) < SPREAD * costs.mean():
                 break
     best = lows + 0.5 * (np.clip(search.result.xfavorite, -1.0, 1.0) + 1.0) * (highs - lows)
-    seconds = time.perf_counter() - before
-    late = None
-    if delay_steps is not None:
-        late = float(_steps_late(best[None, :], delay_steps)[0]) * robot.timestep_s
+    late = None if delay_steps is None else float(steps_late(best[None])[0]) * robot.timestep_s
     return Estimate(
         stiffness=float(best[0]),
         damping=float(best[1]),
         interval=None,
-        seconds=seconds,
+        seconds=time.perf_counter() - before,
         delay_s=late,
     )
-
-
-def _steps_late(candidates: Array, delay_steps: int | None) -> NDArray[np.int64]:
-    """Delay of each candidate in whole steps, shape (b,)."""
-    if delay_steps is None:
-        return np.zeros(len(candidates), dtype=np.int64)
-    return np.minimum(candidates[:, 2].astype(np.int64), delay_steps)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
+from scipy.signal import lfilter
 
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import Robot
@@ -32,15 +33,35 @@ class Excitation:
     """Rest before and after the signal [s]."""
 
 
+def coloured_noise(
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+    *,
+    deviation: float,
+    corner_hz: float,
+    rate_hz: float,
+) -> Array:
+    """Stationary first-order autoregressive noise along the last axis.
+
+    `x[k+1] = a x[k] + sqrt(1 - a^2) deviation w[k]` with `a = exp(-2 pi corner / rate)`, begun in
+    its stationary distribution.
+    """
+    a = float(np.exp(-2.0 * np.pi * corner_hz / rate_hz))
+    white = rng.standard_normal(shape)
+    white[..., 1:] *= np.sqrt(1.0 - a * a)
+    return np.asarray(deviation * lfilter([1.0], [1.0, -a], white, axis=-1))
+
+
 def synthetic_log(
     robot: Robot,
     joint: str,
     excitations: Sequence[Excitation],
-    stiffness: float,
-    damping: float,
+    stiffness: float | Array,
+    damping: float | Array,
     *,
     rate_hz: float = 500.0,
     noise: Sequence[Array] | None = None,
+    delay_s: float = 0.0,
     simulator: JointRigs | None = None,
     **options: Any,
 ) -> JointLog:
@@ -50,11 +71,12 @@ def synthetic_log(
         robot: The robot; with a finer `timestep_s` (and more `decimation`) a finer simulator.
         joint: The joint to excite.
         excitations: Signals, one after the other.
-        stiffness: Gain of the excited joint [N m/rad].
-        damping: Gain of the excited joint [N m s/rad].
+        stiffness: Of the excited joint [N m/rad], one value or one for each repeat.
+        damping: Of the excited joint [N m s/rad], likewise.
         rate_hz: Rate of the log [Hz].
         noise: Added to the position of the joint [rad], one array a segment in the order of the
             log (signal by signal, repeat by repeat), each at least as long as the segment.
+        delay_s: From a command to its effect [s], not necessarily whole steps.
         simulator: Rigs of another simulator, which then also gives the timestep.
         options: Those of `pronk.simulators.mujoco.JointTestRig`.
 
@@ -65,6 +87,7 @@ def synthetic_log(
     if simulator is not None:
         robot = simulator.robot
     known = robot.joint(joint)
+    gains = np.atleast_1d(stiffness), np.atleast_1d(damping)
     pose = np.array([j.default_position for j in robot.joints])
     centre = known.default_position
     tick = robot.timestep_s * robot.decimation
@@ -85,17 +108,16 @@ def synthetic_log(
             amplitude=float(np.abs(one.offsets).max()),
         )
         if simulator is not None:
-            rig = simulator.rig(joint)
-            position_at_steps = play(rig, trace, np.array([stiffness]), np.array([damping]))[0]
+            simulated = play(simulator.rig(joint), trace, *gains)
         else:
-            position_at_steps = simulate(robot, trace, stiffness, damping, **options)[0]
+            simulated = simulate(robot, trace, *gains, **options)
         count = len(ticks) * per_tick
-        times = np.minimum(np.arange(count) / rate, trace.time[-1])
-        position = make_interp_spline(trace.time, position_at_steps, k=3)(times)
+        times = np.clip(np.arange(count) / rate - delay_s, 0.0, trace.time[-1])
+        position = make_interp_spline(trace.time, simulated, k=3, axis=1)(times)
         for repeat in range(one.repeats):
             extra = 0.0 if noise is None else noise[len(segments)][:count]
             commands.append(np.repeat(ticks, per_tick))
-            positions.append(position + extra)
+            positions.append(position[repeat % len(position)] + extra)
             segments.append(
                 Segment(
                     kind=one.kind,

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 import pronk
-from benchmarks.tick import CASES, WAYS, Row, Way, bars, checks, figures, run, table
-from pronk.errors import PronkError
 from pronk.links.machine import State
 from pronk.links.realtime import Pace
 from pronk.policy.runtime import load_policy
@@ -157,35 +155,3 @@ def test_nothing_is_rehearsed_for_a_deadline_that_has_passed() -> None:
     assert warm_up_until(time.monotonic() - 1.0, pytest.fail) == 0  # type: ignore[arg-type]
     # Nor where there is less room than the first one needs.
     assert warm_up_until(time.monotonic() + 5e-4, pytest.fail) == 0  # type: ignore[arg-type]
-
-
-# --- The bench ----------------------------------------------------------------------------------
-
-
-def row(case: str, late: float, network: float) -> Row:
-    def spread(n: int, p99: float) -> dict[str, float | int]:
-        return {"n": n, "p50_ms": p99 / 2} | dict.fromkeys(("p99_ms", "p99_9_ms", "max_ms"), p99)
-
-    way = Way(lateness=spread(9, late), network=spread(9, network), decision=spread(9, 0.4))
-    slow = Way(lateness=spread(9, 7.0), network=spread(9, 7.0), decision=spread(9, 7.0))
-    once = Way(lateness=spread(0, 0.0), network=spread(1000, 0.09), decision=spread(1000, 0.2))
-    ways = dict(zip(WAYS, (once, slow, way), strict=True))
-    return Row(case=case, granted=(), ways=ways, missed=0)
-
-
-def test_the_bars_are_those_of_the_rehearsed_loop_on_an_idle_computer() -> None:
-    rows = [row(case.name, 0.9 + case.hogs, 0.25 - 0.1 * case.real_time) for case in CASES]
-    found = {check.what: check.passed for check in checks(rows)}
-    assert found == {
-        "idle, ordinary: lateness, 99 %": True,
-        "idle, ordinary: network, 99 %": False,
-        "idle, real time: lateness, 99 %": True,
-        "idle, real time: network, 99 %": True,
-    }
-    assert [entry["passed"] for entry in figures(rows)["bars"]] == list(found.values())
-    assert (table(rows).row_count, bars(rows).row_count) == (16, 4)
-
-
-def test_a_bench_too_short_to_say_anything_is_refused() -> None:
-    with pytest.raises(PronkError, match=r"0\.4 s or more"):
-        run(POLICY, 0.1, lambda case, share: None)

@@ -1,0 +1,226 @@
+"""`python -m benchmarks grid`: the grid on twelve joints, its speed and the gains that it finds.
+
+The peer is a bare `mujoco.rollout` loop over the same model, commands and threads, run right
+before and right after each part of the grid. The known gains are the paper's Table I, put into the
+training simulator, logged without noise.
+"""
+
+from __future__ import annotations
+
+import copy
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+from benchmarks.runner import Progress, table
+from benchmarks.synthetic_log import Excitation, synthetic_log
+from pronk.cli import console
+from pronk.excitation.signals import Chirp
+from pronk.match.grid import GridSearch, alike, axes, search
+from pronk.match.measured_joint import MeasuredJoint, measured_joints
+from pronk.match.quick import quick_search
+from pronk.match.refine import refine
+from pronk.match.settings import MatchSettings
+from pronk.report.paper import published
+from pronk.robots import load_robot
+from pronk.robots.robot import Robot
+from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
+
+Gains = tuple[float, float]
+"""Stiffness [N m/rad] and damping [N m s/rad]."""
+
+BARE_PAIRS = 500
+"""Pairs in one run of the bare loop; a fifth of the grid gives its speed."""
+ROBOT = "mini_cheetah"
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFound:
+    """The known gains of one joint, and what the searches found."""
+
+    joint: str
+    known: Gains
+    grid: Gains
+    nearest_cell: bool
+    """The grid's best node is the node nearest to the known gains."""
+    refined: Gains
+    quick: Gains
+    quick_same_cell: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridBench:
+    """What one run gave."""
+
+    joints: tuple[JointFound, ...]
+    pairs: int
+    """Gain pairs of the grid, for each joint."""
+    simulations: int
+    """Families of mirror-image joints that were simulated."""
+    steps: int
+    grid_s: float
+    """Wall time of the grid, everything included [s]."""
+    refine_s: float
+    quick_s: float
+    bare_steps_per_second: float
+    """Of the bare loop, weighted as the grid's own steps are."""
+    memory_mb: float
+    """Largest resident memory of the process [MB]."""
+    steps_per_second: float
+    """Of the grid, everything included."""
+    ratio: float
+    """Speed of the grid over that of the bare loop."""
+
+
+def bare_rollout(rig: JointTestRig, goal: MeasuredJoint, pairs: int, threads: int) -> float:
+    """Steps per second of `mujoco.rollout` alone over a rig's model and a target's command."""
+    command = goal.trace.mirrored(rig.robot)[2][: goal.steps]
+    control = np.tile(rig.control(rig.pose(goal.trace)), (pairs, goal.steps, 1))
+    control[:, :, rig.actuator] += command
+    models = [copy.copy(rig.model) for _ in range(pairs)]
+    data = [mujoco.MjData(rig.model) for _ in range(threads)]
+    width = mujoco.mj_stateSize(rig.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    initial = np.zeros((pairs, width))
+    initial[:, 1 : 1 + rig.model.nq] = rig.pose(goal.trace)
+    with mujoco.rollout.Rollout(nthread=threads) as pool:
+        begin = time.perf_counter()
+        pool.rollout(models, data, initial, control)
+        return pairs * goal.steps / (time.perf_counter() - begin)
+
+
+def run(
+    progress: Progress,
+    *,
+    points: int = 50,
+    length_s: float = 20.0,
+    threads: int = 2,
+    joints: Sequence[str] | None = None,
+) -> GridBench:
+    """Search the grid for every joint, beside the bare loop; then the linearized search.
+
+    Args:
+        progress: Called with the stage and the share done.
+        points: Points of each axis of the grid; the paper has 50.
+        length_s: Length of the chirp [s].
+        threads: Threads of both.
+        joints: All of them if not given.
+    """
+    robot, paper = load_robot(ROBOT), published(ROBOT)
+    assert paper is not None
+    known = {name: paper.joints[name] for name in joints or robot.joint_names}
+    settings = MatchSettings(grid_points=points, threads=threads)
+    goals = []
+    for k, (name, gains) in enumerate(known.items(), start=1):
+        goals.append(_measured(robot, name, gains, length_s, settings))
+        progress("logs with known gains", k / len(known))
+    stiffness, damping = axes(robot, points)
+    groups = alike(goals, robot)
+    grids: dict[str, GridSearch] = {}
+    grid_s = bare_s = 0.0
+    with MujocoSimulator(robot, threads=threads) as simulator:
+        for k, group in enumerate(groups):
+            rig = simulator.rig(group[0].joint)
+            before = simulator.count.steps
+            pairs = min(BARE_PAIRS, points**2)
+            speeds = [bare_rollout(rig, group[0], pairs, threads)]
+            begin = time.perf_counter()
+
+            def advance(share: float, k: int = k) -> None:
+                progress("grid", (k + share) / len(groups))
+
+            found = search(rig, group, stiffness, damping, progress=advance)
+            grid_s += time.perf_counter() - begin
+            speeds.append(bare_rollout(rig, group[0], pairs, threads))
+            bare_s += (simulator.count.steps - before) / float(np.mean(speeds))
+            grids |= {goal.joint: grid for goal, grid in zip(group, found, strict=True)}
+        steps = simulator.count.steps
+        begin = time.perf_counter()
+        fits = refine(simulator, goals, [grids[goal.joint].gains for goal in goals])
+        refine_s = time.perf_counter() - begin
+    begin = time.perf_counter()
+    with MujocoSimulator(robot, threads=threads) as simulator:
+        quick = quick_search(simulator, goals, stiffness, damping)
+    quick_s = time.perf_counter() - begin
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in bytes on macOS, else in kB
+    return GridBench(
+        joints=tuple(
+            JointFound(
+                joint=goal.joint,
+                known=known[goal.joint],
+                grid=grids[goal.joint].gains,
+                nearest_cell=grids[goal.joint].cell
+                == tuple(
+                    int(np.argmin(np.abs(axis - value)))
+                    for axis, value in zip((stiffness, damping), known[goal.joint], strict=True)
+                ),
+                refined=(fit.stiffness, fit.damping),
+                quick=(one.fit.stiffness, one.fit.damping),
+                quick_same_cell=one.grid.cell == grids[goal.joint].cell,
+            )
+            for goal, fit, one in zip(goals, fits, quick, strict=True)
+        ),
+        pairs=points**2,
+        simulations=len(groups),
+        steps=steps,
+        grid_s=grid_s,
+        refine_s=refine_s,
+        quick_s=quick_s,
+        bare_steps_per_second=steps / bare_s,
+        memory_mb=peak / (2.0**20 if sys.platform == "darwin" else 2.0**10),
+        steps_per_second=steps / grid_s,
+        ratio=bare_s / grid_s,
+    )
+
+
+def _measured(
+    robot: Robot, name: str, gains: Gains, length_s: float, settings: MatchSettings
+) -> MeasuredJoint:
+    """A joint's chirp in the training simulator; mirrored joints get a mirrored command."""
+    sign = robot.joint(name).original[1]
+    chirp = Excitation(offsets=sign * Chirp(length_s=length_s).samples(robot.policy_rate_hz))
+    log = synthetic_log(robot, name, [chirp], *gains, threads=settings.threads)
+    return measured_joints(log, name, robot, settings)[0]
+
+
+def _percent(found: Gains, expected: Gains) -> str:
+    errors = (100.0 * (a / b - 1.0) for a, b in zip(found, expected, strict=True))
+    return "{:+.3f} / {:+.3f}".format(*errors)
+
+
+def grid(points: int = 50, json_file: console.JsonFile = None) -> None:
+    """The paper's grid on twelve joints with known gains, beside a bare mujoco.rollout loop.
+
+    Args:
+        points: Points of each axis; the paper has 50.
+        json_file: Also write the figures to this file.
+    """
+    with console.progress() as report:
+        found = run(report, points=points)
+    rows = [
+        (
+            one.joint,
+            f"{one.known[0]:g} / {one.known[1]:g}",
+            f"{one.grid[0]:.2f} / {one.grid[1]:.3f}",
+            "yes" if one.nearest_cell else "NO",
+            _percent(one.refined, one.known),
+            _percent(one.quick, one.refined) + ("" if one.quick_same_cell else " (another cell)"),
+        )
+        for one in found.joints
+    ]
+    caption = (
+        f"{len(found.joints)} joints x {found.pairs} pairs, {found.simulations} simulated "
+        f"families: {found.grid_s:.1f} s, {found.steps_per_second / 1e3:.0f} k steps/s = "
+        f"{100 * found.ratio:.0f} % of a bare mujoco.rollout loop; refinement "
+        f"{found.refine_s:.1f} s; quick way {found.quick_s:.1f} s; memory "
+        f"{found.memory_mb:.0f} MB"
+    )
+    columns = ("joint", "known", "grid", "nearest cell", "refined off by [%]", "quick off [%]")
+    title = "Known gains (Table I, training simulator, no noise)"
+    console.show(table(title, columns, rows, caption))
+    console.write_json(json_file, asdict(found))

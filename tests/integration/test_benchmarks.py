@@ -1,0 +1,382 @@
+"""The benchmarks: known gains are found, paired figures add up, small runs work."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import pronk
+from benchmarks import grid, latency, match, runner, train, trial
+from benchmarks.peers import Estimate, Replay, fit_cma, fit_sysid
+from benchmarks.synthetic_log import coloured_noise
+from benchmarks.train_task import REST, StageCost, Stages, counted
+from hopper import ROBOT as HOPPER
+from hopper import write_hopper
+from pronk.errors import LogError, PronkError
+from pronk.evaluation.protocol import Case
+from pronk.evaluation.trial import Job, Plan, load_subjects, plan_jobs, run_job
+from pronk.logs.joint_log import JointLog
+from pronk.robots import load_robot
+from pronk.runtime.script import STILL, Script
+from pronk.virtual.sim_params import load_sim_params
+
+ROBOT = load_robot("mini_cheetah")
+QUIET = match.Scenario(name="quiet", words="no noise", noise_rad=0.0)
+PEER: dict[str, Any] = {"bounds": ((13.0, 27.0), (0.1, 0.7)), "start": (17.0, 0.4)}
+SHORT: dict[str, Any] = {"repeats": 2, "length_s": 8.0}
+POLICY = Path(pronk.__file__).parents[2] / "policies" / "matched" / "policy.onnx"
+
+
+def ignore(_stage: str, _share: float) -> None: ...
+
+
+def text(made: object) -> str:
+    console = Console(width=160, file=io.StringIO(), record=True)
+    console.print(made)
+    return console.export_text()
+
+
+# --- Blocks in turn -----------------------------------------------------------------------------
+
+
+def test_blocks_take_turns_and_ratios_are_of_neighbours() -> None:
+    order: list[str] = []
+
+    def block(name: str) -> float:
+        order.append(name)
+        return float(len(order))
+
+    times = runner.in_turn([lambda: block("a"), lambda: block("b")], 3)
+    assert order == ["a", "b", "b", "a", "a", "b"]
+    assert times == [[1.0, 4.0, 5.0], [2.0, 3.0, 6.0]]
+    # A machine that halves its speed after the first turn changes no ratio.
+    ratio = runner.paired_ratio((300.0, 150.0, 160.0), (200.0, 100.0, 100.0))
+    assert ratio == pytest.approx((1.5, 1.5, 1.6))
+
+
+# --- match, grid --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def quiet() -> JointLog:
+    return match.known_log(ROBOT, QUIET, np.random.default_rng(0), **SHORT)
+
+
+def test_noise_has_its_variance_and_corner_from_the_first_sample_on() -> None:
+    rng, rate = np.random.default_rng(3), {"corner_hz": 2.0, "rate_hz": 200.0}
+    noise = coloured_noise(rng, (400_000,), deviation=3e-3, **rate)
+    assert noise.std() == pytest.approx(3e-3, rel=0.03)
+    one_step = np.corrcoef(noise[1:], noise[:-1])[0, 1]
+    assert one_step == pytest.approx(math.exp(-2.0 * math.pi * 2.0 / 200.0), abs=3e-3)
+    starts = coloured_noise(rng, (2000, 2), deviation=1.0, **rate)[:, 0]
+    assert starts.std() == pytest.approx(1.0, rel=0.08)
+
+
+def test_logs_are_reproducible_and_have_the_disturbance_of_their_scenario(quiet: JointLog) -> None:
+    def log(scenario: match.Scenario) -> JointLog:
+        return match.known_log(ROBOT, scenario, np.random.default_rng(5), **SHORT)
+
+    noisy = match.SCENARIOS[0]
+    assert np.array_equal(log(noisy).position, log(noisy).position)
+    for scenario, same in ((QUIET, True), (replace(QUIET, gain_spread=0.03), False)):
+        one, two = (log(scenario).cut(segment).position for segment in log(scenario).segments)
+        assert np.array_equal(one, two) == same
+    late = log(replace(QUIET, delay_s=0.010)).position
+    segment = len(late) // 2
+    assert np.allclose(late[2:segment], quiet.position[: segment - 2], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("fit", "tolerance"),
+    [
+        (lambda log: fit_sysid(log, match.JOINT, ROBOT, **PEER), 1e-3),
+        (lambda log: fit_cma(log, match.JOINT, ROBOT, population=12, **PEER), 1e-3),
+        (lambda log: match.fit_pronk(log, robot=ROBOT, method="quick", threads=2), 1e-2),
+    ],
+)
+def test_every_tool_finds_the_known_gains_without_noise(
+    fit: Callable[[JointLog], Estimate], tolerance: float, quiet: JointLog
+) -> None:
+    found = fit(quiet)
+    assert (found.stiffness, found.damping) == pytest.approx(match.KNOWN, rel=tolerance)
+
+
+def test_peers_find_a_delay_of_whole_steps() -> None:
+    late = replace(QUIET, delay_s=0.010)
+    log = match.known_log(ROBOT, late, np.random.default_rng(0), **SHORT)
+    found = fit_sysid(log, match.JOINT, ROBOT, delay_bounds_s=(0.0, 0.04), **PEER)
+    assert found.delay_s == pytest.approx(0.010, abs=3e-4)
+    assert found.stiffness == pytest.approx(match.KNOWN[0], rel=0.01)
+    stepped = fit_cma(log, match.JOINT, ROBOT, delay_steps=8, population=16, **PEER)
+    assert stepped.delay_s == pytest.approx(0.010)
+    assert stepped.stiffness == pytest.approx(match.KNOWN[0], rel=0.01)
+
+
+def test_a_replay_needs_equal_repeats_at_the_physics_step(quiet: JointLog) -> None:
+    other = quiet.command.copy()
+    other[len(other) // 2 :] += 0.1
+    for changes in ({"time": quiet.time * 1.001}, {"command": other}, {"segments": ()}):
+        with pytest.raises(LogError):
+            Replay(replace(quiet, **changes), match.JOINT, ROBOT)
+
+
+def test_a_row_is_the_mean_and_the_coverage_of_its_estimates() -> None:
+    kp, kd = match.KNOWN
+    around = ((kp - 0.5, kp + 0.5), (kd * 0.9, kd * 1.1))
+    beside = ((kp + 1.0, kp + 2.0), (kd * 0.9, kd * 1.1))
+    estimates = [
+        Estimate(stiffness=1.05 * kp, damping=kd, interval=around, seconds=1.0),
+        Estimate(stiffness=kp, damping=0.9 * kd, interval=beside, seconds=3.0),
+    ]
+    row = match.summary("s", "t", "f", estimates)
+    assert (row.stiffness_bias, row.damping_bias) == pytest.approx((2.5, -5.0))
+    assert row.stiffness_sd == pytest.approx(5.0 / math.sqrt(2.0))
+    assert (row.covered, row.intervals, row.seconds) == (3, 4, 2.0)
+    assert row.stiffness_half_width == pytest.approx(50.0 / kp)
+    assert math.isnan(row.delay_ms)
+
+
+@pytest.mark.parametrize("package", ["cma", "colorama"])
+def test_a_missing_peer_is_named(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [n for n in sys.modules if n == "cma" or n.startswith("mujoco.sysid")]:
+        monkeypatch.delitem(sys.modules, name)
+    if hasattr(sys.modules["mujoco"], "sysid"):
+        monkeypatch.delattr(sys.modules["mujoco"], "sysid")
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(PronkError, match=package):
+        match.run(1, 0, ignore)
+
+
+def test_a_delay_softens_only_fits_in_the_time_domain() -> None:
+    scenarios = (replace(match.SCENARIOS[1], noise_rad=1e-3),)
+    rows = match.run(1, 4, ignore, scenarios=scenarios, full_grid=False, **SHORT)
+    by_tool = {one.tool: one for one in rows}
+    sysid, cma = by_tool["mujoco.sysid"], by_tool["CMA-ES as PACE"]
+    assert abs(by_tool["pronk"].stiffness_bias) < 2.0
+    assert sysid.stiffness_bias < -10.0
+    assert cma.stiffness_bias == pytest.approx(sysid.stiffness_bias, abs=0.5)
+    shown = text(match.show(rows, "", ""))
+    assert all(name in shown for name in by_tool)
+    with pytest.raises(PronkError, match="0 trials"):
+        match.run(0, 0, ignore)
+
+
+def test_the_grid_search_is_refined_to_the_known_gains() -> None:
+    found = grid.run(ignore, points=8, length_s=8.0, joints=["FR_knee", "FL_knee"])
+    assert (found.pairs, found.simulations) == (64, 1)
+    for one in found.joints:
+        assert one.refined == pytest.approx(one.known, rel=5e-3)
+    assert found.ratio > 0.0
+
+
+# --- latency, trial -----------------------------------------------------------------------------
+
+
+def test_limits_hold_for_the_warm_loop_on_an_idle_computer() -> None:
+    def figures(late: float, network: float) -> dict[str, dict[str, float | int]]:
+        return {"lateness": {"p99_ms": late}, "network": {"p99_ms": network}}
+
+    rows = [
+        latency.Row(
+            case=case.name,
+            granted=(),
+            ways={way: figures(7.0, 7.0) for way in latency.WAYS[:2]}
+            | {latency.WAYS[2]: figures(0.9 + case.hogs, 0.25 - 0.1 * case.real_time)},
+            missed=0,
+        )
+        for case in latency.CASES
+    ]
+    assert [check.passed for check in latency.checks(rows)] == [True, False, True, True]
+    with pytest.raises(PronkError, match=r"0\.4 s or more"):
+        latency.run(POLICY, 0.1, ignore)
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Job:
+    pytest.importorskip("onnxruntime")
+    script = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)
+    subjects = load_subjects([write_hopper(tmp_path / "policy.onnx")], HOPPER)
+    plan = Plan(cases=(Case(name="spot", command=STILL),), jumps=1, script=script, spread_s=0.0)
+    [(_, job)] = plan_jobs(subjects, plan, robot=HOPPER, sim_params=load_sim_params(), out=tmp_path)
+    return replace(job, keep=None)
+
+
+def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: Job) -> None:
+    before = repr(run_job(job).figures)
+    recording = trial.Recording(job)
+    assert repr(run_job(job).figures) == before
+    assert recording.replay() > 0.0
+    steps, control, motors = recording.blocks[-1]
+    recording.blocks[-1] = (steps - 1, control, motors)
+    with pytest.raises(PronkError, match="another state"):
+        recording.replay()
+
+
+def test_the_trial_reports_speeds_and_their_paired_ratio() -> None:
+    found = trial.figures(10.0, [2.0, 4.0, 2.5], [1.0, 2.8, 2.0])
+    assert (found["ratio"], *found["ratio_range"]) == pytest.approx((0.7, 0.5, 0.8))
+    assert (found["speed"], found["bare_speed"]) == pytest.approx((4.0, 5.0))
+    assert found["passed"]
+    assert not trial.figures(10.0, [2.0], [1.0])["passed"]
+
+
+# --- train --------------------------------------------------------------------------------------
+
+
+class Work:
+    """Methods that take a known time on a clock of their own."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def outer(self) -> str:
+        self.now += 1.0
+        self.inner()
+        self.now += 2.0
+        return "done"
+
+    def inner(self) -> None:
+        self.now += 10.0
+
+    def fails(self) -> None:
+        self.now += 5.0
+        raise ValueError("on purpose")
+
+
+def test_time_belongs_to_the_innermost_stage() -> None:
+    work = Work()
+    stages = Stages(clock=lambda: work.now)
+    parts = [(work, "outer", "o"), (work, "inner", "i"), (work, "fails", "f"), (work, "none", "n")]
+    with stages.measured(parts):
+        work.now += 100.0
+        assert work.outer() == "done"
+        work.inner()
+        with pytest.raises(ValueError, match="on purpose"):
+            work.fails()
+    assert dict(stages.seconds) == {REST: 100.0, "o": 3.0, "i": 20.0, "f": 5.0}
+    assert set(vars(work)) == {"now"}  # unwrapped again
+
+
+def test_the_device_is_waited_for_at_every_border() -> None:
+    work = Work()
+
+    def wait() -> None:
+        work.now += 1.0
+
+    stages = Stages(wait=wait, clock=lambda: work.now)
+    with stages.measured([(work, "inner", "i")]):
+        work.inner()
+    assert dict(stages.seconds) == {REST: 2.0, "i": 11.0}
+
+
+def speed(task: str, blocks: tuple[float, ...]) -> train.TaskSpeed:
+    costs = [
+        StageCost(stage=name, milliseconds=2.0, operations=7.0, waits=1.0)
+        for name in ("physics", REST)
+    ]
+    return train.TaskSpeed(
+        task=task,
+        envs=8,
+        stepping=blocks,
+        training=tuple(0.5 * one for one in blocks),
+        physics_per_step=4.0,
+        step_stages=tuple(costs),
+        iteration_stages=(costs[1],),
+        horizon=24,
+        memory_mb=math.nan,
+        cuda_graphs=False,
+        build_s=1.0,
+    )
+
+
+def test_training_tables_have_the_figures_of_the_json() -> None:
+    made = train.TrainBench(
+        pairs=((speed("Pronk-A", (300e3, 200e3)), speed("Peer-B", (100e3, 200e3))),),
+        scaling={1: (100e3,), 2: (180e3,)},
+        steps=5,
+        iterations=1,
+        machine=dict.fromkeys(("device", "mjlab", "mujoco-warp", "rsl-rl-lib", "torch"), "1"),
+        seconds=1.0,
+    )
+    shown = text(train.rate_table(made))
+    for figure in ("2.00 (1.00 to 3.00)", "250.0 (200.0 to 300.0)", "x1.80"):
+        assert figure in shown
+    assert "14 / 2" in text(train.stage_table(made))
+    assert made.figures()["ratios"][0]["stepping"] == (2.0, 1.0, 3.0)
+
+
+@pytest.mark.parametrize("wrong", [{"envs": ()}, {"envs": (0,)}, {"steps": 0}, {"repeats": 0}])
+def test_impossible_numbers_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(PronkError, match="expected 1 or more"):
+        train.run(**wrong)
+    with pytest.raises(PronkError, match="16,many"):
+        train.train(envs="16,many")
+
+
+@pytest.mark.train
+def test_operations_and_waits_are_counted_by_stage() -> None:
+    torch = pytest.importorskip("torch")
+
+    class Sums:
+        def add(self, x: Any) -> Any:
+            return (x + x) * 2.0
+
+        def look(self, x: Any) -> float:
+            return float((x > 0.0).sum().item())
+
+        def pick(self, x: Any) -> Any:
+            return x[x > 0.0]
+
+    sums, x, stages = Sums(), torch.ones(3, 2), Stages()
+    parts = [(sums, name, name) for name in ("add", "look", "pick")]
+    with torch.no_grad(), stages.measured(parts), counted(stages) as (operations, waits):
+        sums.add(x)
+        sums.look(x)
+        sums.pick(x)
+        x.view(6)[:3].t()  # views are not counted
+        x.mul_(2.0)
+    assert dict(operations) == {"add": 2, "look": 3, "pick": 2, REST: 1}
+    assert +waits == {"look": 1, "pick": 1}
+
+
+@pytest.mark.train
+@pytest.mark.slow
+def test_a_small_training_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mjlab")
+    import mjlab.tasks  # noqa: F401 - registers mjlab's own
+    from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, register_mjlab_task
+
+    from pronk.train.runner.runner import PronkRunner
+    from pronk.train.tasks import JUMP_TASK
+
+    name = "Pronk-Bench-Small"
+    learning, env_cfg = load_rl_cfg(JUMP_TASK), load_env_cfg(JUMP_TASK)
+    learning.actor.hidden_dims = learning.critic.hidden_dims = (8,)
+    learning.algorithm.num_learning_epochs = 1
+    learning.num_steps_per_env = 8
+    register_mjlab_task(name, env_cfg, env_cfg, learning, PronkRunner)
+    with pytest.raises(PronkError, match="no task 'Cartwheel'"):
+        train.run(envs=(2,), device="cpu", tasks=("Cartwheel", "Cartwheel"))
+    lines: list[str] = []
+    found = train.run(lines.append, envs=(4,), steps=4, repeats=1, device="cpu", tasks=(name, name))
+    for one in found.pairs[0]:
+        assert (one.task, one.envs, one.horizon) == (name, 4, 8)
+        step = {cost.stage: cost for cost in one.step_stages}
+        assert step["physics"].operations == 0.0  # what Warp launches is not counted
+        assert step["rewards"].operations > 0.0
+        iteration = {cost.stage for cost in one.iteration_stages}
+        assert {"inference", "advantages", "PPO update", "estimator update"} <= iteration
+        assert 2.0 <= one.physics_per_step <= 6.0
+    assert sum("steps/s" in line for line in lines) == 2
+    json.dumps(found.figures())
+    assert capsys.readouterr().out == ""
