@@ -280,17 +280,17 @@ def test_a_pickle_bomb_as_pt_does_not_run(tmp_path: Path, protocol: int) -> None
         assert "\n" not in str(caught.value)
         assert not boom.exists()
     path.write_bytes(archive(bomb, []))
-    with pytest.raises(LogError, match=r"asks for .* which has no place in a dictionary"):
+    with pytest.raises(LogError, match="a dictionary of tensors does not need"):
         read_log(path, robot=ROBOT)
 
 
 @pytest.mark.parametrize(
     ("program", "words"),
     [
-        (b"cos\nsystem\n(S'true'\ntR.", "asks for os.system"),
-        (b"cbuiltins\neval\n(S'1'\ntR.", "asks for builtins.eval"),
-        (b"cnumpy.core.multiarray\n_reconstruct\n.", "asks for numpy.core.multiarray"),
-        (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "asks for os.system"),
+        (b"cos\nsystem\n(S'true'\ntR.", "names os.system"),
+        (b"cbuiltins\neval\n(S'1'\ntR.", "names builtins.eval"),
+        (b"cnumpy.core.multiarray\n_reconstruct\n.", "names numpy.core.multiarray"),
+        (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "names os.system"),
         (b"(S'x'\nios\nsystem\n.", "opcode INST"),
         (b"ccollections\nOrderedDict\n}b.", "opcode BUILD"),
         (b"\x80\x02ccollections\nOrderedDict\n)\x81.", "opcode NEWOBJ"),
@@ -404,8 +404,8 @@ def test_one_sentence_for_each_mistake_in_a_csv(
         ({"unit": "rad", "time_unit": "h"}, "expected one of s, ms, us, ns"),
         ({"unit": "rad", "columns": {"time": "t"}}, "no column called 't'"),
         ({"unit": "rad", "columns": {"speed.FR_knee": "x"}}, "columns names 'speed.FR_knee'"),
-        ({"unit": "rad", "rate_hz": 100.0}, "100 Hz is claimed and 50.00 Hz measured"),
-        ({"unit": "rad", "joint_names": ["a"]}, "joint_names means nothing for the format csv"),
+        ({"unit": "rad", "rate_hz": 100.0}, "50.00 Hz"),
+        ({"unit": "rad", "joint_names": ["a", "b"]}, "2 joint names for 1 columns"),
         ({"unit": "rad", "command_topic": "/x"}, "command_topic means nothing"),
         ({"format": "hdf5"}, "expected one of mcap, csv, sage, pace, npz"),
     ],

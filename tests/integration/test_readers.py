@@ -1,7 +1,9 @@
-"""Importers: round trips, real recordings, and what measured timestamps say."""
+"""Log readers: round trips, real recordings, timestamps and plausibility."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,23 +14,17 @@ from hypothesis import strategies as st
 
 import pronk
 from pronk.errors import LogError, RobotError
-from pronk.logs.checks import check_motion, motion
+from pronk.logs.checks import check_motion, check_rate, check_unit, examine, time_at_ends
 from pronk.logs.csv_reader import write_csv
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.mcap_log import write_mcap
 from pronk.logs.npz_reader import write_npz
 from pronk.logs.readers import read_log, read_logs
-from pronk.logs.timing import check_claim, check_unit, examine
 from pronk.robots import load_robot
 
 SHARED = Path(pronk.__file__).parents[3] / "shared"
 SO101 = SHARED / "data" / "so101"
 RECORDINGS = ("backlash_detection", "chirp_sweep", "multisine", "sinusoidal_sweep", "step_response")
-ARM = (
-    *("shoulder_pan", "shoulder_lift", "elbow_flex"),
-    *("wrist_flex", "wrist_roll", "gripper"),
-)
-
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the shared recordings are not here")
 
 
@@ -64,18 +60,15 @@ def example(n: int = 500) -> JointLog:
 
 @recorded
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_so101_recordings_run_at_their_true_rate(name: str) -> None:
+def test_so101_recordings_run_at_49_85_hz(name: str) -> None:
     log = read_log(SO101 / name)
     assert log.robot == "so101"
-    assert log.joints == ARM
+    assert log.joints == load_robot("so101").joint_names
     assert log.rate_hz == pytest.approx(49.85, abs=0.005)
-    assert any("at 49.85 Hz" in note for note in log.notes)
     assert log.velocity is not None
     assert log.torque is not None
-    assert log.torque.max() > 0.1
     for segment in log.segments:
         assert segment.kind == "unknown"
-        assert segment.amplitude > 0.0
         check_motion(log, segment.joints[0])
 
 
@@ -84,59 +77,41 @@ def test_so101_numbers_are_those_of_the_files() -> None:
     log = read_log(SO101 / "chirp_sweep", robot=load_robot("so101"))
     assert len(log.time) == 6000
     assert log.time[0] == pytest.approx(5.017034709453583e-6)
-    assert log.time[1] == pytest.approx(0.02010067005176097)
     np.testing.assert_allclose(
         log.command[0], [0.0, 0.129904, 0.629904, 0.0, -0.129904, 0.370096], atol=1e-12
     )
     assert log.position[0, 2] == pytest.approx(0.6987282488819095)
-    # The elbow is centred on 0.5 rad.
+    # The elbow is centred on 0.5 rad; the encoder has 4096 steps a turn.
     assert log.pose is not None
     assert log.pose[log.column("elbow_flex")] == pytest.approx(0.5, abs=1e-4)
-    # The encoder's steps are 4096 a turn.
-    assert motion(log, "shoulder_pan").step == pytest.approx(2.0 * np.pi / 4096, rel=1e-6)
+    step = np.diff(np.unique(log.position[:, 0])).min()
+    assert step == pytest.approx(2.0 * np.pi / 4096, rel=1e-6)
+    # Its joints move by one shifted chirp.
+    assert any("correlate to 1.00" in note for note in log.notes)
 
 
 @recorded
-def test_the_jaw_is_not_taken_for_an_angle() -> None:
+def test_the_jaw_is_no_angle_without_a_scale() -> None:
     log = read_log(SO101 / "multisine")
     assert log.unit("gripper") == "unknown"
     assert log.unit("shoulder_pan") == "rad"
     scaled = read_log(SO101 / "multisine", scale={"gripper": 1.9})
     assert scaled.unit("gripper") == "rad"
     np.testing.assert_allclose(scaled.position[:, 5], 1.9 * log.position[:, 5])
-    np.testing.assert_allclose(scaled.command[:, 5], 1.9 * log.command[:, 5])
     np.testing.assert_array_equal(scaled.position[:, :5], log.position[:, :5])
     np.testing.assert_array_equal(scaled.velocity, log.velocity)  # type: ignore[arg-type]
 
 
 @recorded
-def test_what_the_jaws_encoder_and_velocity_say_of_its_scale() -> None:
-    log = read_log(SO101 / "chirp_sweep")
-    assert log.velocity is not None
-    step = motion(log, "gripper").step
-    assert 2.0 * np.pi / 4096 / step == pytest.approx(2.336, abs=0.001)
-    slope = np.gradient(log.position[:, 5], log.time)[:-1]
-    speed = log.velocity[1:, 5]  # published one sample late
-    assert slope @ speed / (slope @ slope) == pytest.approx(2.33, abs=0.02)
-
-
-@recorded
-def test_commands_that_are_one_chirp_shifted_are_noticed() -> None:
-    log = read_log(SO101 / "chirp_sweep")
-    assert any("correlate to 1.00" in note for note in log.notes)
-
-
-@recorded
-def test_a_claimed_rate_of_50_hz_is_refused() -> None:
-    with pytest.raises(LogError, match=r"50 Hz is claimed and 49\.85 Hz measured \(0\.36 s apart"):
-        read_log(SO101 / "chirp_sweep", rate_hz=50.0)
-    read_log(SO101 / "chirp_sweep", rate_hz=49.85)
-
-
-@recorded
-def test_microseconds_read_as_seconds_are_recognized() -> None:
+def test_expectations_that_the_timestamps_contradict_are_refused() -> None:
+    path = SO101 / "chirp_sweep"
+    with pytest.raises(LogError, match=r"49\.85 Hz"):
+        read_log(path, rate_hz=50.0)
+    read_log(path, rate_hz=49.85)
     with pytest.raises(LogError, match="probably in us"):
-        read_log(SO101 / "chirp_sweep", time_unit="s")
+        read_log(path, time_unit="s")
+    with pytest.raises(RobotError, match="FR_hip_roll"):
+        read_log(path, robot=load_robot("mini_cheetah"))
 
 
 @recorded
@@ -147,30 +122,12 @@ def test_a_folder_of_recordings_is_read_whole() -> None:
 
 
 @recorded
-def test_the_wrong_robot_lists_its_joints() -> None:
-    with pytest.raises(RobotError, match="its joints are FR_hip_roll"):
-        read_log(SO101 / "chirp_sweep", robot=load_robot("mini_cheetah"))
-
-
-@recorded
-def test_sage_joints_can_be_named_otherwise() -> None:
+def test_sage_joints_can_be_renamed() -> None:
     log = read_log(SO101 / "multisine", joint_names=list("abcdef"))
     assert log.joints == tuple("abcdef")
     log = read_log(SO101 / "multisine", joint_names={"Jaw": "claw"})
     assert log.joints[0] == "Rotation"
     assert log.unit("claw") == "unknown"
-
-
-def sage(folder: Path, states: str, controls: str, events: str = "") -> Path:
-    folder.mkdir(exist_ok=True)
-    (folder / "joint_list.txt").write_text("hip\nknee\n")
-    (folder / "state_motor.csv").write_text(
-        "type,timestamp,positions,velocities,torques\n" + states
-    )
-    (folder / "control.csv").write_text("type,timestamp,positions\n" + controls)
-    if events:
-        (folder / "event.csv").write_text("type,timestamp,event\n" + events)
-    return folder
 
 
 def test_sage_command_is_the_one_in_force(tmp_path: Path) -> None:
@@ -179,16 +136,21 @@ def test_sage_command_is_the_one_in_force(tmp_path: Path) -> None:
         f'STATE_MOTOR,{2000 * k + 500},"[0.{k:02d}, 1.0]","[0, 0]","[0, 0]"\n' for k in range(60)
     )
     controls = "".join(f'CONTROL,{20000 * k + 10000},"[{k}.0, 0.5]"\n' for k in range(6))
-    events = "EVENT,0,CONTROL_MODE_ENABLE\nEVENT,20000,MOTION_START\nEVENT,100000,DISABLE\n"
-    log = read_log(sage(tmp_path / "s", states, controls, events))
+    files = {
+        "joint_list.txt": "hip\nknee\n",
+        "state_motor.csv": "type,timestamp,positions,velocities,torques\n" + states,
+        "control.csv": "type,timestamp,positions\n" + controls,
+        "event.csv": "type,timestamp,event\nE,0,ON\nE,20000,MOTION_START\nE,100000,DISABLE\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    log = read_log(tmp_path)
     assert log.robot == "unknown"
     assert log.time[0] == pytest.approx(0.0205)
     assert log.time[-1] == pytest.approx(0.0985)
     np.testing.assert_array_equal(log.command[:, 0], np.floor((log.time * 1e6 - 10000) / 20000))
-    assert log.velocity is None
-    assert "velocities are all zero: not measured" in log.notes
+    assert log.velocity is None  # All zero: not measured.
     assert any("5 states before the first command" in note for note in log.notes)
-    assert any("before MOTION_START or after DISABLE" in note for note in log.notes)
 
 
 # --- round trips --------------------------------------------------------------------------------
@@ -263,28 +225,16 @@ def test_pace_recording_without_pytorch_gives_pytorchs_numbers(tmp_path: Path) -
     np.testing.assert_array_equal(log.position, position.numpy())
     np.testing.assert_array_equal(log.command, command.numpy().astype(float))
     assert log.joints == load_robot("mini_cheetah").joint_names
-    assert log.rate_hz == pytest.approx(400.0)
-    named = read_log(path, joint_names=[f"j{i}" for i in range(12)])
-    assert named.joints[11] == "j11"
     with pytest.raises(LogError, match="give joint_names"):
         read_log(path)
-
-
-def test_pace_reader_leaves_pytorch_alone(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
-    import subprocess
-    import sys
-
-    path = tmp_path / "a.pt"
-    time = torch.arange(50) / 400.0
-    torch.save({"time": time, "dof_pos": time[:, None], "des_dof_pos": time[:, None]}, path)
+    names = [f"j{i}" for i in range(12)]
     code = (
         "import sys; from pronk.logs.readers import read_log;"
-        f"log = read_log({str(path)!r}, joint_names=['a']);"
-        "print(len(log.time), 'torch' in sys.modules)"
+        f"log = read_log({str(path)!r}, joint_names={names});"
+        "print(log.joints[11], 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["50", "False"]
+    assert done.stdout.split() == ["j11", "False"]
 
 
 def test_an_upper_case_ending_and_an_explicit_format(tmp_path: Path) -> None:
@@ -297,15 +247,6 @@ def test_an_upper_case_ending_and_an_explicit_format(tmp_path: Path) -> None:
 # --- timing -------------------------------------------------------------------------------------
 
 
-def test_timing_of_a_perfect_clock() -> None:
-    found = examine(np.arange(1000) / 500.0)
-    assert found.rate_hz == pytest.approx(500.0)
-    assert found.jitter_s < 1e-12
-    assert found.drift_s < 1e-9
-    assert found.gaps == ()
-    assert found.lost == 0
-
-
 def test_jitter_gaps_and_lost_samples_are_counted() -> None:
     rng = np.random.default_rng(0)
     time = np.arange(2000) / 500.0 + rng.normal(0.0, 50e-6, 2000)
@@ -316,24 +257,25 @@ def test_jitter_gaps_and_lost_samples_are_counted() -> None:
     # Each interval has the jitter of two stamps.
     assert found.jitter_s == pytest.approx(50e-6 * np.sqrt(2.0), rel=0.1)
     assert found.gaps[0][0] == pytest.approx(299 / 500.0, abs=1e-3)
-    assert "15 samples lost" in found.words()
     # Lost samples do not make the clock slow.
-    check_claim(found, "log", 500.0)
+    check_rate(found, "log", 500.0)
 
 
-def test_drift_is_the_departure_from_a_straight_line() -> None:
+def test_a_perfect_clock_and_one_that_drifts() -> None:
     index = np.arange(1000)
-    time = index / 500.0 + 1e-3 * np.sin(np.pi * index / 999.0)
-    assert 0.3e-3 < examine(time).drift_s < 1e-3
+    found = examine(index / 500.0)
+    assert found.rate_hz == pytest.approx(500.0)
+    assert found.jitter_s < 1e-12
+    assert found.drift_s < 1e-9
+    assert found.lost == 0
+    assert 0.3e-3 < examine(index / 500.0 + 1e-3 * np.sin(np.pi * index / 999.0)).drift_s < 1e-3
 
 
 @pytest.mark.parametrize(
     ("rate", "read_as", "written_in"),
     [
-        (500.0, "s", "us"),
         (500.0, "s", "ms"),
         (500.0, "us", "s"),
-        (500.0, "ms", "s"),
         (1000.0, "ns", "us"),
         (49.85, "s", "us"),
     ],
@@ -358,8 +300,8 @@ def test_exact_duplicates_can_be_dropped_and_are_mentioned(tmp_path: Path) -> No
         read_log(path, unit="rad")
     back = read_log(path, unit="rad", drop_duplicates=True)
     np.testing.assert_array_equal(back.time, log.time)
-    assert "3 rows that repeat the one before were dropped" in back.notes
-    # The same stamp with another value is not a duplicate, and stays an error.
+    assert any(note.startswith("3 rows") for note in back.notes)
+    # The same timestamp with another value is not a duplicate, and stays an error.
     text[9] = text[9].replace(",", ",1", 1)
     path.write_text("\n".join(text))
     with pytest.raises(LogError, match="repeats the timestamp"):
@@ -392,18 +334,20 @@ def moved(position: np.ndarray, command: np.ndarray, rate: float = 200.0) -> Joi
 SWING = 0.25 * np.sin(2.0 * np.pi * np.cumsum(np.linspace(0.1, 8.0, 4000)) / 200.0)
 
 
-def test_a_joint_that_follows_passes() -> None:
-    found = check_motion(moved(0.8 * SWING, SWING), "FR_knee")
-    assert found.travel == pytest.approx(0.4, rel=0.01)
-    assert found.at_end == 0.0
-
-
-def test_friction_at_the_turning_points_is_not_saturation() -> None:
-    """A joint with a dead band (play operator) rests at every turn, and that is its answer."""
+def test_motion_that_passes() -> None:
+    check_motion(moved(0.8 * SWING, SWING), "FR_knee")
+    assert time_at_ends(moved(0.8 * SWING, SWING), "FR_knee") == 0.0
+    # A joint with a dead band (play operator) rests at every turn, which is not saturation.
     position = np.zeros(len(SWING))
     for k in range(1, len(SWING)):
         position[k] = np.clip(position[k - 1], SWING[k] - 0.1, SWING[k] + 0.1)
-    check_motion(moved(position, SWING), "FR_knee")
+    assert time_at_ends(moved(position, SWING), "FR_knee") < 0.05
+
+
+@pytest.mark.parametrize("limits", [(-0.05, 1.0), (-1.0, 0.1)])
+def test_saturation_is_noted(tmp_path: Path, limits: tuple[float, float]) -> None:
+    write_mcap(tmp_path / "a.mcap", moved(np.clip(SWING, *limits), SWING))
+    assert any("FR_knee is saturated" in note for note in read_log(tmp_path / "a.mcap").notes)
 
 
 @pytest.mark.parametrize(
@@ -412,28 +356,23 @@ def test_friction_at_the_turning_points_is_not_saturation() -> None:
         (np.zeros(4000), SWING, "did not move"),
         (np.where(SWING > 0.0, 0.0015, 0.0), SWING, "did not move"),
         (SWING, np.zeros(4000), "was not excited"),
-        (np.clip(SWING, -0.05, 1.0), SWING, "saturated"),
-        (np.clip(SWING, -1.0, 0.1), SWING, "saturated"),
-        (np.rad2deg(SWING), np.rad2deg(SWING), "probably in degrees"),
-        (20.0 + SWING, 20.0 + SWING, "probably in degrees"),
     ],
 )
-def test_motion_that_cannot_be_believed(
+def test_a_joint_without_motion_is_refused(
     position: np.ndarray, command: np.ndarray, words: str
 ) -> None:
-    with pytest.raises(LogError, match=words) as caught:
+    with pytest.raises(LogError, match=f"FR_knee {words}"):
         check_motion(moved(position, command), "FR_knee")
-    assert "FR_knee" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
-def test_degrees_said_to_be_radians_are_refused_when_read(tmp_path: Path) -> None:
-    log = moved(np.rad2deg(SWING), np.rad2deg(SWING))
-    write_csv(tmp_path / "a.csv", log)
+@pytest.mark.parametrize("offset", [0.0, 20.0])
+def test_degrees_read_as_radians_are_refused(tmp_path: Path, offset: float) -> None:
+    write_csv(
+        tmp_path / "a.csv", moved(*[offset + (np.rad2deg(SWING) if not offset else SWING)] * 2)
+    )
     with pytest.raises(LogError, match="probably in degrees"):
         read_log(tmp_path / "a.csv", unit="rad")
-    back = read_log(tmp_path / "a.csv", unit="deg")
-    np.testing.assert_allclose(back.position[:, 0], SWING, atol=1e-12)
+    assert np.ptp(read_log(tmp_path / "a.csv", unit="deg").position) < 0.6
 
 
 def test_a_log_of_another_robot_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""ROS 2 bags: states and commands joined, and what a bag that was asked wrongly says."""
+"""ROS 2 bags: states and commands joined; wrong topics refused."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "name it with command_topic"),
+        ({}, "command_topic is missing"),
         ({"command_topic": "/elsewhere"}, "no commands on /elsewhere"),
         ({"measured_topic": "/imu", "command_topic": "/joint_command"}, "no sensor_msgs.* on /imu"),
         ({"command_topic": "/joint_command", "command_field": "velocity"}, "holds 0 values"),
@@ -97,7 +97,7 @@ def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
         ({"command_topic": "/joint_command", "command_field": "header"}, "not a list of numbers"),
     ],
 )
-def test_a_bag_asked_the_wrong_way_lists_its_topics(
+def test_a_wrong_topic_or_field_lists_what_there_is(
     tmp_path: Path, options: dict[str, str], words: str
 ) -> None:
     path = tmp_path / "bag.mcap"

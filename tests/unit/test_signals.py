@@ -12,7 +12,7 @@ from scipy.integrate import cumulative_simpson
 
 from pronk.errors import PlanError
 from pronk.excitation.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
-from pronk.logs.correlation import correlation, correlation_note
+from pronk.logs.checks import correlation, correlation_note
 
 ALL: tuple[Signal, ...] = (Chirp(), LogChirp(), Multisine(), SineSteps())
 

@@ -1,28 +1,39 @@
-"""Whether a joint's answer can be believed: did it move, freely, in radians, and is it known."""
+"""Plausibility of a log: timestamps, motion of the joints, unit of the angles, correlation."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import correlate
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
-from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
-LARGEST_COMMAND = 6.3
-"""Peak of a command about its middle above which radians are not believed: a full turn [rad]."""
-LARGEST_POSITION = 4.0 * np.pi
-"""Largest position at which radians are believed: two turns [rad]."""
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds in each unit of time."""
+PLAUSIBLE_HZ = (5.0, 50_000.0)
+"""Rates outside mean a wrong unit: slower ones do not resolve a joint, no drive logs faster."""
+RATE_TOLERANCE = 1e-3
+"""Largest relative difference of the measured from an expected rate. Crystals keep 1e-4; at 1e-3 a
+20 s sweep slips by one 50 Hz tick from its end to its start."""
+_GAP = 2.5
+"""Intervals longer than this many typical ones are gaps: more than one sample is lost."""
 
-_FEW_STEPS = 3.0
-"""Encoder steps within which a joint counts as unmoved."""
+LARGEST_COMMAND = 6.3
+"""Largest plausible peak of a command about its middle: a full turn [rad]."""
+LARGEST_POSITION = 4.0 * np.pi
+"""Largest plausible position: two turns [rad]."""
+
 _UNMOVED = 0.01
 """Share of the command's travel below which a joint did not move; chirps begin far below any
 joint's bandwidth, where it follows one to one."""
+_FEW_STEPS = 3.0
+"""Encoder steps within which a joint counts as unmoved."""
 _NEAR_END = 0.005
 """Share of the position's travel that counts as being at its end."""
 _MOVES_ON = 0.15
@@ -30,120 +41,256 @@ _MOVES_ON = 0.15
 at its turning point stands still while the command comes back, not while it moves on."""
 _LONG_RUN_S = 0.1
 """Time at an end from which on it is not the turning point of an oscillation [s]."""
-_MOSTLY = 0.05
+_SATURATED = 0.05
 """Share of the time at an end, in such runs, that makes a joint saturated."""
+
+CORRELATION_LIMIT = 0.1
+"""Highest absolute correlation of two simultaneous commands that passes without a warning."""
+_REACH_S = 0.5
+"""Lags that are searched [s]: longer than a joint's impulse response."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
-    """How a joint moved."""
+class Timing:
+    """Regularity of measured timestamps."""
 
-    travel: float
-    """Greatest less least position [rad]."""
-    commanded: float
-    """Greatest less least command [rad]."""
-    step: float
-    """Smallest change of position that occurs: the encoder's step, or noise [rad]."""
-    at_end: float
-    """Share of the time that the joint lies at an end of its travel while the command moves on
-    outward."""
+    samples: int
+    duration_s: float
+    rate_hz: float
+    """Mean over the whole record."""
+    typical_s: float
+    """Median interval [s]."""
+    jitter_s: float
+    """Standard deviation of the intervals, gaps left out [s]."""
+    drift_s: float
+    """Largest deviation of the timestamps from a straight line [s]."""
+    gaps: tuple[tuple[float, float], ...] = ()
+    """Start [s] and length [s] of each interval in which samples are missing."""
+
+    @property
+    def lost(self) -> int:
+        """Samples missing in the gaps, by the typical interval."""
+        return sum(round(length / self.typical_s) - 1 for _, length in self.gaps)
+
+    def words(self) -> str:
+        """One line for a log's notes."""
+        text = (
+            f"{self.samples} samples at {self.rate_hz:.2f} Hz over {self.duration_s:.2f} s, "
+            f"jitter {1e3 * self.jitter_s:.3f} ms, drift {1e3 * self.drift_s:.2f} ms"
+        )
+        if self.gaps:
+            start, length = max(self.gaps, key=lambda gap: gap[1])
+            text += (
+                f", {len(self.gaps)} gaps with about {self.lost} samples lost (the longest "
+                f"{length:.3f} s at {start:.3f} s)"
+            )
+        return text
 
 
-def motion(log: JointLog, joint: str) -> Motion:
-    """How a joint moved over a log.
-
-    Raises:
-        LogError: There is no such joint.
-    """
-    column = log.column(joint)
-    position, command = log.position[:, column], log.command[:, column]
-    levels = np.unique(position)
-    travel, commanded = float(np.ptp(position)), float(np.ptp(command))
-    at_end = 0.0
-    if travel > 0.0 and commanded > 0.0:
-        for outward in (1.0, -1.0):
-            out = outward * position
-            near = out >= out.max() - _NEAR_END * travel
-            at_end += _stopped(log.time, near, outward * command, _MOVES_ON * commanded)
-    return Motion(
-        travel=travel,
-        commanded=commanded,
-        step=float(np.diff(levels).min()) if len(levels) > 1 else 0.0,
-        at_end=at_end / float(log.time[-1] - log.time[0]),
+def examine(time: Array) -> Timing:
+    """Rate, jitter, drift and gaps of two or more increasing timestamps [s]."""
+    steps = np.diff(time)
+    typical = float(np.median(steps))
+    gap = steps > _GAP * typical
+    straight = np.polynomial.Polynomial.fit(np.arange(len(time)), time, 1)
+    duration = float(time[-1] - time[0])
+    return Timing(
+        samples=len(time),
+        duration_s=duration,
+        rate_hz=(len(time) - 1) / duration,
+        typical_s=typical,
+        jitter_s=float(np.std(steps[~gap])),
+        drift_s=float(np.abs(time - straight(np.arange(len(time)))).max()),
+        gaps=tuple((float(time[i]), float(steps[i])) for i in np.flatnonzero(gap)),
     )
 
 
-def _stopped(time: Array, near: NDArray[np.bool_], command: Array, outward: float) -> float:
-    """Time in long runs of `near` during which the command grows by more than `outward` [s]."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], near.astype(np.int8), [0]))))
-    total = 0.0
-    for first, stop in edges.reshape(-1, 2):
-        length = float(time[stop - 1] - time[first])
-        grows = float(command[first:stop].max() - command[first])
-        if length >= _LONG_RUN_S and grows > outward:
-            total += length
-    return total
+def check_increasing(time: Array, where: str, row: Callable[[int], str]) -> None:
+    """Refuse timestamps that are not finite, repeat or go back.
+
+    Args:
+        time: Timestamps in any unit, shape (n,).
+        where: File, for the message.
+        row: Name of a sample in the file, for instance `row 7`.
+
+    Raises:
+        LogError: Names the row.
+    """
+    if len(time) < 2:
+        raise LogError(f"{where}: {len(time)} samples; a log needs at least 2.")
+    if not np.isfinite(time).all():
+        lost = row(int(np.argmin(np.isfinite(time))))
+        raise LogError(f"{where}: the timestamp in {lost} is missing or not a number.")
+    steps = np.diff(time)
+    if (steps > 0.0).all():
+        return
+    i = int(np.argmin(steps > 0.0)) + 1
+    if steps[i - 1] == 0.0:
+        raise LogError(
+            f"{where}: {row(i)} repeats the timestamp {time[i]:.9g} of the one before; timestamps "
+            "must increase (drop_duplicates=True drops rows that repeat the one before in full)."
+        )
+    raise LogError(
+        f"{where}: time goes back in {row(i)}, from {time[i - 1]:.9g} to {time[i]:.9g}; sort or "
+        "split the file."
+    )
 
 
-def check_motion(log: JointLog, joint: str) -> Motion:
-    """Refuse a joint that was not excited, did not move, or lies at an end of its travel.
+def check_unit(time: Array, where: str, unit: str) -> None:
+    """Refuse timestamps [s], converted from `unit`, whose rate fits another unit.
 
-    Returns:
-        How it moved.
+    Raises:
+        LogError: Names the likely unit.
+    """
+    rate = 1.0 / float(np.median(np.diff(time)))
+    low, high = PLAUSIBLE_HZ
+    if low <= rate <= high:
+        return
+    rates = {name: rate * TIME_UNITS[unit] / scale for name, scale in TIME_UNITS.items()}
+    # Where several fit, the one nearest to the 500 Hz at which joints are usually logged.
+    likely = sorted(
+        (name for name, hz in rates.items() if low <= hz <= high),
+        key=lambda name: abs(np.log(rates[name] / 500.0)),
+    )
+    hint = (
+        f"the timestamps are probably in {likely[0]} (time_unit={likely[0]!r})"
+        if likely
+        else "no unit of time fits them"
+    )
+    raise LogError(
+        f"{where}: read in {unit!r}, its samples come at {rate:.4g} Hz; expected {low:g} to "
+        f"{high:g} Hz; {hint}."
+    )
+
+
+def check_rate(timing: Timing, where: str, expected_hz: float) -> None:
+    """Refuse an expected rate that differs from the measured one.
+
+    Raises:
+        LogError: Gives both.
+    """
+    if not (np.isfinite(expected_hz) and expected_hz > 0.0):
+        raise LogError(f"{where}: rate_hz is {expected_hz}; expected a positive number.")
+    # Lost samples do not make the clock slow.
+    measured = (timing.samples + timing.lost - 1) / timing.duration_s
+    if abs(measured / expected_hz - 1.0) > RATE_TOLERANCE:
+        late = abs(timing.samples / expected_hz - timing.samples / measured)
+        raise LogError(
+            f"{where}: rate_hz is {expected_hz:g} and the timestamps come at {measured:.2f} Hz "
+            f"({late:.2f} s apart by the end); leave rate_hz out to use the timestamps."
+        )
+
+
+def check_motion(log: JointLog, joint: str) -> None:
+    """Refuse a joint that was not excited or did not move.
 
     Raises:
         LogError: Says which, with the numbers.
     """
-    where = log.source or "log"
-    found = motion(log, joint)
-    unit = log.unit(joint) if log.unit(joint) != "unknown" else "of an unknown unit"
-    if found.commanded == 0.0:
+    where, column = log.source or "log", log.column(joint)
+    position = log.position[:, column]
+    travel, commanded = float(np.ptp(position)), float(np.ptp(log.command[:, column]))
+    if commanded == 0.0:
         raise LogError(f"{where}: {joint} was not excited; its command is constant.")
-    if found.travel < _UNMOVED * found.commanded or (
-        found.travel <= _FEW_STEPS * found.step and found.travel < 0.5 * found.commanded
-    ):
+    levels = np.unique(position)
+    step = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
+    if travel < _UNMOVED * commanded or (travel <= _FEW_STEPS * step and travel < 0.5 * commanded):
+        unit = log.unit(joint) if log.unit(joint) != "unknown" else "of an unknown unit"
         raise LogError(
-            f"{where}: {joint} did not move: its command travels {found.commanded:.3g} {unit}, its "
-            f"position {found.travel:.3g}; check that its drive was enabled, the joint free, and "
+            f"{where}: {joint} did not move: its command travels {commanded:.3g} {unit}, its "
+            f"position {travel:.3g}; check that its drive was enabled, the joint free, and "
             "the columns named right."
         )
-    if found.at_end > _MOSTLY:
-        raise LogError(
-            f"{where}: {joint} is saturated: for {100.0 * found.at_end:.0f} % of the time it lies "
-            "at an end of its travel while its command moves on; ask with a smaller amplitude or "
-            "farther from its stops."
-        )
-    check_radians(log, joint)
-    return found
+
+
+def time_at_ends(log: JointLog, joint: str) -> float:
+    """Share of the time that a joint stays at an end of its travel while its command moves on."""
+    column = log.column(joint)
+    position, command = log.position[:, column], log.command[:, column]
+    travel, commanded = float(np.ptp(position)), float(np.ptp(command))
+    if travel == 0.0 or commanded == 0.0:
+        return 0.0
+    total = 0.0
+    for sign in (1.0, -1.0):
+        near = sign * position >= (sign * position).max() - _NEAR_END * travel
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], near.astype(np.int8), [0]))))
+        for first, stop in edges.reshape(-1, 2):
+            length = float(log.time[stop - 1] - log.time[first])
+            outward = sign * command[first:stop]
+            if length >= _LONG_RUN_S and outward.max() - outward[0] > _MOVES_ON * commanded:
+                total += length
+    return total / float(log.time[-1] - log.time[0])
+
+
+def saturation_note(log: JointLog, joint: str) -> str:
+    """A warning for a joint that is saturated, or ""."""
+    share = time_at_ends(log, joint)
+    if share <= _SATURATED:
+        return ""
+    return (
+        f"{joint} is saturated: for {100.0 * share:.0f} % of the time it stays at an end of its "
+        "travel while its command moves on; excite it with a smaller amplitude or farther from "
+        "its stops"
+    )
 
 
 def check_radians(log: JointLog, joint: str) -> None:
-    """Refuse a joint in radians that turns as only degrees would.
+    """Refuse a joint in radians that moves as only degrees would.
 
     Raises:
-        LogError: Says what was found.
+        LogError: Gives the number.
     """
-    if log.unit(joint) != "rad":
-        return
     column = log.column(joint)
     command, position = log.command[:, column], log.position[:, column]
     peak = 0.5 * float(np.ptp(command))
     farthest = float(max(np.abs(position).max(), np.abs(command).max()))
-    if peak <= LARGEST_COMMAND and farthest <= LARGEST_POSITION:
+    if log.unit(joint) != "rad" or (peak <= LARGEST_COMMAND and farthest <= LARGEST_POSITION):
         return
     swings = peak > LARGEST_COMMAND
     what = f"its command swings by {peak:.3g}" if swings else f"it reaches {farthest:.3g}"
     raise LogError(
-        f"{log.source or 'log'}: {joint} is said to be in radians and {what}, more than a joint "
+        f"{log.source or 'log'}: {joint} is read in radians and {what}, more than a joint "
         "turns; the file is probably in degrees (unit='deg')."
     )
 
 
-def check_joints(log: JointLog, robot: Robot) -> None:
-    """Refuse a log that names joints the robot does not have.
+def correlation(commands: Array, rate_hz: float) -> Array:
+    """Largest absolute correlation of each pair of commands over lags up to half a second.
 
-    Raises:
-        RobotError: Lists the robot's joints.
+    With correlated commands, the motion that one joint causes in another looks like a response to
+    the other's own command: the coherence stays near one while the response is wrong.
+
+    Args:
+        commands: Uniformly sampled, shape (n, joints).
+        rate_hz: Rate of the samples [Hz].
+
+    Returns:
+        Symmetric matrix in 0..1 with ones on the diagonal, shape (joints, joints). A command that
+        never changes correlates with nothing.
     """
-    for name in log.joints:
-        robot.joint(name)
+    centred = commands - commands.mean(axis=0)
+    energy = np.sqrt((centred**2).sum(axis=0))
+    still = energy <= 1e-9 * np.sqrt(len(commands))
+    unit = np.where(still, 0.0, centred / np.where(still, 1.0, energy))
+    middle = len(commands) - 1
+    reach = min(round(_REACH_S * rate_hz), middle)
+    found = np.eye(commands.shape[1])
+    for i in range(len(found)):
+        for j in range(i):
+            lags = correlate(unit[:, i], unit[:, j], method="fft")
+            peak = np.abs(lags[middle - reach : middle + reach + 1]).max()
+            found[i, j] = found[j, i] = min(float(peak), 1.0)
+    return found
+
+
+def correlation_note(commands: Array, joints: Sequence[str], rate_hz: float) -> str:
+    """A warning naming the two most alike commands, or "" where none exceeds the limit."""
+    alike = correlation(commands, rate_hz) - np.eye(len(joints))
+    i, j = divmod(int(np.argmax(alike)), len(joints))
+    if len(joints) < 2 or alike[i, j] <= CORRELATION_LIMIT:
+        return ""
+    return (
+        f"the commands of {joints[j]} and {joints[i]} correlate to {alike[i, j]:.2f} (limit "
+        f"{CORRELATION_LIMIT:g}): a response may contain the effect of one joint on the other; "
+        "excite one joint at a time or use multisines on different harmonics"
+    )

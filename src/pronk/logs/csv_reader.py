@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256, write_text
-from pronk.logs.columns import Columns, import_columns
+from pronk.logs.columns import Columns
 from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import Robot
 
@@ -23,7 +23,7 @@ MOST_BYTES = 2**30
 
 
 def read_text(path: Path) -> str:
-    """A text file, UTF-8 with or without byte order mark.
+    """Read a text file, UTF-8 with or without byte order mark.
 
     Raises:
         LogError: Missing, too large, or not text.
@@ -47,8 +47,7 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
         LogError: No header and rows, or a row of another length; the message names the row.
     """
     text = read_text(path)
-    first = text.split("\n", 1)[0]
-    delimiter = max(",;\t", key=first.count)
+    delimiter = max(",;\t", key=text.split("\n", 1)[0].count)
     try:
         rows = [row for row in csv.reader(text.splitlines(), delimiter=delimiter) if row]
     except csv.Error as error:
@@ -66,123 +65,77 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def read_csv(
-    path: Path,
-    *,
-    robot: Robot | None = None,
-    unit: str | None = None,
-    columns: Mapping[str, str] | None = None,
-    time_unit: str = "s",
-    rate_hz: float | None = None,
-    drop_duplicates: bool = False,
-) -> JointLog:
+    path: Path, *, robot: Robot | None = None, columns: Mapping[str, str] | None = None
+) -> Columns:
     """Read a CSV file.
 
-    Columns are called `time`, `command.JOINT`, `position.JOINT`, and if there are any
-    `velocity.JOINT` and `torque.JOINT`; `columns` tells which columns are meant where they have
-    other names. A velocity is in the unit of the angles per second, torque in N m.
+    Columns are called `time`, `command.JOINT`, `position.JOINT`, and optionally `velocity.JOINT`
+    [angle/s] and `torque.JOINT` [N m]; `columns` maps these names to those in the file.
 
     Args:
         path: The file.
-        robot: The robot, to check the joint names against.
-        unit: Unit of all angles, `rad` or `deg`. It must be said.
+        robot: Not needed: the columns have names.
         columns: The file's name for each of ours, for instance `{"time": "t",
             "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`.
-        time_unit: Unit of the time column.
-        rate_hz: Rate that the file is claimed to have.
-        drop_duplicates: Drop rows that repeat the one before in full.
 
     Raises:
-        LogError: Something is missing or cannot be believed; the message names column and row.
-        RobotError: The robot has no such joint.
+        LogError: Something is missing; the message names column and row.
     """
-    if unit is None:
-        raise LogError(
-            f"{path}: a CSV file does not say whether its angles are radians or degrees; give "
-            "unit='rad' or unit='deg'."
-        )
     header, rows = read_rows(path)
-    where = dict(columns or {})
-    for name in where:
-        kind, _, joint = name.partition(".")
-        if name != "time" and not (kind in QUANTITIES and joint):
-            raise LogError(
-                f"{path}: columns names {name!r}; expected time, or a quantity and a joint, for "
-                f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
-            )
-    for name in header:
-        kind, _, joint = name.partition(".")
-        if name not in where and name not in where.values():
-            if kind in QUANTITIES and joint:
-                where[name] = name
-            elif name == "time":
-                where["time"] = name
-    listed = ", ".join(header)
-    for ours, theirs in where.items():
+    given = dict(columns or {})
+    ours = [name for name in header if name not in given.values()]
+    where = given | {name: name for name in ours if name not in given and _is_ours(name)}
+    if wrong := [name for name in given if not _is_ours(name)]:
+        raise LogError(
+            f"{path}: columns names {wrong[0]!r}; expected time, or a quantity and a joint, for "
+            f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
+        )
+    joints = tuple(name.partition(".")[2] for name in where if name.startswith("position."))
+    needed = ["time", *(f"command.{joint}" for joint in joints)]
+    missing = [name for name in needed if name not in where] or ["position.JOINT"] * (not joints)
+    if missing:
+        raise LogError(
+            f"{path}: no column called {', '.join(missing)}; the header is {', '.join(header)}; "
+            f"say which it is with columns={{{missing[0]!r}: ...}}."
+        )
+    for name, theirs in where.items():
         if header.count(theirs) != 1:
             many = "several columns" if theirs in header else "no column"
             raise LogError(
-                f"{path}: {many} called {theirs!r} (wanted for {ours}); the header is {listed}."
+                f"{path}: {many} called {theirs!r} (for {name}); the header is {', '.join(header)}."
             )
-    if "time" not in where:
-        raise LogError(
-            f"{path}: no column called 'time'; the header is {listed}; say which it is with "
-            "columns={'time': ...}."
-        )
-    joints = tuple(
-        dict.fromkeys(name.partition(".")[2] for name in where if name.startswith("position."))
-    )
-    if not joints:
-        raise LogError(
-            f"{path}: no column called 'position.JOINT'; the header is {listed}; say which they "
-            "are with columns={'position.JOINT': ..., 'command.JOINT': ...}."
-        )
 
-    def matrix(quantity: str) -> Array:
-        return np.stack(
-            [_numbers(path, header, rows, where[f"{quantity}.{joint}"]) for joint in joints], axis=1
-        )
+    def numbers(name: str) -> Array:
+        return _numbers(path, where[name], [row[header.index(where[name])] for row in rows])
 
-    def there(quantity: str) -> bool:
-        return all(f"{quantity}.{joint}" in where for joint in joints)
-
-    if missing := [joint for joint in joints if f"command.{joint}" not in where]:
-        raise LogError(
-            f"{path}: no column for the command of {', '.join(missing)}; the header is {listed}; "
-            "say which it is with columns={'command.JOINT': ...}."
-        )
-    return import_columns(
-        Columns(
-            where=str(path),
-            joints=joints,
-            time=_numbers(path, header, rows, where["time"]),
-            command=matrix("command"),
-            position=matrix("position"),
-            velocity=matrix("velocity") if there("velocity") else None,
-            torque=matrix("torque") if there("torque") else None,
-            row=lambda i: f"row {i + 2}",
-            sha256=sha256(path),
-        ),
-        robot=robot,
-        unit=unit,
-        time_unit=time_unit,
-        rate_hz=rate_hz,
-        drop_duplicates=drop_duplicates,
+    found = {
+        quantity: np.stack([numbers(f"{quantity}.{joint}") for joint in joints], axis=1)
+        for quantity in QUANTITIES
+        if all(f"{quantity}.{joint}" in where for joint in joints)
+    }
+    return Columns(
+        where=str(path),
+        joints=joints,
+        time=numbers("time"),
+        row=lambda i: f"row {i + 2}",
+        sha256=sha256(path),
+        **found,  # type: ignore[arg-type]
     )
 
 
-def _numbers(path: Path, header: list[str], rows: list[list[str]], name: str) -> Array:
-    """One column as numbers, shape (n,)."""
-    index = header.index(name)
-    cells = [row[index] for row in rows]
-    try:
-        values = np.array(cells, dtype=np.float64)
-    except ValueError:
-        values = np.full(len(cells), np.nan)
-        for i, cell in enumerate(cells):
-            try:
-                values[i] = float(cell)
-            except ValueError:
-                break
+def _is_ours(name: str) -> bool:
+    kind, _, joint = name.partition(".")
+    return name == "time" or (kind in QUANTITIES and bool(joint))
+
+
+def _numbers(path: Path, name: str, cells: list[str]) -> Array:
+    """One column as finite numbers, shape (n,)."""
+    values = np.full(len(cells), np.nan)
+    for i, cell in enumerate(cells):
+        try:
+            values[i] = float(cell)
+        except ValueError:
+            break
     if not np.isfinite(values).all():
         i = int(np.argmin(np.isfinite(values)))
         raise LogError(

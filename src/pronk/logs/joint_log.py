@@ -1,8 +1,4 @@
-"""JointLog: commanded and measured motion of joints, in memory.
-
-Files are read and written next door (`readers.py`, `mcap_log.py`); this module only says what a
-log is and what must be true of one.
-"""
+"""JointLog: commanded and measured motion of joints, in memory."""
 
 from __future__ import annotations
 
@@ -20,10 +16,10 @@ SIGNAL_KINDS = ("chirp", "log_chirp", "multisine", "sine_steps", "unknown")
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """One question: a signal sent to some joints between two instants of the log."""
+    """One excitation: a signal sent to some joints between two instants of the log."""
 
     kind: str
-    """One of `SIGNAL_KINDS`; `unknown` for imported logs that do not say."""
+    """One of `SIGNAL_KINDS`."""
     joints: tuple[str, ...]
     """Excited joints (several only with uncorrelated signals)."""
     start: float
@@ -33,7 +29,7 @@ class Segment:
     amplitude: float
     """Peak of the command about the pose [rad]; NaN if unknown."""
     repeat: int = 0
-    """Number of this repeat of the same question, from 0."""
+    """Number of this repeat of the same excitation, from 0."""
     band_hz: tuple[float, float] = (0.0, 0.0)
     """Lowest and highest excited frequency [Hz]."""
     period_s: float | None = None
@@ -42,11 +38,7 @@ class Segment:
     """Joints that were fixed mechanically meanwhile."""
 
     def __post_init__(self) -> None:
-        """Check the kind and the order of the instants.
-
-        Raises:
-            LogError: The kind is unknown or the segment ends before it starts.
-        """
+        """Refuse an unknown kind and a segment that ends before it starts."""
         if self.kind not in SIGNAL_KINDS:
             raise LogError(
                 f"segment kind {self.kind!r}; expected one of {', '.join(SIGNAL_KINDS)}."
@@ -59,8 +51,7 @@ class Segment:
 class JointLog:
     """A recording of commands and positions, one column per joint.
 
-    Positions are absolute joint angles in the robot's convention; `pose` is what the signals were
-    centred on. Timestamps are those that were measured; nothing is resampled here.
+    Positions are absolute joint angles in the robot's convention; timestamps are as measured.
     """
 
     robot: str
@@ -78,7 +69,7 @@ class JointLog:
     torque: Array | None = None
     """Measured or current-derived joint torque [N m], shape (n, joints), if there is any."""
     frequency: Array | None = None
-    """Instantaneous frequency of the question [Hz], shape (n,); NaN between questions."""
+    """Instantaneous frequency of the signal [Hz], shape (n,); NaN between excitations."""
     segments: tuple[Segment, ...] = ()
     stiffness: Array | None = None
     """Gains on the drives [N m/rad], shape (joints,); None if unknown."""
@@ -89,7 +80,7 @@ class JointLog:
     units: tuple[str, ...] = ()
     """Unit of each column's position: `rad`, or `unknown` where the source gives another scale."""
     virtual: bool = False
-    """True if the machine was pronk's virtual robot. Shown wherever a number from it is."""
+    """True if the machine was pronk's virtual robot."""
     source: str = ""
     """File or link it came from."""
     sha256: str = ""
@@ -97,15 +88,11 @@ class JointLog:
     complete: bool = True
     """False if the recording was cut short or its file is truncated."""
     notes: tuple[str, ...] = ()
-    """What the reader found worth saying: jitter, drift, gaps, repaired or dropped rows."""
+    """Remarks of the reader: jitter, drift, gaps, dropped rows."""
     metadata: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check shapes, finiteness and time.
-
-        Raises:
-            LogError: Too short, wrong shape, not finite, or time does not increase.
-        """
+        """Refuse wrong shapes, numbers that are not finite, and time that does not increase."""
         where = self.source or "log"
         n, width = len(self.time), len(self.joints)
         if n < 2:

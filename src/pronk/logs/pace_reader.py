@@ -1,9 +1,9 @@
 """Recordings of PACE: a `.pt` file with `time`, `dof_pos` and `des_dof_pos`.
 
-A `.pt` file is a zip archive that holds raw numbers and a pickle saying how they fit together. A
-pickle is a program, so this one is not run: its opcodes are interpreted by an unpickler that
-knows three names, each replaced by a function of this module that can do nothing but put an
-array together. Anything else is refused by name. PyTorch is not needed.
+A `.pt` file is a zip archive of raw numbers and a pickle that arranges them. A pickle is a program,
+so it is not run: an unpickler interprets its opcodes and knows three names, each replaced by a
+function of this module that can only build an array. Anything else is refused by name. PyTorch is
+not needed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import io
 import math
 import pickle
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,11 +22,8 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.logs.columns import Columns, Names, import_columns
-from pronk.logs.joint_log import JointLog
+from pronk.logs.columns import Columns
 from pronk.robots.robot import Robot
-
-Array = NDArray[np.float64]
 
 KEYS = ("time", "dof_pos", "des_dof_pos")
 
@@ -45,8 +42,7 @@ _FORBIDDEN = (
     *("BUILD", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"),
     *("EMPTY_SET", "ADDITEMS", "FROZENSET"),
 )
-"""Opcodes that make or change objects, or hash what they are given; a dictionary of tensors needs
-none of them."""
+"""Opcodes that a dictionary of tensors does not need: they make objects or hash their input."""
 _KEYED = ("SETITEM", "SETITEMS", "DICT")
 """Opcodes that fill dictionaries."""
 _MOST_PICKLE = 2**20
@@ -65,8 +61,7 @@ class _Dtype:
 class _Unpickler(pickle._Unpickler):
     """Interprets a pickle of tensors, and nothing else.
 
-    The pure Python unpickler, because its memo cannot be made to allocate memory by a number in
-    the file.
+    Pure Python: a number in the file cannot make its memo allocate memory.
     """
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(pickle._Unpickler.dispatch)
@@ -76,11 +71,7 @@ class _Unpickler(pickle._Unpickler):
         self._storage = storage
 
     def find_class(self, module: str, name: str) -> Any:
-        """Our own stand-ins for what torch.save writes.
-
-        Raises:
-            LogError: For every other name.
-        """
+        """Replace the three names that torch.save writes; refuse every other."""
         if module == "torch" and name in _STORAGES:
             return _Dtype(_STORAGES[name])
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
@@ -88,8 +79,8 @@ class _Unpickler(pickle._Unpickler):
         if (module, name) == ("collections", "OrderedDict"):
             return _empty
         raise LogError(
-            f"its pickle asks for {module}.{name}, which has no place in a dictionary of tensors; "
-            "nothing of it was run, and the file is not to be trusted"
+            f"its pickle names {module}.{name}, which a dictionary of tensors does not need; "
+            "nothing of it was run; do not trust the file"
         )
 
     def persistent_load(self, pid: Any) -> NDArray[Any]:
@@ -104,14 +95,14 @@ def _refuse(name: str) -> Callable[..., None]:
     def refuse(_: Any) -> None:
         raise LogError(
             f"its pickle uses the opcode {name}, which a dictionary of tensors does not need; "
-            "nothing of it was run, and the file is not to be trusted"
+            "nothing of it was run; do not trust the file"
         )
 
     return refuse
 
 
 def _text_keys(load: Callable[[Any], None]) -> Callable[..., None]:
-    """Let an opcode fill dictionaries by text alone: nested keys take for ever to hash."""
+    """Let an opcode fill dictionaries with text keys only: nested keys take too long to hash."""
 
     def checked(unpickler: Any) -> None:
         last = unpickler.stack[-2:-1] if load.__name__ == "load_setitem" else unpickler.stack[::2]
@@ -158,7 +149,7 @@ def load_tensors(path: Path) -> dict[str, NDArray[Any]]:
     """Tensors by name from a file that `torch.save` wrote of a dictionary.
 
     Raises:
-        LogError: Not such a file, or its pickle asks for something else.
+        LogError: Not such a file, or its pickle names something else.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -198,32 +189,11 @@ def load_tensors(path: Path) -> dict[str, NDArray[Any]]:
     return {k[:40]: v for k, v in found.items() if isinstance(v, np.ndarray)}
 
 
-def read_pace(
-    path: Path,
-    *,
-    robot: Robot | None = None,
-    joint_names: Names | None = None,
-    unit: str = "rad",
-    time_unit: str = "s",
-    rate_hz: float | None = None,
-    drop_duplicates: bool = False,
-    scale: Mapping[str, float] | None = None,
-) -> JointLog:
+def read_pace(path: Path, *, robot: Robot | None = None) -> Columns:
     """Read a PACE recording: `time` (n,), `dof_pos` and `des_dof_pos` (n, joints).
 
-    Args:
-        path: The file.
-        robot: The robot; gives the joint names if the file has as many columns.
-        joint_names: Names of the columns in order (PACE's `joint_order`).
-        unit: Unit of the angles; PACE writes radians.
-        time_unit: Unit of the timestamps; PACE writes seconds.
-        rate_hz: Rate that the recording is claimed to have.
-        drop_duplicates: Drop rows that repeat the one before in full.
-        scale: Radians per unit of joints whose unit is unknown, by joint name.
-
     Raises:
-        LogError: Not such a file, or it cannot be believed.
-        RobotError: The robot has no such joint.
+        LogError: Not such a file.
     """
     tensors = load_tensors(path)
     if missing := [key for key in KEYS if key not in tensors]:
@@ -233,44 +203,17 @@ def read_pace(
         )
     time, position, command = (np.array(tensors[key], dtype=np.float64) for key in KEYS)
     time = time.reshape(-1)
-    shape = (len(time), position.shape[-1] if position.ndim == 2 else 0)
-    if position.shape != shape or command.shape != shape or 0 in shape:
+    if position.ndim != 2 or command.shape != position.shape or 0 in position.shape:
         raise LogError(
             f"{path}: time has shape {time.shape}, dof_pos {position.shape} and des_dof_pos "
             f"{command.shape}; expected (n,), (n, joints) and (n, joints)."
         )
-    names = _names(path, shape[1], robot, joint_names)
-    return import_columns(
-        Columns(
-            where=str(path),
-            joints=names,
-            time=time,
-            command=command,
-            position=position,
-            sha256=sha256(path),
-            metadata={"format": "pace"},
-        ),
-        robot=robot,
-        unit=unit,
-        time_unit=time_unit,
-        rate_hz=rate_hz,
-        drop_duplicates=drop_duplicates,
-        scale=scale,
+    return Columns(
+        where=str(path),
+        time=time,
+        command=command,
+        position=position,
+        unit="rad",
+        sha256=sha256(path),
+        metadata={"format": "pace"},
     )
-
-
-def _names(path: Path, width: int, robot: Robot | None, names: Names | None) -> tuple[str, ...]:
-    if isinstance(names, Mapping):
-        raise LogError(
-            f"{path}: a PACE file names no joints to rename; give joint_names as a list."
-        )
-    if names is None and robot is not None and len(robot.joints) == width:
-        return robot.joint_names
-    if names is None:
-        raise LogError(
-            f"{path}: a PACE file does not name its {width} joints; give joint_names in the order "
-            "of PACE's joint_order."
-        )
-    if len(names) != width:
-        raise LogError(f"{path}: {len(names)} joint_names for {width} columns; give one each.")
-    return tuple(names)

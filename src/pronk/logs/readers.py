@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -16,18 +17,29 @@ import msgspec
 
 from pronk import plugins
 from pronk.errors import LogError, PronkError
-from pronk.logs.checks import check_joints, check_radians
+from pronk.logs.checks import check_radians, check_rate, check_unit, examine, saturation_note
+from pronk.logs.columns import Columns, import_columns
 from pronk.logs.csv_reader import read_csv
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_log import read_mcap
 from pronk.logs.npz_reader import read_npz
 from pronk.logs.pace_reader import read_pace
 from pronk.logs.sage_reader import is_sage, read_sage
-from pronk.logs.timing import check_claim, check_unit, examine
 from pronk.robots.robot import Robot
 
 GROUP = "pronk.readers"
 """Entry points of readers from other packages; each is a function decorated with `reader`."""
+
+
+def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Parameters that are options of a format."""
+    found = inspect.signature(function).parameters.items()
+    return {name: p for name, p in found if name not in ("path", "robot")}
+
+
+_COMMON = {n: p for n, p in _parameters(import_columns).items() if p.kind is p.KEYWORD_ONLY}
+"""Options of every format whose reader returns `Columns`."""
+_TYPES = {"int": int, "float": float, "bool": bool}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,24 +49,39 @@ class Reader:
     name: str
     suffixes: tuple[str, ...]
     """Endings of file names, lower case, with the dot; empty for folders."""
-    read: Callable[..., JointLog]
-    """`read(path, *, robot, **options)`; its keyword parameters are the options of the format."""
+    function: Callable[..., JointLog | Columns]
+    """`function(path, *, robot, **options)`; its keyword parameters are options of the format."""
+
+    @property
+    def parameters(self) -> Mapping[str, inspect.Parameter]:
+        """Options by name; those of `import_columns` among them where the reader uses it."""
+        returns = str(inspect.signature(self.function).return_annotation)
+        return _parameters(self.function) | (_COMMON if "Columns" in returns else {})
 
     @property
     def options(self) -> tuple[str, ...]:
         """Names of the options."""
-        parameters = inspect.signature(self.read).parameters
-        return tuple(name for name in parameters if name not in ("path", "robot"))
+        return tuple(self.parameters)
+
+    def read(self, path: Path, *, robot: Robot | None = None, **options: Any) -> JointLog:
+        """Read a file; a reader that returns `Columns` has them checked and converted."""
+        own = _parameters(self.function)
+        given = {name: value for name, value in options.items() if name in own}
+        found = self.function(path, robot=robot, **given)
+        if isinstance(found, Columns):
+            common = {name: value for name, value in options.items() if name not in own}
+            return import_columns(found, robot, **common)
+        return found
 
 
-def reader(name: str, *suffixes: str) -> Callable[[Callable[..., JointLog]], Reader]:
+def reader(name: str, *suffixes: str) -> Callable[[Callable[..., JointLog | Columns]], Reader]:
     """Declare a function as the reader of a format.
 
     Args:
         name: Of the format, as `--format` takes it.
         suffixes: Endings of its files, such as `.csv`.
     """
-    return lambda read: Reader(name=name, suffixes=suffixes, read=read)
+    return lambda function: Reader(name=name, suffixes=suffixes, function=function)
 
 
 _BUILT_IN = (
@@ -73,7 +100,6 @@ def readers() -> dict[str, Reader]:
         LogError: An entry point is not a reader, or takes the name or a suffix of another.
     """
     found = {each.name: each for each in _BUILT_IN}
-    taken = {suffix: each.name for each in _BUILT_IN for suffix in each.suffixes}
     for point in entry_points(group=GROUP):
         try:
             each = plugins.load(point)
@@ -85,13 +111,12 @@ def readers() -> dict[str, Reader]:
                 f"entry point {point.value} of {GROUP} is no reader; decorate a function with "
                 "pronk.logs.readers.reader."
             )
-        if each.name in found or taken.keys() & set(each.suffixes):
+        if each.name in found or _suffixes(found).keys() & set(each.suffixes):
             raise LogError(
                 f"entry point {point.value} of {GROUP}: the format {each.name!r} or one of its "
                 f"suffixes {', '.join(each.suffixes)} is taken already."
             )
         found[each.name] = each
-        taken |= dict.fromkeys(each.suffixes, each.name)
     return found
 
 
@@ -115,10 +140,10 @@ def read_log(
         path: File or folder.
         robot: The robot, to check the joint names against, or to name columns that have no names.
         format: One of `readers()`; from the name if None.
-        rate_hz: Rate that the file is expected to have; an error if the timestamps disagree.
-        options: Of the format: `columns`, `unit`, `joint_names`, `time_unit`, `drop_duplicates`
-            (CSV, NPZ and others), `scale` (SAGE), `measured_topic`, `command_topic`,
-            `command_field` (rosbag2); see the function that reads it.
+        rate_hz: Expected rate; an error if the timestamps disagree.
+        options: Of the format: `unit`, `time_unit`, `joint_names`, `drop_duplicates`, `scale`
+            (see `import_columns`), `columns` (CSV), `measured_topic`, `command_topic`,
+            `command_field` (rosbag2).
 
     Returns:
         The log; `notes` list what was found.
@@ -127,77 +152,76 @@ def read_log(
         LogError: The file cannot be read or is not plausible; the message names the remedy.
         RobotError: The robot has no such joint; the message lists those it has.
     """
-    path = Path(path)
-    known = readers()
+    path, known = Path(path), readers()
     kind = format or _sniff(path, known)
     if kind not in known:
         raise LogError(f"{path}: format {kind!r}; expected one of {', '.join(known)}.")
     if kind == "mcap" and path.is_dir():
         path = _only_mcap(path)
+    chosen = known[kind]
     given = {name: value for name, value in options.items() if value is not None}
-    takes = known[kind].options
-    if "rate_hz" in takes and rate_hz is not None:
+    if rate_hz is not None and "rate_hz" in chosen.options:
         given["rate_hz"] = rate_hz
-    if wrong := [name for name in given if name not in takes]:
+    if wrong := [name for name in given if name not in chosen.options]:
         raise LogError(
             f"{path}: {', '.join(wrong)} means nothing for the format {kind}; it takes "
-            f"{', '.join(takes)}."
+            f"{', '.join(chosen.options)}."
         )
-    given = _converted(path, known[kind], given)
     try:
-        return _read(path, known[kind], robot, given, rate_hz)
+        given = {name: _typed(path, chosen, name, value) for name, value in given.items()}
+        log = chosen.read(path, robot=robot, **given)
+        return _checked(path, chosen, log, robot, rate_hz)
     except PronkError as error:
         # Names from the file itself may hold line breaks; a message is one sentence.
         raise type(error)(" ".join(str(error).split())) from error.__cause__
 
 
-def _converted(path: Path, chosen: Reader, given: dict[str, Any]) -> dict[str, Any]:
-    """Convert options given as text to the types that a reader declares, where it does."""
-    parameters = inspect.signature(chosen.read, eval_str=True).parameters
-    found = dict(given)
-    for name, value in given.items():
-        kind = parameters[name].annotation
-        if isinstance(value, str) and kind in (int, float, bool):
-            try:
-                found[name] = msgspec.convert(value, kind, strict=False)
-            except msgspec.ValidationError:
-                raise LogError(
-                    f"{path}: option {name} of the format {chosen.name} is {value!r}; expected "
-                    f"{kind.__name__}."
-                ) from None
-    return found
+def _typed(path: Path, chosen: Reader, name: str, value: Any) -> Any:
+    """Convert an option given as text to the type that a reader declares, where it does."""
+    declared = chosen.parameters[name].annotation
+    kind = _TYPES.get(getattr(declared, "__name__", declared))
+    if kind is None or not isinstance(value, str):
+        return value
+    try:
+        return msgspec.convert(value, kind, strict=False)
+    except msgspec.ValidationError:
+        raise LogError(
+            f"{path}: option {name} of the format {chosen.name} is {value!r}; expected "
+            f"{kind.__name__}."
+        ) from None
 
 
-def _read(
-    path: Path, chosen: Reader, robot: Robot | None, given: dict[str, Any], rate_hz: float | None
+def _checked(
+    path: Path, chosen: Reader, log: JointLog, robot: Robot | None, rate_hz: float | None
 ) -> JointLog:
-    """Read by one reader, and check what all logs must pass."""
-    log = chosen.read(path, robot=robot, **given)
+    """Check what all logs must pass."""
     if not isinstance(log, JointLog):
         raise LogError(f"{path}: the reader {chosen.name} returned {type(log).__name__}.")
+    notes = list(log.notes)
     if "rate_hz" not in chosen.options:
         timing = examine(log.time)
         check_unit(log.time, str(path), "s")
         if rate_hz is not None:
-            check_claim(timing, str(path), rate_hz)
-        log = replace(log, notes=(*log.notes, timing.words()))
-    if robot is not None:
-        if log.robot not in (robot.name, "unknown"):
-            raise LogError(
-                f"{path}: recorded on {log.robot}, but the robot is {robot.name}; name the right "
-                "robot."
-            )
-        check_joints(log, robot)
+            check_rate(timing, str(path), rate_hz)
+        notes.append(timing.words())
+    if robot is not None and log.robot not in (robot.name, "unknown"):
+        raise LogError(
+            f"{path}: recorded on {log.robot}, but the robot is {robot.name}; name the right robot."
+        )
     for joint in log.joints:
+        if robot is not None:
+            robot.joint(joint)
         check_radians(log, joint)
-    return log
+        if note := saturation_note(log, joint):
+            notes.append(note)
+    return replace(log, notes=tuple(notes))
 
 
 def find_logs(paths: Iterable[Path | str]) -> list[Path]:
     """The logs that some paths stand for; a folder that is no log itself means those in it.
 
     Raises:
-        LogError: Nothing was named, or a folder holds no log.
+        LogError: No path is given, or a folder holds no log.
     """
     suffixes = _suffixes(readers())
     found: list[Path] = []
@@ -205,7 +229,11 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
         if not path.is_dir() or is_sage(path) or (path / "metadata.yaml").is_file():
             found.append(path)
             continue
-        inside = sorted(p for p in path.iterdir() if is_sage(p) or _may_be_log(p, suffixes))
+        inside = sorted(
+            p
+            for p in path.iterdir()
+            if is_sage(p) or (p.suffix.lower() in suffixes and not p.name.endswith(_NO_LOGS))
+        )
         if not inside:
             raise LogError(
                 f"{path}: no logs in this folder; expected {', '.join(suffixes)} or SAGE folders."
@@ -222,33 +250,20 @@ def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any
     Args:
         paths: Files and folders.
         processes: Read so many at a time; worth it from four long logs on.
-        options: As for `read_log`.
-
-    Raises:
-        LogError: As `read_log`, or there is no log.
-        RobotError: As `read_log`.
+        options: As for `read_log`; so are the errors.
     """
     files = find_logs(paths)
+    read: Callable[[Path], JointLog] = partial(read_log, **options)
     if processes < 2 or len(files) < _WORTH_PROCESSES:
-        return [_read_with(path, options) for path in files]
+        return [read(path) for path in files]
     # Threads of the simulator do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        return [
-            done.result() for done in [pool.submit(_read_with, path, options) for path in files]
-        ]
-
-
-def _read_with(path: Path, options: Mapping[str, Any]) -> JointLog:
-    return read_log(path, **options)
+        return list(pool.map(read, files))
 
 
 def _suffixes(known: Mapping[str, Reader]) -> dict[str, str]:
     return {suffix: each.name for each in known.values() for suffix in each.suffixes}
-
-
-def _may_be_log(path: Path, suffixes: Mapping[str, str]) -> bool:
-    return path.suffix.lower() in suffixes and not path.name.endswith(_NO_LOGS)
 
 
 def _sniff(path: Path, known: Mapping[str, Reader]) -> str:

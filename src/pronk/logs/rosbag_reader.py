@@ -1,7 +1,6 @@
 """JointState recordings of ROS 2 (rosbag2 in MCAP) as a JointLog.
 
-A bag does not say which topic is the command, and guessing would swap question and answer
-without a trace, so the command topic must be named.
+A bag does not say which topic is the command, so the command topic must be named.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
+from pronk.logs.columns import in_force
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap import Record
 
@@ -39,8 +39,8 @@ def read_joint_states(
 ) -> JointLog:
     """Join the measured states of one topic with the commands of another.
 
-    Stamps in the headers are used where both topics have them, times of reception otherwise: two
-    clocks are never mixed. The command in force at a state is the last one at or before it.
+    Header stamps are used where both topics have them, times of reception otherwise: two clocks
+    are never mixed. The command in force at a state is the last one at or before it.
 
     Args:
         path: The file, for messages.
@@ -64,8 +64,8 @@ def read_joint_states(
         )
     if command_topic is None:
         raise LogError(
-            f"{path}: which topic is the command is not said; it holds {listed}; name it with "
-            "command_topic (and command_field where the positions are not in `position`)."
+            f"{path}: command_topic is missing; the file holds {listed}; name the topic of the "
+            "commands (and command_field where the positions are not in `position`)."
         )
     if command_topic not in topics or command_topic == measured_topic:
         raise LogError(f"{path}: no commands on {command_topic}; it holds {listed}.")
@@ -74,48 +74,52 @@ def read_joint_states(
     commands = [(r, decode(r)) for r in found if r.topic == command_topic]
     stamped = all(_stamp(message) > 0.0 for _, message in (*states, *commands))
 
-    def time_of(record: Record, message: Any) -> float:
-        return _stamp(message) if stamped else record.log_time * 1e-9
+    def times(pairs: list[tuple[Record, Any]]) -> Array:
+        return np.array([_stamp(m) if stamped else r.log_time * 1e-9 for r, m in pairs])
 
     joints = tuple(str(name) for name in states[0][1].name)
-    time = np.array([time_of(r, m) for r, m in states])
-    position = _matrix(path, measured_topic, "position", [m for _, m in states], joints)
-    if position is None:
-        raise LogError(f"{path}: the states on {measured_topic} hold no positions.")
-    sent = np.array([time_of(r, m) for r, m in commands])
-    order = np.argsort(sent, kind="stable")
+    time, sent = times(states), times(commands)
     wanted = np.array(
         [_command(path, command_topic, command_field, m, joints) for _, m in commands]
     )
-    index = np.searchsorted(sent[order], time, side="right") - 1
+    order = np.argsort(sent, kind="stable")
+    index = in_force(sent[order], time)
     known = index >= 0
-    notes = []
-    if not known.all():
-        notes.append(f"{int((~known).sum())} states before the first command were dropped")
-    if not stamped:
-        notes.append("message headers hold no stamps on both topics; times of reception were used")
-    if damage:
-        notes.append(f"the file is cut short ({damage})")
     if int(known.sum()) < 2:
         raise LogError(
             f"{path}: {int(known.sum())} states on {measured_topic} follow a command on "
             f"{command_topic}; at least 2 are needed."
         )
-    start = time[known][0]
-    velocity = _matrix(path, measured_topic, "velocity", [m for _, m in states], joints)
-    torque = _matrix(path, measured_topic, "effort", [m for _, m in states], joints)
+
+    def measured(name: str) -> Array | None:
+        """One field of every state, shape (n, joints); None where a state lacks it."""
+        if any(len(getattr(message, name)) == 0 for _, message in states):
+            return None
+        rows = [_by_name(path, measured_topic, m.name, getattr(m, name), joints) for _, m in states]
+        matrix = np.array(rows)[known]
+        # Drivers fill what they do not measure with NaN.
+        return None if name != "position" and np.isnan(matrix).any() else matrix
+
+    position = measured("position")
+    if position is None:
+        raise LogError(f"{path}: the states on {measured_topic} hold no positions.")
+    notes = {
+        f"{(~known).sum()} states before the first command were dropped": not known.all(),
+        "message headers hold no stamps on both topics; times of reception were used": not stamped,
+        f"the file is cut short ({damage})": bool(damage),
+    }
     return JointLog(
         robot=robot,
         joints=joints,
-        time=time[known] - start,
+        time=time[known] - time[known][0],
         command=wanted[order][index[known]],
-        position=position[known],
-        velocity=None if velocity is None else velocity[known],
-        torque=None if torque is None else torque[known],
+        position=position,
+        velocity=measured("velocity"),
+        torque=measured("effort"),
         source=str(path),
         sha256=sha256(path),
         complete=not damage,
-        notes=tuple(notes),
+        notes=tuple(note for note, applies in notes.items() if applies),
         metadata={"measured_topic": measured_topic, "command_topic": command_topic},
     )
 
@@ -126,20 +130,17 @@ def _decoder(path: Path) -> Callable[[Record], Any]:
     def decode(record: Record) -> Any:
         try:
             decoder = factory.decoder_for(record.encoding, record.schema)
-            if decoder is None:
-                raise LogError(
-                    f"{path}: messages on {record.topic} are encoded as {record.encoding!r} with "
-                    f"schema {record.schema.encoding if record.schema else 'none'!r}; expected "
-                    "cdr with ros2msg."
-                )
-            return decoder(record.data)
-        except LogError:
-            raise
+            if decoder is not None:
+                return decoder(record.data)
         except Exception as error:
             # The decoder is generated from the file's own schema and may fail in any way.
             raise LogError(
                 f"{path}: a message on {record.topic} cannot be decoded ({type(error).__name__})."
             ) from error
+        raise LogError(
+            f"{path}: messages on {record.topic} are encoded as {record.encoding!r} with schema "
+            f"{record.schema.encoding if record.schema else 'none'!r}; expected cdr with ros2msg."
+        )
 
     return decode
 
@@ -147,9 +148,7 @@ def _decoder(path: Path) -> Callable[[Record], Any]:
 def _stamp(message: Any) -> float:
     """Stamp of the header [s]; 0 where there is none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
-        return 0.0
-    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+    return 0.0 if stamp is None else float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
 def _by_name(
@@ -170,18 +169,6 @@ def _by_name(
             f"({', '.join(joints)})."
         )
     return [float(value) for value in values]
-
-
-def _matrix(
-    path: Path, topic: str, name: str, messages: Sequence[Any], joints: Sequence[str]
-) -> Array | None:
-    """One field of every measured message, shape (n, joints); None where any message lacks it."""
-    if any(len(getattr(message, name)) == 0 for message in messages):
-        return None
-    rows = [_by_name(path, topic, m.name, getattr(m, name), joints) for m in messages]
-    matrix = np.array(rows)
-    # Drivers fill what they do not measure with NaN.
-    return None if name != "position" and np.isnan(matrix).any() else matrix
 
 
 def _command(

@@ -8,7 +8,6 @@ the motion began and when the motors were disabled.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.logs.columns import Columns, Names, import_columns
+from pronk.logs.columns import Columns, in_force
 from pronk.logs.csv_reader import read_rows, read_text
-from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -35,9 +33,11 @@ SAGE_JOINTS = {
     "Wrist_Roll": "wrist_roll",
     "Jaw": "gripper",
 }
-"""Names in [sage] recordings to joint names of the SO-101."""
-SAGE_UNITS = {name: "unknown" if name == "Jaw" else "rad" for name in SAGE_JOINTS}
-"""Jaw is on a 0 to 1 scale whose travel in radians is not recorded: not an angle."""
+"""Names in SAGE recordings to joint names of the SO-101.
+
+Jaw is on a 0 to 1 scale whose travel in radians is not recorded: not an angle. (Its encoder moves
+in steps of 0.00065660, and a servo's step is 2 pi / 4096: 2.336 rad a unit; its velocity column,
+which is an angle's, gives 2.33. The recordings state neither, so neither is assumed.)"""
 SAGE_MAPPING = {name: (1.0, 0.0) for name in SAGE_JOINTS if name != "Jaw"}
 """(sign, offset): joint position [rad] = sign * recorded position + offset.
 
@@ -54,120 +54,82 @@ def is_sage(path: Path) -> bool:
     return path.is_dir() and all((path / name).is_file() for name in FILES)
 
 
-def read_sage(
-    path: Path,
-    *,
-    robot: Robot | None = None,
-    joint_names: Names | None = None,
-    unit: str = "rad",
-    time_unit: str = "us",
-    rate_hz: float | None = None,
-    drop_duplicates: bool = False,
-    scale: Mapping[str, float] | None = None,
-) -> JointLog:
+def read_sage(path: Path, *, robot: Robot | None = None) -> Columns:
     """Read a SAGE folder.
 
-    The command in force at a state is the last one at or before its timestamp. The joints of the
-    SO-101 get their robot's names; its Jaw is on a 0 to 1 scale, not an angle, so its unit stays
-    `unknown` unless a scale is given. (In the published recordings the Jaw's encoder moves in steps
-    of 0.00065660, and a servo's step is 2 pi / 4096: 2.336 rad a unit. Its velocity column, which
-    is an angle's, says 2.33. Neither is stated anywhere, so neither is assumed.)
-
-    Args:
-        path: The folder.
-        robot: The robot; the SO-101 is recognized by itself.
-        joint_names: Names to give the joints.
-        unit: Unit of the angles; SAGE writes radians.
-        time_unit: Unit of the timestamps; SAGE writes microseconds.
-        rate_hz: Rate that the recording is claimed to have.
-        drop_duplicates: Drop rows that repeat the one before in full.
-        scale: Radians per unit of joints whose unit is unknown, by joint name.
+    The command in force at a state is the last one at or before its timestamp. Joints of the
+    SO-101 get their robot's names; the unit of its Jaw stays `unknown` unless a scale is given.
 
     Raises:
-        LogError: A file is missing or cannot be believed; the message names file and row.
-        RobotError: The robot has no such joint.
+        LogError: A file is missing or cannot be read; the message names file and row.
     """
     for name in FILES:
         if not (path / name).is_file():
             raise LogError(
                 f"{path}: no {name}; a SAGE recording is a folder with {', '.join(FILES)}."
             )
-    joints = tuple(line.strip() for line in read_text(path / "joint_list.txt").splitlines())
-    joints = tuple(name for name in joints if name)
+    lines = read_text(path / "joint_list.txt").splitlines()
+    joints = tuple(line.strip() for line in lines if line.strip())
     if not joints:
         raise LogError(f"{path / 'joint_list.txt'}: no joints; expected one name a line.")
     so101 = all(name in SAGE_JOINTS for name in joints) and (robot is None or robot.name == "so101")
-    units: tuple[str, ...] = ()
-    notes = []
-    if so101:
-        units = tuple(SAGE_UNITS[name] for name in joints)
-        for name in joints:
-            if SAGE_UNITS[name] != "rad":
-                notes.append(f"{name} is on a scale of its own, not in radians")
-        if joint_names is None:
-            joint_names = {name: SAGE_JOINTS[name] for name in joints}
     sent, (wanted,) = _rows(path / "control.csv", ("positions",), len(joints))
     time, (position, velocity, torque) = _rows(
         path / "state_motor.csv", ("positions", "velocities", "torques"), len(joints)
     )
-    if len(sent) and (np.diff(sent) < 0.0).any():
+    if (np.diff(sent) < 0.0).any():
         row = int(np.argmax(np.diff(sent) < 0.0)) + 3
         raise LogError(f"{path / 'control.csv'}: time goes back in row {row}; sort the file.")
-    index = np.searchsorted(sent, time, side="right") - 1
-    inside = index >= 0
-    if early := int((~inside).sum()):
-        notes.append(f"{early} states before the first command were dropped")
+    index = in_force(sent, time)
     start, stop = _events(path / "event.csv")
-    outside = inside & ((time < start) | (time > stop))
-    if late := int(outside.sum()):
-        inside &= ~outside
-        notes.append(f"{late} states before MOTION_START or after DISABLE were dropped")
-    kept = np.flatnonzero(inside)
+    early, outside = index < 0, (index >= 0) & ((time < start) | (time > stop))
+    kept = np.flatnonzero(~early & ~outside)
     still = not velocity.any()
-    if still:
-        notes.append("velocities are all zero: not measured")
-    return import_columns(
-        Columns(
-            where=str(path),
-            joints=joints,
-            time=time[inside],
-            command=wanted[index[inside]],
-            position=position[inside],
-            velocity=None if still else velocity[inside],
-            torque=torque[inside],
-            units=units,
-            row=lambda i: f"row {int(kept[i]) + 2} of state_motor.csv",
-            notes=tuple(notes),
-            sha256=hashlib.sha256("".join(sha256(path / f) for f in FILES).encode()).hexdigest(),
-            metadata={"format": "sage"},
-        ),
-        robot=robot,
-        robot_name="so101" if so101 else "unknown",
-        unit=unit,
-        time_unit=time_unit,
-        joint_names=joint_names,
-        rate_hz=rate_hz,
-        drop_duplicates=drop_duplicates,
-        scale=scale,
+    notes = {
+        "Jaw is on a scale of its own, not in radians": so101 and "Jaw" in joints,
+        f"{early.sum()} states before the first command were dropped": early.any(),
+        f"{outside.sum()} states before MOTION_START or after DISABLE were dropped": outside.any(),
+        "velocities are all zero: not measured": still,
+    }
+    return Columns(
+        where=str(path),
+        joints=joints,
+        names={name: SAGE_JOINTS[name] for name in joints} if so101 else None,
+        robot="so101" if so101 else "unknown",
+        time=time[kept],
+        command=wanted[index[kept]],
+        position=position[kept],
+        velocity=None if still else velocity[kept],
+        torque=torque[kept],
+        unit="rad",
+        time_unit="us",
+        units=tuple("unknown" if so101 and name == "Jaw" else "rad" for name in joints),
+        row=lambda i: f"row {int(kept[i]) + 2} of state_motor.csv",
+        notes=tuple(note for note, applies in notes.items() if applies),
+        sha256=hashlib.sha256("".join(sha256(path / f) for f in FILES).encode()).hexdigest(),
+        metadata={"format": "sage"},
     )
 
 
-def _rows(path: Path, lists: tuple[str, ...], width: int) -> tuple[Array, list[Array]]:
-    """Timestamps and list columns of one file, shapes (n,) and (n, width) each."""
+def _table(path: Path, names: tuple[str, ...]) -> list[list[str]]:
+    """Cells of some columns of a CSV file, one list a row."""
     header, rows = read_rows(path)
-    for name in ("timestamp", *lists):
+    for name in names:
         if name not in header:
             raise LogError(f"{path}: no column {name!r}; the header is {', '.join(header)}.")
-    stamp = header.index("timestamp")
-    columns = [header.index(name) for name in lists]
-    time = np.empty(len(rows))
-    values = np.empty((len(lists), len(rows), width))
-    for i, row in enumerate(rows):
+    return [[row[header.index(name)] for name in names] for row in rows]
+
+
+def _rows(path: Path, lists: tuple[str, ...], width: int) -> tuple[Array, Array]:
+    """Timestamps and list columns of one file, shapes (n,) and (lists, n, width)."""
+    rows = _table(path, ("timestamp", *lists))
+    time, values = np.empty(len(rows)), np.empty((len(lists), len(rows), width))
+    for i, (stamp, *cells) in enumerate(rows):
         try:
-            time[i] = float(row[stamp])
-            for k, column in enumerate(columns):
-                # JSON, not eval: text from elsewhere must not run.
-                numbers = orjson.loads(row[column])
+            time[i] = float(stamp)
+            for k, cell in enumerate(cells):
+                # JSON, not eval: text of a file must not run.
+                numbers = orjson.loads(cell)
                 if not isinstance(numbers, list) or len(numbers) != width:
                     raise ValueError
                 values[k, i] = numbers
@@ -176,26 +138,16 @@ def _rows(path: Path, lists: tuple[str, ...], width: int) -> tuple[Array, list[A
                 f"{path}: row {i + 2} is not a timestamp and lists of {width} numbers "
                 f"({', '.join(lists)}); repair or remove that row."
             ) from None
-    return time, list(values)
+    return time, values
 
 
 def _events(path: Path) -> tuple[float, float]:
     """When the motion began and when the motors were disabled, in the file's own unit."""
-    start, stop = -np.inf, np.inf
-    if not path.is_file():
-        return start, stop
-    header, rows = read_rows(path)
-    for name in ("timestamp", "event"):
-        if name not in header:
-            raise LogError(f"{path}: no column {name!r}; the header is {', '.join(header)}.")
-    for i, row in enumerate(rows):
+    found = {"MOTION_START": -np.inf, "DISABLE": np.inf}
+    rows = _table(path, ("timestamp", "event")) if path.is_file() else []
+    for i, (stamp, event) in enumerate(rows):
         try:
-            time = float(row[header.index("timestamp")])
+            found[event.strip()] = float(stamp)
         except ValueError:
             raise LogError(f"{path}: row {i + 2} holds no timestamp.") from None
-        event = row[header.index("event")].strip()
-        if event == "MOTION_START":
-            start = time
-        elif event == "DISABLE":
-            stop = time
-    return start, stop
+    return found["MOTION_START"], found["DISABLE"]
