@@ -498,7 +498,7 @@ def test_refusals_are_one_sentence_each(states: list[State], now: float, word: s
 def test_the_delay_must_be_one_that_was_trained_for() -> None:
     assert delay_objection(0.004, 50, (0.0, 0.01)) == ""
     assert "12.0 ms" in delay_objection(0.012, 50, (0.0, 0.01))
-    assert "not answered" in delay_objection(math.nan, 0, (0.0, 0.01))
+    assert "no action" in delay_objection(math.nan, 0, (0.0, 0.01))
 
 
 # --- Operators ----------------------------------------------------------------------------------

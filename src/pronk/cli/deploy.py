@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -106,7 +105,8 @@ def deploy(
     scripts = None if script is None else _scripts(script, contract, walk_only)
     if not address.local and not yes:
         confirm.before_it_moves(contract.robot, str(address))
-    with _operator(contract, scripts, gamepad, seconds) as (operator, words):
+    operator, words = _operator(contract, scripts, gamepad, seconds)
+    with closing(operator):
         console.say(words)
         summary = run(plan, operator, _tell)
     _report(summary)
@@ -125,33 +125,24 @@ def deploy(
     return 0
 
 
-@contextmanager
 def _operator(
     contract: Contract,
     scripts: list[Script] | None,
     gamepad: Path | None,
     seconds: float | None,
-) -> Iterator[tuple[Operator, str]]:
-    """Who holds the stick, and what to tell them."""
+) -> tuple[Operator, str]:
+    """The operator of the run, and its help."""
     from pronk.runtime.teleop import HELP, PAD_HELP, Gamepad, Keyboard, ScriptedOperator, TimeLimit
 
+    operator: Operator
     if scripts is not None:
-        unattended = ScriptedOperator(scripts)
-        what = f"unattended: {len(unattended.scripts)} scripts, {unattended.seconds:.0f} s."
-        yield (unattended if seconds is None else TimeLimit(unattended, seconds)), what
-        return
-    held = (
-        Keyboard(contract.command_ranges)
-        if gamepad is None
-        else Gamepad(gamepad, contract.command_ranges)
-    )
-    try:
-        yield (
-            (held if seconds is None else TimeLimit(held, seconds)),
-            (HELP if gamepad is None else PAD_HELP),
-        )
-    finally:
-        held.close()
+        operator = scripted = ScriptedOperator(scripts)
+        words = f"unattended: {len(scripts)} scripts, {scripted.seconds:.0f} s."
+    elif gamepad is not None:
+        operator, words = Gamepad(gamepad, contract.command_ranges), PAD_HELP
+    else:
+        operator, words = Keyboard(contract.command_ranges), HELP
+    return (operator if seconds is None else TimeLimit(operator, seconds)), words
 
 
 def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:

@@ -39,7 +39,7 @@ from pronk.policy.contract import Contract, check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
-from pronk.runtime.rollout import Rollout, check_standing, run_policy
+from pronk.runtime.rollout import check_standing, ticks
 from pronk.runtime.script import STILL, Script
 from pronk.virtual import capture as captures
 from pronk.virtual.ground import Ground, Start
@@ -207,27 +207,27 @@ def set_down(job: Job) -> VirtualRobot:
     return machine
 
 
-def record(job: Job) -> tuple[captures.Capture, Rollout]:
-    """Run one job; return the capture and the policy's decisions."""
+def record(job: Job) -> tuple[captures.Capture, float]:
+    """Run one job; return the capture and when the policy started [s]."""
     machine, policy = set_down(job), _policy(job.policy, job.sha256)
-    seconds = job.script.seconds
-    done = run_policy(machine, policy, load_robot(job.robot), job.script.commanded, seconds=seconds)
-    return machine.capture(), done
+    robot, seconds = load_robot(job.robot), job.script.seconds
+    taken = list(ticks(machine, policy, robot, job.script.commanded, seconds=seconds))
+    if not taken:
+        raise HardwareError("the policy made no step; let it run for one tick or more.")
+    return machine.capture(), taken[0].time
 
 
 def run_job(job: Job) -> Outcome:
     """Run one job and measure it."""
     begun, begun_cpu = time.perf_counter(), time.process_time()
-    seen, rollout = record(job)
+    seen, began = record(job)
     robot = load_robot(job.robot)
-    figures = job.measure(
-        seen, job.script, robot, began=rollout.began, mass=job.mass, rules=job.rules
-    )
+    figures = job.measure(seen, job.script, robot, began=began, mass=job.mass, rules=job.rules)
     if job.keep is not None:
         captures.save(job.keep, seen)
     return Outcome(
         figures=figures,
-        began=rollout.began,
+        began=began,
         seconds=time.perf_counter() - begun,
         cpu_s=time.process_time() - begun_cpu,
     )

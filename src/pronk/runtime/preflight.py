@@ -1,7 +1,7 @@
-"""What must be so before anything moves. Every refusal is one sentence that says what to do.
+"""Checks of the states before anything moves. Every refusal is one sentence with its remedy.
 
-That nobody else writes to the robot is the link's to find out, when it connects. The policy
-against the robot is `pronk.policy.contract.check`. What the states say is here.
+The link checks when it connects that no other program writes to the robot;
+`pronk.policy.contract.check` checks the policy against the robot.
 """
 
 from __future__ import annotations
@@ -9,21 +9,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.links.machine import State
 from pronk.robots.robot import Robot
+from pronk.runtime.rollout import projected_gravity
 from pronk.runtime.safety import Limits, tilt
 
-Array = NDArray[np.float64]
-
-STATE_RATE_HZ = 500.0
-"""States per second of the robots that pronk knows."""
+RATE_HZ = 500.0
+"""States per second of a robot."""
 RATE_SHARE = 0.6
-"""Least share of those that must arrive: a link may lose a third and the robot still walks."""
+"""Least share of those that must arrive: with a third lost, a robot still walks."""
 GRAVITY = 9.81
 GRAVITY_SLACK = 1.0
-"""Between the median specific force of a robot at rest and gravity [m/s^2]."""
+"""Of the median specific force of a robot at rest [m/s^2]."""
 ATTITUDE_SLACK = 0.2
 """Between "up" by the accelerometer and by the attitude filter [rad]."""
 NORM_SLACK = 0.02
@@ -37,49 +35,32 @@ BATTERY_SHARE = 0.85
 
 
 def refusals(
-    states: Sequence[State],
-    robot: Robot,
-    limits: Limits,
-    *,
-    now: float,
-    seconds: float,
-    rate_hz: float = STATE_RATE_HZ,
+    states: Sequence[State], robot: Robot, limits: Limits, *, now: float, seconds: float
 ) -> tuple[str, ...]:
     """Why the robot must not move; empty if it may.
 
     Args:
-        states: Those met while nothing was sent, oldest first.
-        robot: What it shall be.
+        states: Those received while nothing was sent, oldest first.
+        robot: The expected robot.
         limits: Of the safety filter.
         now: On the same clock as the states [s].
-        seconds: How long was looked.
-        rate_hz: States per second expected.
+        seconds: Time in which they were received [s].
     """
     if len(states) < 2:
         return (
             f"{len(states)} states in {seconds:.1f} s; check the link, the network interface and "
             "that the robot's program runs.",
         )
-    return tuple(
-        sentence
-        for check in (
-            _stream(states, limits, now, seconds, rate_hz),
-            _numbers(states),
-            _attitude(states, limits),
-            _joints(states, robot, limits),
-            _supply(states, robot, limits),
-        )
-        for sentence in check
-    )
+    checks = (_stream(states, limits, now, seconds), _attitude(states, limits))
+    joints = (_joints(states[-1], robot, limits), _supply(states, robot, limits))
+    return tuple(sentence for check in (*checks, *joints) for sentence in check)
 
 
-def _stream(
-    states: Sequence[State], limits: Limits, now: float, seconds: float, rate_hz: float
-) -> Iterator[str]:
+def _stream(states: Sequence[State], limits: Limits, now: float, seconds: float) -> Iterator[str]:
     rate = len(states) / seconds
-    if rate < RATE_SHARE * rate_hz:
+    if rate < RATE_SHARE * RATE_HZ:
         yield (
-            f"{rate:.0f} states per second, expected {rate_hz:.0f}; the link loses or delays too "
+            f"{rate:.0f} states per second, expected {RATE_HZ:.0f}; the link loses or delays too "
             "many, use a cable or another interface."
         )
     age = now - states[-1].time
@@ -89,20 +70,15 @@ def _stream(
             "most; the stream has stopped or is queued somewhere."
         )
     if age < -limits.future_s:
-        yield f"the newest state is {-1e3 * age:.0f} ms ahead of now; mend the link's clock."
-    positions = np.array([state.position for state in states])
-    if seconds >= 0.1 and len(states) > 10 and (positions == positions[0]).all():
-        gyro = np.array([state.gyro for state in states])
-        if (gyro == gyro[0]).all():
-            yield (
-                "no number changed in all states, not even the gyro's noise; the sensors or the "
-                "program that reads them have stopped."
-            )
-
-
-def _numbers(states: Sequence[State]) -> Iterator[str]:
+        yield f"the newest state is {-1e3 * age:.0f} ms ahead of now; correct the link's clock."
+    measured = np.array([np.concatenate((state.position, state.gyro)) for state in states])
+    if seconds >= 0.1 and len(states) > 10 and (measured == measured[0]).all():
+        yield (
+            "no number changed in all states, not even the gyro's noise; the sensors or the "
+            "program that reads them have stopped."
+        )
     for name in ("position", "velocity", "gyro", "accelerometer", "orientation"):
-        if not all(np.isfinite(getattr(state, name)).all() for state in states):
+        if not np.isfinite([getattr(state, name) for state in states]).all():
             yield f"the states' {name} holds something that is not a number; restart the robot."
 
 
@@ -110,9 +86,9 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
     quaternion = np.asarray(states[-1].orientation)
     norm = float(np.linalg.norm(quaternion))
     if not abs(norm - 1.0) <= NORM_SLACK:
-        yield f"the attitude's quaternion has the length {norm:.3f}, expected 1; nobody fills it."
+        yield f"the attitude's quaternion has the length {norm:.3f}, expected 1; it is not set."
         return
-    # The median, so that one knock on the table does not decide.
+    # The median, so that one knock does not decide.
     force = np.median([state.accelerometer for state in states], axis=0)
     size = float(np.linalg.norm(force))
     if not abs(size - GRAVITY) <= GRAVITY_SLACK:
@@ -121,8 +97,7 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
             "and that the robot lies still."
         )
         return
-    w, x, y, z = quaternion / norm
-    up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
+    up = -projected_gravity(quaternion / norm)
     angle = float(np.arccos(np.clip(up @ force / size, -1.0, 1.0)))
     if angle > ATTITUDE_SLACK:
         yield (
@@ -137,12 +112,10 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
         )
 
 
-def _joints(states: Sequence[State], robot: Robot, limits: Limits) -> Iterator[str]:
-    last = states[-1]
+def _joints(last: State, robot: Robot, limits: Limits) -> Iterator[str]:
     for i, joint in enumerate(robot.joints):
         q, v = float(last.position[i]), float(last.velocity[i])
-        low, high = limits.low[i] - OVERRUN, limits.high[i] + OVERRUN
-        if not low <= q <= high:
+        if not limits.low[i] - OVERRUN <= q <= limits.high[i] + OVERRUN:
             yield (
                 f"{joint.name} is at {q:.2f} rad, outside {limits.low[i]:.2f} to "
                 f"{limits.high[i]:.2f} rad; zero its encoder."
@@ -152,18 +125,13 @@ def _joints(states: Sequence[State], robot: Robot, limits: Limits) -> Iterator[s
 
 
 def _supply(states: Sequence[State], robot: Robot, limits: Limits) -> Iterator[str]:
-    nominal = max(joint.drive.bus_voltage for joint in robot.joints)
+    least = BATTERY_SHARE * max(joint.drive.bus_voltage for joint in robot.joints)
     volts = float(np.mean([state.bus_voltage for state in states]))
     # A link that does not carry the voltage gives 0 or NaN.
-    if 0.0 < volts < BATTERY_SHARE * nominal:
-        yield (
-            f"the battery gives {volts:.1f} V, expected {BATTERY_SHARE * nominal:.1f} V at least; "
-            "charge it."
-        )
+    if 0.0 < volts < least:
+        yield f"the battery gives {volts:.1f} V, expected {least:.1f} V at least; charge it."
     hot = states[-1].temperature
-    if hot is None:
-        return
-    for joint, degrees in zip(robot.joints, hot, strict=True):
+    for joint, degrees in zip(robot.joints, () if hot is None else hot, strict=hot is not None):
         if degrees > limits.temperature:
             yield (
                 f"the motor of {joint.name} has {degrees:.0f} deg C, expected "
@@ -172,11 +140,10 @@ def _supply(states: Sequence[State], robot: Robot, limits: Limits) -> Iterator[s
 
 
 def delay_objection(latency_s: float, count: int, trained: tuple[float, float]) -> str:
-    """Why the policy must not take over, from the latency measured while standing; "" if it may.
+    """Why the policy must not start, from the latency measured while standing; "" if it may.
 
-    From the state that a policy step answers to its command on the wire is the part of the command
-    delay that this computer adds; the drives add theirs, so the lower end of what was trained for
-    is not compared.
+    The latency from a state to the command computed from it is this computer's part of the command
+    delay; the drives add theirs, so the lower end of the training range is not compared.
 
     Args:
         latency_s: 95 % of the steps were faster [s].
@@ -184,7 +151,7 @@ def delay_objection(latency_s: float, count: int, trained: tuple[float, float]) 
         trained: Command delays that the policy was trained for [s].
     """
     if count < 10:
-        return "the policy's process has not answered yet; wait a moment or look at the events."
+        return "the policy's process has sent no action yet; wait a moment or see the events."
     if latency_s > trained[1]:
         return (
             f"state to command takes {1e3 * latency_s:.1f} ms (95 % of {count} steps), more than "

@@ -1,6 +1,6 @@
 """The script of one run (paper E1): stand, accelerate, jump, stop.
 
-Times count from the moment at which the policy takes over a standing robot:
+Times count from the moment at which the policy starts on a standing robot:
 
     0 ... stand_s       zero command
     ... + run_s         the velocity command
@@ -41,27 +41,19 @@ def check_velocity(command: Velocity, of: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Script:
-    """What is commanded over the time of one run."""
+    """The commands of one run."""
 
     command: Velocity
     """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
     stand_s: float = 1.0
-    """Before the velocity command [s]."""
     run_s: float = 2.5
-    """From there to the jump input [s]."""
     jump_s: float = 0.5
-    """Length of the jump input [s]; 0 for no jump."""
+    """0 for no jump."""
     keep_s: float = 0.5
-    """From its end to the zero command [s]."""
     stop_s: float = 3.0
-    """From there to the end [s]: long enough to see whether the robot stays upright."""
+    """Long enough to see whether the robot stays upright."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible times.
-
-        Raises:
-            PronkError: One sentence that names the field.
-        """
         check_velocity(self.command, "the script")
         for name in ("stand_s", "run_s", "jump_s", "keep_s", "stop_s"):
             value = getattr(self, name)
@@ -90,15 +82,11 @@ class Script:
 
     @property
     def seconds(self) -> float:
-        """Length of the whole [s]."""
+        """Length of the script [s]."""
         return self.stop + self.stop_s
 
     def commanded(self, t: float) -> Commanded:
-        """Return the velocity command and the jump input at a time.
-
-        Args:
-            t: Since the policy took over [s].
-        """
+        """Velocity command and jump input at a time since the policy started [s]."""
         now = t + _SLACK
         moving = self.start <= now < self.stop
         return (self.command if moving else STILL), self.on <= now < self.off

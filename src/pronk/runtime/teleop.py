@@ -1,4 +1,4 @@
-"""Operators: keyboard, gamepad, and scripted ones that need nobody."""
+"""Operators: keyboard, gamepad, scripts, and the clamping of joints beside a sweep."""
 
 from __future__ import annotations
 
@@ -13,58 +13,51 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from pronk.errors import HardwareError, PronkError
 from pronk.links.network_link import ClampOperator
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.script import STILL, Script, Velocity
 
+Ranges = Mapping[str, tuple[float, float]]
+"""Smallest and largest commands trained for (`Contract.command_ranges`)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class OperatorCommand:
-    """What the operator wants at a moment."""
+    """The operator's input at a moment."""
 
     command: Velocity = STILL
     """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame."""
     jump: bool = False
     held: bool = False
-    """Whether the dead-man button is held: without it the policy's robot is damped."""
+    """Dead-man button; without it the robot is damped while the policy runs."""
     request: OperatorRequest = OperatorRequest.NONE
     """A new request."""
 
 
-class Operator(Protocol):
-    """Gives the stick's position, 50 times a second."""
+class Operator:
+    """Gives the operator's input, 50 times a second."""
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """What is wanted now.
-
-        Args:
-            now: CLOCK_MONOTONIC [s].
-            mode: What the servo is doing.
-        """
+        """The input now (CLOCK_MONOTONIC [s]), in a mode of the servo."""
+        raise NotImplementedError
 
     def notified(self, kind: str, text: str) -> None:
-        """Hear what the servo has to say."""
+        """Receive an event of the servo."""
 
     def leave(self) -> None:
-        """The program was interrupted."""
+        """End, because the program was interrupted."""
+
+    def close(self) -> None:
+        """Release the device."""
 
 
-class ScriptedOperator:
-    """Stands up, runs one script after another, sits down, leaves; needs nobody.
-
-    It ends at the first fault or refusal.
-    """
+class ScriptedOperator(Operator):
+    """Stands up, runs scripts one after another, sits down, ends; ends at the first fault."""
 
     def __init__(self, scripts: Sequence[Script], *, pause_s: float = 1.0) -> None:
-        """Take the scripts.
-
-        Args:
-            scripts: Commands while the policy is in charge, one after the other.
-            pause_s: Of standing still between two [s].
-        """
+        """`pause_s` is the time with a zero command after each script [s]."""
         self.scripts = tuple(scripts)
         self.pause_s = pause_s
         self._began: float | None = None
@@ -75,22 +68,22 @@ class ScriptedOperator:
 
     @property
     def seconds(self) -> float:
-        """While the policy is in charge [s]."""
+        """While the policy runs [s]."""
         return sum(script.seconds + self.pause_s for script in self.scripts)
 
     def notified(self, kind: str, text: str) -> None:
-        """A fault or a refusal ends it."""
+        """End at a fault or refusal."""
         if kind in ("fault", "refused") or (kind == "notice" and self._began is None):
             self._over = True
 
     def leave(self) -> None:
-        """End it."""
+        """End."""
         self._over = True
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """What the scripts say."""
+        """The scripts' input."""
         if self._over or (self.finished and mode is Mode.DAMP):
-            return OperatorCommand(request=self._once(OperatorRequest.QUIT, Mode.ENDED))
+            return OperatorCommand(request=OperatorRequest.QUIT)
         if mode is Mode.DAMP:
             return OperatorCommand(request=self._once(OperatorRequest.STAND, mode))
         if mode is Mode.STAND:
@@ -104,22 +97,21 @@ class ScriptedOperator:
             if t < script.seconds:
                 command, jump = script.commanded(t)
                 return OperatorCommand(command=command, jump=jump, held=True)
-            t -= script.seconds
-            if t < self.pause_s:
+            t -= script.seconds + self.pause_s
+            if t < 0.0:
                 return OperatorCommand(held=True)
-            t -= self.pause_s
         self.finished = True
         return OperatorCommand(held=True, request=self._once(OperatorRequest.SIT, mode))
 
     def _once(self, request: OperatorRequest, mode: Mode) -> OperatorRequest:
-        """A request, said once for each mode."""
-        if self._requested_in is mode and request is not OperatorRequest.QUIT:
+        """A request, once in each mode."""
+        if self._requested_in is mode:
             return OperatorRequest.NONE
         self._requested_in = mode
         return request
 
 
-class BenchOperator:
+class BenchOperator(Operator):
     """Beside a sweep: clamps joints by hand when the servo requests it."""
 
     def __init__(self, clamp_operator: ClampOperator) -> None:
@@ -134,9 +126,6 @@ class BenchOperator:
         if kind == "clamp":
             joints = tuple(name for name in text.split(", ") if name)
             threading.Thread(target=self._fix, args=(joints,), daemon=True).start()
-
-    def leave(self) -> None:
-        """No-op: the run requests the end itself."""
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """The dead-man button is held; a request once joints are clamped, or cannot be."""
@@ -154,55 +143,43 @@ class BenchOperator:
         self._next = OperatorRequest.CLAMPED if self.error is None else OperatorRequest.QUIT
 
 
-class TimeLimit:
-    """Another operator, who sits down when the time is over."""
+class TimeLimit(Operator):
+    """Another operator for a time with the policy running; then it sits down and ends."""
 
     def __init__(self, operator: Operator, seconds: float) -> None:
-        """Begin to count when the policy takes over.
-
-        Args:
-            operator: Who else decides.
-            seconds: With the policy in charge [s].
-        """
+        """Count from the start of the policy [s]."""
         self._operator = operator
         self._seconds = seconds
         self._began: float | None = None
         self._sat = False
+        self.notified = operator.notified  # type: ignore[method-assign]
+        self.leave = operator.leave  # type: ignore[method-assign]
+        self.close = operator.close  # type: ignore[method-assign]
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """What the other wants, until the time is over."""
-        wanted = self._operator.command(now, mode)
+        """The other's input, until the time is over."""
+        given = self._operator.command(now, mode)
         if mode is Mode.POLICY and self._began is None:
             self._began = now
         if self._began is None or now - self._began < self._seconds:
-            return wanted
-        if mode is Mode.POLICY:
-            request = OperatorRequest.NONE if self._sat else OperatorRequest.SIT
-            self._sat = True
-            return OperatorCommand(held=wanted.held, request=request)
-        return (
-            OperatorCommand(request=OperatorRequest.QUIT)
-            if mode is Mode.DAMP
-            else OperatorCommand(held=wanted.held)
-        )
-
-    def notified(self, kind: str, text: str) -> None:
-        """Tell the other."""
-        self._operator.notified(kind, text)
-
-    def leave(self) -> None:
-        """Tell the other."""
-        self._operator.leave()
+            return given
+        if mode is Mode.DAMP:
+            return OperatorCommand(request=OperatorRequest.QUIT)
+        if mode is not Mode.POLICY or self._sat:
+            return OperatorCommand(held=given.held)
+        self._sat = True
+        return OperatorCommand(held=given.held, request=OperatorRequest.SIT)
 
 
 HELP = """\
   hold SPACE   dead-man: let go and the joints are damped
-  1 stand up   2 let the policy walk   3 sit down   0 damp at once   r fault mended   q leave
+  1 stand up   2 start the policy   3 sit down   0 damp at once   r reset a fault   q quit
   w s forward and back   a d left and right   j l turn   x stand still   ENTER jump"""
 """Keys of the keyboard."""
 
-_STEP = {"w": (0, 0.25), "s": (0, -0.25), "a": (1, 0.1), "d": (1, -0.1), "j": (2, 0.2)} | {
-    "l": (2, -0.2)
+_STEPS = {"w": (0, 0.25), "s": (0, -0.25), "a": (1, 0.1), "d": (1, -0.1)} | {
+    "j": (2, 0.2),
+    "l": (2, -0.2),
 }
 _REQUESTS = {
     "1": OperatorRequest.STAND,
@@ -215,25 +192,18 @@ _REQUESTS = {
 _JUMP_S = 0.5
 """Length of the jump input of one press, as in training [s]."""
 _REPEAT_S = 0.8
-"""A key counts as held for this long after it was heard: the longest usual delay before a keyboard
-repeats a key is 0.66 s."""
+"""A key counts as held for this long; keyboards repeat a key after 0.66 s at most [s]."""
 
 
-class Keyboard:
+class Keyboard(Operator):
     """Keys of a terminal.
 
-    A terminal knows no "released", only that a held key repeats itself, so its dead-man button
-    lets go 0.8 s late; a gamepad's does so at once.
+    A terminal does not report the release of a key, only its repetition, so the dead-man button is
+    released 0.8 s late; a gamepad's at once.
     """
 
-    def __init__(
-        self, ranges: Mapping[str, tuple[float, float]], stream: int | None = None
-    ) -> None:
-        """Listen to a terminal, key by key.
-
-        Args:
-            ranges: Commands trained for, smallest and largest (`Contract.command_ranges`).
-            stream: File descriptor; standard input if left out.
+    def __init__(self, ranges: Ranges, stream: int | None = None) -> None:
+        """Read a terminal key by key: standard input, or another file descriptor.
 
         Raises:
             HardwareError: It is no terminal.
@@ -242,40 +212,37 @@ class Keyboard:
         self._ranges = tuple(ranges.values())
         if not os.isatty(self._fd):
             raise HardwareError(
-                "there is no keyboard to hold (standard input is no terminal); run it in a "
-                "terminal, take --gamepad, or --script for a run that needs nobody."
+                "there is no keyboard (standard input is no terminal); run it in a terminal, use "
+                "--gamepad, or --script for a run without an operator."
             )
         self._before = termios.tcgetattr(self._fd)
         tty.setcbreak(self._fd)
         self._command = [0.0, 0.0, 0.0]
         self._held = self._jump = -1e9
-        self._there = True
+        self._connected = True
 
     def close(self) -> None:
-        """Give the terminal back as it was, if it is there."""
+        """Restore the terminal."""
         with suppress(termios.error):
             termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def notified(self, kind: str, text: str) -> None:
-        """After a change of mode nothing of the old command is left."""
+        """Reset the velocity command when the mode changes."""
         if kind == "mode":
             self._command = [0.0, 0.0, 0.0]
 
-    def leave(self) -> None:
-        """Nothing to do."""
-
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """What the keys say."""
+        """The keys' input."""
         del mode
         request = OperatorRequest.NONE
         keys = self._keys()
-        if not self._there:
+        if not self._connected:
             return OperatorCommand(request=OperatorRequest.QUIT)
         for key in keys:
             if key == " ":
                 self._held = now
-            elif key in _STEP:
-                axis, step = _STEP[key]
+            elif key in _STEPS:
+                axis, step = _STEPS[key]
                 low, high = self._ranges[axis]
                 self._command[axis] = min(max(self._command[axis] + step, low), high)
             elif key == "x":
@@ -300,7 +267,7 @@ class Keyboard:
             except OSError:
                 part = b""
             if not part:
-                self._there = False
+                self._connected = False
                 break
             keys += part
         return keys.decode("ascii", "ignore")
@@ -311,7 +278,7 @@ _EVENT = struct.Struct("<IhBB")
 _BUTTON, _AXIS, _INITIAL = 1, 2, 0x80
 _FULL = 32767.0
 _DEAD_ZONE = 0.1
-# Numbers as the kernel's xpad driver gives them, to which other gamepads are mapped.
+# Numbers of the kernel's xpad driver, to which other gamepads are mapped.
 _PAD_REQUESTS = {
     0: OperatorRequest.STAND,
     1: OperatorRequest.DAMP,
@@ -321,24 +288,21 @@ _PAD_REQUESTS = {
     7: OperatorRequest.RESET,
 }
 _LEFT_BUMPER, _RIGHT_BUMPER = 4, 5
-_FORWARD_AXIS, _LEFT_AXIS, _TURN_AXIS = 1, 0, 3
+_AXES = (1, 0, 3)
+"""Forward, left, turn."""
 
 PAD_HELP = """\
   hold LB      dead-man: let go and the joints are damped
-  A stand up   Y let the policy walk   X sit down   B damp at once   START fault mended   BACK leave
+  A stand up   Y start the policy   X sit down   B damp at once   START reset a fault   BACK quit
   left stick forward and sideways   right stick turn   RB jump"""
 """Buttons of the gamepad."""
 
 
-class Gamepad:
-    """A gamepad through the kernel's joystick interface; unplugged is let go."""
+class Gamepad(Operator):
+    """A gamepad through the kernel's joystick interface; unplugged counts as released."""
 
-    def __init__(self, path: Path, ranges: Mapping[str, tuple[float, float]]) -> None:
-        """Open it.
-
-        Args:
-            path: Device, such as /dev/input/js0.
-            ranges: Commands trained for, smallest and largest (`Contract.command_ranges`).
+    def __init__(self, path: Path, ranges: Ranges) -> None:
+        """Open a device such as /dev/input/js0.
 
         Raises:
             HardwareError: It cannot be opened.
@@ -355,27 +319,21 @@ class Gamepad:
         self._buttons: dict[int, bool] = {}
         self._pressed = False
         self._jump = -1e9
-        self._there = True
+        self._connected = True
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Close the device."""
         os.close(self._fd)
 
-    def notified(self, kind: str, text: str) -> None:
-        """A gamepad has no ears."""
-
-    def leave(self) -> None:
-        """Nothing to do."""
-
     def command(self, now: float, mode: Mode) -> OperatorCommand:
-        """What sticks and buttons say."""
+        """The input of sticks and buttons."""
         del mode
         request = self._read()
-        if not self._there:
+        if not self._connected:
             return OperatorCommand(request=request)
-        pushed = [-self._axis(_FORWARD_AXIS), -self._axis(_LEFT_AXIS), -self._axis(_TURN_AXIS)]
+        pushed = (-self._axes.get(number, 0.0) for number in _AXES)
         forward, left, yaw = (
-            push * (high if push > 0.0 else -low)
+            0.0 if abs(push) <= _DEAD_ZONE else push * (high if push > 0.0 else -low)
             for push, (low, high) in zip(pushed, self._ranges, strict=True)
         )
         pressed = self._buttons.get(_RIGHT_BUMPER, False)
@@ -389,10 +347,6 @@ class Gamepad:
             request=request,
         )
 
-    def _axis(self, number: int) -> float:
-        value = self._axes.get(number, 0.0)
-        return value if abs(value) > _DEAD_ZONE else 0.0
-
     def _read(self) -> OperatorRequest:
         request = OperatorRequest.NONE
         while True:
@@ -401,10 +355,9 @@ class Gamepad:
             except BlockingIOError:
                 return request
             except OSError:
-                self._there = False
-                return request
+                data = b""
             if len(data) < _EVENT.size:
-                self._there = False
+                self._connected = False
                 return request
             _, value, kind, number = _EVENT.unpack(data)
             if kind & ~_INITIAL == _AXIS:
