@@ -12,11 +12,12 @@ import pytest
 from command_line import invoke
 from pronk.errors import LogError
 from pronk.links.machine import State
-from pronk.report import build, deploy_page
-from pronk.report.deploy_page import delay, shift
+from pronk.report import build, deploy_page, deploy_run
+from pronk.report.deploy_run import Quantiles, delay, drive_delay
+from pronk.report.page import Part
 from pronk.robots import load_robot
 from pronk.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
-from pronk.runtime.log import DeployLog, DeployLogWriter, read_deploy_log
+from pronk.runtime.log import DeployLogWriter, read_deploy_log
 from pronk.runtime.safety import FilterAction, Reason
 
 ROBOT = load_robot("mini_cheetah")
@@ -117,13 +118,13 @@ def faulted(path: Path, *, end: bool = True) -> Path:
 
 
 def test_quantiles_are_those_of_the_sorted_values() -> None:
-    found = deploy_page.spread(np.r_[np.arange(1000, 0, -1), np.nan])
+    found = Quantiles.of(np.r_[np.arange(1000, 0, -1), np.nan])
     assert (found.n, found.p50, found.p95, found.p99) == (1000, 500.0, 950.0, 990.0)
-    assert (found.p99_9, found.largest) == (999.0, 1000.0)
-    few = deploy_page.spread(np.arange(50.0))
+    assert (found.p99_9, found.max) == (999.0, 1000.0)
+    few = Quantiles.of(np.arange(50.0))
     assert math.isnan(few.p99)
     assert few.p95 == 47.0
-    assert deploy_page.spread(np.array([])).n == 0
+    assert Quantiles.of(np.array([])).n == 0
 
 
 @pytest.mark.parametrize("lag", [1, 2, 4])
@@ -132,7 +133,7 @@ def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
     # A state at tick k sees the target sent at tick k - lag, on the wire 0.4 ms after the tick:
     # right for every shift between (lag - 1) ticks and lag ticks, less 0.4 ms.
     latest = lag * TICK_S - 4e-4
-    found = shift(log, ROBOT)
+    found = drive_delay(log, ROBOT)
     np.testing.assert_allclose(found, (max(latest - TICK_S, 0.0), latest), atol=2.6e-4)
     whole_delay = delay(log, ROBOT)
     assert whole_delay.within is (lag < 4)
@@ -143,7 +144,6 @@ def test_a_delay_beyond_training_is_a_warning(tmp_path: Path) -> None:
     log = read_deploy_log(flown(tmp_path / "run.mcap", lag=5))
     found = delay(log, ROBOT)
     assert found.within is False
-    assert "BEYOND the 0 to 10 ms" in deploy_page.delaying(found)
     assert deploy_page.has_problem(log, found)
 
 
@@ -157,28 +157,27 @@ def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> N
     found = delay(read_deploy_log(path), ROBOT)
     assert np.isnan(found.drives).all()
     assert found.longest == pytest.approx(0.003)
-    assert "without the drives: within" in deploy_page.delaying(found)
+    assert found.within is True
 
 
-def test_what_a_fault_leaves(tmp_path: Path) -> None:
+def test_measures_of_a_fault(tmp_path: Path) -> None:
     log = read_deploy_log(faulted(tmp_path / "run.mcap"))
-    found = deploy_page.stretches(log)
+    found = deploy_run.stretches(log)
     assert [one.mode for one in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
     np.testing.assert_allclose([one.seconds for one in found], 0.2, atol=1e-9)
-    moved, latched = deploy_page.interventions(log)
+    moved, latched = deploy_run.interventions(log)
     assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, FilterAction.LIMIT, 100)
     assert (moved.largest, moved.joint) == (pytest.approx(0.25), ROBOT.joint_names[5])
+    assert moved.first == pytest.approx(0.2)
     assert (latched.reason, latched.ticks, latched.joint) == (Reason.TILT, 100, "")
-    np.testing.assert_allclose(deploy_page.tilt(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
-    joints = deploy_page.tracking(log)
-    assert joints[0].standing == pytest.approx(0.01)
-    assert math.isnan(joints[0].torque)  # all zeros: this robot tells none
-    assert deploy_page.until_fault(log) == 201
-    assert deploy_page.verdict(log) == (
-        "Real mini_cheetah: a fault at 0.40 s, after 0.2 s of the policy: tilted."
-    )
-    assert "100 of 100 commands on the wire were damping" in deploy_page.damping(log)
-    assert deploy_page.filtering(log).endswith("in 100 of 200 commands (50.0 %).")
+    np.testing.assert_allclose(deploy_run.tilt(log)[[0, 250]], [0.0, 1.0], atol=1e-12)
+    joints = deploy_run.tracking(log)
+    assert joints["standing"][0] == pytest.approx(0.01)
+    assert math.isnan(joints["torque"][0])  # all zeros: this robot reports none
+    assert len(deploy_run.times(log)["age of the state"][0]) == 201  # until the fault
+    assert "0.40 s, after 0.2 s of the policy: tilted" in deploy_page.verdict(log)
+    assert "100 of 100 commands" in deploy_page.damping(log)
+    assert "100 of 200 commands" in deploy_page.filtering(log)
 
 
 def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
@@ -186,31 +185,28 @@ def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:
     for k in (0, 1, 2, 5, 6, 10):
         writer.tick(record(k, POSE))
     writer.end(complete=True, figures={})
-    assert deploy_page.missed(read_deploy_log(tmp_path / "run.mcap")) == 5
+    assert deploy_run.missed(read_deploy_log(tmp_path / "run.mcap")) == 5
 
 
-def test_temperatures_where_there_are_any(tmp_path: Path) -> None:
-    assert deploy_page.temperatures(flown(tmp_path / "cold.mcap", count=5)) is None
-    path = flown(tmp_path / "hot.mcap", count=5, temperature=np.arange(12.0) + 30.0)
-    found = deploy_page.temperatures(path)
-    assert found is not None
-    np.testing.assert_allclose(found[0], np.arange(5) * TICK_S)
-    np.testing.assert_array_equal(found[1], np.tile(np.arange(12.0) + 30.0, (5, 1)))
+def test_motor_temperatures_are_drawn_where_they_are_measured(tmp_path: Path) -> None:
+    cold = read_deploy_log(flown(tmp_path / "cold.mcap", count=5))
+    hot = read_deploy_log(flown(tmp_path / "hot.mcap", 5, temperature=np.arange(12.0) + 30.0))
+    panels = [len(deploy_page.overview(log).axes) for log in (cold, hot)]
+    assert panels[1] == panels[0] + 1
+    np.testing.assert_array_equal(hot.temperature[4], np.arange(12.0) + 30.0)
 
 
-def page(path: Path) -> tuple[str, DeployLog]:
-    material = deploy_page.read(path)
-    return str(deploy_page.part(material, anchor="deploy").html), material.log
+def page(path: Path) -> Part:
+    return deploy_page.part(path, path.parent)
 
 
-def test_the_page_of_a_cut_log_says_so(tmp_path: Path) -> None:
+def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:
     path = faulted(tmp_path / "run.mcap", end=False)
     path.write_bytes(path.read_bytes()[:-20])
-    html, log = page(path)
-    assert not log.complete
-    assert "The log was cut" in html
-    assert 'class="verdict warning"' in html
-    assert html.count("data:image/") == 4
+    made = page(path)
+    assert made.figures["complete"] is False
+    assert made.warning
+    assert any("log was cut" in line for line in made.lines)
 
 
 def test_the_page_of_a_refusal(tmp_path: Path) -> None:
@@ -221,10 +217,9 @@ def test_the_page_of_a_refusal(tmp_path: Path) -> None:
         writer.tick(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
     say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")
     writer.end(complete=True, figures={})
-    html, _ = page(path)
-    assert "was not moved: the battery gives 12.0 V; charge it." in html
-    assert "No delay was measured" in html
-    assert "battery [V]" not in html
+    made = page(path)
+    assert made.summary.endswith("the battery gives 12.0 V; charge it.")
+    assert made.figures["delay"]["within"] is None
 
 
 def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
@@ -234,17 +229,16 @@ def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
     written = (tmp_path / "a.html").read_text()
     assert "virtual robot</span>" not in written
     assert "at 0.40 s" in written
-    assert '"within":true' not in (tmp_path / "a.json").read_text().replace(" ", "")
     (tmp_path / "deep").mkdir()
     flown(tmp_path / "deep" / "b.mcap")
     (tmp_path / "other.mcap").write_bytes(b"no log of anything")
-    found = build.find(tmp_path)
+    _, found = build.write_report(tmp_path)
     assert [one.source for one in found] == ["a.mcap", "deep/b.mcap"]
     assert [one.virtual for one in found] == [False, True]
     assert found[1].figures["delay"]["within"] is True
 
 
-def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "other.mcap").write_bytes(b"no log of anything")
     with pytest.raises(LogError, match="not a log of a deployment"):
-        build.find(tmp_path / "other.mcap")
+        build.write_report(tmp_path / "other.mcap")

@@ -59,7 +59,7 @@ def predict(
             written.append(path)
             for one in found.joints:
                 name = stem if stem == one.joint else f"{stem}.{one.joint}"
-                figure = figures.replay(one, virtual=log.virtual)
+                figure = figures.prediction(one, virtual=log.virtual)
                 written.append(style.save(figure, folder / f"{name}.prediction.svg"))
             rows += [row_of(one) | {"log": log.source} for one in found.joints]
             done((i + 1) / len(read))

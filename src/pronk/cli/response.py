@@ -60,7 +60,7 @@ def response(
                     mine = [r for r in found if r.joint == joint]
                     name = stem if excited == (stem,) else f"{stem}.{joint}"
                     written.append(
-                        style.save(figures.answers(mine), folder / f"{name}.response.svg")
+                        style.save(figures.responses(mine), folder / f"{name}.response.svg")
                     )
             rows += [figures_of(r) | {"log": log.source} for r in found]
             done((i + 1) / len(read))

@@ -172,7 +172,7 @@ def more(
         crossed = add_crossings(
             policies, CrossingPlan(seed=seed), progress=report.bar("crossing"), **common
         )
-        sheets.append(on_virtual("crossing", extra_pages.table(crossed)))
+        sheets.append(on_virtual("crossing", extra_pages.crossing_table(crossed)))
         files.append(Path(CROSSING.summary))
     if "variation" in extras:
         plan = Plan(jumps=5, seed=seed)

@@ -1,16 +1,14 @@
-"""One HTML page of a match: verdict first, then what it rests on.
-
-The page is made from the artefacts in a folder alone (`gains.yaml`, `match.npz` and, where there
-are any, `*.prediction.npz`), holds its figures in itself and opens without a network.
-"""
+"""Page of a match: gains, Bode plots, error maps, training ranges, what they rest on."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from pronk.errors import ArtefactError, RobotError
 from pronk.files import write_text
@@ -18,17 +16,19 @@ from pronk.match import gains as gains_file
 from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
-from pronk.match.result import MatchResult
+from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult
 from pronk.report import figures
-from pronk.report.paper import published
-from pronk.report.shell import Part, fill, page, picture
+from pronk.report.page import Code, Content, Fold, Part, Section, interval, number, page, picture
+from pronk.report.page import table as sheet
+from pronk.report.paper import Published, published
+from pronk.report.style import joint_words
 from pronk.robots import load_robot
 
 PAGE_NAME = "match.html"
 
 
 def find_gains(folder: Path) -> Path:
-    """The gains file of a folder: `gains.yaml`, or the only YAML file with that schema.
+    """Return the gains file of a folder: `gains.yaml`, or the only YAML file with that schema.
 
     Raises:
         ArtefactError: There is none, or several and none called `gains.yaml`.
@@ -52,8 +52,18 @@ def find_gains(folder: Path) -> Path:
     raise ArtefactError(f"{folder}: {what} gains.yaml; `pronk match LOG... --out` writes one.")
 
 
+def load(folder: Path, gains: Path | None = None) -> MatchResult:
+    """Read the match of a folder; its gains are found by `find_gains` if None.
+
+    Raises:
+        ArtefactError: The folder has no gains or no `match.npz`, or one of them is damaged.
+    """
+    path = gains or find_gains(folder)
+    return result_file.load(folder / "match.npz", gains_file.load(path))
+
+
 def group_members(gains: MatchedGains) -> dict[str, list[str]]:
-    """Names of the matched joints of each group, by the robot or, failing that, by their names."""
+    """Return the matched joints of each group, by the robot or, if unknown, by their names."""
     try:
         robot = load_robot(gains.robot)
         found = {
@@ -66,7 +76,7 @@ def group_members(gains: MatchedGains) -> dict[str, list[str]]:
 
 
 def drive_gains(gains: MatchedGains) -> dict[str, tuple[float, float]]:
-    """(stiffness, damping) on the real drive of each matched joint; empty for an unknown robot."""
+    """Return (stiffness, damping) of each joint's real drive; empty for an unknown robot."""
     try:
         robot = load_robot(gains.robot)
         joints = [robot.joint(name) for name in gains.joints]
@@ -76,218 +86,46 @@ def drive_gains(gains: MatchedGains) -> dict[str, tuple[float, float]]:
 
 
 def failure_flags(result: MatchResult, name: str) -> list[str]:
-    """The flags that speak against the match of a joint; that about zero armature speaks for it."""
-    joint = result.joints.get(name)
-    flags = (*result.gains.joints[name].flags, *(joint.flags if joint is not None else ()))
-    return [flag for flag in dict.fromkeys(flags) if not flag.startswith("zero armature")]
+    """Return the warnings about the match of a joint; that about zero armature is none."""
+    fit = result.joints.get(name)
+    flags = (*result.gains.joints[name].flags, *(fit.flags if fit is not None else ()))
+    return [flag for flag in dict.fromkeys(flags) if not flag.startswith(ZERO_ARMATURE)]
 
 
-def is_match(result: MatchResult, name: str) -> bool:
-    """True unless a flag of the joint says that there is no match."""
-    return not any(flag.startswith("no match") for flag in failure_flags(result, name))
-
-
-def rms(values: list[float]) -> float:
-    """Root mean square of the finite values; NaN if there are none."""
+def _rms(values: list[float]) -> float:
     finite = np.asarray([v for v in values if np.isfinite(v)])
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
 
 
 def verdict(result: MatchResult) -> dict[str, Any]:
-    """The figures of the first section, also what `--json` gives."""
+    """Return the figures of the summary, also those of `--json`."""
     joints = result.gains.joints
     errors = {name: joint.error_db for name, joint in joints.items() if joint.error_db >= 0.0}
+    flags = {name: found for name in joints if (found := failure_flags(result, name))}
+    unmatched = [f for f in flags.values() if any(flag.startswith("no match") for flag in f)]
     return {
         "robot": result.gains.robot,
         "virtual": result.gains.virtual,
         "joints": len(joints),
-        "matched": sum(is_match(result, name) for name in joints),
-        "naive_error_db": rms([joint.naive_error_db for joint in joints.values()]),
-        "error_db": rms([joint.error_db for joint in joints.values()]),
+        "matched": len(joints) - len(unmatched),
+        "naive_error_db": _rms([joint.naive_error_db for joint in joints.values()]),
+        "error_db": _rms([joint.error_db for joint in joints.values()]),
         "worst": max(errors, key=lambda name: errors[name], default=""),
-        "flags": {name: found for name in joints if (found := failure_flags(result, name))},
+        "flags": flags,
     }
 
 
-def _excitations(result: MatchResult) -> list[dict[str, Any]]:
-    rows = []
-    for name, joint in result.joints.items():
-        first = joint.responses[0]
-        band = first.band(*joint.band_hz)
-        rows.append(
-            {
-                "joint": name,
-                "amplitudes": ", ".join(f"{r.amplitude:g}" for r in joint.responses),
-                "repeats": len(first.repeats),
-                "estimator": first.estimator,
-                "window": first.window,
-                "band": joint.band_hz,
-                "coherence": float(first.coherence[band].min()) if band.any() else float("nan"),
-                "delay_ms": 1000.0 * first.delay_s,
-                "third": 100.0 * first.third_harmonic,
-            }
-        )
-    return rows
+def part(path: Path, root: Path, *, anchor: str = "match", title: str = "Match") -> Part:
+    """Make the part of the match in `path`, a `match.npz`.
 
-
-def _scales(gains: MatchedGains, members: Mapping[str, list[str]]) -> list[dict[str, Any]]:
-    """Mean matched over real gains, per group: what reading A10 is about."""
-    real = drive_gains(gains)
-    rows = []
-    for group, joints in members.items():
-        known = [j for j in joints if j in real and real[j][0] > 0.0 and real[j][1] > 0.0]
-        if known:
-            rows.append(
-                {
-                    "group": group,
-                    "stiffness": np.mean([gains.joints[j].stiffness / real[j][0] for j in known]),
-                    "damping": np.mean([gains.joints[j].damping / real[j][1] for j in known]),
-                }
-            )
-    return rows
-
-
-def knees_first(names: Iterable[str]) -> list[str]:
-    """Joint names, those of knees first: where rotor inertia and mismatch are largest."""
-    return sorted(names, key=lambda name: not name.endswith("knee"))
-
-
-def _predictions(folder: Path) -> list[dict[str, Any]]:
-    shown = []
-    for path in sorted(folder.glob("*.prediction.npz")):
-        prediction = prediction_file.load(path)
-        if not prediction.joints:
-            continue
-        by_joint = {one.joint: one for one in prediction.joints}
-        first = by_joint[knees_first(by_joint)[0]]
-        where = "the virtual robot" if prediction.virtual else "the robot"
-        shown.append(
-            {
-                "source": prediction.source,
-                "virtual": prediction.virtual,
-                "joints": prediction.joints,
-                "picture": picture(
-                    figures.replay(first, virtual=prediction.virtual),
-                    f"Position of {first.joint} over time: command, measured on {where}, "
-                    "simulated with naive and with matched gains",
-                ),
-            }
-        )
-    return shown
-
-
-def _pictures(result: MatchResult) -> dict[str, Any]:
-    gains, joints = result.gains, result.joints
-    where = "on the virtual robot" if gains.virtual else "on the robot"
-    amplitudes = figures.amplitudes(result)
-    zero = {name: joint for name, joint in joints.items() if joint.zero_armature is not None}
-    return {
-        "overview": picture(
-            figures.overview(result),
-            f"Gain over frequency of every joint, measured {where} and simulated",
-        )
-        if joints
-        else None,
-        "example": (knees_first(joints) or [""])[0],
-        "bodes": {
-            name: picture(
-                figures.bode(joint),
-                f"Bode plot of {name}: gain, phase and coherence, measured {where} and simulated",
-            )
-            for name, joint in joints.items()
-        },
-        "maps": picture(
-            figures.error_maps(result, drive_gains(gains)),
-            "Gain error over the grid of stiffness and damping for every joint",
-        )
-        if any(joint.grid_error.size for joint in joints.values())
-        else None,
-        "ranges": picture(
-            figures.ranges(gains, dict(group_members(gains))),
-            "Matched gains of the joints of each group and the ranges that training draws from",
-        )
-        if group_members(gains)
-        else None,
-        "zero": picture(
-            figures.zero_armature(zero[knees_first(zero)[0]]),
-            "Gain over frequency with and without rotor inertia in the simulator",
-        )
-        if zero
-        else None,
-        "amplitudes": picture(amplitudes, "Change of the matched gains with the amplitude")
-        if amplitudes is not None
-        else None,
-    }
-
-
-def _without_armature(result: MatchResult) -> list[dict[str, Any]]:
-    rows = []
-    for name, joint in result.joints.items():
-        if np.isfinite(joint.zero_armature_error_db):
-            said = [flag for flag in joint.flags if flag.startswith("zero armature: no match")]
-            rows.append(
-                {
-                    "joint": name,
-                    "zero_db": joint.zero_armature_error_db,
-                    "error_db": joint.error_db,
-                    "ratio": joint.zero_armature_error_db / max(joint.error_db, 1e-6),
-                    "no_match": bool(said),
-                }
-            )
-    return rows
-
-
-def part(
-    result: MatchResult,
-    folder: Path,
-    gains_name: str = "gains.yaml",
-    *,
-    anchor: str = "",
-    title: str | None = None,
-) -> Part:
-    """The match as a part of a page.
-
-    Args:
-        result: The match.
-        folder: Where `*.prediction.npz` are looked for.
-        gains_name: Name of the gains file, for the commands that the page shows.
-        anchor: What the anchors of the part begin with; one for each part of a page.
-        title: Of the part; names the robot if None.
+    Raises:
+        ArtefactError: An artefact is missing or damaged.
     """
-    members = group_members(result.gains)
-    html = fill(
-        "match.html.j2",
-        at=f"{anchor}-" if anchor else "",
-        gains=result.gains,
-        gains_name=gains_name,
-        joints=result.joints,
-        verdict=verdict(result),
-        excitations=_excitations(result),
-        members=members,
-        scales=_scales(result.gains, members),
-        drive=drive_gains(result.gains),
-        paper=published(result.gains.robot),
-        pictures=_pictures(result),
-        predictions=_predictions(folder),
-        in_time=not any(joint.grid_error.size for joint in result.joints.values()),
-        seconds=result.seconds,
-        steps_per_second=result.grid_steps_per_second,
-        zero=_without_armature(result),
-        delays=any(joint.delay_s > 0.0 for joint in result.gains.joints.values()),
-        amplitude_rows={n: j for n, j in result.joints.items() if len(j.amplitude_gains) > 1},
-    )
-    return Part(anchor=anchor, title=title or f"Match of {result.gains.robot}", html=html)
-
-
-def render(result: MatchResult, folder: Path, gains_name: str = "gains.yaml") -> str:
-    """The page of one match as text; the arguments are those of `part`."""
-    return page(
-        f"match of {result.gains.robot}",
-        [part(result, folder, gains_name)],
-        virtual=result.gains.virtual,
-        sub="Each joint's answer to a sweep, and the simulator gains that give the same answer.",
-        made_from=f"{gains_name} and match.npz",
-    )
+    gains_path = find_gains(path.parent)
+    result = load(path.parent, gains_path)
+    source = str(path.relative_to(root))
+    made = _part(result, path.parent, gains_path.name)
+    return replace(made, anchor=anchor, title=title, source=source)
 
 
 def write_page(out_dir: Path, *, gains: str | None = None) -> Path:
@@ -301,7 +139,362 @@ def write_page(out_dir: Path, *, gains: str | None = None) -> Path:
         ArtefactError: The folder has no gains or no `match.npz`, or one of them is damaged.
     """
     path = out_dir / gains if gains else find_gains(out_dir)
-    result = result_file.load(out_dir / "match.npz", gains_file.load(path))
+    result = load(out_dir, path)
     written = out_dir / PAGE_NAME
-    write_text(written, render(result, out_dir, path.name))
+    title = f"match of {result.gains.robot}"
+    write_text(written, page(title, [_part(result, out_dir, path.name)]))
     return written
+
+
+def _part(result: MatchResult, folder: Path, gains_name: str) -> Part:
+    gains, found = result.gains, verdict(result)
+    errors = (number(found[name], 2) for name in ("naive_error_db", "error_db"))
+    lines = [
+        "Gain error in the compared band, RMS over the joints: {} dB with the nominal gains of the "
+        "real drive, {} dB with the matched gains.".format(*errors)
+    ]
+    if found["worst"]:
+        worst = gains.joints[found["worst"]].error_db
+        lines.append(f"Largest error: {joint_words(found['worst'])}, {number(worst, 2)} dB.")
+    if gains.virtual:
+        lines.append(
+            "Every measured number on this page is of pronk's virtual robot, a simulated machine "
+            "that stands in for hardware. It says nothing about a real robot."
+        )
+    lines += [f"{joint_words(name)}: {'; '.join(flags)}." for name, flags in found["flags"].items()]
+    fits = {name: fit for name, fit in result.joints.items() if fit.responses}
+    return Part(
+        anchor="match",
+        title=f"Match of {gains.robot}",
+        source=f"{gains_name} and match.npz",
+        virtual=gains.virtual,
+        summary=f"{found['matched']} of {found['joints']} joints matched.",
+        lines=lines,
+        warning=found["matched"] < found["joints"] or bool(found["flags"]),
+        sections=[
+            _gains(result),
+            _bode(result, fits),
+            _maps(result),
+            _ranges(gains),
+            _without_armature(fits),
+            _amplitudes(fits),
+            _predictions(folder),
+            _identifiability(result),
+            _use(gains, gains_name),
+            _excitation(gains, fits),
+        ],
+        note="; ".join(f"{joint_words(stage)} {s:.1f} s" for stage, s in result.seconds.items()),
+        figures=found,
+    )
+
+
+def _in_time(result: MatchResult) -> bool:
+    """Whether several joints moved at once and were fitted in time, without a grid."""
+    return not any(fit.grid_error.size for fit in result.joints.values())
+
+
+def _gains(result: MatchResult) -> Section:
+    gains, paper, in_time = result.gains, published(result.gains.robot), _in_time(result)
+    delays = any(joint.delay_s > 0.0 for joint in gains.joints.values())
+    rows = []
+    for name, joint in gains.joints.items():
+        row = {
+            "joint": joint_words(name) + (" (flagged)" if joint.flags else ""),
+            "stiffness [N m/rad]": number(joint.stiffness, 2),
+            "95 %": interval(joint.stiffness_ci95, 2),
+            "damping [N m s/rad]": number(joint.damping),
+            "95 % ": interval(joint.damping_ci95),
+        }
+        if paper:
+            known = paper.joints.get(name)
+            row["paper, Table I"] = f"{known[0]} / {known[1]}" if known else "-"
+        if in_time:
+            row["friction [N m]"] = number(joint.frictionloss)
+        if delays:
+            row["delay [ms]"] = number(1000.0 * joint.delay_s, 1)
+        row |= {
+            "nominal error [dB]": number(joint.naive_error_db, 2),
+            "error [dB]": number(joint.error_db, 2),
+            "lowest coherence": number(joint.coherence_min),
+        }
+        rows.append(row)
+    unit = "blocks of the recordings" if in_time else "repeats"
+    lag = "the lag of the measured phase behind the matched simulation, command and measurement"
+    notes = [f"95 % intervals over {unit}, not samples."]
+    notes += [f"delay: {lag} together."] if delays and not in_time else []
+    if paper and gains.virtual:
+        notes.append(
+            "Table I was measured on the paper's robot; the virtual robot's hidden parameters were "
+            "set so that a match lands near it."
+        )
+    return Section("gains", "Matched gains", sheet(rows, notes=tuple(notes)))
+
+
+def _bode(result: MatchResult, fits: Mapping[str, JointFit]) -> Section | None:
+    if not fits:
+        return None
+    where = "the virtual robot" if result.gains.virtual else "the robot"
+    compared = (
+        "Several joints moved at once and were fitted in time."
+        if _in_time(result)
+        else "Only the gain at the tinted frequencies was compared."
+    )
+    pictures = [
+        picture(
+            figures.bode(fits[name]),
+            f"Bode plot of {name}: gain, phase and coherence, measured on {where} and simulated",
+        )
+        for name in figures.knees_first(list(fits))
+    ]
+    rest = pictures[1:]
+    return Section(
+        "bode",
+        "Bode plots",
+        f"From the held position command to the position of {where}. Numbers in the corners: gain "
+        f"error with nominal and with matched gains. {compared}",
+        picture(
+            figures.overview(fits),
+            f"Gain over frequency of every joint, measured on {where} and simulated",
+        ),
+        pictures[0],
+        Fold(f"Bode plots of the other {len(rest)} joints", *rest),
+    )
+
+
+def _maps(result: MatchResult) -> Section | None:
+    if _in_time(result):
+        return None
+    return Section(
+        "maps",
+        "Error maps",
+        "Error of the simulated gain at every pair of the grid. A long valley means that the data "
+        "determine a combination of stiffness and damping better than either alone.",
+        picture(
+            figures.error_maps(result, drive_gains(result.gains)),
+            "Gain error over the grid of stiffness and damping for every joint",
+        ),
+    )
+
+
+def _ranges(gains: MatchedGains) -> Section:
+    paper, members, rows = published(gains.robot), group_members(gains), []
+    for name, group in gains.groups.items():
+        row = {
+            "group": joint_words(name),
+            "stiffness [N m/rad]": f"{group.stiffness:.2f} ± {group.stiffness_range:.2f}",
+            "damping [N m s/rad]": f"{group.damping:.3f} ± {group.damping_range:.3f}",
+        }
+        if paper:
+            row["paper's training gains"] = _paper_range(paper, name)
+        rows.append(row | {"joints": ", ".join(map(joint_words, members.get(name, [])))})
+    drawn = {name: members[name] for name in gains.groups if name in members}
+    outside = (
+        "One cell of the paper's data lies outside its own range: the hip roll damping of FL, "
+        "0.516, outside 0.45 ± 0.05 (reading A13).",
+    )
+    return Section(
+        "ranges",
+        "Training ranges",
+        "The box covers the intervals of all joints of a group, in the paper's steps (0.5 N m/rad "
+        "and 0.05 N m s/rad); the smallest ellipse leaves out its corners, which no joint has.",
+        picture(
+            figures.ranges(gains, drawn),
+            "Matched gains of the joints of each group and the ranges that training draws from",
+        )
+        if drawn
+        else None,
+        sheet(rows, notes=outside if paper else ()),
+    )
+
+
+def _paper_range(paper: Published, group: str) -> str:
+    if group not in paper.training:
+        return "-"
+    stiffness, damping = paper.training[group]
+    return f"{stiffness} ± {paper.stiffness_range}, {damping} ± {paper.damping_range}"
+
+
+def _without_armature(fits: Mapping[str, JointFit]) -> Section | None:
+    drawn = [name for name, fit in fits.items() if fit.zero_armature is not None]
+    if not drawn:
+        return None
+    rows = [
+        {
+            "joint": joint_words(name),
+            "best error without rotor inertia [dB]": number(fit.zero_armature_error_db, 2),
+            "matched error [dB]": number(fit.error_db, 2),
+            "ratio": number(fit.zero_armature_error_db / max(fit.error_db, 1e-6), 1),
+            "without rotor inertia": "no match"
+            if any(flag.startswith(f"{ZERO_ARMATURE}no match") for flag in fit.flags)
+            else "not excluded",
+        }
+        for name, fit in fits.items()
+        if np.isfinite(fit.zero_armature_error_db)
+    ]
+    return Section(
+        "armature",
+        "Without rotor inertia",
+        "The same search with zero armature. Through the gear the rotor is much of the inertia of "
+        "a light link, and no gains make up for it; a heavy link hides it.",
+        picture(
+            figures.zero_armature(fits[figures.knees_first(drawn)[0]]),
+            "Gain over frequency with and without rotor inertia in the simulator",
+        ),
+        sheet(rows),
+    )
+
+
+def _amplitudes(fits: Mapping[str, JointFit]) -> Section | None:
+    rows = [
+        {
+            "joint": joint_words(name),
+            "amplitude [rad]": number(amplitude),
+            "stiffness [N m/rad]": number(stiffness, 2),
+            "damping [N m s/rad]": number(damping),
+            "change of stiffness [%]": number(100.0 * (stiffness / first[1] - 1.0), 1),
+            "change of damping [%]": number(100.0 * (damping / first[2] - 1.0), 1),
+        }
+        for name, fit in fits.items()
+        if len(fit.amplitude_gains) > 1
+        for first in [max(fit.amplitude_gains.tolist())]
+        for amplitude, stiffness, damping in sorted(fit.amplitude_gains.tolist(), reverse=True)
+    ]
+    if not rows:
+        return None
+    return Section(
+        "amplitudes",
+        "Amplitudes",
+        "Each amplitude matched by itself. Dry friction and backlash weigh more in small motions: "
+        "large changes mean that one pair of gains does not hold for all motions.",
+        Fold("Gains at each amplitude", sheet(rows)),
+    )
+
+
+def _predictions(folder: Path) -> Section | None:
+    content: list[Content | None] = []
+    for path in sorted(folder.glob("*.prediction.npz")):
+        found = prediction_file.load(path)
+        if not found.joints:
+            continue
+        by_joint = {one.joint: one for one in found.joints}
+        first = by_joint[figures.knees_first(list(by_joint))[0]]
+        where = "the virtual robot" if found.virtual else "the robot"
+        content += [
+            f"{found.source}, measured on {where}, was not used by the match.",
+            picture(
+                figures.prediction(first, virtual=found.virtual),
+                f"Position of {first.joint} over time: command, measured on {where}, simulated "
+                "with nominal and with matched gains",
+            ),
+            sheet(
+                {
+                    "joint": joint_words(one.joint),
+                    "unit": one.unit,
+                    "RMSE nominal": number(one.rmse_naive, 4),
+                    "nominal with the delay": number(one.rmse_naive_delayed, 4),
+                    "RMSE matched": number(one.rmse_matched, 4),
+                    "matched / nominal": number(
+                        one.rmse_matched / one.rmse_naive if one.rmse_naive > 0.0 else None, 2
+                    ),
+                    "R² nominal": number(one.r2_naive),
+                    "R² matched": number(one.r2_matched),
+                }
+                for one in found.joints
+            ),
+        ]
+    return Section("prediction", "Prediction of fresh logs", *content) if content else None
+
+
+def _identifiability(result: MatchResult) -> Section:
+    gains, rows = result.gains, []
+    if _in_time(result):
+        text = (
+            "All joints moved at once and were fitted in time. Parameters that these recordings do "
+            "not determine were held at their published values and are flagged. The inertia of the "
+            "links is the model's: stiffness, damping and inertia scaled by the same factor give "
+            "the same motion, except where gravity loads the joint."
+        )
+    else:
+        text = (
+            "The magnitude of a response determines stiffness over inertia and damping over "
+            "inertia. The gains on this page rest on the inertia of the simulator's model, which "
+            "was held fixed: if it is ten per cent too large, both gains come out ten per cent too "
+            "large, and no plot here would show it."
+        )
+        drive = drive_gains(gains)
+        for group, joints in group_members(gains).items():
+            known = [j for j in joints if drive.get(j) and min(drive[j]) > 0.0]
+            ratios = [
+                (gains.joints[j].stiffness / drive[j][0], gains.joints[j].damping / drive[j][1])
+                for j in known
+            ]
+            if ratios:
+                stiffness, damping = np.mean(ratios, axis=0)
+                rows.append(
+                    {
+                        "group": joint_words(group),
+                        "stiffness, matched / real drive": number(stiffness, 2),
+                        "damping, matched / real drive": number(damping, 2),
+                    }
+                )
+    note = (
+        "Either the simulated gains are to be scaled, or the simulated inertia is too large by "
+        "this ratio. In the air both give the same motion; on the ground they differ.",
+    )
+    return Section(
+        "identifiability",
+        "What cannot be identified",
+        text,
+        sheet(rows, notes=note),
+        "The same sweep in a second pose, with a known payload, with recorded torque or with other "
+        "gains on the drive separates stiffness, damping and inertia.",
+    )
+
+
+def _use(gains: MatchedGains, name: str) -> Section:
+    simulator = gains.simulator
+    return Section(
+        "use",
+        "Use the gains",
+        Markup(
+            "<p>They hold for <strong>{} {}</strong> alone: physics step {:g} ms, decimation {}, "
+            "integrator {}, actuator {}, with the armatures in <code>{}</code>. Match again for "
+            "another step or another actuator law.</p>"
+        ).format(
+            *(simulator.engine, simulator.version, 1000.0 * simulator.timestep_s),
+            *(simulator.decimation, simulator.integrator, simulator.actuator, name),
+        ),
+        Code(
+            f"pronk export {name} --to mjlab --out actuators.py\n"
+            f"pronk export {name} --to mjcf --out actuators.xml\n"
+            f"pronk export {name} --to isaaclab --out actuators.py  # match again in Isaac Lab\n"
+            f"pronk predict LOG --robot {gains.robot} --gains {name}"
+        ),
+    )
+
+
+def _excitation(gains: MatchedGains, fits: Mapping[str, JointFit]) -> Section:
+    rows = []
+    for name, fit in fits.items():
+        first = fit.responses[0]
+        band = first.band(*fit.band_hz)
+        rows.append(
+            {
+                "joint": joint_words(name),
+                "amplitudes [rad]": ", ".join(f"{r.amplitude:g}" for r in fit.responses),
+                "repeats": str(len(first.repeats)),
+                "compared [Hz]": f"{fit.band_hz[0]:g} to {fit.band_hz[1]:g}",
+                "lowest coherence": number(first.coherence[band].min() if band.any() else None),
+                "delay by phase [ms]": number(1000.0 * first.delay_s, 1),
+                "third harmonic [%]": number(100.0 * first.third_harmonic, 1),
+                "estimator": f"{first.estimator}, {first.window}",
+            }
+        )
+    hashes = ({"log": name, "SHA-256": sha} for name, sha in gains.logs.items())
+    return Section(
+        "excitation",
+        "Excitation",
+        f"Logs of {'the virtual robot' if gains.virtual else 'the robot'} ({gains.robot}).",
+        sheet(rows),
+        Fold("SHA-256 of the logs", sheet(hashes)),
+    )

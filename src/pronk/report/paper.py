@@ -1,14 +1,10 @@
-"""What the paper published about the joints (arXiv 2404.15096, Table I), to draw beside ours.
-
-Only the robot of the paper has such figures. They are shown and compared with, never fitted to.
-"""
+"""Joint gains that the paper published (arXiv 2404.15096, Table I), to compare with."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 _LEGS = ("FR", "FL", "HR", "HL")
-
 # Table I, columns FR, FL, HR, HL.
 _STIFFNESS = {
     "hip_roll": (20.6, 18.1, 18.5, 21.0),
@@ -20,27 +16,25 @@ _DAMPING = {
     "hip_pitch": (0.382, 0.406, 0.382, 0.431),
     "knee": (0.541, 0.523, 0.553, 0.553),
 }
-# Last column of Table I, and the randomization of the text (D3, D4).
+# Last column of Table I.
 _TRAINING = {"hip_roll": (20.0, 0.45), "hip_pitch": (17.5, 0.4), "knee": (21.5, 0.55)}
-_STIFFNESS_RANGE, _DAMPING_RANGE = 2.0, 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Published:
-    """Gains that the paper gives for one robot."""
+    """Gains that the paper gives for its robot: stiffness [N m/rad] and damping [N m s/rad]."""
 
     joints: dict[str, tuple[float, float]]
-    """Stiffness [N m/rad] and damping [N m s/rad] of each joint."""
     training: dict[str, tuple[float, float]]
-    """The same for each joint group, as used in training."""
-    stiffness_range: float
-    """Half-width of the randomization [N m/rad]."""
-    damping_range: float
-    """Half-width of the randomization [N m s/rad]."""
+    """Of each joint group, as used in training."""
+    stiffness_range: float = 2.0
+    """Half-width of the randomization [N m/rad] (D3)."""
+    damping_range: float = 0.05
+    """Half-width of the randomization [N m s/rad] (D4)."""
 
 
 def published(robot: str) -> Published | None:
-    """The paper's figures for `robot`, or None for a robot it does not treat."""
+    """Return the paper's gains of `robot`; None for another robot than the paper's."""
     if robot != "mini_cheetah":
         return None
     joints = {
@@ -48,9 +42,4 @@ def published(robot: str) -> Published | None:
         for i, leg in enumerate(_LEGS)
         for group in _STIFFNESS
     }
-    return Published(
-        joints=joints,
-        training=dict(_TRAINING),
-        stiffness_range=_STIFFNESS_RANGE,
-        damping_range=_DAMPING_RANGE,
-    )
+    return Published(joints=joints, training=dict(_TRAINING))

@@ -1,8 +1,7 @@
-"""One look for every figure: page width, light ground, colours that survive colour blindness.
+"""Look of every figure, and how figures are made and saved.
 
-Colours are those of Okabe and Ito (*Color Universal Design*, 2008): blue and vermillion stay apart
-under the common colour-vision deficiencies, and every curve also has its own dash, so the figures
-read in grey as well. Figures are built on `matplotlib.figure.Figure` directly: no display, no
+Colours are those of Okabe and Ito (*Color Universal Design*, 2008), which stay apart under the
+common colour-vision deficiencies. Figures are `matplotlib.figure.Figure` objects: no display, no
 global state.
 """
 
@@ -19,7 +18,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+from numpy.typing import NDArray
 
 from pronk.files import written_whole
 
@@ -33,20 +34,15 @@ PAPER = "#CC79A7"
 BAND = "#f3efe2"
 
 PAGE_WIDTH_IN = 10.0
-"""Every figure is as wide as the page: 10 in at 96 px/in is the 960 px column of the page."""
-
+"""10 in at 96 px/in is the 960 px column of the page."""
 LEG_MARKERS = {"FR": "o", "FL": "s", "HR": "^", "HL": "D"}
-"""Marker of each leg, in file order; other robots' joints take the first."""
+"""Marker of each leg, in file order; joints of other robots take the first."""
 
 NAIVE_LINE: dict[str, Any] = {"color": NAIVE, "linestyle": (0, (5, 2)), "linewidth": 1.5}
 MATCHED_LINE: dict[str, Any] = {"color": MATCHED, "linestyle": "-", "linewidth": 1.4}
 MEASURED_LINE: dict[str, Any] = {"color": MEASURED_WIDE, "linestyle": "-", "linewidth": 3.4}
-"""Wide and grey, so that a good match shows as a thin line inside it."""
-ZERO_LINE: dict[str, Any] = {
-    "color": ZERO_ARMATURE,
-    "linestyle": (0, (6, 2, 1, 2)),
-    "linewidth": 1.6,
-}
+"""Wide and grey: a good match shows as a thin line inside it."""
+ZERO_LINE: dict[str, Any] = {"color": ZERO_ARMATURE, "linestyle": (0, (6, 2, 1, 2))}
 
 _RC = {
     "font.family": "DejaVu Sans",
@@ -64,20 +60,11 @@ _RC = {
     "grid.linewidth": 0.7,
     "legend.frameon": False,
     "legend.fontsize": 9.0,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
     # The same figure gives the same bytes.
     "svg.hashsalt": "pronk",
     "svg.fonttype": "path",
     "image.composite_image": False,
 }
-
-
-@contextmanager
-def styled() -> Iterator[None]:
-    """Draw with pronk's look inside the block, leaving matplotlib's settings as they were."""
-    with mpl.rc_context(_RC):  # type: ignore[arg-type]
-        yield
 
 
 def decibel(gain: Any) -> Any:
@@ -86,69 +73,63 @@ def decibel(gain: Any) -> Any:
 
 
 def joint_words(name: str) -> str:
-    """A joint's name for a title: `FR_hip_roll` becomes `FR hip roll`."""
+    """Return a joint's name for a title: `FR_hip_roll` becomes `FR hip roll`."""
     return name.replace("_", " ")
 
 
 def leg_of(name: str) -> str:
-    """The leg part of `LEG_JOINT`, or an empty string for a robot without legs."""
+    """Return the leg of `LEG_JOINT`; an empty string for a robot without legs."""
     head = name.split("_", 1)[0]
     return head if head in LEG_MARKERS else ""
 
 
-def frequency_axis(axes: Axes, low_hz: float, high_hz: float) -> None:
-    """Logarithmic frequency axis with plain numbers at 0.1, 0.2, 0.5, 1, ... Hz."""
-    axes.set_xscale("log")
-    axes.set_xlim(low_hz, high_hz)
-    ticks = [
-        base * 10.0**power
-        for power in range(-3, 4)
-        for base in (1, 2, 5)
-        if low_hz * 0.999 <= base * 10.0**power <= high_hz * 1.001
-    ]
-    axes.xaxis.set_major_locator(FixedLocator(ticks))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+@contextmanager
+def drawing(
+    rows: int = 1, columns: int = 1, *, height: float, **options: Any
+) -> Iterator[tuple[Figure, NDArray[Any]]]:
+    """Make a figure of page width with a grid of axes, and draw in it with pronk's look.
+
+    Args:
+        rows: Of axes.
+        columns: Of axes.
+        height: Of the figure [in].
+        options: Of `Figure.subplots`.
+    """
+    with mpl.rc_context(_RC):  # type: ignore[arg-type]
+        figure = Figure(figsize=(PAGE_WIDTH_IN, height), layout="constrained")
+        yield figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def svg(figure: Figure) -> bytes:
-    """The figure as SVG bytes, without a date in it."""
-    buffer = io.BytesIO()
-    with styled():
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
-
-
-def data_uri(figure: Figure) -> str:
-    """The figure as a `data:` address for the `src` of an image."""
-    return "data:image/svg+xml;base64," + base64.b64encode(svg(figure)).decode("ascii")
-
-
-def png(figure: Figure, dpi: float = 130.0) -> bytes:
-    """The figure as PNG bytes, for figures whose SVG would be large."""
-    buffer = io.BytesIO()
-    with styled():
-        figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
-    return buffer.getvalue()
-
-
-def png_uri(figure: Figure) -> str:
-    """The figure as a `data:` address of a PNG image."""
-    return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as SVG or PNG, by the suffix of `path`, whole or not at all."""
-    with styled(), written_whole(path) as aside:
-        if path.suffix == ".svg":
-            aside.write_bytes(svg(figure))
-        else:
-            figure.savefig(aside, format=path.suffix.lstrip("."), dpi=150)
-    return path
+@contextmanager
+def joint_panels(
+    names: Sequence[str],
+    *,
+    height: float,
+    x_label: str,
+    y_label: str,
+    sharey: bool | Literal["row"] = True,
+) -> Iterator[tuple[Figure, dict[str, Axes]]]:
+    """Make a figure with one titled panel per joint, `height` inches a row."""
+    rows = grid_of_joints(names)
+    width = max(map(len, rows))
+    size = height * len(rows) + 0.7
+    with drawing(len(rows), width, height=size, sharex=True, sharey=sharey) as (figure, grid):
+        panels = {name: grid[r, c] for r, row in enumerate(rows) for c, name in enumerate(row)}
+        for row in rows:
+            panels[row[0]].set_ylabel(y_label)
+        for c in range(width):
+            lowest = panels[[row[c] for row in rows if c < len(row)][-1]]
+            lowest.set_xlabel(x_label)
+            lowest.tick_params(labelbottom=True)
+        for axes in set(grid.flat) - set(panels.values()):
+            axes.set_visible(False)
+        for name, axes in panels.items():
+            axes.set_title(joint_words(name))
+        yield figure, panels
 
 
 def grid_of_joints(names: Sequence[str]) -> list[list[str]]:
-    """Joint names in rows: one row per joint group where they are equally long, else threes."""
+    """Return joint names in rows: one row per joint group if equally long, else threes."""
     groups: dict[str, list[str]] = {}
     for name in names:
         leg = leg_of(name)
@@ -159,30 +140,47 @@ def grid_of_joints(names: Sequence[str]) -> list[list[str]]:
     return [list(names[i : i + 3]) for i in range(0, len(names), 3)]
 
 
-def small_multiples(
-    rows: list[list[str]], *, height: float, sharey: bool | Literal["row"] = True
-) -> tuple[Figure, dict[str, Axes]]:
-    """A figure with one panel per name; call inside `styled`.
-
-    Args:
-        rows: Names by row; short rows leave their last places empty.
-        height: Height of a row [in].
-        sharey: Panels share the vertical axis, all of them or those of a row.
-    """
-    width = max(len(row) for row in rows)
-    figure = Figure(figsize=(PAGE_WIDTH_IN, height * len(rows) + 0.7), layout="constrained")
-    grid = figure.subplots(len(rows), width, sharex=True, sharey=sharey, squeeze=False)
-    panels = {}
-    for r, row in enumerate(rows):
-        for c in range(width):
-            if c < len(row):
-                panels[row[c]] = grid[r, c]
-            else:
-                grid[r, c].set_visible(False)
-    return figure, panels
+def key(label: str, **look: Any) -> Line2D:
+    """Return an entry of a legend."""
+    return Line2D([], [], label=label, **look)
 
 
-def bottom_row(rows: list[list[str]]) -> list[str]:
-    """The lowest name of each column, where the labels of the horizontal axis go."""
-    width = max(len(row) for row in rows)
-    return [[row[c] for row in rows if c < len(row)][-1] for c in range(width)]
+def legend(figure: Figure, keys: Sequence[Any], columns: int | None = None, **look: Any) -> None:
+    """Put a legend below all axes of a figure."""
+    figure.legend(
+        handles=keys, loc="outside lower center", ncols=columns or min(len(keys), 6), **look
+    )
+
+
+def frequency_axis(axes: Axes, low_hz: float, high_hz: float) -> None:
+    """Set a logarithmic frequency axis with plain numbers; 1, 2, 5 a decade where they fit."""
+    bases = (1, 2, 5) if high_hz < 1000.0 * low_hz else (1,)
+    ticks = [base * 10.0**power for power in range(-3, 4) for base in bases]
+    axes.set_xscale("log")
+    axes.set_xlim(low_hz, high_hz)
+    inside = [hz for hz in ticks if low_hz * 0.999 <= hz <= high_hz * 1.001]
+    axes.xaxis.set_major_locator(FixedLocator(inside))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def render(figure: Figure, kind: str = "svg", *, dpi: float = 130.0) -> bytes:
+    """Return the figure as an `svg` or `png` file, without a date in it."""
+    buffer = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else {"Software": None}
+    with mpl.rc_context(_RC):  # type: ignore[arg-type]
+        figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata)
+    return buffer.getvalue()
+
+
+def data_uri(data: bytes, kind: str) -> str:
+    """Return an image file as a `data:` address; `kind` is `svg`, `png` or `gif`."""
+    mime = {"svg": "svg+xml"}.get(kind, kind)
+    return f"data:image/{mime};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as SVG or PNG, by the suffix of `path`, whole or not at all."""
+    with written_whole(path) as aside:
+        aside.write_bytes(render(figure, path.suffix.lstrip("."), dpi=150))
+    return path

@@ -1,277 +1,143 @@
-"""Figures of trials, from arrays: cells beside the paper, traces, sweeps, ratios."""
+"""Figures of trials: jumps beside the paper's, traces over time, lines over a varied parameter."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from pronk.actuator.model import torque_limits
 from pronk.report import style
+from pronk.report.style import drawing, key, legend
 from pronk.robots.robot import Robot
 
-PAPER_WORDS = "paper, hardware"
-"""What the paper's figures are called beside ours."""
+Array = NDArray[np.float64]
+Values = Mapping[str, Mapping[str, Array]]
+"""By policy, then by command: one number a jump."""
+Published = Mapping[str, Mapping[str, tuple[float, float]]]
+"""By policy, then by command: mean and standard deviation that the paper gives."""
+Traces = Mapping[str, Mapping[str, Sequence[Array]]]
+"""By policy, then by command: runs as time [s] and value, each (2, T)."""
+
 _NAMED = {"naive": (style.NAIVE, "D"), "matched": (style.MATCHED, "o")}
 _OTHERS = (("#009E73", "s"), ("#56B4E9", "^"), ("#E69F00", "v"), ("#7a5195", "P"))
+_DASH: dict[str, Any] = {"color": "#666666", "linewidth": 0.9, "linestyle": (0, (2, 2))}
+_PAPER: dict[str, Any] = {"linestyle": "none", "markersize": 6.5, "markerfacecolor": "white"}
+_PAPER |= {"markeredgecolor": style.PAPER, "markeredgewidth": 1.4}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """Colour and mark of one policy."""
-
-    name: str
-    colour: str
-    marker: str
-
-    @property
-    def marks(self) -> dict[str, Any]:
-        """For single jumps: filled, without an edge, so that many may overlap."""
-        return {
-            "linestyle": "none",
-            "marker": self.marker,
-            "markersize": 4.5,
-            "color": self.colour,
-            "alpha": 0.45,
-            "markeredgewidth": 0.0,
-        }
-
-    def key(self, words: str | None = None) -> Line2D:
-        """Its entry in a legend."""
-        return Line2D(
-            [],
-            [],
-            linestyle="none",
-            marker=self.marker,
-            color=self.colour,
-            markersize=6.0,
-            label=words or f"{self.name}, virtual robot",
-        )
-
-
-def looks(policies: Sequence[str]) -> dict[str, Look]:
-    """A look for each policy: `naive` and `matched` always the same, others by their place.
+def looks(policies: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return colour and marker of each policy: fixed for `naive` and `matched`, else by place.
 
     Args:
-        policies: Their names; what follows a comma (`naive, body 1`) does not change the look.
+        policies: Names; what follows a comma (`naive, body 1`) does not change the look.
     """
     found, spare = {}, iter(_OTHERS * (1 + len(policies) // len(_OTHERS)))
     for name in policies:
         base = name.split(",")[0]
         colour, marker = _NAMED[base] if base in _NAMED else next(spare)
-        found[name] = Look(name=name, colour=colour, marker=marker)
+        found[name] = {"color": colour, "marker": marker}
     return found
 
 
-def offsets(count: int, width: float = 0.5) -> list[float]:
-    """Places of `count` things beside each other about zero, `width` from first to last."""
-    if count == 1:
-        return [0.0]
-    return [width * (i / (count - 1) - 0.5) for i in range(count)]
+def _keys(policies: Sequence[str], *, marks: bool = True) -> list[Line2D]:
+    named = {name.split(",")[0]: look for name, look in looks(policies).items()}
+    line = {"linestyle": "none"} if marks else {}
+    return [key(f"{name}, virtual robot", **look, **line) for name, look in named.items()]
 
 
-def paper_key(*, policies: Sequence[str]) -> list[Line2D]:
-    """Entries of a legend for the paper's marks of these of its two policies."""
-    return [
-        Line2D(
-            [],
-            [],
-            linestyle="none",
-            marker=_NAMED[name][1],
-            markerfacecolor="white",
-            markeredgecolor=style.PAPER,
-            markeredgewidth=1.4,
-            markersize=6.5,
-            label=f"{PAPER_WORDS}, {name}",
-        )
-        for name in policies
-    ]
+def offsets(count: int, width: float) -> Array:
+    """Return places of `count` things about zero, `width` from first to last."""
+    return np.linspace(-0.5, 0.5, count) * width if count > 1 else np.zeros(1)
 
 
-def paper_mark(
-    axes: Axes,
-    x: float,
-    y: float,
-    *,
-    policy: str,
-    xerr: float | None = None,
-    yerr: float | None = None,
-) -> None:
-    """Mean and standard deviation as the paper has them: an open mark of its own colour."""
-    axes.errorbar(
-        x,
-        y,
-        xerr=xerr,
-        yerr=yerr,
-        marker=_NAMED[policy][1],
-        markersize=6.5,
-        markerfacecolor="white",
-        markeredgecolor=style.PAPER,
-        markeredgewidth=1.4,
-        ecolor=style.PAPER,
-        elinewidth=1.4,
-        capsize=3.0,
-        linestyle="none",
-        zorder=3,
-    )
-
-
-Array = NDArray[np.float64]
-Values = Mapping[str, Mapping[str, Array]]
-"""By policy, then by command: one number a jump; NaN where there was none."""
-Published = Mapping[str, Mapping[str, tuple[float, float]]]
-"""By policy, then by command: mean and standard deviation that the paper gives."""
-
-
-def finite(values: Array) -> Array:
-    """Those that are numbers."""
-    kept: Array = np.asarray(values, dtype=float)[np.isfinite(values)]
-    return kept
-
-
-def spread(values: Array) -> float:
-    """Standard deviation of a sample, of those that are numbers; NaN for fewer than two."""
-    kept = finite(values)
+def std(values: Array) -> float:
+    """Return the standard deviation of a sample; NaN for fewer than two finite values."""
+    kept = values[np.isfinite(values)]
     return float(np.std(kept, ddof=1)) if len(kept) > 1 else float("nan")
 
 
-def commands_of(values: Values) -> list[str]:
-    """Commands in the order in which they first appear."""
+def commands_of(values: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the commands in the order in which they first appear."""
     return list(dict.fromkeys(name for cases in values.values() for name in cases))
 
 
-def _column(axes: Axes, x: float, values: Array, look: Look) -> None:
-    """Jumps of one cell, a little apart from each other, and their mean and spread."""
-    kept = finite(values)
-    if not len(kept):
-        return
-    axes.plot(x + np.linspace(-0.05, 0.03, len(kept)), kept, **look.marks)
-    axes.errorbar(
-        x + 0.06,
-        kept.mean(),
-        yerr=spread(kept) if len(kept) > 1 else None,
-        marker=look.marker,
-        markersize=6.0,
-        color=look.colour,
-        elinewidth=1.8,
-        capsize=3.5,
-        markeredgecolor="white",
-        markeredgewidth=0.7,
-        linestyle="none",
-        zorder=4,
-    )
-
-
-def _panel(axes: Axes, values: Values, published: Published, label: str) -> None:
-    commands, drawn = commands_of(values), looks(list(values))
-    shown = [name for name in drawn if name in published]
-    places = offsets(len(drawn) + len(shown), 0.62)
-    for i, command in enumerate(commands):
-        slot = iter(places)
-        for name, look in drawn.items():
-            if name in shown:
-                at = i + next(slot)
-                if command in published[name]:
-                    mean, std = published[name][command]
-                    paper_mark(axes, at, mean, policy=name, yerr=std)
-            _column(axes, i + next(slot), values[name].get(command, np.empty(0)), look)
-    axes.set_xticks(range(len(commands)), commands)
-    axes.set_xlim(-0.55, len(commands) - 0.45)
-    axes.grid(visible=False, axis="x")
-    axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.04 * axes.get_ylim()[1])
-    axes.set_ylabel(label)
-
-
-def _keys(policies: Sequence[str], published: Sequence[Published]) -> list[Line2D]:
-    shown = [name for name in policies if any(name in one for one in published)]
-    return [*(look.key() for look in looks(policies).values()), *paper_key(policies=shown)]
-
-
 def cells(panels: Sequence[tuple[str, Values, Published]]) -> Figure:
-    """Every jump, with mean and standard deviation, beside the paper's.
+    """Draw every jump with mean and standard deviation, beside the paper's.
 
     Args:
         panels: One below the other: label of the vertical axis with its unit, ours, the paper's.
     """
-    with style.styled():
-        height = 2.9 if len(panels) < 3 else 2.1
-        drawn = Figure(
-            figsize=(style.PAGE_WIDTH_IN, height * len(panels) + 0.5), layout="constrained"
-        )
-        grid = drawn.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, (label, values, published) in zip(grid, panels, strict=True):
-            _panel(axes, values, published, label)
+    height = 2.9 if len(panels) < 3 else 2.1
+    size = height * len(panels) + 0.5
+    with drawing(len(panels), height=size, sharex=True) as (figure, grid):
+        for axes, (label, values, published) in zip(grid[:, 0], panels, strict=True):
+            _cells_panel(axes, values, published)
+            axes.set_ylabel(label)
         policies = list(panels[0][1])
-        keys = _keys(policies, [published for _, _, published in panels])
-        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys))
-    return drawn
+        paper = [name for name in policies if any(name in given for _, _, given in panels)]
+        keys = [key(f"paper, hardware, {n}", marker=_NAMED[n][1], **_PAPER) for n in paper]
+        legend(figure, [*_keys(policies), *keys])
+    return figure
 
 
-def scatter(
-    heights: Values, distances: Values, paper_heights: Published, paper_distances: Published
-) -> Figure:
-    """Height over distance of every jump, one panel a command, the paper's means with crosses.
+def _cells_panel(axes: Axes, values: Values, published: Published) -> None:
+    commands, policies = commands_of(values), looks(list(values))
+    places = offsets(len(policies) + sum(name in published for name in policies), 0.62)
+    for i, command in enumerate(commands):
+        slot = iter(i + places)
+        for name, look in policies.items():
+            if name in published:
+                x = next(slot)
+                if command in published[name]:
+                    mean, spread = published[name][command]
+                    bar: dict[str, Any] = {"ecolor": style.PAPER, "capsize": 3.0, "zorder": 3}
+                    axes.errorbar(x, mean, yerr=spread, marker=look["marker"], **_PAPER, **bar)
+            x = next(slot)
+            known = np.asarray(values[name].get(command, ()), dtype=float)
+            known = known[np.isfinite(known)]
+            if len(known):
+                many: dict[str, Any] = {"linestyle": "none", "alpha": 0.45, "markersize": 4.5}
+                axes.plot(x + np.linspace(-0.05, 0.03, len(known)), known, **look, **many)
+                bar = {"capsize": 3.5, "markeredgecolor": "white", "zorder": 4}
+                spread = std(known) if len(known) > 1 else 0.0
+                axes.errorbar(x + 0.06, known.mean(), yerr=spread, **look, **bar)
+    axes.set_xticks(range(len(commands)), commands)
+    axes.set_xlim(-0.55, len(commands) - 0.45)
+    axes.grid(visible=False, axis="x")
+    axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.04 * axes.get_ylim()[1])
+
+
+def scatter_over_error(errors_db: Mapping[str, float], panels: Mapping[str, Values]) -> Figure:
+    """Draw the scatter of each command's jumps over the error of the policy's training gains.
 
     Args:
-        heights: [m]
-        distances: [m]
-        paper_heights: [m]
-        paper_distances: [m]
+        errors_db: By policy, RMS over the joints' bands [dB].
+        panels: By what scatters, with its unit as in `height [m]`.
     """
-    commands, drawn_as = commands_of(heights), looks(list(heights))
-    width = min(3, max(1, len(commands)))
-    rows = -(-len(commands) // width)
-    with style.styled():
-        drawn = Figure(figsize=(style.PAGE_WIDTH_IN, 2.75 * rows + 0.5), layout="constrained")
-        grid = drawn.subplots(rows, width, sharex=True, sharey=True, squeeze=False)
-        for axes, command in zip(grid.flat, commands, strict=False):
-            for name, look in drawn_as.items():
-                x = distances.get(name, {}).get(command, np.empty(0))
-                y = heights[name].get(command, np.empty(0))
-                axes.plot(x, y, **look.marks)
-                far, high = (
-                    paper.get(name, {}).get(command) for paper in (paper_distances, paper_heights)
-                )
-                if far and high:
-                    paper_mark(axes, far[0], high[0], policy=name, xerr=far[1], yerr=high[1])
-            axes.set_title(command)
-        for axes in grid[:, 0]:
-            axes.set_ylabel("height [m]")
-        for column in range(width):
-            used = [row for row in range(rows) if row * width + column < len(commands)]
-            grid[used[-1], column].set_xlabel("distance [m]")
-            grid[used[-1], column].tick_params(labelbottom=True)
-        for axes in list(grid.flat)[len(commands) :]:
-            axes.set_visible(False)
-        keys = _keys(list(heights), [paper_heights])
-        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys))
-    return drawn
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """A result over something that was varied. Arrays of the same length, (n,)."""
-
-    x: Array
-    """What was varied, in its unit."""
-    y: Array
-    """The result: a mean or a share."""
-    low: Array
-    """Lower end of its bar; NaN for none."""
-    high: Array
-    """Upper end of its bar; NaN for none."""
-
-    def sorted(self) -> Line:
-        """The same from the smallest `x` to the largest."""
-        order = np.argsort(self.x, kind="stable")
-        return Line(x=self.x[order], y=self.y[order], low=self.low[order], high=self.high[order])
+    policies = looks(list(errors_db))
+    with drawing(1, len(panels), height=3.4) as (figure, grid):
+        for axes, (label, values) in zip(grid[0], panels.items(), strict=True):
+            for name, look in policies.items():
+                stds = np.array([std(one) for one in values.get(name, {}).values()])
+                at = np.full(len(stds), errors_db[name])
+                axes.plot(at, stds, linestyle="none", alpha=0.7, **look)
+                if np.isfinite(stds).any():
+                    bar = {"markersize": 22.0, "markeredgewidth": 2.6, "color": look["color"]}
+                    axes.plot(errors_db[name], np.nanmean(stds), marker="_", **bar)
+            axes.set_xlim(0.0, 1.1 * max(errors_db.values()))
+            axes.set_ylim(0.0, 1.12 * axes.get_ylim()[1])
+            axes.set_xlabel("error of the training gains on the sweep [dB RMS]")
+            axes.set_ylabel(f"standard deviation of the {label}")
+        mean = key("mean over the commands", color="#444444", linewidth=2.6)
+        legend(figure, [*_keys(list(errors_db)), mean])
+    return figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,400 +147,125 @@ class Panel:
     title: str
     x_label: str
     y_label: str
-    lines: Mapping[str, Line]
-    """By policy."""
+    lines: Mapping[str, Array]
+    """By policy: rows of x, the result, and the ends of its error bar, (4, n)."""
     marks: tuple[float, ...] = ()
-    """Places along x that are marked: what the robot has of itself, or what the paper reached."""
+    """Places along x that are marked."""
     share: bool = False
     """The result is a share, 0 to 1."""
 
 
-def _draw_lines(axes: Axes, panel: Panel, drawn_as: Mapping[str, Look]) -> None:
-    width = np.ptp(np.concatenate([line.x for line in panel.lines.values()] or [np.zeros(1)]))
-    for shift, (name, line) in zip(
-        offsets(len(panel.lines), 0.012), panel.lines.items(), strict=True
-    ):
-        look, points = drawn_as[name], line.sorted()
-        x = points.x + shift * width
-        axes.plot(
-            x,
-            points.y,
-            color=look.colour,
-            marker=look.marker,
-            markersize=5.0,
-            linewidth=1.4,
-            linestyle="-" if name != "naive" else (0, (5, 2)),
-            zorder=3,
-        )
-        shown = np.isfinite(points.low) & np.isfinite(points.high)
-        axes.vlines(
-            x[shown], points.low[shown], points.high[shown], color=look.colour, linewidth=1.0
-        )
-    for mark in panel.marks:
-        axes.axvline(mark, color="#888888", linewidth=0.9, linestyle=(0, (2, 2)), zorder=1)
-    axes.set_title(panel.title)
-    axes.set_xlabel(panel.x_label)
-    axes.set_ylabel(panel.y_label)
-    if panel.share:
-        axes.set_ylim(-0.04, 1.04)
-
-
-def lines(
-    panels: Sequence[Panel],
-    *,
-    across: int,
-    mark: str = "",
-    bar: str = "",
-    sharex: Literal["none", "row"] = "none",
-) -> Figure:
-    """Panels of lines.
+def lines(panels: Sequence[Panel], *, columns: int, mark: str, bar: str) -> Figure:
+    """Draw panels of lines, row by row.
 
     Args:
-        panels: Row by row.
-        across: Panels in a row.
-        mark: What the dotted lines are.
-        bar: What the bars are.
-        sharex: Panels of a row vary the same thing.
+        panels: In rows.
+        columns: Panels in a row.
+        mark: Meaning of the marked places.
+        bar: Meaning of the error bars.
     """
-    names = list(dict.fromkeys(name for panel in panels for name in panel.lines))
-    drawn_as = looks(names)
-    rows = -(-len(panels) // across)
-    with style.styled():
-        drawn = Figure(figsize=(style.PAGE_WIDTH_IN, 2.35 * rows + 0.5), layout="constrained")
-        grid = drawn.subplots(rows, across, sharex=sharex, squeeze=False)
-        for axes, panel in zip(grid.flat, panels, strict=False):
-            _draw_lines(axes, panel, drawn_as)
-        for axes in list(grid.flat)[len(panels) :]:
-            axes.set_visible(False)
-        keys = [
-            Line2D([], [], color=look.colour, marker=look.marker, label=f"{name}, virtual robot")
-            for name, look in drawn_as.items()
-        ]
-        if mark:
-            keys.append(Line2D([], [], color="#888888", linestyle=(0, (2, 2)), label=mark))
-        if bar:
-            keys.append(
-                Line2D([], [], color="#444444", marker="|", markersize=9, linestyle="", label=bar)
-            )
-        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys))
-    return drawn
-
-
-def _name_ends(axes: Axes, x: float, ends: Sequence[tuple[float, str]]) -> None:
-    """Write what each line is at its right end, no word over another."""
-    margin = 0.06 * axes.get_ylim()[1]
-    y = -margin
-    for end, words in sorted(ends):
-        y = max(end, y + margin)
-        axes.annotate(
-            words,
-            (x, y),
-            textcoords="offset points",
-            xytext=(22, 0),
-            va="center",
-            annotation_clip=False,
-            fontsize=7.5,
-            color="#555555",
-        )
-
-
-def argument(
-    bode_error_db: Mapping[str, float], panels: Mapping[str, Values], *, named: bool = True
-) -> Figure:
-    """The paper's argument: the error of each policy's training gains beside its jumps' scatter.
-
-    Args:
-        bode_error_db: By policy, how far its training gains are from the sweep, RMS over the
-            joints' bands [dB].
-        panels: By what scatters, with its unit as in `height [m]`: one number a jump.
-        named: Write the commands' names, and join the marks of a command.
-    """
-    drawn_as = looks(list(bode_error_db))
-    with style.styled():
-        drawn = Figure(figsize=(style.PAGE_WIDTH_IN, 3.4), layout="constrained")
-        grid = drawn.subplots(1, len(panels), squeeze=False)[0]
-        for axes, (label, values) in zip(grid, panels.items(), strict=True):
-            ends: list[tuple[float, str]] = []
-            for command in commands_of(values):
-                points = [
-                    (bode_error_db[name], spread(values[name][command]))
-                    for name in drawn_as
-                    if command in values.get(name, {})
-                ]
-                points = sorted(point for point in points if np.isfinite(point[1]))
-                if points and named:
-                    axes.plot(*zip(*points, strict=True), color="#b0b0b0", linewidth=0.8)
-                    ends.append((points[-1][1], command))
-            for name, look in drawn_as.items():
-                stds = finite(np.array([spread(v) for v in values.get(name, {}).values()]))
-                at = np.full(len(stds), bode_error_db[name])
-                axes.plot(at, stds, **look.marks | {"alpha": 0.8, "zorder": 3})
-                if len(stds):
-                    axes.plot(
-                        bode_error_db[name],
-                        stds.mean(),
-                        marker="_",
-                        markersize=22.0,
-                        markeredgewidth=2.6,
-                        color=look.colour,
-                        zorder=4,
-                    )
-            axes.set_xlim(0.0, 1.3 * max(bode_error_db.values()))
-            axes.set_ylim(0.0, 1.12 * axes.get_ylim()[1])
-            _name_ends(axes, max(bode_error_db.values()), ends)
-            axes.set_xlabel("error of the training gains on the sweep [dB RMS]")
-            axes.set_ylabel(f"standard deviation of the {label}")
-        keys = list(
-            {
-                look.colour: look.key(f"{name.split(',')[0]}, virtual robot")
-                for name, look in drawn_as.items()
-            }.values()
-        )
-        keys.append(Line2D([], [], color="#444444", linewidth=2.6, label="mean over the commands"))
-        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys))
-    return drawn
-
-
-_TICKS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ratio:
-    """Standard deviation of one policy over that of another, with its interval."""
-
-    words: str
-    value: float
-    interval: tuple[float, float]
-    """95 %, from resampled jumps."""
-    paper: float | None = None
-    """What the paper's printed table gives."""
-    overall: bool = False
-    """Over all commands: drawn more strongly than one command."""
-
-
-def _draw_ratios(axes: Axes, ratios: Sequence[Ratio], title: str) -> None:
-    for i, ratio in enumerate(ratios):
-        y = len(ratios) - 1 - i
-        weight = 2.6 if ratio.overall else 1.4
-        # An interval may begin at nothing, which has no place on this axis, or have no end.
-        ends = np.clip(ratio.interval, 1e-3, 1e3)
-        axes.plot(ends, (y, y), color=style.MATCHED, linewidth=weight, zorder=3)
-        axes.plot(
-            ratio.value,
-            y,
-            marker="o",
-            markersize=7.5 if ratio.overall else 5.0,
-            color=style.MATCHED,
-            zorder=4,
-        )
-        if ratio.paper is not None:
-            axes.plot(
-                ratio.paper,
-                y,
-                marker="D",
-                markersize=6.5,
-                markerfacecolor="white",
-                markeredgecolor=style.PAPER,
-                markeredgewidth=1.4,
-                linestyle="none",
-                zorder=5,
-            )
-    axes.axvline(1.0, color="#666666", linewidth=1.0, zorder=1)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(FixedLocator(_TICKS))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_yticks(range(len(ratios)), [ratio.words for ratio in reversed(ratios)])
-    axes.set_ylim(-0.6, len(ratios) - 0.4)
-    axes.grid(visible=False, axis="y")
-    axes.set_title(title)
-
-
-def ratios(panels: Sequence[tuple[str, Sequence[Ratio]]], *, over: tuple[str, str]) -> Figure:
-    """Ratios with their intervals beside the paper's, on a logarithmic axis.
-
-    Args:
-        panels: Beside each other: what is compared, and its ratios from top to bottom.
-        over: The two policies; a ratio above one says that the first scatters more.
-    """
-    rows = max(len(found) for _, found in panels)
-    ends = [v for _, found in panels for r in found for v in (*r.interval, r.value, r.paper or 1.0)]
-    inside = [v for v in ends if _TICKS[0] <= v <= _TICKS[-1]]
-    low, high = min([*inside, 0.8]) / 1.2, max([*inside, 1.25]) * 1.2
-    with style.styled():
-        drawn = Figure(figsize=(style.PAGE_WIDTH_IN, 0.36 * rows + 1.6), layout="constrained")
-        grid = drawn.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
-        for axes, (title, found) in zip(grid, panels, strict=True):
-            _draw_ratios(axes, found, title)
-            axes.set_xlabel(f"standard deviation, {over[0]} over {over[1]} [1]")
-            axes.set_xlim(low, high)
-        keys = [
-            Line2D(
-                [], [], color=style.MATCHED, marker="o", label="virtual robot, 95 % of resamples"
-            ),
-            Line2D(
-                [],
-                [],
-                linestyle="none",
-                marker="D",
-                markerfacecolor="white",
-                markeredgecolor=style.PAPER,
-                markeredgewidth=1.4,
-                label=f"{PAPER_WORDS}",
-            ),
-        ]
-        drawn.legend(handles=keys, loc="outside lower center", ncols=2)
-    return drawn
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trace:
-    """One quantity of one run over time."""
-
-    time: Array
-    """[s]. (T,)"""
-    value: Array
-    """(T,)"""
-
-
-Traces = Mapping[str, Mapping[str, Sequence[Trace]]]
-"""By policy, then by command: the runs."""
-
-
-def _grid(
-    names: Sequence[str], columns: Sequence[str], height: float
-) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """A panel for each pair of row and column; call inside `styled`."""
-    drawn = Figure(figsize=(style.PAGE_WIDTH_IN, height * len(names) + 0.6), layout="constrained")
-    grid = drawn.subplots(len(names), len(columns), sharex=True, sharey="row", squeeze=False)
-    return drawn, {
-        (row, column): grid[i, j] for i, row in enumerate(names) for j, column in enumerate(columns)
-    }
+    policies = list(dict.fromkeys(name for panel in panels for name in panel.lines))
+    rows = -(-len(panels) // columns)
+    with drawing(rows, columns, height=2.35 * rows + 0.5) as (figure, grid):
+        for axes, panel in zip(grid.flat, panels, strict=True):
+            width = max((float(np.ptp(line[0])) for line in panel.lines.values()), default=0.0)
+            shifts = width * offsets(len(panel.lines), 0.012)
+            for shift, (name, line) in zip(shifts, panel.lines.items(), strict=False):
+                x, y, low, high = line[:, np.argsort(line[0], kind="stable")]
+                look = looks(policies)[name]
+                axes.plot(x + shift, y, markersize=5.0, linewidth=1.4, zorder=3, **look)
+                axes.vlines(x + shift, low, high, color=look["color"], linewidth=1.0)
+            for place in panel.marks:
+                axes.axvline(place, **_DASH)
+            axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
+            if panel.share:
+                axes.set_ylim(-0.04, 1.04)
+        tick: dict[str, Any] = {"color": "#444444", "marker": "|", "linestyle": "none"}
+        legend(figure, [*_keys(policies, marks=False), key(mark, **_DASH), key(bar, **tick)])
+    return figure
 
 
 def heights(traces: Traces, *, standing: float) -> Figure:
-    """Trunk height of every run over the time since the jump input, one panel a command.
+    """Draw the trunk height of every run over the time since the jump input, a panel a command.
 
     Args:
-        traces: Height [m] over time since the jump input rose [s].
+        traces: Height [m].
         standing: Height of the trunk in the default pose [m].
     """
-    commands = list(dict.fromkeys(name for runs in traces.values() for name in runs))
-    drawn_as = looks(list(traces))
-    with style.styled():
-        drawn, panels = _grid(list(drawn_as), commands, 1.75)
-        first, *_, last = [*drawn_as, *drawn_as]
-        for (name, command), axes in panels.items():
-            for trace in traces[name].get(command, ()):
-                axes.plot(
-                    trace.time, trace.value, color=drawn_as[name].colour, linewidth=0.7, alpha=0.55
-                )
-            axes.axhline(standing, color="#666666", linewidth=0.8, linestyle=(0, (2, 2)))
-        for j, command in enumerate(commands):
-            panels[first, command].set_title(command)
-            panels[last, command].set_xlabel("time since input [s]")
-            if j == 0:
-                for name in drawn_as:
-                    panels[name, command].set_ylabel(f"{name}\ntrunk height [m]")
-        keys = [Line2D([], [], color=look.colour, label=name) for name, look in drawn_as.items()]
-        keys.append(
-            Line2D([], [], color="#666666", linewidth=0.8, linestyle=(0, (2, 2)), label="standing")
-        )
-        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys))
-    return drawn
+    commands, policies = commands_of(traces), looks(list(traces))
+    shape = (len(policies), len(commands))
+    size = 1.75 * len(policies) + 0.6
+    with drawing(*shape, height=size, sharex=True, sharey="row") as (figure, grid):
+        for row, (name, look) in zip(grid, policies.items(), strict=True):
+            for axes, command in zip(row, commands, strict=True):
+                for time, value in traces[name].get(command, ()):
+                    axes.plot(time, value, color=look["color"], linewidth=0.7, alpha=0.55)
+                axes.axhline(standing, **_DASH)
+            row[0].set_ylabel(f"{name}\ntrunk height [m]")
+        for top, bottom, command in zip(grid[0], grid[-1], commands, strict=True):
+            top.set_title(command)
+            bottom.set_xlabel("time since input [s]")
+        keys = [key(f"{n}, virtual robot", color=look["color"]) for n, look in policies.items()]
+        legend(figure, [*keys, key("standing", **_DASH)])
+    return figure
 
 
-def rates(roll: Traces, pitch: Traces) -> Figure:
-    """Roll and pitch rate while accelerating, one column a policy (paper R7).
+def rates(traces: Mapping[str, Traces]) -> Figure:
+    """Draw rates of the trunk while it accelerates, a row a rate, a column a policy (paper R7).
 
     Args:
-        roll: Roll rate in the trunk's frame [rad/s] over the time since the command [s]; of one
-            command.
-        pitch: The same for the pitch rate.
+        traces: By the label of the rate; time since the command to run.
     """
-    drawn_as = looks(list(roll))
-    with style.styled():
-        rows = {"roll rate [rad/s]": roll, "pitch rate [rad/s]": pitch}
-        upper, lower = rows
-        drawn, panels = _grid(list(rows), list(drawn_as), 1.9)
-        for (label, name), axes in panels.items():
-            runs = [trace for found in rows[label][name].values() for trace in found]
-            # One run to be read, as the paper has it, before the others.
-            for i, trace in enumerate(reversed(runs), start=1):
-                last = i == len(runs)
-                axes.plot(
-                    trace.time,
-                    trace.value,
-                    color=drawn_as[name].colour,
-                    linewidth=1.2 if last else 0.5,
-                    alpha=1.0 if last else 0.25,
-                )
-            axes.axhline(0.0, color="#666666", linewidth=0.8)
-            axes.text(
-                0.99,
-                0.96,
-                f"RMS {rms(runs):.2f} rad/s over {len(runs)} runs",
-                transform=axes.transAxes,
-                ha="right",
-                va="top",
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
-            )
-        for label in rows:
-            panels[label, next(iter(drawn_as))].set_ylabel(label)
-        for name in drawn_as:
-            panels[upper, name].set_title(f"{name}, virtual robot")
-            panels[lower, name].set_xlabel("time since the command to run [s]")
-    return drawn
+    policies = looks(list(next(iter(traces.values()))))
+    shape, size = (len(traces), len(policies)), 1.9 * len(traces) + 0.6
+    with drawing(*shape, height=size, sharex=True, sharey="row") as (figure, grid):
+        for row, (label, found) in zip(grid, traces.items(), strict=True):
+            for axes, (name, look) in zip(row, policies.items(), strict=True):
+                runs = [run for one in found[name].values() for run in one]
+                # The first run is drawn strongly, above the others.
+                for i, (time, value) in reversed(list(enumerate(runs))):
+                    weak: dict[str, Any] = {"linewidth": 0.5, "alpha": 0.25} if i else {}
+                    axes.plot(time, value, color=look["color"], **({"linewidth": 1.2} | weak))
+                axes.set_title(f"RMS {rms(runs):.2f} rad/s over {len(runs)} runs", fontsize=9)
+            row[0].set_ylabel(label)
+        for axes in grid[-1]:
+            axes.set_xlabel("time since the command to run [s]")
+        legend(figure, [key(f"{n}, virtual robot", color=p["color"]) for n, p in policies.items()])
+    return figure
 
 
-def rms(runs: Sequence[Trace]) -> float:
-    """Root mean square over all samples of all runs; NaN without any."""
-    values = np.concatenate([trace.value for trace in runs]) if runs else np.empty(0)
+def rms(runs: Sequence[Array]) -> float:
+    """Return the root mean square over all samples of all runs; NaN without any."""
+    values = np.concatenate([run[1] for run in runs]) if runs else np.empty(0)
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
 def torque_speed(
-    robot: Robot, velocity: Array, torque: Array, *, look_of: str, words: str
+    robot: Robot, velocity: Array, torque: Array, *, policy: str, words: str
 ) -> Figure:
-    """What one jump needs of the drives, beside what a drive can give, one panel a joint group.
+    """Draw torque over speed of one jump in the limits of the drives, a panel a joint group.
 
     Args:
         robot: Whose drives.
-        velocity: Of the joints [rad/s]. (T, joints)
-        torque: Of the motors, joint side [N m]. (T, joints)
-        look_of: The policy, for its colour.
-        words: What jump it is.
+        velocity: Of the joints [rad/s], (T, joints).
+        torque: Of the motors, joint side [N m], (T, joints).
+        policy: For the colour.
+        words: Name of the jump.
     """
     groups = list(dict.fromkeys(joint.group for joint in robot.joints))
-    look = looks([look_of])[look_of]
-    with style.styled():
-        drawn = Figure(figsize=(style.PAGE_WIDTH_IN, 3.4), layout="constrained")
-        grid = drawn.subplots(1, len(groups), squeeze=False)[0]
-        for axes, group in zip(grid, groups, strict=True):
+    marks = {"linestyle": "none", "marker": ".", "color": looks([policy])[policy]["color"]}
+    with drawing(1, len(groups), height=3.4) as (figure, grid):
+        for axes, group in zip(grid[0], groups, strict=True):
             inside = [i for i, joint in enumerate(robot.joints) if joint.group == group]
             drive = robot.joints[inside[0]].drive
             speed = np.linspace(-1.1 * drive.no_load_speed, 1.1 * drive.no_load_speed, 401)
-            low, high = torque_limits(
-                speed, drive.stall_torque, drive.no_load_speed, drive.effort_limit
-            )
-            for limit in (low, high):
+            limits = (drive.stall_torque, drive.no_load_speed, drive.effort_limit)
+            for limit in torque_limits(speed, *limits):
                 axes.plot(speed, limit, color=style.MEASURED, linewidth=1.3)
-            axes.plot(
-                velocity[:, inside].ravel(),
-                torque[:, inside].ravel(),
-                linestyle="none",
-                marker=".",
-                markersize=2.2,
-                color=look.colour,
-                alpha=0.5,
-                rasterized=True,
-            )
-            axes.set_title(style.joint_words(group))
-            axes.set_xlabel("speed [rad/s]")
-        grid[0].set_ylabel("torque [N m]")
-        keys = [
-            Line2D([], [], linestyle="none", marker=".", color=look.colour, label=words),
-            Line2D([], [], color=style.MEASURED, label="limits of the drive at nominal voltage"),
-        ]
-        drawn.legend(handles=keys, loc="outside lower center", ncols=2)
-    return drawn
+            points = (velocity[:, inside].ravel(), torque[:, inside].ravel())
+            axes.plot(*points, markersize=2.2, alpha=0.5, rasterized=True, **marks)
+            axes.set(title=style.joint_words(group), xlabel="speed [rad/s]")
+        grid[0, 0].set_ylabel("torque [N m]")
+        limits_key = key("limits of the drive at nominal voltage", color=style.MEASURED)
+        legend(figure, [key(words, **marks), limits_key])
+    return figure

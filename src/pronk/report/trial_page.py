@@ -1,11 +1,9 @@
-"""Page of a trial: verdict, tables beside the paper, figures and film clips."""
+"""Page of a trial: outcome, Table III beside the paper's, figures, films, definitions."""
 
 from __future__ import annotations
 
-import base64
 import io
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,213 +15,127 @@ from pronk.errors import ArtefactError, RobotError
 from pronk.evaluation import tables
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.protocol import RATES
-from pronk.evaluation.published import PAPER_RATIOS, TABLE_III, in_paper_order
+from pronk.evaluation.published import TABLE_III, in_paper_order
 from pronk.evaluation.results import SUMMARY, Results, Row, Subject, load, share_interval
-from pronk.evaluation.tables import Sheet, number, place
-from pronk.match import gains as gains_file
-from pronk.match import result as result_file
 from pronk.match.result import JointFit, MatchResult
-from pronk.report import shell, style
-from pronk.report.match_page import find_gains
-from pronk.report.shell import Part, Picture
-from pronk.report.trial_figures import (
-    Published,
-    Ratio,
-    Trace,
-    Values,
-    argument,
-    cells,
-    heights,
-    rates,
-    ratios,
-    scatter,
-    torque_speed,
-)
+from pronk.report import match_page, style
+from pronk.report import trial_figures as draw
+from pronk.report.page import Content, Fold, Part, Picture, Section, picture, table
+from pronk.report.trial_figures import Published, Values
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
 from pronk.virtual import capture as capture_file
-from pronk.virtual.capture import Capture
 
 Array = NDArray[np.float64]
 
 BEFORE_S, AFTER_S = 0.5, 2.0
 """Window of the height traces about the jump input [s]."""
 TRACE_RATE_HZ = 250.0
-"""Rate that traces are drawn at: no figure is wide enough to show more."""
+"""Rate of drawn traces."""
+_PAPER_GAPS: Published = {
+    "matched": {
+        case: (gap, float("nan"))
+        for case, gap in (("forward 2", 0.55), ("back 2", 0.5), ("side -1", 0.4), ("side +1", 0.4))
+    }
+}
+"""R3: the widest gaps, from video; of which policy is not stated, and no spread is given."""
 
 
 def policies(trial: Results) -> list[str]:
-    """Names of the policies, a naive one first, as in the paper's table."""
+    """Return the names of the policies, `naive` first."""
     return in_paper_order(subject.name for subject in trial.subjects)
 
 
-def values(trial: Results, figure: str, cases: Sequence[str]) -> Values:
-    """One figure of every jump that was found, by policy and command."""
+def values(trial: Results, figure: str) -> Values:
+    """Return one figure of every jump, by policy and command."""
     return {
-        name: {case: trial.values(name, case, figure) for case in cases} for name in policies(trial)
+        name: {case.name: trial.values(name, case.name, figure) for case in trial.cases}
+        for name in policies(trial)
     }
 
 
 def published(figure: str) -> Published:
-    """The paper's Table III, `height` or `distance`, by policy and command; empty for others."""
-    if figure not in ("height", "distance"):
-        return {}
+    """Return the paper's `height`, `distance` or `gap` by policy and command."""
+    if figure == "gap":
+        return _PAPER_GAPS
     return {
         gains: {case: getattr(cell, figure)[gains] for case, cell in TABLE_III.items()}
         for gains in ("naive", "matched")
     }
 
 
-def naive_over_matched(trial: Results, figure: str) -> list[Ratio]:
-    """Ratios of the standard deviations with the naive policy above the line, whichever came first.
-
-    Empty unless the trial has the paper's two policies, and without those of too few jumps for an
-    interval. The first is over all commands.
-    """
-    found = []
-    paper = published(figure)
-    for ratio in trial.ratios:
-        if ratio.figure != figure or {ratio.policy, ratio.other} != {"naive", "matched"}:
-            continue
-        value, low, high = ratio.value, ratio.low, ratio.high
-        if not (math.isfinite(value) and value > 0.0 and math.isfinite(low)):
-            continue
-        if ratio.other == "matched":
-            value, low, high = 1.0 / value, 1.0 / high, 1.0 / low if low > 0.0 else math.inf
-        if ratio.case is None:
-            theirs = PAPER_RATIOS.get(figure)
-        elif ratio.case in paper.get("naive", {}):
-            theirs = paper["naive"][ratio.case][1] / paper["matched"][ratio.case][1]
-        else:
-            theirs = None
-        found.append(
-            Ratio(
-                words=ratio.case or "mean over the commands",
-                value=value,
-                interval=(low, high),
-                paper=theirs,
-                overall=ratio.case is None,
-            )
-        )
-    return found
-
-
 @dataclass(frozen=True, kw_only=True)
-class Seen:
-    """What the captures of a trial give the figures, by policy and then by command."""
+class Captured:
+    """Traces of a trial's captures by policy and command, each (2, T): time [s] and value."""
 
-    height: dict[str, dict[str, list[Trace]]]
-    """Trunk height [m] over the time since the jump input [s]."""
-    roll: dict[str, dict[str, list[Trace]]]
-    """Roll rate [rad/s] over the time since the command to run [s], at `RATES` alone."""
-    pitch: dict[str, dict[str, list[Trace]]]
+    height: dict[str, dict[str, list[Array]]]
+    """Trunk height [m] over the time since the jump input."""
+    roll: dict[str, dict[str, list[Array]]]
+    """Roll rate [rad/s] over the time since the command to run; of `RATES` alone."""
+    pitch: dict[str, dict[str, list[Array]]]
     """Pitch rate, the same."""
-    hardest: HardestJump | None
-    """Of the first policy."""
+    hardest: tuple[Row, Array, Array] | None
+    """The first policy's jump nearest to its drives' limits: row, joint velocities [rad/s] and
+    motor torques [N m] from the jump input to `AFTER_S` later, (T, joints)."""
     missing: int
     """Captures that the table names and the folder does not hold."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class HardestJump:
-    """The jump that comes nearest to the drives' torque-speed curves."""
-
-    row: Row
-    velocity: Array
-    """Of the joints, from the input to `AFTER_S` later [rad/s]. (T, joints)"""
-    torque: Array
-    """Of the motors, joint side [N m]. (T, joints)"""
-
-
-def hardest(rows: Sequence[Row]) -> Row | None:
-    """The jump with the least torque margin of any joint; None without a jump."""
+def least_margin(rows: Sequence[Row]) -> Row | None:
+    """Return the jump with the least torque margin of any joint; None without a jump."""
     found = [row for row in rows if row.figures.found and len(row.figures.torque_margin)]
     return min(found, key=lambda row: min(row.figures.torque_margin), default=None)
 
 
-def cut(time: Array, value: Array, start: float, end: float) -> Trace:
-    """A stretch of a series, from a new zero at 0, thinned to `TRACE_RATE_HZ`.
-
-    Args:
-        time: Since the new zero [s]. (T,)
-        value: (T,)
-        start: First time of the stretch [s].
-        end: Last time [s].
-    """
+def _cut(time: Array, value: Array, start: float, end: float) -> Array:
+    """Return `value` between two times, thinned to `TRACE_RATE_HZ`, as (2, T)."""
     inside = np.flatnonzero((time >= start) & (time <= end))
     if len(inside) > 1:
         dt = float(time[inside[-1]] - time[inside[0]]) / (len(inside) - 1)
         inside = inside[:: max(1, round(1.0 / (TRACE_RATE_HZ * dt)))]
-    return Trace(time=time[inside], value=value[inside])
+    return np.stack([time[inside], value[inside]])
 
 
-def _captures(trial: Results, folder: Path) -> Iterator[tuple[Row, Path]]:
-    for row in trial.rows:
-        if row.capture:
-            yield row, folder / row.capture
-
-
-def see(
-    trial: Results, folder: Path, *, progress: Callable[[float], None] = lambda share: None
-) -> Seen | None:
-    """Read the captures of a trial; None if it kept none, or none is there any more.
-
-    Args:
-        trial: Whose table names them.
-        folder: Where they are.
-        progress: Called with the share of them that is read.
+def captured(trial: Results, folder: Path) -> Captured | None:
+    """Read the captures of a trial; None if there are none.
 
     Raises:
         ArtefactError: A capture is damaged.
     """
-    kept = list(_captures(trial, folder))
+    kept = [(row, folder / row.capture) for row in trial.rows if row.capture]
     present = [(row, path) for row, path in kept if path.exists()]
     if not present:
         return None
-    found: dict[str, dict[str, dict[str, list[Trace]]]] = {
+    found: dict[str, dict[str, dict[str, list[Array]]]] = {
         what: {name: {} for name in policies(trial)} for what in ("height", "roll", "pitch")
     }
-    worst = hardest([row for row, _ in present if row.policy == trial.subjects[0].name])
-    jump = None
-    for i, (row, path) in enumerate(present):
-        seen = capture_file.load(path)
-        for what, trace in _traces(row, seen).items():
+    hard = least_margin([row for row, _ in present if row.policy == trial.subjects[0].name])
+    hardest = None
+    for row, path in present:
+        capture = capture_file.load(path)
+        time = capture.time - row.began
+        since = time - row.script.on
+        traces = {"height": _cut(since, capture.position[:, 2], -BEFORE_S, AFTER_S)}
+        if row.case == RATES.name:
+            for i, what in enumerate(("roll", "pitch")):
+                rate = capture.angular_velocity[:, i]
+                traces[what] = _cut(time - row.script.start, rate, 0.0, row.script.run_s)
+        for what, trace in traces.items():
             found[what][row.policy].setdefault(row.case, []).append(trace)
-        if row is worst:
-            jump = _hardest(row, seen)
-        progress((i + 1) / len(present))
-    return Seen(**found, hardest=jump, missing=len(kept) - len(present))
-
-
-def _traces(row: Row, seen: Capture) -> dict[str, Trace]:
-    since = seen.time - row.began
-    script = row.script
-    found = {
-        "height": cut(since - script.on, seen.position[:, 2], -BEFORE_S, AFTER_S),
-    }
-    if row.case == RATES.name:
-        for i, what in enumerate(("roll", "pitch")):
-            rate = seen.angular_velocity[:, i]
-            found[what] = cut(since - script.start, rate, 0.0, script.run_s)
-    return found
-
-
-def _hardest(row: Row, seen: Capture) -> HardestJump:
-    since = seen.time - row.began - row.script.on
-    inside = (since >= 0.0) & (since <= AFTER_S)
-    return HardestJump(row=row, velocity=seen.joint_velocity[inside], torque=seen.torque[inside])
+        if row is hard:
+            inside = (since >= 0.0) & (since <= AFTER_S)
+            hardest = (row, capture.joint_velocity[inside], capture.torque[inside])
+    return Captured(**found, hardest=hardest, missing=len(kept) - len(present))
 
 
 def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
-    """Error of a joint's simulated gain with these gains, RMS over its band [dB].
+    """Return the RMS gain error over the band with these gains, from the joint's error map [dB].
+
+    NaN outside of the map, or without one.
 
     Args:
-        joint: Its map: mean squares in dB^2 over a grid.
+        joint: Its map holds mean squares [dB^2] over a grid.
         stiffness: [N m/rad]
         damping: [N m s/rad]
-
-    Returns:
-        NaN outside of the grid, or without a map.
     """
     from scipy.interpolate import RectBivariateSpline
 
@@ -232,140 +144,67 @@ def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
         return float("nan")
     if not (k[0] <= stiffness <= k[-1] and d[0] <= damping <= d[-1]):
         return float("nan")
-    # The error is smooth between nodes, its square root has a cusp at a match.
+    # The square of the error is smooth between nodes; its root has a cusp at a match.
     kx, ky = min(3, len(k) - 1), min(3, len(d) - 1)
     surface = RectBivariateSpline(k, d, joint.grid_error, kx=kx, ky=ky)
-    square = float(surface.ev([stiffness], [damping])[0])
-    return float(np.sqrt(max(square, 0.0)))
+    return float(np.sqrt(max(float(surface.ev([stiffness], [damping])[0]), 0.0)))
 
 
-def errors_db(result: MatchResult, subject: Subject) -> dict[str, float]:
-    """Error of a policy's training gains for each joint of a match [dB]; NaN if it is unknown."""
-    fields = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
-    gains = {name: (stiffness, damping) for name, stiffness, damping in zip(*fields, strict=False)}
-    return {
-        name: joint_error_db(joint, *gains.get(name, (np.nan, np.nan)))
-        for name, joint in result.joints.items()
-    }
+def gains_errors(trial: Results, result: MatchResult) -> dict[str, float]:
+    """Return the error of each policy's training gains on a sweep, RMS over the joints [dB].
 
-
-def bode_error_db(result: MatchResult, subject: Subject) -> float:
-    """Error of a policy's training gains, RMS over the joints [dB]; NaN if one is unknown."""
-    errors = list(errors_db(result, subject).values())
-    return float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
-
-
-def joint_errors(trial: Results, result: MatchResult) -> Sheet:
-    """Errors of every policy's training gains, and of the matched gains of each joint by itself."""
-    found = {subject.name: errors_db(result, subject) for subject in trial.subjects}
-    return Sheet(
-        title="Error of the training gains on the sweep [dB RMS over the joint's band]",
-        columns=("joint", *found, "its own matched gains"),
-        rows=tuple(
-            (
-                style.joint_words(name),
-                *(number(errors[name], 2) for errors in found.values()),
-                number(joint.error_db, 2),
-            )
+    Empty unless it is known for all joints of every policy.
+    """
+    found = {}
+    for subject in trial.subjects:
+        gains = _training_gains(subject)
+        errors = [
+            joint_error_db(joint, *gains.get(name, (np.nan, np.nan)))
             for name, joint in result.joints.items()
-        ),
-        notes=(
-            "Training has one pair of gains for each group of joints, so even matched gains miss a "
-            "joint that differs from its group.",
-        ),
-    )
+        ]
+        found[subject.name] = float(np.sqrt(np.mean(np.square(errors)))) if errors else np.nan
+    return found if np.isfinite(list(found.values())).all() else {}
+
+
+def _training_gains(subject: Subject) -> dict[str, tuple[float, float]]:
+    """Stiffness [N m/rad] and damping [N m s/rad] by joint, as of the contract."""
+    fields = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
+    return {name: (stiffness, damping) for name, stiffness, damping in zip(*fields, strict=False)}
 
 
 def match_near(folder: Path, root: Path) -> MatchResult | None:
-    """The match that lies nearest to a trial: in its folder or one above it, down from `root`."""
+    """Return the match nearest to a trial: in its folder or one above it, up to `root`."""
     for near in (folder, *folder.parents):
         if (near / "match.npz").exists():
             try:
-                return result_file.load(near / "match.npz", gains_file.load(find_gains(near)))
+                return match_page.load(near)
             except ArtefactError:
-                # The page reports it where the match itself is shown.
-                return None
+                return None  # reported where the match itself is shown
         if near == root:
             return None
     return None
 
 
-def bode_errors_db(trial: Results, result: MatchResult) -> Mapping[str, float]:
-    """By policy; empty unless every policy's is known."""
-    found = {subject.name: bode_error_db(result, subject) for subject in trial.subjects}
-    return found if all(np.isfinite(value) for value in found.values()) else {}
-
-
-LARGEST_BYTES = 1_500_000
-"""A moving picture larger than this is made smaller before it goes into the page."""
-SMALL_WIDTH = 320
-"""Width that it is made smaller to [px]."""
-EVERY = 2
-"""Of its frames, every which is kept."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Clips:
-    """What a trial's folder has to look at."""
-
-    moving: tuple[Picture, ...]
-    strips: tuple[Picture, ...]
-    films: tuple[str, ...]
-    """Names of video files, which a page only names: they are large."""
-
-    def __bool__(self) -> bool:
-        """True if there is anything."""
-        return bool(self.moving or self.strips or self.films)
-
-
-def clips(folder: Path) -> Clips:
-    """Everything to look at in a folder and in those in it, in the order of their names.
+def films(folder: Path) -> list[Content]:
+    """Return the moving pictures and frames in a trial's folder, and the names of its films.
 
     Raises:
         ArtefactError: A picture is damaged.
     """
-    return Clips(
-        moving=tuple(_moving(path) for path in _files(folder, "gif")),
-        strips=tuple(_still(path) for path in _files(folder, "png")),
-        films=tuple(str(path.relative_to(folder)) for path in _files(folder, "mp4")),
-    )
-
-
-def _files(folder: Path, kind: str) -> list[Path]:
-    # A folder with a trial of its own is a part of its own, with its pictures.
+    # A folder with a trial of its own is a part of its own.
     inner = [path for path in folder.iterdir() if path.is_dir() and not (path / SUMMARY).exists()]
-    return sorted(path for place in (folder, *inner) for path in place.glob(f"*.{kind}"))
+    found: dict[str, list[Path]] = {
+        kind: sorted(path for place in (folder, *inner) for path in place.glob(f"*.{kind}"))
+        for kind in ("png", "gif", "mp4")
+    }
+    content: list[Content] = [_image(path) for path in (*found["png"], *found["gif"])]
+    if found["mp4"]:
+        names = ", ".join(str(path.relative_to(folder)) for path in found["mp4"])
+        content.append(f"Films in the trial's folder: {names}.")
+    return content
 
 
-def _words(path: Path) -> str:
-    return f"{path.stem.replace('_', ' ')}, virtual robot"
-
-
-def _still(path: Path) -> Picture:
-    coded = base64.b64encode(_checked(path)).decode("ascii")
-    return Picture(
-        src=f"data:image/png;base64,{coded}",
-        alt=f"Still frames: {_words(path)}",
-        caption=_words(path),
-    )
-
-
-def _moving(path: Path) -> Picture:
-    data = _checked(path)
-    coded = base64.b64encode(smaller(data) if len(data) > LARGEST_BYTES else data).decode("ascii")
-    return Picture(
-        src=f"data:image/gif;base64,{coded}",
-        alt=f"Moving picture: {_words(path)}",
-        caption=_words(path),
-    )
-
-
-def _checked(path: Path) -> bytes:
-    """The bytes of a picture that can be opened.
-
-    Raises:
-        ArtefactError: It cannot.
-    """
+def _image(path: Path) -> Picture:
     from PIL import Image
 
     data = path.read_bytes()
@@ -374,272 +213,193 @@ def _checked(path: Path) -> bytes:
             opened.load()
     except Exception as error:
         raise ArtefactError(
-            f"{path}: no picture that can be opened ({type(error).__name__}); delete it, or let "
-            "`pronk trial` make it anew."
+            f"{path}: not a readable picture ({type(error).__name__}); delete it, or run `pronk "
+            "trial` again."
         ) from error
-    return data
+    words = f"{path.stem.replace('_', ' ')}, virtual robot"
+    kind = path.suffix[1:]
+    return Picture(src=style.data_uri(data, kind), alt=f"Film frames: {words}", caption=words)
 
 
-def smaller(data: bytes) -> bytes:
-    """A GIF at most `SMALL_WIDTH` wide with every `EVERY`-th frame, at its own speed."""
-    from PIL import Image, ImageSequence
-
-    with Image.open(io.BytesIO(data)) as film:
-        scale = min(1.0, SMALL_WIDTH / film.width)
-        size = (max(1, round(film.width * scale)), max(1, round(film.height * scale)))
-        frames: list[Image.Image] = []
-        times: list[int] = []
-        for i, frame in enumerate(ImageSequence.Iterator(film)):
-            shown = int(frame.info.get("duration", 40))
-            if i % EVERY:
-                times[-1] += shown
-            else:
-                frames.append(frame.convert("RGB").resize(size))
-                times.append(shown)
-    out = io.BytesIO()
-    frames[0].save(
-        out, format="GIF", save_all=True, append_images=frames[1:], duration=times, loop=0
-    )
-    return out.getvalue()
-
-
-_PAPER_GAPS: Published = {
-    "matched": {
-        "forward 2": (0.55, math.nan),
-        "back 2": (0.50, math.nan),
-        "side -1": (0.40, math.nan),
-        "side +1": (0.40, math.nan),
-    }
-}
-"""R3: the widest gap a jump could cross, from video; the paper does not say of which policy, and
-gives no spread."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Material:
-    """All that the part of a trial is made from, read and found good."""
-
-    trial: Results
-    seen: Seen | None
-    """What its captures hold; None without any."""
-    clips: Clips
-    match: MatchResult | None
-    """Of the sweep that lies nearest, for the error of the policies' training gains."""
-
-
-def read(
-    folder: Path, root: Path, progress: Callable[[float], None] = lambda share: None
-) -> Material:
-    """Read a trial and what lies beside it.
-
-    Args:
-        folder: Of the trial.
-        root: No match is looked for above it.
-        progress: Called with the share of the captures that is read.
+def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial") -> Part:
+    """Make the part of the trial in `path`, a `summary.json`.
 
     Raises:
         ArtefactError: The trial, a capture or a picture is damaged.
     """
-    trial = load(folder)
-    return Material(
-        trial=trial,
-        clips=clips(folder),
-        match=match_near(folder, root),
-        seen=see(trial, folder, progress=progress),
-    )
-
-
-def part(material: Material, *, anchor: str, title: str = "Trial") -> Part:
-    """The trial as a part of a page.
-
-    Args:
-        material: What it is made from.
-        anchor: What the anchors of the part begin with.
-        title: Of the part.
-    """
-    trial, seen, match = material.trial, material.seen, material.match
-    errors = bode_errors_db(trial, match) if match else {}
-    html = shell.fill(
-        "trial.html.j2",
-        at=f"{anchor}-" if anchor else "",
-        trial=trial,
-        first=trial.subjects[0].name,
-        totals=totals(trial),
-        checks=trial_checks(trial),
-        verdicts=[tables.verdict(trial, other.name) for other in trial.subjects[1:]],
-        table_iii=[tables.table_iii(trial, figure) for figure in ("height", "distance")],
-        landings=tables.landings(trial),
-        criteria=tables.criteria(trial),
-        scatter=tables.scatter(trial) if trial.ratios else None,
-        more=[_by_policy(trial, subject.name) for subject in trial.subjects],
-        drives=tables.drives(trial),
-        definitions=tables.definitions(),
-        pictures=_pictures(trial, seen, errors),
-        clips=material.clips,
-        errors=errors,
-        joint_errors=joint_errors(trial, match) if match else None,
-        kept=_kept(trial, seen),
-        rates_case=f"{RATES.command[0]:g}",
-        groups={subject.name: _groups(subject) for subject in trial.subjects},
-    )
-    return Part(anchor=anchor, title=title, html=html)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Total:
-    """What became of all jumps of one policy."""
-
-    n: int
-    found: int
-    succeeded: int
-    fell: int
-
-    @property
-    def share(self) -> float:
-        """Of all commanded jumps, those that landed well."""
-        return self.succeeded / self.n
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval of it."""
-        return share_interval(self.succeeded, self.n)
-
-
-def totals(trial: Results) -> dict[str, Total]:
-    """Over all commands, by policy."""
-    return {
-        name: Total(
-            n=sum(cell.n for cell in own),
-            found=sum(cell.found for cell in own),
-            succeeded=sum(cell.succeeded for cell in own),
-            fell=sum(cell.fell for cell in own),
+    folder = path.parent
+    trial, match = load(folder), match_near(folder, root)
+    checks, first = trial_checks(trial), trial.subjects[0].name
+    passed = sum(check.passed for check in checks)
+    verdicts = [tables.verdict(trial, other.name) for other in trial.subjects[1:]]
+    lines = [_total(trial, name) for name in policies(trial)]
+    if trial.virtual:
+        lines.append(
+            "Every jump on this page is of pronk's virtual robot, a simulated machine whose "
+            "parameters neither match nor training can read. The paper's figures are of hardware."
         )
-        for name in policies(trial)
-        if (own := [cell for cell in trial.cells if cell.policy == name])
-    }
-
-
-def _pictures(
-    trial: Results, seen: Seen | None, errors: Mapping[str, float]
-) -> dict[str, Picture | None]:
-    cases = [case.name for case in trial.cases]
-    where = place(trial)
-    height, distance, gap = (values(trial, name, cases) for name in ("height", "distance", "gap"))
-    panels = [(words, naive_over_matched(trial, words)) for words in ("distance", "height")]
-    drawn: dict[str, Picture | None] = {
-        "cells": shell.picture(
-            cells(
-                [
-                    ("height [m]", height, published("height")),
-                    ("distance [m]", distance, published("distance")),
-                ]
+    return Part(
+        anchor=anchor,
+        title=title,
+        source=str(path.relative_to(root)),
+        virtual=trial.virtual,
+        summary=f"{first}: {passed} of {len(checks)} acceptance criteria passed.",
+        lines=[*lines, *(f"{one[0].upper()}{one[1:]}" for one in verdicts)],
+        warning=passed < len(checks),
+        sections=[
+            _table_iii(trial),
+            Section("criteria", "Acceptance criteria", tables.criteria(trial)),
+            _scatter(trial, gains_errors(trial, match) if match else {}),
+            Section("films", "Films", *shown) if (shown := films(folder)) else None,
+            Section("landings", "Landings", tables.landings(trial)),
+            *_traces(trial, captured(trial, folder)),
+            Section(
+                "figures",
+                "All figures",
+                *(Fold(f"Figures of {s.name}", tables.more(trial, s.name)) for s in trial.subjects),
+                Fold("Drives", tables.drives(trial)),
+                Fold("Definitions", tables.definitions()),
             ),
-            f"Height and distance of every jump on the {where}, by command and policy, with the "
-            "paper's means and standard deviations",
+            _setup(trial),
+        ],
+        figures={"checks": [check.row() for check in checks]},
+    )
+
+
+def _total(trial: Results, name: str) -> str:
+    own = [cell for cell in trial.cells if cell.policy == name]
+    n, found, landed, fell = (
+        sum(getattr(cell, field) for cell in own) for field in ("n", "found", "succeeded", "fell")
+    )
+    low, high = share_interval(landed, n)
+    return (
+        f"{name}: {n} jumps commanded, {found} jumped, {landed} landed: {100 * landed / n:.1f} % "
+        f"(95 % interval {100 * low:.1f} to {100 * high:.1f}), {fell} fell."
+    )
+
+
+def _table_iii(trial: Results) -> Section:
+    panels = [
+        (f"{name} [m]", values(trial, name), published(name))
+        for name in ("height", "distance", "gap")
+    ]
+    return Section(
+        "table",
+        "Table III",
+        "Every jump is a small mark, with mean and standard deviation beside. Open marks are the "
+        "paper's: five jumps a cell on hardware; gaps are its widest, read off video.",
+        picture(
+            draw.cells(panels),
+            f"Height, distance and gap of every jump on the {tables.place(trial)}, by command and "
+            "policy, with the paper's means and standard deviations",
         ),
-        "scatter": shell.picture(
-            scatter(height, distance, published("height"), published("distance")),
-            f"Height over distance of every jump on the {where}, one panel a command, with the "
-            "paper's means and standard deviations",
-        ),
-        "gaps": shell.picture(
-            cells([("gap [m]", gap, _PAPER_GAPS)]),
-            f"Gap of every jump on the {where}, by command and policy, with the paper's",
-        ),
-        "ratios": shell.picture(
-            ratios(panels, over=("naive", "matched")),
-            "Ratios of the standard deviations of distance and height, naive over matched, with "
-            "95 % intervals, beside the paper's",
-        )
-        if any(found for _, found in panels)
-        else None,
-        "argument": shell.picture(
-            argument(errors, {"height [m]": height, "distance [m]": distance}),
+        *(tables.table_iii(trial, figure) for figure in ("height", "distance")),
+    )
+
+
+def _scatter(trial: Results, errors: Mapping[str, float]) -> Section | None:
+    if not trial.ratios:
+        return None
+    panels = {f"{name} [m]": values(trial, name) for name in ("height", "distance")}
+    drawn = (
+        picture(
+            draw.scatter_over_error(errors, panels),
             "Standard deviation of height and distance over the error of each policy's training "
             "gains on the sweep",
         )
         if len(errors) > 1
-        else None,
-    }
-    return drawn | _seen_pictures(trial, seen)
-
-
-def _seen_pictures(trial: Results, seen: Seen | None) -> dict[str, Picture | None]:
-    """Those that need captures."""
-    drawn: dict[str, Picture | None] = dict.fromkeys(("heights", "rates", "torque_speed"))
-    if seen is None:
-        return drawn
-    where = place(trial)
-    standing = float(trial.rules.get("standing_height", math.nan))
-    drawn["heights"] = shell.picture(
-        heights(seen.height, standing=standing),
-        f"Height of the trunk of the {where} over the time since the jump input, by policy and "
-        "command",
-        dense=True,
+        else None
     )
+    return Section(
+        "scatter",
+        "Scatter",
+        "The paper reports less scatter with matched gains. Intervals are over the jumps of these "
+        "policies, not over other trainings.",
+        tables.scatter(trial),
+        drawn,
+    )
+
+
+def _traces(trial: Results, seen: Captured | None) -> list[Section]:
+    """Sections that need captures."""
+    if seen is None:
+        return []
+    where, found = tables.place(trial), []
     if any(seen.roll.values()):
-        drawn["rates"] = shell.picture(
-            rates(seen.roll, seen.pitch),
-            f"Roll and pitch rate of the {where} while it accelerates to 2.25 m/s, by policy",
-            dense=True,
+        rates = {"roll rate [rad/s]": seen.roll, "pitch rate [rad/s]": seen.pitch}
+        words = f"Roll and pitch rate of the {where} while it accelerates to 2.25 m/s, by policy"
+        text = (
+            f"In the trunk's frame, until the jump input, at {RATES.name} (the paper's figure 6)."
         )
-    if seen.hardest is not None and (robot := _robot(trial)) is not None:
-        row = seen.hardest.row
-        drawn["torque_speed"] = shell.picture(
-            torque_speed(
-                robot,
-                seen.hardest.velocity,
-                seen.hardest.torque,
-                look_of=row.policy,
-                words=f"{row.policy}, {row.case}, jump {row.number}, {where}",
-            ),
-            f"Torque over speed of every joint in one jump of the {where}, with the limits of the "
-            "drives",
-            dense=True,
-        )
-    return drawn
-
-
-def _robot(trial: Results) -> Robot | None:
-    """The robot of a trial; None for one that this pronk does not know."""
-    try:
-        return load_robot(trial.robot)
-    except RobotError:
-        return None
-
-
-def _kept(trial: Results, seen: Seen | None) -> str:
-    """How many jumps the captures are of, in words."""
-    if seen is None:
-        return ""
-    shown = sum(len(runs) for found in seen.height.values() for runs in found.values())
+        drawn = picture(draw.rates(rates), words, dense=True)
+        found.append(Section("rates", "Roll and pitch rates", text, drawn))
+    standing = float(trial.rules.get("standing_height", np.nan))
+    count = sum(len(runs) for cases in seen.height.values() for runs in cases.values())
     missing = f" {seen.missing} captures are missing from the folder." if seen.missing else ""
-    if shown == len(trial.rows):
-        return f"All {shown} jumps."
+    text = f"{count} of {len(trial.rows)} jumps, those with a capture.{missing}"
+    words = f"Trunk height of the {where} over the time since the jump input, by policy and command"
+    drawn = picture(draw.heights(seen.height, standing=standing), words, dense=True)
+    found.append(Section("heights", "Trunk height over time", text, drawn))
+    try:
+        robot = load_robot(trial.robot)
+    except RobotError:
+        return found
+    if seen.hardest is not None:
+        row, velocity, torque = seen.hardest
+        name = f"{row.policy}, {row.case}, jump {row.number}, {where}"
+        figure = draw.torque_speed(robot, velocity, torque, policy=row.policy, words=name)
+        words = f"Torque over speed of every joint in one jump of the {where}, with drive limits"
+        text = (
+            "The captured jump nearest to the limits of the nominal drive; the virtual robot's "
+            "motors have torque constants and a bus voltage of their own."
+        )
+        drawn = picture(figure, words, dense=True)
+        found.append(Section("drives", "Torque and speed of the drives", text, drawn))
+    return found
+
+
+def _setup(trial: Results) -> Section:
+    script = trial.script
+    rows = [
+        {
+            "policy": subject.name,
+            "trained with": f"{subject.contract.get('gains', 'unknown')} gains: {_groups(subject)}",
+            "file": subject.path,
+            "SHA-256": subject.sha256,
+        }
+        for subject in trial.subjects
+    ]
+    versions = ", ".join(f"{name} {version}" for name, version in trial.versions.items())
+    params = trial.sim_params
+    where = f"the virtual {trial.robot}" if trial.virtual else trial.robot
+    return Section(
+        "setup",
+        "Setup",
+        f"{len(trial.cases)} commands, {len(trial.rows)} jumps on {where}, seed {trial.seed}. "
+        f"Each: stand {script.stand_s:.1f} s, run {script.run_s:.1f} s and up to "
+        f"{trial.spread_s:.1f} s more, jump input {script.jump_s:.1f} s, run on "
+        f"{script.keep_s:.1f} s, stop {script.stop_s:.1f} s. Heading, joint offsets and noise are "
+        "drawn for each jump; all policies meet the same draws.",
+        table(rows),
+        f"Parameters: {params.get('file', 'unknown')}, SHA-256 {params.get('sha256', 'unknown')}. "
+        f"Versions: {versions}. {_timing(trial.timing)}",
+    )
+
+
+def _timing(timing: Mapping[str, Any]) -> str:
+    if not timing.get("simulated_s"):
+        return ""
     return (
-        f"{shown} of {len(trial.rows)} jumps, those whose captures were kept; pronk trial "
-        f"--keep-captures keeps all.{missing}"
+        f"{timing['simulated_s']:.0f} s simulated in {timing.get('seconds', np.nan):.0f} s with "
+        f"{timing.get('processes', np.nan):.0f} processes."
     )
 
 
-def _by_policy(trial: Results, name: str) -> Sheet:
-    """The columns of one policy of the table of all other figures."""
-    whole = tables.more(trial)
-    head = f"{name}: "
-    kept = [i for i, column in enumerate(whole.columns) if column.startswith(head)]
-    return Sheet(
-        title=f"{name}: mean +- standard deviation",
-        columns=(whole.columns[0], *(whole.columns[i].removeprefix(head) for i in kept)),
-        rows=tuple((row[0], *(row[i] for i in kept)) for row in whole.rows),
-    )
-
-
-def _groups(subject: Subject) -> list[dict[str, Any]]:
-    """Gains that a policy was trained with, once for each group of joints."""
-    fields = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
-    found: dict[str, dict[str, Any]] = {}
-    for name, stiffness, damping in zip(*fields, strict=False):
+def _groups(subject: Subject) -> str:
+    """Gains that a policy was trained with, once for each joint group."""
+    found: dict[str, str] = {}
+    for name, (stiffness, damping) in _training_gains(subject).items():
         leg = style.leg_of(name)
-        group = name.removeprefix(f"{leg}_") if leg else name
-        found.setdefault(group, {"group": group, "stiffness": stiffness, "damping": damping})
-    return list(found.values())
+        group = style.joint_words(name.removeprefix(f"{leg}_") if leg else name)
+        found.setdefault(group, f"{group} {stiffness:.1f} / {damping:.3f}")
+    return ", ".join(found.values())

@@ -1,0 +1,314 @@
+"""Measures of a deployment's log: modes, jumps, delays, interventions, tracking, timing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.robots.robot import Robot
+from pronk.runtime.ipc import Mode
+from pronk.runtime.log import DeployLog
+from pronk.runtime.safety import FilterAction, Reason
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POLICY_MODES = (Mode.POLICY, Mode.HALT)
+"""Modes in which the policy gives the targets."""
+_MOVED = 1e-9
+"""Smaller changes of a target are rounding [rad]."""
+_SHIFTS = np.arange(0.0, 0.0305, 0.00025)
+"""Delays tried for the drives, multiples of the virtual robot's physics step [s]."""
+_EXPLAINED = 0.8
+"""Least share of the torque's variance that the drive law must explain."""
+_GENTLE = 0.5
+"""Share of its effort limit below which a drive follows the law at any battery voltage."""
+_AS_GOOD = 1.1
+"""Residuals up to this multiple of the least are no worse."""
+_LEAST = 250
+"""Fewest ticks to fit: half a second."""
+_UNKNOWN = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """A time in one mode."""
+
+    mode: Mode
+    begin: float
+    """Since the first tick [s]."""
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantiles:
+    """Values that the given share does not exceed [s]; NaN where fewer than one lies beyond."""
+
+    n: int
+    p50: float
+    p95: float
+    p99: float
+    p99_9: float
+    max: float
+
+    @classmethod
+    def of(cls, values: Array) -> Quantiles:
+        """Compute them over the finite values."""
+        found = np.sort(values[np.isfinite(values)])
+        n = len(found)
+
+        def quantile(share: float) -> float:
+            if n * (1.0 - share) < 1.0 - 1e-9:
+                return float("nan")
+            return float(found[int(np.ceil(share * n - 1e-9)) - 1])
+
+        p50, p95, p99, p99_9 = map(quantile, (0.5, 0.95, 0.99, 0.999))
+        most = float(found[-1]) if n else float("nan")
+        return cls(n=n, p50=p50, p95=p95, p99=p99, p99_9=p99_9, max=most)
+
+    def milliseconds(self) -> dict[str, float | int | None]:
+        """Return the count, and the times in ms; None for unknown."""
+        times = asdict(self)
+        n = times.pop("n")
+        return {"n": n} | {f"{name}_ms": known(1e3 * value) for name, value in times.items()}
+
+
+def known(value: float) -> float | None:
+    """Return a number for JSON; None for NaN."""
+    return float(value) if np.isfinite(value) else None
+
+
+def seconds(log: DeployLog, time: Array | float) -> Array:
+    """Return times on the log's clock as times since its first tick [s]."""
+    return np.asarray(np.asarray(time, dtype=float) - log.time[0])
+
+
+def policy_active(log: DeployLog) -> Mask:
+    """Return the ticks in which the policy gave the targets, (T,)."""
+    return np.asarray(np.isin(log.mode, POLICY_MODES))
+
+
+def stretches(log: DeployLog) -> tuple[Stretch, ...]:
+    """Return the modes one after the other."""
+    edges = [0, *(np.flatnonzero(np.diff(log.mode)) + 1), len(log.time)]
+    period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
+    t = seconds(log, np.append(log.time, log.time[-1] + period))
+    return tuple(
+        Stretch(mode=Mode(int(log.mode[a])), begin=float(t[a]), seconds=float(t[b] - t[a]))
+        for a, b in pairwise(edges)
+    )
+
+
+def faults(log: DeployLog) -> tuple[float, ...]:
+    """Return when faults began, since the first tick [s]."""
+    return tuple(float(seconds(log, one.time)) for one in log.events if one.kind == "fault")
+
+
+def jumps(log: DeployLog) -> tuple[tuple[float, float], ...]:
+    """Return the begin and end of each jump input, since the first tick [s]."""
+    if not len(log.step_time):
+        return ()
+    t = seconds(log, np.append(log.step_time, log.step_time[-1] + 0.02))
+    edges = np.diff(np.concatenate([[0], (log.jump & log.step_live).astype(int), [0]]))
+    return tuple(
+        (float(t[a]), float(t[b]))
+        for a, b in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True)
+    )
+
+
+def missed(log: DeployLog) -> int:
+    """Return the number of ticks left out because their time had passed."""
+    return int((np.diff(log.tick) - 1).sum())
+
+
+def tilt(log: DeployLog) -> Array:
+    """Return the angle of the trunk's z axis from the vertical [rad]; NaN without an attitude."""
+    size = np.linalg.norm(log.orientation, axis=1)
+    x, y = log.orientation[:, 1], log.orientation[:, 2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y) / size**2, -1.0, 1.0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intervention:
+    """Action of the safety filter for one reason."""
+
+    reason: Reason
+    level: FilterAction
+    ticks: int
+    first: float
+    """Since the first tick [s]."""
+    largest: float
+    """Largest change of a target [rad]; NaN while damped."""
+    joint: str
+    """Joint whose target was changed most often; empty while damped."""
+
+
+def interventions(log: DeployLog) -> tuple[Intervention, ...]:
+    """Return what the filter did, by level and reason; the mildest first."""
+    found = []
+    with np.errstate(invalid="ignore"):
+        change = np.abs(log.sent - log.desired)
+    for level in list(FilterAction)[1:]:
+        for reason in Reason:
+            there = (log.level == level) & (log.reason == reason)
+            if not there.any():
+                continue
+            of = change[there]
+            finite = bool(np.isfinite(of).any()) and level < FilterAction.DAMP
+            often = (of > _MOVED).sum(axis=0)
+            found.append(
+                Intervention(
+                    reason=reason,
+                    level=level,
+                    ticks=int(there.sum()),
+                    first=float(seconds(log, log.time[there][0])),
+                    largest=float(np.nanmax(of)) if finite else float("nan"),
+                    joint=log.joints[int(often.argmax())] if finite and often.any() else "",
+                )
+            )
+    return tuple(found)
+
+
+def in_force(log: DeployLog) -> Array:
+    """Return the target of the drives when each state was measured [rad], (T, joints).
+
+    The one of the tick before; NaN for the first tick and after a damped one.
+    """
+    return np.vstack([np.full((1, log.sent.shape[1]), np.nan), log.sent[:-1]])
+
+
+def _rms(values: Array) -> Array:
+    """Of the finite values of each column; NaN without any."""
+    with np.errstate(invalid="ignore"):
+        there = np.isfinite(values)
+        return np.asarray(np.sqrt((np.where(there, values, 0.0) ** 2).sum(0) / there.sum(0)))
+
+
+def _largest(values: Array) -> Array:
+    """Of the finite values of each column; NaN without any."""
+    size = np.where(np.isfinite(values), np.abs(values), -1.0).max(axis=0, initial=-1.0)
+    return np.where(size >= 0.0, size, np.nan)
+
+
+def tracking(log: DeployLog) -> dict[str, Array]:
+    """Return how each joint followed its targets, (joints,); NaN where there was no such time.
+
+    `error`, `largest`: target in force less position while the policy was active, RMS and largest
+    [rad]; `standing`: RMS in the mode `STAND` [rad]; `torque`, `torque_largest`: as the robot
+    reports them [N m]; `speed_largest` [rad/s].
+    """
+    error = in_force(log) - log.position
+    active = policy_active(log)
+    torque = log.torque if log.torque.any() else np.full_like(log.torque, np.nan)
+    return {
+        "standing": _rms(error[log.mode == Mode.STAND]),
+        "error": _rms(error[active]),
+        "largest": _largest(error[active]),
+        "torque": _rms(torque[active]),
+        "torque_largest": _largest(torque[active]),
+        "speed_largest": _largest(log.velocity[active]),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delay:
+    """Measured delay beside that of training [s]."""
+
+    trained: tuple[float, float] | None
+    """Range of the policy's training; None where the log does not hold it."""
+    command: Quantiles
+    """From a state to the first command that uses it, while the policy was active."""
+    drives: tuple[float, float]
+    """From a command on the wire to its torque, bounds; NaN where it could not be estimated."""
+
+    @property
+    def total(self) -> tuple[float, float]:
+        """Median of the command with the drives' least; its 95 % with the drives' most [s]."""
+        return self.command.p50 + self.drives[0], self.command.p95 + self.drives[1]
+
+    @property
+    def longest(self) -> float:
+        """Upper end of what is known [s]: of the total, else of the commands alone."""
+        return self.total[1] if np.isfinite(self.total[1]) else self.command.p95
+
+    @property
+    def within(self) -> bool | None:
+        """Whether the delay is at most the longest of training; None where it is unknown."""
+        if self.trained is None or not np.isfinite(self.longest):
+            return None
+        return bool(self.longest <= self.trained[1])
+
+
+def delay(log: DeployLog, robot: Robot | None) -> Delay:
+    """Measure the delay.
+
+    Args:
+        log: Of the run.
+        robot: With the gains of its drives; None leaves the drives' part unknown.
+    """
+    trained = log.header.get("policy", {}).get("delay_range_s")
+    return Delay(
+        trained=None if trained is None else (float(trained[0]), float(trained[1])),
+        command=Quantiles.of(log.latency[policy_active(log)]),
+        drives=_UNKNOWN if robot is None else drive_delay(log, robot),
+    )
+
+
+def drive_delay(log: DeployLog, robot: Robot) -> tuple[float, float]:
+    """Return the delays with which targets explain torques best, least and most [s].
+
+    NaN where there is too little to fit, where torques are not measured, where the law explains
+    too little of them, or where the longest delay tried is among the best.
+    """
+    kp = np.array([joint.stiffness for joint in robot.joints])
+    kd = np.array([joint.damping for joint in robot.joints])
+    gentle = _GENTLE * np.array([joint.drive.effort_limit for joint in robot.joints])
+    wire = log.time + log.work
+    first = np.concatenate([[True], np.diff(log.state_sequence) > 0])  # each state once
+    use = policy_active(log) & first & (log.state_time - _SHIFTS[-1] > wire[0])
+    if use.sum() < _LEAST:
+        return _UNKNOWN
+    t, q, v, measured = (a[use] for a in (log.state_time, log.position, log.velocity, log.torque))
+    residuals = []
+    for by in _SHIFTS:
+        target = log.sent[np.searchsorted(wire, t - by, side="right") - 1]
+        expected = kp * (target - q) - kd * v
+        there = np.isfinite(measured) & (np.abs(expected) < gentle)  # false where damped
+        if there.sum() < _LEAST or np.var(measured[there]) == 0.0:
+            return _UNKNOWN
+        residuals.append(np.mean((measured - expected)[there] ** 2) / np.var(measured[there]))
+    left = np.array(residuals)
+    good = _SHIFTS[left <= _AS_GOOD * left.min()]
+    if 1.0 - left.min() < _EXPLAINED or good[-1] == _SHIFTS[-1]:
+        return _UNKNOWN
+    return float(good[0]), float(good[-1])
+
+
+def times(log: DeployLog) -> Mapping[str, tuple[Array, str]]:
+    """Return everything that was timed [s] by name, and what it is."""
+    bad = log.level >= FilterAction.DAMP
+    until_fault = int(bad.argmax()) + 1 if bad.any() else len(bad)
+    live = log.step_live
+    found = {
+        "servo tick late": (log.lateness, "from a tick's deadline to its begin"),
+        "age of the state": (
+            log.state_age[:until_fault],
+            "from the newest state to the tick's begin, until a fault",
+        ),
+        "state to command": (
+            log.latency[policy_active(log)],
+            "from the state that the policy read to the first command on the wire that uses it",
+        ),
+        "servo's work": (log.work, "from a tick's begin until its command was on the wire"),
+        "policy step late": (
+            log.step_lateness[live],
+            "from a step's deadline to its begin, while the policy was active",
+        ),
+        "inference": (log.decision[live], "observation built and network run, the same steps"),
+    }
+    return {name: one for name, one in found.items() if np.isfinite(one[0]).any()}

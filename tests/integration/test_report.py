@@ -1,0 +1,279 @@
+"""Pages of the report: whole, self-contained, escaped; damaged and missing artefacts."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from command_line import invoke
+from pronk.errors import ArtefactError
+from pronk.evaluation import results, tables
+from pronk.evaluation.metrics import JumpFigures
+from pronk.match import gains as gains_file
+from pronk.report import build, match_page, trial_page
+from report_cases import CASES, match, walks, write_match, write_tree, write_trial
+
+NASTY = "<img src=x onerror=alert(1)>"
+
+
+class Checker(HTMLParser):
+    """Tags that are open, anchors, links, images and text of a page."""
+
+    VOID = frozenset({"meta", "link", "img", "br"})
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.pictures: list[dict[str, str]] = []
+        self.text = ""
+        self.feed(html)
+        self.close()
+        assert self.open == []
+        assert len(self.ids) == len(set(self.ids))
+        assert {link.removeprefix("#") for link in self.links} <= set(self.ids)
+        for word in ("<script", "@import", "http://", "https://", "<iframe", "<object", "url("):
+            assert word not in html
+        assert "nan" not in re.sub(r"[A-Za-z]+nan|nan[a-z]+", "", self.text).lower()
+        self.text = re.sub(r"\s+", " ", self.text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        fields = {name: value or "" for name, value in attrs}
+        self.open += [tag] * (tag not in self.VOID)
+        self.ids += [fields["id"]] if "id" in fields else []
+        self.links += [fields["href"]] if tag == "a" else []
+        self.pictures += [fields] if tag == "img" else []
+        for name in {"src", "href"} & set(fields):
+            assert fields[name].startswith(("data:", "#")), fields[name]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag, f"</{tag}> closes another tag"
+
+    def handle_data(self, data: str) -> None:
+        self.text += f" {data}"
+
+
+def report(folder: Path) -> Checker:
+    return Checker(build.write_report(folder)[0].read_text(encoding="utf-8"))
+
+
+def match_report(folder: Path) -> Checker:
+    return Checker(match_page.write_page(folder).read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tree(tmp_path_factory.mktemp("tree"))
+
+
+@pytest.fixture(scope="module")
+def html(tree: Path) -> str:
+    return build.write_report(tree)[0].read_text(encoding="utf-8")
+
+
+def test_the_page_of_everything(tree: Path, html: str) -> None:
+    page = Checker(html)
+    assert {"trial", "walk", "crossing", "variation", "bodies", "match"} < set(page.ids)
+    assert "trial1" not in page.ids  # trials of the randomized robots belong to their part
+    for section in ("table", "criteria", "scatter", "films", "landings", "rates", "heights"):
+        assert f"trial-{section}" in page.ids
+    assert {"trial-drives", "trial-figures", "trial-setup", "match-gains"} < set(page.ids)
+    assert len(html.encode()) < 8e6
+    assert len(page.pictures) > 12
+    assert all(len(one["alt"]) > 20 for one in page.pictures)
+    kinds = {one["src"].split(";")[0] for one in page.pictures}
+    assert kinds == {"data:image/svg+xml", "data:image/png", "data:image/gif"}
+
+
+def test_tables_hashes_seeds_and_versions_are_on_the_page(tree: Path, html: str) -> None:
+    text = Checker(html).text.replace("_", " ")
+    trial = results.load(tree / "trial")
+    for one in tables.sheets(trial):
+        for cell in {cell for row in one.rows for cell in row}:
+            shown = cell.replace("+-", "±").replace(">=", "≥").replace("<=", "≤")
+            shown = "–" if shown == "-" else shown.split(": ")[-1].replace("_", " ")
+            assert shown in text, (one.title, cell)
+    for word in (*(s.sha256 for s in trial.subjects), "ab" * 32, "seed 3", "pronk 0.1.0"):
+        assert word in html
+
+
+def test_numbers_of_the_virtual_robot_are_called_so(html: str, tmp_path: Path) -> None:
+    assert 'class="badge">virtual robot<' in html
+    for words in ("matched, virtual robot", "paper, matched", "hardware", "a simulated machine"):
+        assert words in Checker(html).text
+    real = match_report(write_match(tmp_path, match(virtual=False, legs=1), prediction=True))
+    assert "virtual robot" not in real.text
+
+
+def test_outcomes_of_the_parts(html: str) -> None:
+    text = Checker(html).text
+    assert "matched, virtual robot: 0 of 2 walks ended in a fall." in text
+    assert "matched, virtual robot: gaps crossed 0.20 m (forward 2)." in text
+    assert "a foot was in the gap (5)" in text
+    assert "12 of 12 jumps on varied robots landed" in text
+    assert "2 other virtual robots: 24 of 24 jumps landed" in text
+
+
+def test_the_page_of_a_match(tmp_path: Path) -> None:
+    result = match()
+    page = match_report(write_match(tmp_path, result, prediction=True))
+    for section in ("gains", "bode", "maps", "ranges", "armature", "amplitudes", "prediction"):
+        assert f"match-{section}" in page.ids
+    assert {"match-identifiability", "match-use", "match-excitation"} < set(page.ids)
+    found = match_page.verdict(result)
+    assert (found["matched"], found["joints"]) == (12, 12)
+    expected = np.sqrt(np.mean([j.error_db**2 for j in result.joints.values()]))
+    assert found["error_db"] == pytest.approx(expected)
+    numbers = ("12 of 12 joints matched", f"{expected:.2f} dB", "3.11.0", "dc_motor_pd", "0.516")
+    for words in (*numbers, *result.gains.logs.values(), *result.joints):
+        assert words.replace("_", " ") in page.text.replace("_", " ")
+    bare = {
+        name: replace(fit, zero_armature=None, zero_armature_error_db=float("nan"))
+        for name, fit in result.joints.items()
+    }
+    (tmp_path / "fresh.prediction.npz").unlink()
+    ids = match_report(write_match(tmp_path, replace(result, joints=bare))).ids
+    assert not {"match-armature", "match-prediction"} & set(ids)
+
+
+def test_a_joint_without_a_match_is_a_warning() -> None:
+    result = match(legs=1)
+    warning = "no match: the best gains miss the measured response by 2 dB RMS"
+    bad = replace(result.joints["FR_knee"], flags=(warning,))
+    found = match_page.verdict(replace(result, joints={**result.joints, "FR_knee": bad}))
+    assert found["matched"] == 2
+    assert warning in found["flags"]["FR_knee"]
+    assert not any("zero armature" in flag for flags in found["flags"].values() for flag in flags)
+
+
+def test_text_of_files_is_escaped(tmp_path: Path) -> None:
+    result = match(legs=1)
+    gains = replace(result.gains, logs={NASTY: "0" * 64})
+    write_match(tmp_path, replace(result, gains=gains))
+    write_trial(tmp_path, ("matched",), CASES[:1])
+    body = json.loads((tmp_path / "summary.json").read_text())
+    body["sim_params"]["file"] = body["policies"][0]["path"] = NASTY
+    (tmp_path / "summary.json").write_text(json.dumps(body))
+    text = build.write_report(tmp_path)[0].read_text(encoding="utf-8")
+    assert NASTY not in text
+    assert text.count("&lt;img src=x onerror=alert(1)&gt;") == 3
+
+
+def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
+    write_trial(tmp_path, ("matched",), CASES[:1])
+    first = build.write_report(tmp_path)[0].read_bytes()
+    assert build.write_report(tmp_path)[0].read_bytes() == first
+
+
+def test_one_policy_without_captures_or_match(tmp_path: Path) -> None:
+    write_trial(tmp_path, ("matched",), CASES[:2])
+    page = report(tmp_path)
+    assert "trial-table" in page.ids
+    assert not {f"trial-{name}" for name in ("scatter", "films", "rates", "heights")} & set(
+        page.ids
+    )
+
+
+def test_missing_captures_are_counted(tmp_path: Path) -> None:
+    trial = write_trial(tmp_path, ("matched",), CASES[:1], keep=True)
+    (tmp_path / trial.rows[1].capture).unlink()
+    found = trial_page.captured(trial, tmp_path)
+    assert found is not None
+    assert (found.missing, len(found.height["matched"]["forward 1"])) == (1, 2)
+    assert "2 of 3 jumps" in report(tmp_path).text
+
+
+def test_a_policy_that_never_jumps(tmp_path: Path) -> None:
+    trial = write_trial(tmp_path, ("matched",), CASES[:2])
+    rows = tuple(replace(row, figures=JumpFigures(standing=True, fell=True)) for row in trial.rows)
+    results.save(tmp_path, replace(trial, rows=rows))
+    assert "6 jumps commanded, 0 jumped" in report(tmp_path).text
+
+
+def test_two_trials_are_two_parts(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        write_trial(tmp_path / name, ("matched",), CASES[:1])
+    page = report(tmp_path)
+    assert "Trial: monday" in page.text
+    assert "Trial: tuesday" in page.text
+
+
+def test_the_nearest_match_is_not_looked_for_above_the_root(tree: Path) -> None:
+    found = trial_page.match_near(tree / "trial", tree)
+    assert found is not None
+    assert set(found.joints) == {"FR_knee"}
+    assert trial_page.match_near(tree / "trial", tree / "trial") is None
+
+
+@pytest.mark.parametrize(
+    ("name", "bytes_kept"),
+    [
+        ("trial/summary.json", 300),
+        ("trial/trials.csv", 2000),
+        *((f"trial/{name}.json", 200) for name in ("walk", "crossing", "variation", "bodies")),
+        ("trial/bodies/body_2/trial/trials.csv", 2000),
+        ("trial/captures/naive_forward_1_001.npz", 500),
+        ("trial/videos/matched_forward_2.gif", 5),
+        ("match.npz", 100),
+    ],
+)
+def test_damage_is_one_sentence_and_no_page(
+    tree: Path, tmp_path: Path, name: str, bytes_kept: int
+) -> None:
+    for path in tree.rglob("*"):
+        if path.is_file() and path.name != build.NAME:
+            copy = tmp_path / path.relative_to(tree)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    damaged = tmp_path / name
+    damaged.write_bytes(damaged.read_bytes()[:bytes_kept])
+    with pytest.raises(ArtefactError, match=damaged.stem) as refusal:
+        build.write_report(tmp_path)
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / build.NAME).exists()
+
+
+def test_missing_artefacts_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="nothing to report"):
+        build.write_report(tmp_path)
+    with pytest.raises(ArtefactError, match="no such folder"):
+        build.write_report(tmp_path / "nowhere")
+    with pytest.raises(ArtefactError, match="no such folder"):
+        match_page.write_page(tmp_path / "nowhere")
+    with pytest.raises(ArtefactError, match=r"gains\.yaml"):
+        match_page.write_page(tmp_path)
+    gains_file.save(tmp_path / "gains.yaml", match(legs=1).gains)
+    with pytest.raises(ArtefactError, match=r"match\.npz"):
+        match_page.write_page(tmp_path)
+    assert not (tmp_path / match_page.PAGE_NAME).exists()
+
+
+def test_gains_under_another_name_are_found(tmp_path: Path) -> None:
+    write_match(tmp_path, match(legs=1))
+    (tmp_path / "gains.yaml").rename(tmp_path / "tuesday.yaml")
+    (tmp_path / "other.yaml").write_text("just: something\n")
+    assert match_page.find_gains(tmp_path).name == "tuesday.yaml"
+    gains_file.save(tmp_path / "wednesday.yaml", match(legs=1).gains)
+    with pytest.raises(ArtefactError, match="several gains files"):
+        match_page.find_gains(tmp_path)
+
+
+def test_the_command_writes_the_page_and_its_figures(tmp_path: Path) -> None:
+    write_trial(tmp_path / "trial", ("matched",), CASES[:1])
+    results.save(tmp_path / "trial", walks())
+    figures = tmp_path / "figures.json"
+    done = invoke(["report", str(tmp_path), "--json", str(figures)])
+    assert done.exit_code == 0
+    assert (tmp_path / "report.html").exists()
+    parts = json.loads(figures.read_text())["parts"]
+    assert [one["source"] for one in parts] == ["trial/summary.json", "trial/walk.json"]
+    assert parts[0]["checks"][0]["what"] == "forward 1: height"
+    assert invoke(["report", str(tmp_path / "nowhere")]).exit_code == 2

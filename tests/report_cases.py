@@ -1,0 +1,336 @@
+"""Matches and trials for tests of the report, with numbers known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pronk.evaluation import bodies, results, variation, walk
+from pronk.evaluation.bodies import Bodies, Body, GainsError
+from pronk.evaluation.course import CrossingFigures
+from pronk.evaluation.crossing import CROSSING
+from pronk.evaluation.jumps import JumpRules
+from pronk.evaluation.metrics import JumpFigures, measure
+from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
+from pronk.evaluation.results import Kind, Results, Row, Subject
+from pronk.evaluation.variation import NOMINAL, VARIATION
+from pronk.evaluation.walk import WALK, walk_script
+from pronk.evaluation.walk_metrics import WalkFigures
+from pronk.match import gains as gains_file
+from pronk.match import prediction as prediction_file
+from pronk.match import result as match_file
+from pronk.match.gains import GroupGains, MatchedGains
+from pronk.match.prediction import JointPrediction, Prediction
+from pronk.match.result import JointFit, MatchResult
+from pronk.response.response import FrequencyResponse
+from pronk.robots import load_robot
+from pronk.simulators.simulator import SimulatorInfo
+from pronk.virtual import capture as captures
+from pronk.virtual.capture import Capture
+from seen_jump import SCRIPT, STANDING, G, seen_jump
+
+LEGS = ("FR", "FL", "HR", "HL")
+GROUPS = {
+    "hip_roll": (0.0300, 19.5, 0.48, (1.0, 10.0)),
+    "hip_pitch": (0.0260, 17.5, 0.40, (1.0, 10.0)),
+    "knee": (0.0070, 21.9, 0.54, (0.1, 15.0)),
+}
+"""Inertia of leg and rotor [kg m^2], matched stiffness and damping, band [Hz]."""
+NOMINAL_GAINS = (17.0, 0.4)
+ROBOT = load_robot("mini_cheetah")
+CASES = (PAPER_COMMANDS[0], PAPER_COMMANDS[1], RATES)
+FLIGHTS = {"matched": (400, 410, 420), "naive": (380, 400, 420)}
+"""Time in the air of each policy's jumps [ms]: the naive ones differ twice as much."""
+RATE, OMEGA = 3.0, 25.0
+"""Amplitude [rad/s] and omega [rad/s] of the roll rate of the matched policy."""
+
+
+def second_order(omega, stiffness, damping, inertia, viscous=0.01):
+    """Return the response of the paper's equation M2 with a still target velocity."""
+    s = 1j * omega
+    return stiffness / (inertia * s**2 + (damping + viscous) * s + stiffness)
+
+
+def error_db(measured, simulated, band):
+    gap = 20.0 * np.log10(np.abs(measured) / np.abs(simulated))
+    return float(np.sqrt(np.mean(gap[band] ** 2)))
+
+
+def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
+    """Return a fit of one joint at two amplitudes with noise of a few per cent."""
+    rng = np.random.default_rng(leg)
+    inertia, stiffness, damping, band_hz = GROUPS[name]
+    stiffness *= 1.0 + 0.02 * (leg - 1.5)
+    omega = 2.0 * np.pi * np.arange(0.25, 22.6, 0.25)
+    matched = second_order(omega, stiffness, damping, inertia)
+    naive = second_order(omega, *NOMINAL_GAINS, inertia)
+    responses = []
+    for amplitude in (0.25, 0.125):
+        noise = 0.01 * (rng.normal(size=(3, omega.size)) + 1j * rng.normal(size=(3, omega.size)))
+        repeats = matched * np.exp(-1j * omega * 0.002) + noise * 0.25 / amplitude
+        responses.append(
+            FrequencyResponse(
+                joint=f"{LEGS[leg]}_{name}",
+                amplitude=amplitude,
+                omega=omega,
+                response=repeats.mean(axis=0),
+                coherence=1.0 - 0.3 * (omega / omega[-1]) ** 3,
+                averages=np.full(omega.size, 12.0),
+                repeats=repeats,
+                estimator="H1",
+                window="hann 4 s, 75 % overlap",
+                segment_s=4.0,
+                delay_s=0.002,
+                third_harmonic=0.02,
+                virtual=virtual,
+                source="synthetic",
+            )
+        )
+    first = responses[0]
+    band = first.band(*band_hz)
+    k, d = np.linspace(13, 27, 21), np.linspace(0.1, 0.7, 21)
+    surface = [
+        [error_db(first.response, second_order(omega, a, b, inertia), band) ** 2 for b in d]
+        for a in k
+    ]
+    is_knee = name == "knee"
+    return JointFit(
+        joint=first.joint,
+        responses=tuple(responses),
+        grid_stiffness=k,
+        grid_damping=d,
+        grid_error=np.array(surface),
+        stiffness=stiffness,
+        damping=damping,
+        ci95={
+            "stiffness": (stiffness - 0.6, stiffness + 0.6),
+            "damping": (damping - 0.02, damping + 0.02),
+        },
+        covariance=np.array([[0.09, 0.0015], [0.0015, 1e-4]]),
+        band_hz=band_hz,
+        matched=matched,
+        naive=naive,
+        coherence_min=0.91,
+        armature=0.0026,
+        error_db=error_db(first.response, matched, band),
+        naive_error_db=error_db(first.response, naive, band),
+        zero_armature_error_db=2.9 if is_knee else float("nan"),
+        zero_armature=second_order(omega, 27.0, 0.62, 0.0012) if is_knee else None,
+        amplitude_gains=np.array(
+            [[0.25, stiffness, damping], [0.125, stiffness * 0.98, damping * 1.03]]
+        ),
+        flags=(
+            *(("3 of 60 frequencies left out for low coherence",) if is_knee else ()),
+            "zero armature: no match, the best node misses by 2.9 dB RMS, 30 times the match",
+        ),
+    )
+
+
+def match(*, virtual: bool = True, robot: str = "mini_cheetah", legs: int = 4) -> MatchResult:
+    """Return a match of the three joints of some legs."""
+    fits = [joint_fit(name, leg, virtual=virtual) for leg in range(legs) for name in GROUPS]
+    joints = {fit.joint: fit for fit in fits}
+    groups = {
+        name: GroupGains(
+            stiffness=round(k * 2) / 2,
+            damping=round(d * 20) / 20,
+            stiffness_range=2.0,
+            damping_range=0.05,
+            ellipsoid=((1.2, 0.0), (0.0, 0.001)),
+            ellipsoid_center=(k, d),
+        )
+        for name, (_, k, d, _) in GROUPS.items()
+    }
+    gains = MatchedGains(
+        robot=robot,
+        simulator=SimulatorInfo(version="3.11.0"),
+        joints={name: fit.gains() for name, fit in joints.items()},
+        groups=groups,
+        logs={f"{name}.mcap": f"{i:064x}" for i, name in enumerate(joints)},
+        virtual=virtual,
+    )
+    seconds = {"estimate": 1.2, "grid": 31.0}
+    return MatchResult(gains=gains, joints=joints, seconds=seconds, grid_steps_per_second=6e5)
+
+
+def joint_prediction() -> JointPrediction:
+    """Return a prediction whose nominal simulation is wrong between 4 and 5 s alone."""
+    time = np.arange(0.0, 6.0, 0.002)
+    command = 0.25 * np.sin(2.0 * np.pi * 0.8 * time**2)[(np.arange(time.size) // 10) * 10]
+    return JointPrediction(
+        joint="FR_knee",
+        time=time,
+        command=command,
+        measured=command,
+        naive=np.where((time > 4.0) & (time < 5.0), 1.3, 1.0) * command,
+        naive_delayed=1.1 * command,
+        matched=1.01 * command,
+        signal="log_chirp",
+    )
+
+
+def write_match(folder: Path, result: MatchResult, *, prediction: bool = False) -> Path:
+    gains_file.save(folder / "gains.yaml", result.gains)
+    match_file.save(folder / "match.npz", result)
+    if prediction:
+        one = Prediction(
+            joints=(joint_prediction(),), virtual=result.gains.virtual, source="fresh.mcap"
+        )
+        prediction_file.save(folder / "fresh.prediction.npz", one)
+    return folder
+
+
+def lift_off(flight: int) -> float:
+    """Return the lift-off velocity of a flight of so many milliseconds [m/s]."""
+    return G * flight / 2000.0
+
+
+def subject(name: str, **contract: Any) -> Subject:
+    gains = {"naive": ((17.0,) * 3, (0.4,) * 3)}
+    stiffness, damping = gains.get(name, ((20.0, 17.5, 21.5), (0.45, 0.40, 0.55)))
+    fields = {"gains": name, "joint_names": ROBOT.joint_names}
+    fields |= {"stiffness": stiffness * 4, "damping": damping * 4}
+    return Subject(name=name, path=f"{name}.onnx", sha256=name[0] * 64, contract=fields | contract)
+
+
+def jump_capture(flight: int, scale: float) -> Capture:
+    made = seen_jump(up=lift_off(flight))
+    rate = np.zeros_like(made.angular_velocity)
+    rate[:, 0] = scale * RATE * np.sin(OMEGA * (made.time - SCRIPT.start))
+    velocity = np.tile(np.linspace(-10.0, 10.0, len(made.time))[:, None], (1, 12))
+    return replace(made, angular_velocity=rate, joint_velocity=velocity, torque=0.5 * velocity)
+
+
+def of_kind(kind: Kind, names: tuple[str, ...], **rest: Any) -> Results:
+    fields: dict[str, Any] = {"script": SCRIPT, "joint_names": ROBOT.joint_names, "seed": 3}
+    fields |= {"sim_params": {"file": "shipped with pronk", "sha256": "ab" * 32}}
+    fields |= {"robot": ROBOT.name, "versions": {"pronk": "0.1.0"}, "kind": kind}
+    return Results(**(fields | {"subjects": tuple(map(subject, names))} | rest))
+
+
+def row(policy: str, case: Case, number: int, figures: Any, **rest: Any) -> Row:
+    script = replace(SCRIPT, command=case.command)
+    one = {"policy": policy, "case": case.name, "number": number, "seed": number}
+    return Row(**one, figures=figures, script=script, **rest)
+
+
+def write_trial(
+    folder: Path,
+    policies: tuple[str, ...] = ("matched", "naive"),
+    cases: tuple[Case, ...] = CASES,
+    *,
+    keep: bool = False,
+) -> Results:
+    """Write a trial measured by `pronk.evaluation.metrics` on closed-form jumps, and read it."""
+    rules, rows = JumpRules(standing_height=STANDING), []
+    for name in policies:
+        for case in cases:
+            script = replace(SCRIPT, command=case.command)
+            for number, flight in enumerate(FLIGHTS[name]):
+                capture = jump_capture(flight, 2.0 if name == "naive" else 1.0)
+                path = f"captures/{name}_{case.name}_{number:03d}.npz".replace(" ", "_")
+                if keep:
+                    captures.save(folder / path, capture)
+                figures = measure(capture, script, ROBOT, began=0.0, mass=12.0, rules=rules)
+                rows.append(row(name, case, number, figures, capture=path if keep else ""))
+    timing = {"seconds": 2.0, "simulated_s": 9.0, "processes": 1}
+    extra = {"cases": cases, "rows": tuple(rows), "rules": asdict(rules), "timing": timing}
+    results.save(folder, of_kind(results.JUMPS, policies, **extra))
+    return results.load(folder)
+
+
+def walks() -> Results:
+    """Two walks a policy; the naive one falls once."""
+    case = walk.WALKS[0]
+    fields: dict[str, Any] = {"non_foot_contact": False, "lasted": 20.0, "forward": 1.9}
+    rows = tuple(
+        row(name, case, i, WalkFigures(fell=name == "naive" and i == 0, **fields))
+        for name in ("matched", "naive")
+        for i in range(2)
+    )
+    script = walk_script((0.0, 0.0, 0.0))
+    return of_kind(WALK, ("matched", "naive"), cases=(case,), rows=rows, script=script)
+
+
+def crossings() -> Results:
+    """Gaps of 0.2 m crossed 4 times of 5, of 0.4 m never."""
+    case = PAPER_COMMANDS[1]
+    fields = {"obstacle": "gap", "lead": 0.4, "take_off": 0.1, "landing": 0.1, "reach": 0.3}
+    rows = tuple(
+        row("matched", case, i, CrossingFigures(size=size, why=why, speed=2.0, **fields))
+        for size in (0.2, 0.4)
+        for i in range(5)
+        for why in ["" if size < 0.3 and i else "a foot was in the gap"]
+    )
+    settings = {"kinds": ["gap", "up"], "runs": 5, "enough": 4}
+    return of_kind(CROSSING, ("matched",), cases=(case,), rows=rows, settings=settings)
+
+
+def varied() -> Results:
+    """Heights of 0.4 m, and 0.3 m with 1 kg more mass, with which the naive policy falls."""
+    mass, rows = replace(variation.PARAMETERS[0], values=(1.0,)), []
+    for parameter, value, height in ((NOMINAL, 0.0, 0.4), (mass.name, 1.0, 0.3)):
+        for name in ("matched", "naive"):
+            for case in CASES[:2]:
+                for number in range(3):
+                    good = name == "matched" or parameter != mass.name
+                    known = dict.fromkeys(variation.VARIED_FIGURES, 0.5 + 0.1 * number)
+                    known["height"] = height + 0.01 * (number - 1)
+                    figures = JumpFigures(
+                        standing=True, found=True, upright=good, fell=not good, **known
+                    )
+                    rows.append(row(name, case, number, figures, parameter=parameter, value=value))
+    settings = {"parameters": [asdict(mass)], "nominal": {mass.name: 0.0}}
+    names = ("matched", "naive")
+    return of_kind(VARIATION, names, cases=CASES[:2], rows=tuple(rows), settings=settings)
+
+
+def write_bodies(folder: Path) -> Bodies:
+    """Write two randomized robots with trials of their own."""
+    gains, found = match(legs=1).gains, []
+    for i in (1, 2):
+        where = f"bodies/body_{i}"
+        gains_file.save(folder / where / "gains.yaml", gains)
+        errors = {"training gains of matched": 0.1 * i, "training gains of naive": 0.6 * i}
+        errors[bodies.MATCHED] = 0.02 * i
+        found.append(
+            Body(
+                name=f"body {i}",
+                folder=where,
+                seed=i,
+                sha256="ef" * 32,
+                joints=gains.joints,
+                groups=gains.groups,
+                errors=tuple(
+                    GainsError(gains=n, rms_db=e, joints_db={"FR_knee": e}, pairs={})
+                    for n, e in errors.items()
+                ),
+                trial=write_trial(folder / where / "trial", cases=CASES[:2]),
+            )
+        )
+    head = of_kind(results.JUMPS, ("matched", "naive"), cases=(), rows=())
+    fields = {n: getattr(head, n) for n in ("robot", "subjects", "sim_params", "seed", "versions")}
+    made = Bodies(**fields, bodies=tuple(found))
+    bodies.save(folder, made)
+    return made
+
+
+def write_tree(root: Path) -> Path:
+    """Write a match, and below it a trial with all that may lie beside it."""
+    result = match(legs=1)
+    write_match(root, replace(result, joints={"FR_knee": result.joints["FR_knee"]}))
+    write_trial(root / "trial", keep=True)
+    for each in (walks(), crossings(), varied()):
+        results.save(root / "trial", each)
+    write_bodies(root / "trial")
+    frames = [Image.new("RGB", (64, 40), (i * 60, 90, 120)) for i in range(4)]
+    film = root / "trial" / "videos" / "matched_forward_2"
+    film.parent.mkdir()
+    frames[0].save(film.with_suffix(".gif"), save_all=True, append_images=frames[1:], duration=40)
+    frames[0].save(film.with_suffix(".png"))
+    film.with_suffix(".mp4").write_bytes(b"a film")
+    return root

@@ -1,0 +1,306 @@
+"""Figures of the report: curves, marks and axes, from data known in closed form."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from pronk.evaluation.crossing import climbs
+from pronk.report import extra_pages, figures, style, trial_figures, trial_page
+from pronk.report.paper import published
+from report_cases import (
+    CASES,
+    FLIGHTS,
+    GROUPS,
+    LEGS,
+    NOMINAL_GAINS,
+    OMEGA,
+    RATE,
+    ROBOT,
+    crossings,
+    joint_fit,
+    joint_prediction,
+    lift_off,
+    match,
+    subject,
+    varied,
+    write_bodies,
+    write_trial,
+)
+from seen_jump import DT, SCRIPT, Z_OFF, G
+
+
+@pytest.fixture(scope="module")
+def result():
+    return match()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("trial")
+
+
+@pytest.fixture(scope="module")
+def trial(folder):
+    return write_trial(folder, keep=True)
+
+
+@pytest.fixture(scope="module")
+def captured(trial, folder):
+    found = trial_page.captured(trial, folder)
+    assert found is not None
+    return found
+
+
+def legend(figure):
+    return " ".join(text.get_text() for text in figure.legends[0].get_texts())
+
+
+def curve(axes, colour):
+    return next(line for line in axes.lines if line.get_color() == colour)
+
+
+def drawn_figures(result):
+    groups = {name: [j for j in result.joints if j.endswith(name)] for name in GROUPS}
+    knee = result.joints["FR_knee"]
+    return [
+        figures.bode(knee),
+        figures.hero(result),
+        figures.overview(result.joints),
+        figures.error_maps(result, dict.fromkeys(result.joints, NOMINAL_GAINS)),
+        figures.ranges(result.gains, groups),
+        figures.zero_armature(knee),
+        figures.prediction(joint_prediction(), virtual=True),
+        figures.responses(knee.responses),
+    ]
+
+
+def test_axes_have_units_and_legends_fit(result) -> None:
+    for figure in drawn_figures(result):
+        labels = [f(axes) for axes in figure.axes for f in (lambda a: a.get_ylabel(),
+                                                            lambda a: a.get_xlabel())]  # fmt: skip
+        named = [label for label in labels if label and label != "coherence"]
+        assert named
+        assert all(re.search(r"\[.+\]$", label) for label in named), named
+        FigureCanvasAgg(figure).draw()
+        box = figure.legends[0].get_window_extent()
+        assert box.x0 >= 0.0
+        assert box.x1 <= figure.bbox.x1
+
+
+def test_bode_has_gain_in_decibel_and_phase_in_degrees(result) -> None:
+    fit = result.joints["FR_knee"]
+    gain, phase, _ = figures.bode(fit).axes
+    for colour, values in ((style.MATCHED, fit.matched), (style.NAIVE, fit.naive)):
+        assert np.allclose(curve(gain, colour).get_ydata(), 20.0 * np.log10(np.abs(values)))
+        degrees = np.degrees(np.unwrap(np.angle(values)))
+        assert np.allclose(curve(phase, colour).get_ydata(), degrees)
+    hz = fit.responses[0].omega / (2.0 * np.pi)
+    assert np.allclose(curve(gain, style.MATCHED).get_xdata(), hz)
+
+
+def test_measured_curves_of_the_virtual_robot_are_named_so(result) -> None:
+    assert "virtual robot" in legend(figures.bode(result.joints["FR_knee"]))
+    assert "virtual robot" in legend(figures.overview(result.joints))
+    assert "virtual robot" in figures.hero(result).axes[0].get_title(loc="left")
+    assert "virtual" not in legend(figures.bode(joint_fit("knee", virtual=False)))
+
+
+def test_overview_has_a_row_per_group_and_a_column_per_leg(result) -> None:
+    assert style.grid_of_joints(list(result.joints)) == [
+        [f"{leg}_{name}" for leg in LEGS] for name in GROUPS
+    ]
+    arm = ["Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll"]
+    assert style.grid_of_joints(arm) == [arm[:3], arm[3:]]
+
+
+def test_error_map_marks_grid_optimum_refined_gains_drive_and_paper(result) -> None:
+    axes = figures.error_maps(result, dict.fromkeys(result.joints, NOMINAL_GAINS)).axes[0]
+    fit = result.joints["FR_hip_roll"]
+    i, j = np.unravel_index(fit.grid_error.argmin(), fit.grid_error.shape)
+    marked = {line.get_marker(): line.get_xydata()[0] for line in axes.lines}
+    assert np.allclose(marked["s"], (fit.grid_stiffness[i], fit.grid_damping[j]))
+    assert np.allclose(marked["o"], (fit.stiffness, fit.damping))
+    assert np.allclose(marked["x"], NOMINAL_GAINS)
+    assert np.allclose(marked["+"], (20.6, 0.492))
+    # The map shows RMS dB: the square root of what the artefact holds.
+    shown = np.asarray(axes.collections[0].get_array()).reshape(fit.grid_error.T.shape)
+    assert np.allclose(shown, np.sqrt(fit.grid_error.T))
+
+
+def test_paper_gains_are_of_the_papers_robot_alone() -> None:
+    assert published("so101") is None
+    axes = figures.error_maps(match(robot="so101", legs=1)).axes[0]
+    assert "+" not in {line.get_marker() for line in axes.lines}
+
+
+def test_ellipse_passes_through_the_points_of_its_equation() -> None:
+    covariance = np.array([[0.09, 0.0015], [0.0015, 1e-4]])
+    drawn = figures.ellipse((20.0, 0.5), covariance, squared=5.99)
+    points = drawn.get_patch_transform().transform(drawn.get_path().vertices)[::3]
+    away = points - (20.0, 0.5)
+    assert np.allclose(np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away), 5.99)
+
+
+def test_zero_armature_needs_a_search_with_it(result) -> None:
+    with pytest.raises(ValueError, match="FR_hip_roll"):
+        figures.zero_armature(result.joints["FR_hip_roll"])
+
+
+def test_figures_are_reproducible_and_leave_matplotlib_settings_alone(result) -> None:
+    before = dict(mpl.rcParams)
+    one, other = (style.render(figures.bode(result.joints["FL_knee"])) for _ in range(2))
+    assert one == other
+    assert dict(mpl.rcParams) == before
+
+
+def test_prediction_shows_where_the_nominal_simulation_is_worst() -> None:
+    one = joint_prediction()
+    window = figures.busiest_window(one, 1.0)
+    assert one.time[window][[0, -1]] == pytest.approx([4.0, 5.0], abs=0.1)
+    assert figures.busiest_window(one, 100.0) == slice(0, len(one.time))
+
+
+def test_cells_draw_mean_spread_and_the_paper(trial) -> None:
+    distance, paper = trial_page.values(trial, "distance"), trial_page.published("distance")
+    assert list(distance) == ["naive", "matched"]  # as in the paper
+    axes = trial_figures.cells([("distance [m]", distance, paper)]).axes[0]
+    points = {
+        (round(float(y), 6), round(float(np.ptp(bar.get_segments()[0][:, 1])) / 2.0, 6))
+        for line, _, bars in (one.lines for one in axes.containers)
+        for y in line.get_ydata()
+        for bar in bars
+    }
+    # At 1 m/s the trunk flies its time in the air; a sample deviates by ten milliseconds.
+    assert {(0.41, 0.01), (0.40, 0.02)} <= points
+    for gains in ("naive", "matched"):
+        for case in ("forward 1", "forward 2"):
+            assert paper[gains][case] in points
+    assert paper["matched"]["forward 2"] == (0.969, 0.026)
+
+
+def test_height_traces_begin_before_the_jump_input(captured) -> None:
+    time, height = captured.height["matched"]["forward 1"][0]
+    assert time[0] == pytest.approx(-trial_page.BEFORE_S, abs=DT)
+    assert time[-1] <= trial_page.AFTER_S + 1e-9
+    assert np.allclose(np.diff(time), 1.0 / trial_page.TRACE_RATE_HZ)
+    flight = FLIGHTS["matched"][0] / 1000.0
+    inside = (time > 0.2 + DT) & (time < 0.2 + flight - DT)
+    t = time[inside] - 0.2
+    expected = Z_OFF + lift_off(FLIGHTS["matched"][0]) * t - 0.5 * G * t**2
+    assert np.allclose(height[inside], expected, atol=1e-6)
+    axes = trial_figures.heights(captured.height, standing=0.29).axes[0]
+    assert len(axes.lines) == 4
+    assert axes.lines[-1].get_ydata()[0] == 0.29
+
+
+def test_rates_are_of_the_acceleration_at_the_papers_speed(captured) -> None:
+    assert set(captured.roll["naive"]) == {CASES[2].name}
+    runs = captured.roll["naive"][CASES[2].name]
+    time, rate = runs[0]
+    assert time[[0, -1]] == pytest.approx([0.0, SCRIPT.run_s])
+    assert np.allclose(rate, 2.0 * RATE * np.sin(OMEGA * time), atol=1e-6)
+    # A sine over nearly whole periods.
+    assert trial_figures.rms(runs) == pytest.approx(2.0 * RATE / math.sqrt(2.0), rel=0.02)
+    figure = trial_figures.rates({"roll": captured.roll, "pitch": captured.pitch})
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert f"RMS {trial_figures.rms(runs):.2f} rad/s over 3 runs" in titles
+
+
+def test_torque_over_speed_is_drawn_with_the_limits_of_the_drives(captured) -> None:
+    row, velocity, torque = captured.hardest
+    assert row.policy == "matched"
+    assert np.allclose(torque, 0.5 * velocity)
+    figure = trial_figures.torque_speed(ROBOT, velocity, torque, policy="matched", words="a jump")
+    knee = next(axes for axes in figure.axes if axes.get_title(loc="left") == "knee")
+    drive = ROBOT.joint("FR_knee").drive
+    curves = [line for line in knee.lines if line.get_color() == style.MEASURED]
+    upper = max(curves, key=lambda line: float(np.sum(line.get_ydata())))
+    at = np.interp([0.0, 0.9 * drive.no_load_speed], *upper.get_data())
+    assert at == pytest.approx([drive.effort_limit, 0.1 * drive.stall_torque], rel=1e-3)
+
+
+def test_the_jump_nearest_to_the_drives_limits_has_the_least_margin(trial) -> None:
+    rows = [row for row in trial.rows if row.policy == "matched"]
+    easy = replace(rows[0], figures=replace(rows[0].figures, torque_margin=(0.5,) * 12))
+    hard = replace(rows[1], figures=replace(rows[1].figures, torque_margin=(0.9, *(0.1,) * 11)))
+    none = replace(rows[2], figures=replace(rows[2].figures, found=False))
+    assert trial_page.least_margin([easy, hard, none]) is hard
+    assert trial_page.least_margin([none]) is None
+
+
+def test_lines_are_drawn_in_order_with_bars_and_marks() -> None:
+    line = np.array([[0.4, 0.0, 0.0, 0.4], [0.2, 0.8, 0.4, 1.0]]).T
+    labels = {"title": "gap", "x_label": "size [m]", "y_label": "crossed [1]"}
+    panel = trial_figures.Panel(**labels, lines={"matched": line}, marks=(0.55,))
+    axes = trial_figures.lines([panel], columns=1, mark="paper", bar="interval").axes[0]
+    assert np.allclose(axes.lines[0].get_xydata(), [[0.2, 0.8], [0.4, 0.0]])
+    assert axes.lines[-1].get_xdata()[0] == 0.55
+    assert np.allclose(axes.collections[0].get_segments()[0], [[0.2, 0.4], [0.2, 1.0]])
+
+
+def test_crossings_become_shares_with_wilsons_interval() -> None:
+    size, share, low, high = extra_pages.climb_line(climbs(crossings())[0])
+    assert size.tolist() == [0.2, 0.4]
+    assert share.tolist() == [0.8, 0.0]
+    # Wilson with 4 of 5, z = 1.96.
+    z2 = 1.959964**2
+    middle = (0.8 + z2 / 10.0) / (1.0 + z2 / 5.0)
+    half = math.sqrt(z2 * 0.8 * 0.2 / 5.0 + z2**2 / 100.0) / (1.0 + z2 / 5.0)
+    assert (low[0], high[0]) == pytest.approx((middle - half, middle + half))
+
+
+def test_variation_gives_means_over_commands_and_shares_of_landings() -> None:
+    together = extra_pages.by_value(varied(), "trunk_mass_offset", "naive")
+    value, height, low, high = extra_pages.varied_line(together, "height")
+    assert value.tolist() == [0.0, 1.0]
+    assert height == pytest.approx([0.4, 0.3])
+    assert high - low == pytest.approx([0.02, 0.02])
+    assert extra_pages.varied_line(together, "landed")[1].tolist() == [1.0, 0.0]
+    assert [panel.marks for panel in extra_pages.variation_panels(varied())] == [(0.0,)] * 3
+    assert extra_pages.mean([0.4, math.nan, 0.2]) == pytest.approx(0.3)
+    assert math.isnan(extra_pages.mean([math.nan]))
+
+
+def test_scatter_over_gain_error_of_randomized_robots(tmp_path) -> None:
+    found = write_bodies(tmp_path)
+    errors, distance = extra_pages.errors_db(found), extra_pages.by_body(found, "distance")
+    expected = {"matched, body 1": 0.1, "naive, body 1": 0.6}
+    expected |= {"matched, body 2": 0.2, "naive, body 2": 1.2}
+    assert errors == pytest.approx(expected)
+    assert set(distance) == set(errors)
+    figure = trial_figures.scatter_over_error(errors, {"distance [m]": distance})
+    axes, texts = figure.axes[0], figure.legends[0].get_texts()
+    assert len(texts) == 3  # the robots of a policy share a look
+    means = {line.get_xdata()[0]: line.get_ydata()[0] for line in axes.lines
+             if line.get_marker() == "_"}  # fmt: skip
+    assert means[1.2] == pytest.approx(trial_figures.std(np.array([0.38, 0.40, 0.42])), rel=0.6)
+
+
+def test_error_of_gains_is_interpolated_in_the_error_map() -> None:
+    fit = joint_fit("knee")
+    k, d = fit.grid_stiffness, fit.grid_damping
+    # A map that cubic splines reproduce exactly.
+    smooth = 0.5 * (k[:, None] - 20.0) ** 2 + 30.0 * (d[None, :] - 0.5) ** 2 + 0.01
+    mapped = replace(fit, grid_error=smooth)
+    expected = math.sqrt(0.5 * 1.3**2 + 30.0 * 0.07**2 + 0.01)
+    assert trial_page.joint_error_db(mapped, 21.3, 0.43) == pytest.approx(expected)
+    assert math.isnan(trial_page.joint_error_db(mapped, 40.0, 0.43))
+    empty = replace(fit, grid_error=np.empty((0, 0)))
+    assert math.isnan(trial_page.joint_error_db(empty, 20.0, 0.5))
+
+
+def test_error_of_training_gains_is_known_for_all_policies_or_for_none(trial, result) -> None:
+    errors = trial_page.gains_errors(trial, result)
+    nominal = [fit.naive_error_db for fit in result.joints.values()]
+    assert errors["naive"] == pytest.approx(math.sqrt(np.mean(np.square(nominal))), rel=0.02)
+    assert errors["matched"] < errors["naive"]
+    for contract in ({"stiffness": (99.0,) * 12}, {"joint_names": ()}):
+        subjects = (subject("matched", **contract), *trial.subjects[1:])
+        assert trial_page.gains_errors(replace(trial, subjects=subjects), result) == {}
