@@ -1,8 +1,29 @@
-"""Messages that are broken in the ways in which messages break."""
+"""States for tests of links, and messages that are broken in the ways in which messages break."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+
+from pronk.links.machine import State
+
+
+def some_state(**changes: Any) -> State:
+    """A state of twelve joints with another number in every place, each exact in 32 bits."""
+    values: dict[str, Any] = {
+        "time": 1.0,
+        "sequence": 7,
+        "position": np.arange(12) / 16 - 0.25,
+        "velocity": np.arange(12) / 8,
+        "torque": np.arange(12) / 4,
+        "gyro": np.array([0.25, -0.5, 1.0]),
+        "accelerometer": np.array([0.5, 0.25, 9.75]),
+        "bus_voltage": 24.5,
+        "orientation": np.array([0.5, -0.5, 0.5, 0.5]),
+        "robot_time": 12.5,
+    }
+    return State(**(values | changes))
 
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:

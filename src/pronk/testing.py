@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from pronk.errors import HardwareError, LogError, PronkError
+from pronk.links.link import Codec, Transport
 from pronk.links.machine import Command, RefusedError, damping_command
-from pronk.links.stream_link import Codec, Transport
 from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import Reader
 from pronk.robots.robot import Robot

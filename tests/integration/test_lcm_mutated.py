@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from broken_message import some_state
 from pronk.links.lcm.codec import (
     BENCH_CHANNEL,
     CHEETAH,
     REQUEST_CHANNEL,
     WTW,
     Layout,
+    StateDecoder,
     decode_command,
     encode_command,
     encode_state,
 )
 from pronk.links.lcm.messages import MESSAGES
-from pronk.links.lcm.state_decoder import StateDecoder
-from pronk.links.machine import Command, RefusedError, State
+from pronk.links.machine import RefusedError, State
 from pronk.robots import load_robot
 from pronk.virtual.faults import flip_bit
+from pronk.virtual.lcm_server import LcmServerTransport
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.server import RobotServer, hold_of
 from pronk.virtual.sim_params import load_sim_params
@@ -37,10 +41,7 @@ BOTH = pytest.mark.parametrize("layout", [CHEETAH, WTW], ids=["cheetah", "wtw"])
 def good_command(layout: Layout) -> bytes:
     """A command that would move every joint by half a radian."""
     hold = hold_of(ROBOT)
-    return encode_command(
-        layout,
-        Command(position=hold.position + 0.5, stiffness=hold.stiffness, damping=hold.damping),
-    )
+    return encode_command(layout, replace(hold, position=hold.position + 0.5))
 
 
 class Breaker:
@@ -88,11 +89,21 @@ class Breaker:
         return self.others[self.rng.integers(len(self.others))]
 
 
+def virtual_leg() -> VirtualRobot:
+    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
+    machine.connect()
+    return machine
+
+
+def served(layout: Layout) -> tuple[VirtualRobot, LcmServerTransport, RobotServer]:
+    machine, wire = virtual_leg(), LcmServerTransport(ROBOT, layout, "memq://")
+    return machine, wire, RobotServer(machine, wire, hold=hold_of(ROBOT))
+
+
 @pytest.fixture(scope="module")
 def undisturbed() -> list[State]:
     """What one leg of the virtual robot does without a command."""
-    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
-    machine.connect()
+    machine = virtual_leg()
     return [machine.latest(), *machine.wait(STEPS * 0.002)]
 
 
@@ -100,13 +111,8 @@ def undisturbed() -> list[State]:
 def test_a_hundred_thousand_broken_messages_move_nothing(
     layout: Layout, undisturbed: list[State]
 ) -> None:
-    from pronk.virtual.lcm_server import LcmServerTransport
-
-    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
-    machine.connect()
+    machine, wire, server = served(layout)
     states = [machine.latest()]
-    wire = LcmServerTransport(ROBOT, layout, "memq://")
-    server = RobotServer(machine, wire, hold=hold_of(ROBOT))
     broken = Breaker(layout, seed=2)
     # On the channels of requests, too, none of these may do anything.
     channels = (layout.command_channel,) * 8 + (BENCH_CHANNEL, REQUEST_CHANNEL)
@@ -133,12 +139,7 @@ def test_a_hundred_thousand_broken_messages_move_nothing(
 
 @BOTH
 def test_the_same_server_does_move_when_commanded(layout: Layout, undisturbed: list[State]) -> None:
-    from pronk.virtual.lcm_server import LcmServerTransport
-
-    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=1, legs=("FR",))
-    machine.connect()
-    wire = LcmServerTransport(ROBOT, layout, "memq://")
-    server = RobotServer(machine, wire, hold=hold_of(ROBOT))
+    machine, wire, server = served(layout)
     wire.receive(layout.command_channel, good_command(layout))
     for step in range(STEPS):
         server.step((step + 1) * 0.002)
@@ -168,25 +169,18 @@ def test_one_flipped_bit_never_commands_the_impossible(layout: Layout) -> None:
 
 @BOTH
 def test_broken_states_make_no_state(layout: Layout) -> None:
-    decoder = StateDecoder(layout, ROBOT.joint_names)
-    state = State(
-        time=0.0, sequence=1, position=np.zeros(12), velocity=np.zeros(12), torque=np.zeros(12),
-        gyro=np.zeros(3), accelerometer=np.array([0.0, 0.0, 9.81]), bus_voltage=24.0,
-    )  # fmt: skip
-    (_, attitude), (_, joints) = encode_state(layout, state)
+    decoder = StateDecoder(layout, Counter())
+    (_, attitude), (_, joints) = encode_state(layout, some_state())
     decoder.attitude(attitude, 0.0)
     rng = np.random.default_rng(3)
     for k in range(20_000):
-        good = (attitude, joints)[k % 2]
+        take, good = ((decoder.attitude, attitude), (decoder.joints, joints))[k % 2]
         data = (
             flip_bit(good, int(rng.integers(64))),
             good[: rng.integers(len(good))],
             good[:8] + rng.bytes(int(rng.integers(len(good)))),
             rng.bytes(int(rng.integers(300))),
         )[rng.integers(4)]
-        (decoder.attitude, decoder.joints)[k % 2](data, 0.001)
-        decoder.beacon(data)
-    assert decoder.latest is None
-    assert not decoder.virtual
-    decoder.joints(joints, 0.002)
-    assert decoder.latest is not None
+        with pytest.raises(RefusedError):
+            take(data, 0.001)
+    assert decoder.joints(joints, 0.002) is not None

@@ -24,8 +24,8 @@ import pytest
 from hopper import write_hopper
 from pronk.errors import HardwareError
 from pronk.links.address import Address
+from pronk.links.link import Freshness
 from pronk.links.machine import Command, Machine
-from pronk.links.state_checks import Freshness
 from pronk.robots import load_robot
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.log import read_deploy_log
@@ -122,8 +122,8 @@ class Wire:
 def over_lcm(port: int) -> Wire:
     import lcm
 
-    from pronk.links.lcm.address import url_of
     from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
+    from pronk.links.lcm.link import url_of
 
     mouth, ear = (lcm.LCM(url_of(port=port)) for _ in range(2))
     met: list[tuple[float, bytes]] = []

@@ -19,8 +19,6 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.links.command_writer import CommandWriter
-from pronk.links.lcm.address import url_of
 from pronk.links.lcm.codec import (
     CHEETAH,
     REQUEST_CHANNEL,
@@ -28,9 +26,9 @@ from pronk.links.lcm.codec import (
     encode_command,
     mode_request,
 )
-from pronk.links.lcm.link import LcmMachine
+from pronk.links.lcm.link import LcmMachine, url_of
+from pronk.links.link import CommandWriter, Freshness
 from pronk.links.machine import Command, State
-from pronk.links.state_checks import Freshness
 from pronk.robots import load_robot
 from pronk.virtual.server import hold_of
 
@@ -81,16 +79,10 @@ class Process:
         return self.running.stdout.readline()
 
     def machine(self, **options: object) -> LcmMachine:
-        made = LcmMachine(
-            ROBOT,
-            layout=self.layout,
-            port=self.port,
-            exclusive_s=0.3,
-            # A computer that runs tests side by side is busy; what is tested here is not that.
-            fresh=Freshness(share=0.02, longest_gap_s=10.0),
-            **options,  # type: ignore[arg-type]
-        )
-        return made
+        # A computer that runs tests side by side is busy; what is tested here is not that.
+        fresh = Freshness(share=0.02, longest_gap_s=10.0)
+        common = {"layout": self.layout, "port": self.port, "exclusive_s": 0.3, "fresh": fresh}
+        return LcmMachine(ROBOT, **common, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +150,7 @@ def test_a_joint_moves_as_commanded_and_is_left_damped(
     machine.close()
     with pytest.raises(HardwareError, match="call connect"):
         machine.latest()
-    with pytest.raises(HardwareError, match="must be fixed mechanically"):
+    with pytest.raises(HardwareError, match="FR_knee"):
         machine.clamp(("FR_knee",))
 
 
@@ -204,7 +196,7 @@ def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
     rival = threading.Thread(target=command)
     rival.start()
     try:
-        with pytest.raises(HardwareError, match="another program commands the joints"):
+        with pytest.raises(HardwareError, match="another program"):
             machine.connect()
     finally:
         done.set()
@@ -217,7 +209,7 @@ def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
     until = time.monotonic() + LIMIT_S
     while not machine.counts["foreign"] and time.monotonic() < until:
         machine.wait(machine.now() + 0.01)
-    with pytest.raises(HardwareError, match="another program commands the joints"):
+    with pytest.raises(HardwareError, match="another program"):
         machine.send(HOLD)
     machine.close()
 
@@ -225,7 +217,7 @@ def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
 def test_the_robots_own_controller_is_released(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
     lcm.LCM(url_of(port=process.port)).publish(REQUEST_CHANNEL, mode_request(4, 1))
-    with pytest.raises(HardwareError, match="another program commands the joints"):
+    with pytest.raises(HardwareError, match="another program"):
         process.machine().connect()
     machine = process.machine(release=True)
     machine.connect()
@@ -235,18 +227,12 @@ def test_the_robots_own_controller_is_released(servers: dict[str, Process]) -> N
 def test_the_wrong_layout_is_refused(servers: dict[str, Process]) -> None:
     # Both stacks have a channel leg_control_data: what comes there is refused by its fingerprint.
     machine = LcmMachine(ROBOT, layout="wtw", port=servers["cheetah"].port)
-    with pytest.raises(HardwareError, match="sent no state on leg_control_data"):
+    with pytest.raises(HardwareError, match="leg_control_data"):
         machine.connect()
 
 
-def test_a_real_bench_needs_a_clamp_operator() -> None:
-    requests: list[tuple[str, ...]] = []
+def test_a_link_that_was_never_opened_closes() -> None:
     machine = LcmMachine(ROBOT, port=free_port())
-    with pytest.raises(HardwareError, match="FR_knee must be fixed mechanically"):
-        machine.clamp(("FR_knee",))
-    machine.clamp(())
-    LcmMachine(ROBOT, port=free_port(), clamp_operator=requests.append).clamp(("FR_knee",))
-    assert requests == [("FR_knee",)]
     # Never opened: nothing to damp, nothing to close.
     machine.damp()
     machine.close()
@@ -292,9 +278,7 @@ def test_a_wire_that_fails_never_ends_the_damping() -> None:
             time.sleep(0.01)
         assert (len(wire), writer.counts["expired"]) == (1, 1)
         # The sender of a command gets the error; damping never raises.
-        with pytest.raises(
-            HardwareError, match=r"put on the wire \(\[Errno 101\] Network is unrea"
-        ):
+        with pytest.raises(HardwareError, match="Errno 101"):
             writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
         writer.damp()
         cut.clear()

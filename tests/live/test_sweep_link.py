@@ -29,10 +29,10 @@ from pronk.errors import HardwareError, LogError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
 from pronk.links.address import Address
-from pronk.links.lcm.address import url_of
 from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
+from pronk.links.lcm.link import url_of
+from pronk.links.link import Freshness
 from pronk.links.machine import Command
-from pronk.links.state_checks import Freshness
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_log import read_mcap
 from pronk.robots import Robot, load_robot

@@ -138,8 +138,8 @@ def _open_wire(
 ) -> tuple[ServerTransport, str]:
     """The robot's end of the wire, and its address in words."""
     if link == "lcm":
-        from pronk.links.lcm.address import url_of
         from pronk.links.lcm.codec import layout_of
+        from pronk.links.lcm.link import url_of
         from pronk.virtual.lcm_server import LcmServerTransport
 
         if domain is not None:

@@ -11,7 +11,7 @@ from pronk.cli import confirm, console
 if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
     from pronk.links.address import Address
-    from pronk.links.state_checks import Freshness
+    from pronk.links.link import Freshness
     from pronk.robots.robot import Robot
     from pronk.runtime.ipc import Event
     from pronk.runtime.run import Recorded

@@ -21,9 +21,8 @@ import msgspec
 
 from pronk import plugins
 from pronk.errors import HardwareError
+from pronk.links.link import ClampOperator, Freshness
 from pronk.links.machine import Machine
-from pronk.links.network_link import ClampOperator
-from pronk.links.state_checks import Freshness
 from pronk.robots.robot import Robot
 
 SIM = "sim"
@@ -42,11 +41,7 @@ def link_names() -> tuple[str, ...]:
 
 
 def find_link(name: str) -> Callable[..., Machine]:
-    """Import a link.
-
-    Raises:
-        HardwareError: There is no such link, or its library is not installed.
-    """
+    """Import a link; HardwareError where there is none, or its library is not installed."""
     target = BUILT_IN.get(name)
     if target is None:
         known = entry_points(group=GROUP)
@@ -71,15 +66,10 @@ class Address:
 
     @classmethod
     def parse(cls, text: str, interface: str | None = None, **options: str | int | None) -> Address:
-        """Read an address, and check that the link has its options.
+        """Read a URI or a short name; refuse an unknown link or option.
 
-        Args:
-            text: A URI or a short name.
-            interface: Where the text names none.
-            options: Added to those of the text; None is no option.
-
-        Raises:
-            HardwareError: The link or an option is unknown, or an option is given twice.
+        `interface` serves where the text names none; `options` are added to those of the text, and
+        None is no option.
         """
         kind, found, query = text, "", ""
         if "://" in text:
@@ -122,14 +112,7 @@ class Address:
         exclusive_s: float = 1.0,
         fresh: Freshness | None = None,
     ) -> Machine:
-        """Make the machine, not yet connected.
-
-        Args:
-            robot: Expected at the address.
-            clamp_operator: Fixes joints on a real bench; None without one.
-            release: Make the robot's own controller let go of the joints first.
-            exclusive_s: How long no other program may have commanded before pronk does [s].
-            fresh: How fresh states must be; None for what moving a robot takes.
+        """Make the machine, not yet connected; arguments as of `NetworkLink`.
 
         Raises:
             HardwareError: The link's library is not installed, the address is impossible, or the

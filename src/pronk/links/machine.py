@@ -1,7 +1,7 @@
-"""The boundary: one small interface to a machine, real or virtual.
+"""The interface to a machine, real or virtual.
 
 The servo side runs at the machine's own rate; pronk sends position commands and reads states.
-Times are the machine's own monotonic clock in seconds.
+Times are the machine's own monotonic clock in seconds. Joints are in file order.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class State:
     sequence: int
     """Counts states from 0; a jump means states were lost."""
     position: Array
-    """Joint positions in file order [rad], shape (joints,)."""
+    """Joint positions [rad], shape (joints,)."""
     velocity: Array
     """Joint velocities [rad/s], shape (joints,)."""
     torque: Array
@@ -48,8 +48,8 @@ class State:
     bus_voltage: float
     """[V]"""
     orientation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-    """Trunk to world, as the machine's own attitude filter has it, unit quaternion w, x, y, z,
-    shape (4,). Its yaw starts anywhere."""
+    """Trunk to world by the machine's own attitude filter, unit quaternion w, x, y, z, shape (4,).
+    Its yaw starts anywhere."""
     robot_time: float | None = None
     """The robot's own stamp [s], where the wire carries one."""
     temperature: Array | None = None
@@ -77,21 +77,15 @@ class Command:
 
 
 def damping_command(joints: int, damping: float = 1.0) -> Command:
-    """Make a command without stiffness.
-
-    Args:
-        joints: How many.
-        damping: [N m s/rad]; with 1 a Mini Cheetah's leg sinks from its pose in about a second.
-    """
+    """Make a command without stiffness; with 1 N m s/rad a Mini Cheetah sinks in about a second."""
     zeros = np.zeros(joints)
     return Command(position=zeros, stiffness=zeros, damping=zeros + damping)
 
 
 def check_command(command: Command, joints: int) -> None:
-    """Check that drives can follow a command.
+    """Raise HardwareError for a wrong shape, NaN, infinity, a negative gain or an impossible time.
 
-    Raises:
-        HardwareError: Wrong shape, not finite, a negative gain, or an impossible time.
+    A link's `encode` calls it first.
     """
     for name in ("position", "stiffness", "damping"):
         values = np.asarray(getattr(command, name))
@@ -110,13 +104,11 @@ def check_command(command: Command, joints: int) -> None:
 
 
 class Machine(Protocol):
-    """A robot that answers. Every link implements this and nothing else."""
+    """A robot that takes commands and reports states. Every link implements this."""
 
     robot: str
     """Name of the robot."""
     virtual: bool
-    """True for the virtual robot."""
-
     torque_kind: TorqueKind
     """Whether `State.torque` was measured, computed from the command, or is absent (zeros)."""
 
@@ -124,27 +116,19 @@ class Machine(Protocol):
         """The machine's clock [s]."""
 
     def connect(self) -> None:
-        """Open the link and check that the machine is fit to move.
-
-        Raises:
-            HardwareError: No answer, or a pre-flight check failed.
-        """
+        """Open the link; raise HardwareError unless the machine is fit to move."""
 
     def latest(self) -> State:
         """The newest state, without waiting."""
 
     def wait(self, until: float) -> list[State]:
-        """Let time pass to `until` on the machine's clock; return the states met on the way."""
+        """Let time pass to `until` on the machine's clock; return the states met."""
 
     def send(self, command: Command) -> None:
         """Put a command into force."""
 
     def clamp(self, joints: tuple[str, ...]) -> None:
-        """Fix joints mechanically where they are (a person's job on a real bench); () frees all.
-
-        Raises:
-            HardwareError: The machine cannot.
-        """
+        """Fix joints mechanically where they are; () frees all. HardwareError if impossible."""
 
     def damp(self) -> None:
         """Let the joints sink softly: no stiffness, some damping."""

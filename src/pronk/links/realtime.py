@@ -1,7 +1,12 @@
-"""Real-time settings of the operating system, and pacing by absolute deadlines.
+r"""Real-time settings, pacing by absolute deadlines, and signals of a terminal.
 
-Nothing here is needed for a loop to be right, only for it to be on time; so what is not granted is
-reported and the loop runs without it.
+Real-time settings are not needed for a loop to be right, only for it to be on time: what is not
+granted is reported and the loop runs without it.
+
+Ctrl-C, Ctrl-\, Ctrl-Z and the end of the terminal, a lost ssh connection, go to every process of
+the program in front of it. A process that moves a robot must damp the joints before it ends, so it
+receives none of them: `unheard` while it starts, `leave` when it runs. The program that started it
+receives them, and ends it in order: `Interrupts`.
 """
 
 from __future__ import annotations
@@ -11,9 +16,14 @@ import errno
 import gc
 import math
 import os
+import signal
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,6 +31,11 @@ _LOCK_NOW_AND_LATER = 3
 """MCL_CURRENT | MCL_FUTURE of mlockall(2)."""
 _LEAST_CORES = 4
 """Fewest cores of which one can be given away."""
+
+TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP)
+r"""Signals of a terminal: Ctrl-C, Ctrl-\, Ctrl-Z, and its end."""
+ENDING = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
+"""Signals that end a program."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +53,7 @@ class Wanted:
 def enter(wanted: Wanted) -> tuple[str, ...]:
     """Request settings for this process; return one line for each reply.
 
-    The garbage of what is loaded so far is collected and then left alone for good: a collection in
-    the middle of a loop takes milliseconds.
+    Garbage collection stops for good: a collection in a loop takes milliseconds.
     """
     gc.collect()
     gc.freeze()
@@ -111,18 +125,10 @@ def sleep_until(deadline: float) -> None:
 
 
 class Pace:
-    """Ticks at absolute deadlines.
-
-    Lateness never adds up, and missed ticks are counted, not made up for.
-    """
+    """Ticks at absolute deadlines; lateness never adds up, missed ticks are only counted."""
 
     def __init__(self, rate_hz: float, start: float | None = None) -> None:
-        """Begin.
-
-        Args:
-            rate_hz: Ticks per second.
-            start: Deadline of tick 0 on CLOCK_MONOTONIC [s]; now if left out.
-        """
+        """Begin with tick 0 due at `start` on CLOCK_MONOTONIC [s], now if left out."""
         self.rate_hz = rate_hz
         self.start = time.monotonic() if start is None else start
         self.tick = 0
@@ -172,11 +178,65 @@ class Histogram:
 
     def figures(self) -> dict[str, float | int]:
         """The usual quantiles [ms], the largest and the count."""
-        return {
-            "n": self.count,
-            "p50_ms": 1e3 * self.quantile(0.5),
-            "p95_ms": 1e3 * self.quantile(0.95),
-            "p99_ms": 1e3 * self.quantile(0.99),
-            "p99_9_ms": 1e3 * self.quantile(0.999),
-            "max_ms": 1e3 * self.largest,
-        }
+        shares = {"p50_ms": 0.5, "p95_ms": 0.95, "p99_ms": 0.99, "p99_9_ms": 0.999}
+        quantiles = {name: 1e3 * self.quantile(share) for name, share in shares.items()}
+        return {"n": self.count, **quantiles, "max_ms": 1e3 * self.largest}
+
+
+@contextmanager
+def unheard() -> Iterator[None]:
+    """Start processes that ignore the terminal; signals that come meanwhile wait."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def leave() -> None:
+    """Take this process out of the terminal's session and ignore its signals.
+
+    Raises:
+        PermissionError: It leads a group of processes, as a program started by a shell does.
+    """
+    os.setsid()
+    for number in TERMINAL:
+        signal.signal(number, signal.SIG_IGN)
+
+
+class Interrupts:
+    """Records signals that end the program, without breaking into it; `check` raises them.
+
+    A context manager. Outside the main thread, where Python receives no signals, it records none.
+    """
+
+    def __init__(self) -> None:
+        """Record nothing yet."""
+        self._received = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Begin to record."""
+        if threading.current_thread() is threading.main_thread():
+            for number in ENDING:
+                before = signal.getsignal(number)
+                # What is ignored, as by nohup, stays so.
+                if before not in (signal.SIG_IGN, None):
+                    self._before[number] = before
+                    signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Restore the handlers of before; twice does no harm."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before.clear()
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal has come since the last check."""
+        if self._received:
+            self._received = False
+            raise KeyboardInterrupt
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self._received = True

@@ -33,7 +33,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.links.terminal import leave
+from pronk.links.realtime import leave
 from pronk.logs.mcap import (
     BOOLEAN,
     INTEGER,

@@ -10,10 +10,9 @@ from typing import Protocol
 
 from pronk.errors import HardwareError
 from pronk.links.address import Address
+from pronk.links.link import ClampOperator, Freshness
 from pronk.links.machine import Machine, State, TorqueKind
-from pronk.links.network_link import ClampOperator
 from pronk.links.realtime import Wanted, sleep_until
-from pronk.links.state_checks import Freshness
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.runtime.safety import Limits

@@ -26,8 +26,7 @@ import orjson
 
 from pronk.errors import PronkError
 from pronk.links.machine import State
-from pronk.links.realtime import Histogram, Pace, enter, sleep_until
-from pronk.links.terminal import leave
+from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
 from pronk.policy.contract import Contract
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy

@@ -17,8 +17,8 @@ import orjson
 
 from pronk import __version__
 from pronk.errors import HardwareError, LogError, PronkError
-from pronk.links.network_link import ClampOperator
-from pronk.links.terminal import Interrupts, unheard
+from pronk.links.link import ClampOperator
+from pronk.links.realtime import Interrupts, unheard
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared

@@ -22,8 +22,7 @@ import orjson
 
 from pronk.errors import HardwareError, PronkError
 from pronk.links.machine import Command, Machine, State
-from pronk.links.realtime import Histogram, Pace, enter, sleep_until
-from pronk.links.terminal import leave
+from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
 from pronk.runtime.ipc import (
     REAL,
     STATE,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pronk.errors import HardwareError, PronkError
-from pronk.links.network_link import ClampOperator
+from pronk.links.link import ClampOperator
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.script import STILL, Script, Velocity
 

@@ -6,13 +6,16 @@ counted. Behind the bytes is a virtual robot of whatever kind `dds.codec` has a 
 
 from __future__ import annotations
 
+import json
+from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from pronk.errors import HardwareError
 from pronk.links.dds import messages
 from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take, write
 from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
-from pronk.links.dds.service import (
+from pronk.links.dds.link import (
     BAD_PARAMETER,
     BENCH,
     CHECK_MODE,
@@ -22,7 +25,6 @@ from pronk.links.dds.service import (
     SELECT_MODE,
     SWITCHER,
     UNKNOWN_API,
-    Server,
 )
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import Robot
@@ -32,6 +34,40 @@ MODES = ("", "normal", "ai", "advanced", "mcf")
 """Controllers of a Go2 that can hold its joints; the first is none."""
 _SERVICE_POLLS = 20
 """Looks for commands to one for requests: 10 ms at the virtual robot's rate."""
+
+
+Handler = Callable[[int, Any], tuple[int, Any]]
+"""From a function's number and its parameter to the code and the data of the response."""
+
+
+class Server:
+    """A Unitree service of the virtual robot. One thread, never blocks, never raises."""
+
+    def __init__(
+        self, participant: Participant, service: str, handler: Handler, counts: Counter[str]
+    ) -> None:
+        """Begin to listen; refused requests are counted in `counts`."""
+        self._requests = participant.reader(f"rt/api/{service}/request", messages.Request)
+        self._responses = participant.writer(f"rt/api/{service}/response", messages.Response)
+        self._handler = handler
+        self._counts = counts
+
+    def poll(self) -> None:
+        """Respond to what has come."""
+        for request in take(self._requests, self._counts):
+            identity = request.header.identity
+            try:
+                parameter = json.loads(request.parameter or "null")
+            except (ValueError, RecursionError):
+                code, data = BAD_PARAMETER, None
+            else:
+                code, data = self._handler(identity.api_id, parameter)
+            if code != DONE:
+                self._counts["refused: request"] += 1
+            status = messages.ResponseStatus(code=code)
+            header = messages.ResponseHeader(identity=identity, status=status)
+            text = "" if data is None else json.dumps(data)
+            self._responses.write(messages.Response(header=header, data=text, binary=[]))
 
 
 class DdsServerTransport(ServerTransport):

@@ -6,7 +6,6 @@ Cheetah-Software would pass it to the motors.
 
 from __future__ import annotations
 
-from pronk.links.lcm.address import open_lcm
 from pronk.links.lcm.codec import (
     BEACON_CHANNEL,
     BENCH_CHANNEL,
@@ -21,6 +20,7 @@ from pronk.links.lcm.codec import (
     read_clamp_message,
     read_mode_request,
 )
+from pronk.links.lcm.link import open_lcm
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import Robot
 from pronk.virtual.server import ServerTransport

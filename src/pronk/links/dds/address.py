@@ -121,12 +121,7 @@ class Participant:
     """One member of a domain, with readers and writers of its own."""
 
     def __init__(self, network: DdsNetwork) -> None:
-        """Join.
-
-        Raises:
-            HardwareError: The interface is not there, or this process is on the same domain
-                elsewhere.
-        """
+        """Join; refuse a missing interface, and a domain that this process uses elsewhere."""
         domain = network.domain
         assert domain is not None
         known = _domains.get(domain)
@@ -146,14 +141,7 @@ class Participant:
             ) from None
 
     def reader(self, topic: str, message: Any, *, raw: bool = False, own: bool = True) -> Any:
-        """Make a reader.
-
-        Args:
-            topic: Its name.
-            message: Its IDL type.
-            raw: Leave the samples bytes (`Message`).
-            own: Receive from this participant as well.
-        """
+        """Make a reader of an IDL type; `raw` samples stay bytes, `own` are of this participant."""
         policies = [Policy.History.KeepLast(_QUEUE)]
         if not own:
             policies.append(Policy.IgnoreLocal.Participant)

@@ -1,4 +1,4 @@
-"""Bytes to states and commands, and back, in Unitree's messages: pure functions, no sockets.
+"""Unitree's messages to states and commands, and back, without a socket.
 
 Joints. Slots 0 to 11 are FR, FL, RR, RL, each hip, thigh, calf: pronk's own order, FR FL HR HL,
 each hip_roll, hip_pitch, knee. On a Go2 the hip turns about +x, thigh and calf about +y, all zero
@@ -16,6 +16,7 @@ makes Unitree's drives leave that part out.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,14 +44,21 @@ VIRTUAL = (0x4E4F5250, 0x4D49534B)
 """`sn` that identifies a virtual robot: `PRONKSIM`."""
 TICKS_PER_S = 1000
 """Of the robot's clock in its states."""
+STATE_RATE_HZ = 500.0
+"""Of `rt/lowstate`."""
+_TICKS_BACK = 1000
+"""A robot's clock that is this much earlier than the last was started again [ms]."""
+_TICKS_AHEAD = 500
+"""A robot's clock that runs ahead of this computer's by more than this between two states has
+jumped [ms]."""
+_LEAST_STEP_S = 1e-6
 
 _JOINTS = 12
 _IMU = 10  # numbers: quaternion, gyroscope, accelerometer
 _POS_STOP = float(np.float32(POS_STOP))
-_MOST_POSITION = 4.0 * math.pi
-"""Farthest target that is believed [rad]: no joint turns twice."""
-_MOST_STIFFNESS, _MOST_DAMPING = 1000.0, 100.0
-"""Largest gains that are believed, ten times what anyone uses [N m/rad, N m s/rad]."""
+# Plausible targets and gains [rad, N m/rad, N m s/rad]: no joint turns twice, and these gains are
+# ten times what anyone uses.
+_MOST = {"position": 4.0 * math.pi, "stiffness": 1000.0, "damping": 100.0}
 # Of a leg's three joints, and how softly they sink [N m s/rad]: Unitree's own deployments damp a
 # Go2 with 3 to 8, pronk's Mini Cheetah sinks in about a second with 1.
 _SIGNS = {"go2": (1.0, 1.0, 1.0), "mini_cheetah": (1.0, -1.0, -1.0)}
@@ -89,19 +97,12 @@ def joint_map(robot: Robot) -> JointMap:
 def encode_command(joints: JointMap, command: Command) -> bytes:
     """Encode a `LowCmd` with its checksum; refuse a command that no drive could follow."""
     check_command(command, _JOINTS)
-    position, stiffness, damping = (
-        np.asarray(getattr(command, name), dtype=np.float64)
-        for name in ("position", "stiffness", "damping")
-    )
-    for name, values, most in (
-        ("position", position, _MOST_POSITION),
-        ("stiffness", stiffness, _MOST_STIFFNESS),
-        ("damping", damping, _MOST_DAMPING),
-    ):
-        if (size := np.abs(values).max()) > most:
+    for name, most in _MOST.items():
+        if (size := np.abs(getattr(command, name)).max()) > most:
             raise HardwareError(
                 f"command.{name} is up to {size:g}, expected at most {most:g}; it was not sent."
             )
+    position, stiffness, damping = (np.asarray(getattr(command, name)) for name in _MOST)
     message = idle_command()
     q, dq, _, kp, kd = _columns(message["motor_cmd"], "q", "kd").T
     q[:] = np.where(stiffness > 0.0, joints.sign * position, POS_STOP)
@@ -141,15 +142,16 @@ def decode_command(joints: JointMap, data: bytes) -> Command:
     tau = tau * on
     stiffness, damping = kp * on * (q != _POS_STOP), kd * on * (dq != VEL_STOP)
     position = np.where(stiffness > 0.0, joints.sign * q, 0.0)
-    for name, gains, most in (("kp", stiffness, _MOST_STIFFNESS), ("kd", damping, _MOST_DAMPING)):
-        if not 0.0 <= gains.min() <= gains.max() <= most:
+    for name, values in (
+        ("position", abs(position)),
+        ("stiffness", stiffness),
+        ("damping", damping),
+    ):
+        if not 0.0 <= values.min() <= values.max() <= _MOST[name]:
             raise RefusedError(
                 "out of range",
-                f"{name} is from {gains.min():g} to {gains.max():g}, expected 0 to {most:g}.",
+                f"{name} is {values.min():g} to {values.max():g}, expected 0 to {_MOST[name]:g}.",
             )
-    if np.abs(position).max() > _MOST_POSITION:
-        far = np.abs(position).max()
-        raise RefusedError("out of range", f"a motor is commanded to {far:g} rad.")
     if tau.any() or (damping * dq).any():
         raise RefusedError(
             "feed-forward",
@@ -183,70 +185,83 @@ def encode_state(joints: JointMap, state: State) -> bytes:
     return pack(messages.LowState, message)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LowState:
-    """A state that arrived, before this computer has given it a time and a number."""
+class StateDecoder:
+    """Numbers the states of `rt/lowstate`.
 
-    joints: JointMap
-    message: NDArray[Any]
-    """One record, shape (1,)."""
+    Unitree's states carry no number, but the robot's clock in milliseconds; at 500 Hz it shows how
+    many states were lost on the way. No state is made, and the reason counted, of a clock that went
+    back or stood still, and of values that repeat to the last bit, as no live sensor's do (frozen
+    data behind a live clock). A message that is refused raises RefusedError.
+    """
 
-    @property
-    def tick(self) -> int:
-        """The robot's clock [ms], modulo 2^32."""
-        return int(self.message["tick"][0])
+    def __init__(self, joints: JointMap, counts: Counter[str]) -> None:
+        """Begin; `counts` gets `out of order`, `clock jumps` and `repeated`."""
+        self.counts = counts
+        self.virtual = False
+        """Whether the last state was a virtual robot's."""
+        self._joints = joints
+        self._tick: int | None = None
+        self._time = -math.inf
+        self._sequence = -1
+        self._measured = b""
 
-    @property
-    def virtual(self) -> bool:
-        """Whether a virtual robot sent it."""
-        return tuple(int(word) for word in self.message["sn"][0]) == VIRTUAL
+    def take(self, data: bytes, arrived: float) -> State | None:
+        """Decode a message that arrived at a time [s]; states that came together are 1 us apart."""
+        message = unpack(messages.LowState, data)
+        tick, steps = int(message["tick"][0]), 1
+        if self._tick is not None:
+            ahead = (tick - self._tick + 2**31) % 2**32 - 2**31
+            if -_TICKS_BACK < ahead <= 0:
+                self.counts["out of order"] += 1
+                return None
+            if ahead < 0 or ahead > 1e3 * (arrived - self._time) + _TICKS_AHEAD:
+                self.counts["clock jumps"] += 1
+            else:
+                steps = max(1, round(ahead * STATE_RATE_HZ / TICKS_PER_S))
+        arrived = max(arrived, self._time + _LEAST_STEP_S)
+        sequence = self._sequence + steps
+        state = state_of(self._joints, message, time=arrived, sequence=sequence)
+        self._tick, self._time, self._sequence = tick, arrived, sequence
+        measured = message["imu_state"].tobytes() + message["motor_state"].tobytes()
+        if measured == self._measured:
+            self.counts["repeated"] += 1
+            return None
+        self._measured = measured
+        self.virtual = tuple(int(word) for word in message["sn"][0]) == VIRTUAL
+        return state
 
-    @property
-    def measured(self) -> bytes:
-        """What was measured of joints and trunk; real sensors never say the same twice."""
-        message = self.message
-        return bytes(message["imu_state"].tobytes() + message["motor_state"].tobytes())
 
-    def state(self, *, time: float, sequence: int) -> State:
-        """Convert to pronk's terms, without temperatures where all of them read zero.
+def state_of(joints: JointMap, message: NDArray[Any], *, time: float, sequence: int) -> State:
+    """Convert a `LowState` record (1,); temperatures that all read zero are left out.
 
-        Args:
-            time: When it arrived, on the local clock [s].
-            sequence: Its number.
-
-        Raises:
-            RefusedError: `not finite`, or `quaternion` (not of length 1).
-        """
-        motors = self.message["motor_state"]
-        q, dq, _, tau = _finite("motor_state", _columns(motors, "q", "tau_est")).T
-        imu = self.message["imu_state"].view("<f4")[:_IMU]
-        orientation, gyro, accelerometer = np.split(_finite("imu_state", imu), (4, 7))
-        length = math.sqrt(orientation @ orientation)
-        if not abs(length - 1.0) <= 0.02:
-            raise RefusedError(
-                "quaternion",
-                f"imu_state.quaternion has length {length:.3f}, expected 1 within .02; the "
-                "inertial unit is not running.",
-            )
-        temperature = motors["temperature"][0, :_JOINTS].astype(np.float64)
-        return State(
-            time=time,
-            sequence=sequence,
-            position=self.joints.sign * q,
-            velocity=self.joints.sign * dq,
-            torque=self.joints.sign * tau,
-            gyro=gyro,
-            accelerometer=accelerometer,
-            bus_voltage=float(self.message["power_v"][0]),
-            orientation=orientation / length,
-            robot_time=self.tick / TICKS_PER_S,
-            temperature=temperature if temperature.any() else None,
+    Raises:
+        RefusedError: `not finite`, or `quaternion` (not of length 1).
+    """
+    motors = message["motor_state"]
+    q, dq, _, tau = _finite("motor_state", _columns(motors, "q", "tau_est")).T
+    imu = message["imu_state"].view("<f4")[:_IMU]
+    orientation, gyro, accelerometer = np.split(_finite("imu_state", imu), (4, 7))
+    length = math.sqrt(orientation @ orientation)
+    if not abs(length - 1.0) <= 0.02:
+        raise RefusedError(
+            "quaternion",
+            f"imu_state.quaternion has length {length:.3f}, expected 1 within .02; the "
+            "inertial unit is not running.",
         )
-
-
-def decode_state(joints: JointMap, data: bytes) -> LowState:
-    """Decode a `LowState`; refuse a wrong `header`, `length` or `checksum`."""
-    return LowState(joints=joints, message=unpack(messages.LowState, data))
+    temperature = motors["temperature"][0, :_JOINTS].astype(np.float64)
+    return State(
+        time=time,
+        sequence=sequence,
+        position=joints.sign * q,
+        velocity=joints.sign * dq,
+        torque=joints.sign * tau,
+        gyro=gyro,
+        accelerometer=accelerometer,
+        bus_voltage=float(message["power_v"][0]),
+        orientation=orientation / length,
+        robot_time=int(message["tick"][0]) / TICKS_PER_S,
+        temperature=temperature if temperature.any() else None,
+    )
 
 
 def _columns(motors: NDArray[Any], first: str, last: str) -> NDArray[np.float32]:

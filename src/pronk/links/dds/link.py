@@ -1,50 +1,151 @@
 """A robot behind Unitree's DDS messages: a Go2, or the virtual robot.
 
-A thread sleeps until a state arrives, stamps and keeps it, so that a state's age is right however
-late the caller is. The command in force is repeated, because Unitree's drives are written to all
-the time and it is not published what they do when that stops.
+The command in force is repeated, because Unitree's drives are written to all the time and it is not
+published what they do when that stops.
 
-No state is made, and the reason counted, of a message that is refused, above all for its checksum;
-of a clock that went back or stood still; of values that repeat to the last bit, as no live
-sensor's do (frozen data behind a live clock).
+Unitree's services are a request and its response on two topics, in JSON. A request carries an id of
+its own and the number of a function (`api_id`); the response carries both again, and a code, 0 for
+done. `motion_switcher` (1001 CheckMode, 1003 ReleaseMode) reports which of the robot's own
+controllers holds the joints, and releases it. Older firmware has `robot_state` (1001 ServiceSwitch)
+instead.
 """
 
 from __future__ import annotations
 
-import threading
+import json
 import time
-from collections import Counter, deque
+from collections import Counter
 from typing import Any
 
 from pronk.errors import HardwareError
-from pronk.links.command_writer import CommandWriter
 from pronk.links.dds import messages
 from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take, write
-from pronk.links.dds.codec import encode_command, joint_map
-from pronk.links.dds.service import BENCH, CLAMP, Client, check_own_controller
-from pronk.links.dds.state_decoder import STATE_RATE_HZ, StateDecoder
-from pronk.links.machine import State, TorqueKind
-from pronk.links.network_link import ANSWER_S, NetworkLink, wait_for
+from pronk.links.dds.codec import STATE_RATE_HZ, StateDecoder, encode_command, joint_map
+from pronk.links.link import ANSWER_S, CommandWriter, NetworkLink
 from pronk.robots.robot import Robot
+
+SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
+OLDER, SERVICE_SWITCH = "robot_state", 1001
+BENCH, CLAMP = "pronk_bench", 1
+"""Of the virtual robot alone: requests for clamps."""
+
+DONE, UNKNOWN_API, BAD_PARAMETER = 0, 3203, 3204
+"""Codes of a response; the errors are unitree_sdk2's for an unknown function and for an impossible
+parameter."""
+
+_POLL_S = 0.002
+_RELEASE_TRIES, _RELEASE_PAUSE_S = 10, 0.2
 
 _LONGEST_BURST_S = 0.1
 _LONGEST_PAUSE_S = 0.05
-_KEPT_STATES = 10_000
 _REPEAT_S = 0.004
 """Silence after which the command in force is written again; Unitree's examples write every 1 to
 10 ms."""
 
 
-class DdsMachine(NetworkLink):
-    """A robot with twelve joints behind Unitree's messages. Implements `Machine`.
+class Client:
+    """Calls a service."""
 
-    Pre-flight, in this order: states arrive with right checksums; none of the robot's own
-    controllers holds the joints (or it lets go of them); states come at 500 Hz without gaps, from
-    one robot; no other program commands.
+    def __init__(self, participant: Participant, service: str) -> None:
+        """Prepare; nothing is sent."""
+        self._service = service
+        self._requests = participant.writer(f"rt/api/{service}/request", messages.Request)
+        self._responses = participant.reader(f"rt/api/{service}/response", messages.Response)
+
+    def call(self, api_id: int, parameter: Any, *, timeout_s: float = 2.0) -> Any | None:
+        """Call a function, again while there is no response; return its data, or None without one.
+
+        Args:
+            api_id: Number of the function.
+            parameter: What JSON can hold.
+            timeout_s: How long to try in all [s].
+
+        Raises:
+            HardwareError: The service responded with another code than 0.
+        """
+        identity = messages.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
+        header = messages.RequestHeader(
+            identity=identity,
+            lease=messages.RequestLease(id=0),
+            policy=messages.RequestPolicy(priority=0, noreply=False),
+        )
+        request = messages.Request(header=header, parameter=json.dumps(parameter), binary=[])
+        end = time.monotonic() + timeout_s
+        again = -1.0
+        while time.monotonic() < end:
+            if time.monotonic() >= again and self._requests.get_matched_subscriptions():
+                self._requests.write(request)
+                again = time.monotonic() + timeout_s / 4
+            for response in take(self._responses, Counter()):
+                if response.header.identity == identity:
+                    return self._data(api_id, response)
+            time.sleep(_POLL_S)
+        return None
+
+    def _data(self, api_id: int, response: Any) -> Any:
+        code = response.header.status.code
+        if code != DONE:
+            raise HardwareError(
+                f"the robot's service {self._service} returned {code} for function {api_id}, "
+                "expected 0; switch by the robot's own remote or app instead."
+            )
+        try:
+            return json.loads(response.data or "null") or {}
+        except ValueError:
+            raise HardwareError(
+                f"the robot's service {self._service} returned {response.data[:60]!r} for function "
+                f"{api_id}, expected JSON; is its firmware one that pronk knows?"
+            ) from None
+
+
+def check_own_controller(participant: Participant, *, release: bool, timeout_s: float) -> None:
+    """Check that none of the robot's own controllers holds the joints; `release` one that does.
+
+    Raises:
+        HardwareError: One holds them and may not be, or could not be, released; or the robot does
+            not respond in time.
     """
+    switcher = Client(participant, SWITCHER)
+    response = switcher.call(CHECK_MODE, {}, timeout_s=timeout_s)
+    if response is None:
+        # Older firmware ends its sport mode by another service.
+        sport = {"name": "sport_mode", "switch": 0}
+        older = Client(participant, OLDER)
+        if release and older.call(SERVICE_SWITCH, sport, timeout_s=timeout_s) is not None:
+            return
+        raise HardwareError(
+            f"the robot did not respond on its service {SWITCHER} within {timeout_s:g} s, so it is "
+            "not known whether its own controller is off; check the network, and its firmware."
+        )
+    name = _name(response)
+    for _ in range(_RELEASE_TRIES if release else 0):
+        if not name:
+            break
+        switcher.call(RELEASE_MODE, {}, timeout_s=timeout_s)
+        time.sleep(_RELEASE_PAUSE_S)
+        name = _name(switcher.call(CHECK_MODE, {}, timeout_s=timeout_s))
+    if name and release:
+        raise HardwareError(
+            f"the robot's own controller {name!r} did not let go of the joints after "
+            f"{_RELEASE_TRIES} requests; switch it off by the robot's app."
+        )
+    if name:
+        raise HardwareError(
+            f"the robot's own controller {name!r} holds the joints; lay the robot down or hang it "
+            "up, and have the controller released (--disable-onboard-controller)."
+        )
+
+
+def _name(response: Any) -> str:
+    return str(response.get("name", "")) if isinstance(response, dict) else ""
+
+
+class DdsMachine(NetworkLink):
+    """A robot with twelve joints behind Unitree's messages. Implements `Machine`."""
 
     wire = "DDS"
-    torque_kind: TorqueKind = "measured"  # tau_est, by the drives from their currents
+    torque_kind = "measured"  # tau_est, by the drives from their currents
+    state_rate_hz = STATE_RATE_HZ
 
     def __init__(
         self,
@@ -67,119 +168,62 @@ class DdsMachine(NetworkLink):
                 impossible.
         """
         super().__init__(robot, **common)
-        self.counts: Counter[str] = Counter()
-        """What was met: states, commands, `repeats`, `expired`, `foreign`, and why states were
-        not made."""
         self._joints = joint_map(robot)
         self._network = DdsNetwork(interface=interface, domain=domain)
-        self._bench: Client | None = None
-        self._command_topic = COMMANDS
+        self._command_topic, self._address = COMMANDS, f"{STATES} in {self._network}"
 
-    # --- beginning and end ----------------------------------------------------------------------
-
-    def _open(self) -> None:
-        self.counts.clear()
-        self._latest: State | None = None
-        self._met: deque[State] = deque(maxlen=_KEPT_STATES)
+    def _open(self) -> CommandWriter:
         self._decoder = StateDecoder(self._joints, self.counts)
-        self._speakers: set[int] = set()
-        self._participant = Participant(self._network)
-        self._states_in = self._participant.reader(STATES, messages.LowState, raw=True)
-        self._others = self._participant.reader(COMMANDS, messages.LowCmd, raw=True, own=False)
-        out = self._participant.writer(COMMANDS, messages.LowCmd, raw=True)
-        self._writer = CommandWriter(
+        self._senders: set[int] = set()
+        self._participant = own = Participant(self._network)
+        self._states_in = own.reader(STATES, messages.LowState, raw=True)
+        self._others = own.reader(COMMANDS, messages.LowCmd, raw=True, own=False)
+        out = own.writer(COMMANDS, messages.LowCmd, raw=True)
+        self._bench = Client(own, BENCH)
+        self._wake = own.wake_on(self._states_in, self._others)
+        return CommandWriter(
             lambda command: encode_command(self._joints, command),
             lambda data: write(out, data, self.counts),
             damping=self._joints.sink_damping,
             repeat_s=_REPEAT_S,
             counts=self.counts,
         )
-        self._wake = self._participant.wake_on(self._states_in, self._others)
-        self._serving = True
-        self._thread = threading.Thread(target=self._serve, name="pronk dds", daemon=True)
-        self._thread.start()
 
     def _shut(self) -> None:
-        self._serving = False
-        self._thread.join()
-        self._bench = None
-        del self._wake, self._states_in, self._others, self._participant
+        del self._wake, self._states_in, self._others, self._bench, self._participant
 
-    @property
-    def _foreign_commands(self) -> int:
-        return self.counts["foreign"]
-
-    def _newest(self) -> State | None:
-        return self._latest
-
-    def _arrived(self) -> list[State]:
-        states = []
-        while self._met:
-            states.append(self._met.popleft())
-        return states
-
-    def _preflight(self) -> None:
-        begun = time.monotonic()
-        if not wait_for(lambda: self._latest is not None):
-            raise HardwareError(
-                f"{self.robot} sent no state on {STATES} within {ANSWER_S:g} s in {self._network}"
-                + (f"; what came was refused: {why}" if (why := self._decoder.last_error) else "")
-                + "; check that the robot or the virtual one runs, the domain and the interface."
-            )
+    def _prepare(self) -> None:
         self.virtual = self._decoder.virtual
         if self._joints.virtual_only and not self.virtual:
             raise HardwareError(
-                f"what answers in {self._network} is not pronk's virtual robot, and no real "
+                f"the robot in {self._network} is not pronk's virtual robot, and no real "
                 f"{self.robot} speaks Unitree's messages; name the robot that it is."
             )
-        self._bench = Client(self._participant, BENCH)
         check_own_controller(self._participant, release=self._release, timeout_s=ANSWER_S)
-        silent_from = time.monotonic()
-        self.counts["foreign"] = 0
-        self._check_states(begun)
-        self.check_exclusive(silent_from)
-        self.wait(0.0)
 
-    def _hold(self, joints: tuple[str, ...]) -> bool:
-        request = {"joints": list(joints)}
-        return self._bench is not None and (
-            self._bench.call(CLAMP, request, timeout_s=ANSWER_S) is not None
-        )
-
-    def _check_states(self, begun: float) -> None:
-        self.fresh_states(STATE_RATE_HZ, until=begun + 2.0 * ANSWER_S)
-        if len(self._speakers) > 1:
+    def _confirm(self) -> None:
+        if len(self._senders) > 1:
             raise HardwareError(
-                f"{len(self._speakers)} robots speak on {STATES} in {self._network}, expected one; "
+                f"{len(self._senders)} robots speak on {STATES} in {self._network}, expected one; "
                 "switch the others off, or take another domain."
             )
 
-    # --- the thread -----------------------------------------------------------------------------
-
-    def _serve(self) -> None:
-        while self._serving:
-            self._wake.wait(int(_LONGEST_PAUSE_S * 1e9))
-            self._receive()
+    def _hold(self, joints: tuple[str, ...]) -> bool:
+        request = {"joints": list(joints)}
+        return self._bench.call(CLAMP, request, timeout_s=ANSWER_S) is not None
 
     def _receive(self) -> None:
+        self._wake.wait(int(_LONGEST_PAUSE_S * 1e9))
         arrived = time.monotonic()
         if take(self._others, self.counts):
-            self._foreign()
-        messages = take(self._states_in, self.counts)
-        for message in messages:
+            self.counts["foreign"] += 1
+            # Damp, for it is unknown which command the drives follow.
+            if self._writer is not None and self._writer.wrote:
+                self._writer.damp()
+        samples = take(self._states_in, self.counts)
+        for sample in samples:
             # Those that waited together are distinguished by when they were sent.
-            before = (
-                messages[-1].sample_info.source_timestamp - message.sample_info.source_timestamp
-            )
-            stamp = arrived - min(max(before * 1e-9, 0.0), _LONGEST_BURST_S)
-            self._speakers.add(message.sample_info.publication_handle)
-            state = self._decoder.take(message.data, stamp)
-            if state is not None:
-                self._latest = state
-                self._met.append(state)
-
-    def _foreign(self) -> None:
-        """Damp when there is another writer, for it is unknown which command the drives follow."""
-        self.counts["foreign"] += 1
-        if self._writer is not None and self._writer.wrote:
-            self._writer.damp()
+            last, this = (each.sample_info.source_timestamp for each in (samples[-1], sample))
+            stamp = arrived - min(max((last - this) * 1e-9, 0.0), _LONGEST_BURST_S)
+            self._senders.add(sample.sample_info.publication_handle)
+            self._take(self._decoder.take, sample.data, stamp)

@@ -1,4 +1,4 @@
-"""Bytes to states and commands, and back: pure functions, no sockets.
+"""LCM messages to states and commands, and back, without a socket.
 
 Layouts. `cheetah` is Cheetah-Software on the robot with MiniCheetahSpi_Controller: states are
 spi_data_t and microstrain_lcmt, commands are leg_control_command_lcmt on spi_debug_cmd, of which
@@ -25,6 +25,7 @@ mechanically on request, and its beacon identifies it and lists the joints that 
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -59,6 +60,10 @@ MODES = {0: "", 1: "stand_up", 3: "balance_stand", 4: "locomotion", 6: "recovery
 _MODE = b"control_mode"
 # ControlParameters.h: the value is a double. ControlParameterInterface.h: set a robot's parameter.
 _DOUBLE, _SET = 1, 1
+
+_OLDEST_ATTITUDE_S = 0.02
+_NUMBER_JUMP = 1000
+"""A count this far from the last is that of a robot that was started again, or a broken one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,34 +145,6 @@ def layout_of(name: str) -> Layout:
     return LAYOUTS[name]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Joints:
-    """A message of the joints, in pronk's order and signs."""
-
-    position: Array
-    """[rad], shape (12,)."""
-    velocity: Array
-    """[rad/s], shape (12,)."""
-    torque: Array
-    """[N m], shape (12,); zeros where the layout has none."""
-    robot_time: float | None = None
-    """The robot's own stamp [s]; None where it is not filled."""
-    number: int | None = None
-    """The robot's own count; None where it is not filled."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Attitude:
-    """A message of the inertial unit."""
-
-    orientation: Array
-    """Trunk to world, w, x, y, z, shape (4,)."""
-    gyro: Array
-    """Angular velocity in the trunk's frame [rad/s], shape (3,)."""
-    accelerometer: Array
-    """Specific force in the trunk's frame, +9.81 along z at rest [m/s^2], shape (3,)."""
-
-
 def encode_command(layout: Layout, command: Command) -> bytes:
     """Encode a command; refuse one that is not for twelve joints or that no drive could follow."""
     check_command(command, _JOINTS)
@@ -192,9 +169,9 @@ def decode_command(layout: Layout, data: bytes) -> Command:
     message = layout.command
     fields = message.decode(data)
     kp, kd = layout.gain_fields
-    position = _within(message, "q_des", fields["q_des"], -_MOST_POSITION, _MOST_POSITION)
-    stiffness = _within(message, kp, fields[kp], 0.0, _MOST_STIFFNESS)
-    damping = _within(message, kd, fields[kd], 0.0, _MOST_DAMPING)
+    position = _within(message, fields, "q_des", _MOST_POSITION)
+    stiffness = _within(message, fields, kp, _MOST_STIFFNESS, low=0.0)
+    damping = _within(message, fields, kd, _MOST_DAMPING, low=0.0)
     # Of Cheetah-Software's message the robot reads nothing else.
     if layout is WTW and (np.any(fields["qd_des"]) or np.any(fields["tau_ff"])):
         raise RefusedError(
@@ -232,45 +209,47 @@ def encode_state(layout: Layout, state: State) -> tuple[tuple[str, bytes], tuple
     )
 
 
-def decode_joints(layout: Layout, data: bytes) -> Joints:
+def decode_joints(layout: Layout, data: bytes) -> tuple[dict[str, Any], int | None]:
     """Decode the joints of a state.
+
+    Returns:
+        (fields of a `State`, the robot's own count or None where it is not filled).
 
     Raises:
         RefusedError: `fingerprint`, `length`, `not finite` or `out of range`.
     """
-    fields, message = layout.joints.decode(data), layout.joints
+    message = layout.joints
+    fields: Any = message.decode(data)
     torque, stamp, number = np.zeros(_JOINTS), 0, 0
     if layout.numbered:
-        q, qd = fields["q"], fields["qd"]
-        torque = _within(message, "tau_est", fields["tau_est"], -_MOST_TORQUE, _MOST_TORQUE)
+        torque = _within(message, fields, "tau_est", _MOST_TORQUE)
         stamp, number = int(fields["timestamp_us"]), int(fields["id"])
     else:
         # By joint, then leg, on the wire; by leg, then joint, here.
-        q, qd = (
-            np.array([fields[f"{kind}_{name}"] for name in _SPI_JOINTS]).T.ravel()
+        fields = {
+            kind: np.array([fields[f"{kind}_{name}"] for name in _SPI_JOINTS]).T.ravel()
             for kind in ("q", "qd")
-        )
-    position = _within(message, "q", q, -_MOST_POSITION, _MOST_POSITION)
-    velocity = _within(message, "qd", qd, -_MOST_SPEED, _MOST_SPEED)
-    return Joints(
-        position=position * layout.signs,
-        velocity=velocity * layout.signs,
-        torque=torque * layout.signs,
+        }
+    state = {
+        "position": _within(message, fields, "q", _MOST_POSITION) * layout.signs,
+        "velocity": _within(message, fields, "qd", _MOST_SPEED) * layout.signs,
+        "torque": torque * layout.signs,
         # The bridge of walk-these-ways itself leaves both at 0.
-        robot_time=1e-6 * stamp if stamp else None,
-        number=number or None,
-    )
+        "robot_time": 1e-6 * stamp if stamp else None,
+    }
+    return state, number or None
 
 
-def decode_attitude(layout: Layout, data: bytes) -> Attitude:
-    """Decode the trunk's part of a state.
+def decode_attitude(layout: Layout, data: bytes) -> dict[str, Array]:
+    """Decode the trunk's part of a state: its fields `orientation`, `gyro` and `accelerometer`.
 
     Raises:
         RefusedError: `fingerprint`, `length`, `not finite`, `out of range`, or `quaternion` (not of
             length 1).
     """
-    fields, message = layout.attitude.decode(data), layout.attitude
-    orientation = _within(message, "quat", fields["quat"], -2.0, 2.0)
+    message = layout.attitude
+    fields = message.decode(data)
+    orientation = _within(message, fields, "quat", 2.0)
     length = float(np.sqrt(orientation @ orientation))
     if not abs(length - 1.0) <= 0.02:
         raise RefusedError(
@@ -279,34 +258,61 @@ def decode_attitude(layout: Layout, data: bytes) -> Attitude:
             "unit is not running, or the order of the numbers is another.",
         )
     turn, force = layout.imu_fields
-    return Attitude(
-        orientation=orientation / length,
-        gyro=_within(message, turn, fields[turn], -_MOST_TURN, _MOST_TURN),
-        accelerometer=_within(message, force, fields[force], -_MOST_FORCE, _MOST_FORCE),
-    )
+    return {
+        "orientation": orientation / length,
+        "gyro": _within(message, fields, turn, _MOST_TURN),
+        "accelerometer": _within(message, fields, force, _MOST_FORCE),
+    }
 
 
-def state_of(joints: Joints, attitude: Attitude, *, time: float, sequence: int) -> State:
-    """Join the newest halves of a state; its bus voltage is NaN, which neither layout carries.
+class StateDecoder:
+    """Numbers the states that messages make.
 
-    Args:
-        joints: Of this state.
-        attitude: The newest before them.
-        time: When the joints' message arrived, on the local clock [s].
-        sequence: Local count.
+    No state is made, and the reason counted, of joints without a young attitude; of values that
+    repeat to the last bit, as no live sensor's do (frozen data behind a live count); of a count
+    that went backwards. A message that is refused raises RefusedError. Bus voltage is NaN, for
+    neither layout carries it.
     """
-    return State(
-        time=time,
-        sequence=sequence,
-        position=joints.position,
-        velocity=joints.velocity,
-        torque=joints.torque,
-        gyro=attitude.gyro,
-        accelerometer=attitude.accelerometer,
-        bus_voltage=float("nan"),
-        orientation=attitude.orientation,
-        robot_time=joints.robot_time,
-    )
+
+    def __init__(self, layout: Layout, counts: Counter[str]) -> None:
+        """Begin; `counts` gets `no attitude`, `out of order` and `repeated`."""
+        self.counts = counts
+        self._layout = layout
+        self._attitude: dict[str, Any] = {}
+        self._attitude_came = -float("inf")
+        self._values = b""
+        self._number: int | None = None
+        self._sequence = -1
+
+    def attitude(self, data: bytes, now: float) -> None:
+        """Take a message of the inertial unit that arrived at `now` [s]."""
+        self._attitude = decode_attitude(self._layout, data)
+        self._attitude_came = now
+
+    def joints(self, data: bytes, now: float) -> State | None:
+        """Take a message of the joints that arrived at `now` [s]: it completes a state."""
+        joints, number = decode_joints(self._layout, data)
+        if now - self._attitude_came > _OLDEST_ATTITUDE_S:
+            self.counts["no attitude"] += 1
+            return None
+        passed = 1
+        if number is not None and self._number is not None:
+            passed = number - self._number
+            if -_NUMBER_JUMP < passed <= 0:
+                self.counts["out of order"] += 1
+                return None
+        self._number = number
+        attitude = self._attitude
+        parts = (joints["position"], joints["velocity"], *list(attitude.values())[1:])
+        values = b"".join(part.tobytes() for part in parts)
+        if values == self._values:
+            self.counts["repeated"] += 1
+            return None
+        self._values = values
+        # Where the robot counts, what it counted and did not arrive is missing here too.
+        self._sequence += passed if 0 < passed < _NUMBER_JUMP else 1
+        voltage = float("nan")
+        return State(time=now, sequence=self._sequence, bus_voltage=voltage, **joints, **attitude)
 
 
 def roll_pitch_yaw(orientation: Array) -> Array:
@@ -362,10 +368,14 @@ def read_clamp_message(names: tuple[str, ...], data: bytes) -> tuple[int, tuple[
     return int(fields["request"]), tuple(name for name, held in flags if held)
 
 
-def _within(message: Message, name: str, values: NDArray[Any], low: float, high: float) -> Array:
-    """Convert a field to float64; refuse what is not finite or out of bounds."""
+def _within(
+    message: Message, fields: Any, name: str, most: float, low: float | None = None
+) -> Array:
+    """Convert a field to float64; refuse what is not finite or not in `low` (or -most) to most."""
+    values: NDArray[Any] = fields[name]
+    low = -most if low is None else low
     # Before the conversion, which warns of a signalling NaN; NaN is within nothing.
-    if ((values >= low) & (values <= high)).all():
+    if ((values >= low) & (values <= most)).all():
         return np.asarray(values, dtype=np.float64)
     if not np.isfinite(values).all():
         raise RefusedError(
@@ -374,5 +384,5 @@ def _within(message: Message, name: str, values: NDArray[Any], low: float, high:
     raise RefusedError(
         "out of range",
         f"{message.name}.{name} lies between {values.min():g} and {values.max():g}, expected "
-        f"{low:g} to {high:g}, which is all that the motors and sensors can do.",
+        f"{low:g} to {most:g}, which is all that the motors and sensors can do.",
     )

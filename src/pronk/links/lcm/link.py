@@ -1,5 +1,10 @@
 """A robot behind LCM: the Mini Cheetah, a Go1 by the bridge of walk-these-ways, or a virtual robot.
 
+LCM is UDP multicast. With a time-to-live of 0 a packet never leaves the host; a private port keeps
+it from other users of LCM here. LCM itself cannot choose an interface: the system's routes do
+(a missing one is the commonest first failure on the Mini Cheetah, Cheetah-Software issue 8), so
+the route is looked up and must lead out of the interface that was named.
+
 One handle receives, in a thread of its own, because polling one message per tick from LCM's queue
 yields data hundreds of milliseconds old; the other publishes. Times are the local monotonic
 clock's: a state's is when its last message arrived.
@@ -7,40 +12,108 @@ clock's: a state's is when its last message arrived.
 
 from __future__ import annotations
 
+import ipaddress
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
+from pathlib import Path
 from typing import Any
 
 from pronk.errors import HardwareError
-from pronk.links.command_writer import CommandWriter
-from pronk.links.lcm.address import open_lcm, url_of
 from pronk.links.lcm.codec import (
     BEACON_CHANNEL,
     BENCH_CHANNEL,
     REQUEST_CHANNEL,
     RESPONSE_CHANNEL,
+    StateDecoder,
     clamp_message,
     encode_command,
     layout_of,
     mode_request,
+    read_clamp_message,
 )
-from pronk.links.lcm.state_decoder import StateDecoder
-from pronk.links.machine import State, TorqueKind
-from pronk.links.network_link import ANSWER_S, NetworkLink, wait_for
+from pronk.links.link import ANSWER_S, CommandWriter, NetworkLink, wait_for
 from pronk.robots.robot import Robot
 
+GROUP = "239.255.76.67"
+"""LCM's multicast group, that of every robot too."""
+ROBOT_PORT = 7667
+"""LCM's port, that of every robot too."""
+VIRTUAL_PORT = 7768
+"""The virtual robot's: private, so that nothing here ever meets a real one."""
+_ROUTES = Path("/proc/net/route")
 _QUEUE = 100
 _REMEMBERED = 512
 """Commands kept to recognize one's own."""
 
 
-class LcmMachine(NetworkLink):
-    """A robot with twelve joints behind LCM. Implements `Machine`.
+def url_of(*, port: int | None = None, interface: str | None = None) -> str:
+    """The address of a link.
 
-    Pre-flight, in this order: states arrive at the layout's rate without gaps for 200 ms; no
-    other program commands.
+    Args:
+        port: UDP port; `VIRTUAL_PORT` on loopback and `ROBOT_PORT` on an interface if None.
+        interface: To the real robot; `lo` on the robot itself, None stays on this computer.
+
+    Raises:
+        HardwareError: The port is impossible, or multicast does not leave by that interface.
     """
+    number = port if port is not None else (ROBOT_PORT if interface else VIRTUAL_PORT)
+    if not 1024 <= number <= 65535:
+        raise HardwareError(
+            f"LCM port {number}; expected 1024 to 65535, for instance {VIRTUAL_PORT}."
+        )
+    if interface is None and number == ROBOT_PORT:
+        raise HardwareError(
+            f"LCM port {ROBOT_PORT} is the real robots'; take another, as {VIRTUAL_PORT}, "
+            "or name the robot's network interface (lo on the robot itself)."
+        )
+    if interface in (None, "lo"):
+        return f"udpm://{GROUP}:{number}?ttl=0"
+    way = multicast_interface(_ROUTES.read_text(encoding="ascii")) if _ROUTES.exists() else None
+    if way != interface:
+        raise HardwareError(
+            f"LCM's multicast leaves by {way or 'no interface'}, expected {interface}; set the "
+            f"route: `sudo ip route add {GROUP} dev {interface}`."
+        )
+    # One hop: the robot's own cable, and no router.
+    return f"udpm://{GROUP}:{number}?ttl=1"
+
+
+def multicast_interface(table: str) -> str | None:
+    """The interface by which LCM's packets leave, or None, by a table as in /proc/net/route."""
+    group = int(ipaddress.IPv4Address(GROUP))
+    best: tuple[int, int, str] | None = None
+    for line in table.splitlines()[1:]:
+        words = line.split()
+        if len(words) < 8 or not int(words[3], 16) & 1:
+            continue
+        target, mask = (int.from_bytes(bytes.fromhex(words[k])[::-1], "big") for k in (1, 7))
+        if group & mask == target:
+            # The longest mask wins, then the smallest metric.
+            found = (mask, -int(words[6]), words[0])
+            best = max(best, found) if best else found
+    return best[2] if best else None
+
+
+def open_lcm(url: str) -> Any:
+    """Open an LCM handle (`lcm.LCM`), which belongs to one thread."""
+    try:
+        import lcm
+    except ImportError:
+        raise HardwareError(
+            'the package lcm is not installed; install it with `pip install "pronk[hardware]"`.'
+        ) from None
+    try:
+        return lcm.LCM(url)
+    except (RuntimeError, OSError) as error:
+        raise HardwareError(
+            f"LCM cannot open {url} ({error}); without a network, multicast needs a route: "
+            f"`sudo ip route add {GROUP} dev lo`."
+        ) from None
+
+
+class LcmMachine(NetworkLink):
+    """A robot with twelve joints behind LCM. Implements `Machine`."""
 
     wire = "LCM"
 
@@ -58,9 +131,8 @@ class LcmMachine(NetworkLink):
         Args:
             robot: Names, order and limits of the joints.
             layout: `cheetah` (or `spi`) or `wtw`.
-            port: UDP port; None for the virtual robot's on loopback, the robots' on an interface.
-            interface: Network interface of a real robot, `lo` on the robot itself; None never
-                leaves this computer and meets no real robot.
+            port: As of `url_of`.
+            interface: As of `url_of`.
             **common: As `NetworkLink` takes them.
 
         Raises:
@@ -68,66 +140,48 @@ class LcmMachine(NetworkLink):
                 is impossible.
         """
         super().__init__(robot, **common)
-        self._layout = layout_of(layout)
+        self._layout = known = layout_of(layout)
         if len(robot.joints) != 12:
             raise HardwareError(
                 f"{robot.name} has {len(robot.joints)} joints; the LCM messages of {layout} are "
                 "for twelve."
             )
-        self.torque_kind: TorqueKind = self._layout.torque_kind
-        self._command_topic = self._layout.command_channel
+        self.torque_kind, self.state_rate_hz = known.torque_kind, known.state_rate_hz
+        self._command_topic = known.command_channel
         self._interface = interface
         self._url = url_of(port=port, interface=interface)
-        self._foreign = 0
-        self._decoder = StateDecoder(self._layout, robot.joint_names)
-        self._written: Counter[str] = Counter()
+        self._address = f"{known.joints_channel} and {known.attitude_channel} at {self._url}"
 
-    @property
-    def counts(self) -> Counter[str]:
-        """States, and why some were not made; commands, `expired`, `foreign`."""
-        return self._decoder.counts + self._written + Counter(foreign=self._foreign)
-
-    def _open(self) -> None:
+    def _open(self) -> CommandWriter:
         layout = self._layout
-        decoder = self._decoder = StateDecoder(layout, self._robot.joint_names)
-        self._foreign = 0
+        decoder = StateDecoder(layout, self.counts)
+        # Request for clamps that the virtual robot met last, and the joints it holds.
+        self._held: tuple[int, tuple[str, ...]] | None = None
         self._responses: list[bytes] = []
         # Newest first: a message that comes back is nearly always the last one.
         self._own: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._publishing, self._remembering = threading.Lock(), threading.Lock()
         self._in, self._out = open_lcm(self._url), open_lcm(self._url)
-        self._writer = CommandWriter(lambda command: encode_command(layout, command), self._command)
-        self._written = self._writer.counts
         for channel, handler in (
-            (layout.attitude_channel, lambda _, data: decoder.attitude(data, time.monotonic())),
-            (layout.joints_channel, lambda _, data: decoder.joints(data, time.monotonic())),
-            (layout.command_channel, lambda _, data: self._met_command(data)),
-            (BEACON_CHANNEL, lambda _, data: decoder.beacon(data)),
-            (RESPONSE_CHANNEL, lambda _, data: self._responses.append(data)),
+            (layout.attitude_channel, lambda data: decoder.attitude(data, time.monotonic())),
+            (layout.joints_channel, lambda data: decoder.joints(data, time.monotonic())),
+            (layout.command_channel, self._met_command),
+            (BEACON_CHANNEL, self._met_beacon),
+            (RESPONSE_CHANNEL, self._responses.append),
         ):
-            self._in.subscribe(channel, handler).set_queue_capacity(_QUEUE)
-        self._reading = True
-        self._thread = threading.Thread(target=self._read, name="pronk lcm reader", daemon=True)
-        self._thread.start()
+            subscription = self._in.subscribe(
+                channel, lambda _, data, handler=handler: self._take(handler, data)
+            )
+            subscription.set_queue_capacity(_QUEUE)
+        return CommandWriter(
+            lambda command: encode_command(layout, command), self._command, counts=self.counts
+        )
 
     def _shut(self) -> None:
-        self._reading = False
-        self._thread.join()
         del self._in, self._out
 
-    @property
-    def _foreign_commands(self) -> int:
-        return self._foreign
-
-    def _newest(self) -> State | None:
-        return self._decoder.latest
-
-    def _arrived(self) -> list[State]:
-        return self._decoder.drain()
-
-    def _read(self) -> None:
-        while self._reading:
-            self._in.handle_timeout(50)
+    def _receive(self) -> None:
+        self._in.handle_timeout(50)
 
     def _publish(self, channel: str, data: bytes) -> None:
         # The handle belongs to one thread at a time.
@@ -145,30 +199,14 @@ class LcmMachine(NetworkLink):
             try:
                 self._own.remove(data)
             except ValueError:
-                self._foreign += 1
+                self.counts["foreign"] += 1
 
-    def _preflight(self) -> None:
-        decoder, layout = self._decoder, self._layout
-        begun = time.monotonic()
-        if not wait_for(lambda: decoder.latest is not None):
-            raise HardwareError(
-                f"{self.robot} sent no state on {layout.joints_channel} and "
-                f"{layout.attitude_channel} within {ANSWER_S:g} s at {self._url}"
-                + (f"; what came was refused: {decoder.last_error}" if decoder.last_error else "")
-                + "; check that its program runs, the layout, the port and the network."
-            )
-        if self._release:
-            self._let_go()
-        self._foreign, silent_from = 0, time.monotonic()
-        self.fresh_states(layout.state_rate_hz, until=begun + 2.0 * ANSWER_S)
-        self.check_exclusive(silent_from)
-        if self._interface is None:
-            # Its beacon comes ten times a second; no other simulator has one.
-            wait_for(lambda: decoder.virtual)
-        self.virtual = decoder.virtual
-        decoder.drain()
+    def _met_beacon(self, data: bytes) -> None:
+        self._held = read_clamp_message(self._robot.joint_names, data)
 
-    def _let_go(self) -> None:
+    def _prepare(self) -> None:
+        if not self._release:
+            return
         data = mode_request(0, time.monotonic_ns())
         self._publish(REQUEST_CHANNEL, data)
         if not wait_for(lambda: data in self._responses):
@@ -177,6 +215,12 @@ class LcmMachine(NetworkLink):
                 f"{ANSWER_S:g} s; release it by its own remote."
             )
 
+    def _confirm(self) -> None:
+        if self._interface is None:
+            # Its beacon comes ten times a second; no other simulator has one.
+            wait_for(lambda: self._held is not None)
+        self.virtual = self._held is not None
+
     def _hold(self, joints: tuple[str, ...]) -> bool:
         names, request = self._robot.joint_names, time.monotonic_ns()
         data = clamp_message(names, joints, request)
@@ -184,6 +228,6 @@ class LcmMachine(NetworkLink):
         # Requested again, for the way there may lose messages.
         for _ in range(4):
             self._publish(BENCH_CHANNEL, data)
-            if wait_for(lambda: self._decoder.held == held, ANSWER_S / 4):
+            if wait_for(lambda: self._held == held, ANSWER_S / 4):
                 return True
         return False

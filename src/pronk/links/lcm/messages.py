@@ -13,8 +13,6 @@ Sources: the `lcm-types` of Cheetah-Software (MIT Biomimetics) and of walk-these
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,92 +36,54 @@ _NAMES: dict[int, str] = {}
 _FIELD = re.compile(r"\s*(\w+)\s+(\w+)(?:\[(\d+)\])?\s*")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Field:
-    """One field of a message."""
-
-    name: str
-    kind: str
-    """LCM's name of its type, for instance float."""
-    count: int | None
-    """Length of a one-dimensional array; None for a scalar."""
-
-
-@dataclass(frozen=True)
 class Message:
-    """A type of message: its fields in wire order, and all that follows from them."""
+    """A type of message."""
 
-    name: str
-    """Its stack and its name there, for instance cheetah.spi_data_t."""
-    fingerprint: int
-    """As lcm-gen 1.5.3 gives it."""
-    layout: str
-    """Fields in LCM's own language, separated by semicolons: `float q[12]; int64_t id`."""
+    def __init__(self, name: str, fingerprint: int, layout: str) -> None:
+        """Read a layout and check its fingerprint.
 
-    def __post_init__(self) -> None:
-        """Refuse a field that cannot be read, and a fingerprint that is not that of the fields."""
-        if self.computed_fingerprint != self.fingerprint:
-            raise HardwareError(
-                f"{self.name}: the fields hash to {self.computed_fingerprint:#018x}, expected "
-                f"{self.fingerprint:#018x}; a name, type or length in the table is wrong."
-            )
-        _NAMES.setdefault(self.fingerprint, self.name)
+        Args:
+            name: Its stack and its name there, for instance cheetah.spi_data_t.
+            fingerprint: As lcm-gen 1.5.3 gives it.
+            layout: Fields in LCM's own language and in wire order, `float q[12]; int64_t id`.
 
-    @cached_property
-    def fields(self) -> tuple[Field, ...]:
-        """The fields in wire order."""
-        made = []
-        for text in self.layout.split(";"):
+        Raises:
+            HardwareError: A field cannot be read, or the fields hash to another fingerprint.
+        """
+        self.name, self.fingerprint, self.layout = name, fingerprint, layout
+        columns: list[Any] = [("_fingerprint", ">u8")]
+        value = 0x12345678
+        for text in layout.split(";"):
             found = _FIELD.fullmatch(text)
             if found is None or found[1] not in _KINDS:
                 raise HardwareError(
-                    f"{self.name}: field {text.strip()!r} is not `type name` or `type name[count]` "
+                    f"{name}: field {text.strip()!r} is not `type name` or `type name[count]` "
                     f"of {', '.join(_KINDS)}."
                 )
-            count = int(found[3]) if found[3] else None
-            made.append(Field(name=found[2], kind=found[1], count=count))
-        return tuple(made)
-
-    @cached_property
-    def computed_fingerprint(self) -> int:
-        """The hash of the fields by lcm-gen's rule, as an unsigned number of 64 bits."""
-        value = 0x12345678
-        for field in self.fields:
-            value = _hash_text(_hash_text(value, field.name), field.kind)
-            value = _hash(value, 0 if field.count is None else 1)
-            if field.count is not None:
+            kind, field, count = found.groups()
+            columns.append((field, _KINDS[kind], () if count is None else (int(count),)))
+            value = _hash_text(_hash_text(value, field), kind)
+            value = _hash(value, 0 if count is None else 1)
+            if count is not None:
                 # 0: the dimension is a constant.
-                value = _hash_text(_hash(value, 0), str(field.count))
-        return (value << 1 | value >> 63) & _WORD
-
-    @cached_property
-    def dtype(self) -> np.dtype[np.void]:
-        """The whole message, fingerprint included, as a numpy record."""
-        columns: list[Any] = [("_fingerprint", ">u8")]
-        for field in self.fields:
-            shape = () if field.count is None else (field.count,)
-            columns.append((field.name, _KINDS[field.kind], shape))
-        return np.dtype(columns)
-
-    @property
-    def size(self) -> int:
+                value = _hash_text(_hash(value, 0), count)
+        computed = (value << 1 | value >> 63) & _WORD
+        if computed != fingerprint:
+            raise HardwareError(
+                f"{name}: the fields hash to {computed:#018x}, expected {fingerprint:#018x}; a "
+                "name, type or length in the table is wrong."
+            )
+        self.dtype = np.dtype(columns)
+        """The whole message, fingerprint included, as a NumPy record."""
+        self.size = self.dtype.itemsize
         """Length on the wire, fingerprint included [bytes]."""
-        return self.dtype.itemsize
+        _NAMES.setdefault(fingerprint, name)
 
     def encode(self, **values: ArrayLike) -> bytes:
-        """Encode a message; fields that are not named are 0, scalars fill arrays.
-
-        Raises:
-            HardwareError: A name is not that of a field.
-        """
+        """Encode a message; fields that are not named are 0, scalars fill arrays."""
         record = np.zeros((), self.dtype)
         record["_fingerprint"] = self.fingerprint
         for name, value in values.items():
-            if name not in self.dtype.fields or name == "_fingerprint":  # type: ignore[operator]
-                raise HardwareError(
-                    f"{self.name} has no field {name!r}; it has "
-                    f"{', '.join(field.name for field in self.fields)}."
-                )
             record[name] = value
         return record.tobytes()
 
