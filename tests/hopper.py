@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pronk.policy.contract import Contract, measured_layout
-from pronk.policy.contract_json import METADATA_KEY, to_json
+from pronk.policy.contract import METADATA_KEY, Contract, measured_layout, to_json
 from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
 from pronk.robots import load_robot
 

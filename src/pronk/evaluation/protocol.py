@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pronk.errors import PronkError
-from pronk.policy import paper
 from pronk.runtime.script import Velocity, check_velocity
 
 
@@ -28,8 +27,15 @@ class Case:
         check_velocity(self.command, f"case {self.name!r}")
 
 
-PAPER_COMMANDS = tuple(Case(name=name, command=command) for name, command in paper.JUMPS.items())
-"""The paper's five."""
+PAPER_COMMANDS = (
+    Case(name="forward 1", command=(1.0, 0.0, 0.0)),
+    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
+    Case(name="side -1", command=(0.0, -1.0, 0.0)),
+    Case(name="side +1", command=(0.0, 1.0, 0.0)),
+    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
+)
+"""The jumps of Table III of the paper. Positive sideways is to the left: the paper does not define
+it, and its robot is symmetric."""
 
 RATES = Case(name="forward 2.25", command=(2.25, 0.0, 0.0))
 """Of the paper's figure of roll and pitch rates (R7)."""

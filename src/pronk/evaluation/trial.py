@@ -25,6 +25,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
 import pronk
@@ -470,7 +471,7 @@ def load_subjects(paths: Sequence[Path], robot: Robot, *, jump: bool = True) -> 
             sha256=policy.sha256,
             contract={
                 key: dict(value) if isinstance(value, Mapping) else value
-                for key, value in vars(policy.contract).items()
+                for key, value in msgspec.structs.asdict(policy.contract).items()
                 if key not in _LEFT_OUT
             },
         )

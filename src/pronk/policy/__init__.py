@@ -1,1 +1,1 @@
-"""The network and its contract: one code for training's export, trial and deployment."""
+"""The network and its contract, for training's export, trials and deployment."""

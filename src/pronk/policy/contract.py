@@ -1,24 +1,25 @@
-"""The contract of a policy: all that a stranger needs to run it, beside the network.
+"""The contract of a policy: all that is needed to run its network.
 
-A network is numbers in, numbers out. Which joint is the third one, what a zero action means, how
-old the samples of a history are, with which gains the drive must follow: the contract says it,
-and it travels in the metadata of `policy.onnx` (see `pronk.policy.contract_json`).
+It is JSON in the entry `pronk.contract` of the metadata of `policy.onnx`; in ONNX Runtime
+`json.loads(session.get_modelmeta().custom_metadata_map["pronk.contract"])`.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
+
+import msgspec
 
 from pronk.errors import ArtefactError
 from pronk.policy.layout import ACTIONS, HISTORY, MEASURED
 from pronk.robots.robot import Robot
 
+SCHEMA = "pronk/policy/1"
+METADATA_KEY = "pronk.contract"
 GAINS = ("matched", "naive")
-"""Where the gains of training came from: `gains.yaml`, or the numbers set on the real drive."""
+"""Where the gains of training came from: `gains.yaml`, or the nominal gains of the real drive."""
 COMMANDS = ("vx", "vy", "yaw_rate")
 """The command in order: forward and left [m/s], about the trunk's z [rad/s]."""
 
@@ -32,39 +33,47 @@ _UNITS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class ObservationPart:
-    """A named stretch of the input "measured"; the stretches follow each other in order."""
+class ObservationPart(msgspec.Struct, frozen=True, kw_only=True):
+    """A named slice of the input "measured"; the slices follow each other in order."""
 
     name: str
     size: int
     """Numbers in it, all samples together."""
     times_s: tuple[float, ...]
-    """Sample times relative to now [s], as they stand in the vector: oldest first. An action's
-    time is that of the observation it answered."""
+    """Sample times relative to now [s], oldest first as in the vector; of an action, the time of
+    the observation that it followed."""
     unit: str
 
 
 def measured_layout(policy_rate_hz: float) -> tuple[ObservationPart, ...]:
     """The layout that this pronk trains and runs with (see `pronk.policy.layout`).
 
-    Joint positions are relative to the default position, actions as the network gave them, and
-    vectors in the trunk's frame (x forward, y left, z up).
+    Joint positions are relative to the default position, actions are outputs of the network, and
+    vectors are in the trunk's frame (x forward, y left, z up).
     """
-    now = (0.0,)
+    past = [-i / policy_rate_hz for i in range(max(HISTORY, ACTIONS), 0, -1)]
+    samples = (*past[1 - HISTORY :], 0.0)
     times = {
-        "joint_position": tuple(-i / policy_rate_hz for i in range(HISTORY - 1, 0, -1)) + now,
-        "joint_velocity": tuple(-i / policy_rate_hz for i in range(HISTORY - 1, 0, -1)) + now,
-        "action": tuple(-i / policy_rate_hz for i in range(ACTIONS, 0, -1)),
+        "joint_position": samples,
+        "joint_velocity": samples,
+        "action": tuple(past[-ACTIONS:]),
     }
     return tuple(
-        ObservationPart(name=name, size=part.size, times_s=times.get(name, now), unit=_UNITS[name])
+        ObservationPart(
+            name=name, size=part.size, times_s=times.get(name, (0.0,)), unit=_UNITS[name]
+        )
         for name, part in MEASURED.items()
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Contract:
+class Contract(
+    msgspec.Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    tag_field="schema",
+    tag=SCHEMA,
+):
     """What a policy was trained for. Per-joint tuples are in the order of `joint_names`."""
 
     robot: str
@@ -92,19 +101,19 @@ class Contract:
     """Physics steps per policy step."""
     delay_range_s: tuple[float, float]
     """Command delays trained for [s]."""
-    command_ranges: Mapping[str, tuple[float, float]]
+    command_ranges: dict[str, tuple[float, float]]
     """Smallest and largest command trained for, by the names in `COMMANDS`."""
     jump: bool
     """True if the network has the input "jump"."""
     lift_off_velocity: float | None
-    """Upward velocity of the trunk wanted at lift-off [m/s]; None for a policy without jump."""
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Phases, iterations, seed, run: how it came about."""
-    versions: Mapping[str, str] = field(default_factory=dict)
+    """Upward velocity of the trunk at lift-off that was trained for [m/s]; None without jump."""
+    provenance: dict[str, Any] = {}
+    """Phases, iterations, seed and run of its training."""
+    versions: dict[str, str] = {}
     """Package to version at training."""
 
     def __post_init__(self) -> None:
-        """Refuse what contradicts itself.
+        """Refuse contradictions.
 
         Raises:
             ArtefactError: One sentence that names the field.
@@ -114,14 +123,13 @@ class Contract:
             values = getattr(self, name)
             _demand(len(values) == n, name, values, f"one number for each of the {n} joints")
             _demand(all(map(math.isfinite, values)), name, values, "finite")
-        for name in ("action_scale", "stiffness"):
-            values = getattr(self, name)
-            _demand(min(values, default=1.0) > 0.0, name, values, "positive")
+            if name in ("action_scale", "stiffness"):
+                _demand(all(value > 0.0 for value in values), name, values, "positive")
         _demand(min(self.damping, default=0.0) >= 0.0, "damping", self.damping, "not negative")
         _demand(self.gains in GAINS, "gains", self.gains, " or ".join(GAINS))
-        hashed = re.fullmatch("[0-9a-f]{64}", self.gains_sha256) is not None
         _demand(
-            hashed or (self.gains == "naive" and not self.gains_sha256),
+            re.fullmatch("[0-9a-f]{64}", self.gains_sha256) is not None
+            or (self.gains == "naive" and not self.gains_sha256),
             "gains_sha256",
             self.gains_sha256,
             "64 hex digits, or empty for naive gains that rest on no file",
@@ -139,12 +147,46 @@ class Contract:
         for name, (low, high) in {**ranges, "delay_range_s": self.delay_range_s}.items():
             rising = math.isfinite(low) and math.isfinite(high) and low <= high
             _demand(rising, name, (low, high), "finite, the smaller number first")
+        velocity = self.lift_off_velocity
         _demand(
-            self.jump == (self.lift_off_velocity is not None),
+            self.jump == (velocity is not None) and math.isfinite(velocity or 0.0),
             "lift_off_velocity",
-            self.lift_off_velocity,
+            velocity,
             "a number for a policy that jumps and null for one that does not",
         )
+
+
+def to_json(contract: Contract) -> str:
+    """The contract as JSON, `schema` first."""
+    return msgspec.json.encode(contract).decode()
+
+
+def from_json(text: str, *, source: object) -> Contract:
+    """Read what `to_json` wrote.
+
+    Args:
+        text: The JSON.
+        source: Where it is from, for errors.
+
+    Raises:
+        ArtefactError: Not JSON, of another schema, with fields missing, unknown or of another
+            type, or contradicting itself.
+    """
+    try:
+        body = msgspec.json.decode(text)
+        # A field of older files: the jump input had to wait for a moment of the stride.
+        if isinstance(body, dict) and body.pop("waits_for_stride", False) is not False:
+            raise ArtefactError(
+                "the policy waits for a moment of its stride before it jumps (waits_for_stride), "
+                "which this pronk does not do; train it again."
+            )
+        return msgspec.convert(body, Contract)
+    except ArtefactError as error:
+        raise ArtefactError(f"{source}: {error}") from None
+    except msgspec.MsgspecError as error:
+        raise ArtefactError(
+            f"{source}: not a contract of schema {SCHEMA!r}, which this pronk reads: {error}."
+        ) from None
 
 
 def check(contract: Contract, robot: Robot, *, gains_sha256: str | None = None) -> None:
@@ -153,16 +195,20 @@ def check(contract: Contract, robot: Robot, *, gains_sha256: str | None = None) 
     Args:
         contract: What the policy was trained for.
         robot: What it shall run on.
-        gains_sha256: Of the `gains.yaml` in hand, if the policy must be trained with that one.
+        gains_sha256: Of the `gains.yaml` that the policy must be trained with, if any.
 
     Raises:
         ArtefactError: One sentence that names the field.
     """
-    _equal("robot", contract.robot, robot.name)
-    _equal("joint_names", contract.joint_names, robot.joint_names)
-    _equal("policy_rate_hz", contract.policy_rate_hz, robot.policy_rate_hz)
-    _equal("timestep_s", contract.timestep_s, robot.timestep_s)
-    _equal("decimation", contract.decimation, robot.decimation)
+    for field, want in {
+        "robot": robot.name,
+        "joint_names": robot.joint_names,
+        "policy_rate_hz": robot.policy_rate_hz,
+        "timestep_s": robot.timestep_s,
+        "decimation": robot.decimation,
+    }.items():
+        got = getattr(contract, field)
+        _demand(got == want, field, got, f"{want!r}, as the robot has it")
     for joint, position in zip(robot.joints, contract.default_position, strict=True):
         low, high = joint.range
         _demand(
@@ -172,30 +218,29 @@ def check(contract: Contract, robot: Robot, *, gains_sha256: str | None = None) 
             f"within the joint's limits, {low} to {high} rad",
         )
     for name in ("stiffness", "damping"):
-        got = dict(zip(contract.joint_names, getattr(contract, name), strict=True))
+        gains = dict(zip(contract.joint_names, getattr(contract, name), strict=True))
         for joint in robot.joints:
-            # Training gains are per group; naive ones are those set on the real drive.
-            naive = contract.gains == "naive"
-            want = getattr(joint, name) if naive else got[robot.group(joint.group)[0].name]
+            # Matched gains are per group; naive ones are those of the real drive.
+            if contract.gains == "naive":
+                expected, reason = getattr(joint, name), "that of the drive"
+            else:
+                expected = gains[robot.group(joint.group)[0].name]
+                reason = f"as in all of {joint.group}"
             _demand(
-                math.isclose(got[joint.name], want, rel_tol=1e-6),
+                math.isclose(gains[joint.name], expected, rel_tol=1e-6),
                 f"{name} of {joint.name}",
-                got[joint.name],
-                f"{want:g}, {'that of the drive' if naive else f'as in all of {joint.group}'}",
+                gains[joint.name],
+                f"{expected:g}, {reason}",
             )
     if gains_sha256 is not None:
         _demand(
             contract.gains_sha256 == gains_sha256,
             "gains_sha256",
             contract.gains_sha256,
-            f"{gains_sha256!r}, that of the gains in hand",
+            f"{gains_sha256!r}, that of the given gains",
         )
 
 
 def _demand(met: bool, name: str, got: object, expected: str) -> None:
     if not met:
         raise ArtefactError(f"the contract's {name} is {got!r}; it must be {expected}.")
-
-
-def _equal(name: str, got: object, expected: object) -> None:
-    _demand(got == expected, name, got, f"{expected!r}, as the robot has it")

@@ -1,8 +1,8 @@
-"""What a policy reads, number by number: the observation vector and its parts.
+"""The observation vector of a policy, number by number.
 
-The measured part is one vector, with a short history, because actor and estimator must see the
-same measurement with the same noise. The jump input stands apart: phase 1 has none, phase 2 adds
-it at the end (paper N3).
+The measured part is one vector with a short history, so that actor and estimator read the same
+measurement with the same noise. The jump input is separate: phase 1 has none, phase 2 adds it at
+the end (paper N3).
 
     measured   angular velocity 3, projected gravity 3, position 3 x 12, velocity 3 x 12,
                previous actions 2 x 12, command 3                                     = 105
@@ -10,7 +10,7 @@ it at the end (paper N3).
 
 Histories run from old to new: t-0.04, t-0.02, t (positions and velocities); t-0.04, t-0.02
 (actions). The estimator reads all but the command (102, with the jump input 103: paper N1, reading
-A19); the actor reads what is current (45), behind the estimate (7): 52, with the jump input 53
+A19); the actor reads the estimate (7), then the current samples (45): 52, with the jump input 53
 (paper N2, reading A19 of one previous action).
 
 Frames and units: angular velocity [rad/s] and gravity (unit vector) in the trunk's frame (x
@@ -31,7 +31,7 @@ ACTIONS = 2
 
 @dataclass(frozen=True)
 class Part:
-    """A named stretch of the measured vector."""
+    """A named slice of the measured vector."""
 
     name: str
     start: int
@@ -39,7 +39,7 @@ class Part:
 
     @property
     def indices(self) -> range:
-        """Where it stands."""
+        """Its positions in the vector."""
         return range(self.start, self.start + self.size)
 
 
@@ -75,13 +75,13 @@ ACTOR_INDICES: tuple[int, ...] = (
     *_newest["joint_velocity"],
     *MEASURED["action"].indices[-JOINTS:],
 )
-"""What of the measured vector the actor reads itself, behind the estimate."""
+"""Part of the measured vector that the actor reads, behind the estimate."""
 
 ESTIMATOR_INDICES: tuple[int, ...] = tuple(range(MEASURED["command"].start))
-"""What of the measured vector the estimator reads."""
+"""Part of the measured vector that the estimator reads."""
 
 ESTIMATE = {"contact": 4, "linear_velocity": 3}
-"""What the estimator gives: contact probability per foot (FR, FL, HR, HL), trunk velocity in the
+"""Outputs of the estimator: contact probability per foot (FR, FL, HR, HL), trunk velocity in the
 trunk's frame [m/s]. The actor reads it in this order, in front of its own part."""
 
 ESTIMATE_SIZE = sum(ESTIMATE.values())

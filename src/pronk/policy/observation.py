@@ -1,7 +1,7 @@
-"""The measured vector on the robot: what training's observation manager builds, one robot's worth.
+"""The measured vector of one robot, as training's observation manager builds it.
 
-At a reset the first sample fills the whole history, and the actions before it count as zero: so
-episodes begin in training, and so a policy must begin everywhere else.
+At a reset the first sample fills the whole history, and the actions before it are zero, as at the
+beginning of an episode in training.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SIZES = {"angular_velocity": 3, "projected_gravity": 3, "position": JOINTS, "ve
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """What the robot measures at one moment. Joints in the order of the contract."""
+    """One sample of the robot's sensors. Joints in the order of the contract."""
 
     angular_velocity: ArrayLike
     """Of the trunk, in its frame (x forward, y left, z up) [rad/s]. (3,)"""
@@ -33,11 +33,7 @@ class Measurement:
     """Joint velocities [rad/s]. (12,)"""
 
     def __post_init__(self) -> None:
-        """Refuse what is not a number.
-
-        Raises:
-            ArtefactError: A part has another size or is not finite; the message names it.
-        """
+        """Raise `ArtefactError` for a part of another size or not finite."""
         for name, size in _SIZES.items():
             finite(f"the measured {name}", getattr(self, name), (size,))
 
@@ -46,32 +42,28 @@ class History:
     """The last samples of one robot, oldest first, and the measured vector made of them."""
 
     def __init__(self, default_position: ArrayLike) -> None:
-        """Begin as after `reset`.
-
-        Args:
-            default_position: What observed positions are relative to [rad]. (12,)
-        """
+        """Begin as after `reset`; positions are relative to `default_position` [rad]. (12,)."""
         self._default = np.asarray(default_position, np.float32)
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next sample fills the history."""
+        """Begin anew: the next sample fills the history."""
         self._position: Floats | None = None
         self._velocity: Floats | None = None
         self._actions = np.zeros((ACTIONS, JOINTS), np.float32)
 
     def observe(self, measurement: Measurement, command: ArrayLike) -> Floats:
-        """Take a sample and give the measured vector of now, laid out as `layout.MEASURED`.
+        """Add a sample; returns the measured vector, laid out as `layout.MEASURED`.
 
         Args:
-            measurement: Of now.
+            measurement: The sample.
             command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
 
         Returns:
             (105,)
 
         Raises:
-            ArtefactError: The command has another size or is not finite; nothing was taken.
+            ArtefactError: The command has another size or is not finite; nothing was added.
         """
         commanded = finite("the command", command, (3,))
         position = np.asarray(measurement.position, np.float32) - self._default
@@ -88,12 +80,11 @@ class History:
         return np.concatenate([np.asarray(parts[name], np.float32).ravel() for name in MEASURED])
 
     def acted(self, action: Floats) -> None:
-        """Remember what the network answered to the last observation. (12,)."""
+        """Add the network's action for the last observation. (12,)."""
         self._actions = np.concatenate([self._actions[1:], action[None]])
 
 
 def _pushed(history: Floats | None, sample: Floats) -> Floats:
-    """The history with a sample behind it, as long as before; the first sample fills it."""
     if history is None:
         return np.tile(sample, (HISTORY, 1))
     return np.concatenate([history[1:], sample[None]])
@@ -102,21 +93,16 @@ def _pushed(history: Floats | None, sample: Floats) -> Floats:
 def finite(what: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """`value` as float32.
 
-    Args:
-        what: Its name, for the error.
-        value: Numbers.
-        shape: What it must have.
-
     Raises:
-        ArtefactError: Of another shape, or with a number that is not finite.
+        ArtefactError: Of another shape, or with a number that is not finite; names it `what`.
     """
     given = np.asarray(value)
     if given.shape != shape:
         raise ArtefactError(f"{what} has the shape {given.shape}; expected {shape}.")
-    with np.errstate(over="ignore"):  # what overflows becomes infinite, and is refused
+    with np.errstate(over="ignore"):  # overflow gives infinity, which is refused
         array = given.astype(np.float32, copy=False)
         flat = array.ravel()
-        # A finite sum of squares has finite parts, and costs less than looking at each.
+        # A finite sum of squares has finite parts; this is the fastest check.
         if math.isfinite(flat.dot(flat)):
             return array
     for index in np.argwhere(~np.isfinite(array)):

@@ -1,7 +1,4 @@
-"""A policy that runs: `policy.onnx` in ONNX Runtime, on one thread of the processor.
-
-The same code runs a policy in trials, on the virtual robot and on the real one.
-"""
+"""Run `policy.onnx` in ONNX Runtime on one thread: in trials and on a machine alike."""
 
 from __future__ import annotations
 
@@ -16,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.policy.contract import Contract, measured_layout
-from pronk.policy.contract_json import METADATA_KEY, from_json
+from pronk.policy.contract import METADATA_KEY, Contract, from_json, measured_layout
 from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
 from pronk.policy.observation import Floats, History, Measurement, finite
 
@@ -28,7 +24,7 @@ _OUTPUTS = {"action": JOINTS, **ESTIMATE}
 
 @dataclass(frozen=True, kw_only=True)
 class Inference:
-    """What the network gives for N observations."""
+    """Outputs of the network for N observations."""
 
     action: Floats
     """(N, 12)"""
@@ -39,22 +35,16 @@ class Inference:
 
 
 class Policy:
-    """A network, its contract, and the past of the one robot that `step` runs."""
+    """A network, its contract, and the history of the one robot that `step` runs."""
 
     def __init__(self, session: Any, contract: Contract, *, sha256: str = "") -> None:
-        """Wrap what `load_policy` has opened and checked.
-
-        Args:
-            session: ONNX Runtime's.
-            contract: That of the file.
-            sha256: Of the file, hex.
-        """
+        """Wrap an ONNX Runtime session that `load_policy` has checked; `sha256` is of the file."""
         self.contract = contract
         self.sha256 = sha256
         self.inference: Inference | None = None
-        """What the network gave in the last `step`; None before the first."""
+        """Outputs of the last `step`; None before the first."""
         self.network_s = math.nan
-        """How long ONNX Runtime took for its last answer [s]; NaN before the first."""
+        """Time that ONNX Runtime took last [s]; NaN before the first."""
         self._session = session
         self._jumps = contract.jump
         self._default = np.asarray(contract.default_position)
@@ -62,11 +52,11 @@ class Policy:
         self._history = History(contract.default_position)
 
     def sibling(self) -> Self:
-        """The same network with a past of its own: nothing it does is seen by this one."""
+        """The same network with a history of its own."""
         return type(self)(self._session, self.contract, sha256=self.sha256)
 
     def reset(self) -> None:
-        """Begin anew: the next measurement is taken for the whole past, past actions for zero."""
+        """Begin anew: the next measurement fills the history, past actions are zero."""
         self._history.reset()
         self.inference = None
 
@@ -76,15 +66,15 @@ class Policy:
         """One policy step; call it at `contract.policy_rate_hz`.
 
         Args:
-            measurement: Of now.
+            measurement: The present one.
             command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
-            jump: The jump input.
+            jump: The jump input; refused by a policy without one.
 
         Returns:
             Joint position targets in the order of the contract, absolute [rad]. (12,)
 
         Raises:
-            ArtefactError: Something is not finite, or jump is set without a jump input.
+            ArtefactError: A number is not finite, or jump is refused.
         """
         self._refuse_jump(jump)
         measured = self._history.observe(measurement, command)
@@ -102,8 +92,7 @@ class Policy:
             jump: The jump input, 0 or 1; None is 0 for all. (N, 1)
 
         Raises:
-            ArtefactError: A shape is wrong, something is not finite, or the jump input is set
-                for a policy without one.
+            ArtefactError: A shape is wrong, a number is not finite, or jump is refused.
         """
         count = len(np.atleast_1d(measured))
         read = finite('the input "measured"', measured, (count, MEASURED_SIZE))
@@ -130,12 +119,12 @@ class Policy:
         if jump and not self._jumps:
             raise ArtefactError(
                 "this policy was trained to walk only and has no jump input; "
-                "`pronk train jump` teaches it."
+                "`pronk train jump` adds one."
             )
 
 
 def load_policy(path: Path | str) -> Policy:
-    """Open a policy. Whether it fits a robot, `pronk.policy.contract.check` says.
+    """Open a policy; `pronk.policy.contract.check` checks that it fits a robot.
 
     Args:
         path: `policy.onnx`, as `pronk train` writes it.
@@ -177,7 +166,7 @@ def _session(data: bytes, path: Path) -> Any:
             "install it with `pip install 'pronk[policy]'`."
         ) from None
     options = onnxruntime.SessionOptions()
-    # A network this small is slower on several threads, and a control loop wants the others.
+    # A network this small is slower on several threads.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors come as exceptions

@@ -21,8 +21,7 @@ from torch import Tensor, nn
 
 import pronk
 from pronk.files import written_whole
-from pronk.policy.contract import COMMANDS, Contract, measured_layout
-from pronk.policy.contract_json import METADATA_KEY, to_json
+from pronk.policy.contract import COMMANDS, METADATA_KEY, Contract, measured_layout, to_json
 from pronk.policy.layout import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
 from pronk.policy.runtime import load_policy
 from pronk.robots.robot import Robot

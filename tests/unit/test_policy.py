@@ -1,0 +1,342 @@
+"""The contract, the measured vector and the runtime of a policy, without training."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from hopper import DEFAULT, ROBOT, contract
+from pronk.errors import ArtefactError, PronkError
+from pronk.policy.contract import METADATA_KEY, check, from_json, measured_layout, to_json
+from pronk.policy.layout import MEASURED, MEASURED_SIZE
+from pronk.policy.observation import History, Measurement, finite
+from pronk.policy.runtime import Policy, load_policy
+
+SCALE = np.full(12, 0.5)
+WALK: dict[str, Any] = {"jump": False, "lift_off_velocity": None}
+
+
+def measurement(**changes: Any) -> Measurement:
+    kept: dict[str, Any] = {
+        "angular_velocity": np.zeros(3),
+        "projected_gravity": [0.0, 0.0, -1.0],
+        "position": DEFAULT,
+        "velocity": np.zeros(12),
+    }
+    return Measurement(**(kept | changes))
+
+
+# --- Contract -----------------------------------------------------------------------------------
+
+
+def test_layout_by_hand() -> None:
+    layout = measured_layout(50.0)
+    three, two = (-0.04, -0.02, 0.0), (-0.04, -0.02)
+    assert [(part.name, part.size, part.times_s) for part in layout] == [
+        ("angular_velocity", 3, (0.0,)),
+        ("projected_gravity", 3, (0.0,)),
+        ("joint_position", 36, three),
+        ("joint_velocity", 36, three),
+        ("action", 24, two),
+        ("command", 3, (0.0,)),
+    ]
+    assert sum(part.size for part in layout) == MEASURED_SIZE == 105
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, WALK, {"gains": "naive", "gains_sha256": ""}, {"versions": {"torch": "2.13"}}]
+)
+def test_json_gives_the_same_contract_back(changes: dict[str, Any]) -> None:
+    before = contract(**changes)
+    text = to_json(before)
+    assert from_json(text, source="here") == before
+    old = json.loads(text) | {"waits_for_stride": False}
+    assert from_json(json.dumps(old), source="here") == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"default_position": (0.0,) * 11}, "default_position"),
+        ({"action_scale": (0.35,) * 11 + (0.0,)}, "action_scale"),
+        ({"stiffness": (math.nan,) * 12}, "stiffness"),
+        ({"damping": (0.4,) * 11 + (-0.1,)}, "damping"),
+        ({"gains": "best"}, "gains"),
+        ({"gains_sha256": ""}, "gains_sha256"),
+        ({"gains": "naive", "gains_sha256": "xyz"}, "gains_sha256"),
+        ({"policy_rate_hz": 100.0}, "policy_rate_hz"),
+        ({"decimation": 0}, "policy_rate_hz"),
+        ({"delay_range_s": (0.02, 0.01)}, "delay_range_s"),
+        ({"command_ranges": {"vx": (-1.0, 1.0)}}, "command_ranges"),
+        ({"command_ranges": {"vx": (1, -1), "vy": (0, 0), "yaw_rate": (0, 0)}}, "of vx"),
+        ({"jump": False, "lift_off_velocity": 2.5}, "lift_off_velocity"),
+        ({"lift_off_velocity": None}, "lift_off_velocity"),
+    ],
+)
+def test_a_contract_that_contradicts_itself_is_refused(changes: dict[str, Any], field: str) -> None:
+    with pytest.raises(ArtefactError, match=f"contract's {field}|{field} is"):
+        contract(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"schema": "pronk/policy/9"}, "pronk/policy/9"),
+        ({"mass": 1.0}, "mass"),
+        ({"joint_names": "FR"}, "joint_names"),
+        ({"stiffness": ["a"] * 12}, "stiffness"),
+        ({"stiffness": [True] * 12}, "stiffness"),
+        ({"jump": 1}, "jump"),
+        ({"robot": None}, "robot"),
+        ({"decimation": 4.5}, "decimation"),
+        ({"delay_range_s": [0.0]}, "delay_range_s"),
+        ({"versions": []}, "versions"),
+        ({"observation": [{"name": "command"}]}, "observation"),
+        ({"damping": [-1.0] * 12}, "damping"),
+        ({"waits_for_stride": True}, "waits_for_stride"),
+    ],
+)
+def test_a_contract_that_cannot_be_read_is_refused(changes: dict[str, Any], name: str) -> None:
+    text = json.dumps(json.loads(to_json(contract())) | changes)
+    with pytest.raises(ArtefactError, match=f"^policy.onnx: .*{name}"):
+        from_json(text, source="policy.onnx")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}"])
+def test_text_that_is_no_contract_is_refused(text: str) -> None:
+    with pytest.raises(ArtefactError, match=r"^policy.onnx: .*pronk/policy/1"):
+        from_json(text, source="policy.onnx")
+
+
+def test_a_contract_that_fits_the_robot_is_accepted() -> None:
+    check(contract(), ROBOT, gains_sha256="0f" * 32)
+    naive = {"stiffness": (17.0,) * 12, "damping": (0.4,) * 12}
+    check(contract(gains="naive", gains_sha256="", **naive), ROBOT)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"robot": "so101"}, "robot"),
+        ({"joint_names": ROBOT.joint_names[::-1]}, "joint_names"),
+        ({"policy_rate_hz": 100.0, "decimation": 2}, "policy_rate_hz"),
+        ({"timestep_s": 0.002, "decimation": 10}, "timestep_s"),
+        ({"default_position": (0.0, 0.0, 3.0) * 4}, "default_position of FR_knee"),
+        ({"stiffness": (20.0,) * 11 + (21.0,)}, "stiffness of HL_knee"),
+        ({"gains": "naive", "stiffness": (17.0,) * 12}, "damping of FR_hip_roll"),
+        ({"gains_sha256": "1e" * 32}, "gains_sha256"),
+    ],
+)
+def test_a_contract_for_another_robot_or_gains_is_refused(
+    changes: dict[str, Any], field: str
+) -> None:
+    with pytest.raises(ArtefactError, match=f"contract's {field} is"):
+        check(contract(**changes), ROBOT, gains_sha256="0f" * 32)
+
+
+# --- The measured vector ------------------------------------------------------------------------
+
+
+def test_history_by_hand() -> None:
+    history = History(DEFAULT)
+    command = (1.0, -0.5, 0.25)
+    for _ in range(2):  # the second time after a reset
+        vectors = []
+        for k in range(4):
+            velocity = np.full(12, -10.0 * (k + 1))
+            now = measurement(position=DEFAULT + k + 1.0, velocity=velocity)
+            vectors.append(history.observe(now, command))
+            history.acted(np.full(12, 100.0 + k, np.float32))
+        # The first sample fills the history; no action came before it.
+        samples = [(1, 1, 1), (1, 1, 2), (1, 2, 3), (2, 3, 4)]
+        actions = [(0, 0), (0, 100), (100, 101), (101, 102)]
+        for vector, positions, before in zip(vectors, samples, actions, strict=True):
+            expected = {
+                "angular_velocity": np.zeros(3),
+                "projected_gravity": (0, 0, -1),
+                "joint_position": np.repeat(positions, 12),
+                "joint_velocity": -10.0 * np.repeat(positions, 12),
+                "action": np.repeat(before, 12),
+                "command": command,
+            }
+            for name, values in expected.items():
+                found = vector[list(MEASURED[name].indices)]
+                np.testing.assert_allclose(found, values, atol=1e-6)
+            assert vector.dtype == np.float32
+        history.reset()
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"position": np.zeros(11)}, r"position .*\(11,\); expected \(12,\)"),
+        ({"velocity": [np.nan] * 12}, r"velocity is nan at \[0\]"),
+        ({"angular_velocity": [0.0, np.inf, 0.0]}, r"angular_velocity is inf at \[1\]"),
+    ],
+)
+def test_a_measurement_that_is_not_finite_is_refused(changes: dict[str, Any], match: str) -> None:
+    with pytest.raises(ArtefactError, match=match):
+        measurement(**changes)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
+def test_finite_numbers_of_any_size_and_type_are_read(kind: type) -> None:
+    most = 2**62 if kind is np.int64 else kind(3.4e38)  # its square overflows a float32
+    value = np.array([most, 1, -most], kind)
+    np.testing.assert_array_equal(finite("it", value, (3,)), value.astype(np.float32))
+    for bad in (math.nan, -math.inf, 1e39):
+        with pytest.raises(ArtefactError, match=r"it is (nan|-?inf) at \[1\]"):
+            finite("it", [0.0, bad, 1e300], (3,))
+
+
+# --- Runtime ------------------------------------------------------------------------------------
+
+WEIGHTS = 0.1 * np.random.default_rng(7).normal(size=(MEASURED_SIZE + 1, 19)).astype(np.float32)
+
+
+def write_network(path: Path, metadata: dict[str, str], *, jump: bool, width: int = 105) -> Path:
+    """A linear network: action, contact and velocity are columns of (measured, jump) WEIGHTS."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    inputs = {"measured": width} | ({"jump": 1} if jump else {})
+    outputs = {"action": 12, "contact": 4, "linear_velocity": 3}
+    weights = np.concatenate([WEIGHTS[:width], WEIGHTS[MEASURED_SIZE:]])[: width + jump]
+    tensor = onnx.numpy_helper.from_array
+    graph = helper.make_graph(
+        [
+            helper.make_node("Concat", list(inputs), ["x"], axis=1),
+            helper.make_node("MatMul", ["x", "weights"], ["y"]),
+            helper.make_node("Split", ["y", "sizes"], list(outputs), axis=1),
+        ],
+        "linear",
+        [helper.make_tensor_value_info(k, kind, ["batch", n]) for k, n in inputs.items()],
+        [helper.make_tensor_value_info(k, kind, ["batch", n]) for k, n in outputs.items()],
+        [tensor(weights, "weights"), tensor(np.array([12, 4, 3]), "sizes")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    helper.set_model_props(model, metadata)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def write_policy(folder: Path, **changes: Any) -> Path:
+    made = contract(**changes)
+    metadata = {METADATA_KEY: to_json(made)}
+    return write_network(folder / "policy.onnx", metadata, jump=made.jump)
+
+
+@pytest.fixture
+def jumper(tmp_path: Path) -> Policy:
+    return load_policy(write_policy(tmp_path))
+
+
+@pytest.fixture
+def walker(tmp_path: Path) -> Policy:
+    return load_policy(write_policy(tmp_path, **WALK))
+
+
+def test_the_contract_can_be_read_without_pronk(tmp_path: Path) -> None:
+    path = write_policy(tmp_path)
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    body = json.loads(session.get_modelmeta().custom_metadata_map["pronk.contract"])
+    assert (body["schema"], body["joint_names"][2]) == ("pronk/policy/1", "FR_knee")
+    policy = load_policy(path)
+    assert policy.contract == contract()
+    assert policy.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_targets_are_default_plus_scaled_action_of_the_history(jumper: Policy) -> None:
+    random = np.random.default_rng(1)
+    history = History(DEFAULT)
+    for k in range(6):
+        if k == 4:
+            jumper.reset()
+            history.reset()
+            assert jumper.inference is None
+        now = measurement(position=random.normal(size=12), velocity=random.normal(size=12))
+        command = random.normal(size=3)
+        target = jumper.step(now, command, jump=k % 2 == 1)
+        output = np.append(history.observe(now, command), np.float32(k % 2)) @ WEIGHTS
+        history.acted(output[:12])
+        np.testing.assert_allclose(target, DEFAULT + SCALE * output[:12], atol=1e-5)
+        assert jumper.inference is not None
+        np.testing.assert_allclose(jumper.inference.contact, output[None, 12:16], atol=1e-5)
+        np.testing.assert_allclose(jumper.inference.linear_velocity, output[None, 16:], atol=1e-5)
+
+
+def test_a_batch_is_its_rows(jumper: Policy) -> None:
+    random = np.random.default_rng(2)
+    measured = random.normal(size=(9, 105)).astype(np.float32)
+    jump = (random.random((9, 1)) < 0.5).astype(np.float32)
+    together = jumper.infer(measured, jump)
+    for i in range(9):
+        alone = jumper.infer(measured[i : i + 1], jump[i : i + 1])
+        np.testing.assert_allclose(alone.action[0], together.action[i], atol=1e-5)
+    still = jumper.infer(measured, np.zeros((9, 1)))
+    np.testing.assert_array_equal(jumper.infer(measured).action, still.action)
+
+
+def test_a_refused_step_changes_nothing(walker: Policy) -> None:
+    first = walker.step(measurement(), np.ones(3))
+    walker.reset()
+    moved = measurement(position=DEFAULT + 1.0)
+    with pytest.raises(ArtefactError, match=r"command is nan at \[2\]"):
+        walker.step(moved, [0.0, 0.0, np.nan])
+    with pytest.raises(ArtefactError, match="walk only"):
+        walker.step(moved, np.ones(3), jump=True)
+    with pytest.raises(ArtefactError, match="walk only"):
+        walker.infer(np.zeros((2, 105)), np.array([[0.0], [1.0]]))
+    np.testing.assert_array_equal(walker.step(measurement(), np.ones(3)), first)
+
+
+def test_inputs_and_outputs_that_are_not_finite_are_refused(jumper: Policy) -> None:
+    measured = np.zeros((3, 105), np.float32)
+    measured[1, 7] = np.nan
+    with pytest.raises(ArtefactError, match=r'"measured" is nan at \[1, 7\]'):
+        jumper.infer(measured)
+    with pytest.raises(ArtefactError, match='"jump" is inf'):
+        jumper.infer(np.zeros((1, 105)), [[1e300]])
+    with pytest.raises(ArtefactError, match=r"\(3, 104\); expected \(3, 105\)"):
+        jumper.infer(np.zeros((3, 104)))
+    with pytest.raises(ArtefactError, match='"action" is'):
+        jumper.infer(np.full((1, 105), 3e38, np.float32))
+
+
+def test_files_that_hold_no_policy_are_refused(tmp_path: Path) -> None:
+    whole = write_policy(tmp_path).read_bytes()
+    (tmp_path / "half.onnx").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.onnx").write_text("not a network")
+    (tmp_path / "empty.onnx").write_bytes(b"")
+    write_network(tmp_path / "foreign.onnx", {"author": "someone"}, jump=False)
+    write_network(tmp_path / "odd.onnx", {METADATA_KEY: "{}"}, jump=True)
+    walks = to_json(contract(**WALK))
+    write_network(tmp_path / "jumps.onnx", {METADATA_KEY: walks}, jump=True)
+    write_network(tmp_path / "narrow.onnx", {METADATA_KEY: walks}, jump=False, width=45)
+    mixed = msgspec.structs.replace(contract(), observation=measured_layout(50.0)[::-1])
+    write_network(tmp_path / "mixed.onnx", {METADATA_KEY: to_json(mixed)}, jump=True)
+    names = [path.name for path in tmp_path.iterdir() if path.name != "policy.onnx"]
+    for name in (*names, "none.onnx", ""):
+        with pytest.raises(ArtefactError) as refusal:
+            load_policy(tmp_path / name)
+        assert str(refusal.value).startswith(f"{tmp_path / name}: ")
+        assert "\n" not in str(refusal.value)
+    assert len(names) == 8
+
+
+def test_without_onnx_runtime_its_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_policy(tmp_path)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(PronkError, match=r"pip install 'pronk\[policy\]'"):
+        load_policy(path)
