@@ -23,8 +23,8 @@ import numpy as np
 import pytest
 
 from pronk.cli import main as cli
-from pronk.cli.confirm import Person
-from pronk.cli.sweep_wire import record_wire
+from pronk.cli.console import Person
+from pronk.cli.sweep import record_wire
 from pronk.errors import HardwareError, LogError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp

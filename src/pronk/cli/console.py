@@ -1,4 +1,4 @@
-"""What every command shares: where words go, progress, figures as JSON, finding logs.
+"""Output of the commands: tables, progress, figures as JSON; confirmations before a robot moves.
 
 Results go to standard output; progress and warnings go to standard error, so that a table can be
 piped into a file.
@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+import select
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,11 +21,15 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 from rich.text import Text
 
+from pronk.errors import HardwareError
+
 JsonFile = Annotated[Path | None, tyro.conf.arg(name="json")]
+
+_LOOK_S = 0.2
 
 
 def out() -> Console:
-    """Standard output. Made anew each time, so that a redirected stream is found."""
+    """Standard output; made anew each time, so that a redirected stream is found."""
     return Console(highlight=False, soft_wrap=True)
 
 
@@ -33,7 +39,7 @@ def err() -> Console:
 
 
 def say(text: str) -> None:
-    """Print one line to standard output, as it stands."""
+    """Print one line to standard output."""
     out().print(text, markup=False)
 
 
@@ -43,46 +49,44 @@ def warn(text: str) -> None:
 
 
 def wrote(*paths: Path) -> None:
-    """Say what was written."""
+    """Print what was written."""
     for path in paths:
         say(f"wrote {path}")
 
 
 def following(*commands: str) -> None:
-    """Say what to do next."""
-    say("next:")
-    for command in commands:
-        say(f"  {command}")
+    """Print what to do next."""
+    say("\n  ".join(("next:", *commands)))
 
 
-def table(title: str, *columns: str) -> Table:
-    """A table whose first column is a name and whose others are numbers."""
+def table(title: str, *columns: str, rows: Iterable[Sequence[str]] = ()) -> Table:
+    """Make a table whose first column is a name and whose others are numbers."""
     made = Table(title=Text(title), title_justify="left", title_style="bold", header_style="bold")
     for i, column in enumerate(columns):
-        made.add_column(Text(column), justify="left" if i == 0 else "right", no_wrap=i == 0)
+        made.add_column(Text(column), justify="right" if i else "left", no_wrap=not i)
+    for cells in rows:
+        row(made, *cells)
     return made
 
 
 def row(made: Table, *cells: str) -> None:
-    """Add a row; brackets in a cell are brackets, not markup."""
+    """Add a row; brackets in a cell are not markup."""
     made.add_row(*(Text(cell) for cell in cells))
 
 
 def show(made: Table) -> None:
     """Print a table; a stream that is not a terminal gets the width the table needs."""
     console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=160)
-    console.print(made)
+    (console if console.is_terminal else Console(highlight=False, width=160)).print(made)
 
 
 def number(value: float, digits: int = 2) -> str:
-    """A number for a table; a dash where it is unknown."""
+    """Format a number; a dash where it is unknown."""
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def _plain(value: Any) -> Any:
-    """Numbers, text, lists and mappings that strict JSON can hold; unknown numbers are null."""
+    """Convert to what strict JSON can hold; unknown numbers are null."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -91,19 +95,16 @@ def _plain(value: Any) -> Any:
         return str(value)
     if hasattr(value, "tolist"):
         return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     """Write a command's figures, if a file was requested."""
-    if path is None:
-        return
-    from pronk.files import write_text
+    if path is not None:
+        from pronk.files import write_text
 
-    write_text(path, json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n")
-    wrote(path)
+        write_text(path, json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n")
+        wrote(path)
 
 
 class Reporter:
@@ -114,13 +115,13 @@ class Reporter:
         self._tasks: dict[str, Any] = {}
 
     def __call__(self, stage: str, share: float) -> None:
-        """Tell that `stage` has come as far as `share`, 0 to 1."""
+        """Set the share of `stage` that is done, 0 to 1."""
         if stage not in self._tasks:
             self._tasks[stage] = self._progress.add_task(stage, total=1.0)
         self._progress.update(self._tasks[stage], completed=min(max(share, 0.0), 1.0))
 
     def bar(self, stage: str) -> Callable[[float], None]:
-        """The same for one stage, as a function of the share alone."""
+        """Begin a stage; the result sets its share."""
         self(stage, 0.0)
         return lambda share: self(stage, share)
 
@@ -135,5 +136,56 @@ def progress() -> Iterator[Reporter]:
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=err()) as shown:
-        yield Reporter(shown)
+    with Progress(*columns, console=err()) as bars:
+        yield Reporter(bars)
+
+
+def confirm(robot: str, where: str) -> None:
+    """Have the robot's name typed before a real one moves.
+
+    Raises:
+        HardwareError: Another word was typed.
+    """
+    say(
+        f"A real {robot} at {where} is about to move. Keep everybody out of its reach; the first "
+        "time, hang it up."
+    )
+    try:
+        typed = input(f"Type the robot's name ({robot}) to go on: ").strip()
+    except EOFError:
+        typed = ""
+    if typed != robot:
+        raise HardwareError(f"that was not {robot!r}; nothing was moved.")
+
+
+class Person:
+    """A person at the test rig who clamps joints and confirms it."""
+
+    def __init__(self) -> None:
+        """No joint is clamped yet."""
+        self._fixed: tuple[str, ...] = ()
+
+    def __call__(self, joints: tuple[str, ...]) -> None:
+        """Have these joints clamped and all others freed; returns when they are.
+
+        Raises:
+            HardwareError: Standard input has ended.
+        """
+        if set(joints) == set(self._fixed):
+            return
+        free = [name for name in self._fixed if name not in joints]
+        words = [f"fix {', '.join(joints)} mechanically where they are"] if joints else []
+        words += [f"free {', '.join(free)}"] if free else []
+        say(
+            f"By hand, please: {', and '.join(words)}. The drives hold the pose meanwhile; keep "
+            "clear of the legs afterwards. Press Enter when it is done."
+        )
+        # Polling lets a fault end the program meanwhile.
+        while not select.select([sys.stdin], [], [], _LOOK_S)[0]:
+            pass
+        if not sys.stdin.readline():
+            raise HardwareError(
+                "nobody is there to fix joints by hand; sweep joints that need no clamp "
+                "(--joints), or run this from a terminal."
+            )
+        self._fixed = joints

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pronk
 from pronk.cli import console
-from pronk.cli.sweep import AMPLITUDES, make
-from pronk.cli.sweep_virtual import record_virtual
+from pronk.cli.sweep import AMPLITUDES, make, record_virtual
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from pronk.cli import confirm, console
-from pronk.cli.choices import Base, Layout
+from pronk.cli import console
+from pronk.cli.options import Base, Layout
 from pronk.errors import HardwareError, PronkError
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def deploy(
     )
     scripts = None if script is None else _scripts(script, contract, walk_only)
     if not address.local and not yes:
-        confirm.before_it_moves(contract.robot, str(address))
+        console.confirm(contract.robot, str(address))
     operator, words = _operator(contract, scripts, gamepad, seconds)
     with closing(operator):
         console.say(words)

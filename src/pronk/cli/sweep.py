@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from pronk.cli import confirm, console, sweep_wire
-from pronk.cli.choices import Layout
-from pronk.cli.sweep_virtual import record_virtual as record_virtual
-from pronk.errors import HardwareError
+from pronk.cli import console
+from pronk.cli.options import LinkOptions
+from pronk.errors import HardwareError, PlanError
 
 if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
-    from pronk.excitation.signals import Signal
+    from pronk.links.address import Address
+    from pronk.links.link import Freshness
     from pronk.robots.robot import Robot
-
+    from pronk.runtime.ipc import Event
+    from pronk.runtime.run import Recorded
+    from pronk.virtual.sim_params import SimParams
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
 """Excitation signals."""
-
-
 AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
 
@@ -30,22 +32,13 @@ AMPLITUDES = (0.25, 0.125)
 def sweep(
     robot: tyro.conf.Positional[str],
     out: Path,
-    link: str = "sim",
-    interface: str | None = None,
-    layout: Layout | None = None,
-    port: int | None = None,
-    domain: int | None = None,
-    release: Annotated[bool, tyro.conf.arg(name="disable-onboard-controller")] = False,
-    real_time: bool = True,
-    sim_params: Path | None = None,
+    machine: LinkOptions = LinkOptions(),  # noqa: B008
     joints: tuple[str, ...] = (),
     signal: SignalName = "chirp",
     amplitude: tuple[float, ...] = (),
     repeats: int = 3,
-    seed: int = 0,
     plan_only: bool = False,
     overwrite: bool = False,
-    yes: bool = False,
     json_file: console.JsonFile = None,
 ) -> None:
     """Excite every joint: plan, check against the limits, excite, record.
@@ -53,113 +46,84 @@ def sweep(
     Args:
         robot: Robot, for instance mini_cheetah.
         out: Folder for the logs, one MCAP per joint.
-        link: sim, the virtual robot in this program; lcm or dds, by wire; or a URI such as
-            dds://eth0, lcm://eth0?layout=wtw.
-        interface: Network interface to a real robot; without it nothing leaves here.
-        layout: Messages on LCM; cheetah if left out.
-        port: UDP port of LCM.
-        domain: Domain of DDS.
-        release: Make the robot's own controller let go of the joints.
-        real_time: Ask for real-time scheduling (by wire).
-        sim_params: Parameters of the virtual robot, instead of the shipped one.
+        machine: The machine.
         joints: Joints to excite; repeat it. All if left out.
         signal: Excitation signal.
         amplitude: Peak of the command in rad; repeat it for several.
         repeats: Times each amplitude is repeated.
-        seed: Of the virtual robot's noise.
         plan_only: Show what it would do to the robot and leave.
-        overwrite: Replace logs that are already there.
-        yes: No confirmation before real hardware moves.
+        overwrite: Replace logs that exist.
         json_file: Also write the figures to this file.
     """
-    from pronk.links.address import SIM, Address
+    from pronk.links.address import SIM
     from pronk.robots import load_robot
 
-    machine = load_robot(robot)
-    virtual = link.partition(":")[0] == SIM
-    options = {"layout": layout, "port": port, "domain": domain}
-    address = Address.parse(link, interface, **options)
-    if virtual and (address.interface not in (None, "bench") or release):
+    known, address = load_robot(robot), machine.address()
+    virtual = address.kind == SIM
+    if virtual and (address.interface not in (None, "bench") or machine.release):
         raise HardwareError(
             f"{address}: the virtual robot of a sweep is on the bench, without a wire; leave out "
             "--interface and --disable-onboard-controller; give --seed and --sim-params."
         )
-    if virtual:
-        seed = int(address.options.get("seed", seed))
-        params = address.options.get("params")
-        sim_params = sim_params if params is None else Path(str(params))
-    elif sim_params is not None:
-        raise HardwareError("--sim-params is of --link sim; give it to `pronk simulate` instead.")
-    names = [part for entry in joints or () for part in entry.split(",") if part]
+    names = [part for entry in joints for part in entry.split(",") if part]
     with console.progress() as report:
         report("forecast", 0.0)
-        plan = make(machine, names or None, signal, tuple(amplitude or AMPLITUDES), repeats)
+        plan = make(known, names or None, signal, amplitude or AMPLITUDES, repeats)
         report("forecast", 1.0)
     show_plan(plan)
     plan.check()
     figures: dict[str, Any] = {
-        "robot": machine.name,
+        "robot": known.name,
         "link": str(address),
+        "virtual": virtual,
         "duration_s": plan.duration_s,
         "plan": plan.rows(),
         "logs": [],
-    } | ({"virtual": True} if virtual else {})
+    }
     if plan_only:
         console.write_json(json_file, figures)
         console.say("next: the same command without --plan-only")
         return
-    if virtual:
-        with console.progress() as report:
-            paths = record_virtual(
-                machine,
+    if not (address.local or machine.yes):
+        console.confirm(known.name, str(address))
+    with console.progress() as report:
+        bar = report.bar(f"excite over {address.kind}")
+        if virtual:
+            params = address.options.get("params")
+            figures["logs"] = record_virtual(
+                known,
                 plan,
                 out,
-                sim_params=sim_params,
-                seed=seed,
+                sim_params=None if params is None else Path(str(params)),
+                seed=int(address.options.get("seed", 0)),
                 overwrite=overwrite,
-                progress=report.bar("excite the virtual robot"),
+                progress=bar,
             )
-        figures["logs"] = paths
-        console.say(f"wrote {len(paths)} logs of the virtual robot to {out}")
-    else:
-        if not address.local and not yes:
-            confirm.before_it_moves(machine.name, str(address))
-        with console.progress() as report:
-            recorded = sweep_wire.record_wire(
-                machine,
+        else:
+            recorded = record_wire(
+                known,
                 plan,
                 out,
                 address,
-                release=release,
+                release=machine.release,
                 overwrite=overwrite,
-                real_time=real_time,
-                progress=report.bar(f"excite over {address.kind}"),
+                real_time=machine.real_time,
+                progress=bar,
             )
-        figures |= {
-            "virtual": recorded.virtual,
-            "logs": recorded.logs,
-            "servo": recorded.servo,
-        }
-        sweep_wire.tell(recorded, out)
+            figures |= vars(recorded)
+    where = "the virtual robot" if figures["virtual"] else "a robot that is not the virtual one"
+    console.say(f"wrote {len(figures['logs'])} logs of {where} to {out}")
+    if late := figures.get("servo"):
+        console.say(
+            f"servo: {late['n']} ticks, late by {late['p50_ms']:.2f} ms (median), "
+            f"{late['p99_ms']:.2f} ms (99 %), {late['max_ms']:.1f} ms at most; "
+            f"{late['missed']} missed"
+        )
     console.write_json(json_file, figures)
     console.following(
         f"pronk response {out}",
         f"pronk match {out} --robot {robot} --out {out}/gains.yaml",
     )
-
-
-def make_signal(name: SignalName) -> Signal:
-    """The signal of that name with its usual settings."""
-    from pronk.excitation import signals
-
-    kinds = {
-        "chirp": signals.Chirp,
-        "log-chirp": signals.LogChirp,
-        "multisine": signals.Multisine,
-        "sine-steps": signals.SineSteps,
-    }
-    made: Signal = kinds[name]()
-    return made
 
 
 def make(
@@ -169,41 +133,174 @@ def make(
     amplitudes: Sequence[float],
     repeats: int | Sequence[int],
 ) -> SweepPlan:
-    """The plan of a sweep, one joint after another."""
+    """Plan a sweep with the usual settings of a signal, one joint after another."""
+    from pronk.excitation import signals
     from pronk.excitation.plan import make_plan
 
-    return make_plan(robot, joints, make_signal(signal), amplitudes=amplitudes, repeats=repeats)
+    kinds: dict[str, type[signals.Signal]] = {
+        "chirp": signals.Chirp,
+        "log-chirp": signals.LogChirp,
+        "multisine": signals.Multisine,
+        "sine-steps": signals.SineSteps,
+    }
+    return make_plan(robot, joints, kinds[signal](), amplitudes=amplitudes, repeats=repeats)
 
 
 def show_plan(plan: SweepPlan) -> None:
     """Print what the sweep will do to each joint, against its limits."""
-    made = console.table(
-        f"Plan: {len(plan.asks)} questions, {plan.duration_s:.0f} s of the robot's time; "
-        "worst case over what is uncertain",
-        "joint",
-        "amplitude [rad]",
-        "position [rad]",
-        "of",
-        "speed [rad/s]",
-        "of",
-        "torque [N m]",
-        "of",
-        "power [W]",
-        "bus [A]",
-    )
-    for row in plan.rows():
-        low, high = float(row["lowest_rad"]), float(row["highest_rad"])
-        console.row(
-            made,
-            str(row["joint"]),
-            f"{row['amplitude_rad']:g}",
-            f"{low:.2f} to {high:.2f}",
-            f"{float(row['range_low_rad']):.2f} to {float(row['range_high_rad']):.2f}",
-            f"{float(row['speed_rad_s']):.1f}",
-            f"{float(row['no_load_speed_rad_s']):.1f}",
-            f"{float(row['torque_nm']):.1f}",
-            f"{float(row['effort_limit_nm']):.1f}",
-            f"{float(row['electrical_power_w']):.0f}",
-            f"{float(row['bus_current_a']):.1f}",
+    columns = {
+        "joint": "{joint}",
+        "amplitude [rad]": "{amplitude_rad:g}",
+        "position [rad]": "{lowest_rad:.2f} to {highest_rad:.2f}",
+        "of range": "{range_low_rad:.2f} to {range_high_rad:.2f}",
+        "speed [rad/s]": "{speed_rad_s:.1f}",
+        "of no-load": "{no_load_speed_rad_s:.1f}",
+        "torque [N m]": "{torque_nm:.1f}",
+        "of limit": "{effort_limit_nm:.1f}",
+        "power [W]": "{electrical_power_w:.0f}",
+        "bus [A]": "{bus_current_a:.1f}",
+    }
+    rows = [[cell.format(**row) for cell in columns.values()] for row in plan.rows()]
+    title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
+    console.show(console.table(title, *columns, rows=rows))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Limb:
+    """The part of a sweep that moves one limb of the virtual robot."""
+
+    plan: SweepPlan
+    sim_params: SimParams
+    limb: str
+    joints: tuple[str, ...]
+    out: Path
+    seed: int
+    overwrite: bool
+
+
+def record_virtual(
+    robot: Robot,
+    plan: SweepPlan,
+    out: Path,
+    *,
+    sim_params: Path | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> list[Path]:
+    """Excite the virtual robot faster than real time, limbs side by side in processes.
+
+    On a rigid bench limbs do not affect each other, so each process simulates one.
+
+    Args:
+        robot: The robot.
+        plan: What to excite; checked by the caller.
+        out: Folder for the logs.
+        sim_params: sim_params file; the shipped one if None.
+        seed: Of all noise; each limb derives its own.
+        overwrite: Replace logs that exist.
+        progress: Called with the share done, 0 to 1.
+
+    Returns:
+        The logs, in the order of the robot's joints.
+    """
+    from pronk.evaluation.processes import in_processes
+    from pronk.virtual.plant import leg_of, legs_of
+    from pronk.virtual.sim_params import load_sim_params
+
+    params = load_sim_params(sim_params, robot)
+    params.check_joints(robot.joint_names, str(sim_params or "sim_params"))
+    if len(plan.sets) != len(plan.joints):
+        raise PlanError("several joints excited at once: the virtual robot excites one at a time.")
+    jobs = [
+        _Limb(
+            plan=plan,
+            sim_params=params,
+            limb=limb,
+            joints=joints,
+            out=out,
+            seed=seed * 1000 + index,
+            overwrite=overwrite,
         )
-    console.show(made)
+        for index, limb in enumerate(legs_of(robot))
+        if (joints := tuple(name for name in plan.joints if leg_of(robot, name) == limb))
+    ]
+    logs = in_processes(_record_limb, jobs, processes=os.cpu_count() or 1, progress=progress)
+    order = {name: i for i, name in enumerate(robot.joint_names)}
+    return sorted((path for paths in logs for path in paths), key=lambda path: order[path.stem])
+
+
+def _record_limb(job: _Limb) -> list[Path]:
+    from pronk.runtime.sweep import record
+    from pronk.virtual.robot import VirtualRobot
+
+    robot = job.plan.robot
+    return record(
+        VirtualRobot(robot, job.sim_params, seed=job.seed, legs=(job.limb,)),
+        robot,
+        job.plan,
+        job.out,
+        joints=job.joints,
+        overwrite=job.overwrite,
+        metadata={"link": "virtual robot, in this program"},
+    )
+
+
+def record_wire(
+    robot: Robot,
+    plan: SweepPlan,
+    out: Path,
+    address: Address,
+    *,
+    release: bool = False,
+    overwrite: bool = False,
+    real_time: bool = False,
+    limits: Mapping[str, float] | None = None,
+    fresh: Freshness | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Recorded:
+    """Sweep a robot in real time, all joints over one connection of the servo's process.
+
+    Args:
+        robot: The robot.
+        plan: What to excite; checked by the caller.
+        out: Folder for the logs.
+        address: Where it is.
+        release: Make its own controller let go of the joints first.
+        overwrite: Replace logs that exist.
+        real_time: Request real-time scheduling, and print what was granted.
+        limits: Other values for scalar limits of the safety filter.
+        fresh: How fresh states must be at first; the usual if None.
+        progress: Called with the share done, 0 to 1.
+
+    Raises:
+        PronkError: The robot may not be moved or the filter stopped it, or a process was killed;
+            what was recorded until then stays.
+    """
+    from pronk.runtime.plan import Link, Plan
+    from pronk.runtime.run import run_sweep
+    from pronk.runtime.sweep import SweepTask
+
+    metadata = {"link": str(address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
+    task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
+    link = Link(robot=robot.source or robot.name, address=address, release=release, fresh=fresh)
+    whole: list[str] = []
+
+    def notify(event: Event) -> None:
+        if event.kind == "log":
+            whole.append(event.text)
+        elif event.kind == "system" and real_time:
+            console.say(event.text)
+
+    job = Plan(link=link, sweep=task, real_time=real_time, limits=limits or {})
+    try:
+        return run_sweep(job, clamp_operator=console.Person(), notify=notify, progress=progress)
+    except BaseException:
+        cut = [path.name for path in task.paths if path.exists() and path.name not in whole]
+        if whole or cut:
+            console.warn(
+                f"ended early; in {out} are kept {', '.join(whole) or 'no whole log'} whole"
+                + (f", and {cut[0]} up to the end" if cut else "")
+                + "; sweep the others with --joints"
+            )
+        raise

@@ -383,11 +383,6 @@ class Recorded:
     servo: dict[str, float | int]
     """Lateness of the servo's ticks, and how many were `missed`."""
 
-    @property
-    def words(self) -> str:
-        """Which robot the logs are of."""
-        return "the virtual robot" if self.virtual else "a robot that is not the virtual one"
-
 
 def run_sweep(
     plan: Plan,

@@ -1,0 +1,141 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from pronk.errors import HardwareError, PronkError
+
+if TYPE_CHECKING:
+    from pronk.links.address import Address
+    from pronk.logs.joint_log import JointLog
+    from pronk.robots.robot import Robot
+
+Layout = Literal["cheetah", "wtw"]
+"""Messages on LCM: Cheetah-Software's, or walk-these-ways'."""
+Base = Literal["bench", "ground"]
+"""What the virtual robot's trunk is fixed to, or stands on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkOptions:
+    """The machine that a command moves."""
+
+    link: str = "sim"
+    """sim, the virtual robot in this program; lcm or dds, by wire; or a URI such as dds://eth0,
+    lcm://eth0?layout=wtw, sim://ground."""
+    interface: str | None = None
+    """Network interface to a real robot; without it nothing leaves this computer."""
+    layout: Layout | None = None
+    """Messages on LCM; cheetah if left out."""
+    port: int | None = None
+    """UDP port of LCM."""
+    domain: int | None = None
+    """Domain of DDS."""
+    release: Annotated[bool, tyro.conf.arg(name="disable-onboard-controller")] = False
+    """Make the robot's own controller let go of the joints."""
+    real_time: bool = True
+    """Request real-time scheduling (by wire)."""
+    sim_params: Path | None = None
+    """Parameters of the virtual robot, instead of the shipped ones."""
+    seed: int = 0
+    """Of the virtual robot's noise."""
+    yes: bool = False
+    """No confirmation before real hardware moves."""
+
+    def address(self, base: Base | None = None) -> Address:
+        """The machine's address, with what belongs to its link.
+
+        Args:
+            base: Of the virtual robot; None for the link's own.
+
+        Raises:
+            HardwareError: An option is not of the link.
+        """
+        from pronk.links.address import SIM, Address
+
+        options: dict[str, Any] = {"layout": self.layout, "port": self.port, "domain": self.domain}
+        if self.link.partition(":")[0] == SIM:
+            params = None if self.sim_params is None else str(self.sim_params)
+            options |= {"seed": self.seed or None, "params": params}
+            return Address.parse(self.link, base or self.interface, **options)
+        if self.sim_params is not None:
+            raise HardwareError(
+                "--sim-params is of --link sim; give it to `pronk simulate` instead."
+            )
+        return Address.parse(self.link, self.interface, **options)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How logs are read."""
+
+    unit: str | None = None
+    """Unit of all angles, rad or deg; required for CSV."""
+    time_unit: str | None = None
+    """Unit of the timestamps: s, ms, us or ns."""
+    columns: tuple[str, ...] = ()
+    """CSV: OURS=THEIRS, as in position.FR_knee=q3; repeat it."""
+    joint_names: tuple[str, ...] = ()
+    """THEIRS=OURS for joints of other names; repeat it."""
+    scale: tuple[str, ...] = ()
+    """JOINT=RADIANS per unit, for a joint that is not in radians; repeat it."""
+    rate_hz: float | None = None
+    """Rate that the log is expected to have; another one is an error."""
+    log_format: Annotated[str | None, tyro.conf.arg(name="format")] = None
+    """mcap, csv, sage, pace, npz or a plugin's; from the name if left out."""
+    measured_topic: str | None = None
+    """rosbag2: topic of the measured JointState; /joint_states if left out."""
+    command_topic: str | None = None
+    """rosbag2: topic of the commands."""
+    command_field: str | None = None
+    """rosbag2: field of the positions in a command message, as in points.0.positions."""
+    reader_options: Annotated[tuple[str, ...], tyro.conf.arg(name="reader-option")] = ()
+    """NAME=VALUE for a reader of another package; repeat it."""
+
+    def read(self, paths: Sequence[Path], robot: Robot | None) -> list[JointLog]:
+        """Read every log that some paths stand for, on all cores.
+
+        Raises:
+            LogError: As `pronk.logs.readers.read_logs`.
+            RobotError: The same.
+        """
+        from pronk.logs.readers import read_logs
+
+        scale = {}
+        for name, value in _pairs(self.scale, "--scale").items():
+            try:
+                scale[name] = float(value)
+            except ValueError:
+                raise PronkError(f"--scale: {value!r} is not a number.") from None
+        options: dict[str, Any] = {
+            "unit": self.unit,
+            "time_unit": self.time_unit,
+            "columns": _pairs(self.columns, "--columns") or None,
+            "joint_names": _pairs(self.joint_names, "--joint-names") or None,
+            "scale": scale or None,
+            "rate_hz": self.rate_hz,
+            "format": self.log_format,
+            "measured_topic": self.measured_topic,
+            "command_topic": self.command_topic,
+            "command_field": self.command_field,
+            **_pairs(self.reader_options, "--reader-option"),
+        }
+        given = {name: value for name, value in options.items() if value is not None}
+        return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **given)
+
+
+def _pairs(entries: Sequence[str], option: str) -> dict[str, str]:
+    found = {}
+    for entry in entries:
+        name, _, value = entry.partition("=")
+        if not (name and value):
+            raise PronkError(f"{option} {entry!r}: expected NAME=VALUE.")
+        found[name] = value
+    return found
