@@ -91,11 +91,12 @@ def run(
         quiet = synthetic_log(robot, name, [replace(chirp, repeats=1)], *known)
         clean = measured_joints(quiet, name, robot, settings)[0].measured.response
         operator = operators(log, name, settings.estimator)[0][0]
+        to_response = operator.matrix(operator.time)
         gains, low, high = (np.empty((trials, 2)) for _ in range(3))
         with MujocoSimulator(robot, threads=threads) as simulator:
             for begin in range(0, trials, BATCH):
                 count = min(BATCH, trials - begin)
-                errors = operator.apply(noise(rng, (count, repeats, len(operator.time))))
+                errors = noise(rng, (count, repeats, len(operator.time))) @ to_response
                 goals = []
                 for response in clean + errors:
                     each = replace(noisy.measured, response=response.mean(axis=0), repeats=response)

@@ -18,15 +18,7 @@ def second_order(
     `stiffness exp(-s delay) / (inertia s^2 + damping s + stiffness)` at s = j omega: paper M2 with
     zero target velocity (reading A9), where `damping` is the drive's and the joint's own together.
 
-    Args:
-        omega: Angular frequency [rad/s], shape (f,).
-        stiffness: [N m/rad]
-        damping: [N m s/rad]
-        inertia: Link and armature about the joint's axis [kg m^2].
-        delay_s: Delay of the command [s].
-
-    Returns:
-        Complex response, shape (f,).
+    Units: rad/s, N m/rad, N m s/rad, kg m^2 (link and armature), s.
     """
     s = 1j * np.asarray(omega, dtype=np.float64)
     joint = stiffness / (inertia * s**2 + damping * s + stiffness)
@@ -36,20 +28,10 @@ def second_order(
 def simulate_second_order(
     command: Array, rate_hz: float, *, stiffness: float, damping: float, inertia: float
 ) -> Array:
-    """Exact answer of the same joint, at rest at first, to a held command.
+    """Exact response [rad] of the same joint, at rest at first, to a held command [rad].
 
     The command is constant within each step of `1 / rate_hz`, for which the zero-order-hold
     equivalent is exact.
-
-    Args:
-        command: Command in force from each sample to the next [rad], shape (n,).
-        rate_hz: Rate of the samples.
-        stiffness: [N m/rad]
-        damping: [N m s/rad]
-        inertia: [kg m^2]
-
-    Returns:
-        Position at the samples [rad], shape (n,).
     """
     joint = (np.array([stiffness]), np.array([inertia, damping, stiffness]))
     numerator, denominator, _ = cont2discrete(joint, 1.0 / rate_hz, method="zoh")

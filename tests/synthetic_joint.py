@@ -89,13 +89,13 @@ def friction_joint(frictionloss: float) -> Callable[[Array, float], Array]:
 
 
 def linear_joint(**joint: float) -> Callable[[Array, float], Array]:
-    """The exact answer of a second-order joint."""
+    """The exact response of a second-order joint."""
     return lambda command, rate: simulate_second_order(command, rate, **joint)
 
 
 def make_log(
-    questions: list[tuple[Array, Array, Array | None]],
-    answer: Callable[[Array, float], Array],
+    signals: list[tuple[Array, Array, Array | None]],
+    joint: Callable[[Array, float], Array],
     *,
     kind: str,
     noise: float = 0.0,
@@ -104,7 +104,7 @@ def make_log(
     jitter: float = 0.0,
     seed: int = 0,
 ) -> JointLog:
-    """One log from several questions (time, command, frequency or None), a repeat each.
+    """One log from several signals (time, command, frequency or None), a repeat each.
 
     `jitter` moves each timestamp by up to that share of an interval. The machine of such a log
     reads its state and puts the command of that row into force at the moved instant.
@@ -113,19 +113,19 @@ def make_log(
     start = 3.0
     columns: list[tuple[Array, Array, Array, Array]] = []
     segments = []
-    for repeat, (time, command, frequency) in enumerate(questions):
+    for repeat, (time, command, frequency) in enumerate(signals):
         rate = round(1.0 / float(time[1] - time[0]))
         moved, position = time, np.empty(0)
         if jitter:
-            # The truth between samples, on a grid forty times as fine.
+            # The motion between samples, on a grid forty times as fine.
             fine = 40
             index = np.round((np.arange(len(time)) + jitter * rng.random(len(time))) * fine)
             index = (index - index[0]).astype(int)
             moved = index / (rate * fine)
             dense = np.repeat(command, np.diff(np.append(index, index[-1] + 1)))
-            position = answer(dense, rate * fine)[index]
+            position = joint(dense, rate * fine)[index]
         else:
-            position = answer(command, rate)
+            position = joint(command, rate)
         position = position + noise * rng.standard_normal(len(time))
         hz = np.full(len(time), np.nan) if frequency is None else frequency
         columns.append((start + moved, command, position, hz))

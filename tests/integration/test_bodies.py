@@ -22,7 +22,7 @@ from pronk.evaluation.variation import NOMINAL, VARIATION, Parameter, add_variat
 from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
-from pronk.response.estimator import Estimator
+from pronk.response.response import Estimator
 from pronk.runtime.script import Script
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params

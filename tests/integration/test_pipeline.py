@@ -18,7 +18,7 @@ from pronk.match import result as result_file
 from pronk.match.pipeline import match_logs
 from pronk.match.result import MatchResult
 from pronk.match.settings import MatchSettings
-from pronk.response.estimator import Estimator
+from pronk.response.response import Estimator
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

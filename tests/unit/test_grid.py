@@ -24,7 +24,7 @@ from pronk.match.grid import (
 from pronk.match.measured_joint import MeasuredJoint, SimRequest, measured_joints, merged, responses
 from pronk.match.quick import quick_search
 from pronk.match.settings import MatchSettings
-from pronk.response.estimator import Estimator
+from pronk.response.response import Estimator
 from pronk.robots import load_robot
 from pronk.simulators.mujoco import MujocoSimulator
 

@@ -19,7 +19,7 @@ from pronk.match.result import amplitude_spread
 from pronk.match.settings import MatchSettings
 from pronk.match.uncertainty import interval, measurement_error_db
 from pronk.response.estimate import operators
-from pronk.response.estimator import Estimator
+from pronk.response.response import Estimator
 from pronk.robots import load_robot
 from pronk.simulators.mujoco import MujocoSimulator
 
@@ -77,7 +77,8 @@ def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
     log = synthetic_log(ROBOT, JOINT, [ask], *KNOWN, noise=noise)
     measured = measured_joints(log, JOINT, ROBOT, SHORT)[0]
     operator = operators(log, JOINT, SHORT.estimator)[0][0]
-    shaken = operator.apply(coloured(rng, (trials, repeats, len(operator.time)), deviation))
+    noises = coloured(rng, (trials, repeats, len(operator.time)), deviation)
+    shaken = noises @ operator.matrix(operator.time)
     responses = clean.measured.response + shaken
     goals = [
         replace(

@@ -17,7 +17,7 @@ from pronk.excitation.signals import Chirp
 from pronk.match.grid import search
 from pronk.match.measured_joint import measured_joints
 from pronk.match.settings import MatchSettings
-from pronk.response.estimator import Estimator
+from pronk.response.response import Estimator
 from pronk.robots import load_robot
 from pronk.simulators.mujoco import DEVICES, JointTestRig, MujocoSimulator, rig_on
 

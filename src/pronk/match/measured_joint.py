@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
-from pronk.response.estimate import estimate, log_rate, questions
+from pronk.response.averaged import H1Operator
+from pronk.response.estimate import estimate, excitations, log_rate
 from pronk.response.estimate import operator as build_operator
-from pronk.response.operator import H1Operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
 from pronk.simulators.command_trace import CommandTrace, command_trace
@@ -181,8 +181,8 @@ def measured_joints(
             )
         log = replace(log, segments=chosen)
     measured = estimate(log, joint, settings.estimator)
-    parts = questions(log, joint)
-    rate_hz = log_rate([part for repeats in parts for part in repeats])
+    parts = excitations(log, joint)
+    rate_hz = log_rate(parts)
     found: list[MeasuredJoint] = []
     warnings: list[str] = []
     for repeats, response in zip(parts, measured, strict=True):

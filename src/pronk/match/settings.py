@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pronk.errors import PronkError
-from pronk.response.estimator import Estimator
+from pronk.response.response import Estimator
 from pronk.simulators.mujoco import DEVICES
 
 

@@ -4,20 +4,16 @@ import sys
 from types import ModuleType
 
 from pronk.logs.joint_log import JointLog
-from pronk.response.delay import DelayFit, fit_delay
-from pronk.response.distortion import Distortion, distortion, third_harmonic
+from pronk.response.averaged import H1Operator
+from pronk.response.diagnostics import DelayFit, fit_delay, third_harmonic
 from pronk.response.estimate import estimate, operators
-from pronk.response.estimator import Estimator
-from pronk.response.operator import H1Operator
-from pronk.response.response import FrequencyResponse, load, save
+from pronk.response.response import Estimator, FrequencyResponse, load, save
 
 __all__ = [
     "DelayFit",
-    "Distortion",
     "Estimator",
     "FrequencyResponse",
     "H1Operator",
-    "distortion",
     "estimate",
     "fit_delay",
     "load",

@@ -1,4 +1,4 @@
-"""From a log to responses: which questions belong together, and which estimator reads them."""
+"""From a log to responses: group the repeats of each excitation and choose the estimator."""
 
 from __future__ import annotations
 
@@ -6,31 +6,24 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.errors import LogError, PronkError
+from pronk.logs.checks import check_motion
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.response.delay import fit_delay
-from pronk.response.distortion import third_harmonic
-from pronk.response.estimator import Estimator
-from pronk.response.grid import analysis_rate, grid_over, held_mean, interpolate
-from pronk.response.operator import H1Operator
-from pronk.response.periodic import estimate_multisine, multisine_operator
-from pronk.response.response import FrequencyResponse
-from pronk.response.spectra import Sums, layout, rests, segment_spectra, sums, total
-from pronk.response.steps import estimate_steps
+from pronk.response.averaged import H1Operator, estimate_averaged
+from pronk.response.diagnostics import fit_delay, third_harmonic
+from pronk.response.grid import analysis_rate
+from pronk.response.periodic import estimate_multisine, estimate_steps, multisine_operator
+from pronk.response.response import Estimator, FrequencyResponse
 
-Array = NDArray[np.float64]
-
-_UNMOVED = 0.01
-"""Share of the command's travel below which a joint did not move."""
+_ESTIMATORS = {"multisine": estimate_multisine, "sine_steps": estimate_steps}
 
 
-def questions(log: JointLog, joint: str) -> list[list[JointLog]]:
-    """Split a log into the excitations of one joint, gathered into repeats.
+def excitations(log: JointLog, joint: str) -> list[list[JointLog]]:
+    """Split a log into the excitations of one joint, grouped into repeats.
 
-    Questions of the same kind, amplitude, period, band and clamping are repeats of one another.
-    A log without segments is one question of unknown kind; an amplitude that is not known is read
+    Excitations of the same kind, amplitude, period, band and clamping are repeats of one another.
+    A log without segments is one excitation of unknown kind; an amplitude that is not known is read
     off the command.
 
     Returns:
@@ -44,93 +37,32 @@ def questions(log: JointLog, joint: str) -> list[list[JointLog]]:
     segments = [segment for segment in log.segments if joint in segment.joints]
     if not log.segments:
         start, stop = float(log.time[0]), float(log.time[-1])
-        segments = [
-            Segment(
-                kind="unknown", joints=log.joints, start=start, stop=stop, amplitude=float("nan")
-            )
-        ]
+        nan = float("nan")
+        whole = Segment(kind="unknown", joints=log.joints, start=start, stop=stop, amplitude=nan)
+        segments = [whole]
     if not segments:
         excited = sorted({name for segment in log.segments for name in segment.joints})
         raise LogError(f"{where}: {joint} was not excited; {', '.join(excited)} were.")
     groups: dict[tuple[object, ...], list[JointLog]] = {}
     for segment in segments:
         part = log.cut(segment)
-        command = part.command[:, column]
-        travel = float(np.ptp(command))
+        travel = float(np.ptp(part.command[:, column]))
         if travel == 0.0:
             raise LogError(
                 f"{where}: the command of {joint} stands still between {segment.start:.3f} and "
-                f"{segment.stop:.3f} s; there is nothing to answer."
+                f"{segment.stop:.3f} s; the joint was not excited."
             )
         if np.isnan(segment.amplitude):
             part = replace(part, segments=(replace(segment, amplitude=travel / 2.0),))
-        known = part.segments[0]
-        key = (
-            round(known.amplitude, 6),
-            known.kind,
-            known.period_s,
-            known.band_hz,
-            known.clamped,
-        )
+        s = part.segments[0]
+        key = (round(s.amplitude, 6), s.kind, s.period_s, s.band_hz, s.clamped)
         groups.setdefault(key, []).append(part)
     return sorted(groups.values(), key=lambda parts: -parts[0].segments[0].amplitude)
 
 
-def log_rate(parts: Sequence[JointLog]) -> float:
-    """One rate of the analysis grid for all questions, so that they share their frequencies [Hz].
-
-    The mean rate inside the questions, to four significant digits; what was logged, or not, between
-    them does not count.
-    """
-    steps = sum(len(part.time) - 1 for part in parts)
-    span = sum(float(part.time[-1] - part.time[0]) for part in parts)
-    return float(f"{steps / span:.4g}")
-
-
-def _check_moved(part: JointLog, joint: str) -> None:
-    column = part.column(joint)
-    moved = float(np.ptp(part.position[:, column]))
-    commanded = float(np.ptp(part.command[:, column]))
-    if moved < _UNMOVED * commanded:
-        raise LogError(
-            f"{part.source or 'log'}: {joint} moved {moved:.3g} while its command travelled "
-            f"{commanded:.3g}; check that its drive was enabled and the joint free."
-        )
-
-
-def _averaged(
-    parts: Sequence[JointLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
-) -> FrequencyResponse:
-    """H1 over the segments of all repeats."""
-    each: list[Sums] = []
-    omega = np.empty(0)
-    padded = []
-    for part in parts:
-        column = part.column(joint)
-        grid = grid_over(part.time, rate_hz)
-        command = held_mean(part.time, part.command[:, column], grid)
-        position = interpolate(part.time, part.position[:, column], grid)
-        padded.append(rests(command, rate_hz))
-        where = layout(grid, estimator, padded=padded[-1])
-        spectra = [segment_spectra(x, where, estimator) for x in (command, position)]
-        each.append(sums(spectra[0], spectra[1], where))
-        omega = where.omega
-    whole = total(each)
-    ends = "reaching over the ends at rest" if all(padded) else "inside the question"
-    return FrequencyResponse(
-        joint=joint,
-        amplitude=amplitude,
-        omega=omega,
-        response=whole.response(omega, rate_hz),
-        coherence=whole.coherence(),
-        averages=whole.averages(),
-        repeats=np.array([one.response(omega, rate_hz) for one in each]),
-        estimator="H1",
-        window=f"{estimator.words()}, {ends}, mean of each segment removed",
-        segment_s=estimator.segment_s,
-        virtual=parts[0].virtual,
-        source=parts[0].source,
-    )
+def log_rate(groups: Sequence[Sequence[JointLog]]) -> float:
+    """One rate of the analysis grid for all excitations, so that they share frequencies [Hz]."""
+    return analysis_rate([part.time for parts in groups for part in parts])
 
 
 def estimate(
@@ -138,14 +70,9 @@ def estimate(
 ) -> list[FrequencyResponse]:
     """Responses of one joint, from its held command to its position.
 
-    Chirps and questions of unknown kind are averaged over segments (Welch); multisines and sine
+    Chirps and excitations of unknown kind are averaged over segments (Welch); multisines and sine
     steps are read line by line. Repeats are combined by averaging their spectra, and kept one by
-    one in `repeats`. A single long question is one repeat: its segments are its averages.
-
-    Args:
-        log: The log.
-        joint: The joint.
-        estimator: Settings; the defaults if not given.
+    one in `repeats`. A single long excitation is one repeat: its segments are its averages.
 
     Returns:
         One response per amplitude (and per kind, if there are several), largest amplitude first.
@@ -154,17 +81,14 @@ def estimate(
         LogError: The joint is unknown, was not excited, or did not move; or a segment is too short.
     """
     settings = estimator or Estimator()
-    groups = questions(log, joint)
-    rate_hz = log_rate([part for parts in groups for part in parts])
+    groups = excitations(log, joint)
+    rate_hz = log_rate(groups)
     found = []
     for parts in groups:
         for part in parts:
-            _check_moved(part, joint)
-        segment = parts[0].segments[0]
-        read = {"multisine": estimate_multisine, "sine_steps": estimate_steps}.get(
-            segment.kind, _averaged
-        )
-        response = read(parts, joint, segment.amplitude, settings, rate_hz)
+            check_motion(part, joint)
+        read = _ESTIMATORS.get(parts[0].segments[0].kind, estimate_averaged)
+        response = read(parts, joint, settings, rate_hz)
         third = np.array([third_harmonic(part, joint) for part in parts])
         known = third[np.isfinite(third)]
         found.append(
@@ -178,7 +102,7 @@ def estimate(
 
 
 def operator(part: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
-    """Return the estimate of one question as a matrix; equal repeats share it.
+    """Return the estimate of one excitation as a matrix; equal repeats share it.
 
     Args:
         part: A log of one segment.
@@ -204,18 +128,6 @@ def operators(
     log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[list[H1Operator]]:
     """Return the `operator` of every repeat of every response of `estimate`."""
-    groups = questions(log, joint)
-    rate_hz = log_rate([part for parts in groups for part in parts])
-    settings = estimator or Estimator()
+    groups = excitations(log, joint)
+    rate_hz, settings = log_rate(groups), estimator or Estimator()
     return [[operator(part, joint, settings, rate_hz) for part in parts] for parts in groups]
-
-
-__all__ = [
-    "Estimator",
-    "analysis_rate",
-    "estimate",
-    "log_rate",
-    "operator",
-    "operators",
-    "questions",
-]

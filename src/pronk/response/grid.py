@@ -1,9 +1,8 @@
 """The uniform analysis grid that measured timestamps are brought to.
 
-Measured timestamps are believed. The position is smooth, so it is read between them with a cubic
-spline. The command is a staircase, so it is read as its mean over each grid interval: on a grid
-that falls on the measured timestamps that is the zero-order hold exactly, and off it (jitter,
-drift) no step is moved in time, which sampling a staircase at other instants would do.
+The position is smooth, so it is read between the timestamps with a cubic spline. The command is a
+staircase, so it is read as its mean over each grid interval: on a grid that falls on the timestamps
+that is the zero-order hold exactly, and off it (jitter, drift) no step is moved in time.
 
 Both have the same transform. With u(t) the staircase, its mean over [t, t + D] has the spectrum
 `U(w) exp(+j w D/2) sinc(f D)`, sinc(x) = sin(pi x) / (pi x). Position over command on the grid is
@@ -13,6 +12,7 @@ the Nyquist frequency of the grid.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,48 +45,50 @@ class Grid:
         """The instants [s], shape (count,)."""
         return np.asarray(self.start + np.arange(self.count) / self.rate_hz)
 
+    @property
+    def edges(self) -> Array:
+        """The instants and the end of the last interval [s], shape (count + 1,)."""
+        return np.asarray(self.start + np.arange(self.count + 1) / self.rate_hz)
 
-def analysis_rate(time: Array) -> float:
-    """Mean rate of measured timestamps, to four significant digits [Hz].
 
-    Rounding gives repeats of one question the same grid although their jitter differs; what it
+def analysis_rate(times: Sequence[Array]) -> float:
+    """Mean rate inside several stretches of timestamps, to four significant digits [Hz].
+
+    Rounding gives repeats of one excitation the same grid although their jitter differs; what it
     shifts (5e-5 of the time at most) the interpolation undoes.
     """
-    return float(f"{(len(time) - 1) / (time[-1] - time[0]):.4g}")
+    span = sum(float(time[-1] - time[0]) for time in times)
+    return float(f"{sum(len(time) - 1 for time in times) / span:.4g}")
 
 
 def grid_over(time: Array, rate_hz: float | None = None) -> Grid:
-    """The grid from the first to the last measured timestamp.
-
-    Args:
-        time: Measured timestamps [s], shape (n,).
-        rate_hz: Rate of the grid; `analysis_rate(time)` if not given.
-    """
-    rate = analysis_rate(time) if rate_hz is None else rate_hz
+    """The grid from the first to the last timestamp; at their own rate if none is given [Hz]."""
+    rate = analysis_rate([time]) if rate_hz is None else rate_hz
     # A hundredth of an interval forgives the rounding of the rate and of the timestamps.
     count = int(np.floor((time[-1] - time[0]) * rate + 0.01)) + 1
     return Grid(start=float(time[0]), rate_hz=rate, count=count)
 
 
-def held_mean(time: Array, command: Array, grid: Grid) -> Array:
-    """Mean of a held command over each grid interval.
+def held_mean(time: Array, command: Array, edges: Array) -> Array:
+    """Mean over each interval of a command that is held from each timestamp to the next.
+
+    Before the first timestamp the first command holds, after the last one the last.
 
     Args:
-        time: Measured timestamps [s], shape (n,).
-        command: Command in force from each timestamp to the next [rad], shape (n,).
-        grid: Where to read it.
+        time: Timestamps [s], shape (n,).
+        command: Command in force from each of them [rad], shape (n,).
+        edges: Ends of the intervals [s], shape (m + 1,).
 
     Returns:
-        Mean over [t, t + 1/rate] at each grid instant t [rad], shape (grid.count,).
+        Means [rad], shape (m,).
     """
-    step = 1.0 / grid.rate_hz
-    end = grid.times[-1] + 2.0 * step
-    knots = np.append(time, max(end, time[-1] + step))
+    before, after = min(edges[0], time[0]) - 1.0, max(edges[-1], time[-1]) + 1.0
+    knots = np.concatenate(([before], time, [after]))
     # About its own mean, so that the integral stays small and its differences exact.
     mean = float(command.mean())
-    area = np.concatenate(([0.0], np.cumsum((command - mean) * np.diff(knots))))
-    edges = grid.start + np.arange(grid.count + 1) * step
-    return np.asarray(np.diff(np.interp(edges, knots, area)) / step + mean)
+    about = np.concatenate((command[:1], command)) - mean
+    area = np.concatenate(([0.0], np.cumsum(about * np.diff(knots))))
+    return np.asarray(np.diff(np.interp(edges, knots, area)) / np.diff(edges) + mean)
 
 
 def interpolate(time: Array, values: Array, grid: Grid) -> Array:
@@ -116,7 +118,7 @@ def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
     last = grid.start + (grid.count - 1) / grid.rate_hz
     if time[0] > grid.start + _REACH_S or time[-1] < last - _REACH_S:
         raise LogError(
-            f"samples from {time[0]:.3f} to {time[-1]:.3f} s do not span the measured question, "
+            f"samples from {time[0]:.3f} to {time[-1]:.3f} s do not span the excitation, "
             f"{grid.start:.3f} to {last:.3f} s; simulate or record all of it."
         )
     degree = min(3, len(time) - 1)

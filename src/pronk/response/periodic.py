@@ -1,26 +1,29 @@
-"""Multisines, read line by line.
+"""Periodic excitations, read line by line: multisines and sine steps.
 
 Whole periods need no window and leak nothing, so the transform of a period is exact at the lines
-that were excited. The scatter from period to period is noise; what stands at lines that were not
-excited, above that noise, is nonlinear distortion (`distortion.py`). After Pintelon and Schoukens,
-*System Identification: A Frequency Domain Approach*, 2nd ed.: best linear approximation, even and
-odd detection lines.
+that were excited; the scatter from period to period is noise. After Pintelon and Schoukens,
+*System Identification: A Frequency Domain Approach*, 2nd ed.
+
+Sine steps are one frequency after another, each held for whole periods: every step is read at its
+own frequency, and at three times it, after the joint has settled.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import get_window
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
-from pronk.response.estimator import Estimator
+from pronk.response.averaged import H1Operator
 from pronk.response.grid import Grid, analysis_rate, held_mean, hold, interpolate
-from pronk.response.operator import H1Operator
-from pronk.response.response import FrequencyResponse
+from pronk.response.response import Estimator, FrequencyResponse
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -31,32 +34,96 @@ a tenth of a sample leaves at silent lines, far below the tilt of pronk's multis
 _SAME_PERIOD = 0.1
 """Largest RMS difference, as a share of the command, between periods that count as equal."""
 _ENOUGH_REPEATS = 3
-"""From so many questions on, the question is the unit of uncertainty; below, the period."""
+"""From so many excitations on, these are the unit of uncertainty; below, the period."""
+
+_SETTLE_S = 0.5
+"""Dropped at the head of each step, a whole period at the least, and beside a ramp [s]."""
+_MOST_BLOCKS = 4
+"""Blocks that a step is read in: enough to see the scatter, few enough to hold several periods."""
+_STEADY = 0.1
+"""Largest deviation of a period of the command from the median one: ramps fall out."""
+_FINE = 4
+"""How much finer than the log the grid of a step is: its period seldom fits the ticks of the
+command, and the images of a held command must not fold back onto the line."""
+_SAME_HZ = 1e-6
+"""Relative change of frequency that begins another step."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Periods:
-    """Spectra of the steady periods of one question, transient dropped."""
+class Spectra:
+    """What was read at the lines of one excitation."""
+
+    omega: Array
+    """[rad/s], increasing, shape (f,)."""
+    command: ComplexArray
+    """Per period (or block of periods), shape (p, f)."""
+    position: ComplexArray
+    """Shape (p, f)."""
+    factor: ComplexArray
+    """Grid factor of each line (`grid.hold`), shape (f,)."""
+    third: Array
+    """Position at three times a step's frequency over that at it, shape (f,); else NaN."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Lines:
+    """The excited lines of a periodic command, over its steady periods."""
 
     grid: Grid
-    """Whole periods from the first that counts."""
-    omega: Array
-    """Every line in the band, excited or not [rad/s], shape (l,)."""
-    lines: NDArray[np.intp]
-    """Their numbers (1 is the inverse of the period), shape (l,)."""
+    samples: int
+    """Samples in a period."""
+    numbers: NDArray[np.intp]
+    """Of the lines; 1 is the inverse of the period."""
     command: ComplexArray
-    """Shape (p, l)."""
-    position: ComplexArray
-    """Shape (p, l)."""
+    """Shape (p, lines)."""
 
     @property
-    def excited(self) -> NDArray[np.bool_]:
-        """Lines that the command holds, shape (l,)."""
-        size = np.abs(self.command).mean(axis=0)
-        return np.asarray(size >= _EXCITED * size.max())
+    def omega(self) -> Array:
+        return np.asarray(2.0 * np.pi * self.numbers * self.grid.rate_hz / self.samples)
 
 
-def _steady(command: Array, samples: int) -> tuple[int, int]:
+def _lines(
+    time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float | None
+) -> _Lines:
+    """Find the periods that count and the lines excited in them.
+
+    The periods are those in which the command repeats the period before; ramps fall out by
+    themselves, and the first steady period is dropped as the transient.
+    """
+    rate = analysis_rate([time]) if rate_hz is None else rate_hz
+    samples = max(round(period_s * rate), 1)
+    fine = samples / period_s
+    count = int(np.floor((time[-1] - time[0]) * fine + 0.01)) + 1
+    start = float(time[0])
+    held = held_mean(time, command, Grid(start=start, rate_hz=fine, count=count).edges)
+    first, stop = _steady_periods(held, samples)
+    if stop - first < 3:
+        raise LogError(
+            f"a signal of period {period_s:g} s repeats itself {max(stop - first, 0)} times in "
+            f"{time[-1] - time[0]:.2f} s; 3 equal periods are needed (1 to settle, 2 to compare)."
+        )
+    grid = Grid(
+        start=start + (first + 1) * period_s, rate_hz=fine, count=(stop - first - 1) * samples
+    )
+    numbers = np.arange(1, samples // 2)
+    hz = numbers * fine / samples
+    numbers = numbers[(hz >= estimator.min_hz - 1e-9) & (hz <= estimator.top_hz(fine) + 1e-9)]
+    if len(numbers) == 0:
+        raise LogError(
+            f"a signal of period {period_s:g} s has no line between {estimator.min_hz:g} and "
+            f"{estimator.top_hz(fine):g} Hz."
+        )
+    u = _at_lines(held_mean(time, command, grid.edges), samples, numbers)
+    size = np.abs(u).mean(axis=0)
+    excited = size >= _EXCITED * size.max()
+    return _Lines(grid=grid, samples=samples, numbers=numbers[excited], command=u[:, excited])
+
+
+def _at_lines(values: Array, samples: int, numbers: NDArray[np.intp]) -> ComplexArray:
+    return np.asarray(np.fft.rfft(values.reshape(-1, samples), axis=1)[:, numbers] / samples)
+
+
+def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
     """First and one-past-last period of the longest run in which the command repeats itself."""
     whole = len(command) // samples
     periods = command[: whole * samples].reshape(whole, samples)
@@ -71,53 +138,16 @@ def _steady(command: Array, samples: int) -> tuple[int, int]:
     return best
 
 
-def steady_grid(
-    time: Array, command: Array, period_s: float, *, rate_hz: float | None = None
-) -> tuple[Grid, int]:
-    """Grid over the periods that count, a whole number of samples each.
-
-    They are those in which the command repeats the period before; ramps fall out by themselves,
-    and the first steady period is dropped as the transient.
-
-    Returns:
-        The grid, and the number of samples in a period.
-
-    Raises:
-        LogError: Fewer than two periods are left.
-    """
-    rate = analysis_rate(time) if rate_hz is None else rate_hz
-    samples = round(period_s * rate)
-    fine = samples / period_s
-    count = int(np.floor((time[-1] - time[0]) * fine + 0.01)) + 1
-    held = held_mean(time, command, Grid(start=float(time[0]), rate_hz=fine, count=count))
-    first, stop = _steady(held, max(samples, 1))
-    if stop - first < 3:
-        raise LogError(
-            f"a periodic question of {period_s:g} s repeats itself {max(stop - first, 0)} times in "
-            f"{time[-1] - time[0]:.2f} s; 3 equal periods are needed (1 to settle, 2 to compare)."
-        )
-    start = float(time[0]) + (first + 1) * period_s
-    return Grid(start=start, rate_hz=fine, count=(stop - first - 1) * samples), samples
-
-
-def _lines(grid: Grid, samples: int, estimator: Estimator) -> NDArray[np.intp]:
-    spacing = grid.rate_hz / samples
-    lines = np.arange(1, samples // 2)
-    hz = lines * spacing
-    top = estimator.top_hz(grid.rate_hz)
-    return np.asarray(lines[(hz >= estimator.min_hz - 1e-9) & (hz <= top + 1e-9)])
-
-
 def read_periods(
-    log: JointLog, joint: str, estimator: Estimator, *, rate_hz: float | None = None
-) -> Periods:
-    """Spectra of the steady periods of one multisine.
+    log: JointLog, joint: str, estimator: Estimator, rate_hz: float | None = None
+) -> Spectra:
+    """Spectra of the steady periods of one multisine at its excited lines.
 
     Args:
-        log: One question (`JointLog.cut`), whose segment gives the period.
+        log: One excitation (`JointLog.cut`), whose segment gives the period.
         joint: The excited joint.
         estimator: Gives the band.
-        rate_hz: Rate of the analysis grid; about that of the timestamps if not given.
+        rate_hz: About the rate of the analysis grid; that of the timestamps if not given.
 
     Raises:
         LogError: The segment gives no period, or fewer than three equal periods.
@@ -129,117 +159,14 @@ def read_periods(
             "name it, or call the segment `unknown` to have it averaged by segments."
         )
     column = log.column(joint)
-    grid, samples = steady_grid(log.time, log.command[:, column], period, rate_hz=rate_hz)
-    lines = _lines(grid, samples, estimator)
-
-    def spectra(values: Array) -> ComplexArray:
-        return np.asarray(np.fft.rfft(values.reshape(-1, samples), axis=1)[:, lines] / samples)
-
-    return Periods(
-        grid=grid,
-        omega=np.asarray(2.0 * np.pi * lines * grid.rate_hz / samples),
-        lines=lines,
-        command=spectra(held_mean(log.time, log.command[:, column], grid)),
-        position=spectra(interpolate(log.time, log.position[:, column], grid)),
-    )
-
-
-def _response(command: ComplexArray, position: ComplexArray) -> ComplexArray:
-    """H1 over the first axis."""
-    return np.asarray(
-        (np.conj(command) * position).sum(axis=0) / (np.abs(command) ** 2).sum(axis=0)
-    )
-
-
-def combined(
-    command: Sequence[ComplexArray],
-    position: Sequence[ComplexArray],
-    factor: ComplexArray,
-    *,
-    omega: Array,
-    joint: str,
-    amplitude: float,
-    window: str,
-    segment_s: float,
-    virtual: bool,
-    source: str,
-) -> FrequencyResponse:
-    """Response from the periods of every question.
-
-    Args:
-        command: Spectra of each question's periods, shape (p, f) each.
-        position: The same of the position.
-        factor: Grid factor (`grid.hold`), shape (f,).
-        omega: And the rest: as in FrequencyResponse.
-        joint: See there.
-        amplitude: See there.
-        window: See there.
-        segment_s: See there.
-        virtual: See there.
-        source: See there.
-    """
-    u, y = np.concatenate(list(command)), np.concatenate(list(position))
-    if len(command) >= _ENOUGH_REPEATS:
-        repeats = np.array([_response(a, b) for a, b in zip(command, position, strict=True)])
-    else:
-        repeats = y / u
-    power = (np.abs(u) ** 2).sum(axis=0) * (np.abs(y) ** 2).sum(axis=0)
-    cross = np.abs((np.conj(u) * y).sum(axis=0)) ** 2
-    return FrequencyResponse(
-        joint=joint,
-        amplitude=amplitude,
-        omega=omega,
-        response=_response(u, y) / factor,
-        coherence=np.clip(cross / np.maximum(power, np.finfo(np.float64).tiny), 0.0, 1.0),
-        averages=np.full(len(omega), float(len(u))),
-        repeats=repeats / factor,
-        estimator="periodic",
-        window=window,
-        segment_s=segment_s,
-        virtual=virtual,
-        source=source,
-    )
-
-
-def estimate_multisine(
-    parts: Sequence[JointLog], joint: str, amplitude: float, estimator: Estimator, rate_hz: float
-) -> FrequencyResponse:
-    """Response at the lines of a multisine, averaged over periods and questions.
-
-    `repeats` holds one row per question if there are three or more (other random phases are then
-    part of the scatter), one per period otherwise.
-
-    Args:
-        parts: The questions, one log each (`JointLog.cut`).
-        joint: The excited joint.
-        amplitude: Peak of the command [rad].
-        estimator: Gives the band.
-        rate_hz: Rate of the analysis grid, adjusted to a whole number of samples a period.
-
-    Raises:
-        LogError: Too few periods, or questions with different lines.
-    """
-    read = [read_periods(part, joint, estimator, rate_hz=rate_hz) for part in parts]
-    excited = read[0].excited
-    for other in read[1:]:
-        if len(other.excited) != len(excited) or not (other.excited == excited).all():
-            raise LogError(
-                f"{parts[0].source or 'log'}: the multisines of {joint} ask different lines; give "
-                "repeats the same period and band."
-            )
-    omega = read[0].omega[excited]
-    period = float(parts[0].segments[0].period_s or 0.0)
-    return combined(
-        [r.command[:, excited] for r in read],
-        [r.position[:, excited] for r in read],
-        hold(omega, read[0].grid.rate_hz),
-        omega=omega,
-        joint=joint,
-        amplitude=amplitude,
-        window=f"whole periods of {period:g} s, ramps and the first steady period dropped",
-        segment_s=period,
-        virtual=parts[0].virtual,
-        source=parts[0].source,
+    found = _lines(log.time, log.command[:, column], period, estimator, rate_hz)
+    position = interpolate(log.time, log.position[:, column], found.grid)
+    return Spectra(
+        omega=found.omega,
+        command=found.command,
+        position=_at_lines(position, found.samples, found.numbers),
+        factor=hold(found.omega, found.grid.rate_hz),
+        third=np.full(len(found.omega), np.nan),
     )
 
 
@@ -251,25 +178,197 @@ def multisine_operator(
     *,
     rate_hz: float | None = None,
 ) -> H1Operator:
-    """`estimate_multisine` of one question as a matrix, for a fixed command.
+    """`estimate_multisine` of one excitation as a matrix, for a fixed command.
 
     Raises:
         LogError: Fewer than three equal periods.
     """
-    grid, samples = steady_grid(time, command, period_s, rate_hz=rate_hz)
-    lines = _lines(grid, samples, estimator)
-    u = np.fft.rfft(held_mean(time, command, grid).reshape(-1, samples), axis=1)[:, lines] / samples
-    size = np.abs(u).mean(axis=0)
-    excited = size >= _EXCITED * size.max()
-    lines, u = lines[excited], u[:, excited]
-    omega = 2.0 * np.pi * lines * grid.rate_hz / samples
-    kernel = np.exp(-2j * np.pi * np.outer(np.arange(samples), lines) / samples) / samples
+    found = _lines(time, command, period_s, estimator, rate_hz)
+    samples, u = found.samples, found.command
+    turns = np.outer(np.arange(samples), found.numbers) / samples
+    kernel = np.exp(-2j * np.pi * turns) / samples
     excitation = np.asarray((np.abs(u) ** 2).sum(axis=0))
-    scale = np.conj(u) / (excitation * hold(omega, grid.rate_hz))
+    scale = np.conj(u) / (excitation * hold(found.omega, found.grid.rate_hz))
     return H1Operator(
-        omega=np.asarray(omega),
+        omega=found.omega,
         time=np.asarray(time, dtype=np.float64),
-        grid=grid,
+        grid=found.grid,
         weights=np.concatenate([kernel * row for row in scale]),
         excitation=excitation,
     )
+
+
+def _runs(frequency: Array) -> list[tuple[int, int]]:
+    """First and one-past-last sample of each stretch of constant frequency."""
+    known = np.isfinite(frequency) & (frequency > 0.0)
+    filled = np.where(known, frequency, -1.0)
+    new = np.flatnonzero(np.abs(np.diff(filled)) > _SAME_HZ * np.abs(filled[1:])) + 1
+    edges = [0, *new.tolist(), len(filled)]
+    return [(a, b) for a, b in pairwise(edges) if filled[a] > 0.0]
+
+
+def _steady_step(
+    time: Array, command: Array, span: float, hz: float, rate_hz: float
+) -> tuple[int, int]:
+    """First and one-past-last period of a step, counted from its start, that is steady."""
+    settle = max(1, int(np.ceil(_SETTLE_S * hz)))
+    periods = int(np.floor(span * hz + 0.01))
+    if periods <= settle:
+        return settle, periods
+    samples = max(4, round(rate_hz / hz))
+    grid = Grid(start=float(time[0]), rate_hz=samples * hz, count=samples * periods)
+    turn = np.exp(-2j * np.pi * np.arange(samples) / samples)
+    found = held_mean(time, command, grid.edges).reshape(periods, samples) @ turn
+    # Smoothed, or the images of a held command would make single periods look unlike.
+    size = np.abs(uniform_filter1d(found, settle, mode="nearest"))
+    even = np.flatnonzero(np.abs(size - np.median(size)) <= _STEADY * np.median(size))
+    if len(even) == 0:
+        return settle, settle
+    end = int(even[-1]) + 1
+    return int(even[0]) + settle, end if end == periods else end - settle
+
+
+def read_steps(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> Spectra:
+    """Read every step of one excitation inside the band.
+
+    Args:
+        log: One excitation (`JointLog.cut`) with its instantaneous frequency.
+        joint: The excited joint.
+        estimator: Gives the band.
+        rate_hz: About the rate of the grid; each step takes a whole number of samples a period.
+
+    Raises:
+        LogError: No frequency channel, no step in the band, or steps of fewer than three periods.
+    """
+    where = log.source or "log"
+    if log.frequency is None:
+        raise LogError(
+            f"{where}: sine steps without the channel of instantaneous frequency; give it, or call "
+            "the segment `unknown` to have it averaged by segments."
+        )
+    column = log.column(joint)
+    time, command, position = log.time, log.command[:, column], log.position[:, column]
+    steps = []
+    for first, stop in _runs(log.frequency):
+        hz = float(log.frequency[first])
+        if not estimator.min_hz - 1e-9 <= hz <= estimator.top_hz(rate_hz) + 1e-9:
+            continue
+        # The last sample's interval belongs to the step as well.
+        span = float(time[stop - 1] - time[first]) + 1.0 / rate_hz
+        inside = slice(first, min(stop + 3, len(time)))
+        dropped, end = _steady_step(time[inside], command[inside], span, hz, rate_hz)
+        steps.append((hz, inside, dropped, end - dropped))
+    if not steps:
+        raise LogError(
+            f"{where}: no sine step of {joint} between {estimator.min_hz:g} and "
+            f"{estimator.top_hz(rate_hz):g} Hz."
+        )
+    hz, _, dropped, periods = min(steps, key=lambda step: step[3])
+    if periods < 2:
+        raise LogError(
+            f"{where}: the step at {hz:g} Hz lasts {dropped + max(periods, 0)} periods; "
+            f"{dropped + 2} are needed ({dropped} to settle, 2 to compare)."
+        )
+    # Two periods a block where there are four, for the window below.
+    blocks = max(2, min(periods // 2, _MOST_BLOCKS))
+    rows = []
+    for hz, inside, dropped, periods in sorted(steps, key=lambda step: step[0]):
+        each = periods // blocks
+        samples = round(_FINE * each * rate_hz / hz)
+        grid = Grid(
+            # The last whole blocks: the joint has settled longest.
+            start=float(time[inside][0]) + (dropped + periods - blocks * each) / hz,
+            rate_hz=samples * hz / each,
+            count=samples * blocks,
+        )
+        u = held_mean(time[inside], command[inside], grid.edges).reshape(blocks, samples)
+        y = interpolate(time[inside], position[inside], grid).reshape(blocks, samples)
+        # The held command has images that are not whole periods of a block; a window keeps them
+        # out. It needs two periods to keep the mean out as well.
+        window = get_window("hann", samples) if each >= 2 else np.ones(samples)
+        turn = 2j * np.pi * each * np.arange(samples) / samples
+        once, thrice = window * np.exp(-turn), window * np.exp(-3.0 * turn)
+        omega = 2.0 * np.pi * hz
+        ratio = abs((y @ thrice).mean()) / abs((y @ once).mean())
+        factor = hold(np.array([omega]), grid.rate_hz)[0]
+        third = ratio if 3.0 * hz < rate_hz / 2.0 else float("nan")
+        rows.append((omega, u @ once, y @ once, factor, third))
+    omegas, us, ys, factors, thirds = zip(*rows, strict=True)
+    return Spectra(
+        omega=np.array(omegas),
+        command=np.stack(us, axis=1),
+        position=np.stack(ys, axis=1),
+        factor=np.array(factors),
+        third=np.array(thirds),
+    )
+
+
+def _h1(command: ComplexArray, position: ComplexArray) -> ComplexArray:
+    cross = (np.conj(command) * position).sum(axis=0)
+    return np.asarray(cross / (np.abs(command) ** 2).sum(axis=0))
+
+
+def _combined(
+    parts: Sequence[JointLog], joint: str, read: Sequence[Spectra], window: str, segment_s: float
+) -> FrequencyResponse:
+    """Response averaged over the periods of every excitation.
+
+    `repeats` holds one row per excitation if there are three or more (other random phases are then
+    part of the scatter), one per period otherwise.
+    """
+    omega, factor = read[0].omega, read[0].factor
+    for other in read[1:]:
+        if other.omega.shape != omega.shape or not np.allclose(other.omega, omega):
+            raise LogError(
+                f"{parts[0].source or 'log'}: the repeats of {joint} excite different frequencies; "
+                "give them the same period, band and steps."
+            )
+    u = np.concatenate([one.command for one in read])
+    y = np.concatenate([one.position for one in read])
+    if len(read) >= _ENOUGH_REPEATS:
+        repeats = np.array([_h1(one.command, one.position) for one in read])
+    else:
+        repeats = y / u
+    power = (np.abs(u) ** 2).sum(axis=0) * (np.abs(y) ** 2).sum(axis=0)
+    cross = np.abs((np.conj(u) * y).sum(axis=0)) ** 2
+    return FrequencyResponse(
+        joint=joint,
+        amplitude=parts[0].segments[0].amplitude,
+        omega=omega,
+        response=_h1(u, y) / factor,
+        coherence=np.clip(cross / np.maximum(power, np.finfo(np.float64).tiny), 0.0, 1.0),
+        averages=np.full(len(omega), float(len(u))),
+        repeats=repeats / factor,
+        estimator="periodic",
+        window=window,
+        segment_s=segment_s,
+        virtual=parts[0].virtual,
+        source=parts[0].source,
+    )
+
+
+def estimate_multisine(
+    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
+) -> FrequencyResponse:
+    """Response at the lines of a multisine, averaged over periods and repeats.
+
+    Raises:
+        LogError: Too few periods, or repeats with different lines.
+    """
+    read = [read_periods(part, joint, estimator, rate_hz) for part in parts]
+    period = float(parts[0].segments[0].period_s or 0.0)
+    words = f"whole periods of {period:g} s, ramps and the first steady period dropped"
+    return _combined(parts, joint, read, words, period)
+
+
+def estimate_steps(
+    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
+) -> FrequencyResponse:
+    """Response at the frequencies of sine steps, averaged over blocks of periods and repeats.
+
+    Raises:
+        LogError: As `read_steps`, or repeats with different frequencies.
+    """
+    read = [read_steps(part, joint, estimator, rate_hz) for part in parts]
+    words = f"whole periods of each step, the first and at least {_SETTLE_S:g} s dropped"
+    return _combined(parts, joint, read, words, float(2.0 * np.pi / read[0].omega[0]))

@@ -1,0 +1,313 @@
+"""H1 from windowed segments, averaged; and the same estimate as a matrix.
+
+Padding: a chirp of pronk starts and ends at rest, so before and after it both signals are known
+to stay where they are; segments then reach over the ends, every sample counts alike, and there is
+no transient to drop. Of an excitation that ends in motion only whole segments inside it are used.
+
+With the command given, H1 is linear in the position: `H = position @ A`, A complex of shape
+(samples, f) and computed once (`H1Operator`). A grid of simulated positions becomes responses in
+one matrix product, by the same segments, windows, means and interpolation as the measured log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import ShortTimeFFT, get_window
+
+from pronk.errors import LogError
+from pronk.logs.joint_log import JointLog
+from pronk.response.grid import Grid, grid_over, held_mean, hold, interpolate, pull_back
+from pronk.response.response import Estimator, FrequencyResponse
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_TINY = np.finfo(np.float64).tiny
+_SILENT = 1e-4
+"""Share of the largest excitation (power) below which a frequency counts as not excited."""
+_LEAKED = 0.3
+"""Share of a neighbour's power below which a frequency counts as that neighbour's leakage: beside
+a single line a Hann window leaves 0.25. Its response would be that at the line."""
+_SETTLED_S = 0.2
+"""A command that is constant for so long at the end leaves the joint at rest [s]: five times the
+slowest time constant of the drives this was written for."""
+_AT_CENTRE = 0.05
+"""Share of the amplitude by which an excitation at rest may start off the point it ends at."""
+
+
+def rests(command: Array, rate_hz: float) -> bool:
+    """True if a command [rad] ends constant, and starts where it ends: the joint is at rest."""
+    tail = max(2, round(_SETTLED_S * rate_hz))
+    amplitude = float(np.ptp(command)) / 2.0
+    if len(command) <= tail or amplitude == 0.0:
+        return False
+    return bool(
+        np.ptp(command[-tail:]) <= 1e-6 * amplitude
+        and abs(command[0] - command[-1]) <= _AT_CENTRE * amplitude
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Where the segments of one excitation lie on its grid."""
+
+    starts: NDArray[np.intp]
+    """First sample of each segment; negative or beyond the end where padded, shape (k,)."""
+    window: Array
+    """Shape (samples,)."""
+    omega: Array
+    """Frequencies reported [rad/s], shape (f,)."""
+    bins: NDArray[np.intp]
+    """Their numbers in the transform of a segment, shape (f,)."""
+    rate_hz: float
+    count: int
+    """Samples of the excitation, without padding."""
+    transform: ShortTimeFFT
+    slices: tuple[int, int]
+    """First and one-past-last slice of the transform."""
+
+    def measured(self, segment: int) -> Array:
+        """The window of a segment, zero where it lies in the padding, shape (samples,)."""
+        sample = self.starts[segment] + np.arange(len(self.window))
+        return np.where((sample >= 0) & (sample < self.count), self.window, 0.0)
+
+    def spectra(self, values: Array) -> ComplexArray:
+        """Windowed transform of each segment, mean taken away, shape (k, f).
+
+        The phase counts from the first sample of each segment.
+        """
+        found = self.transform.stft_detrend(values, "constant", *self.slices, padding="edge")
+        return np.asarray(found[self.bins].T)
+
+
+def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
+    """Lay the segments over a grid.
+
+    Raises:
+        LogError: The excitation is too short for two segments, or no frequency is left.
+    """
+    samples, rate_hz = round(estimator.segment_s * grid.rate_hz), grid.rate_hz
+    span = grid.count / rate_hz
+    if samples < 8 or grid.count < samples:
+        raise LogError(
+            f"an excitation of {span:.2f} s ({grid.count} samples at {rate_hz:g} Hz) does not "
+            f"fill a segment of {estimator.segment_s:g} s; choose a shorter Estimator.segment_s."
+        )
+    transform = ShortTimeFFT(
+        get_window(estimator.window, samples, fftbins=True),
+        hop=max(1, round(samples * (1.0 - estimator.overlap))),
+        fs=rate_hz,
+        phase_shift=None,
+    )
+    if padded:
+        slices = int(transform.p_min), int(transform.p_max(grid.count))
+    else:
+        last = transform.upper_border_begin(grid.count)[1]
+        slices = int(transform.lower_border_end[1]), int(last)
+    if slices[1] - slices[0] < 2:
+        raise LogError(
+            f"an excitation of {span:.2f} s holds a single segment of {estimator.segment_s:g} s, "
+            "of which coherence is always 1; choose a shorter Estimator.segment_s."
+        )
+    hz, top_hz = np.asarray(transform.f), estimator.top_hz(rate_hz)
+    # From the second line on: the main lobe of the window at the first reaches the mean.
+    chosen = (hz >= max(estimator.min_hz, hz[2]) - 1e-9) & (hz <= top_hz + 1e-9)
+    if not chosen.any():
+        raise LogError(
+            f"no frequency between {estimator.min_hz:g} and {top_hz:g} Hz with segments of "
+            f"{estimator.segment_s:g} s at {rate_hz:g} Hz."
+        )
+    return Layout(
+        starts=np.arange(*slices) * transform.hop - transform.m_num_mid,
+        window=np.asarray(transform.win, dtype=np.float64),
+        omega=np.asarray(2.0 * np.pi * hz[chosen]),
+        bins=np.flatnonzero(chosen),
+        rate_hz=rate_hz,
+        count=grid.count,
+        transform=transform,
+        slices=slices,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sums:
+    """Auto and cross spectra summed over segments. Sums of several excitations add up."""
+
+    uu: Array
+    uy: ComplexArray
+    """conj(U) Y, shape (f,)."""
+    yy: Array
+    segments: float
+    """Number of segments, those that reach into the padding in part."""
+    spread: Array
+    """Power that white noise of unit power per segment leaves in `uy`, shape (f,)."""
+
+    def __add__(self, other: Sums) -> Sums:
+        """Sums over the segments of both."""
+        return Sums(**{name: value + vars(other)[name] for name, value in vars(self).items()})
+
+    def response(self, omega: Array, rate_hz: float) -> ComplexArray:
+        """Response by H1 = Suy / Suu, from the held command; the noise is on the position."""
+        h1 = self.uy / np.maximum(self.uu, _TINY)
+        return np.asarray(h1 / hold(omega, rate_hz))
+
+    def coherence(self) -> Array:
+        """Magnitude-squared coherence; 0 where the frequency was not excited, shape (f,).
+
+        Every segment counts, also those in which a chirp is elsewhere: they bring the noise (and
+        the harmonics) at this frequency and nothing else. Coherence is then the share of the
+        position's power at this frequency, over the whole log, that the command explains. A
+        single passage of a chirp in a single segment would be 1 by construction.
+        """
+        raw = np.abs(self.uy) ** 2 / np.maximum(self.uu * self.yy, _TINY)
+        beside = np.pad(self.uu, 1)
+        leaked = self.uu < _LEAKED * np.maximum(beside[:-2], beside[2:])
+        excited = (self.uu >= _SILENT * self.uu.max()) & ~leaked
+        return np.where(excited, np.clip(raw, 0.0, 1.0), 0.0)
+
+    def averages(self) -> Array:
+        """Effective number of independent averages that the coherence rests on, shape (f,).
+
+        `segments sum P / sum_s,t conj(U_s) U_t r_st`, P = |U|^2 and r_st the overlap of windows s
+        and t inside the excitation: the number n for which `(1 - coherence) / (2 n coherence)` is
+        the variance of the estimate under white noise, and 1/n the coherence of a position that
+        is noise alone. For a stationary random command it is Welch's number; for a chirp it
+        counts the segments in which the chirp is elsewhere, as `coherence` does.
+        """
+        return np.asarray(self.segments * self.uu / np.maximum(self.spread, _TINY))
+
+
+def sums(command: ComplexArray, position: ComplexArray, where: Layout) -> Sums:
+    """Sum the spectra of one excitation (`Layout.spectra`, shape (k, f)) over its segments."""
+    # Phase from a common instant, in which the noise of two segments correlates by their overlap.
+    aligned = command * np.exp(-1j * np.outer(where.starts / where.rate_hz, where.omega))
+    power = float(where.window @ where.window)
+    windows = [where.measured(i) for i in range(len(where.starts))]
+    segments, spread = 0.0, np.zeros(len(where.omega))
+    for i, start in enumerate(where.starts):
+        own = float(windows[i] @ windows[i]) / power
+        segments += own
+        spread += own * np.abs(aligned[i]) ** 2
+        for j in range(i + 1, len(where.starts)):
+            shift = int(where.starts[j] - start)
+            if shift >= len(where.window):
+                break
+            overlap = float(windows[i][shift:] @ windows[j][:-shift]) / power
+            spread += 2.0 * overlap * (np.conj(aligned[i]) * aligned[j]).real
+    return Sums(
+        uu=np.asarray((np.abs(command) ** 2).sum(axis=0)),
+        uy=np.asarray((np.conj(command) * position).sum(axis=0)),
+        yy=np.asarray((np.abs(position) ** 2).sum(axis=0)),
+        segments=segments,
+        spread=np.asarray(np.maximum(spread, 0.0)),
+    )
+
+
+def estimate_averaged(
+    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
+) -> FrequencyResponse:
+    """H1 over the segments of all repeats, one log each (`JointLog.cut`)."""
+    each: list[Sums] = []
+    padded = []
+    for part in parts:
+        column = part.column(joint)
+        grid = grid_over(part.time, rate_hz)
+        command = held_mean(part.time, part.command[:, column], grid.edges)
+        position = interpolate(part.time, part.position[:, column], grid)
+        padded.append(rests(command, rate_hz))
+        where = layout(grid, estimator, padded=padded[-1])
+        each.append(sums(where.spectra(command), where.spectra(position), where))
+    whole, omega = reduce(add, each), where.omega
+    ends = "reaching over the ends at rest" if all(padded) else "inside the excitation"
+    return FrequencyResponse(
+        joint=joint,
+        amplitude=parts[0].segments[0].amplitude,
+        omega=omega,
+        response=whole.response(omega, rate_hz),
+        coherence=whole.coherence(),
+        averages=whole.averages(),
+        repeats=np.array([one.response(omega, rate_hz) for one in each]),
+        estimator="H1",
+        window=f"{estimator.window} {estimator.segment_s:g} s, {100.0 * estimator.overlap:.0f} % "
+        f"overlap, {ends}, mean of each segment removed",
+        segment_s=estimator.segment_s,
+        virtual=parts[0].virtual,
+        source=parts[0].source,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class H1Operator:
+    """Linear map from the positions of one excitation to its response."""
+
+    omega: Array
+    """[rad/s], shape (f,)."""
+    time: Array
+    """Measured timestamps of the log it was built for [s], shape (n,)."""
+    grid: Grid
+    """The analysis grid."""
+    weights: ComplexArray
+    """Map from positions on the grid, shape (grid.count, f)."""
+    excitation: Array
+    """Sum of |U|^2: the weight of this excitation among repeats, shape (f,)."""
+
+    @classmethod
+    def build(
+        cls, time: Array, command: Array, estimator: Estimator, *, rate_hz: float | None = None
+    ) -> H1Operator:
+        """Compute the map for one command.
+
+        Args:
+            time: Measured timestamps [s], shape (n,).
+            command: Command in force at each [rad], shape (n,).
+            estimator: Settings.
+            rate_hz: Rate of the analysis grid; that of the timestamps if not given.
+
+        Raises:
+            LogError: The excitation is shorter than two segments.
+        """
+        grid = grid_over(time, rate_hz)
+        held = held_mean(time, command, grid.edges)
+        where = layout(grid, estimator, padded=rests(held, grid.rate_hz))
+        excited = where.spectra(held)
+        uu = np.asarray((np.abs(excited) ** 2).sum(axis=0))
+        conjugate = np.conj(excited) / (np.maximum(uu, _TINY) * hold(where.omega, grid.rate_hz))
+        samples = np.arange(len(where.window)) / grid.rate_hz
+        kernel = where.window[:, None] * np.exp(-1j * np.outer(samples, where.omega))
+        # Taking the mean of a segment away is taking the mean of the kernel away.
+        kernel -= kernel.mean(axis=0)
+        # Padding repeats the first and last sample; its weights gather on them.
+        before = max(0, -int(where.starts[0]))
+        after = max(0, int(where.starts[-1]) + len(where.window) - grid.count)
+        spread = np.zeros((before + grid.count + after, len(where.omega)), dtype=np.complex128)
+        for start, row in zip(where.starts + before, conjugate, strict=True):
+            spread[start : start + len(where.window)] += kernel * row
+        weights = spread[before : before + grid.count].copy()
+        weights[0] += spread[:before].sum(axis=0)
+        weights[-1] += spread[before + grid.count :].sum(axis=0)
+        times = np.asarray(time, dtype=np.float64)
+        return cls(omega=where.omega, time=times, grid=grid, weights=weights, excitation=uu)
+
+    def matrix(self, sample_times: Array) -> ComplexArray:
+        """Map from positions sampled at other instants, so that `H = positions @ matrix`.
+
+        The cubic interpolation onto the analysis grid is included. For a large batch multiply by
+        `matrix.real` and `matrix.imag` apart, made contiguous, with the batch in one dimension:
+        numpy turns real positions into complex ones otherwise.
+
+        Args:
+            sample_times: Increasing instants on the clock of the log [s], shape (m,).
+
+        Returns:
+            Shape (m, f).
+
+        Raises:
+            LogError: The instants do not span the excitation.
+        """
+        return pull_back(self.weights, np.asarray(sample_times, dtype=np.float64), self.grid)
