@@ -35,6 +35,8 @@ _START_S = 30.0
 _END_S = 10.0
 """In which each process must have ended."""
 
+_QUIT = OperatorCommand(request=OperatorRequest.QUIT)
+
 
 @dataclass(kw_only=True)
 class RunSummary:
@@ -52,18 +54,22 @@ class RunSummary:
     trained_delay_s: tuple[float, float] = (0.0, 0.0)
     """Command delays that the policy was trained for [s]."""
 
+    def texts(self, kind: str) -> list[str]:
+        """The texts of the events of one kind."""
+        return [event.text for event in self.events_seen if event.kind == kind]
+
     @property
     def faults(self) -> list[str]:
         """Faults that damped the robot."""
-        return [notice.text for notice in self.events_seen if notice.kind == "fault"]
+        return self.texts("fault")
 
     @property
     def refusals(self) -> list[str]:
         """Results of the pre-flight checks and of opening the link."""
-        return [notice.text for notice in self.events_seen if notice.kind == "refused"]
+        return self.texts("refused")
 
     def delay_words(self) -> str:
-        """The measured delay beside the range that the policy was trained for, in one line."""
+        """The measured delay and the range that the policy was trained for, in one line."""
         low, high = (1e3 * edge for edge in self.trained_delay_s)
         measured = self.servo.get("state_to_command", {})
         if not measured.get("n"):
@@ -125,30 +131,28 @@ class Deployment:
         with unheard():
             self.shared = Shared()
         name = self.shared.name
-        trained = self.summary.trained_delay_s
         self.write(OperatorCommand())
         self._servo_end, servo_end = context.Pipe(duplex=False)
         self._policy_end, policy_end = context.Pipe(duplex=False)
-        self.servo = context.Process(
-            target=serve, args=(plan, name, trained, servo_end), name="pronk servo"
-        )
+        self._logger_end, talk = context.Pipe()
+        trained = self.summary.trained_delay_s
+
+        def process(body: Callable[..., None], *arguments: Any) -> BaseProcess:
+            made: BaseProcess = context.Process(target=body, args=arguments, name=body.__name__)
+            return made
+
+        self.servo = process(serve, plan, name, trained, servo_end)
         if plan.policy is not None:
-            self.policy = context.Process(
-                target=serve_policy, args=(plan, name, policy_end), name="pronk policy"
-            )
+            self.policy = process(serve_policy, plan, name, policy_end)
         if plan.log is not None or plan.sweep is not None:
-            talk, self._logger_end = context.Pipe()
-            self.logger = context.Process(
-                target=write_log, args=(plan, self._header, name, talk), name="pronk log"
-            )
+            self.logger = process(write_log, plan, self._header, name, talk)
         self._interrupts.__enter__()
         self._open = True
         try:
             with unheard():
-                if self.policy is not None:
-                    self.policy.start()
-                if self.logger is not None:
-                    self.logger.start()
+                for started in (self.policy, self.logger):
+                    if started is not None:
+                        started.start()
             if self.logger is not None:
                 self._await_logger(self.logger)
             # Last, so that its first tick is logged.
@@ -172,7 +176,7 @@ class Deployment:
 
     @property
     def mode(self) -> Mode:
-        """What the servo is doing; `ENDED` too if its process is gone."""
+        """Mode of the servo; `ENDED` too if its process is gone."""
         if not self.servo.is_alive():
             return Mode.ENDED
         record = self.shared.state.read()
@@ -215,31 +219,31 @@ class Deployment:
             progress: Called with the share of a sweep that is done, 0 to 1.
         """
         wake = time.monotonic()
-        while True:
-            for notice in self.events_seen():
-                operator.notified(notice.kind, notice.text)
-                notify(notice)
-            mode = self.mode
-            if mode is Mode.ENDED:
-                break
-            progress(self._progress())
+        while (mode := self._noted(operator, notify)) is not Mode.ENDED:
+            record = self.shared.state.read()
+            progress(0.0 if record is None else float(record["progress"]))
             try:
                 command = operator.command(time.monotonic(), mode)
-                if self.plan.sweep is not None and not self._logging():
-                    command = OperatorCommand(request=OperatorRequest.QUIT)
-                self.write(command)
+                logging = self.logger is not None and self.logger.is_alive()
+                self.write(command if logging or self.plan.sweep is None else _QUIT)
             except KeyboardInterrupt:
                 self.summary.interrupted = True
-                self.write(OperatorCommand(request=OperatorRequest.QUIT))
+                self.write(_QUIT)
                 operator.leave()
             wake = max(wake + 1.0 / _RATE_HZ, time.monotonic())
             time.sleep(max(0.0, wake - time.monotonic()))
-        for notice in self.events_seen():
-            notify(notice)
+        self._noted(operator, notify)
         return self.summary
 
+    def _noted(self, operator: Operator, notify: Callable[[Event], None]) -> Mode:
+        """Pass on the new events; the mode after them."""
+        for event in self.events_seen():
+            operator.notified(event.kind, event.text)
+            notify(event)
+        return self.mode
+
     def close(self) -> None:
-        """Damp, end all processes, finish the log; twice does no harm."""
+        """Damp, end all processes, finish the log; closing twice has no effect."""
         if not self._open:
             return
         self._open = False
@@ -247,10 +251,10 @@ class Deployment:
             if self.servo.pid is not None:
                 self._stop_servo()
             self.summary.servo = _received(self._servo_end)
-            if self.policy is not None and self.policy.pid is not None:
-                self.policy.terminate()
-                self.policy.join(_END_S)
             if self.policy is not None:
+                if self.policy.pid is not None:
+                    self.policy.terminate()
+                    self.policy.join(_END_S)
                 self.summary.policy = _received(self._policy_end)
             self.events_seen()
             if self.logger is not None and self.logger.pid is not None:
@@ -266,7 +270,7 @@ class Deployment:
     def _stop_servo(self) -> None:
         """Request the end; commands continue meanwhile, because their absence is a fault."""
         until = time.monotonic() + _END_S
-        self.write(OperatorCommand(request=OperatorRequest.QUIT))
+        self.write(_QUIT)
         while self.servo.is_alive() and time.monotonic() < until:
             self.servo.join(1.0 / _RATE_HZ)
             self.write(OperatorCommand())
@@ -288,13 +292,6 @@ class Deployment:
             return  # what it flushed is there
         logger.join(_END_S)
 
-    def _logging(self) -> bool:
-        return self.logger is not None and self.logger.is_alive()
-
-    def _progress(self) -> float:
-        record = self.shared.state.read()
-        return 0.0 if record is None else float(record["progress"])
-
     def _await_logger(self, logger: BaseProcess) -> None:
         until = time.monotonic() + _START_S
         while not self._logger_end.poll(0.05):
@@ -312,9 +309,7 @@ class Deployment:
             self.servo.join(0.05)
             self.events_seen()
             if self.servo.exitcode is not None:
-                why = (
-                    " ".join(self.summary.refusals) or "its process ended without an error message"
-                )
+                why = " ".join(self.summary.refusals) or "its process ended without an error."
                 raise HardwareError(f"the link {self.plan.link.robot} was not opened: {why}")
             if time.monotonic() > until:
                 raise HardwareError(
@@ -325,16 +320,13 @@ class Deployment:
 def _received(end: Connection) -> dict[str, Any]:
     """The figures that a process sent when it ended; {} if it was killed."""
     try:
-        if end.poll(1.0):
-            found: dict[str, Any] = orjson.loads(end.recv_bytes())
-            return found
+        return dict(orjson.loads(end.recv_bytes())) if end.poll(1.0) else {}
     except (EOFError, OSError):
-        pass
-    return {}
+        return {}
 
 
 def run(plan: Plan, operator: Operator, notify: Callable[[Event], None]) -> RunSummary:
-    """Run a deployment from beginning to end.
+    """Run a policy from beginning to end.
 
     Raises:
         PronkError: It could not start.
@@ -350,25 +342,15 @@ def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
     """Of a policy's log."""
     import onnxruntime
 
-    robot, limits = plan.robot, plan.safety()
-    link = plan.link
+    contract = policy.contract
+    shown = ("gains", "gains_sha256", "delay_range_s", "jump", "virtual")
     return {
-        "robot": robot.name,
-        "joints": list(robot.joint_names),
-        "link": str(link),
-        "policy": {
-            "file": str(plan.policy),
-            "sha256": policy.sha256,
-            "gains": policy.contract.gains,
-            "gains_sha256": policy.contract.gains_sha256,
-            "delay_range_s": list(policy.contract.delay_range_s),
-            "jump": policy.contract.jump,
-            "virtual": policy.contract.virtual,
-        },
-        "limits": {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(limits).items()
-        },
+        "robot": plan.robot.name,
+        "joints": list(plan.robot.joint_names),
+        "link": str(plan.link),
+        "policy": {"file": str(plan.policy), "sha256": policy.sha256}
+        | {name: getattr(contract, name) for name in shown},
+        "limits": vars(plan.safety()),
         "timing": vars(plan.timing),
         "versions": {"pronk": __version__, "onnxruntime": onnxruntime.__version__},
     }
