@@ -1,35 +1,28 @@
 """The log of a run of a policy: what is recorded, the process that writes it, and the reader.
 
-`t` is CLOCK_MONOTONIC in seconds, the clock of everything that is measured; the messages' log time
-is the wall clock.
+Every time is on CLOCK_MONOTONIC in seconds, the clock of everything that is measured; the messages'
+log time is the wall clock.
 
-    /deploy/header       once, first: robot, joints, policy, limits
-    /deploy/state        500 Hz: the newest state at a tick
-    /deploy/desired      500 Hz: joint targets before the filter, the policy's share, the mode
-    /deploy/sent         500 Hz: joint targets after it, the decision, or damping
-    /deploy/timing       500 Hz: lateness, age of the state, latency of a new action
-    /deploy/observation  50 Hz: input of the network
-    /deploy/action       50 Hz: its action, and the operator's command
-    /deploy/event        mode changes, faults, refusals, settings granted by the operating system,
-                         and whether the robot is virtual
-    /deploy/end          last: the figures of the run; a log without it was cut
+    /deploy/header   once, first: robot, joints, policy, limits
+    /deploy/tick     500 Hz: the fields of `pronk.runtime.ipc.TICK`
+    /deploy/step     50 Hz: the fields of `pronk.runtime.ipc.STEP`
+    /deploy/event    mode changes, faults, refusals, settings granted by the operating system, and
+                     whether the robot is virtual
+    /deploy/end      last: the figures of the run; a log without it was cut
 """
-
-# ruff: noqa: RUF009 (a column is a field)
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import orjson
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
@@ -43,51 +36,45 @@ from pronk.logs.mcap import (
     STRINGS,
     DamagedError,
     McapWriter,
+    Record,
     records,
 )
-from pronk.policy.layout import MEASURED_SIZE
-from pronk.runtime.ipc import VIRTUAL, Mode, Shared
+from pronk.runtime.ipc import STEP, TICK, VIRTUAL, Mode, Shared
 from pronk.runtime.plan import Plan
 from pronk.runtime.safety import FilterAction, Reason
 from pronk.runtime.sweep import SweepLogs
 
-Array = NDArray[np.float64]
-
-SCHEMA = "pronk/deploy/2"
-ROOT = "/deploy/"
+SCHEMA = "pronk/deploy/3"
+_HEADER, _TICK, _STEP, _EVENT, _END = (
+    f"/deploy/{name}" for name in ("header", "tick", "step", "event", "end")
+)
 # Foxglove reads the properties of every object; without them it refuses the channel.
 _OBJECT: dict[str, Any] = {"type": "object", "properties": {}}
-_TICK = {"t": NUMBER, "tick": INTEGER}
-_STEP = {"t": NUMBER, "step": INTEGER}
-TOPICS: dict[str, dict[str, Any]] = {
-    "header": {"schema": STRING, "robot": STRING, "joints": STRINGS, "link": STRING}
-    | {"policy": _OBJECT, "limits": _OBJECT, "timing": _OBJECT, "versions": _OBJECT},
-    "state": {"t": NUMBER, "sequence": INTEGER, "bus_voltage": NUMBER, "robot_time": NUMBER}
-    | {"position": NUMBERS, "velocity": NUMBERS, "torque": NUMBERS, "temperature": NUMBERS}
-    | {"gyro": NUMBERS, "accelerometer": NUMBERS, "orientation": NUMBERS},
-    "desired": _TICK
-    | {"mode": INTEGER, "mode_name": STRING, "position": NUMBERS, "blend": NUMBER}
-    | {"action": INTEGER, "state_sequence": INTEGER},
-    "sent": _TICK
-    | {"position": NUMBERS, "stiffness": NUMBER, "damped": BOOLEAN, "level": INTEGER}
-    | {"reason": INTEGER, "reason_name": STRING},
-    "timing": _TICK | {"lateness": NUMBER, "work": NUMBER, "state_age": NUMBER, "latency": NUMBER},
-    "observation": _STEP | {"state_sequence": INTEGER, "observation": NUMBERS},
-    "action": _STEP
-    | {"live": BOOLEAN, "command": NUMBERS, "jump": BOOLEAN, "action": NUMBERS}
-    | {"target": NUMBERS, "contact": NUMBERS, "linear_velocity": NUMBERS, "lateness": NUMBER}
-    | {"decision": NUMBER, "state_age": NUMBER},
-    "event": {"t": NUMBER, "kind": STRING, "text": STRING, "reason": STRING, "level": STRING},
-    "end": {"complete": BOOLEAN, "figures": _OBJECT},
-}
-"""Topic to the fields of its messages."""
 
-_WRONG = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
-"""Raised when messages of another kind are read."""
+
+def _properties(dtype: np.dtype[Any]) -> dict[str, Any]:
+    """JSON Schema of a record's fields."""
+    fields = {name: dtype[name] for name in dtype.names or ()}
+    return {
+        name: NUMBERS if of.shape else INTEGER if of.kind == "i" else NUMBER
+        for name, of in fields.items()
+    }
+
+
+TOPICS: dict[str, dict[str, Any]] = {
+    _HEADER: {"schema": STRING, "robot": STRING, "joints": STRINGS, "link": STRING}
+    | {"policy": _OBJECT, "limits": _OBJECT, "timing": _OBJECT, "versions": _OBJECT},
+    _TICK: _properties(TICK) | {"mode_name": STRING, "reason_name": STRING},
+    _STEP: _properties(STEP),
+    _EVENT: {"time": NUMBER, "kind": STRING, "text": STRING, "reason": STRING, "level": STRING},
+    _END: {"complete": BOOLEAN, "figures": _OBJECT},
+}
+
 MOST_BYTES = 16 * 2**30
 """Largest size that a log may unpack to, four hours [bytes]. It is parsed chunk by chunk and only
 its numbers are kept."""
-_NO_LOG = "not a log of a deployment; `pronk deploy POLICY --log FILE` writes one."
+_WRONG = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""Raised when messages of another kind are read."""
 
 
 class DeployLogWriter:
@@ -100,82 +87,47 @@ class DeployLogWriter:
             LogError: The file cannot be made.
         """
         try:
-            self._file = McapWriter(path, {ROOT + name: of for name, of in TOPICS.items()})
+            self._file = McapWriter(path, TOPICS)
         except OSError as error:
             raise LogError(f"{path}: cannot be written ({error.strerror}).") from None
         self._wall = time.time() - time.monotonic()
         facts = {"schema": SCHEMA, "robot": header.get("robot"), "link": header.get("link")}
         facts["policy_sha256"] = (header.get("policy") or {}).get("sha256")
         self._file.metadata({name: str(value) for name, value in facts.items()})
-        self.put("header", time.monotonic(), {"schema": SCHEMA, **header})
+        self._put(_HEADER, time.monotonic(), {"schema": SCHEMA, **header})
         self.flush = self._file.flush
         self.flush()
-
-    def put(self, topic: str, t: float, body: dict[str, Any]) -> None:
-        """Write a message; `t` is CLOCK_MONOTONIC [s]."""
-        self._file.put(ROOT + topic, t + self._wall, body)
 
     def tick(self, record: np.void) -> None:
         """Write one tick of the servo, a record of `TICK`."""
         row = _values(record)
-        begun = row["begun"]
-        head = {"t": begun, "tick": row["tick"]}
-        self.put("state", begun, {"t": row["time"]} | _chosen(row, "state"))
-        names = {"mode_name": Mode(row["mode"]).name, "position": row["desired"]}
-        desired = _chosen(row, "desired") | names | {"state_sequence": row["action_state"]}
-        self.put("desired", begun, head | desired)
-        sent = _chosen(row, "sent") | {"t": row["done"], "position": row["sent"]}
-        sent |= {"damped": bool(row["damped"]), "reason_name": Reason(row["reason"]).name}
-        self.put("sent", begun, head | sent)
-        timing = {
-            "lateness": begun - row["deadline"],
-            "work": row["done"] - begun,
-            "state_age": begun - row["time"],
-            "latency": row["latency"],
-        }
-        self.put("timing", begun, head | timing)
+        row |= {"mode_name": Mode(row["mode"]).name, "reason_name": Reason(row["reason"]).name}
+        self._put(_TICK, row["begun"], row)
 
     def step(self, record: np.void) -> None:
         """Write one step of the policy, a record of `STEP`."""
         row = _values(record)
-        begun = row["begun"]
-        head = {"t": begun, "step": row["sequence"]}
-        self.put("observation", begun, head | _chosen(row, "observation"))
-        action = _chosen(row, "action") | {
-            "live": bool(row["live"]),
-            "jump": bool(row["jump"]),
-            "lateness": begun - row["deadline"],
-            "decision": row["inferred"] - row["observed"],
-            "state_age": begun - row["state_time"],
-        }
-        self.put("action", begun, head | action)
+        self._put(_STEP, row["begun"], row)
 
     def event(self, record: np.void) -> None:
         """Write a record of `EVENT`."""
         row = _values(record)
-        body = {
-            "t": row["time"],
-            "kind": row["kind"].decode("ascii"),
-            "text": row["text"].decode("ascii"),
-            "reason": Reason(row["reason"]).name,
-            "level": FilterAction(row["level"]).name,
-        }
-        self.put("event", row["time"], body)
+        row |= {name: row[name].decode("ascii") for name in ("kind", "text")}
+        row |= {"reason": Reason(row["reason"]).name, "level": FilterAction(row["level"]).name}
+        self._put(_EVENT, row["time"], row)
 
     def end(self, *, complete: bool, figures: dict[str, Any]) -> None:
         """Write the end and close the file."""
-        self.put("end", time.monotonic(), {"complete": complete, "figures": figures})
+        self._put(_END, time.monotonic(), {"complete": complete, "figures": figures})
         self._file.close()
+
+    def _put(self, topic: str, t: float, body: dict[str, Any]) -> None:
+        self._file.put(topic, t + self._wall, body)
 
 
 def _values(record: np.void) -> dict[str, Any]:
     """A record as plain numbers and lists."""
     return {name: record[name].tolist() for name in record.dtype.names or ()}
-
-
-def _chosen(row: dict[str, Any], topic: str) -> dict[str, Any]:
-    """The fields of a topic that a record has under the same name."""
-    return {name: row[name] for name in TOPICS[topic] if name in row}
 
 
 READY = b"ready"
@@ -285,106 +237,33 @@ class DeployEvent:
     """Name of a `FilterAction`."""
 
 
-_JOINTS = -1
-"""Shape of one number a joint."""
-
-
-def _column(
-    topic: str, key: str, *shape: int, dtype: DTypeLike = np.float64, tick: bool = True
-) -> Any:
-    """An array of `DeployLog`: where its rows come from, and the shape of a row."""
-    return field(
-        metadata={"topic": topic, "key": key, "shape": shape, "dtype": dtype, "tick": tick}
-    )
-
-
-def _step(key: str, *shape: int, topic: str = "action", dtype: DTypeLike = np.float64) -> Any:
-    """An array with one row a step of the policy."""
-    return _column(topic, key, *shape, dtype=dtype, tick=False)
+_TICK_NAMES = {"time": "begun", "state_time": "time", "state_sequence": "sequence"} | {
+    "action_number": "action"
+}
+_STEP_NAMES = {f"step_{name}": name for name in ("deadline", "done", "state_time")} | {
+    "step_time": "begun",
+    "step_live": "live",
+}
+"""Arrays of a log whose fields in the records have other names."""
+_FLAGS = ("damped", "step_live", "jump")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeployLog:
     """A run as arrays: T ticks of the servo, P steps of the policy.
 
-    Times are on CLOCK_MONOTONIC [s], joints in file order; NaN where there was nothing.
+    The fields of the records (`pronk.runtime.ipc`) are attributes: of `ticks` first, then those of
+    `steps` that have another name (`step_time`, `step_live`, `command`, `jump`, `observation`,
+    `action`, `target`, `contact`, `linear_velocity`). `time` is the begin of a tick, `state_time`
+    and `state_sequence` are of the newest state, `action_number` is of the policy's action. Times
+    are on CLOCK_MONOTONIC [s], joints in file order; NaN where there was nothing.
     """
 
     header: dict[str, Any]
-    time: Array = _column("desired", "t")
-    """When each tick began. (T,)"""
-    tick: NDArray[np.int64] = _column("desired", "tick", dtype=np.int64)
-    """Its number. (T,)"""
-    mode: NDArray[np.int64] = _column("desired", "mode", dtype=np.int64)
-    """A `Mode`. (T,)"""
-    state_time: Array = _column("state", "t")
-    """Of the newest state. (T,)"""
-    state_sequence: NDArray[np.int64] = _column("state", "sequence", dtype=np.int64)
-    """(T,)"""
-    position: Array = _column("state", "position", _JOINTS)
-    """[rad] (T, joints)"""
-    velocity: Array = _column("state", "velocity", _JOINTS)
-    """[rad/s] (T, joints)"""
-    torque: Array = _column("state", "torque", _JOINTS)
-    """[N m] (T, joints)"""
-    temperature: Array = _column("state", "temperature", _JOINTS)
-    """Of the motors [deg C]. (T, joints)"""
-    gyro: Array = _column("state", "gyro", 3)
-    """[rad/s] (T, 3)"""
-    accelerometer: Array = _column("state", "accelerometer", 3)
-    """[m/s^2] (T, 3)"""
-    orientation: Array = _column("state", "orientation", 4)
-    """w, x, y, z (T, 4)"""
-    bus_voltage: Array = _column("state", "bus_voltage")
-    """[V] (T,)"""
-    desired: Array = _column("desired", "position", _JOINTS)
-    """Targets before the filter [rad]. (T, joints)"""
-    sent: Array = _column("sent", "position", _JOINTS)
-    """Targets after it [rad]; NaN while damped. (T, joints)"""
-    blend: Array = _column("desired", "blend")
-    """Share of the policy. (T,)"""
-    stiffness: Array = _column("sent", "stiffness")
-    """Share of the drives' own. (T,)"""
-    damped: NDArray[np.bool_] = _column("sent", "damped", dtype=np.bool_)
-    """(T,)"""
-    level: NDArray[np.int64] = _column("sent", "level", dtype=np.int64)
-    """A `FilterAction`. (T,)"""
-    reason: NDArray[np.int64] = _column("sent", "reason", dtype=np.int64)
-    """A `Reason`. (T,)"""
-    action_number: NDArray[np.int64] = _column("desired", "action", dtype=np.int64)
-    """Number of the policy's action in force; -1 for none. (T,)"""
-    lateness: Array = _column("timing", "lateness")
-    """(T,)"""
-    work: Array = _column("timing", "work")
-    """From the begin of the tick until the command was on the wire. (T,)"""
-    state_age: Array = _column("timing", "state_age")
-    """(T,)"""
-    latency: Array = _column("timing", "latency")
-    """From a state to the first command computed from it; NaN between. (T,)"""
-    step_time: Array = _step("t")
-    """When each policy step began. (P,)"""
-    step_live: NDArray[np.bool_] = _step("live", dtype=np.bool_)
-    """Whether the policy was in charge. (P,)"""
-    step_lateness: Array = _step("lateness")
-    """(P,)"""
-    decision: Array = _step("decision")
-    """Time of observation and network. (P,)"""
-    step_state_age: Array = _step("state_age")
-    """(P,)"""
-    command: Array = _step("command", 3)
-    """Commanded by the operator: forward, left [m/s], yaw rate [rad/s]. (P, 3)"""
-    jump: NDArray[np.bool_] = _step("jump", dtype=np.bool_)
-    """(P,)"""
-    observation: Array = _step("observation", MEASURED_SIZE, topic="observation")
-    """(P, 105)"""
-    action: Array = _step("action", _JOINTS)
-    """(P, joints)"""
-    target: Array = _step("target", _JOINTS)
-    """[rad] (P, joints)"""
-    contact: Array = _step("contact", 4)
-    """Estimated. (P, 4)"""
-    linear_velocity: Array = _step("linear_velocity", 3)
-    """Estimated [m/s]. (P, 3)"""
+    ticks: NDArray[Any]
+    """Records of `TICK`. (T,)"""
+    steps: NDArray[Any]
+    """Records of `STEP`. (P,)"""
     events: tuple[DeployEvent, ...]
     complete: bool
     """True if the end was written and no record was lost."""
@@ -394,6 +273,45 @@ class DeployLog:
     """What ended the reading early; empty if nothing did."""
     source: str
     sha256: str
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        """An array by its name."""
+        if name in _TICK_NAMES:
+            found = self.ticks[_TICK_NAMES[name]]
+        elif name in _STEP_NAMES:
+            found = self.steps[_STEP_NAMES[name]]
+        elif name in (STEP.names or ()) and name not in ("deadline", "begun", "done"):
+            found = self.steps[name]
+        elif name in (TICK.names or ()):
+            found = self.ticks[name]
+        else:
+            raise AttributeError(name)
+        return found.astype(bool) if name in _FLAGS else found
+
+    @property
+    def lateness(self) -> NDArray[np.float64]:
+        """Of each tick. (T,)."""
+        return np.asarray(self.ticks["begun"] - self.ticks["deadline"])
+
+    @property
+    def work(self) -> NDArray[np.float64]:
+        """From the begin of the tick until the command was on the wire. (T,)."""
+        return np.asarray(self.ticks["done"] - self.ticks["begun"])
+
+    @property
+    def state_age(self) -> NDArray[np.float64]:
+        """Of the newest state at a tick. (T,)."""
+        return np.asarray(self.ticks["begun"] - self.ticks["time"])
+
+    @property
+    def step_lateness(self) -> NDArray[np.float64]:
+        """Of each step. (P,)."""
+        return np.asarray(self.steps["begun"] - self.steps["deadline"])
+
+    @property
+    def decision(self) -> NDArray[np.float64]:
+        """Time of observation and network. (P,)."""
+        return np.asarray(self.steps["inferred"] - self.steps["observed"])
 
     @property
     def virtual(self) -> bool:
@@ -406,140 +324,87 @@ class DeployLog:
         return tuple(self.header["joints"])
 
 
-_COLUMNS = {each.name: each.metadata for each in fields(DeployLog) if each.metadata}
-
-
 def is_deploy_log(path: Path) -> bool:
     """Whether the first message of a file is the header of a deployment's log."""
     try:
         with path.open("rb") as file:
             for batch in records(file, path.stat().st_size):
                 for record in batch:
-                    return record.topic == ROOT + "header"
+                    return record.topic == _HEADER
     except (OSError, DamagedError):
         pass
     return False
 
 
-def read_deploy_log(path: Path, *, only: Collection[str] | None = None) -> DeployLog:
+def read_deploy_log(path: Path) -> DeployLog:
     """Read a log; one that was cut anywhere gives what came before.
 
-    The file's text is read chunk by chunk and never held as a whole.
-
-    Args:
-        path: The log.
-        only: Names of the arrays of `DeployLog` to read; the others have no rows. None for all.
-
     Raises:
-        LogError: Not a deployment's log, or cut before its first tick; or there is no such array.
+        LogError: Not a deployment's log, or cut before its first tick.
     """
-    wanted = set(_COLUMNS if only is None else only)
-    if unknown := wanted - set(_COLUMNS):
-        raise LogError(
-            f"{path}: unknown arrays {', '.join(sorted(unknown))}; "
-            f"the arrays of a log are {', '.join(_COLUMNS)}."
-        )
-    found = _Columns(wanted)
+    messages: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
+    messages[_TICK], messages[_STEP] = [np.empty(0, TICK)], [np.empty(0, STEP)]
     damage = ""
     try:
-        with path.open("rb") as file:
-            for batch in records(file, path.stat().st_size, MOST_BYTES):
-                found.take((record.topic, record.data) for record in batch)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
-    except DamagedError as error:
-        damage = str(error)
-    except _WRONG as error:
-        raise _foreign(path, error) from None
-    if not found.header:
-        raise LogError(f"{path}: {_NO_LOG}")
-    if found.header.get("schema") != SCHEMA:
-        raise LogError(
-            f"{path}: schema {found.header.get('schema')!r}; this pronk reads {SCHEMA!r}."
-        )
-    try:
-        arrays = found.arrays()
-        if not found.ticks:
+        try:
+            with path.open("rb") as file:
+                for batch in records(file, path.stat().st_size, MOST_BYTES):
+                    _take(messages, batch)
+        except DamagedError as error:
+            damage = str(error)
+        if not messages[_HEADER]:
+            raise LogError(
+                f"{path}: not a log of a deployment; `pronk deploy POLICY --log FILE` writes one."
+            )
+        header = messages[_HEADER][0]
+        if header.get("schema") != SCHEMA:
+            raise LogError(f"{path}: schema {header.get('schema')!r}; this pronk reads {SCHEMA!r}.")
+        ticks, steps = np.concatenate(messages[_TICK]), np.concatenate(messages[_STEP])
+        if not len(ticks):
             raise LogError(f"{path}: cut before the first tick; nothing to read.")
-        end = found.end
+        end = messages[_END][0] if messages[_END] else {}
         return DeployLog(
-            header=found.header,
-            **arrays,
-            events=tuple(DeployEvent(time=row.pop("t"), **row) for row in found.events),
+            header=header,
+            ticks=ticks,
+            steps=steps,
+            events=tuple(DeployEvent(**row) for row in messages[_EVENT]),
             complete=bool(end.get("complete", False)) and not damage,
             figures=end.get("figures", {}),
             damage=damage,
             source=str(path),
             sha256=sha256(path),
         )
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
     except _WRONG as error:
-        raise _foreign(path, error) from None
+        raise LogError(
+            f"{path}: its messages are not those of {SCHEMA} ({type(error).__name__})."
+        ) from None
 
 
-def _foreign(path: Path, error: Exception) -> LogError:
-    return LogError(f"{path}: its messages are not those of {SCHEMA} ({type(error).__name__}).")
-
-
-class _Columns:
-    """The rows of a log so far, as an array per chunk; messages not wanted are only counted."""
-
-    def __init__(self, wanted: Collection[str]) -> None:
-        self.header: dict[str, Any] = {}
-        self.events: list[dict[str, Any]] = []
-        self.end: dict[str, Any] = {}
-        self.ticks = 0
-        self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in wanted}
-        self._counts = {each["topic"]: 0 for each in _COLUMNS.values()}
-
-    def take(self, batch: Iterable[tuple[str, bytes]]) -> None:
-        """Take the messages of a chunk: topic and JSON.
-
-        Raises:
-            KeyError: A message lacks a field.
-            TypeError: A field is not a number.
-            ValueError: A field has another shape, or a message is not JSON.
-        """
-        chunk: dict[str, list[bytes]] = {}
-        for topic, data in batch:
-            if topic.startswith(ROOT):
-                chunk.setdefault(topic.removeprefix(ROOT), []).append(data)
-        for topic, messages in chunk.items():
-            if topic in self._counts:
-                self._take_rows(topic, messages)
-            elif topic == "event":
-                self.events += map(orjson.loads, messages)
-            elif topic == "end":
-                self.end = orjson.loads(messages[0])
-            elif topic == "header" and not self.header:
-                self.header = orjson.loads(messages[0])
-
-    def _take_rows(self, topic: str, messages: list[bytes]) -> None:
-        self._counts[topic] += len(messages)
-        wanted = [name for name in self._rows if _COLUMNS[name]["topic"] == topic]
-        if not wanted:
-            return
+def _take(messages: dict[str, list[Any]], batch: list[Record]) -> None:
+    """Add the messages of a chunk, ticks and steps as arrays."""
+    for topic, found in messages.items():
+        data = [record.data for record in batch if record.topic == topic]
         # One parse for all of them: four times faster than one by one.
-        rows = orjson.loads(b"[" + b",".join(messages) + b"]")
-        for name in wanted:
-            key, dtype = _COLUMNS[name]["key"], _COLUMNS[name]["dtype"]
-            values = np.array([row[key] for row in rows], dtype=dtype)  # None becomes NaN
-            if values.shape[1:] != self._shape(name):
-                raise ValueError(f"rows of the shape {values.shape[1:]}")
-            self._rows[name].append(values)
+        rows = orjson.loads(b"[" + b",".join(data) + b"]")
+        kind = {_TICK: TICK, _STEP: STEP}.get(topic)
+        found += rows if kind is None or not rows else [_table(rows, kind)]
 
-    def _shape(self, name: str) -> tuple[int, ...]:
-        joints = len(self.header["joints"])
-        return tuple(joints if size == _JOINTS else size for size in _COLUMNS[name]["shape"])
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """The columns; a chunk ends between any two messages, so only full rows are kept."""
-        whole = {True: set[int](), False: set[int]()}
-        for each in _COLUMNS.values():
-            whole[each["tick"]].add(self._counts[each["topic"]])
-        self.ticks = min(whole[True])
-        arrays = {}
-        for name, each in _COLUMNS.items():
-            none = np.empty((0, *self._shape(name)), each["dtype"])
-            arrays[name] = np.concatenate([none, *self._rows.get(name, [])])
-            arrays[name] = arrays[name][: min(whole[each["tick"]])]
-        return arrays
+def _table(rows: list[dict[str, Any]], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Messages as records; null becomes NaN.
+
+    Raises:
+        KeyError: A message lacks a field.
+        TypeError: A field is not a number.
+        ValueError: A field has another shape.
+    """
+    table = np.zeros(len(rows), dtype=kind)
+    for name in kind.names or ():
+        of = kind[name]
+        values = np.array([row[name] for row in rows], dtype=of.base)
+        if values.shape != (len(rows), *of.shape):
+            raise ValueError(f"{name} has the shape {values.shape[1:]}")
+        table[name] = values
+    return table
