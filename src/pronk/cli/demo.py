@@ -282,17 +282,17 @@ def figures_of(
     result: MatchResult, replays: list[JointPrediction], trial: Results | None
 ) -> dict[str, Any]:
     """Collect the figures for `--json`."""
-    from pronk.cli.match import figures_of as match_figures
-    from pronk.cli.predict import row_of
+    from pronk.cli.match import prediction_rows
+    from pronk.cli.match import summary as match_summary
     from pronk.cli.trial import figures as trial_figures
     from pronk.report.paper import published
 
     paper = published(ROBOT)
     assert paper is not None
-    return match_figures(result) | {
+    return match_summary(result) | {
         "cells_from_table_1": {
             name: cells_apart(result, name, paper.joints[name]) for name in result.joints
         },
-        "predictions": [row_of(one) for one in replays],
+        "predictions": prediction_rows(replays),
         "trial": trial_figures(trial) if trial is not None else None,
     }

@@ -1,26 +1,26 @@
-"""`pronk match`: grid, refinement, ranges, page."""
+"""`pronk match`, `pronk predict` and `pronk export`: gains, replays with them, export."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
-from pronk.cli import console, logs
+from pronk.cli import console
+from pronk.cli.options import Reading
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
+    from pronk.match.prediction import JointPrediction
     from pronk.match.result import MatchResult
 
-
 Mode = Literal["gains", "drive"]
-"""What is looked for."""
-
-
 Interval = Literal["student", "bootstrap"]
-"""How intervals are made from repeats."""
+Target = Literal["mjlab", "mjcf", "isaaclab"]
 
 
 def match(
@@ -35,39 +35,43 @@ def match(
     phase: bool = False,
     simulator: str = "mujoco",
     device: str = "cpu",
-    reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
+    reading: Reading = Reading(),  # noqa: B008
     json_file: console.JsonFile = None,
 ) -> None:
-    """Find the gains that make the simulator answer like the robot.
+    """Find the gains with which the simulator responds like the robot.
 
     Args:
         paths: Logs, or folders of logs.
         robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF.
         out: The gains file.
-        mode: gains: stiffness and damping (the paper's), the default. drive: stiffness
-            is known; damping, armature, friction and delay are looked for.
+        mode: gains: stiffness and damping (the paper's). drive: damping, armature, friction and
+            delay at known stiffness.
         quick: Search the linearized model, verify by simulation.
         zero_armature: Repeat the search without rotor inertia.
-        free: drive: look for this instead; repeat it. What the sweeps cannot tell is
-            refused.
+        free: drive: fit this instead; repeat it. What the sweeps cannot tell apart is refused.
         interval: 95 % intervals over repeats; the bootstrap needs eight.
-        phase: Let the refinement see the phase and a free delay.
+        phase: Refine on the phase too, with a free delay.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
             pronk[train]).
-        json_file: Also write the figures to this file.
         reading: How logs are read.
+        json_file: Also write the figures to this file.
     """
+    from pronk.match import gains as gains_file
+    from pronk.match import result as result_file
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
+    from pronk.report.match_page import write_page
     from pronk.robots import load_robot
 
-    machine = load_robot(robot)
+    known = load_robot(robot)
     if out.suffix not in (".yaml", ".yml"):
         raise PronkError(
             f"--out {out}: expected a name that ends in .yaml, for instance gains.yaml."
         )
-    read = logs.read(paths, reading, machine)
+    if free and mode != "drive":
+        raise PronkError("--fit names what --mode drive fits; give --mode drive as well.")
+    logs = reading.read(paths, known)
     settings = MatchSettings(
         method="quick" if quick else "grid",
         zero_armature=zero_armature,
@@ -76,17 +80,24 @@ def match(
         device=device,
         simulator=simulator,
     )
-    if free and mode != "drive":
-        raise PronkError("--fit names what --mode drive looks for; say --mode drive as well.")
     with console.progress() as report:
-        result = match_logs(read, machine, mode=mode, free=free, settings=settings, progress=report)
-        page = write(result, out, report)
+        result = match_logs(logs, known, mode=mode, free=free, settings=settings, progress=report)
+        gains_file.save(out, result.gains)
+        result_file.save(out.parent / "match.npz", result)
+        report("page", 0.0)
+        page = write_page(out.parent, gains=out.name)
+        report("page", 1.0)
     show(result)
-    figures = figures_of(result)
+    figures = summary(result)
     if any(np.isfinite(joint.rmse) for joint in result.joints.values()):
         show_arm(result)
-        held = {name: joint.held for name, joint in result.joints.items() if joint.held}
-        figures |= {"mode": mode, "held": held, "rmse": rmse_of(result)}
+        joints = result.joints.items()
+        figures["mode"] = mode
+        figures["held"] = {name: joint.held for name, joint in joints if joint.held}
+        figures["rmse"] = {
+            name: {"published": joint.published_rmse, "matched": joint.rmse}
+            for name, joint in joints
+        }
     console.wrote(out, out.parent / "match.npz", page)
     console.write_json(json_file, figures)
     console.following(
@@ -96,70 +107,20 @@ def match(
     )
 
 
-def rmse_of(result: MatchResult) -> dict[str, dict[str, float]]:
-    """Error in time of each joint over the logs that were fitted [rad]."""
-    return {
-        name: {"published": joint.published_rmse, "matched": joint.rmse}
-        for name, joint in result.joints.items()
-    }
-
-
-def show_arm(result: MatchResult) -> None:
-    """Print what belongs to the gains of an arm, and its error in time."""
-    made = console.table(
-        "Several joints moved at once, so the whole arm was fitted in time",
-        "joint",
-        "armature [kg m^2]",
-        "dry friction [N m]",
-        "command delay [ms]",
-        "RMSE published [rad]",
-        "RMSE matched [rad]",
-    )
-    for name, joint in result.joints.items():
-        console.row(
-            made,
-            name,
-            console.number(joint.armature, 4),
-            console.number(joint.frictionloss, 3),
-            console.number(1000.0 * joint.delay_s, 1),
-            console.number(joint.published_rmse, 4),
-            console.number(joint.rmse, 4),
-        )
-    console.show(made)
-    for name, reason in result.excluded.items():
-        console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
-
-
-def write(result: MatchResult, out: Path, report: console.Reporter) -> Path:
-    """Write the gains, `match.npz` and the page beside each other; return the page's path."""
-    from pronk.match import gains as gains_file
-    from pronk.match import result as result_file
-    from pronk.report.match_page import write_page
-
-    gains_file.save(out, result.gains)
-    result_file.save(out.parent / "match.npz", result)
-    report("page", 0.0)
-    page = write_page(out.parent, gains=out.name)
-    report("page", 1.0)
-    return page
-
-
-def figures_of(result: MatchResult) -> dict[str, Any]:
-    """What `--json` gives of a match."""
+def summary(result: MatchResult) -> dict[str, Any]:
+    """Figures of a match, for JSON."""
     from pronk.report.match_page import verdict
+
+    def zero(name: str) -> float | None:
+        fit = result.joints.get(name)
+        return fit.zero_armature_error_db if fit else None
 
     return verdict(result) | {
         "gains": {
-            name: {
-                "stiffness": gains.stiffness,
-                "damping": gains.damping,
-                "stiffness_ci95": gains.stiffness_ci95,
-                "damping_ci95": gains.damping_ci95,
+            name: vars(gains)
+            | {
                 "grid": [gains.grid_stiffness, gains.grid_damping],
-                "delay_s": gains.delay_s,
-                "error_db": gains.error_db,
-                "naive_error_db": gains.naive_error_db,
-                "zero_armature_error_db": zero_of(result, name),
+                "zero_armature_error_db": zero(name),
             }
             for name, gains in result.gains.joints.items()
         },
@@ -169,12 +130,6 @@ def figures_of(result: MatchResult) -> dict[str, Any]:
     }
 
 
-def zero_of(result: MatchResult, name: str) -> float:
-    """Best error without rotor inertia [dB]; NaN where it was not looked for."""
-    joint = result.joints.get(name)
-    return float("nan") if joint is None else joint.zero_armature_error_db
-
-
 def show(result: MatchResult) -> None:
     """Print the gains, with the paper's beside them where there are any."""
     from pronk.report.match_page import failure_flags
@@ -182,46 +137,196 @@ def show(result: MatchResult) -> None:
 
     paper = published(result.gains.robot)
     where = "the virtual robot" if result.gains.virtual else "the robot"
+    rows, flags = [], []
+    for name, gains in result.gains.joints.items():
+        failures = failure_flags(result, name)
+        flags += [f"* {name}: {flag}" for flag in failures]
+        known = paper.joints.get(name) if paper else None
+        rows.append(
+            [
+                name + (" *" if failures else ""),
+                f"{gains.stiffness:.2f}",
+                _interval(gains.stiffness_ci95, 2),
+                f"{gains.damping:.3f}",
+                _interval(gains.damping_ci95, 3),
+                *([f"{known[0]:g} / {known[1]:g}" if known else "-"] if paper else []),
+                console.number(gains.naive_error_db),
+                console.number(gains.error_db),
+            ]
+        )
     made = console.table(
-        f"Gains of the simulator that answers like {where} ({result.gains.robot})",
+        f"Gains of the simulator that responds like {where} ({result.gains.robot})",
         "joint",
         "stiffness [N m/rad]",
         "95 %",
         "damping [N m s/rad]",
         "95 %",
         *(["paper, Table I"] if paper else []),
-        "gain error naive [dB]",
+        "gain error nominal [dB]",
         "matched [dB]",
+        rows=rows,
     )
-    for name, gains in result.gains.joints.items():
-        known = paper.joints.get(name) if paper else None
-        console.row(
-            made,
-            name + (" *" if failure_flags(result, name) else ""),
-            f"{gains.stiffness:.2f}",
-            _interval(gains.stiffness_ci95, 2),
-            f"{gains.damping:.3f}",
-            _interval(gains.damping_ci95, 3),
-            *([f"{known[0]:g} / {known[1]:g}" if known else "-"] if paper else []),
-            console.number(gains.naive_error_db),
-            console.number(gains.error_db),
-        )
     console.show(made)
-    groups = console.table("For training", "group", "stiffness [N m/rad]", "damping [N m s/rad]")
-    for name, group in result.gains.groups.items():
-        console.row(
-            groups,
+    groups = (
+        [
             name,
             f"{group.stiffness:g} +- {group.stiffness_range:g}",
             f"{group.damping:g} +- {group.damping_range:g}",
-        )
-    console.show(groups)
-    for name in result.gains.joints:
-        for flag in failure_flags(result, name):
-            console.say(f"* {name}: {flag}")
+        ]
+        for name, group in result.gains.groups.items()
+    )
+    columns = ("group", "stiffness [N m/rad]", "damping [N m s/rad]")
+    console.show(console.table("For training", *columns, rows=groups))
+    for flag in flags:
+        console.say(flag)
 
 
 def _interval(bounds: tuple[float, float], digits: int) -> str:
-    if bounds[0] == bounds[1]:
-        return "held"
-    return f"{console.number(bounds[0], digits)} to {console.number(bounds[1], digits)}"
+    low, high = (console.number(bound, digits) for bound in bounds)
+    return "held" if bounds[0] == bounds[1] else f"{low} to {high}"
+
+
+def show_arm(result: MatchResult) -> None:
+    """Print what belongs to the gains of an arm that was fitted in time, and its error."""
+    made = console.table(
+        "Several joints moved at once, so the whole arm was fitted in time",
+        "joint",
+        "armature [kg m^2]",
+        "dry friction [N m]",
+        "command delay [ms]",
+        "RMSE published [rad]",
+        "RMSE matched [rad]",
+        rows=(
+            [
+                name,
+                console.number(joint.armature, 4),
+                console.number(joint.frictionloss, 3),
+                console.number(1000.0 * joint.delay_s, 1),
+                console.number(joint.published_rmse, 4),
+                console.number(joint.rmse, 4),
+            ]
+            for name, joint in result.joints.items()
+        ),
+    )
+    console.show(made)
+    for name, reason in result.excluded.items():
+        console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
+
+
+def predict(
+    paths: tyro.conf.Positional[tuple[Path, ...]],
+    robot: str,
+    gains: Path,
+    out: Path | None = None,
+    simulator: str = "mujoco",
+    reading: Reading = Reading(),  # noqa: B008
+    json_file: console.JsonFile = None,
+) -> None:
+    """Replay logs in the simulator with nominal and with matched gains; RMSE and R2 per joint.
+
+    Args:
+        paths: Logs, or folders of logs.
+        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF.
+        gains: gains.yaml of `pronk match`.
+        out: Folder for replays and figures; beside the gains.
+        simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
+        reading: How logs are read.
+        json_file: Also write the figures to this file.
+    """
+    from pronk.match import gains as gains_file
+    from pronk.match import prediction as prediction_file
+    from pronk.match.predict import predict as predict_log
+    from pronk.report import figures, style
+    from pronk.robots import load_robot
+
+    known, matched = load_robot(robot), gains_file.load(gains)
+    logs = reading.read(paths, known)
+    fitted = [log.source for log in logs if log.sha256 and log.sha256 in matched.logs.values()]
+    folder = out if out is not None else gains.parent
+    rows: list[dict[str, Any]] = []
+    written: list[Path] = []
+    excluded: dict[str, str] = {}
+    with console.progress() as report:
+        done = report.bar("predict")
+        for i, log in enumerate(logs):
+            found = predict_log(log, known, matched, simulator=simulator)
+            excluded |= found.excluded
+            stem = Path(log.source or "log").stem
+            path = folder / f"{stem}.prediction.npz"
+            prediction_file.save(path, replace(found, source=Path(log.source).name))
+            written.append(path)
+            for one in found.joints:
+                name = stem if stem == one.joint else f"{stem}.{one.joint}"
+                figure = figures.prediction(one, virtual=log.virtual)
+                written.append(style.save(figure, folder / f"{name}.prediction.svg"))
+            rows += [row | {"log": log.source} for row in prediction_rows(found.joints)]
+            done((i + 1) / len(logs))
+    virtual = any(log.virtual for log in logs)
+    made = console.table(
+        "Replayed logs of the virtual robot" if virtual else "Replayed logs",
+        "joint",
+        "signal",
+        "RMSE nominal",
+        "nominal with the delay",
+        "RMSE matched",
+        "unit",
+        "matched / nominal",
+        "R2 nominal",
+        "R2 matched",
+        rows=(
+            [
+                row["joint"],
+                row["signal"].replace("_", " "),
+                console.number(row["rmse_naive"], 4),
+                console.number(row["rmse_naive_delayed"], 4),
+                console.number(row["rmse_matched"], 4),
+                row["unit"],
+                console.number(row["rmse_matched"] / (row["rmse_naive"] or float("nan"))),
+                console.number(row["r2_naive"], 3),
+                console.number(row["r2_matched"], 3),
+            ]
+            for row in rows
+        ),
+    )
+    console.show(made)
+    for source in fitted:
+        console.warn(f"{source} was used by these gains: this is a check of the fit.")
+    for reason in excluded.values():
+        console.say(f"left out: {reason}")
+    console.wrote(*written)
+    console.write_json(json_file, {"predictions": rows, "fitted_on": fitted, "excluded": excluded})
+    if (folder / "match.npz").exists():
+        console.following(f"pronk report {folder}   # puts these replays on the page")
+
+
+def prediction_rows(found: Iterable[JointPrediction]) -> list[dict[str, Any]]:
+    """Figures of replays, for the table and for JSON."""
+    names = ("joint", "signal", "unit", "rmse_naive", "rmse_naive_delayed", "rmse_matched")
+    return [{n: getattr(one, n) for n in (*names, "r2_naive", "r2_matched")} for one in found]
+
+
+def export(
+    gains: tyro.conf.Positional[Path],
+    to: Target,
+    out: Path,
+    robot: str | None = None,
+    json_file: console.JsonFile = None,
+) -> None:
+    """Write matched gains as actuator configuration of mjlab, MuJoCo or Isaac Lab.
+
+    Args:
+        gains: gains.yaml of `pronk match`.
+        to: What reads the file.
+        out: The file to write.
+        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF; the gains' if left out.
+        json_file: Also write the figures to this file.
+    """
+    from pronk.files import write_text
+    from pronk.match import gains as gains_file
+    from pronk.match.export import export_text
+    from pronk.robots import load_robot
+
+    text = export_text(gains_file.load(gains), to, load_robot(robot) if robot else None)
+    write_text(out, text)
+    console.wrote(out)
+    console.write_json(json_file, {"written": out, "to": to})

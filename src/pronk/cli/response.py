@@ -1,4 +1,4 @@
-"""`pronk response`: the answer of every joint, as a table and as Bode plots."""
+"""`pronk response`: frequency responses as a table and as Bode plots."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from pronk.cli import console, logs
+from pronk.cli import console
+from pronk.cli.options import Reading
+from pronk.errors import LogError
 
 if TYPE_CHECKING:
+    from pronk.logs.joint_log import JointLog
     from pronk.response.response import FrequencyResponse
 
-
 COHERENT = 0.95
-"""Coherence from which on a frequency counts as answered."""
+"""Least coherence of a frequency that counts as measured."""
 
 
 def response(
@@ -22,66 +24,77 @@ def response(
     robot: str | None = None,
     out: Path | None = None,
     plots: bool = True,
-    reading: logs.ReadingOptions = logs.ReadingOptions(),  # noqa: B008
+    reading: Reading = Reading(),  # noqa: B008
     json_file: console.JsonFile = None,
 ) -> None:
     """Estimate the frequency response of every joint that was excited.
 
     Args:
         paths: Logs, or folders of logs.
-        robot: Robot, where the log does not say.
+        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF; the log's if left out.
         out: Folder for what is written; beside the log if left out.
         plots: Draw Bode plots.
-        json_file: Also write the figures to this file.
         reading: How logs are read.
+        json_file: Also write the figures to this file.
     """
     from pronk.report import figures, style
     from pronk.response import Estimator, estimate, save
     from pronk.robots import load_robot
 
-    read = logs.read(paths, reading, load_robot(robot) if robot else None)
-    settings = Estimator()
+    logs = reading.read(paths, load_robot(robot) if robot else None)
     rows: list[dict[str, Any]] = []
     written: list[Path] = []
     with console.progress() as report:
         done = report.bar("estimate")
-        for i, log in enumerate(read):
-            excited = logs.excited_joints(log)
+        for i, log in enumerate(logs):
+            source = Path(log.source or "log")
+            folder, stem = out or source.parent, source.stem
             found: list[FrequencyResponse] = []
-            for k, joint in enumerate(excited):
-                found += estimate(log, joint, settings)
-                done((i + (k + 1) / (len(excited) + 1)) / len(read))
-            folder, stem = logs.home(log, out)
-            path = folder / f"{stem}.response.npz"
-            save(path, found)
-            written.append(path)
-            if plots:
-                for joint in excited:
-                    mine = [r for r in found if r.joint == joint]
-                    name = stem if excited == (stem,) else f"{stem}.{joint}"
-                    written.append(
-                        style.save(figures.responses(mine), folder / f"{name}.response.svg")
-                    )
-            rows += [figures_of(r) | {"log": log.source} for r in found]
-            done((i + 1) / len(read))
-    show(rows, virtual=any(log.virtual for log in read))
-    for log in read:
+            for joint in (joints := excited_joints(log)):
+                mine = estimate(log, joint, Estimator())
+                found += mine
+                if plots:
+                    name = stem if joints == (stem,) else f"{stem}.{joint}"
+                    path = folder / f"{name}.response.svg"
+                    written.append(style.save(figures.responses(mine), path))
+            save(folder / f"{stem}.response.npz", found)
+            written.append(folder / f"{stem}.response.npz")
+            rows += [summary(one) | {"log": log.source} for one in found]
+            done((i + 1) / len(logs))
+    show(rows)
+    for log in logs:
         for note in log.notes:
             console.say(f"note: {Path(log.source).name}: {note}")
     console.wrote(*written)
     console.write_json(json_file, {"responses": rows, "written": written})
-    name = robot or read[0].robot or "ROBOT"
+    name = robot or logs[0].robot or "ROBOT"
     where = " ".join(str(path) for path in paths)
     console.following(f"pronk match {where} --robot {name} --out gains.yaml")
 
 
-def figures_of(found: FrequencyResponse) -> dict[str, Any]:
-    """What the table says of one response."""
+def excited_joints(log: JointLog) -> tuple[str, ...]:
+    """Joints of the log's segments; without segments, those whose command moves.
+
+    Raises:
+        LogError: There is none.
+    """
+    named = {name for segment in log.segments for name in segment.joints}
+    moving = log.command.max(axis=0) > log.command.min(axis=0)
+    pairs = zip(log.joints, moving, strict=True)
+    excited = tuple(name for name, moves in pairs if (name in named if log.segments else moves))
+    if not excited:
+        raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
+    return excited
+
+
+def summary(found: FrequencyResponse) -> dict[str, Any]:
+    """Figures of one response, for the table and for JSON."""
     import numpy as np
 
     hz = found.frequency_hz
     coherent = hz[found.coherence >= COHERENT]
-    inside = found.band(float(coherent.min()), float(coherent.max())) if len(coherent) else hz > 0.0
+    band = [float(coherent.min()), float(coherent.max())] if len(coherent) else None
+    inside = found.band(*band) if band else hz > 0.0
     peak = int(np.argmax(np.where(inside, found.gain, -np.inf)))
     return {
         "joint": found.joint,
@@ -89,7 +102,7 @@ def figures_of(found: FrequencyResponse) -> dict[str, Any]:
         "amplitude_rad": found.amplitude,
         "repeats": len(found.repeats),
         "estimator": found.estimator,
-        "coherent_hz": [float(coherent.min()), float(coherent.max())] if len(coherent) else None,
+        "coherent_hz": band,
         "coherence_min": float(found.coherence[inside].min()),
         "peak_db": float(20.0 * np.log10(found.gain[peak])),
         "peak_hz": float(hz[peak]),
@@ -100,50 +113,38 @@ def figures_of(found: FrequencyResponse) -> dict[str, Any]:
 
 
 def bandwidth_hz(found: FrequencyResponse) -> float:
-    """Frequency at which the gain falls 3 dB below that at the lowest frequency [Hz].
+    """Frequency at which the gain falls 3 dB below that at the lowest frequency, interpolated [Hz].
 
-    Only frequencies after the last one above that level count, so a noisy dip is not taken for
-    the end of the band; NaN if the gain never falls, interpolated between the two neighbours.
+    It lies after the last coherent frequency above that level, so that a noisy dip is not taken for
+    the end of the band; NaN if the gain never falls.
     """
     import numpy as np
 
     level = found.gain[0] / np.sqrt(2.0)
-    reliable = found.coherence >= 0.5
-    above = np.flatnonzero((found.gain >= level) & reliable)
+    above = np.flatnonzero((found.gain >= level) & (found.coherence >= 0.5))
     if len(above) == 0 or above[-1] + 1 >= len(found.gain):
         return float("nan")
-    i = int(above[-1])
-    return float(np.interp(-level, -found.gain[i : i + 2], found.frequency_hz[i : i + 2]))
+    ends = slice(above[-1], above[-1] + 2)
+    return float(np.interp(-level, -found.gain[ends], found.frequency_hz[ends]))
 
 
-def show(rows: list[dict[str, Any]], *, virtual: bool) -> None:
+def show(rows: list[dict[str, Any]]) -> None:
     """Print the table of responses."""
-    made = console.table(
-        "Responses of the virtual robot" if virtual else "Responses",
-        "joint",
-        "amplitude [rad]",
-        "repeats",
-        f"coherence >= {COHERENT} [Hz]",
-        "least there",
-        "peak [dB]",
-        "at [Hz]",
-        "-3 dB at [Hz]",
-        "command delay [ms]",
-        "third harmonic [%]",
-    )
-    for row in rows:
-        band = row["coherent_hz"]
-        console.row(
-            made,
-            row["joint"],
-            f"{row['amplitude_rad']:.3g}",
-            str(row["repeats"]),
-            f"{band[0]:.2g} to {band[1]:.3g}" if band else "none",
-            console.number(row["coherence_min"], 3),
-            console.number(row["peak_db"]),
-            console.number(row["peak_hz"]),
-            console.number(row["bandwidth_hz"]),
-            console.number(1000.0 * row["delay_s"], 1),
-            console.number(100.0 * row["third_harmonic"], 1),
-        )
-    console.show(made)
+    virtual = any(row["virtual"] for row in rows)
+    columns = {
+        "joint": lambda row: row["joint"],
+        "amplitude [rad]": lambda row: f"{row['amplitude_rad']:.3g}",
+        "repeats": lambda row: str(row["repeats"]),
+        f"coherence >= {COHERENT} [Hz]": lambda row: (
+            "{:.2g} to {:.3g}".format(*row["coherent_hz"]) if row["coherent_hz"] else "none"
+        ),
+        "least there": lambda row: console.number(row["coherence_min"], 3),
+        "peak [dB]": lambda row: console.number(row["peak_db"]),
+        "at [Hz]": lambda row: console.number(row["peak_hz"]),
+        "-3 dB at [Hz]": lambda row: console.number(row["bandwidth_hz"]),
+        "command delay [ms]": lambda row: console.number(1000.0 * row["delay_s"], 1),
+        "third harmonic [%]": lambda row: console.number(100.0 * row["third_harmonic"], 1),
+    }
+    cells = ([make(row) for make in columns.values()] for row in rows)
+    title = "Responses of the virtual robot" if virtual else "Responses"
+    console.show(console.table(title, *columns, rows=cells))
