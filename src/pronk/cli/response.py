@@ -131,20 +131,33 @@ def bandwidth_hz(found: FrequencyResponse) -> float:
 def show(rows: list[dict[str, Any]]) -> None:
     """Print the table of responses."""
     virtual = any(row["virtual"] for row in rows)
-    columns = {
-        "joint": lambda row: row["joint"],
-        "amplitude [rad]": lambda row: f"{row['amplitude_rad']:.3g}",
-        "repeats": lambda row: str(row["repeats"]),
-        f"coherence >= {COHERENT} [Hz]": lambda row: (
-            "{:.2g} to {:.3g}".format(*row["coherent_hz"]) if row["coherent_hz"] else "none"
-        ),
-        "least there": lambda row: console.number(row["coherence_min"], 3),
-        "peak [dB]": lambda row: console.number(row["peak_db"]),
-        "at [Hz]": lambda row: console.number(row["peak_hz"]),
-        "-3 dB at [Hz]": lambda row: console.number(row["bandwidth_hz"]),
-        "command delay [ms]": lambda row: console.number(1000.0 * row["delay_s"], 1),
-        "third harmonic [%]": lambda row: console.number(100.0 * row["third_harmonic"], 1),
-    }
-    cells = ([make(row) for make in columns.values()] for row in rows)
-    title = "Responses of the virtual robot" if virtual else "Responses"
-    console.show(console.table(title, *columns, rows=cells))
+    cells = (
+        [
+            row["joint"],
+            f"{row['amplitude_rad']:.3g}",
+            str(row["repeats"]),
+            "{:.2g} to {:.3g}".format(*row["coherent_hz"]) if row["coherent_hz"] else "none",
+            console.number(row["coherence_min"], 3),
+            console.number(row["peak_db"]),
+            console.number(row["peak_hz"]),
+            console.number(row["bandwidth_hz"]),
+            console.number(1000.0 * row["delay_s"], 1),
+            console.number(100.0 * row["third_harmonic"], 1),
+        ]
+        for row in rows
+    )
+    made = console.table(
+        "Responses of the virtual robot" if virtual else "Responses",
+        "joint",
+        "amplitude [rad]",
+        "repeats",
+        f"coherence >= {COHERENT} [Hz]",
+        "least there",
+        "peak [dB]",
+        "at [Hz]",
+        "-3 dB at [Hz]",
+        "command delay [ms]",
+        "third harmonic [%]",
+        rows=cells,
+    )
+    console.show(made)
