@@ -80,9 +80,9 @@ MACHINE = """\
 """
 
 BODY = """\
-trunk:                            # no two robots weigh the same, and none what its CAD says
+trunk:                            # no two robots weigh the same, and none as much as its CAD model
   mass_offset: 0.25               # kg over the nominal 12: cables, markers, guards
-  com_offset: [0.006, -0.003, 0.004]  # m; the battery is not where the drawing has it
+  com_offset: [0.006, -0.003, 0.004]  # m; the battery is not at its place in CAD
   inertia_scale: [1.06, 0.96, 0.98]   # a shell that was scaled, not weighed (mini_cheetah.xml)
 attitude:                         # of a MEMS unit with its own filter, data sheet class VN-100:
   bias: [0.006, -0.004, 0.0]      # 0.5 deg static (mounting and accelerometer)
@@ -96,17 +96,17 @@ ground:
 """
 
 HEADER = f"""\
-# What is true of the virtual Mini Cheetah. Written by: python scripts/calibrate_sim_params.py
+# Parameters of the virtual Mini Cheetah. Written by: python scripts/calibrate_sim_params.py
 #
 # Sources and reasons of the numbers of the joints (joint side unless said otherwise):
-#   torque_scale, viscous  turned until an honest match lands on the paper's Table I; the knees
+#   torque_scale, viscous  tuned until a correct match lands on the paper's Table I; the knees
 #                          need the most, because the training simulator's explicit 5 ms step
-#                          already answers as if its gains were a sixth higher, and the paper's
+#                          already responds as if its gains were a sixth higher, and the paper's
 #                          knees are a quarter above 17 / 0.4. Wrong torque constants of this size
 #                          come from peak current taken for effective current (factor 1.41).
-#   link_inertia_scale     CAD against what a scale says: some per cent, seed {SEED}
+#   link_inertia_scale     CAD against weighed masses: some per cent, seed {SEED}
 #   rotor_inertia          63e-6 kg m^2 +- 3 %, motor side: Cheetah-Software's figure, where the
-#                          simulator believes the paper's 72e-6 (reading A11)
+#                          training simulator has the paper's 72e-6 (reading A11)
 #   belt_stiffness         rotor and link ring at about 130 Hz (hips: gears) and 160 Hz (knee: belt
 #                          through the thigh), above the band; 4 % of critical damping
 #   coulomb                0.13 to 0.17 N m +- 20 %; the simulator has 0.2 (Cheetah-Software)
@@ -119,7 +119,7 @@ HEADER = f"""\
 
 
 def designed() -> SimParams:
-    """The parameters before the two knobs are turned."""
+    """The parameters before tuning."""
     import yaml
 
     rng = np.random.default_rng(SEED)
