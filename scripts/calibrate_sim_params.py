@@ -24,7 +24,7 @@ from pronk.logs.mcap_log import read_mcap
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
-from pronk.runtime.sweep import record
+from pronk.runtime.sweep import SweepTask, record
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import (
     SCHEMA,
@@ -168,7 +168,8 @@ def matched(
     plan = make_plan(robot, [name], amplitudes=(0.25,), repeats=1)
     machine = VirtualRobot(robot, sim_params, legs=(name.split("_")[0],))
     with tempfile.TemporaryDirectory() as folder:
-        logs = [read_mcap(path) for path in record(machine, robot, plan, Path(folder))]
+        task = SweepTask(plan=plan, out_dir=Path(folder))
+        logs = [read_mcap(path) for path in record(machine, task)]
     settings = MatchSettings(method=method, zero_armature=False)  # type: ignore[arg-type]
     found = match_logs(logs, robot, settings=settings).joints[name]
     return np.array([found.stiffness, found.damping]), found.error_db, found.naive_error_db

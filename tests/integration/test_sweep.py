@@ -16,7 +16,7 @@ from pronk.links.machine import Command, State
 from pronk.logs.mcap_log import read_mcap
 from pronk.robots import load_robot
 from pronk.runtime.safety import filtered
-from pronk.runtime.sweep import logged_joints, record
+from pronk.runtime.sweep import SweepTask, logged_joints, record
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params
 
@@ -55,10 +55,15 @@ def plan_of(*joints: str, **options: object) -> SweepPlan:
     return make_plan(ROBOT, joints, SHORT, **settings)  # type: ignore[arg-type]
 
 
+def sweep(machine: Watched, plan: SweepPlan, out_dir: Path, **options: Any) -> list[Path]:
+    progress = options.pop("progress", lambda share, what: None)
+    return record(machine, SweepTask(plan=plan, out_dir=out_dir, **options), progress)
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Watched, SweepPlan, list[Path]]:
     machine, plan = Watched(), plan_of("FR_hip_roll", "FR_knee")
-    return machine, plan, record(machine, ROBOT, plan, tmp_path_factory.mktemp("sweep"))
+    return machine, plan, sweep(machine, plan, tmp_path_factory.mktemp("sweep"))
 
 
 Recorded = tuple[Watched, SweepPlan, list[Path]]
@@ -139,10 +144,6 @@ def test_no_sample_belongs_to_two_excitations(recorded: Recorded) -> None:
     assert first.stop < second.start
 
 
-def interrupted(tmp_path: Path, machine: Watched, plan: SweepPlan, **options: Any) -> None:
-    record(machine, plan.robot, plan, tmp_path, **options)
-
-
 class Slipping(Watched):
     """A knee's encoder slips in the middle of a sweep."""
 
@@ -171,7 +172,7 @@ def test_a_measured_state_beyond_a_limit_damps_and_keeps_the_log(
 ) -> None:
     watched = machine()
     with pytest.raises(HardwareError, match=why):
-        interrupted(tmp_path, watched, plan)
+        sweep(watched, plan, tmp_path)
     # At once where it happened, and again on the way out (closing damps too).
     assert watched.calls[-4:] == ["damp", "damp", "close", "damp"]
     log = read_mcap(tmp_path / "FR_knee.mcap")
@@ -183,7 +184,7 @@ def test_a_command_beyond_a_limit_is_clamped_by_the_filter(tmp_path: Path) -> No
     """The plan excites by 0.2 rad about 1.6 rad; the filter keeps the command within the range."""
     joints = tuple(replace(j, range=(1.5, 1.7)) if "knee" in j.name else j for j in ROBOT.joints)
     plan = replace(plan_of("FR_knee"), robot=replace(ROBOT, joints=joints))
-    interrupted(tmp_path, Watched(), plan)
+    sweep(Watched(), plan, tmp_path)
     log = read_mcap(tmp_path / "FR_knee.mcap")
     commands = log.command[:, log.column("FR_knee")]
     np.testing.assert_allclose([commands.min(), commands.max()], [1.5, 1.7], atol=1e-5)
@@ -205,7 +206,7 @@ def test_every_command_of_a_sweep_passes_the_filter(
             super().send(command)
 
     monkeypatch.setattr("pronk.runtime.sweep.filtered", counted)
-    interrupted(tmp_path, Counted(), plan_of("FR_knee"))
+    sweep(Counted(), plan_of("FR_knee"), tmp_path)
     assert sent
     assert all(one is other for one, other in zip(sent, passed, strict=True))
 
@@ -218,7 +219,7 @@ def test_the_interrupt_key_damps_the_joints_and_keeps_the_log(tmp_path: Path) ->
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        interrupted(tmp_path, machine, plan_of("FR_knee"), progress=impatient)
+        sweep(machine, plan_of("FR_knee"), tmp_path, progress=impatient)
     assert "damp" in machine.calls
     assert "close" in machine.calls
     log = read_mcap(tmp_path / "FR_knee.mcap")
@@ -231,42 +232,35 @@ def test_a_silent_machine_is_an_error(tmp_path: Path) -> None:
     machine = Watched()
     machine.silent_after = 4.0
     with pytest.raises(HardwareError, match="sent no state between"):
-        interrupted(tmp_path, machine, plan_of("FR_knee"))
+        sweep(machine, plan_of("FR_knee"), tmp_path)
     assert not read_mcap(tmp_path / "FR_knee.mcap").complete
 
 
 def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:
     plan = plan_of("FR_hip_roll", "FR_knee", amplitudes=(0.1,))
     shares: list[float] = []
-    paths = record(
-        Watched(),
-        ROBOT,
-        plan,
-        tmp_path,
-        joints=["FR_knee"],
-        prefix="run1_",
-        progress=lambda share, _: shares.append(share),
-    )
-    assert [path.name for path in paths] == ["run1_FR_knee.mcap"]
-    assert [path.name for path in tmp_path.iterdir()] == ["run1_FR_knee.mcap"]
+    one = {"joints": ("FR_knee",), "progress": lambda share, _: shares.append(share)}
+    paths = sweep(Watched(), plan, tmp_path, **one)
+    assert [path.name for path in paths] == ["FR_knee.mcap"]
+    assert list(tmp_path.iterdir()) == paths
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1.0)
     with pytest.raises(HardwareError, match="none of FL_knee"):
-        record(Watched(), ROBOT, plan, tmp_path, joints=["FL_knee"])
+        sweep(Watched(), plan, tmp_path, joints=("FL_knee",))
 
 
 def test_a_log_in_the_way_is_not_lost(tmp_path: Path) -> None:
     kept = tmp_path / "FR_knee.mcap"
     kept.write_bytes(b"a day's work")
     with pytest.raises(HardwareError, match="FR_knee"):
-        record(Watched(), ROBOT, plan_of("FR_knee"), tmp_path)
+        sweep(Watched(), plan_of("FR_knee"), tmp_path)
     assert kept.read_bytes() == b"a day's work"
 
 
 def test_a_plan_that_could_exceed_a_limit_moves_nothing(tmp_path: Path) -> None:
     machine = Watched()
     with pytest.raises(PlanError, match="fits"):
-        record(machine, ROBOT, plan_of("FR_knee", amplitudes=(1.5,)), tmp_path)
+        sweep(machine, plan_of("FR_knee", amplitudes=(1.5,)), tmp_path)
     assert machine.calls == []
     assert list(tmp_path.iterdir()) == []
 
@@ -275,7 +269,7 @@ def test_a_machine_of_another_robot_is_refused(tmp_path: Path) -> None:
     machine = Watched()
     machine.robot = "so101"
     with pytest.raises(HardwareError, match="so101"):
-        record(machine, ROBOT, plan_of("FR_knee"), tmp_path)
+        sweep(machine, plan_of("FR_knee"), tmp_path)
 
 
 def test_the_leg_is_what_is_logged() -> None:

@@ -231,19 +231,18 @@ def record_virtual(
 
 
 def _record_limb(job: _Limb) -> list[Path]:
-    from pronk.runtime.sweep import record
+    from pronk.runtime.sweep import SweepTask, record
     from pronk.virtual.robot import VirtualRobot
 
     robot = job.plan.robot
-    return record(
-        VirtualRobot(robot, job.sim_params, seed=job.seed, legs=(job.limb,)),
-        robot,
-        job.plan,
-        job.out,
+    task = SweepTask(
+        plan=job.plan,
+        out_dir=job.out,
         joints=job.joints,
         overwrite=job.overwrite,
         metadata={"link": "virtual robot, in this program"},
     )
+    return record(VirtualRobot(robot, job.sim_params, seed=job.seed, legs=(job.limb,)), task)
 
 
 def record_wire(

@@ -51,7 +51,7 @@ from pronk.match.measured_joint import SimRequest, logs_by_joint, measured_joint
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots.robot import Robot
-from pronk.runtime.sweep import record
+from pronk.runtime.sweep import SweepTask, record
 from pronk.simulators.mujoco import MujocoSimulator
 from pronk.virtual.plant import legs_of
 from pronk.virtual.robot import VirtualRobot
@@ -256,8 +256,9 @@ class _Leg:
 def _sweep_leg(leg: _Leg) -> list[Path]:
     robot = leg.plan.robot
     machine = VirtualRobot(robot, leg.sim_params, seed=leg.seed, legs=(leg.leg,))
-    joints = [name for name in leg.plan.joints if name.split("_")[0] == leg.leg]
-    return record(machine, robot, leg.plan, leg.out, joints=joints, overwrite=True)
+    joints = tuple(name for name in leg.plan.joints if name.split("_")[0] == leg.leg)
+    task = SweepTask(plan=leg.plan, out_dir=leg.out, joints=joints, overwrite=True)
+    return record(machine, task)
 
 
 def match_body(

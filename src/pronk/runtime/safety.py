@@ -579,6 +579,8 @@ def tilt(orientation: Array) -> float:
 
 def _stacked(rows: Sequence[object], count: int) -> Array:
     """Rows of numbers; a row that is not `count` numbers is all NaN. (rows, count)."""
+    if all(row is None for row in rows):
+        return np.full((len(rows), count), np.nan)
     try:
         array = np.array(rows, dtype=float)
     except (TypeError, ValueError):

@@ -9,12 +9,13 @@ joints are left damped and the log up to then stays readable.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,28 +56,25 @@ class SweepTask:
     out_dir: Path
     joints: tuple[str, ...] | None = None
     """Record only these joints of the plan, so that several processes can share one."""
-    prefix: str = ""
-    """Begins the name of every file."""
     overwrite: bool = False
-    """Replace logs that are already there."""
+    """Replace logs that exist."""
     metadata: Mapping[str, str] = field(default_factory=dict)
     """Added to the logs' own, for instance the link."""
 
     @property
     def sets(self) -> list[tuple[str, ...]]:
         """Joints that are excited together; one log each."""
-        wanted = self.plan.joints if self.joints is None else self.joints
-        return [names for names in self.plan.sets if set(names) & set(wanted)]
+        chosen = set(self.plan.joints if self.joints is None else self.joints)
+        return [names for names in self.plan.sets if set(names) & chosen]
 
     @property
     def paths(self) -> list[Path]:
         """Of the logs."""
-        return [self.out_dir / f"{self.prefix}{_file_name(names)}.mcap" for names in self.sets]
+        return [self.out_dir / f"{'_and_'.join(names)}.mcap" for names in self.sets]
 
     def excitations(self, index: int) -> list[Ask]:
         """Excitations of one log."""
-        joints = self.sets[index]
-        return [ask for ask in self.plan.asks if ask.joints == joints]
+        return [ask for ask in self.plan.asks if ask.joints == self.sets[index]]
 
     @property
     def seconds(self) -> float:
@@ -90,7 +88,7 @@ class SweepTask:
         Raises:
             PlanError: The plan could exceed a limit.
             RobotError: A joint is unknown.
-            HardwareError: The plan does not excite a joint, or a log is in the way.
+            HardwareError: The plan does not excite a joint, or a log exists.
         """
         for name in self.joints or ():
             self.plan.robot.joint(name)
@@ -227,15 +225,14 @@ class SweepLogs:
             self._writer.flush()
 
 
-@dataclass(frozen=True, kw_only=True)
-class SweepStep:
+class SweepStep(NamedTuple):
     """The command of one tick."""
 
     target: Array
     """[rad] (joints,)"""
     stiffness: float = 1.0
     """Share of the plan's stiffness."""
-    frequency: float = np.nan
+    frequency: float = math.nan
     """Instantaneous, of the signal [Hz]."""
     segment: int = -1
     """Number of the excitation in its log; -1 between."""
@@ -263,11 +260,11 @@ class SweepController:
         """Begin on a machine that is connected.
 
         Args:
-            task: What to do.
+            task: The sweep.
             machine: Clamps joints.
             sink: Takes the log's records (`sample_dtype`).
             state: The newest.
-            real_time: Stiffen the joints first, and hold them while a person clamps others.
+            real_time: Stiffen the joints first, and hold them while the operator clamps others.
             progress: Called about twice a second of machine time.
             limits: Other values for the scalar limits of the filter.
         """
@@ -283,7 +280,7 @@ class SweepController:
             low=np.where(q < low, q - _SAG, low),
             high=np.where(q > high, q + _SAG, high),
         )
-        """Of the filter: as far out as the joints lay at first, until they are at the pose."""
+        """Of the filter: until the joints are at the pose, as wide as they were at first."""
         self._sink = sink
         record = np.zeros((), dtype=sample_dtype(len(self.plan.robot.joints)))
         record["virtual"] = machine.virtual
@@ -487,54 +484,29 @@ class SweepController:
 
 
 def record(
-    machine: Machine,
-    robot: Robot,
-    plan: SweepPlan,
-    out_dir: Path,
-    *,
-    progress: Progress | None = None,
-    prefix: str = "",
-    joints: Sequence[str] | None = None,
-    overwrite: bool = False,
-    metadata: Mapping[str, str] | None = None,
+    machine: Machine, task: SweepTask, progress: Progress = lambda share, what: None
 ) -> list[Path]:
-    """Carry out a plan on a machine whose clock waits; one MCAP file per joint.
-
-    The plan is checked first. The link is opened here and closed again.
+    """Carry out a sweep on a machine whose clock waits; the link is opened here and closed again.
 
     Args:
-        machine: The machine; not connected.
-        robot: The robot.
-        plan: What to excite.
-        out_dir: Folder for the logs; made if it is missing.
+        machine: Not connected.
+        task: The sweep; its plan is checked first.
         progress: Called about twice a second of machine time.
-        prefix: Begins the name of every file.
-        joints: Record only these joints of the plan, so that several processes can share it.
-        overwrite: Replace logs that are already there.
-        metadata: Added to the logs' own, for instance the link.
 
     Returns:
-        The files, in the order written.
+        The logs, in the order written.
 
     Raises:
         PlanError: The plan could exceed a limit.
         RobotError: A joint is unknown.
-        HardwareError: A log is in the way, the machine sends no states, or the filter stopped it.
-            The joints are then damped, and the log up to that moment is whole and says why.
+        HardwareError: A log exists, the machine sends no states, or the filter stopped the sweep.
+            The joints are then damped, and the log up to then is readable and has the reason.
     """
-    if machine.robot != robot.name or plan.robot.name != robot.name:
+    if machine.robot != task.plan.robot.name:
         raise HardwareError(
-            f"the machine is {machine.robot!r}, the plan is for {plan.robot.name!r} and the robot "
-            f"is {robot.name!r}; all three must be the same."
+            f"the machine is {machine.robot!r} and the plan is for {task.plan.robot.name!r}; both "
+            "must be the same."
         )
-    task = SweepTask(
-        plan=plan,
-        out_dir=out_dir,
-        joints=None if joints is None else tuple(joints),
-        prefix=prefix,
-        overwrite=overwrite,
-        metadata=metadata or {},
-    )
     task.check()
     machine.connect()
     try:
@@ -545,11 +517,11 @@ def record(
                 SweepLogs(task).replay,
                 state=machine.latest(),
                 real_time=False,
-                progress=progress or (lambda share, what: None),
+                progress=progress,
             )
         )
     finally:
-        # Every way out, the interrupt key included, leaves the joints damped.
+        # In every case, the interrupt key included, the joints are damped.
         machine.damp()
         machine.close()
     return task.paths
@@ -596,7 +568,3 @@ def logged_joints(robot: Robot, excited: Sequence[str]) -> tuple[str, ...]:
         joint = robot.joint(name)
         wanted |= {name, *joint.chain, *joint.clamped}
     return tuple(name for name in robot.joint_names if name in wanted)
-
-
-def _file_name(joints: Sequence[str]) -> str:
-    return joints[0] if len(joints) == 1 else f"together_{joints[0]}_and_{len(joints) - 1}_more"
