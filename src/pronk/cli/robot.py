@@ -11,7 +11,6 @@ from pronk.cli import console
 from pronk.errors import RobotError
 
 Action = Literal["new", "check"]
-"""What to do."""
 
 
 def robot(
@@ -23,24 +22,20 @@ def robot(
     """Write a filled-in robot.yaml for an MJCF or URDF, or check a robot.
 
     Args:
-        action: new: write a robot.yaml; check: say what is missing or inconsistent.
+        action: new: write a robot.yaml; check: list what is missing or inconsistent.
         path: MJCF or URDF for new; robot.yaml, its folder, or a model for check.
         out: The file to write; robot.yaml beside the model if left out.
-        overwrite: Replace a file that is already there.
+        overwrite: Replace a file that exists.
     """
-    if action == "new":
-        _new(path, out, overwrite)
-    else:
-        _check(path)
-
-
-def _new(path: Path, out: Path | None, overwrite: bool) -> None:
     from pronk.files import write_text
     from pronk.robots.bare import yaml_of_model
 
+    if action == "check":
+        _check(path)
+        return
     target = out or path.with_name("robot.yaml")
     if target.exists() and not overwrite:
-        raise RobotError(f"{target} is already there; give another --out, or --overwrite.")
+        raise RobotError(f"{target} exists; give another --out, or --overwrite.")
     if target.parent.resolve() != path.parent.resolve():
         raise RobotError(f"--out {target}: the robot.yaml belongs beside its model {path}.")
     write_text(target, yaml_of_model(path))
@@ -53,29 +48,20 @@ def _check(path: Path) -> None:
     from pronk.robots.model import bench_spec
 
     found = load_robot(path)
-    table = console.table(
-        f"{found.name}: {len(found.joints)} joints",
-        "joint",
-        "group",
-        "range [rad]",
-        "default [rad]",
-        "effort limit [N m]",
-        "chain",
-        "clamped",
-    )
-    problems = []
+    rows, problems = [], []
     for joint in found.joints:
         bench_spec(found, joint.name).compile()
         low, high = joint.range
-        console.row(
-            table,
-            joint.name,
-            joint.group,
-            f"{low:.2f} to {high:.2f}",
-            f"{joint.default_position:.2f}",
-            f"{joint.drive.effort_limit:.3g}",
-            " ".join(joint.chain),
-            " ".join(joint.clamped),
+        rows.append(
+            [
+                joint.name,
+                joint.group,
+                f"{low:.2f} to {high:.2f}",
+                f"{joint.default_position:.2f}",
+                f"{joint.drive.effort_limit:.3g}",
+                " ".join(joint.chain),
+                " ".join(joint.clamped),
+            ]
         )
         if not low < joint.default_position < high:
             problems.append(f"poses.default of {joint.name} is outside of its range")
@@ -83,7 +69,9 @@ def _check(path: Path) -> None:
             problems.append(f"the rotor inertia (armature) of {joint.name} is 0")
         if not joint.drive.frictionloss:
             problems.append(f"the dry friction (frictionloss) of {joint.name} is 0")
-    console.show(table)
+    columns = ("group", "range [rad]", "default [rad]", "effort limit [N m]", "chain", "clamped")
+    title = f"{found.name}: {len(found.joints)} joints"
+    console.show(console.table(title, "joint", *columns, rows=rows))
     for problem in problems:
         console.warn(problem)
-    console.say("nothing is inconsistent" if not problems else f"{len(problems)} to check")
+    console.say(f"{len(problems)} to check" if problems else "nothing is inconsistent")

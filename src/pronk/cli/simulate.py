@@ -17,19 +17,13 @@ if TYPE_CHECKING:
     from pronk.robots.robot import Robot
     from pronk.virtual.server import RobotServer, ServerTransport
 
-
 _PRIORITY = 30
 """Of SCHED_FIFO; below that of the commanding process."""
 _LATE_MS = 5.0
-"""Lateness of one tick in a hundred above which a virtual robot no longer moves like one [ms]."""
-
+"""Lateness of one tick in a hundred above which the measured timing is not representative."""
 
 WireLink = Literal["lcm", "dds"]
-"""Wire of the virtual robot."""
-
-
 Silence = Literal["hold", "zero", "damp"]
-"""What the drives do when commands stop."""
 
 
 def simulate(
@@ -59,7 +53,7 @@ def simulate(
         link: The wire.
         layout: Messages on LCM: Cheetah-Software's, or walk-these-ways'.
         base: bench: the trunk is fixed; ground: it stands and moves freely.
-        sim_params: Parameters of the virtual robot, instead of the shipped one.
+        sim_params: Parameters of the virtual robot, instead of the shipped ones.
         seed: Of all noise and all faults.
         port: UDP port on this computer (LCM); 7768 if left out.
         domain: Domain on this computer (DDS); 77 if left out, never 0.
@@ -72,8 +66,8 @@ def simulate(
             left out. LCM: stand_up, balance_stand, locomotion, recovery_stand; DDS:
             normal, ai, advanced, mcf.
         duration: End after this time, in s; Ctrl-C ends it too.
-        capture: Write what a motion-capture rig saw to this .npz (--base ground).
-        realtime: Ask the system for real-time scheduling.
+        capture: Write what a motion-capture rig would measure to this .npz (--base ground).
+        realtime: Request real-time scheduling.
         json_file: Also write the figures to this file.
     """
     from pronk.links.realtime import Wanted, enter
@@ -86,8 +80,7 @@ def simulate(
 
     if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
-    known = load_robot(robot)
-    wrong = parse_faults(faults)
+    known, wrong = load_robot(robot), parse_faults(faults)
     watchdog = Watchdog(action=silence, after_s=silence_after)
     machine = VirtualRobot(
         known,
@@ -98,9 +91,9 @@ def simulate(
     )
     if realtime:
         # Before the wire is open, so that its threads are scheduled alike.
-        for answer in enter(Wanted(priority=_PRIORITY, lock=False)):
-            console.say(answer)
-    wire, where = _open_wire(link, known, layout, port=port, domain=domain, mode=mode)
+        for granted in enter(Wanted(priority=_PRIORITY, lock=False)):
+            console.say(granted)
+    wire, where = _open_wire(link, known, layout, port, domain, mode)
     try:
         machine.connect()
         server = RobotServer(
@@ -118,23 +111,16 @@ def simulate(
     finally:
         wire.close()
         machine.close()
-    _tell(figures)
+    _report(figures)
     console.write_json(json_file, figures)
-    way = f"--link {link}"
-    way += f" --layout {layout}" if layout != "cheetah" else ""
-    way += f" --port {port}" if port is not None else ""
-    way += f" --domain {domain}" if domain is not None else ""
+    options = {"layout": layout if layout != "cheetah" else None, "port": port, "domain": domain}
+    words = [f"--{name} {value}" for name, value in options.items() if value is not None]
+    way = " ".join([f"--link {link}", *words])
     console.following(f"pronk sweep {robot} {way} --out DIR   # while a virtual robot runs")
 
 
 def _open_wire(
-    link: WireLink,
-    robot: Robot,
-    layout: Layout,
-    *,
-    port: int | None,
-    domain: int | None,
-    mode: str,
+    link: WireLink, robot: Robot, layout: Layout, port: int | None, domain: int | None, mode: str
 ) -> tuple[ServerTransport, str]:
     """The robot's end of the wire, and its address in words."""
     if link == "lcm":
@@ -157,7 +143,7 @@ def _open_wire(
 
 
 def _run(server: RobotServer, duration: float | None) -> None:
-    """Live until Ctrl-C, a SIGTERM, or the end of the time given."""
+    """Serve until Ctrl-C, a SIGTERM, or the end of the duration."""
     signals: list[int] = []
     end = time.monotonic() + duration if duration is not None else float("inf")
     before = {
@@ -171,8 +157,8 @@ def _run(server: RobotServer, duration: float | None) -> None:
             signal.signal(number, handler)
 
 
-def _tell(figures: dict[str, Any]) -> None:
-    """One line of what happened."""
+def _report(figures: dict[str, Any]) -> None:
+    """Print counts and punctuality."""
     wire: dict[str, int] = figures["wire"]
     refused = sum(count for name, count in wire.items() if name.startswith("refused"))
     late = figures["lateness_ms"]
@@ -184,8 +170,8 @@ def _tell(figures: dict[str, Any]) -> None:
     )
     if late["p99"] > _LATE_MS:
         console.warn(
-            f"1 in 100 ticks was late by {late['p99']:.0f} ms or more: this computer is too busy, "
-            "and what was measured on the wire is not what an idle one would give"
+            f"1 in 100 ticks was late by {late['p99']:.0f} ms or more: this computer is too busy "
+            "for timing measurements"
         )
     if figures["slipped_s"]:
         console.warn(
