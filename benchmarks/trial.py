@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -125,8 +124,7 @@ def run(
     (subject,) = load_subjects([policy], robot)
     plan = Plan(cases=(CASE,), jumps=1, seed=seed)
     chosen = sim_params or load_sim_params()
-    [(_, job)] = plan_jobs([subject], plan, robot=robot, sim_params=chosen, out=Path())
-    job = replace(job, keep=None)
+    [job] = plan_jobs([subject], plan, robot=robot, sim_params=chosen)
     recording = Recording(job)  # the warm-up as well
     done = iter(range(1, 2 * repeats + 1))
 

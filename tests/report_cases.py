@@ -11,15 +11,12 @@ from PIL import Image
 
 from pronk.evaluation import bodies, results, variation, walk
 from pronk.evaluation.bodies import Bodies, Body, GainsError
-from pronk.evaluation.course import CrossingFigures
-from pronk.evaluation.crossing import CROSSING
-from pronk.evaluation.jumps import JumpRules
-from pronk.evaluation.metrics import JumpFigures, measure
+from pronk.evaluation.crossing import CROSSING, CrossingFigures
+from pronk.evaluation.jumps import JumpFigures, JumpRules, measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.results import Kind, Results, Row, Subject
 from pronk.evaluation.variation import NOMINAL, VARIATION
-from pronk.evaluation.walk import WALK, walk_script
-from pronk.evaluation.walk_metrics import WalkFigures
+from pronk.evaluation.walk import WALK, WalkFigures, walk_script
 from pronk.match import gains as gains_file
 from pronk.match import prediction as prediction_file
 from pronk.match import result as match_file
@@ -225,7 +222,7 @@ def write_trial(
     *,
     keep: bool = False,
 ) -> Results:
-    """Write a trial measured by `pronk.evaluation.metrics` on closed-form jumps, and read it."""
+    """Write a trial measured by `pronk.evaluation.jumps` on closed-form jumps, and read it."""
     rules, rows = JumpRules(standing_height=STANDING), []
     for name in policies:
         for case in cases:

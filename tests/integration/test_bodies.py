@@ -16,9 +16,17 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import results, variation, walk
 from pronk.evaluation.bodies import gains_errors
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.random_params import GROUP_TORQUE, TOLERANCES, draw, save_sim_params
 from pronk.evaluation.trial import Plan
-from pronk.evaluation.variation import NOMINAL, VARIATION, Parameter, add_variation
+from pronk.evaluation.variation import (
+    GROUP_TORQUE,
+    NOMINAL,
+    TOLERANCES,
+    VARIATION,
+    Parameter,
+    add_variation,
+    draw_robot,
+    save_sim_params,
+)
 from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
@@ -37,7 +45,7 @@ QUICK = MatchSettings(method="quick", estimator=Estimator(segment_s=4.0), zero_a
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_draws_stay_within_their_tolerances(seed: int) -> None:
-    drawn = draw(SIM_PARAMS, ROBOT, seed=seed)
+    drawn = draw_robot(SIM_PARAMS, ROBOT, seed=seed)
     parts = {
         "machine": [(SIM_PARAMS.machine, drawn.machine)],
         "trunk": [(SIM_PARAMS.trunk, drawn.trunk)],
@@ -61,7 +69,7 @@ def test_draws_stay_within_their_tolerances(seed: int) -> None:
 
 
 def test_a_body_is_its_seed_and_its_file(tmp_path: Path) -> None:
-    one, again, other = (draw(SIM_PARAMS, ROBOT, seed=seed) for seed in (1, 1, 2))
+    one, again, other = (draw_robot(SIM_PARAMS, ROBOT, seed=seed) for seed in (1, 1, 2))
     assert one == again != other
     assert one.joints["FR_knee"] != SIM_PARAMS.joints["FR_knee"]
     path = tmp_path / "body" / "sim_params.yaml"
@@ -78,7 +86,7 @@ def test_a_body_is_its_seed_and_its_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_drawn_bodies_can_exist(seed: int) -> None:
-    VirtualRobot(ROBOT, draw(SIM_PARAMS, ROBOT, seed=seed), base="ground")
+    VirtualRobot(ROBOT, draw_robot(SIM_PARAMS, ROBOT, seed=seed), base="ground")
 
 
 # --- The Bode error of gains --------------------------------------------------------------------
@@ -135,7 +143,6 @@ def test_only_the_varied_number_differs(tmp_path: Path) -> None:
     assert repr(read.rows) == repr(found.rows)
     assert repr(read.cells) == repr(found.cells)
     assert variation.parameters_of(read) == (volts,)
-    assert len(variation.table(read).rows) == 2
 
 
 def test_a_walking_policy_stands(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 from command_line import invoke
 from pronk.errors import ArtefactError
 from pronk.evaluation import results, tables
-from pronk.evaluation.metrics import JumpFigures
+from pronk.evaluation.jumps import JumpFigures
 from pronk.match import gains as gains_file
 from pronk.report import build, match_page, trial_page
 from report_cases import CASES, match, walks, write_match, write_tree, write_trial

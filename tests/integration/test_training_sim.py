@@ -18,14 +18,17 @@ from pronk.evaluation.jumps import JumpRules, Series, measure_jump
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Spread
 from pronk.evaluation.training_sim.evaluation import (
+    JUMPS,
+    NEVER,
+    WALKS,
     CommandResult,
     EstimatorResult,
     Evaluation,
+    Plan,
     evaluate_policy,
     load_speed_errors,
     save,
 )
-from pronk.evaluation.training_sim.plan import JUMPS, NEVER, WALKS, Plan
 
 DT = 0.005
 
@@ -369,7 +372,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     """The folder of a run with one checkpoint of random weights, and its actor."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("mjlab")
-    from pronk.evaluation.training_sim.subject import blank_actor
+    from pronk.evaluation.training_sim.run import blank_actor
     from pronk.train.runner import checkpoint
     from pronk.train.runner.run_folder import RunFolder
 
@@ -388,7 +391,7 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
     torch = pytest.importorskip("torch")
     from tensordict import TensorDict
 
-    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.evaluation.training_sim.run import load_subject
     from pronk.robots import load_robot
     from pronk.train.gains import training_gains
 
@@ -411,7 +414,7 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
 @pytest.mark.train
 def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
     pytest.importorskip("mjlab")
-    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.evaluation.training_sim.run import load_subject
     from pronk.train.runner import checkpoint
 
     with pytest.raises(ArtefactError, match="no checkpoints in it; expected the folder of a run"):
@@ -436,7 +439,7 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
     pytest.importorskip("onnxruntime")
     from tensordict import TensorDict
 
-    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.evaluation.training_sim.run import load_subject
     from pronk.robots import load_robot
     from pronk.train.gains import training_gains
     from pronk.train.rl.export import contract_for, export_policy
@@ -479,7 +482,7 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
 def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> None:
     pytest.importorskip("mjlab")
     from pronk.cli.evaluate import run
-    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.evaluation.training_sim.run import load_subject
     from pronk.robots import load_robot
     from pronk.train.gains import training_gains
 

@@ -14,10 +14,9 @@ from command_line import invoke
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import results
-from pronk.evaluation.metrics import measure
-from pronk.evaluation.processes import in_processes
+from pronk.evaluation.jumps import measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
-from pronk.evaluation.trial import Plan, draw, load_subjects, prepare, run_trial
+from pronk.evaluation.trial import Plan, draw, in_processes, load_subjects, prepare, run_trial
 from pronk.files import sha256
 from pronk.runtime.script import STILL, Script
 from pronk.virtual import capture
@@ -39,20 +38,14 @@ def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def weak(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Called naive: it is thrown only half as far."""
+    """Trained with nominal gains; it jumps half as hard."""
     path = tmp_path_factory.mktemp("weak") / "policy.onnx"
-    gains = {
-        "gains": "naive",
-        "gains_sha256": "",
-        "stiffness": (17.0,) * 12,
-        "damping": (0.4,) * 12,
-    }
-    return write_hopper(path, 0.5, **gains)
+    gains = {"stiffness": (17.0,) * 12, "damping": (0.4,) * 12}
+    return write_hopper(path, 0.5, gains="naive", gains_sha256="", **gains)
 
 
 def go(policies: list[Path], out: Path, **changes: Any) -> results.Results:
-    kept: dict[str, Any] = {"robot": ROBOT, "sim_params": SIM_PARAMS, "out": out}
-    return run_trial(policies, PLAN, **(kept | changes))
+    return run_trial(policies, PLAN, robot=ROBOT, sim_params=SIM_PARAMS, out=out, **changes)
 
 
 # --- What is drawn ------------------------------------------------------------------------------
@@ -61,35 +54,29 @@ def go(policies: list[Path], out: Path, **changes: Any) -> results.Results:
 def test_every_jump_has_a_start_of_its_own() -> None:
     plan = Plan(spread_s=0.5)
     drawn = [draw(plan, case, n, ROBOT) for case in plan.cases for n in range(30)]
-    assert len({start.yaw for _, start, _ in drawn}) == len(drawn)
-    assert len({start.joint_offset for _, start, _ in drawn}) == len(drawn)
-    assert len({seed for _, _, seed in drawn}) == len(drawn)
+    for values in zip(
+        *((start.yaw, start.joint_offset, seed) for _, start, seed in drawn), strict=True
+    ):
+        assert len(set(values)) == len(drawn)
     later = {round((script.run_s - 2.5) * 50, 6) for script, _, _ in drawn}
     # Whole policy steps, from none to all 25 of them.
-    assert later <= set(range(26))
-    assert {0, 25} <= later
+    assert {0, 25} <= later <= set(range(26))
     offsets = [each for _, start, _ in drawn for each in start.joint_offset or ()]
-    assert 0.04 < max(offsets) <= 0.05
     assert -0.05 <= min(offsets) < -0.04
-
-
-def test_draws_depend_on_seed_command_and_number_alone() -> None:
+    assert 0.04 < max(offsets) <= 0.05
+    # Draws depend on seed, command and number alone.
     few = Plan(cases=PAPER_COMMANDS[3:4], jumps=2)
-    for number in range(2):
-        one, other = (draw(plan, PAPER_COMMANDS[3], number, ROBOT) for plan in (Plan(), few))
-        assert one == other
-    assert draw(replace(few, seed=1), PAPER_COMMANDS[3], 0, ROBOT) != one
+    assert draw(few, PAPER_COMMANDS[3], 1, ROBOT) == drawn[3 * 30 + 1]
+    assert draw(replace(few, seed=1), PAPER_COMMANDS[3], 1, ROBOT) != drawn[3 * 30 + 1]
 
 
 @pytest.mark.parametrize(
     ("changes", "what"),
     [
-        ({"jumps": 0}, "0 jumps for each command"),
+        ({"jumps": 0}, "0 jumps"),
         ({"seed": -1}, "seed -1"),
-        ({"cases": ()}, "the commands are none"),
+        ({"cases": ()}, "none"),
         ({"cases": PAPER_COMMANDS[:1] * 2}, "forward 1, forward 1"),
-        ({"spread_s": -0.1}, "Plan.spread_s"),
-        ({"joint_offset": float("nan")}, "Plan.joint_offset"),
     ],
 )
 def test_impossible_plans_are_refused(changes: dict[str, Any], what: str) -> None:
@@ -120,7 +107,7 @@ def test_the_number_of_processes_changes_no_digit(
     assert summaries[0] == summaries[1]
 
 
-def test_a_trial_says_what_it_ran(tried: Path, hopper: Path) -> None:
+def test_a_trial_keeps_what_it_ran(tried: Path, hopper: Path) -> None:
     made = results.load(tried)
     assert [subject.name for subject in made.subjects] == ["matched", "naive"]
     assert made.subjects[0].sha256 == sha256(hopper)
@@ -129,14 +116,11 @@ def test_a_trial_says_what_it_ran(tried: Path, hopper: Path) -> None:
     assert made.mass == pytest.approx(12.0)
     assert made.sim_params == {"sha256": "ab"}
     assert made.versions["mujoco"]
-    # The hop is real, and half a throw is a lower one.
+    # The hop is real, and half as hard is a lower one.
     strong, half = (made.cell(n, CASE.name).figures["height"].mean for n in ("matched", "naive"))
     assert 0.2 < strong < 0.5
     assert half < strong
-
-
-def test_what_is_kept_measures_the_same_again(tried: Path) -> None:
-    made = results.load(tried)
+    # What is kept measures the same again.
     kept = sorted(path.name for path in (tried / "captures").iterdir())
     assert kept == ["matched_forward_1_000.npz", "naive_forward_1_000.npz"]
     for row in made.rows:
@@ -170,7 +154,7 @@ def test_policies_are_named_apart(hopper: Path, weak: Path, tmp_path: Path) -> N
     assert [s.name for s in load_subjects([hopper, weak], ROBOT)] == ["matched", "naive"]
     other = write_hopper(tmp_path / "other.onnx", 0.7)
     assert [s.name for s in load_subjects([hopper, other], ROBOT)] == ["policy", "other"]
-    with pytest.raises(PronkError, match="same policy twice"):
+    with pytest.raises(PronkError, match="twice"):
         load_subjects([hopper, hopper], ROBOT)
 
 
@@ -182,50 +166,44 @@ def test_policies_are_named_apart(hopper: Path, weak: Path, tmp_path: Path) -> N
         ({"timestep_s": 0.002, "decimation": 10}, "timestep_s"),
         ({"robot": "spot"}, "robot"),
         ({"jump": False}, "walk only"),
+        (None, "not a network"),
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused(
-    changes: dict[str, Any], what: str, tmp_path: Path
+    changes: dict[str, Any] | None, what: str, tmp_path: Path
 ) -> None:
-    path = write_hopper(tmp_path / "policy.onnx", **changes)
+    path = tmp_path / "policy.onnx"
+    with pytest.raises(ArtefactError, match="no such file"):
+        go([path], tmp_path / "out")
+    if changes is None:
+        path.write_bytes(b"not a network")
+    else:
+        write_hopper(path, **changes)
     with pytest.raises(ArtefactError, match=what) as caught:
         go([path], tmp_path / "out")
-    assert str(caught.value).startswith(f"{path}: ")
+    assert str(path) in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ArtefactError, match="no such file"):
-        go([tmp_path / "policy.onnx"], tmp_path / "out")
-    (tmp_path / "policy.onnx").write_bytes(b"not a network")
-    with pytest.raises(ArtefactError, match="not a network that ONNX Runtime can run"):
-        go([tmp_path / "policy.onnx"], tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+def test_only_a_trial_is_overwritten(tmp_path: Path) -> None:
     prepare(tmp_path / "new")
     assert (tmp_path / "new").is_dir()
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(PronkError, match="a file; expected"):
-        prepare(tmp_path / "file")
-    with pytest.raises(PronkError, match="not empty"):
-        prepare(tmp_path)
-    with pytest.raises(PronkError, match="holds no trial"):
-        prepare(tmp_path, overwrite=True)
+    for out, overwrite, what in (
+        (tmp_path / "file", False, "a file"),
+        (tmp_path, False, "not empty"),
+        (tmp_path, True, "no trial"),
+        (tmp_path / "file" / "below", False, "cannot be written to"),
+    ):
+        with pytest.raises(PronkError, match=what):
+            prepare(out, overwrite=overwrite)
     assert (tmp_path / "file").read_text() == "mine"
-    with pytest.raises(PronkError, match="cannot be written to"):
-        prepare(tmp_path / "file" / "below")
-
-
-def test_overwriting_deletes_the_trial_and_nothing_else(tmp_path: Path) -> None:
-    (tmp_path / "captures").mkdir()
-    (tmp_path / "videos").mkdir()
+    old = tmp_path / "old"
     for name in ("trials.csv", "summary.json", "captures/a.npz", "videos/a.gif", "notes.txt"):
-        (tmp_path / name).write_text("old")
-    prepare(tmp_path, overwrite=True)
-    kept = sorted(path.name for path in tmp_path.rglob("*"))
-    assert kept == ["captures", "notes.txt", "videos"]
+        (old / name).parent.mkdir(exist_ok=True, parents=True)
+        (old / name).write_text("old")
+    prepare(old, overwrite=True)
+    assert sorted(path.name for path in old.rglob("*")) == ["captures", "notes.txt", "videos"]
 
 
 # --- The command --------------------------------------------------------------------------------
@@ -236,7 +214,7 @@ def test_the_command_writes_tables_page_and_figures(hopper: Path, tmp_path: Path
     words = ["trial", hopper, "--out", out, "--commands=0,-1", "--jumps", "1", "--processes", "1"]
     done = invoke([*words, "--no-video", "--definitions", "--json", figures])
     assert done.exit_code == 0, done.stderr
-    for text in ("side -1", "paper, matched", "not a real one", "Definitions", str(out)):
+    for text in ("side -1", "paper, matched", "Definitions", str(out)):
         assert text in done.stdout
     body = json.loads(figures.read_text())
     assert body["virtual"] is True

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from hopper import ROBOT, write_hopper
 from pronk import opengl
 from pronk.errors import PronkError
-from pronk.evaluation.jump_events import JumpEvents, jump_events
+from pronk.evaluation.jumps import JumpEvents, jump_events
 from pronk.evaluation.pictures import overlay, video
 from pronk.evaluation.pictures.film import FPS, Film, plan
 from pronk.evaluation.protocol import Case

@@ -1,4 +1,4 @@
-"""How sizes grow: practice, rungs, the largest that was crossed; and one real attempt."""
+"""Gaps and steps: the blocks, the trigger of the jump, what counts as crossed, and the search."""
 
 from __future__ import annotations
 
@@ -6,59 +6,194 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
-from pronk.evaluation import course, crossing, results
-from pronk.evaluation.course import CrossingFigures
+from pronk.evaluation import crossing, results
 from pronk.evaluation.crossing import (
     CROSSING,
+    Attempt,
+    CrossingFigures,
     CrossingPlan,
     Ladder,
-    Search,
+    Obstacle,
+    Operator,
     add_crossings,
     climbs,
+    direction,
+    judge,
+    lost,
+    search,
 )
+from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Results, Row, Subject
-from pronk.runtime.script import Script
+from pronk.runtime.script import STILL, Script
+from pronk.virtual.capture import Capture
+from pronk.virtual.ground import Ground
 from pronk.virtual.sim_params import load_sim_params
+from seen_jump import DELAY, SCRIPT, changed, seen_jump
+
+FORWARD, BACK, LEFT = (2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+GAP = Obstacle(kind="gap", size=0.3)
+# At 2 m/s the trunk of `seen_jump` is at 4.0 m at the jump input and at 4.4 m at lift-off; the
+# flight of 2 * 2.0 / g = 0.408 s takes it to 5.216 m. Feet stand 0.21 m before and behind it.
+SEEN = seen_jump(up=2.0, speed=2.0)
+TOOK_OFF, LANDED = 4.398 + 0.21, 5.216 - 0.21
+EDGE = 4.65
+
+
+def judged(
+    seen: Capture,
+    obstacle: Obstacle = GAP,
+    command: tuple[float, float, float] = FORWARD,
+    triggered: float | None = SCRIPT.on,
+) -> CrossingFigures:
+    return judge(seen, obstacle, command, edge=EDGE, triggered=triggered, rules=JumpRules())
+
+
+# --- The course ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "between", "after"),
+    [("gap", 0.0, -crossing.DEPTH, 0.0), ("up", 0.0, 0.3, 0.3), ("down", 0.0, -0.3, -0.3)],
+)
+@pytest.mark.parametrize(("command", "way"), [(FORWARD, (1, 0)), (BACK, (-1, 0)), (LEFT, (0, 1))])
+def test_the_floor_is_where_it_should_be(
+    kind: crossing.Shape,
+    before: float,
+    between: float,
+    after: float,
+    command: tuple[float, float, float],
+    way: tuple[int, int],
+) -> None:
+    own = Ground(friction=0.55, stiffness=20e3)
+    ground = Obstacle(kind=kind, size=0.3).on(own, command, 2.0)
+    assert (ground.friction, ground.stiffness) == (0.55, 20e3)
+    places = {0.0: before, 1.99: before, 2.01: between, 2.29: between, 2.31: after, 8.0: after}
+    for side in (0.0, 3.0):
+        for s, expected in places.items():
+            x, y = s * way[0] + side * way[1], s * way[1] + side * way[0]
+            assert ground.height(x, y) == pytest.approx(expected)
+    assert Obstacle(kind="flat").on(Ground(), command, 2.0) == Ground()
+
+
+@pytest.mark.parametrize("command", [(1.0, 1.0, 0.0), STILL])
+def test_a_course_leads_straight_on(command: tuple[float, float, float]) -> None:
+    with pytest.raises(PronkError, match="course"):
+        direction(command)
+
+
+def test_the_operator_looks_at_the_trunk() -> None:
+    script = Script(command=FORWARD, stand_s=1.0, jump_s=0.4, keep_s=0.2)
+    place = 5.0  # where it stands does not matter before it runs
+    operator = Operator(script, edge=2.0, lead=0.5, where=lambda: place)
+    assert operator(0.5) == (STILL, False)
+    place = 1.49
+    assert operator(1.0) == (FORWARD, False)
+    assert operator.triggered is None
+    place = 1.5
+    assert operator(1.02) == (FORWARD, True)
+    assert operator.triggered == 1.02
+    place = 0.0  # never taken back
+    assert [operator(t) for t in (1.40, 1.43, 1.63)] == [
+        (FORWARD, True),
+        (FORWARD, False),
+        (STILL, False),
+    ]
+
+
+def test_a_gap_that_was_crossed() -> None:
+    found = judged(SEEN)
+    assert found.success
+    assert found.take_off == pytest.approx(EDGE - TOOK_OFF, abs=1e-9)
+    assert found.reach == pytest.approx(TOOK_OFF - 4.0, abs=1e-9)
+    assert found.reach == pytest.approx(2.0 * (DELAY - 1e-3) + 0.21)
+    assert found.landing == pytest.approx(LANDED - EDGE - 0.3, abs=2e-3)
+    assert found.speed == pytest.approx(2.0)
+    aside = judged(seen_jump(up=2.0, speed=2.0, yaw=math.pi / 2), command=LEFT)
+    assert aside.landing == pytest.approx(found.landing)
+
+
+def span(begin: float, end: float | None = None) -> slice:
+    return slice(round(begin * 1000), None if end is None else round(end * 1000))
+
+
+LOW = changed(SEEN, "foot_position", (span(3.4, 3.45), 0), [4.8, 0.0, -0.01])
+"""A foot's centre is under the floor while it is over the gap."""
+LEANT = changed(SEEN, "orientation", span(5.5), [0.9, 0.0, 0.4359, 0.0])
+LAY = changed(SEEN, "orientation", span(4.5, 4.6), [0.7, 0.714, 0.0, 0.0])
+"""Upright at the end, but it lay on its side meanwhile."""
+
+
+@pytest.mark.parametrize(
+    ("seen", "size", "why"),
+    [
+        (LOW, 0.3, crossing.STEPPED_IN),
+        (changed(SEEN, "other_contact", 4000, True), 0.3, crossing.NON_FOOT_CONTACT),
+        (SEEN, 0.4, crossing.NOT_OVER),  # the hind feet come down 6 mm before the far edge
+        (LEANT, 0.3, crossing.FELL),
+        (LAY, 0.3, crossing.FELL),
+        (changed(SEEN, "position", (span(5.0), 0), 4.9), 0.3, crossing.NOT_OVER),  # went back
+    ],
+)
+def test_a_gap_that_was_not_crossed(seen: Capture, size: float, why: str) -> None:
+    assert judged(seen, Obstacle(kind="gap", size=size)).why == why
+
+
+def test_what_happens_elsewhere_does_not_count() -> None:
+    # A foot pressed into the floor beside the gap, a shank that touched before the jump.
+    low = changed(SEEN, "foot_position", (span(3.7, 3.75), 0, 2), -0.001)
+    assert judged(changed(low, "other_contact", span(0.0, 2.9), True)).success
+    assert judged(SEEN, triggered=None).why == crossing.NOT_TRIGGERED
+    # Steps have no bottom to fall into.
+    assert judged(LOW, Obstacle(kind="down", size=0.3)).success
+    up = judged(LOW, Obstacle(kind="up", size=0.3))
+    assert up.landing == pytest.approx(LANDED - EDGE, abs=2e-3)
+
+
+def test_a_lost_run_is_seen_at_once() -> None:
+    up = Obstacle(kind="up", size=0.3)
+    cases = ((SEEN, GAP), (LAY, GAP), (LOW, GAP), (LOW, up))
+    assert [lost(seen, obstacle, FORWARD, EDGE) for seen, obstacle in cases] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+
+
+# --- The search ---------------------------------------------------------------------------------
 
 SIM_PARAMS = load_sim_params()
 SUBJECT = Subject(name="matched", path="policy.onnx", sha256="0" * 64, contract={})
-CASE = Case(name="forward 2", command=(2.0, 0.0, 0.0))
-PLAN = CrossingPlan(
-    cases=(CASE,),
-    ladders={"gap": Ladder(first=0.1, step=0.1, leads=(0.0, 0.1))},
-    runs=3,
-    enough=2,
-    practice=2,
-    most=0.45,
-)
+CASE = Case(name="forward 2", command=FORWARD)
+LADDER = Ladder(first=0.1, step=0.1, leads=(0.0, 0.1))
+PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, practice=2, most=0.45)
 
 
-def start_search(plan: CrossingPlan = PLAN) -> Search:
-    return Search([SUBJECT], plan, robot=ROBOT, sim_params=SIM_PARAMS)
-
-
-def climb(crossed: dict[tuple[float, float], int]) -> list[Row]:
+def climb(
+    crossed: dict[tuple[float, float], int], plan: CrossingPlan = PLAN, reach: float = 0.5
+) -> tuple[list[Row], list[Attempt]]:
     """Climb with a robot that crosses so many runs of each size and lead beyond its reach."""
-    search = start_search()
-    while planned := search.next_round():
-        found = []
-        for row, task in planned:
-            kind, size = task.obstacle.kind, task.obstacle.size
-            if kind == "flat":
-                found.append(CrossingFigures(size=0.0, lead=0.0, reach=0.5 + 0.1 * row.number))
-                continue
-            good = row.number < crossed[size, round(task.lead - 0.55, 6)]
-            why = "" if good else course.NON_FOOT_CONTACT
-            found.append(CrossingFigures(obstacle=kind, size=size, lead=task.lead, why=why))
-        assert 0.0 <= search.share(0.5) <= 1.0
-        search.take([row for row, _ in planned], found)
-    assert search.share(0.0) == 1.0
-    return search.rows
+    done: list[Attempt] = []
+
+    def run(tasks: list[Attempt]) -> list[Row]:
+        done.extend(tasks)
+        return [replace(task.job.row, figures=figures(task)) for task in tasks]
+
+    def figures(task: Attempt) -> CrossingFigures:
+        kind, size, number = task.obstacle.kind, task.obstacle.size, task.job.row.number
+        if kind == "flat":
+            return CrossingFigures(size=0.0, lead=0.0, reach=reach + 0.1 * number)
+        good = number < crossed[size, round(task.lead - 0.55, 6)]
+        why = "" if good else crossing.NON_FOOT_CONTACT
+        return CrossingFigures(obstacle=kind, size=size, lead=task.lead, why=why)
+
+    return search([SUBJECT], plan, robot=ROBOT, sim_params=SIM_PARAMS, run=run), done
 
 
 def result(rows: list[Row]) -> Results:
@@ -76,66 +211,43 @@ def result(rows: list[Row]) -> Results:
 
 
 def test_sizes_grow_until_no_lead_does() -> None:
-    counts = {
-        (0.1, 0.0): 1,
-        (0.1, 0.1): 3,
-        (0.2, 0.0): 2,
-        (0.2, 0.1): 2,
-        (0.3, 0.0): 0,
-        (0.3, 0.1): 1,
+    counts = ((1, 3), (2, 2), (0, 1))
+    crossed = {
+        (round(0.1 * size, 6), lead): count
+        for size, pair in enumerate(counts, start=1)
+        for lead, count in zip(LADDER.leads, pair, strict=True)
     }
-    rows = climb(counts)
+    rows, _ = climb(crossed)
     # Two jumps of practice, then three runs for each of two leads at three sizes.
     assert len(rows) == 2 + 3 * 2 * 3
     (found,) = climbs(result(rows))
     assert [rung.size for rung in found.rungs] == [0.1, 0.2, 0.3]
     assert [(rung.crossed, rung.runs) for rung in found.rungs] == [(3, 3), (2, 3), (1, 3)]
     assert [rung.lead for rung in found.rungs] == pytest.approx([0.65, 0.55, 0.65])
-    assert found.rungs[0].reasons == {course.NON_FOOT_CONTACT: 2}
+    assert found.rungs[0].reasons == {crossing.NON_FOOT_CONTACT: 2}
     assert (found.largest, found.ever) == (0.2, 0.3)
-
-
-def test_a_larger_gap_does_not_count_without_the_smaller() -> None:
-    rows = climb({(0.1, 0.0): 0, (0.1, 0.1): 1})
-    more = [
-        replace(row, figures=replace(row.figures, size=0.2, why=""))
-        for row in rows
-        if row.figures.obstacle == "gap"
-    ]
+    # A larger gap does not count without the smaller.
+    rows, _ = climb({(0.1, 0.0): 0, (0.1, 0.1): 1})
+    more = [replace(row, figures=replace(row.figures, size=0.2, why="")) for row in rows[2:]]
     (found,) = climbs(result([*rows, *more]))
     assert (found.largest, found.ever) == (0.0, 0.2)
 
 
 def test_a_robot_that_does_not_jump_crosses_nothing() -> None:
-    search = start_search()
-    planned = search.next_round()
-    search.take([row for row, _ in planned], [CrossingFigures(reach=math.nan)] * len(planned))
-    assert search.next_round() == []
-    assert climbs(result(search.rows))[0].rungs == ()
+    rows, _ = climb({}, reach=math.nan)
+    assert len(rows) == PLAN.practice
+    assert climbs(result(rows))[0].rungs == ()
 
 
 def test_starts_depend_on_command_and_number_alone() -> None:
     def starts(plan: CrossingPlan) -> list[object]:
-        search = start_search(plan)
-        return [(task.job.start, task.job.seed) for _, task in search.next_round()]
+        return [(a.job.start, a.job.row.seed) for a in climb({}, plan, reach=math.nan)[1]]
 
-    other = Case(name="back 2", command=(-2.0, 0.0, 0.0))
+    other = Case(name="back 2", command=BACK)
     both = starts(replace(PLAN, cases=(other, CASE)))
-    assert both[2:] == starts(PLAN)
-    assert starts(replace(PLAN, seed=1)) != starts(PLAN)
+    assert both[2:] == starts(PLAN) != starts(replace(PLAN, seed=1))
     for start, _ in both[2:]:  # type: ignore[misc]
         assert -crossing.PHASE_S * 2.0 <= start.position[0] <= 0.0
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"enough": 4}, {"practice": 0}, {"cases": (Case(name="x", command=(1.0, 1.0, 0.0)),)}],
-)
-def test_impossible_plans_are_refused(changes: dict[str, object]) -> None:
-    with pytest.raises(PronkError, match="expected"):
-        replace(PLAN, **changes)  # type: ignore[arg-type]
-    with pytest.raises(PronkError, match="sizes must be positive"):
-        Ladder(first=0.1, step=0.0, leads=(0.0,))
 
 
 def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
@@ -145,10 +257,10 @@ def test_a_hopper_that_does_not_run_never_comes_to_the_edge(
     monkeypatch.setattr(crossing, "LATE", 0.2)  # half a second is enough to see it stand
     policy = write_hopper(tmp_path / "policy.onnx")
     slow = Case(name="forward", command=(0.2, 0.0, 0.0))
-    plan = replace(
-        PLAN, cases=(slow,), practice=1, script=Script(command=slow.command, stand_s=0.1)
-    )
+    script = Script(command=slow.command, stand_s=0.1)
+    plan = replace(PLAN, cases=(slow,), practice=1, script=script)
     found = add_crossings([policy], plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path)
-    assert [row.figures.why for row in found.rows] == [course.NOT_TRIGGERED]
+    assert [row.figures.why for row in found.rows] == [crossing.NOT_TRIGGERED]
     assert climbs(found)[0].largest == 0.0
     assert repr(results.load(tmp_path, CROSSING).rows) == repr(found.rows)
+    assert np.isnan(found.rows[0].figures.reach)

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hopper import ROBOT
-from pronk.evaluation.walk import walk_script
-from pronk.evaluation.walk_metrics import SETTLE_S, WalkFigures, measure_walk
+from pronk.evaluation.walk import SETTLE_S, WalkFigures, measure_walk, walk_script
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 from seen_jump import STANDING, changed
@@ -24,23 +23,14 @@ COMMAND = (2.0, 0.0, 0.5)
 
 
 def walked(
-    forward: float = 1.8,
-    left: float = 0.1,
-    yaw_rate: float = 0.5,
-    sway: float = 0.0,
-    seconds: float = 8.0,
+    forward: float = 1.8, left: float = 0.1, yaw_rate: float = 0.5, sway: float = 0.0
 ) -> Capture:
     """A trunk that moves at constant velocities in its own frame, and may sway sideways at 4 Hz."""
-    time = np.arange(round(seconds / DT)) * DT
+    time = np.arange(round(8.0 / DT)) * DT
     yaw = yaw_rate * time
     side = left + sway * np.sin(2.0 * np.pi * 4.0 * time)
-    velocity = np.column_stack(
-        [
-            forward * np.cos(yaw) - side * np.sin(yaw),
-            forward * np.sin(yaw) + side * np.cos(yaw),
-            np.zeros(len(time)),
-        ]
-    )
+    cos, sin, still = np.cos(yaw), np.sin(yaw), np.zeros(len(time))
+    velocity = np.column_stack([forward * cos - side * sin, forward * sin + side * cos, still])
     position = np.cumsum(velocity, axis=0) * DT
     position[:, 2] = STANDING
     orientation = np.zeros((len(time), 4))

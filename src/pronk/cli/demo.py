@@ -144,8 +144,7 @@ def jump_and_film(
     from dataclasses import replace
 
     from pronk.cli.trial import painted
-    from pronk.evaluation.processes import cores
-    from pronk.evaluation.trial import Plan, run_trial
+    from pronk.evaluation.trial import Plan, cores, run_trial
     from pronk.files import sha256
     from pronk.robots import load_robot
     from pronk.virtual.sim_params import SHIPPED, load_sim_params

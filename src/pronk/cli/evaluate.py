@@ -13,9 +13,8 @@ from pronk.cli import console
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.evaluation.training_sim.evaluation import Evaluation
-    from pronk.evaluation.training_sim.plan import Plan
-    from pronk.evaluation.training_sim.subject import Subject
+    from pronk.evaluation.training_sim.evaluation import Evaluation, Plan
+    from pronk.evaluation.training_sim.run import Subject
     from pronk.train.gains import TrainingGains
 
 
@@ -52,7 +51,7 @@ def evaluate(
         seed: Of all draws.
         device: auto: a GPU if there is one. On the CPU take a few robots.
     """
-    from pronk.evaluation.training_sim.plan import JUMPS, WALKS, Plan
+    from pronk.evaluation.training_sim.evaluation import JUMPS, WALKS, Plan
     from pronk.robots import load_robot
     from pronk.train.gains import training_gains
     from pronk.train.runner.devices import find_devices, require_extra
@@ -73,7 +72,7 @@ def evaluate(
     from pronk.cli.trial import show
     from pronk.evaluation.tables import evaluation_sheets
     from pronk.evaluation.training_sim.evaluation import load_speed_errors, save
-    from pronk.evaluation.training_sim.subject import load_subject
+    from pronk.evaluation.training_sim.run import load_subject
 
     errors = {} if before is None else load_speed_errors(before)
     subject = load_subject(policy, where)

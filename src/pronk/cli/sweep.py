@@ -204,7 +204,7 @@ def record_virtual(
     Returns:
         The logs, in the order of the robot's joints.
     """
-    from pronk.evaluation.processes import in_processes
+    from pronk.evaluation.trial import in_processes
     from pronk.virtual.plant import leg_of, legs_of
     from pronk.virtual.sim_params import load_sim_params
 

@@ -69,10 +69,9 @@ def trial(
     """
     from pronk.errors import PronkError
     from pronk.evaluation import tables
-    from pronk.evaluation.processes import cores
     from pronk.evaluation.protocol import parse_cases
     from pronk.evaluation.results import SUMMARY, TABLE
-    from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, run_trial
+    from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, cores, run_trial
     from pronk.files import sha256
     from pronk.report.build import write_report
     from pronk.robots import load_robot

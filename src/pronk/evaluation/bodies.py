@@ -1,7 +1,7 @@
 """Randomized robots: other virtual robots, each matched by its own sweep, and the same trial.
 
-Every robot is drawn around given parameters (`pronk.evaluation.random_params`), excited by its own
-sweep, matched, and tried with the same script. Its folder holds all of it:
+Every robot is drawn around given parameters (`pronk.evaluation.variation.draw_robot`), excited by
+its own sweep, matched, and tried with the same script. Its folder holds all of it:
 
     sim_params.yaml    the robot, for `--sim-params`
     logs/              its sweep
@@ -10,15 +10,11 @@ sweep, matched, and tried with the same script. Its folder holds all of it:
     trial/             trials.csv and summary.json
 
 The gains are those of the training simulator; the drives keep their own, 17 / 0.4. A policy that is
-tried here was trained with the gains of another robot. The match gives the error of those gains on
-this robot's sweep (`Body.errors`), the trial how well the policy jumps all the same. A policy
-trained with the robot's own `gains.yaml` can be tried beside the others.
-
-Error of gains, by the estimator of the measured response, over the joint's band (paper F11):
+tried here was trained with the gains of another robot, or with the robot's own `gains.yaml`. The
+error of gains on a robot's sweep, by the estimator of the measured response, over the joint's band
+(paper F11), contains nothing that was outside the sweep (ground, mass, delay):
 
     error(f) = 20 log10 |H_simulated(f)| / |H_measured(f)|                [dB]
-
-It contains nothing that was outside the sweep (ground, mass, delay).
 """
 
 from __future__ import annotations
@@ -27,6 +23,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,19 +31,18 @@ import msgspec
 import numpy as np
 
 from pronk.errors import PronkError
-from pronk.evaluation.processes import in_processes
-from pronk.evaluation.random_params import GROUP_TORQUE, TOLERANCES, draw, save_sim_params
 from pronk.evaluation.results import Results, Subject, load_json, save_json
 from pronk.evaluation.results import load as load_results
 from pronk.evaluation.tables import Sheet, number
-from pronk.evaluation.trial import Plan, load_subjects, run_trial, versions
+from pronk.evaluation.trial import Plan, in_processes, load_subjects, run_trial, versions
+from pronk.evaluation.variation import GROUP_TORQUE, TOLERANCES, draw_robot, save_sim_params
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.files import sha256
 from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import read_logs
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
-from pronk.match.gains import GroupGains, JointGains, MatchedGains
+from pronk.match.gains import MatchedGains
 from pronk.match.measured_joint import SimRequest, logs_by_joint, measured_joints, responses
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
@@ -57,17 +53,12 @@ from pronk.virtual.plant import legs_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
-SCHEMA = "pronk/trial-bodies/2"
+SCHEMA = "pronk/trial-bodies/3"
 FILE = "bodies.json"
 FOLDER = "bodies"
 WRITER = "pronk trial POLICY --bodies"
-SIM_PARAMS, LOGS, GAINS, MATCH, TRIAL = (
-    "sim_params.yaml",
-    "logs",
-    "gains.yaml",
-    "match.npz",
-    "trial",
-)
+SIM_PARAMS, LOGS, GAINS, MATCH = "sim_params.yaml", "logs", "gains.yaml", "match.npz"
+TRIAL = "trial"
 """Names in a robot's folder."""
 NAIVE = "drive's own"
 MATCHED = "matched anew"
@@ -107,10 +98,6 @@ class Body:
     sha256: str
     """Of its sim_params file."""
     errors: tuple[GainsError, ...]
-    joints: Mapping[str, JointGains]
-    """Matched."""
-    groups: Mapping[str, GroupGains]
-    """For training."""
     trial: Results
 
 
@@ -129,8 +116,6 @@ class Bodies:
     seconds: float = 0.0
     """Wall time [s]."""
     bodies: tuple[Body, ...]
-    tolerances: Mapping[str, Any] = field(default_factory=dict)
-    """Of the draws."""
 
 
 def add_bodies(
@@ -161,8 +146,7 @@ def add_bodies(
         out: Folder of the trial; the robots' folders are made in `bodies` in it.
         about: Source of the parameters, kept with the results.
         count: Robots.
-        own: For each robot, in order, policies that were trained with its gains; they are tried on
-            it beside the others.
+        own: For each robot, in order, policies that were trained with its gains.
         repeats: Of the sweep of each joint.
         seed: The robots are drawn from `1000 seed + 1` and on.
         processes: Jobs at once; the numbers do not depend on it.
@@ -171,57 +155,46 @@ def add_bodies(
     Raises:
         PronkError: Of policies, parameters or plan, before the first step.
     """
-    begun, plan = time.perf_counter(), plan or Plan()
-    if count < 1 or len(own) > count:
-        raise PronkError(
-            f"{count} bodies and own policies for {len(own)}; expected 1 or more bodies, and own "
-            "policies for no more than those."
-        )
-    tell = progress or (lambda stage, share: None)
+    begun = time.perf_counter()
+    if len(own) > count:
+        raise PronkError(f"own policies for {len(own)} bodies; there are {count}.")
+    report = progress or (lambda stage, share: None)
     subjects = load_subjects(policies, robot)
     given = [[*policies, *(own[i] if i < len(own) else ())] for i in range(count)]
     for paths in given:
         load_subjects(paths, robot)
     seeds = [1000 * seed + number for number in range(1, count + 1)]
-    drawn = [draw(sim_params, robot, seed=one) for one in seeds]
+    drawn = [draw_robot(sim_params, robot, seed=one) for one in seeds]
     bodies = []
-    for i, (params, paths) in enumerate(zip(drawn, given, strict=True), start=1):
-        name = f"body {i}"
-        folder = out / FOLDER / name.replace(" ", "_")
-
-        def stage(what: str, share: float, name: str = name) -> None:
-            tell(f"{name}: {what}", share)
-
+    for i, (params, paths) in enumerate(zip(drawn, given, strict=True)):
+        name, folder = f"body {i + 1}", out / FOLDER / f"body_{i + 1}"
         matched, logs = match_body(
             robot,
             params,
             folder,
-            seed=seeds[i - 1],
+            seed=seeds[i],
             repeats=repeats,
             processes=processes,
-            progress=stage,
+            progress=lambda what, share, name=name: report(f"{name}: {what}", share),  # type: ignore[misc]
         )
         digest = sha256(folder / SIM_PARAMS)
-        stage("jump", 0.0)
         trial = run_trial(
             paths,
-            plan,
+            plan or Plan(),
             robot=robot,
             sim_params=params,
             out=folder / TRIAL,
             about={"file": str(folder / SIM_PARAMS), "sha256": digest},
             overwrite=True,
             processes=processes,
-            progress=lambda share, stage=stage: stage("jump", share),  # type: ignore[misc]
+            progress=partial(report, f"{name}: jump"),
         )
         bodies.append(
             Body(
                 name=name,
                 folder=str(folder.relative_to(out)),
-                seed=seeds[i - 1],
+                seed=seeds[i],
                 sha256=digest,
-                joints=matched.joints,
-                groups=matched.groups,
                 errors=_errors(robot, logs, matched, trial.subjects),
                 trial=trial,
             )
@@ -233,7 +206,6 @@ def add_bodies(
         seed=seed,
         seconds=time.perf_counter() - begun,
         bodies=tuple(bodies),
-        tolerances={"torque_scale of a group": GROUP_TORQUE, **TOLERANCES},
     )
     save(out, found)
     return found
@@ -242,23 +214,12 @@ def add_bodies(
 # ---- sweep and match ----
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Leg:
-    """The sweep of one leg; on a rigid test rig legs do not affect each other."""
-
-    plan: SweepPlan
-    sim_params: SimParams
-    leg: str
-    out: Path
-    seed: int
-
-
-def _sweep_leg(leg: _Leg) -> list[Path]:
-    robot = leg.plan.robot
-    machine = VirtualRobot(robot, leg.sim_params, seed=leg.seed, legs=(leg.leg,))
-    joints = tuple(name for name in leg.plan.joints if name.split("_")[0] == leg.leg)
-    task = SweepTask(plan=leg.plan, out_dir=leg.out, joints=joints, overwrite=True)
-    return record(machine, task)
+def _sweep_leg(leg: tuple[str, int, SweepPlan, SimParams, Path]) -> list[Path]:
+    """Sweep the joints of one leg; on a rigid test rig legs do not affect each other."""
+    name, seed, plan, sim_params, out = leg
+    machine = VirtualRobot(plan.robot, sim_params, seed=seed, legs=(name,))
+    joints = tuple(joint for joint in plan.joints if joint.split("_")[0] == name)
+    return record(machine, SweepTask(plan=plan, out_dir=out, joints=joints, overwrite=True))
 
 
 def match_body(
@@ -273,45 +234,32 @@ def match_body(
 ) -> tuple[MatchedGains, list[JointLog]]:
     """Excite all joints of a virtual robot with the paper's chirp, and match them.
 
-    The match reads the logs and nothing else. A folder that has the robot's gains is read.
-
-    Args:
-        robot: The robot's model.
-        sim_params: Of the virtual robot.
-        folder: For parameters, logs, gains and match.
-        seed: Of all noise.
-        repeats: Of the sweep of each joint.
-        processes: Legs at once; the logs do not depend on it.
-        progress: Called with the stage and the share of it that is done.
+    The match reads the logs and nothing else. A folder that has the robot's gains is read. `seed`
+    is of all noise; `repeats` of the sweep of each joint; `processes` sweep legs at once.
 
     Raises:
         PlanError: The sweep could exceed a limit of the robot.
         HardwareError: It did.
     """
     files = [folder / LOGS / f"{joint}.mcap" for joint in robot.joint_names]
-    if _is_matched(folder, sim_params):
+    if not _is_matched(folder, sim_params):
+        (folder / GAINS).unlink(missing_ok=True)
+        says = f"A randomized virtual robot, drawn by `{WRITER}`, seed {seed}."
+        save_sim_params(folder / SIM_PARAMS, sim_params, says=says)
+        plan = make_plan(robot, amplitudes=(AMPLITUDE,), repeats=repeats)
+        plan.check()
+        legs = [
+            (leg, 1000 * seed + i, plan, sim_params, folder / LOGS)
+            for i, leg in enumerate(legs_of(robot))
+        ]
+        in_processes(_sweep_leg, legs, processes=processes, progress=partial(progress, "sweep"))
+        progress("match", 0.0)
         logs = read_logs(files, processes=processes, robot=robot)
-        return gains_file.load(folder / GAINS), logs
-    (folder / GAINS).unlink(missing_ok=True)
-    says = f"A randomized virtual robot, drawn by `{WRITER}`, seed {seed}."
-    save_sim_params(folder / SIM_PARAMS, sim_params, says=says)
-    plan = make_plan(robot, amplitudes=(AMPLITUDE,), repeats=repeats)
-    plan.check()
-    legs = [
-        _Leg(plan=plan, sim_params=sim_params, leg=leg, out=folder / LOGS, seed=1000 * seed + i)
-        for i, leg in enumerate(legs_of(robot))
-    ]
-    in_processes(
-        _sweep_leg, legs, processes=processes, progress=lambda share: progress("sweep", share)
-    )
-    logs = read_logs(files, processes=processes, robot=robot)
-    progress("match", 0.0)
-    found = match_logs(logs, robot, settings=SETTINGS)
-    result_file.save(folder / MATCH, found)
-    gains_file.save(folder / GAINS, found.gains)
-    progress("match", 1.0)
-    # As a later run reads them, to the last digit.
-    return gains_file.load(folder / GAINS), logs
+        found = match_logs(logs, robot, settings=SETTINGS)
+        result_file.save(folder / MATCH, found)
+        gains_file.save(folder / GAINS, found.gains)
+        progress("match", 1.0)
+    return gains_file.load(folder / GAINS), read_logs(files, processes=processes, robot=robot)
 
 
 def _is_matched(folder: Path, sim_params: SimParams) -> bool:
@@ -327,37 +275,26 @@ def _is_matched(folder: Path, sim_params: SimParams) -> bool:
 # ---- error of gains ----
 
 
-def gains_of(subject: Subject) -> dict[str, tuple[float, float]]:
-    """Return the gains that a policy was trained with, by joint."""
-    contract = subject.contract
-    pairs = zip(contract["stiffness"], contract["damping"], strict=True)
-    return dict(zip(contract["joint_names"], pairs, strict=True))
-
-
 def gains_errors(
     logs: Sequence[JointLog],
     robot: Robot,
     gains: Mapping[str, Pairs],
     *,
-    settings: MatchSettings | None = None,
+    settings: MatchSettings = SETTINGS,
 ) -> tuple[GainsError, ...]:
-    """Return the errors of several sets of gains on one robot's sweep.
+    """Return the errors of several sets of gains, by a name, on one robot's sweep.
 
-    Args:
-        logs: The robot's sweep; the largest amplitude of each joint is compared.
-        robot: Of the training simulator.
-        gains: By a name, gains by joint.
-        settings: Estimator and coherence limit, those of the match.
+    The largest amplitude of each joint is compared; `robot` is that of the training simulator,
+    `settings` are those of the match.
 
     Raises:
         LogError: The logs excite no joint or cannot be used.
         IdentifiabilityError: A joint's band is mostly incoherent.
         PronkError: A set lacks the gains of an excited joint.
     """
-    chosen = settings or MatchSettings()
     goals = [
         max(
-            (goal for log in sources for goal in measured_joints(log, joint, robot, chosen)),
+            (goal for log in sources for goal in measured_joints(log, joint, robot, settings)),
             key=lambda goal: goal.measured.amplitude,
         )
         for joint, sources in logs_by_joint(logs, robot).items()
@@ -368,7 +305,7 @@ def gains_errors(
             f"the gains {name!r} have none for {joint}; give a pair for every excited joint."
         )
     requests = [SimRequest(goal, *pairs[goal.joint]) for pairs in gains.values() for goal in goals]
-    with MujocoSimulator(robot, threads=chosen.threads, device=chosen.device) as simulator:
+    with MujocoSimulator(robot, threads=settings.threads, device=settings.device) as simulator:
         simulated = iter(responses(simulator, requests))
     found = []
     for name, pairs in gains.items():
@@ -385,89 +322,63 @@ def _errors(
     robot: Robot, logs: Sequence[JointLog], matched: MatchedGains, subjects: Sequence[Subject]
 ) -> tuple[GainsError, ...]:
     """The errors of the gains of the policies, of the robot's drives, and of its own match."""
-    groups = matched.groups
-    pairs: dict[str, Pairs] = {
-        f"training gains of {subject.name}": gains_of(subject) for subject in subjects
-    }
+    pairs: dict[str, Pairs] = {}
+    for subject in subjects:
+        names, *own = (subject.contract[name] for name in ("joint_names", "stiffness", "damping"))
+        pairs[f"training gains of {subject.name}"] = dict(
+            zip(names, zip(*own, strict=True), strict=True)
+        )
     pairs[NAIVE] = {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints}
     pairs[MATCHED] = {name: (one.stiffness, one.damping) for name, one in matched.joints.items()}
-    pairs[TRAINABLE] = {
-        joint.name: (groups[joint.group].stiffness, groups[joint.group].damping)
-        for joint in robot.joints
-    }
-    return gains_errors(logs, robot, pairs, settings=SETTINGS)
+    groups = {name: (one.stiffness, one.damping) for name, one in matched.groups.items()}
+    pairs[TRAINABLE] = {joint.name: groups[joint.group] for joint in robot.joints}
+    return gains_errors(logs, robot, pairs)
 
 
 # ---- file ----
 
-_BODY = ("name", "folder", "seed", "sha256", "errors")
-
 
 def save(folder: Path, found: Bodies) -> Path:
     """Write `bodies.json`; returns its path. Trials and gains are files of their own."""
-    head = {name: getattr(found, name) for name in vars(found) if name != "bodies"}
     entries = [
-        {name: getattr(body, name) for name in _BODY} | {"cells": body.trial.cells}
+        {name: value for name, value in vars(body).items() if name != "trial"}
+        | {"cells": body.trial.cells}
         for body in found.bodies
     ]
-    return save_json(folder / FILE, SCHEMA, {**head, "bodies": entries})
+    tolerances = {"torque_scale of a group": GROUP_TORQUE, **TOLERANCES}
+    body = {**vars(found), "tolerances": tolerances, "bodies": entries}
+    return save_json(folder / FILE, SCHEMA, body)
 
 
 def load(folder: Path) -> Bodies:
-    """Read what `save` wrote, and each robot's gains and trial.
+    """Read what `save` wrote, and each robot's trial.
 
     Raises:
         ArtefactError: A file is missing, damaged or of another schema.
     """
     with load_json(folder / FILE, SCHEMA, WRITER) as stored:
-        entries = [
-            (entry, msgspec.convert(entry["errors"], tuple[GainsError, ...]))
-            for entry in stored.pop("bodies")
-        ]
-        del stored["schema"]
-        stored["subjects"] = msgspec.convert(stored["subjects"], tuple[Subject, ...])
-        bodies = []
-        for entry, errors in entries:
-            own = folder / entry["folder"]
-            gains = gains_file.load(own / GAINS)
-            bodies.append(
-                Body(
-                    **{name: entry[name] for name in _BODY if name != "errors"},
-                    errors=errors,
-                    joints=gains.joints,
-                    groups=gains.groups,
-                    trial=load_results(own / TRIAL),
-                )
-            )
-        return Bodies(**stored, bodies=tuple(bodies))
+        for body in stored["bodies"]:
+            body["trial"] = load_results(folder / body["folder"] / TRIAL)
+        return msgspec.convert(stored, Bodies)
 
 
 def table(found: Bodies) -> Sheet:
-    """Every robot: its gains by group, the error of gains on it, and the jumps."""
+    """Every robot: the error of gains on it, and the jumps."""
     rows = []
     for body in found.bodies:
         errors = {one.gains: one.rms_db for one in body.errors}
-        groups = ", ".join(
-            f"{name} {gains.stiffness:g}/{gains.damping:g}" for name, gains in body.groups.items()
-        )
-        for subject in body.trial.subjects:
-            cells = [cell for cell in body.trial.cells if cell.policy == subject.name]
+        for name in (subject.name for subject in body.trial.subjects):
+            cells = [cell for cell in body.trial.cells if cell.policy == name]
             best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
+            landed = f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}"
+            own, trained = errors[MATCHED], errors[f"training gains of {name}"]
             rows.append(
-                (
-                    f"{body.name}: {subject.name}",
-                    groups,
-                    number(errors[MATCHED], 3),
-                    number(errors[f"training gains of {subject.name}"], 3),
-                    f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}",
-                    number(best),
-                )
+                (f"{body.name}: {name}", number(own), number(trained), landed, number(best))
             )
     return Sheet(
         title="Randomized virtual robots, each matched by its own sweep",
         columns=(
             "body: policy",
-            "matched anew, by group",
             "error of its match [dB]",
             "error of the policy's training gains [dB]",
             "landed",

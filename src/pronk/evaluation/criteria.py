@@ -7,37 +7,20 @@ evaluation in the training simulator, or of the whole. A number that could not b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from pronk.evaluation.jumps import RISE
-from pronk.evaluation.published import TABLE_III
-from pronk.evaluation.results import Cell, Results
+from pronk.evaluation.protocol import TABLE_III
+from pronk.evaluation.results import Results
 
 if TYPE_CHECKING:
     from pronk.evaluation.training_sim.evaluation import CommandResult, Evaluation
 
 Sense = Literal["<=", ">="]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Criterion:
-    """A limit on a number of a summary."""
-
-    what: str
-    number: Callable[[Any], float]
-    """From the summary."""
-    sense: Sense
-    limit: float
-    unit: str = ""
-
-    def check(self, summary: Any) -> Check:
-        """Compare the summary's number with the limit."""
-        value = float(self.number(summary))
-        return Check(
-            what=self.what, value=value, sense=self.sense, limit=self.limit, unit=self.unit
-        )
+Number = Callable[[Any], float]
+"""From a summary."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,22 +43,35 @@ class Check:
         return {**asdict(self), "passed": self.passed}
 
 
-def mean(figure: str) -> Callable[[Any], float]:
+@dataclass(frozen=True)
+class Criterion:
+    """A limit on a number of a summary."""
+
+    what: str
+    number: Number
+    sense: Sense
+    limit: float
+    unit: str = ""
+
+    def check(self, summary: Any) -> Check:
+        """Compare the summary's number with the limit."""
+        kept = {name: getattr(self, name) for name in ("what", "sense", "limit", "unit")}
+        return Check(value=float(self.number(summary)), **kept)
+
+
+def mean(figure: str) -> Number:
     """Return a function that reads the mean of a figure from a summary."""
     return lambda summary: float(summary.figures[figure].mean)
 
 
-def std(figure: str) -> Callable[[Any], float]:
+def std(figure: str) -> Number:
     """Return a function that reads the standard deviation of a figure from a summary."""
     return lambda summary: float(summary.figures[figure].std)
 
 
-def _least(what: str, number: Callable[[Any], float], limit: float, unit: str = "") -> Criterion:
-    return Criterion(what=what, number=number, sense=">=", limit=limit, unit=unit)
-
-
-def _most(what: str, number: Callable[[Any], float], limit: float, unit: str = "") -> Criterion:
-    return Criterion(what=what, number=number, sense="<=", limit=limit, unit=unit)
+def share(name: str) -> Number:
+    """Return a function that reads a share of the robots from a summary."""
+    return lambda summary: float(summary.shares[name])
 
 
 # ---- trial on the virtual robot ----
@@ -93,21 +89,13 @@ JUMPS = 20
 def of_command(name: str) -> tuple[Criterion, ...]:
     """Return the criteria of one command of a trial: the paper's matched column, and more."""
     found = []
-    if name in TABLE_III:
-        for figure in ("height", "distance"):
-            average, deviation = getattr(TABLE_III[name], figure)["matched"]
-            found.append(_least(f"{name}: {figure}", mean(figure), average, "m"))
-            found.append(_most(f"{name}: {figure}, std", std(figure), deviation, "m"))
+    for figure in ("height", "distance") if name in TABLE_III else ():
+        average, deviation = getattr(TABLE_III[name], figure)["matched"]
+        found.append(Criterion(f"{name}: {figure}", mean(figure), ">=", average, "m"))
+        found.append(Criterion(f"{name}: {figure}, std", std(figure), "<=", deviation, "m"))
     if name in GAPS:
-        found.append(_least(f"{name}: gap", mean("gap"), GAPS[name], "m"))
-    return (*found, _least(f"{name}: success", lambda cell: cell.success, SUCCESS))
-
-
-def _best_height(cells: Sequence[Cell]) -> float:
-    return max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
-
-
-BEST = _least("best: height", _best_height, HEIGHT, "m")
+        found.append(Criterion(f"{name}: gap", mean("gap"), ">=", GAPS[name], "m"))
+    return (*found, Criterion(f"{name}: success", lambda cell: cell.success, ">=", SUCCESS))
 
 
 def trial_checks(trial: Results) -> list[Check]:
@@ -116,7 +104,8 @@ def trial_checks(trial: Results) -> list[Check]:
     cells = [cell for cell in trial.cells if cell.policy == first]
     found = [criterion.check(cell) for cell in cells for criterion in of_command(cell.case)]
     if any(cell.case in TABLE_III for cell in cells):
-        found.append(BEST.check(cells))
+        best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
+        found.append(Check(what="best: height", value=best, sense=">=", limit=HEIGHT, unit="m"))
     return found
 
 
@@ -124,44 +113,44 @@ def trial_checks(trial: Results) -> list[Check]:
 
 WALKS = ("forward 2", "back 2", "left 1", "right 1")
 """Those at 3 m/s are only reported."""
-TURNS = ("yaw 2", "yaw -2")
-STAND = "stand"
-DISTANCE = {
-    "forward 1": 0.70,
-    "forward 2": 1.10,
-    "side -1": 0.65,
-    "side +1": 0.65,
-    "back 2": 1.10,
-}
+DISTANCE = {"forward 1": 0.7, "forward 2": 1.1, "side -1": 0.65, "side +1": 0.65, "back 2": 1.1}
 """[m]"""
 LIFT_OFF_VELOCITY = 2.5
 """Desired [m/s]."""
 COST = 1.10
 """Largest growth of the speed error by the jump phases."""
 
-_WALK = (
-    _most("speed error", mean("speed_error"), 0.15, "m/s"),
-    _most("falls", lambda walk: walk.shares["fell"], 0.005),
+_OF_WALK = dict.fromkeys(
+    WALKS,
+    (
+        Criterion("speed error", mean("speed_error"), "<=", 0.15, "m/s"),
+        Criterion("falls", share("fell"), "<=", 0.005),
+    ),
 )
-_TURN = (_most("yaw rate error", mean("yaw_error"), 0.2, "rad/s"),)
-_STAND = (_most("speed", mean("speed_error_averaged"), 0.05, "m/s"),)
+_TURN = Criterion("yaw rate error", mean("yaw_error"), "<=", 0.2, "rad/s")
+_STAND = Criterion("speed", mean("speed_error_averaged"), "<=", 0.05, "m/s")
+_OF_WALK |= {"yaw 2": (_TURN,), "yaw -2": (_TURN,), "stand": (_STAND,)}  # type: ignore[dict-item]
 _JUMP = (
-    _least("height", mean("height"), HEIGHT, "m"),
-    _most("std of height", std("height"), 0.03, "m"),
-)
-_JUMP_MORE = (
-    _least("upright", lambda jump: jump.shares["upright"], 0.99),
+    Criterion("height", mean("height"), ">=", HEIGHT, "m"),
+    Criterion("std of height", std("height"), "<=", 0.03, "m"),
+    Criterion("upright", share("upright"), ">=", 0.99),
     # Flights of the gait before and after do not count.
-    _least("one high flight", lambda jump: jump.shares["single"], 0.95),
-    _most(
+    Criterion("one high flight", share("single"), ">=", 0.95),
+    Criterion(
         f"lift-off velocity off {LIFT_OFF_VELOCITY:g}",
         lambda jump: abs(jump.figures["lift_off_velocity"].mean - LIFT_OFF_VELOCITY),
+        "<=",
         0.3,
         "m/s",
     ),
-    _most("lift-off after, 95th percentile", lambda jump: jump.figures["delay"].p95, 0.3, "s"),
+    Criterion(
+        "lift-off after, 95th percentile", lambda jump: jump.figures["delay"].p95, "<=", 0.3, "s"
+    ),
 )
-_UNCOMMANDED = "flight without a jump input"
+_ESTIMATOR = (
+    Criterion("velocity RMSE", lambda estimator: estimator.rmse_vector, "<=", 0.15, "m/s"),
+    Criterion("contacts right", lambda estimator: estimator.contacts_right, ">=", 0.95),
+)
 
 
 def _highest(results: Iterable[CommandResult]) -> float:
@@ -170,26 +159,11 @@ def _highest(results: Iterable[CommandResult]) -> float:
     return max((one for one in highest if not math.isnan(one)), default=0.0)
 
 
-_WHOLE = (
-    _most(f"{_UNCOMMANDED}, walking", lambda whole: _highest(whole.walks), RISE, "m"),
-    _most(f"{_UNCOMMANDED}, around jumps", lambda whole: _highest(whole.jumps), RISE, "m"),
-)
-_ESTIMATOR = (
-    _most("velocity RMSE", lambda estimator: estimator.rmse_vector, 0.15, "m/s"),
-    _least("contacts right", lambda estimator: estimator.contacts_right, 0.95),
-)
-_COST = _most("speed error over that before jumping", lambda cost: cost, COST)
-
-
 def cost_of_jumping(before: Mapping[str, float], after: Mapping[str, float]) -> float:
-    """Mean speed error of `WALKS` after the jump phases over that before.
+    """Mean speed error of `WALKS` after the jump phases over that before; NaN if one is missing.
 
-    Args:
-        before: Mean speed error by walk, of the policy that only walks [m/s].
-        after: The same of the policy that jumps.
-
-    Returns:
-        The ratio; NaN where one of them was not evaluated on a walk of `WALKS`.
+    `before` and `after` are mean speed errors by walk [m/s], of the policy that only walks and of
+    the one that jumps.
     """
     sums = [math.fsum(errors.get(name, math.nan) for name in WALKS) for errors in (before, after)]
     return sums[1] / sums[0] if sums[0] else math.nan
@@ -197,21 +171,27 @@ def cost_of_jumping(before: Mapping[str, float], after: Mapping[str, float]) -> 
 
 def evaluation_checks(evaluation: Evaluation) -> list[Check]:
     """Check every criterion that belongs to the commands of an evaluation."""
-    named: list[tuple[str, Iterable[Criterion], Any]] = []
+    found: list[Check] = []
     for walk in evaluation.walks:
-        of_name = {**dict.fromkeys(WALKS, _WALK), **dict.fromkeys(TURNS, _TURN), STAND: _STAND}
-        named.append((f"{walk.name}: ", of_name.get(walk.name, ()), walk))
+        for criterion in _OF_WALK.get(walk.name, ()):
+            found.append(replace(criterion, what=f"{walk.name}: {criterion.what}").check(walk))
     for jump in evaluation.jumps:
-        own = [_least("distance", mean("distance"), DISTANCE[jump.name], "m")] * (
-            jump.name in DISTANCE
-        )
-        named.append((f"jump {jump.name}: ", (*_JUMP, *own, *_JUMP_MORE), jump))
-    flown = zip(_WHOLE, (evaluation.walks, evaluation.jumps), strict=True)
-    named.append(("", [criterion for criterion, results in flown if results], evaluation))
+        criteria = list(_JUMP)
+        if jump.name in DISTANCE:
+            far = Criterion("distance", mean("distance"), ">=", DISTANCE[jump.name], "m")
+            criteria.insert(2, far)
+        for criterion in criteria:
+            found.append(replace(criterion, what=f"jump {jump.name}: {criterion.what}").check(jump))
+    for when, results in (("walking", evaluation.walks), ("around jumps", evaluation.jumps)):
+        if results:
+            what = f"flight without a jump input, {when}"
+            found.append(
+                Check(what=what, value=_highest(results), sense="<=", limit=RISE, unit="m")
+            )
     if evaluation.estimator is not None:
-        named.append(("", _ESTIMATOR, evaluation.estimator))
+        found += [criterion.check(evaluation.estimator) for criterion in _ESTIMATOR]
     if evaluation.before:
         cost = cost_of_jumping(evaluation.before, evaluation.speed_errors())
-        named.append(("", (_COST,), cost))
-    checks = [(head, one.check(part)) for head, criteria, part in named for one in criteria]
-    return [Check(**{**asdict(check), "what": head + check.what}) for head, check in checks]
+        what = "speed error over that before jumping"
+        found.append(Check(what=what, value=cost, sense="<=", limit=COST))
+    return found

@@ -1,5 +1,14 @@
 """Crossing gaps and steps of growing size, until it fails.
 
+    gap     the floor ends at the edge and goes on `size` further; between, it is 1 m down
+    up      behind the edge the floor is `size` higher
+    down    behind the edge the floor is `size` lower
+    flat    no edge: for practice
+
+Coordinates: s along the commanded direction, which the robot faces at the start; the edge is at
+s = `edge`. The jump input rises when the trunk is `lead` before it (the operator's choice), stays
+for `jump_s`, the velocity for `keep_s` longer; then the command is zero.
+
 For each command, first practice on flat ground: how far in front of the trunk, at the jump input,
 do the front-most feet stand for the last time (`reach`)? A robot that lifts off right at the edge
 is one whose jump input rises that far before it. Then, size by size, `runs` runs for each of a few
@@ -7,66 +16,68 @@ leads about that distance; every run starts at its own place, so that it meets t
 phase of its gait, which the operator does not use. A size counts as crossed with the lead that did
 best, if it did so in `enough` of its runs; the sizes grow until no lead does.
 
-`pronk.evaluation.course` has the courses, the operator, and what crossed means.
+Crossed means all of this, from the jump input to 2 s after the landing:
+
+    no foot's centre was below floor level between the edges of a gap;
+    nothing but feet touched anything;
+    landing: every foot has touched ground behind the far edge;
+    2 s later trunk and feet are behind the far edge, and the trunk leans 30 degrees at most,
+    never having leant 70 degrees.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.evaluation.course import (
-    CrossingFigures,
-    Kind,
-    Obstacle,
-    Operator,
-    direction,
-    judge,
-    lost,
+from pronk.evaluation.jumps import (
+    FALLEN_COSINE,
+    JumpRules,
+    cosine_of_tilt,
+    jump_flights,
+    number,
+    sample_at,
+    series_of,
 )
-from pronk.evaluation.jumps import JumpRules
-from pronk.evaluation.processes import in_processes
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.results import Kind as ResultsKind
-from pronk.evaluation.results import Results, Row, Subject, save
+from pronk.evaluation.results import Kind, Results, Row, Subject, save
 from pronk.evaluation.trial import (
     Job,
+    Setup,
     build,
     case_rng,
+    in_processes,
     load_subjects,
-    planned_run,
+    opened,
     set_down,
     versions,
 )
-from pronk.policy.runtime import load_policy
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
 from pronk.runtime.rollout import ticks
-from pronk.runtime.script import STILL, Script
-from pronk.virtual.ground import Start
+from pronk.runtime.script import STILL, Commanded, Script, Velocity
+from pronk.virtual.capture import Capture
+from pronk.virtual.ground import Box, Ground, Start
 from pronk.virtual.sim_params import SimParams
 
-CROSSING = ResultsKind(
-    table="crossing.csv",
-    summary="crossing.json",
-    schema="pronk/trial-crossing/2",
-    writer="pronk trial POLICY --crossing",
-    figures=CrossingFigures,
-)
-CROSSED_BY = (
-    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
-    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
-    Case(name="side +1", command=(0.0, 1.0, 0.0)),
-    Case(name="side -1", command=(0.0, -1.0, 0.0)),
-)
-"""The commands of the paper's gaps (R3)."""
+Array = NDArray[np.float64]
+Shape = Literal["flat", "gap", "up", "down"]
+
+DEPTH = 1.0
+"""Of a gap [m]."""
+BEHIND, BEYOND = 5.0, 15.0
+"""Floor behind the start and behind the far edge [m]."""
+WIDE = 8.0
+"""Half-width of the course [m]."""
 RUN_UP_S = 2.0
 """The edge is as far away as the command goes in this time [s]."""
 PHASE_S = 0.5
@@ -75,6 +86,251 @@ LATE = 3.0
 """A run ends if the robot has not reached the edge after this many times the run-up."""
 STEERED = 0.02
 """Half-width of the headings at the start: the robot is aimed at the edge [rad]."""
+
+NOT_TRIGGERED = "never came to the place of the jump"
+STEPPED_IN = "a foot went below the floor between the edges"
+NON_FOOT_CONTACT = "something but a foot touched"
+NOT_OVER = "not every foot came down behind the far edge"
+FELL = "not upright 2 s later"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """A gap or a step."""
+
+    kind: Shape
+    size: float = 0.0
+    """Width of a gap, height of a step [m]."""
+
+    @property
+    def far(self) -> float:
+        """From the edge to where the floor goes on [m]."""
+        return self.size if self.kind == "gap" else 0.0
+
+    def on(self, ground: Ground, command: Velocity, edge: float) -> Ground:
+        """Put the obstacle on a ground, whose friction and stiffness stay.
+
+        It begins at `edge` [m] in the direction of the command, along x or along y.
+        """
+        if self.kind == "flat":
+            return replace(ground, floor=0.0, terrain=())
+        before, after = (-BEHIND, edge), (edge + self.far, edge + self.far + BEYOND)
+        floor = {"gap": -DEPTH, "up": 0.0, "down": -self.size}[self.kind]
+        boxes = [] if self.kind == "up" else [_box(before, floor, 0.0, command)]
+        if self.kind != "down":
+            top = self.size if self.kind == "up" else 0.0
+            boxes.append(_box(after, floor, top, command))
+        return replace(ground, floor=floor, terrain=tuple(boxes))
+
+
+def direction(command: Velocity) -> Array:
+    """Unit vector of a command in the plane. (2,).
+
+    Raises:
+        PronkError: It points neither forward or back nor to a side.
+    """
+    forward, left, _ = command
+    if bool(forward) == bool(left):
+        raise PronkError(
+            f"command {command} on a course; expected one straight forward, back or to a side."
+        )
+    return np.array([np.sign(forward), np.sign(left)])
+
+
+def _box(span: tuple[float, float], low: float, high: float, command: Velocity) -> Box:
+    """A block between two heights, from one place of the course to another."""
+    along = direction(command)
+    middle, half = 0.5 * (span[0] + span[1]), 0.5 * (span[1] - span[0])
+    x, y = middle * along
+    across = np.where(along != 0.0, half, WIDE)
+    return Box(
+        center=(float(x), float(y), 0.5 * (low + high)),
+        half_size=(float(across[0]), float(across[1]), 0.5 * (high - low)),
+    )
+
+
+# ---- one run ----
+
+
+class Operator:
+    """The command over time: run, and jump when the trunk is `lead` before the edge."""
+
+    def __init__(
+        self, script: Script, *, edge: float, lead: float, where: Callable[[], float]
+    ) -> None:
+        """Begin before the first tick; `where` returns the trunk's place along the course [m]."""
+        self._script, self._where, self._trigger_at = script, where, edge - lead
+        self.triggered: float | None = None
+        """When the jump input rose, since the policy took over [s]."""
+
+    def __call__(self, t: float) -> Commanded:
+        """Return the command at a time since the policy took over [s]."""
+        script = self._script
+        if t < script.stand_s:
+            return STILL, False
+        if self.triggered is None and self._where() >= self._trigger_at:
+            self.triggered = t
+        if self.triggered is None:
+            return script.command, False
+        since = t - self.triggered
+        moving = since < script.jump_s + script.keep_s
+        return (script.command if moving else STILL), since < script.jump_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrossingFigures:
+    """One run at an obstacle."""
+
+    obstacle: str = "flat"
+    """Its kind; `flat` for practice."""
+    why: str = ""
+    """Empty if it was crossed, else the first condition that was not met."""
+    size: float = number("m", "width of the gap, height of the step")
+    lead: float = number("m", "from the trunk to the edge when the jump input rises")
+    take_off: float = number("m", "from the front-most last foothold before the flight to the edge")
+    landing: float = number("m", "from the far edge to the hind-most first foothold behind it")
+    reach: float = number("m", "from the trunk at the jump input to the front-most last foothold")
+    speed: float = number("m/s", "along the course at the jump input")
+
+    @property
+    def success(self) -> bool:
+        """The obstacle was crossed."""
+        return not self.why
+
+
+CROSSING = Kind(
+    table="crossing.csv",
+    summary="crossing.json",
+    schema="pronk/trial-crossing/3",
+    writer="pronk trial POLICY --crossing",
+    figures=CrossingFigures,
+)
+
+
+def lost(seen: Capture, obstacle: Obstacle, command: Velocity, edge: float) -> bool:
+    """Whether a run has failed already: a sample leans too far, or a foot stepped in."""
+    fallen = cosine_of_tilt(seen.orientation) < FALLEN_COSINE
+    return bool(fallen.any() or _stepped_in(seen, obstacle, command, edge).any())
+
+
+def judge(
+    seen: Capture,
+    obstacle: Obstacle,
+    command: Velocity,
+    *,
+    edge: float,
+    triggered: float | None,
+    rules: JumpRules,
+) -> CrossingFigures:
+    """Decide whether an obstacle was crossed, and measure it.
+
+    Args:
+        seen: The recorded run.
+        obstacle: What lay in the way.
+        command: Forward, left [m/s].
+        edge: Where it began, along the course [m].
+        triggered: When the jump input rose, on the capture's clock [s]; None for never.
+        rules: Of flights, and of an upright robot.
+    """
+    if triggered is None:
+        return CrossingFigures(why=NOT_TRIGGERED)
+    along, count = direction(command), len(seen.time)
+    on = min(sample_at(seen, triggered), count - 1)
+    feet, trunk = seen.foot_position[:, :, :2] @ along, seen.position[:, :2] @ along
+    far = edge + obstacle.far
+    behind = seen.contact & (feet >= far)
+    first = np.where(behind[on:].any(axis=0), on + behind[on:].argmax(axis=0), count)
+    landed = int(first.max())
+    judged = landed + round(rules.upright_s / seen.dt)
+    legs = np.arange(feet.shape[1])
+    figures: dict[str, Any] = {"speed": float(seen.velocity[on, :2] @ along)}
+    main = jump_flights(series_of(seen, whole=True), on, rules).main
+    if main is not None:
+        before = seen.contact[: main.liftoff]
+        stood = feet[main.liftoff - 1 - before[::-1].argmax(axis=0), legs]
+        front = float(np.where(before.any(axis=0), stood, -np.inf).max())
+        figures["reach"] = front - float(trunk[on])
+        if obstacle.kind != "flat":
+            figures["take_off"] = edge - front
+    if landed < count and obstacle.kind != "flat":
+        figures["landing"] = float(feet[first, legs].min()) - far
+    end, cosine = min(judged + 1, count), cosine_of_tilt(seen.orientation)
+    upright = judged < count and cosine[judged] >= rules.upright_cosine
+    if _stepped_in(seen, obstacle, command, edge)[:end].any():
+        why = STEPPED_IN
+    elif seen.other_contact[on:end].any():
+        why = NON_FOOT_CONTACT
+    elif landed >= count:
+        why = NOT_OVER
+    elif not upright or (cosine[:end] < FALLEN_COSINE).any():
+        why = FELL
+    elif min(trunk[judged], feet[judged].min()) < far:
+        why = NOT_OVER
+    else:
+        why = ""
+    return CrossingFigures(why=why, **figures)
+
+
+def _stepped_in(
+    seen: Capture, obstacle: Obstacle, command: Velocity, edge: float
+) -> NDArray[np.bool_]:
+    """Samples with the centre of a foot below the floor between the edges of a gap. (T,)."""
+    if obstacle.kind != "gap":
+        return np.zeros(len(seen.time), dtype=bool)
+    feet = seen.foot_position[:, :, :2] @ direction(command)
+    between = (feet > edge) & (feet < edge + obstacle.size)
+    return np.asarray((between & (seen.foot_position[:, :, 2] < 0.0)).any(axis=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """One run at an obstacle, with all that it depends on."""
+
+    job: Job
+    """Its script has the command and the times `stand_s`, `jump_s` and `keep_s`."""
+    obstacle: Obstacle
+    edge: float
+    """Where it begins, along the course [m]."""
+    lead: float
+    """From the trunk to it when the jump input rises [m]."""
+
+
+def attempt(task: Attempt) -> Row:
+    """Run once at an obstacle and measure it."""
+    job, script, rules, obstacle = task.job, task.job.row.script, task.job.rules, task.obstacle
+    along = direction(script.command)
+    machine = set_down(job)
+    operator = Operator(
+        script,
+        edge=task.edge,
+        lead=task.lead,
+        where=lambda: float(machine.snapshot().position[0, :2] @ along),
+    )
+    # Time to lift off, to fly and land on all feet, and to stand.
+    after = rules.search_s + 1.0 + rules.upright_s
+    late = script.stand_s + LATE * (RUN_UP_S + PHASE_S)
+    began, policy = machine.now(), opened(job.policy, job.sha256)
+    for tick in ticks(machine, policy, load_robot(job.robot), operator):
+        if operator.triggered is None:
+            if tick.since > late:
+                break
+        elif tick.since > operator.triggered + after or lost(
+            machine.snapshot(), obstacle, script.command, task.edge
+        ):
+            break
+    figures = judge(
+        machine.capture(),
+        obstacle,
+        script.command,
+        edge=task.edge,
+        triggered=None if operator.triggered is None else began + operator.triggered,
+        rules=rules,
+    )
+    measured = replace(figures, obstacle=obstacle.kind, size=obstacle.size, lead=task.lead)
+    return replace(job.row, figures=measured)
+
+
+# ---- many runs ----
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,21 +344,12 @@ class Ladder:
     leads: tuple[float, ...]
     """Added to the reach of practice [m]."""
 
-    def __post_init__(self) -> None:
-        """Refuse a ladder without rungs.
-
-        Raises:
-            PronkError: A size is not positive, or there is no lead.
-        """
-        if not (self.first > 0.0 and self.step > 0.0 and self.leads):
-            raise PronkError(f"{self}: sizes must be positive, and there must be a lead.")
-
     def size(self, rung: int) -> float:
         """Of the rung, from 0 [m]."""
         return round(self.first + rung * self.step, 6)
 
 
-LADDERS: Mapping[Kind, Ladder] = {
+LADDERS: Mapping[Shape, Ladder] = {
     "gap": Ladder(first=0.1, step=0.05, leads=(0.04, 0.09, 0.14)),
     "up": Ladder(first=0.05, step=0.05, leads=(0.05, 0.15, 0.25)),
     "down": Ladder(first=0.1, step=0.1, leads=(0.0, 0.1)),
@@ -111,10 +358,15 @@ LADDERS: Mapping[Kind, Ladder] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CrossingPlan:
-    """Commands, sizes and runs."""
+    """Commands, sizes and runs; the commands are those of the paper's gaps (R3)."""
 
-    cases: tuple[Case, ...] = CROSSED_BY
-    ladders: Mapping[Kind, Ladder] = field(default_factory=lambda: dict(LADDERS))
+    cases: tuple[Case, ...] = (
+        Case(name="forward 2", command=(2.0, 0.0, 0.0)),
+        Case(name="back 2", command=(-2.0, 0.0, 0.0)),
+        Case(name="side +1", command=(0.0, 1.0, 0.0)),
+        Case(name="side -1", command=(0.0, -1.0, 0.0)),
+    )
+    ladders: Mapping[Shape, Ladder] = field(default_factory=lambda: dict(LADDERS))
     runs: int = 5
     """For each size and lead."""
     enough: int = 4
@@ -130,105 +382,134 @@ class CrossingPlan:
     """Half-width of the joints' offsets from the default pose at the start [rad]."""
     rules: JumpRules = field(default_factory=JumpRules)
 
-    def __post_init__(self) -> None:
-        """Refuse an empty plan.
 
-        Raises:
-            PronkError: One sentence that names the field.
-        """
-        if self.practice < 1 or not 1 <= self.enough <= self.runs:
-            raise PronkError(
-                f"{self.practice} jumps of practice, {self.enough} of {self.runs} runs; expected "
-                "1 or more of each, and not more needed than run."
-            )
-        for case in self.cases:
-            direction(case.command)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Attempt:
-    """One run at an obstacle, with all that it depends on."""
-
-    job: Job
-    """Policy, parameters and start; its script has the command and the times `stand_s`, `jump_s`
-    and `keep_s`."""
-    obstacle: Obstacle
-    edge: float
-    """Where it begins, along the course [m]."""
-    lead: float
-    """From the trunk to it when the jump input rises [m]."""
-
-
-def attempt(task: Attempt) -> CrossingFigures:
-    """Run once at an obstacle."""
-    job, script, rules = task.job, task.job.script, task.job.rules
-    along = direction(script.command)
-    machine = set_down(job)
-    operator = Operator(
-        script,
-        edge=task.edge,
-        lead=task.lead,
-        where=lambda: float(machine.snapshot().position[0, :2] @ along),
-    )
-    # Time to lift off, to fly and land on all feet, and to stand.
-    after = rules.search_s + 1.0 + rules.upright_s
-    late = script.stand_s + LATE * (RUN_UP_S + PHASE_S)
-    began = machine.now()
-    for tick in ticks(machine, load_policy(job.policy), load_robot(job.robot), operator):
-        if operator.triggered is None:
-            if tick.since > late:
-                break
-        elif tick.since > operator.triggered + after or lost(
-            machine.snapshot(), task.obstacle, script.command, task.edge
-        ):
-            break
-    figures = judge(
-        machine.capture(),
-        task.obstacle,
-        script.command,
-        edge=task.edge,
-        triggered=None if operator.triggered is None else began + operator.triggered,
-        rules=rules,
-    )
-    return replace(figures, obstacle=task.obstacle.kind, size=task.obstacle.size, lead=task.lead)
+def attempts(
+    subject: Subject,
+    case: Case,
+    obstacle: Obstacle,
+    *,
+    lead: float,
+    runs: int,
+    plan: CrossingPlan,
+    robot: Robot,
+    sim_params: SimParams,
+) -> list[Attempt]:
+    """Return runs at one obstacle; their starts are alike for all obstacles and leads."""
+    speed, found = math.hypot(*case.command[:2]), []
+    edge = RUN_UP_S * speed
+    for count in range(runs):
+        rng = case_rng(plan.seed, case, count)
+        x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
+        offset = rng.uniform(-plan.joint_offset, plan.joint_offset, len(robot.joints))
+        yaw = float(rng.uniform(-STEERED, STEERED))
+        row = Row(
+            policy=subject.name,
+            case=case.name,
+            number=count,
+            seed=int(rng.integers(2**31)),
+            figures=None,
+            script=replace(plan.script, command=case.command),
+        )
+        job = Job(
+            row=row,
+            policy=Path(subject.path),
+            sha256=subject.sha256,
+            robot=robot.name,
+            sim_params=sim_params,
+            start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
+            ground=obstacle.on(sim_params.ground, case.command, edge),
+            rules=plan.rules,
+        )
+        found.append(Attempt(job=job, obstacle=obstacle, edge=edge, lead=lead))
+    return found
 
 
-def add_crossings(
-    policies: Sequence[Path],
-    plan: CrossingPlan | None = None,
+def search(
+    subjects: Sequence[Subject],
+    plan: CrossingPlan,
     *,
     robot: Robot,
     sim_params: SimParams,
-    out: Path,
-    about: Mapping[str, Any] | None = None,
-    processes: int = 1,
-    progress: Callable[[float], None] | None = None,
+    run: Callable[[list[Attempt]], list[Row]],
+) -> list[Row]:
+    """Practise, then climb all ladders at once, a rung of each in every round; `run` runs one."""
+    who = {"plan": plan, "robot": robot, "sim_params": sim_params}
+    pairs = [(subject, case) for subject in subjects for case in plan.cases]
+    flat, count = Obstacle(kind="flat"), plan.practice
+    rows = run([a for s, c in pairs for a in attempts(s, c, flat, lead=0.0, runs=count, **who)])  # type: ignore[arg-type]
+    reach: dict[tuple[str, str], float] = {}
+    for subject, case in pairs:
+        own = [row for row in rows if (row.policy, row.case) == (subject.name, case.name)]
+        known = [r.figures.reach for r in own if math.isfinite(r.figures.reach)]
+        if known:  # without a jump there is nothing to cross
+            reach[subject.name, case.name] = float(np.mean(known))
+    climbing = {
+        (subject.name, case.name, kind): (subject, case, 0)
+        for subject, case in pairs
+        if (subject.name, case.name) in reach
+        for kind in plan.ladders
+    }
+    while climbing:
+        tasks = [
+            task
+            for (policy, command, kind), (subject, case, rung) in climbing.items()
+            for lead in plan.ladders[kind].leads
+            for task in attempts(
+                subject,
+                case,
+                Obstacle(kind=kind, size=plan.ladders[kind].size(rung)),
+                lead=round(reach[policy, command] + lead, 4),
+                runs=plan.runs,
+                **who,  # type: ignore[arg-type]
+            )
+        ]
+        found = run(tasks)
+        rows += found
+        for key, (subject, case, rung) in list(climbing.items()):
+            tried = [r for r in found if (r.policy, r.case, r.figures.obstacle) == key]
+            higher = plan.ladders[key[2]].size(rung + 1) <= plan.most + 1e-9
+            if rung_of(tried).crossed >= plan.enough and higher:
+                climbing[key] = subject, case, rung + 1
+            else:
+                del climbing[key]
+    return rows
+
+
+def add_crossings(
+    policies: Sequence[Path], plan: CrossingPlan | None = None, **setup: Unpack[Setup]
 ) -> Results:
     """Let policies cross gaps and steps; write `crossing.csv` and `crossing.json`.
 
-    Arguments and errors as of `run_trial`; how much there is to do is an estimate.
+    Arguments and errors as of `run_trial`; the progress is an estimate.
     """
     begun, plan = time.perf_counter(), plan or CrossingPlan()
-    subjects = load_subjects(policies, robot)
-    search = Search(subjects, plan, robot=robot, sim_params=sim_params)
-    while planned := search.next_round():
-        tasks = [task for _, task in planned]
+    robot, out, rounds = setup["robot"], setup["out"], 0
+    subjects, progress = load_subjects(policies, robot), setup.get("progress")
+
+    def run(tasks: list[Attempt]) -> list[Row]:
+        """Run one round; about five more follow each."""
+        nonlocal rounds
         build(tasks[0].job)  # refuses impossible parameters
 
         def share(part: float) -> None:
             if progress is not None:
-                progress(search.share(part))
+                progress((rounds + part) / (rounds + part + 5.0))
 
-        found = in_processes(attempt, tasks, processes=processes, progress=share)
-        search.take([row for row, _ in planned], found)
+        found = in_processes(attempt, tasks, processes=setup.get("processes", 1), progress=share)
+        rounds += 1
+        return found
+
+    rows = search(subjects, plan, robot=robot, sim_params=setup["sim_params"], run=run)
+    if progress is not None:
+        progress(1.0)
     results = Results(
         kind=CROSSING,
         robot=robot.name,
         subjects=subjects,
         cases=plan.cases,
-        rows=tuple(search.rows),
+        rows=tuple(rows),
         seed=plan.seed,
-        sim_params=dict(about or {}),
+        sim_params=dict(setup.get("about") or {}),
         script=plan.script,
         rules=asdict(plan.rules),
         settings={"kinds": list(plan.ladders), "runs": plan.runs, "enough": plan.enough},
@@ -237,114 +518,6 @@ def add_crossings(
     )
     save(out, results)
     return results
-
-
-class Search:
-    """Climbs all ladders at once, a rung of each in every round."""
-
-    def __init__(
-        self,
-        subjects: Sequence[Subject],
-        plan: CrossingPlan,
-        *,
-        robot: Robot,
-        sim_params: SimParams,
-    ) -> None:
-        """Begin before practice."""
-        self.rows: list[Row] = []
-        self._subjects, self._plan = subjects, plan
-        self._robot, self._sim_params = robot, sim_params
-        self._reach: dict[tuple[str, str], float] = {}
-        self._rung: dict[tuple[str, str, Kind], int | None] = {
-            (subject.name, case.name, kind): 0
-            for subject in subjects
-            for case in plan.cases
-            for kind in plan.ladders
-        }
-
-    def share(self, part: float) -> float:
-        """Of the ladders, those that are done; the others as if five rungs were left of each.
-
-        Args:
-            part: Of this round that is done. Practice counts as a rung.
-        """
-        shares = []
-        for (policy, case, _), rung in self._rung.items():
-            done = part + ((rung or 0) + 1 if (policy, case) in self._reach else 0)
-            shares.append(1.0 if rung is None else done / (done + 5.0))
-        return sum(shares) / len(shares)
-
-    def next_round(self) -> list[tuple[Row, Attempt]]:
-        """Return practice first, then a rung of every ladder that is not done."""
-        jobs: list[tuple[Row, Attempt]] = []
-        for subject in self._subjects:
-            for case in self._plan.cases:
-                reach = self._reach.get((subject.name, case.name))
-                if reach is None:
-                    flat = Obstacle(kind="flat")
-                    jobs += self._attempts(subject, case, flat, 0.0, self._plan.practice)
-                    continue
-                for kind, ladder in self._plan.ladders.items():
-                    rung = self._rung[subject.name, case.name, kind]
-                    for lead in () if rung is None else ladder.leads:
-                        obstacle = Obstacle(kind=kind, size=ladder.size(rung or 0))
-                        meant = round(reach + lead, 4)
-                        jobs += self._attempts(subject, case, obstacle, meant, self._plan.runs)
-        return jobs
-
-    def _attempts(
-        self, subject: Subject, case: Case, obstacle: Obstacle, lead: float, runs: int
-    ) -> list[tuple[Row, Attempt]]:
-        plan, edge = self._plan, RUN_UP_S * math.hypot(*case.command[:2])
-        found = []
-        for number in range(runs):
-            start, seed = draw_start(plan, case, number, self._robot)
-            row, job = planned_run(
-                subject,
-                case,
-                number,
-                drawn=(replace(plan.script, command=case.command), start, seed),
-                robot=self._robot,
-                sim_params=self._sim_params,
-                rules=plan.rules,
-                ground=obstacle.on(self._sim_params.ground, case.command, edge),
-            )
-            found.append((row, Attempt(job=job, obstacle=obstacle, edge=edge, lead=lead)))
-        return found
-
-    def take(self, planned: Sequence[Row], found: Sequence[CrossingFigures]) -> None:
-        """Note the outcome of a round, and climb or stop."""
-        rows = [replace(row, figures=each) for row, each in zip(planned, found, strict=True)]
-        self.rows += rows
-        for key in dict.fromkeys((row.policy, row.case) for row in rows):
-            own = [row for row in rows if (row.policy, row.case) == key]
-            if own[0].figures.obstacle == "flat":
-                reaches = [r.figures.reach for r in own if math.isfinite(r.figures.reach)]
-                self._reach[key] = float(np.mean(reaches)) if reaches else math.nan
-                if not reaches:  # no jump with this command: nothing to cross
-                    self._rung |= dict.fromkeys([(*key, kind) for kind in self._plan.ladders])
-                continue
-            for kind, ladder in self._plan.ladders.items():
-                tried = [row for row in own if row.figures.obstacle == kind]
-                if tried:
-                    rung = self._rung[*key, kind] or 0
-                    higher = ladder.size(rung + 1) <= self._plan.most + 1e-9
-                    enough = rung_of(tried).crossed >= self._plan.enough
-                    self._rung[*key, kind] = rung + 1 if enough and higher else None
-
-
-def draw_start(plan: CrossingPlan, case: Case, number: int, robot: Robot) -> tuple[Start, int]:
-    """Draw start and noise seed of a run: alike for all obstacles and leads."""
-    rng = case_rng(plan.seed, case, number)
-    back = PHASE_S * math.hypot(*case.command[:2]) * rng.uniform()
-    x, y = (-back * direction(case.command)).tolist()
-    offset = rng.uniform(-plan.joint_offset, plan.joint_offset, len(robot.joints))
-    start = Start(
-        position=(x, y),
-        yaw=float(rng.uniform(-STEERED, STEERED)),
-        joint_offset=tuple(offset.tolist()),
-    )
-    return start, int(rng.integers(2**31))
 
 
 # ---- sums ----
@@ -384,38 +557,28 @@ def rung_of(rows: Sequence[Row]) -> Rung:
     counts = {lead: sum(each.success for each in figures if each.lead == lead) for lead in leads}
     # With equal counts the shorter lead: the one nearer to the edge.
     best = max(leads, key=lambda lead: (counts[lead], -lead))
-    reasons: dict[str, int] = {}
-    for each in figures:
-        if each.why:
-            reasons[each.why] = reasons.get(each.why, 0) + 1
     return Rung(
         size=figures[0].size,
         lead=best,
         crossed=counts[best],
         runs=sum(each.lead == best for each in figures),
-        reasons=reasons,
+        reasons=Counter(each.why for each in figures if each.why),
     )
 
 
 def climbs(results: Results) -> tuple[Climb, ...]:
     """Sum up every policy with every command and kind of obstacle."""
     found = []
-    for subject in results.subjects:
-        for case in results.cases:
+    for policy in (subject.name for subject in results.subjects):
+        for case in (case.name for case in results.cases):
             for kind in results.settings["kinds"]:
-                own = [r for r in results.of(subject.name, case.name) if r.figures.obstacle == kind]
+                own = [r for r in results.of(policy, case) if r.figures.obstacle == kind]
                 sizes = sorted({row.figures.size for row in own})
                 rungs = [rung_of([r for r in own if r.figures.size == size]) for size in sizes]
                 enough = [rung.crossed >= results.settings["enough"] for rung in rungs]
                 whole = enough.index(False) if False in enough else len(enough)
-                found.append(
-                    Climb(
-                        policy=subject.name,
-                        case=case.name,
-                        kind=kind,
-                        rungs=tuple(rungs),
-                        largest=sizes[whole - 1] if whole else 0.0,
-                        ever=max((r.figures.size for r in own if r.figures.success), default=0.0),
-                    )
-                )
+                largest = sizes[whole - 1] if whole else 0.0
+                ever = max((r.figures.size for r in own if r.figures.success), default=0.0)
+                who = {"policy": policy, "case": case, "kind": kind}
+                found.append(Climb(**who, rungs=tuple(rungs), largest=largest, ever=ever))
     return tuple(found)

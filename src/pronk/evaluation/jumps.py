@@ -1,45 +1,33 @@
 """Flight phases and the figures of a jump, from the recorded motion of one robot.
 
-The only measure of a jump: trials of the virtual robot and the evaluation in the training simulator
-record the trunk and the foot contacts and call `measure_jump`. Samples k = 0, 1, ... are those of
-the physics steps, at times k dt; the foot contacts of a sample belong to its position. The trunk's
-position is that of its frame's origin in the world, z up. A series ends where the robot falls.
+Trials of the virtual robot (`measure`) and the evaluation in the training simulator
+(`measure_jump`) record trunk and foot contacts at every physics step; a sample's contacts belong to
+its position. A series ends where the robot falls.
 
-Flight phase: samples l .. d-1 without any foot on the ground, at least `flight_s` long; l is its
-lift-off, d (the first sample with a foot on the ground) its touchdown, (d - l) dt its duration.
-Shorter gaps are contact chatter. Sampling cuts up to one step off each end.
+A flight phase is a stretch of `flight_s` or longer without a foot on the ground, from its lift-off
+(first sample in the air) to its touchdown (first sample on the ground). A jump input that rises at
+sample c has the flights that lift off within `search_s`. Fast gaits fly, too, but do not lift the
+trunk: a high flight lasts `long_s` and its trunk rises more than `rise` over standing height. The
+main flight is the longest high one, the first of equal ones; without one there was no jump.
 
-A jump belongs to a jump input that rises at sample c. Its flights are those with
-c <= l <= c + search_s / dt. A fast gait has flights of `long_s` or longer, too, but they do not
-lift the trunk: a high flight lasts `long_s` or more with max z more than `rise` over standing
-height. The main flight is the longest high one, at equal length the first; without one there was no
-jump. With p, z the trunk's position and height, v its velocity, e = d + tail_s / dt:
-
-    height                 max z - min z over c .. e                       (paper E5)
-                           (without a jump: over c .. c + search_s / dt)
-    apex_gain              max z over l .. d-1, less standing height
-    rise, ballistic        max z over l .. d-1 less z_l;  v_z^2 / 2g at l
-    delay, duration        (l - c) dt;  (d - l) dt
-    lift_off_velocity      v_z at l;  horizontal_velocity |v_xy| at l      (reading A6)
-    distance               |xy_d - xy_l|                                   (reading A17)
-    along                  (xy_d - xy_l) . R_yaw(l) u, u the unit command in the trunk's frame
-    distance_minima        |xy_b - xy_a|, z_a the least over c .. l, z_b the least over d .. e
-    upright                at d + upright_s / dt the robot has not fallen and the trunk's z axis is
-                           within `tilt_deg` of the vertical
+`FIGURES` has unit and equation of every figure, in the symbols of `SYMBOLS`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import PronkError
+from pronk.actuator import model as drive
 from pronk.robots.legged import legged
+from pronk.robots.robot import Robot
+from pronk.runtime.script import Script
+from pronk.virtual.capture import Capture
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -48,16 +36,31 @@ GRAVITY = 9.81
 """[m/s^2]"""
 RISE = 0.03
 """Over standing height; a flight in which the trunk goes higher is a jump, commanded or not [m]."""
+FALLEN_COSINE = 0.34
+"""A trunk that leans further (70 degrees) has fallen, as in training."""
+FALLEN_HEIGHT = 0.08
+"""A trunk that is lower lies on the ground, as in training [m]."""
+AVERAGE_S = 0.01
+"""Over which joint speeds are averaged [s]."""
+SETTLE_S = 1.0
+"""Time to reach the commanded speed, left out of the figures of the run [s]."""
+BODY = legged("mini_cheetah")
+SYMBOLS = (
+    "c: the jump input rises. l, d: lift-off and touchdown of the main flight, the longest in "
+    "which the trunk rises more than 3 cm over standing. e: d + 0.5 s. p, z, v: position, height "
+    "and velocity of the trunk's origin. f_i, r: centre and radius of a foot. u: direction of "
+    "p_d - p_l in the plane."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class JumpRules:
-    """Times [s] and heights of the definitions."""
+    """Times [s] and heights [m] of the definitions."""
 
     flight_s: float = 0.015
-    """Shortest flight phase: three physics steps."""
+    """Shortest flight phase: three physics steps of training."""
     long_s: float = 0.06
-    """Shortest flight that is counted as a long one; a ballistic hop of this length rises 4 mm."""
+    """Shortest high flight; a ballistic hop of this length rises 4 mm."""
     search_s: float = 1.5
     """A jump lifts off within this time after its command."""
     tail_s: float = 0.5
@@ -68,25 +71,10 @@ class JumpRules:
     """Largest tilt of an upright robot [deg]."""
     grace_s: float = 0.5
     """Time after the start in which flights are not counted: the robot is set down."""
-    standing_height: float = field(default_factory=lambda: legged("mini_cheetah").standing_height)
-    """Of the trunk, in the default pose [m]."""
+    standing_height: float = BODY.standing_height
+    """Of the trunk, in the default pose."""
     rise: float = RISE
-    """Over standing height, what a high flight exceeds [m]."""
-
-    def __post_init__(self) -> None:
-        """Refuse rules that contradict each other.
-
-        Raises:
-            PronkError: A number is not positive, or a long flight is shorter than a flight.
-        """
-        for name, value in vars(self).items():
-            if not value > 0.0:
-                raise PronkError(f"JumpRules.{name} is {value}; it must be positive.")
-        if self.long_s < self.flight_s:
-            raise PronkError(
-                f"JumpRules.long_s is {self.long_s}; it must not be shorter than flight_s, "
-                f"{self.flight_s}."
-            )
+    """Over standing height, what a high flight exceeds."""
 
     @property
     def high(self) -> float:
@@ -104,7 +92,7 @@ class Series:
     """The recorded motion of one robot, from its start to its fall or to the end."""
 
     position: Array
-    """Trunk, world frame [m]. (T, 3)"""
+    """Trunk, world frame, z up [m]. (T, 3)"""
     velocity: Array
     """Trunk, world frame [m/s]. (T, 3)"""
     orientation: Array
@@ -114,24 +102,12 @@ class Series:
     dt: float
     """Time between samples [s]."""
 
-    def __post_init__(self) -> None:
-        """Refuse arrays of other shapes.
-
-        Raises:
-            PronkError: A shape is not the documented one.
-        """
-        length = len(self.position)
-        for name, width in (("position", 3), ("velocity", 3), ("orientation", 4), ("contact", 4)):
-            shape = np.shape(getattr(self, name))
-            if shape != (length, width):
-                raise PronkError(f"Series.{name} has shape {shape}; expected {(length, width)}.")
-
     def steps(self, seconds: float) -> int:
         """Samples in a time, to the nearest."""
         return steps(seconds, self.dt)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Flight:
     """A flight phase: samples `liftoff` .. `touchdown` - 1."""
 
@@ -144,20 +120,31 @@ class Flight:
         return self.touchdown - self.liftoff
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class JumpFlights:
-    """The flight phases of one jump input, and the others."""
+    """The flight phases of one jump input, the high ones of them, and all others."""
 
     all: tuple[Flight, ...]
     high: tuple[Flight, ...]
-    """Those of `long_s` or more that are high."""
     uncommanded: tuple[Flight, ...]
-    """Those that belong to no jump input."""
 
     @property
     def main(self) -> Flight | None:
         """The longest of the high ones; None if there was no jump."""
         return max(self.high, key=lambda phase: phase.samples, default=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JumpEvents:
+    """Rise and fall of the jump input, lift-off and touchdown, on the capture's clock [s]."""
+
+    on: float
+    off: float
+    liftoff: float
+    touchdown: float
+
+
+# ---- trunk ----
 
 
 def steps(seconds: float, dt: float) -> int:
@@ -166,22 +153,14 @@ def steps(seconds: float, dt: float) -> int:
 
 
 def heading(orientation: Array) -> Array:
-    """Yaw of unit quaternions, atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)) [rad].
-
-    Args:
-        orientation: w, x, y, z. (..., 4)
-    """
+    """Yaw of unit quaternions w, x, y, z [rad]: atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)). (...,)."""
     w, x, y, z = np.moveaxis(np.asarray(orientation), -1, 0)
     yaw: Array = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return yaw
 
 
 def cosine_of_tilt(orientation: Array) -> Array:
-    """Vertical part of the trunk's z axis, 1 - 2 (x^2 + y^2). (...,).
-
-    Args:
-        orientation: w, x, y, z. (..., 4)
-    """
+    """Vertical part of the trunk's z axis, 1 - 2 (x^2 + y^2), of quaternions w, x, y, z. (...,)."""
     cosine: Array = 1.0 - 2.0 * (orientation[..., 1] ** 2 + orientation[..., 2] ** 2)
     return cosine
 
@@ -207,36 +186,26 @@ def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
     `contact`: feet on the ground. (T, 4)
     """
     airborne = ~np.asarray(contact, dtype=bool).any(axis=-1)
-    edges = np.flatnonzero(np.diff(airborne.astype(np.int8), prepend=0))
-    return tuple(
-        Flight(liftoff=int(begin), touchdown=int(end))
-        for begin, end in zip(edges[0::2], edges[1::2], strict=False)
-        if end - begin >= least
-    )
+    edges = np.flatnonzero(np.diff(airborne.astype(np.int8), prepend=0)).tolist()
+    pairs = zip(edges[0::2], edges[1::2], strict=False)
+    return tuple(Flight(begin, end) for begin, end in pairs if end - begin >= least)
 
 
 def jump_flights(series: Series, on: int | None, rules: JumpRules) -> JumpFlights:
-    """Sort the flight phases by whether they belong to the jump input.
-
-    It is on from sample `on`, or never if None.
-    """
+    """Sort the flight phases by whether they belong to the jump input that rises at sample `on`."""
     z = series.position[:, 2]
     phases = flights(series.contact, least=series.steps(rules.flight_s))
     last = -1 if on is None else on + series.steps(rules.search_s)
     own = tuple(phase for phase in phases if on is not None and on <= phase.liftoff <= last)
     long = (phase for phase in own if phase.samples >= series.steps(rules.long_s))
-    high = (phase for phase in long if z[phase.liftoff : phase.touchdown].max() > rules.high)
-    others = tuple(phase for phase in phases if phase not in own)
-    return JumpFlights(all=own, high=tuple(high), uncommanded=others)
+    high = tuple(phase for phase in long if z[phase.liftoff : phase.touchdown].max() > rules.high)
+    return JumpFlights(own, high, tuple(phase for phase in phases if phase not in own))
 
 
 def uncommanded_height(series: Series, on: int | None, rules: JumpRules) -> float:
     """Highest trunk in a flight phase that belongs to no jump input [m]; NaN without one.
 
-    Args:
-        series: The robot.
-        on: First sample with the jump input; None for a robot that only walks.
-        rules: Of the definitions; flights that lift off within `grace_s` do not count.
+    `on` is the first sample with the jump input, None for a robot that only walks.
     """
     tops = [
         series.position[phase.liftoff : phase.touchdown, 2].max()
@@ -251,15 +220,9 @@ def measure_jump(
 ) -> tuple[dict[str, Any], Flight | None]:
     """Measure the jump of the input that rises at sample `on`.
 
-    Args:
-        series: The robot; it has sample `on`.
-        on: First sample with the jump input.
-        command: Forward and left velocity command [m/s].
-        rules: Of the definitions.
-
     Returns:
-        The figures of the module by name; without a jump only `found`, `flights`, `high_flights`
-        and `height`. And the main flight, or None.
+        The trunk's figures by name; without a jump only `found`, `flights`, `high_flights` and
+        `height`. And the main flight, or None.
     """
     dt, plane, z = series.dt, series.position[:, :2], series.position[:, 2]
     found = jump_flights(series, on, rules)
@@ -294,3 +257,272 @@ def measure_jump(
         "delay": (up - on) * dt,
         "duration": main.samples * dt,
     }, main
+
+
+# ---- figures of a capture ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """What a figure of a run is."""
+
+    name: str
+    unit: str
+    """`1` for a number without one."""
+    says: str
+    """Its equation."""
+    joints: bool = False
+    """True if there is one for every joint."""
+
+    @property
+    def column(self) -> str:
+        """Name and unit, as a column of a table is called: `height_m`, `peak_torque_N_m`."""
+        unit = "" if self.unit == "1" else "_" + self.unit.replace("/", "_per_").replace(" ", "_")
+        return self.name + unit
+
+
+def number(unit: str, says: str) -> Any:
+    """Declare a figure that is a number: its unit and its equation."""
+    return field(default=math.nan, metadata={"unit": unit, "says": says})
+
+
+def _joints(unit: str, says: str) -> Any:
+    return field(default=(), metadata={"unit": unit, "says": says, "joints": True})
+
+
+@dataclass(frozen=True, kw_only=True)
+class JumpFigures:
+    """One jump. A figure that does not exist (no jump, no landing) is NaN."""
+
+    standing: bool
+    """The robot had not fallen when the jump input came."""
+    found: bool = False
+    """There was a jump."""
+    non_foot_contact: bool = False
+    """Something but a foot touched the ground, from c to 2 s after d."""
+    fell: bool = False
+    """The robot fell, at any time of the run."""
+    upright: bool = False
+    """There was a jump, and 2 s after d the robot stood, tilted by 30 degrees at most."""
+
+    height: float = number("m", "max z - min z over c .. e (paper E5)")
+    apex_gain: float = number(
+        "m", "max z over l .. d-1, less the height of the trunk in the default pose"
+    )
+    rise: float = number("m", "max z over l .. d-1, less z_l")
+    ballistic: float = number("m", "v_z^2 / 2g with v_z at l: what a stone would rise")
+    clearance: float = number(
+        "m",
+        "max over l .. d-1 of min over the feet of (height of f_i - r): all feet are this high at "
+        "once",
+    )
+    clearance_half: float = number(
+        "m",
+        "min over the middle half of l .. d-1 of min over the feet of (height of f_i - r): no foot "
+        "is lower for half of the flight",
+    )
+    distance: float = number("m", "|p_d - p_l| in the plane (paper E6, reading A17)")
+    along: float = number("m", "(p_d - p_l) along the commanded direction, heading at l")
+    distance_minima: float = number(
+        "m",
+        "|p_b - p_a| in the plane, z_a the least over c .. l and z_b the least over d .. e "
+        "(the other reading of A17)",
+    )
+    gap: float = number(
+        "m",
+        "min over the feet of f_i . u at its first contact from d on, less max over the feet of "
+        "f_i . u at its last contact before l (reading A16)",
+    )
+    lift_off_velocity: float = number("m/s", "v_z at l (reading A6)")
+    horizontal_velocity: float = number("m/s", "|v_xy| at l")
+    delay: float = number("s", "time from c to l")
+    duration: float = number("s", "time from l to d")
+    flights: float = number("1", "flight phases that lift off from c to c + 1.5 s")
+    high_flights: float = number("1", "those of them that are 60 ms or longer and high")
+    speed: float = number(
+        "m/s", "mean velocity along the command and the heading, from 1 s after it to c"
+    )
+    roll_rate_rms: float = number("rad/s", "root mean square of the roll rate while accelerating")
+    roll_rate_peak: float = number("rad/s", "greatest |roll rate| while accelerating")
+    pitch_rate_rms: float = number("rad/s", "root mean square of the pitch rate while accelerating")
+    pitch_rate_peak: float = number("rad/s", "greatest |pitch rate| while accelerating")
+    energy: float = number(
+        "J", "electrical energy over c .. e, what comes back into the battery taken off"
+    )
+    cost_of_transport: float = number(
+        "1", "electrical energy / (m g |p_c - p_b|) from b, 1 s after the command to run, to c"
+    )
+    peak_torque: tuple[float, ...] = _joints("N m", "greatest |motor torque| over c .. e")
+    peak_speed: tuple[float, ...] = _joints(
+        "rad/s", "greatest |joint speed|, averaged over 10 ms, over c .. e"
+    )
+    torque_margin: tuple[float, ...] = _joints(
+        "1",
+        "least distance over c .. e of the motor torque from the drive's torque-speed curve at "
+        "nominal bus voltage and that speed, as a share of the effort limit; 0 on the curve, "
+        "negative beyond it, as where a motor gives more than its drive believes",
+    )
+
+    @property
+    def success(self) -> bool:
+        """The landing: upright 2 s later, and nothing but feet touched the ground."""
+        return self.upright and not self.non_foot_contact
+
+
+def figures_of(kind: type[Any]) -> dict[str, Figure]:
+    """Return every figure that is a number, by name, of a dataclass of figures."""
+    return {one.name: Figure(name=one.name, **one.metadata) for one in fields(kind) if one.metadata}
+
+
+FIGURES: Mapping[str, Figure] = figures_of(JumpFigures)
+
+
+def series_of(capture: Capture, *, whole: bool = False) -> Series:
+    """Return the trunk and the contacts, up to the fall unless `whole`."""
+    end = len(capture.time) if whole else fallen_at(capture)
+    names = ("position", "velocity", "orientation", "contact")
+    return Series(**{name: getattr(capture, name)[:end] for name in names}, dt=capture.dt)
+
+
+def fallen_at(capture: Capture) -> int:
+    """First sample at which the robot lies or leans too far; the sample count if it never does."""
+    cosine = cosine_of_tilt(capture.orientation)
+    fallen = (cosine < FALLEN_COSINE) | (capture.position[:, 2] < FALLEN_HEIGHT)
+    return int(np.argmax(fallen)) if fallen.any() else len(fallen)
+
+
+def sample_at(capture: Capture, time: float) -> int:
+    """First sample at or after a time on the capture's clock [s]."""
+    return int(np.searchsorted(capture.time, time - 1e-3 * capture.dt))
+
+
+def jump_events(capture: Capture, script: Script, *, began: float = 0.0) -> JumpEvents | None:
+    """Return the times of the main flight, or None without a jump.
+
+    `began` is when the policy took over, on the capture's clock [s].
+    """
+    series, rise = series_of(capture), began + script.on
+    on = sample_at(capture, rise)
+    main = jump_flights(series, on, JumpRules()).main if on < len(series.position) else None
+    if main is None:
+        return None
+    up, down = (float(capture.time[k]) for k in (main.liftoff, main.touchdown))
+    return JumpEvents(on=rise, off=began + script.off, liftoff=up, touchdown=down)
+
+
+def measure(
+    capture: Capture,
+    script: Script,
+    robot: Robot,
+    *,
+    began: float,
+    mass: float,
+    rules: JumpRules | None = None,
+) -> JumpFigures:
+    """Return the figures of one run.
+
+    Args:
+        capture: The recorded run.
+        script: What was commanded.
+        robot: Its drives' limits give the torque margin.
+        began: When the policy took over, on the capture's clock [s].
+        mass: Of the robot, for the cost of transport [kg].
+        rules: Of the definitions.
+    """
+    rules = rules or JumpRules()
+    series = series_of(capture)
+    run, on = (sample_at(capture, began + t) for t in (script.start, script.on))
+    fell = len(series.position) < len(capture.time)
+    if on >= len(series.position):
+        return JumpFigures(standing=False, fell=fell)
+    figures, main = measure_jump(series, on, script.command, rules)
+    seconds = rules.search_s if main is None else rules.tail_s
+    last = (on if main is None else main.touchdown) + series.steps(seconds)
+    end = min(last, len(series.position) - 1)
+    judged = (main.touchdown + series.steps(rules.upright_s)) if main else end
+    figures |= {
+        "non_foot_contact": bool(capture.other_contact[on : judged + 1].any()),
+        "energy": float(capture.electrical_power[on : end + 1].sum() * capture.dt),
+    }
+    figures |= _rates(capture, run, on)
+    figures |= _run(capture, script, run + series.steps(SETTLE_S), on, mass=mass)
+    figures |= _loads(capture, robot, on, end)
+    if main is not None:
+        feet = capture.foot_position[main.liftoff : main.touchdown, :, 2]
+        low = feet.min(axis=1) - BODY.foot_radius
+        quarter = len(low) // 4
+        figures |= {
+            "clearance": float(low.max()),
+            "clearance_half": float(low[quarter : len(low) - quarter].min()),
+            "gap": _gap(capture, main),
+        }
+    return JumpFigures(standing=True, fell=fell, **figures)
+
+
+def _rates(capture: Capture, start: int, on: int) -> dict[str, float]:
+    """Roll and pitch rates in the trunk's frame while the robot accelerates (R7)."""
+    rates = capture.angular_velocity[start:on, :2]
+    if not len(rates):
+        return {}
+    rms, peak = np.sqrt(np.mean(rates**2, axis=0)), np.abs(rates).max(axis=0)
+    return {
+        f"{axis}_rate_{what}": float(values[i])
+        for i, axis in enumerate(("roll", "pitch"))
+        for what, values in (("rms", rms), ("peak", peak))
+    }
+
+
+def _run(capture: Capture, script: Script, start: int, on: int, *, mass: float) -> dict[str, float]:
+    """Speed and cost of transport of the steady run before the jump."""
+    if start >= on:
+        return {}
+    travelled = float(np.hypot(*(capture.position[on, :2] - capture.position[start, :2])))
+    work = float(capture.electrical_power[start:on].sum() * capture.dt)
+    figures = {"cost_of_transport": work / (mass * GRAVITY * travelled)} if travelled else {}
+    forward, left = script.command[:2]
+    if math.hypot(forward, left):
+        direction = heading(capture.orientation[start:on]) + math.atan2(left, forward)
+        velocity = capture.velocity[start:on]
+        part = velocity[:, 0] * np.cos(direction) + velocity[:, 1] * np.sin(direction)
+        figures["speed"] = float(part.mean())
+    return figures
+
+
+def _loads(capture: Capture, robot: Robot, on: int, end: int) -> dict[str, tuple[float, ...]]:
+    """Peaks of each joint, and how near to its torque-speed curve they come."""
+    # Links ring on their belts at 100 Hz and more; what the motors turn at is the average.
+    half = max(1, round(0.5 * AVERAGE_S / capture.dt))
+    late = np.minimum(np.arange(on, end + 1) + half, len(capture.time) - 1)
+    early = np.maximum(np.arange(on, end + 1) - half, 0)
+    turned = capture.joint_position[late] - capture.joint_position[early]
+    speed = turned / (capture.time[late] - capture.time[early])[:, None]
+    torque = capture.torque[on : end + 1]
+    margins = []
+    for i, joint in enumerate(robot.joints):
+        limits = (joint.drive.stall_torque, joint.drive.no_load_speed, joint.drive.effort_limit)
+        low, high = drive.torque_limits(speed[:, i], *limits)
+        least = np.minimum(high - torque[:, i], torque[:, i] - low).min()
+        margins.append(float(least) / joint.drive.effort_limit)
+    return {
+        "peak_torque": tuple(np.abs(torque).max(axis=0).tolist()),
+        "peak_speed": tuple(np.abs(speed).max(axis=0).tolist()),
+        "torque_margin": tuple(margins),
+    }
+
+
+def _gap(capture: Capture, flight: Flight) -> float:
+    """Widest gap across the way of travel without a foothold (reading A16) [m].
+
+    NaN if a foot never stood before or never touches again, or nothing was travelled.
+    """
+    up, down = flight.liftoff, flight.touchdown
+    displacement = capture.position[down, :2] - capture.position[up, :2]
+    length = float(np.hypot(*displacement))
+    before, after = capture.contact[:up], capture.contact[down:]
+    if length == 0.0 or not (before.any(axis=0).all() and after.any(axis=0).all()):
+        return math.nan
+    travelled = capture.foot_position[:, :, :2] @ (displacement / length)
+    feet = np.arange(travelled.shape[1])
+    left = travelled[up - 1 - before[::-1].argmax(axis=0), feet]
+    met = travelled[down + after.argmax(axis=0), feet]
+    return float(met.min() - left.max())

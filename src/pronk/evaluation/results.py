@@ -2,7 +2,7 @@
 
 Jumps, walks, varied robots and crossings share one container, one table and one codec; a `Kind` has
 what differs. Unknown numbers are NaN, in CSV an empty cell, in JSON null. Sums are computed from
-the rows; those in the JSON file are for readers of it.
+the rows; those in the JSON file are for its readers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import ArtefactError
-from pronk.evaluation.metrics import JumpFigures, figures_of
+from pronk.evaluation.jumps import JumpFigures, figures_of
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.files import write_text
-from pronk.runtime.script import STILL, Script
+from pronk.runtime.script import Script
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ one jump alone, which does not scatter."""
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """A kind of results: its files and its figures."""
+    """A kind of results: its files `NAME.csv` and `NAME.json`, and its figures."""
 
     table: str
     summary: str
@@ -48,7 +48,7 @@ class Kind:
     writer: str
     """The command that writes it."""
     figures: type[Any]
-    """Dataclass of one run's figures: flags, and numbers with `Figure` metadata."""
+    """Dataclass of one run's figures: flags, texts, and numbers with `Figure` metadata."""
     compared: tuple[str, ...] = ()
     """Figures whose scatter is compared between policies."""
 
@@ -56,7 +56,7 @@ class Kind:
 JUMPS = Kind(
     table="trials.csv",
     summary="summary.json",
-    schema="pronk/trial/2",
+    schema="pronk/trial/3",
     writer="pronk trial POLICY --out FOLDER",
     figures=JumpFigures,
     compared=(
@@ -109,7 +109,7 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """A figure over many runs; unknown values are left out. NaN where there are none."""
+    """A figure over the `n` runs that have it; NaN where there are none."""
 
     mean: float = math.nan
     std: float = math.nan
@@ -120,11 +120,10 @@ class Spread:
     p95: float = math.nan
     most: float = math.nan
     n: int = 0
-    """Runs that have the figure."""
 
     @classmethod
     def of(cls, values: ArrayLike) -> Self:
-        """Sum up one value a run."""
+        """Sum up one value a run; unknown ones are left out."""
         known = np.asarray(values, dtype=float)
         known = known[np.isfinite(known)]
         if not len(known):
@@ -189,13 +188,13 @@ class Results:
     """The runs of one kind, and what was run."""
 
     kind: Kind = JUMPS
+    rows: tuple[Row, ...] = ()
+    """By policy, then command, then number."""
     robot: str
     virtual: bool = True
     """Measured on pronk's virtual robot."""
     subjects: tuple[Subject, ...]
     cases: tuple[Case, ...]
-    rows: tuple[Row, ...]
-    """By policy, then command, then number."""
     joint_names: tuple[str, ...] = ()
     seed: int
     sim_params: Mapping[str, Any]
@@ -204,9 +203,9 @@ class Results:
     """Without the spread of the jump input's time."""
     spread_s: float = 0.0
     rules: Mapping[str, float] = field(default_factory=dict)
-    """Of the definitions, see `pronk.evaluation.jumps.JumpRules`."""
-    mass: float = math.nan
-    """Of the robot, for the cost of transport [kg]."""
+    """`JumpRules` of the definitions."""
+    mass: float = 0.0
+    """Of the robot, for the cost of transport [kg]; 0 where there is none."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """What else belongs to the kind."""
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -247,26 +246,24 @@ class Results:
     def _cell(self, rows: Sequence[Row]) -> Cell:
         figures = [row.figures for row in rows]
         found = [each for each in figures if getattr(each, "found", True)]
-        succeeded = sum(each.success for each in figures)
-        known = figures_of(self.kind.figures)
+        counts = {
+            name: sum(getattr(each, name, name == "standing") for each in figures)
+            for name in ("standing", "fell", "non_foot_contact")
+        }
+        succeeded, known = sum(each.success for each in figures), figures_of(self.kind.figures)
 
         def spread(name: str, joint: int | None = None) -> Spread:
             values = (getattr(each, name) for each in found)
             return Spread.of([v if joint is None else v[joint] if v else math.nan for v in values])
 
         return Cell(
-            policy=rows[0].policy,
-            case=rows[0].case,
-            parameter=rows[0].parameter,
-            value=rows[0].value,
+            **{name: getattr(rows[0], name) for name in ("policy", "case", "parameter", "value")},
+            **counts,
             n=len(rows),
-            standing=sum(getattr(each, "standing", True) for each in figures),
             found=len(found),
             succeeded=succeeded,
             success=succeeded / len(rows),
             success_ci95=share_interval(succeeded, len(rows)),
-            fell=sum(getattr(each, "fell", False) for each in figures),
-            non_foot_contact=sum(getattr(each, "non_foot_contact", False) for each in figures),
             figures={name: spread(name) for name, each in known.items() if not each.joints},
             joints={
                 name: {joint: spread(name, i) for i, joint in enumerate(self.joint_names)}
@@ -292,16 +289,9 @@ class Results:
             [self.values(name, each, figure) for each in cases] for name in (first, other)
         )
         value, low, high = ratio_of_scatter(own, others, seed=self.seed)
-        return Ratio(
-            figure=figure,
-            case=case,
-            policy=first,
-            other=other,
-            value=value,
-            low=low,
-            high=high,
-            n=(sum(map(len, own)), sum(map(len, others))),
-        )
+        n = (sum(map(len, own)), sum(map(len, others)))
+        who = {"figure": figure, "case": case, "policy": first, "other": other}
+        return Ratio(**who, value=value, low=low, high=high, n=n)  # type: ignore[arg-type]
 
 
 def share_interval(count: int, n: int) -> tuple[float, float]:
@@ -317,18 +307,9 @@ def ratio_of_scatter(
 ) -> tuple[float, float, float]:
     """Sum of the standard deviations of `others` over that of `own`, and its 95 % interval.
 
-    The interval is that of the percentile bootstrap, every sample resampled by itself. All NaN
-    where a sample has fewer than two values or `own` does not scatter; with fewer than `FEWEST`
-    values in a sample the interval alone is NaN.
-
-    Args:
-        own: One sample of a figure for each command.
-        others: The same of the other policy.
-        seed: Of the bootstrap.
-        resamples: Of the bootstrap.
-
-    Returns:
-        (ratio, low, high)
+    One sample of a figure for each command. The interval is that of the percentile bootstrap, every
+    sample resampled by itself. All NaN where a sample has fewer than two values or `own` does not
+    scatter; with fewer than `FEWEST` values in a sample the interval alone is NaN.
     """
     from scipy.stats import DegenerateDataWarning, bootstrap
 
@@ -368,75 +349,60 @@ def ratio_of_scatter(
 def _columns(kind: Kind, joint_names: Sequence[str]) -> Iterator[tuple[str, str, int | None]]:
     """Column, field of the figures, and index of the joint, flags first."""
     known = figures_of(kind.figures)
-    for entry in fields(kind.figures):
-        figure = known.get(entry.name)
-        if figure is None:
-            yield entry.name, entry.name, None
-        elif figure.joints:
-            unit = figure.column.removeprefix(entry.name)
-            yield from (
-                (f"{entry.name}_{joint}{unit}", entry.name, i)
-                for i, joint in enumerate(joint_names)
-            )
+    for name in (entry.name for entry in fields(kind.figures)):
+        column = known[name].column if name in known else name
+        if name in known and known[name].joints:
+            unit = column.removeprefix(name)
+            yield from ((f"{name}_{joint}{unit}", name, i) for i, joint in enumerate(joint_names))
         else:
-            yield figure.column, entry.name, None
+            yield column, name, None
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
     if isinstance(value, bool):
         return str(int(value))
-    return repr(value) if math.isfinite(value) else ""
+    return value if isinstance(value, str) else repr(value) if math.isfinite(value) else ""
 
 
 def to_csv(results: Results) -> str:
     """One row a run; unknown figures are empty, flags 1 and 0, numbers exact."""
     text, columns = io.StringIO(), list(_columns(results.kind, results.joint_names))
     varied = any(row.parameter for row in results.rows)
-    writer = csv.writer(text, lineterminator="\n")
-    own = ["policy", "command", *(["parameter", "value"] if varied else []), "number", "seed"]
-    own += ["capture", "success", "run_s", "began_s"]
-    writer.writerow([*own, *(column for column, _, _ in columns)])
+    table = []
     for row in results.rows:
-        cells: list[Any] = [row.policy, row.case]
-        cells += [row.parameter, row.value] if varied else []
-        cells += [row.number, row.seed, row.capture, row.figures.success]
-        cells += [row.script.run_s, row.began]
-        for _, name, joint in columns:
+        cells: dict[str, Any] = {"policy": row.policy, "command": row.case}
+        cells |= {"parameter": row.parameter, "value": row.value} if varied else {}
+        cells |= {"number": row.number, "seed": row.seed, "capture": row.capture}
+        cells |= {"success": row.figures.success, "run_s": row.script.run_s, "began_s": row.began}
+        for column, name, joint in columns:
             value = getattr(row.figures, name)
-            cells.append(value if joint is None else value[joint] if value else math.nan)
-        writer.writerow([_text(cell) for cell in cells])
+            cells[column] = value if joint is None else value[joint] if value else math.nan
+        table.append({column: _text(value) for column, value in cells.items()})
+    writer = csv.DictWriter(text, list(table[0]) if table else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
     return text.getvalue()
 
 
 def _rows(table: str, head: Results, path: Path) -> Iterator[Row]:
     commands = {case.name: case.command for case in head.cases}
     columns = list(_columns(head.kind, head.joint_names))
-    types = {entry.name: str(entry.type) for entry in fields(head.kind.figures)}
     for line, entry in enumerate(csv.DictReader(io.StringIO(table)), start=2):
         try:
             figures: dict[str, Any] = {}
             for column, name, joint in columns:
-                text = entry[column]
-                if text is None:
+                if (text := entry[column]) is None:
                     raise ValueError("the line is cut off")
-                if joint is not None:
-                    if text:
-                        figures[name] = (*figures.get(name, ()), float(text))
-                elif types[name] == "float":
-                    figures[name] = float(text or "nan")
-                else:
-                    figures[name] = bool(int(text)) if types[name] == "bool" else str(text)
+                if text:
+                    figures[name] = text if joint is None else (*figures.get(name, ()), text)
+            command = commands[entry["command"]]
             yield Row(
                 policy=entry["policy"],
                 case=entry["command"],
                 number=int(entry["number"]),
                 seed=int(entry["seed"]),
-                figures=head.kind.figures(**figures),
-                script=replace(
-                    head.script, command=commands[entry["command"]], run_s=float(entry["run_s"])
-                ),
+                figures=msgspec.convert(figures, head.kind.figures, strict=False),
+                script=replace(head.script, command=command, run_s=float(entry["run_s"])),
                 capture=entry["capture"],
                 began=float(entry["began_s"]),
                 parameter=entry.get("parameter", ""),
@@ -450,9 +416,9 @@ def _rows(table: str, head: Results, path: Path) -> Iterator[Row]:
 
 
 def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
-    """Write a body of dataclasses and plain values as JSON, whole or not at all.
+    """Write a body of dataclasses and plain values as JSON, whole or not at all; return the path.
 
-    NaN becomes null. Returns the path.
+    NaN becomes null.
     """
     text = msgspec.json.format(msgspec.json.encode({"schema": schema, **body}), indent=2)
     write_text(path, text.decode() + "\n")
@@ -464,7 +430,7 @@ def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
     """Read a JSON file of one schema; errors of the block count as damage of the file.
 
     Raises:
-        ArtefactError: Missing, damaged or of another schema; the sentence names the file.
+        ArtefactError: Missing, damaged or of another schema; the message names the file.
     """
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
@@ -474,7 +440,9 @@ def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
         raise ArtefactError(f"{path}: cannot be read ({type(error).__name__}).") from None
     found = body.get("schema") if isinstance(body, dict) else None
     if found != schema:
-        raise ArtefactError(f"{path}: schema {found!r}; this pronk reads {schema!r}.")
+        raise ArtefactError(
+            f"{path}: schema {found!r}; this pronk reads {schema!r}. `{writer}` writes it anew."
+        )
     try:
         yield body
     except (KeyError, TypeError, AttributeError, ValueError, msgspec.ValidationError) as error:
@@ -483,60 +451,32 @@ def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
         ) from error
 
 
-_HEAD = ("robot", "virtual", "joint_names", "seed", "sim_params", "mass", "settings")
-_LATE = ("versions", "timing")
-
-
 def save(folder: Path, results: Results) -> tuple[Path, Path]:
     """Write table and summary, each whole or not at all, the summary last; return the files."""
     kind = results.kind
     table = folder / kind.table
     write_text(table, to_csv(results))
-    script = {k: v for k, v in asdict(results.script).items() if k != "command"}
-    summary = save_json(
-        folder / kind.summary,
-        kind.schema,
-        {name: getattr(results, name) for name in _HEAD}
-        | {
-            "policies": results.subjects,
-            "protocol": {
-                "commands": results.cases,
-                "script": script,
-                "spread_s": results.spread_s,
-                "rules": results.rules,
-            },
-        }
-        | {name: getattr(results, name) for name in _LATE}
-        | {
-            "definitions": figures_of(kind.figures),
-            "cells": results.cells,
-            "ratios": results.ratios,
-        },
-    )
-    return table, summary
+    head = {name: value for name, value in vars(results).items() if name in _HEAD}
+    sums = {"cells": results.cells, "ratios": results.ratios}
+    body = {**head, "definitions": figures_of(kind.figures), **sums}
+    return table, save_json(folder / kind.summary, kind.schema, body)
+
+
+_HEAD = {entry.name for entry in fields(Results)} - {"kind", "rows"}
 
 
 def load(folder: Path, kind: Kind = JUMPS) -> Results:
     """Read what `save` wrote.
 
     Raises:
-        ArtefactError: Missing, damaged or of another schema; the sentence names file and field.
+        ArtefactError: Missing, damaged or of another schema; the message names file and field.
     """
     with load_json(folder / kind.summary, kind.schema, kind.writer) as body:
-        protocol = body["protocol"]
-        head = Results(
-            kind=kind,
-            subjects=msgspec.convert(body["policies"], tuple[Subject, ...]),
-            cases=msgspec.convert(protocol["commands"], tuple[Case, ...]),
-            rows=(),
-            script=Script(command=STILL, **protocol["script"]),
-            spread_s=protocol["spread_s"],
-            rules=protocol["rules"],
-            **{name: body[name] for name in (*_HEAD, *_LATE)}
-            | {"joint_names": tuple(body["joint_names"])},
-        )
+        stored = {name: body[name] for name in _HEAD}
+        head = replace(msgspec.convert(stored, Results), kind=kind)
+        runs = sum(cell["n"] for cell in body["cells"])
         counts = {
-            (c["parameter"], c["value"], c["policy"], c["case"]): c["n"] for c in body["cells"]
+            (c["policy"], c["case"], c["parameter"], c["value"], c["n"]) for c in body["cells"]
         }
     path = folder / kind.table
     try:
@@ -546,13 +486,12 @@ def load(folder: Path, kind: Kind = JUMPS) -> Results:
             f"{path}: cannot be read ({error.strerror}); `{kind.writer}` writes it."
         ) from None
     results = replace(head, rows=tuple(_rows(table, head, path)))
-    found = {
-        (c.parameter, c.value if c.parameter else None, c.policy, c.case): c.n
+    if counts != {
+        (c.policy, c.case, c.parameter, c.value if c.parameter else None, c.n)
         for c in results.cells
-    }
-    if found != counts:
+    }:
         raise ArtefactError(
-            f"{path}: {len(results.rows)} runs do not fit the {sum(counts.values())} that "
-            f"{kind.summary} counts; run the trial again."
+            f"{path}: {len(results.rows)} runs do not fit the {runs} that {kind.summary} counts; "
+            "run the trial again."
         )
     return results

@@ -15,28 +15,29 @@ from __future__ import annotations
 
 import hashlib
 import math
+import multiprocessing
 import os
 import platform
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NotRequired, TypedDict, TypeVar, Unpack
 
 import msgspec
 import numpy as np
 
 import pronk
 from pronk.errors import ArtefactError, HardwareError, PronkError
-from pronk.evaluation.jumps import JumpRules
-from pronk.evaluation.metrics import measure
+from pronk.evaluation.jumps import JumpRules, measure
 from pronk.evaluation.pictures.video import ENDINGS
-from pronk.evaluation.processes import in_processes
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.results import JUMPS, SUMMARY, TABLE, Kind, Results, Row, Subject, save
-from pronk.policy.contract import Contract, check
+from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot
@@ -47,12 +48,34 @@ from pronk.virtual.ground import Ground, Start
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams
 
+J = TypeVar("J")
+R = TypeVar("R")
+Keep = Literal["none", "some", "all"]
+Progress = Callable[[float], None]
+"""Called with the share done, 0 to 1."""
+
 CAPTURES, VIDEOS = "captures", "videos"
 """Folders beside the table."""
 _OFFSETS = (1.0, 0.5, 0.0)
 """Shares of the drawn joint offsets that are tried until the robot stands."""
-_LEFT_OUT = ("observation", "provenance", "waits_for_stride")
+_LEFT_OUT = ("observation", "provenance")
 """Fields of a policy's contract that a trial does not keep."""
+
+
+class Setup(TypedDict):
+    """What every kind of trial runs on."""
+
+    robot: Robot
+    """Of the policies."""
+    sim_params: SimParams
+    """Of the virtual robot."""
+    out: Path
+    """Folder for tables, summaries and captures."""
+    about: NotRequired[Mapping[str, Any] | None]
+    """Source of the parameters, kept with the results."""
+    processes: NotRequired[int]
+    """Runs at once; the numbers do not depend on it."""
+    progress: NotRequired[Progress | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +86,7 @@ class Plan:
     jumps: int = 20
     """With each command."""
     rates: int = 0
-    """Jumps at `RATES` besides, their captures kept: for the paper's figure of roll and pitch
-    rates (R7)."""
+    """Jumps at `RATES` besides, for the paper's figure of roll and pitch rates (R7)."""
     seed: int = 0
     script: Script = field(default_factory=lambda: Script(command=STILL))
     """Times; the command is each case's."""
@@ -78,15 +100,9 @@ class Plan:
     rules: JumpRules = field(default_factory=JumpRules)
 
     def __post_init__(self) -> None:
-        """Refuse an empty or impossible plan.
-
-        Raises:
-            PronkError: One sentence that names the field.
-        """
+        """Raise `PronkError` for an empty plan or a negative seed."""
         if self.jumps < 1:
             raise PronkError(f"{self.jumps} jumps for each command; expected 1 or more.")
-        if self.rates < 0:
-            raise PronkError(f"{self.rates} jumps at {RATES.name}; expected 0 or more.")
         if self.seed < 0:
             raise PronkError(f"seed {self.seed}; expected 0 or more.")
         names = [case.name for case in self.tried]
@@ -95,10 +111,6 @@ class Plan:
                 f"the commands are {', '.join(names) or 'none'}; expected one or more, all "
                 "different."
             )
-        for name in ("spread_s", "yaw", "joint_offset"):
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise PronkError(f"Plan.{name} is {value}; it must be finite, not negative.")
 
     @property
     def tried(self) -> tuple[Case, ...]:
@@ -133,18 +145,16 @@ def draw(plan: Plan, case: Case, number: int, robot: Robot) -> tuple[Script, Sta
 class Job:
     """One run with all that it depends on, so that every process runs it alike."""
 
+    row: Row
+    """The run, without figures."""
     policy: Path
     sha256: str
     robot: str
     sim_params: SimParams
-    ground: Ground | None
     start: Start
-    seed: int
-    """Of the virtual robot's noise."""
-    script: Script
+    ground: Ground | None = None
+    """None for that of the parameters."""
     rules: JumpRules
-    mass: float
-    """[kg]"""
     keep: Path | None = None
     """File for the capture; None for none."""
     measure: Callable[..., Any] = measure
@@ -153,11 +163,9 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """The figures of one run, and its cost."""
+    """One run with its figures, and its cost."""
 
-    figures: Any
-    began: float
-    """When the policy took over, on the capture's clock [s]."""
+    row: Row
     seconds: float
     """Wall time [s]."""
     cpu_s: float
@@ -165,12 +173,22 @@ class Outcome:
 
 
 @lru_cache(maxsize=4)
-def _policy(path: Path, sha256: str) -> Policy:
-    """Open the policy once in each process."""
+def opened(path: Path, sha256: str) -> Policy:
+    """Open a policy once in each process.
+
+    Raises:
+        ArtefactError: It was changed since the trial began.
+    """
     policy = load_policy(path)
     if policy.sha256 != sha256:
         raise ArtefactError(f"{path}: was changed while the trial ran; run the trial again.")
     return policy
+
+
+@lru_cache(maxsize=4)
+def mass_of(robot: str) -> float:
+    """Mass of a whole robot, by name, from its model [kg]."""
+    return float(load_robot(robot).build_spec().compile().body_mass.sum())
 
 
 def build(job: Job, offset: float = 1.0) -> VirtualRobot:
@@ -181,7 +199,7 @@ def build(job: Job, offset: float = 1.0) -> VirtualRobot:
     return VirtualRobot(
         load_robot(job.robot),
         job.sim_params,
-        seed=job.seed,
+        seed=job.row.seed,
         base="ground",
         ground=job.ground,
         start=start,
@@ -208,27 +226,20 @@ def set_down(job: Job) -> VirtualRobot:
     return machine
 
 
-def record(job: Job) -> tuple[captures.Capture, float]:
-    """Run one job; return the capture and when the policy started [s]."""
-    machine, policy = set_down(job), _policy(job.policy, job.sha256)
-    robot, seconds = load_robot(job.robot), job.script.seconds
-    taken = list(ticks(machine, policy, robot, job.script.commanded, seconds=seconds))
-    if not taken:
-        raise HardwareError("the policy made no step; let it run for one tick or more.")
-    return machine.capture(), taken[0].time
-
-
 def run_job(job: Job) -> Outcome:
     """Run one job and measure it."""
     begun, begun_cpu = time.perf_counter(), time.process_time()
-    seen, began = record(job)
-    robot = load_robot(job.robot)
-    figures = job.measure(seen, job.script, robot, began=began, mass=job.mass, rules=job.rules)
+    machine, robot, script = set_down(job), load_robot(job.robot), job.row.script
+    policy = opened(job.policy, job.sha256)
+    taken = list(ticks(machine, policy, robot, script.commanded, seconds=script.seconds))
+    if not taken:
+        raise HardwareError("the policy made no step; let it run for one tick or more.")
+    seen, began, mass = machine.capture(), taken[0].time, mass_of(job.robot)
+    figures = job.measure(seen, script, robot, began=began, mass=mass, rules=job.rules)
     if job.keep is not None:
         captures.save(job.keep, seen)
     return Outcome(
-        figures=figures,
-        began=began,
+        row=replace(job.row, figures=figures, began=began),
         seconds=time.perf_counter() - begun,
         cpu_s=time.process_time() - begun_cpu,
     )
@@ -237,57 +248,55 @@ def run_job(job: Job) -> Outcome:
 # ---- many runs ----
 
 
-@lru_cache(maxsize=4)
-def _mass(name: str) -> float:
-    return float(load_robot(name).build_spec().compile().body_mass.sum())
+def cores() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        return os.cpu_count() or 1
 
 
-def mass_of(robot: Robot) -> float:
-    """Mass of the whole robot, from its model [kg]."""
-    return _mass(robot.name)
-
-
-def planned_run(
-    subject: Subject,
-    case: Case,
-    number: int,
+def in_processes(
+    work: Callable[[J], R],
+    jobs: Sequence[J],
     *,
-    drawn: tuple[Script, Start, int],
-    robot: Robot,
-    sim_params: SimParams,
-    rules: JumpRules,
-    ground: Ground | None = None,
-    keep: tuple[Path, str] | None = None,
-    measure: Callable[..., Any] = measure,
-) -> tuple[Row, Job]:
-    """Return one run as a row without figures, and as a job.
+    processes: int = 1,
+    progress: Progress | None = None,
+) -> list[R]:
+    """Do every job and return the results in the order of the jobs.
 
-    `drawn` has script, start and noise seed; `keep` folder and name of the capture's file.
+    `work` is a function of a module, that other processes can import; jobs are pickled. With one
+    process everything happens in this one.
+
+    Raises:
+        PronkError: Fewer than one process, or one was killed; and what `work` raises.
     """
-    script, start, seed = drawn
-    row = Row(
-        policy=subject.name,
-        case=case.name,
-        number=number,
-        seed=seed,
-        figures=None,
-        script=script,
-        capture=keep[1] if keep else "",
-    )
-    return row, Job(
-        policy=Path(subject.path),
-        sha256=subject.sha256,
-        robot=robot.name,
-        sim_params=sim_params,
-        ground=ground,
-        start=start,
-        seed=seed,
-        script=script,
-        rules=rules,
-        mass=mass_of(robot),
-        keep=keep[0] / keep[1] if keep else None,
-        measure=measure,
-    )
+    if processes < 1:
+        raise PronkError(f"{processes} processes; expected 1 or more.")
+    report = progress or (lambda share: None)
+    if processes == 1 or len(jobs) <= 1:
+        done = []
+        for job in jobs:
+            done.append(work(job))
+            report(len(done) / len(jobs))
+        return done
+    # A fork of a process that has threads can deadlock.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+        futures: list[Future[R]] = [pool.submit(work, job) for job in jobs]
+        try:
+            for count, future in enumerate(as_completed(futures), start=1):
+                future.result()
+                report(count / len(jobs))
+        except BrokenProcessPool:
+            raise PronkError(
+                "one of the processes was killed, most likely for want of memory; "
+                "try again with --processes 1."
+            ) from None
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return [future.result() for future in futures]
 
 
 def plan_jobs(
@@ -296,15 +305,14 @@ def plan_jobs(
     *,
     robot: Robot,
     sim_params: SimParams,
-    out: Path,
-    ground: Ground | None = None,
-    keep: Literal["none", "some", "all"] = "some",
+    out: Path | None = None,
+    keep: Keep = "none",
     measure: Callable[..., Any] = measure,
-) -> list[tuple[Row, Job]]:
-    """Return every run of a plan, with its row except for the figures.
+) -> list[Job]:
+    """Return every run of a plan.
 
     With `keep="some"` the captures of the first jump with each command and of those at `RATES` are
-    kept.
+    kept in `out`.
     """
     found = []
     for subject in subjects:
@@ -312,57 +320,86 @@ def plan_jobs(
             for number in range(plan.jumps if case in plan.cases else plan.rates):
                 stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
                 some = number == 0 or case not in plan.cases
-                kept = keep == "all" or (keep == "some" and some)
+                kept = out is not None and (keep == "all" or (keep == "some" and some))
+                capture = f"{CAPTURES}/{stem}.npz" if kept else ""
+                script, start, seed = draw(plan, case, number, robot)
+                row = Row(
+                    policy=subject.name,
+                    case=case.name,
+                    number=number,
+                    seed=seed,
+                    figures=None,
+                    script=script,
+                    capture=capture,
+                )
                 found.append(
-                    planned_run(
-                        subject,
-                        case,
-                        number,
-                        drawn=draw(plan, case, number, robot),
-                        robot=robot,
+                    Job(
+                        row=row,
+                        policy=Path(subject.path),
+                        sha256=subject.sha256,
+                        robot=robot.name,
                         sim_params=sim_params,
+                        start=start,
                         rules=plan.rules,
-                        ground=ground,
-                        keep=(out, f"{CAPTURES}/{stem}.npz") if kept else None,
+                        keep=out / capture if out is not None and kept else None,
                         measure=measure,
                     )
                 )
     return found
 
 
-def run_jobs(
-    planned: Sequence[tuple[Row, Job]],
-    *,
-    kind: Kind,
-    subjects: tuple[Subject, ...],
+def run_plan(
+    policies: Sequence[Path],
     plan: Plan,
-    robot: Robot,
-    out: Path,
-    about: Mapping[str, Any] | None,
+    *,
+    kind: Kind = JUMPS,
+    jump: bool = True,
+    varied: Sequence[tuple[str, float, SimParams]] = (),
     settings: Mapping[str, Any] | None = None,
-    processes: int = 1,
-    progress: Callable[[float], None] | None = None,
+    keep: Keep = "none",
+    overwrite: bool | None = None,
+    measure: Callable[..., Any] = measure,
+    **setup: Unpack[Setup],
 ) -> Results:
-    """Run planned jobs, and save and return their results."""
-    begun, jobs = time.perf_counter(), [job for _, job in planned]
-    done = in_processes(run_job, jobs, processes=processes, progress=progress)
-    simulated = sum(job.script.seconds for job in jobs)
+    """Run, measure, save and return all jobs of a plan; see `run_trial`.
+
+    Args:
+        policies: `policy.onnx` of each.
+        plan: Commands and draws.
+        kind: Files and figures.
+        jump: The policies need the jump input.
+        varied: Parameter, value and body, for every body; the one of `setup` if empty.
+        settings: What else is kept with the results.
+        keep: Which captures are kept.
+        overwrite: Whether a trial in the folder is replaced; None adds to the folder.
+        measure: From capture to figures; a function of a module.
+        setup: What it runs on.
+    """
+    robot, out, processes = setup["robot"], setup["out"], setup.get("processes", 1)
+    subjects, jobs = load_subjects(policies, robot, jump=jump), []
+    for parameter, value, params in varied or [("", math.nan, setup["sim_params"])]:
+        kept = {"out": out, "keep": keep, "measure": measure}
+        made = plan_jobs(subjects, plan, robot=robot, sim_params=params, **kept)  # type: ignore[arg-type]
+        build(made[0])  # refuses impossible parameters
+        jobs += [replace(j, row=replace(j.row, parameter=parameter, value=value)) for j in made]
+    if overwrite is not None:
+        prepare(out, overwrite=overwrite)
+    begun = time.perf_counter()
+    done = in_processes(run_job, jobs, processes=processes, progress=setup.get("progress"))
+    simulated = sum(job.row.script.seconds for job in jobs)
     results = Results(
         kind=kind,
         robot=robot.name,
         subjects=subjects,
         cases=plan.tried,
-        rows=tuple(
-            replace(row, figures=each.figures, began=each.began)
-            for (row, _), each in zip(planned, done, strict=True)
-        ),
+        rows=tuple(each.row for each in done),
         joint_names=robot.joint_names,
         seed=plan.seed,
-        sim_params=dict(about or {}),
+        sim_params=dict(setup.get("about") or {}),
         script=plan.script,
         spread_s=plan.spread_s,
         rules=asdict(plan.rules),
-        mass=mass_of(robot),
+        mass=mass_of(robot.name),
         settings=dict(settings or {}),
         versions=versions(),
         timing={
@@ -383,57 +420,24 @@ def run_trial(
     policies: Sequence[Path],
     plan: Plan,
     *,
-    robot: Robot,
-    sim_params: SimParams,
-    out: Path,
-    about: Mapping[str, Any] | None = None,
-    ground: Ground | None = None,
     keep_captures: bool = False,
     overwrite: bool = False,
-    processes: int = 1,
-    progress: Callable[[float], None] | None = None,
+    **setup: Unpack[Setup],
 ) -> Results:
     """Let policies jump on the virtual robot and write the results.
 
     Args:
         policies: `policy.onnx` of each; scatter is compared with that of the first.
         plan: Commands and draws.
-        robot: The robot of the policies.
-        sim_params: Of the virtual robot.
-        out: Folder for table, summary and captures.
-        about: Source of the parameters, kept with the results.
-        ground: Under the robot; None for that of the parameters.
         keep_captures: Keep the capture of every jump, not of the first with each command alone.
-        overwrite: Replace a trial in `out`.
-        processes: Jumps at once; the numbers do not depend on it.
-        progress: Called with the share done, 0 to 1.
+        overwrite: Replace a trial in the folder.
+        setup: What it runs on.
 
     Raises:
         PronkError: Of policies, parameters or folder, before the first step.
     """
-    subjects = load_subjects(policies, robot)
-    planned = plan_jobs(
-        subjects,
-        plan,
-        robot=robot,
-        sim_params=sim_params,
-        out=out,
-        ground=ground,
-        keep="all" if keep_captures else "some",
-    )
-    build(planned[0][1])  # refuses impossible parameters
-    prepare(out, overwrite=overwrite)
-    return run_jobs(
-        planned,
-        kind=JUMPS,
-        subjects=subjects,
-        plan=plan,
-        robot=robot,
-        out=out,
-        about=about,
-        processes=processes,
-        progress=progress,
-    )
+    keep: Keep = "all" if keep_captures else "some"
+    return run_plan(policies, plan, keep=keep, overwrite=overwrite, **setup)
 
 
 def load_subjects(paths: Sequence[Path], robot: Robot, *, jump: bool = True) -> tuple[Subject, ...]:
@@ -442,28 +446,26 @@ def load_subjects(paths: Sequence[Path], robot: Robot, *, jump: bool = True) -> 
     A policy is named after the gains of its training; two of a kind, after their files.
 
     Raises:
-        ArtefactError: Missing, damaged, not for the robot, or without the jump input; the sentence
-            names file and field.
+        ArtefactError: Missing, damaged, not for the robot, or without the jump input where `jump`.
         PronkError: The same policy twice.
     """
-    found = []
+    policies = []
     for path in paths:
-        policy = load_policy(path)
+        policies.append(load_policy(path))
+        contract = policies[-1].contract
         try:
-            check(policy.contract, robot)
+            check(contract, robot)
         except ArtefactError as error:
             raise ArtefactError(f"{path}: {error}") from None
-        if jump and not policy.contract.jump:
+        if jump and not contract.jump:
             raise ArtefactError(
                 f"{path}: this policy was trained to walk only and has no jump input; "
                 "`pronk train jump` adds it."
             )
-        found.append((path, policy))
-    if len({policy.sha256 for _, policy in found}) != len(found):
+    if len({policy.sha256 for policy in policies}) != len(policies):
         raise PronkError(
             f"{', '.join(map(str, paths))}: the same policy twice; give each policy once."
         )
-    names = _names([(path, policy.contract) for path, policy in found])
     return tuple(
         Subject(
             name=name,
@@ -475,14 +477,17 @@ def load_subjects(paths: Sequence[Path], robot: Robot, *, jump: bool = True) -> 
                 if key not in _LEFT_OUT
             },
         )
-        for name, (path, policy) in zip(names, found, strict=True)
+        for name, path, policy in zip(
+            _names(paths, [policy.contract.gains for policy in policies]),
+            paths,
+            policies,
+            strict=True,
+        )
     )
 
 
-def _names(policies: Sequence[tuple[Path, Contract]]) -> list[str]:
-    gains = [contract.gains for _, contract in policies]
-    stems = [path.stem for path, _ in policies]
-    for names in (gains, stems, [path.parent.name for path, _ in policies]):
+def _names(paths: Sequence[Path], gains: list[str]) -> list[str]:
+    for names in (gains, [path.stem for path in paths], [path.parent.name for path in paths]):
         if len(set(names)) == len(names) and all(names):
             return names
     return [f"{name} {i}" for i, name in enumerate(gains, start=1)]
@@ -491,9 +496,7 @@ def _names(policies: Sequence[tuple[Path, Contract]]) -> list[str]:
 def prepare(out: Path, *, overwrite: bool = False) -> None:
     """Make the folder of a trial, before anything is computed.
 
-    Args:
-        out: The folder.
-        overwrite: Take a folder that holds a trial, and delete that trial's own files.
+    With `overwrite` a folder that holds a trial is taken, and that trial's own files are deleted.
 
     Raises:
         PronkError: A file, a folder that is not empty, or one that cannot be written to.
@@ -514,7 +517,7 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
                 f"--out {out}: holds no trial to overwrite; give a new or an empty folder."
             )
         out.mkdir(parents=True, exist_ok=True)
-        # Finds out now, not after an hour, that the folder cannot be written to.
+        # Fails now, not after an hour, if the folder cannot be written to.
         with tempfile.NamedTemporaryFile(dir=out):
             pass
         films = (path for ending in ENDINGS for path in (out / VIDEOS).glob(f"*{ending}"))

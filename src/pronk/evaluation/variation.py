@@ -1,31 +1,34 @@
-"""Jumps of virtual robots that differ in one parameter from the nominal one.
+"""Virtual robots that differ from the given one: by one parameter at a time, or drawn at random.
 
-Every point has the script, starts, noise and times of every other point; one parameter has another
-value. `PARAMETERS` has the values, and the range of training.
+Variation: every point has the script, starts, noise and times of every other point; one parameter
+has another value. Random robots: seeded draws within `TOLERANCES`; everything else stays.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Unpack
 
+import msgspec
 import numpy as np
+import yaml
 
 from pronk.errors import PronkError
-from pronk.evaluation.metrics import JumpFigures
+from pronk.evaluation.jumps import JumpFigures
 from pronk.evaluation.results import Cell, Kind, Results
 from pronk.evaluation.tables import Sheet, number
-from pronk.evaluation.trial import Plan, build, load_subjects, plan_jobs, run_jobs
+from pronk.evaluation.trial import Plan, Setup, run_plan
+from pronk.files import write_text
 from pronk.robots.robot import Robot
-from pronk.virtual.sim_params import SimParams, with_changes
+from pronk.virtual.sim_params import SCHEMA, JointParams, SimParams, with_changes
 
 VARIATION = Kind(
     table="variation.csv",
     summary="variation.json",
-    schema="pronk/trial-variation/2",
+    schema="pronk/trial-variation/3",
     writer="pronk trial POLICY --variation",
     figures=JumpFigures,
 )
@@ -56,17 +59,6 @@ class Parameter:
     values: tuple[float, ...]
     trained: str
     """Its range in training, in words."""
-
-    def __post_init__(self) -> None:
-        """Refuse a parameter without values.
-
-        Raises:
-            PronkError: There are none, or the same twice.
-        """
-        if not self.values or len(set(self.values)) != len(self.values):
-            raise PronkError(
-                f"values {self.values} of {self.name!r}; expected one or more, all different."
-            )
 
     def of(self, sim_params: SimParams) -> float:
         """Return the nominal value."""
@@ -112,10 +104,7 @@ PARAMETERS = (
 
 def parameters_of(results: Results) -> tuple[Parameter, ...]:
     """Return the varied parameters."""
-    return tuple(
-        Parameter(**{**entry, "values": tuple(entry["values"])})
-        for entry in results.settings["parameters"]
-    )
+    return msgspec.convert(results.settings["parameters"], tuple[Parameter, ...])
 
 
 def line(results: Results, parameter: str, policy: str, case: str) -> tuple[Cell, ...]:
@@ -133,73 +122,185 @@ def add_variation(
     policies: Sequence[Path],
     plan: Plan | None = None,
     *,
-    robot: Robot,
-    sim_params: SimParams,
-    out: Path,
-    about: Mapping[str, Any] | None = None,
     parameters: tuple[Parameter, ...] = PARAMETERS,
-    processes: int = 1,
-    progress: Callable[[float], None] | None = None,
+    **setup: Unpack[Setup],
 ) -> Results:
     """Let policies jump on varied virtual robots; write `variation.csv` and `variation.json`.
 
-    Arguments and errors as of `run_trial`; the plan has five jumps with each of the paper's
-    commands if None.
+    Arguments and errors as of `run_trial`; five jumps with each of the paper's commands if `plan`
+    is None.
     """
-    plan = plan or Plan(jumps=5)
-    subjects = load_subjects(policies, robot)
-    nominal = {each.name: each.of(sim_params) for each in parameters}
-    varied = [(NOMINAL, 0.0, sim_params)] + [
-        (each.name, value, with_changes(sim_params, **{each.name: value}))
+    base = setup["sim_params"]
+    varied = [
+        (each.name, value, with_changes(base, **{each.name: value}))
         for each in parameters
         for value in each.values
     ]
-    planned = []
-    for name, value, params in varied:
-        jobs = plan_jobs(subjects, plan, robot=robot, sim_params=params, out=out, keep="none")
-        build(jobs[0][1])  # refuses impossible parameters
-        planned += [(replace(row, parameter=name, value=value), job) for row, job in jobs]
-    return run_jobs(
-        planned,
+    return run_plan(
+        policies,
+        plan or Plan(jumps=5),
         kind=VARIATION,
-        subjects=subjects,
-        plan=plan,
-        robot=robot,
-        out=out,
-        about=about,
-        settings={"parameters": [asdict(each) for each in parameters], "nominal": nominal},
-        processes=processes,
-        progress=progress,
+        varied=[(NOMINAL, 0.0, base), *varied],
+        settings={
+            "parameters": [asdict(each) for each in parameters],
+            "nominal": {each.name: each.of(base) for each in parameters},
+        },
+        **setup,
     )
 
 
 def table(results: Results) -> Sheet:
-    """Landings and heights at every value, all commands together."""
+    """Landings and mean height and distance at every value, all commands together."""
     rows = []
     for each in parameters_of(results):
         for value in sorted({*each.values, results.settings["nominal"][each.name]}):
-            for subject in results.subjects:
-                cells = [
-                    cell
-                    for case in results.cases
-                    for cell in line(results, each.name, subject.name, case.name)
-                    if cell.value == value
-                ]
-                means = (
-                    [cell.figures[name].mean for cell in cells if cell.found]
+            for policy in (subject.name for subject in results.subjects):
+                lines = (line(results, each.name, policy, case.name) for case in results.cases)
+                cells = [cell for cells in lines for cell in cells if cell.value == value]
+                known = [cell.figures for cell in cells if cell.found]
+                height, distance = (
+                    number(float(np.mean([one[name].mean for one in known])) if known else math.nan)
                     for name in ("height", "distance")
                 )
-                rows.append(
-                    (
-                        f"{each.says}, {subject.name}",
-                        f"{value:g} {each.unit}".removesuffix(" 1"),
-                        f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}",
-                        *(number(float(np.mean(one)) if one else math.nan) for one in means),
-                    )
-                )
+                landed = f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}"
+                what = f"{value:g} {each.unit}".removesuffix(" 1")
+                rows.append((f"{each.says}, {policy}", what, landed, height, distance))
     return Sheet(
         title="Virtual robot, one parameter varied at a time",
         columns=("parameter, policy", "value", "landed", "height [m]", "distance [m]"),
         rows=tuple(rows),
         notes=("Means of the commands' means, over the jumps that there were.",),
     )
+
+
+# ---- random robots ----
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How far a number is drawn from the one it is drawn around, uniformly."""
+
+    kind: Literal["relative", "about"]
+    """`relative`: a share of the number; `about`: about `centre`, whatever the number was."""
+    centre: float
+    half: float
+    """Half-width of the draw."""
+    why: str
+
+
+def _relative(half: float, why: str) -> Tolerance:
+    return Tolerance("relative", 0.0, half, why)
+
+
+def _about(centre: float, half: float, why: str) -> Tolerance:
+    return Tolerance("about", centre, half, why)
+
+
+GROUP_TORQUE = 0.06
+"""Relative half-width of a factor on `torque_scale` that the joints of one group share: motors of
+one batch have one magnet material and one winding."""
+
+TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
+    "joints": {
+        "torque_scale": _relative(0.03, "beside the batch: motor to motor, current sensor"),
+        "link_inertia_scale": _relative(0.03, "castings, screws, cables"),
+        "rotor_inertia": _relative(0.05, "makers give +-5 to 10 %"),
+        "belt_stiffness": _relative(0.2, "belt tension, gear preload"),
+        "belt_damping": _relative(0.3, "the same"),
+        "coulomb": _relative(0.3, "preload of gears and seals, grease"),
+        "breakaway": _relative(0.3, "moves with coulomb"),
+        "stribeck_speed": _relative(0.3, "grease"),
+        "presliding_stiffness": _relative(0.2, "grease, preload"),
+        "presliding_damping": _relative(0.2, "the same"),
+        "viscous": _relative(0.3, "grease and its temperature"),
+        "encoder_offset": _about(0.0, 0.004, "zeroed by hand against a stop [rad]"),
+    },
+    "machine": {
+        "command_delay_s": _about(0.003, 0.002, "half to two and a half 500 Hz cycles [s]"),
+        "measurement_delay_s": _about(0.00125, 0.00075, "up to a 500 Hz cycle [s]"),
+        "drive_lag_s": _about(0.0005, 0.0002, "filter of the speed, current loop [s]"),
+        "bus_voltage": _about(24.1, 1.1, "a 6S battery from nearly flat to full [V]"),
+        "bus_resistance": _relative(0.5, "age and cold of the cells"),
+        "gyro_bias": _about(0.0, 0.006, "after some minutes of warming up [rad/s]"),
+        "accelerometer_bias": _about(0.0, 0.08, "8 mg, a MEMS unit's data sheet [m/s^2]"),
+    },
+    "trunk": {
+        "mass_offset": _about(0.3, 0.6, "another battery, a payload [kg]; training drew -0.4..1.6"),
+        "com_offset": _about(0.0, 0.008, "where battery and computer sit [m]"),
+        "inertia_scale": _relative(0.02, "castings, screws, cables"),
+    },
+    "attitude": {
+        "bias": _about(0.0, 0.012, "IMU mounted askew by 0.7 degrees [rad]"),
+        "yaw_drift": _about(0.0, 0.004, "gyro bias that is left [rad/s]"),
+    },
+    "ground": {
+        "friction": _about(0.8, 0.2, "rubber on vinyl to rubber on concrete [1]"),
+        "stiffness": _relative(0.4, "shore hardness of the feet, mats"),
+        "damping": _relative(0.4, "the same"),
+    },
+}
+"""By part of the parameters and name of the number."""
+
+_DIGITS = 5
+"""Of a drawn number, so that a written file holds it exactly."""
+
+
+def draw_robot(sim_params: SimParams, robot: Robot, *, seed: int) -> SimParams:
+    """Draw a random robot: every number of `TOLERANCES` anew about given parameters.
+
+    Raises:
+        RobotError: The parameters are not of this robot, or a drawn robot cannot exist.
+    """
+    sim_params.check_joints(robot.joint_names)
+    rng = np.random.default_rng([seed, 0x707])
+    batch = {group: 1.0 + GROUP_TORQUE * rng.uniform(-1.0, 1.0) for group in robot.groups}
+    joints: dict[str, JointParams] = {}
+    for joint in robot.joints:
+        own = sim_params.joints[joint.name]
+        drawn = _drawn(own, "joints", rng)
+        drawn["torque_scale"] = _rounded(drawn["torque_scale"] * batch[joint.group])
+        # Break-away is friction's peak: it moves with the friction, and is never below it.
+        ratio = own.breakaway / own.coulomb if own.coulomb else 1.0
+        drawn["breakaway"] = max(_rounded(drawn["coulomb"] * ratio), drawn["coulomb"])
+        joints[joint.name] = replace(own, **drawn)
+    parts: dict[str, Any] = {"joints": joints}
+    for name in ("machine", "trunk", "attitude", "ground"):
+        part = getattr(sim_params, name)
+        parts[name] = replace(part, **_drawn(part, name, rng))
+    return replace(sim_params, **parts)
+
+
+def _drawn(part: object, name: str, rng: np.random.Generator) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for field, tolerance in TOLERANCES[name].items():
+        value = getattr(part, field)
+        spread = tolerance.half * rng.uniform(-1.0, 1.0, np.shape(value))
+        centre = np.asarray(tolerance.centre if tolerance.kind == "about" else value)
+        new = centre * (1.0 + spread) if tolerance.kind == "relative" else centre + spread
+        values[field] = tuple(map(_rounded, new)) if np.ndim(new) else _rounded(float(new))
+    return values
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def save_sim_params(path: Path, sim_params: SimParams, *, says: str) -> None:
+    """Write parameters as YAML for `--sim-params`, whole or not at all.
+
+    `says` is the comment at its head.
+
+    Raises:
+        PronkError: There are blocks or a lowered floor, which a file does not hold.
+    """
+    if sim_params.ground != replace(sim_params.ground, terrain=(), floor=0.0):
+        raise PronkError(f"{path}: a sim_params file holds no terrain; take the blocks away first.")
+    body = msgspec.to_builtins(sim_params)
+    for name in ("terrain", "floor"):
+        del body["ground"][name]
+    body["joints"] = body.pop("joints")
+    head = "".join(f"# {line}".rstrip() + "\n" for line in says.splitlines())
+    text = yaml.safe_dump(
+        {"schema": SCHEMA, **body}, default_flow_style=None, sort_keys=False, width=100
+    )
+    write_text(path, f"{head}\n{text}")

@@ -1,26 +1,50 @@
-"""Walks of the virtual robot: one velocity for a long time (paper R4), many times."""
+"""Walks of the virtual robot: one velocity for a long time (paper R4), many times, measured.
+
+With v the trunk's horizontal velocity and w its yaw rate, both in the trunk's frame, c and r the
+commanded ones, and means over the samples from `SETTLE_S` after the command to its end (or to the
+fall). A velocity averaged over the last half second is without what a stride does. The path of the
+cost of transport is that of the averaged velocity, so that swaying counts for nothing; energy that
+comes back into the battery is taken off.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.evaluation.jumps import (
+    GRAVITY,
+    Figure,
+    JumpRules,
+    fallen_at,
+    figures_of,
+    number,
+    sample_at,
+    series_of,
+    uncommanded_height,
+)
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Kind, Results
-from pronk.evaluation.trial import Plan, build, load_subjects, plan_jobs, run_jobs
-from pronk.evaluation.walk_metrics import WalkFigures, measure_walk
+from pronk.evaluation.trial import Plan, Setup, run_plan
 from pronk.robots.robot import Robot
 from pronk.runtime.script import STILL, Script, Velocity
-from pronk.virtual.sim_params import SimParams
+from pronk.virtual.capture import Capture
 
-WALK = Kind(
-    table="walk.csv",
-    summary="walk.json",
-    schema="pronk/trial-walk/2",
-    writer="pronk trial POLICY --walk",
-    figures=WalkFigures,
-)
+Array = NDArray[np.float64]
+
+SETTLE_S = 2.0
+"""Time to reach the velocity, left out of the figures [s]."""
+AVERAGE_S = 0.5
+"""Window of the moving average [s]."""
+NO_PATH = 0.5
+"""Shortest path that has a cost of transport [m]."""
+WALK_S = 20.0
+"""Length of a walk [s]."""
 WALKS = (
     Case(name="forward 2", command=(2.0, 0.0, 0.0)),
     Case(name="back 2", command=(-2.0, 0.0, 0.0)),
@@ -32,8 +56,140 @@ WALKS = (
 )
 """The paper's R4, turning at the ends of the trained range (C3), and standing. Positive sideways
 and positive turns are to the left."""
-WALK_S = 20.0
-"""Length of a walk [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WalkFigures:
+    """One walk."""
+
+    fell: bool
+    """The robot fell before the command ended."""
+    non_foot_contact: bool
+    """Something but a foot touched the ground meanwhile."""
+
+    lasted: float = number("s", "time from the command to the fall, or to its end")
+    speed_error: float = number("m/s", "mean |v - c|")
+    speed_error_averaged: float = number("m/s", "mean |mean of v over the last 0.5 s - c|")
+    yaw_error: float = number("rad/s", "mean |w - r|")
+    yaw_error_averaged: float = number("rad/s", "mean |mean of w over the last 0.5 s - r|")
+    forward: float = number("m/s", "mean of v forward")
+    left: float = number("m/s", "mean of v to the left")
+    yaw_rate: float = number("rad/s", "mean of w")
+    roll_rate_rms: float = number("rad/s", "root mean square of the roll rate")
+    pitch_rate_rms: float = number("rad/s", "root mean square of the pitch rate")
+    power: float = number("W", "mean electrical power, what comes back taken off")
+    cost_of_transport: float = number(
+        "1", "electrical energy / (m g path); no value where no speed is commanded"
+    )
+    uncommanded: float = number(
+        "m", "highest trunk over ground in a flight phase; no value without one"
+    )
+
+    @property
+    def success(self) -> bool:
+        """The robot did not fall."""
+        return not self.fell
+
+
+WALK_FIGURES: Mapping[str, Figure] = figures_of(WalkFigures)
+WALK = Kind(
+    table="walk.csv",
+    summary="walk.json",
+    schema="pronk/trial-walk/3",
+    writer="pronk trial POLICY --walk",
+    figures=WalkFigures,
+)
+
+
+def velocity_errors(
+    velocity: Array,
+    orientation: Array,
+    angular_velocity: Array,
+    command: Sequence[float],
+    *,
+    first: int,
+    average: int,
+) -> tuple[dict[str, float], Array]:
+    """Compare a walk with its command.
+
+    Args:
+        velocity: Trunk, world frame [m/s]. (T, 3)
+        orientation: Trunk to world, unit quaternions w, x, y, z. (T, 4)
+        angular_velocity: Trunk's frame [rad/s]. (T, 3)
+        command: Forward, left [m/s], yaw rate [rad/s].
+        first: First sample that counts.
+        average: Window of the moving average [samples].
+
+    Returns:
+        Errors and means by name, and the averaged velocity of the samples that count. (T', 3)
+    """
+    w, x, y, z = orientation.T
+    # The first two columns of the rotation of the trunk to the world: its x and its y axis.
+    ahead = np.stack(
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)], axis=1
+    )
+    left = np.stack(
+        [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)], axis=1
+    )
+    own = np.stack(
+        [(ahead * velocity).sum(axis=1), (left * velocity).sum(axis=1), angular_velocity[:, 2]],
+        axis=1,
+    )
+    total = np.cumsum(own, axis=0)
+    total[average:] -= total[:-average].copy()
+    counts = np.minimum(np.arange(1, len(own) + 1), average)
+    averaged: Array = (total / counts[:, None])[first:]
+    figures = {}
+    for name, values in (("", own[first:]), ("_averaged", averaged)):
+        error = values - np.asarray(command)
+        figures[f"speed_error{name}"] = float(np.hypot(error[:, 0], error[:, 1]).mean())
+        figures[f"yaw_error{name}"] = float(np.abs(error[:, 2]).mean())
+    means = own[first:].mean(axis=0).tolist()
+    return figures | dict(zip(("forward", "left", "yaw_rate"), means, strict=True)), averaged
+
+
+def measure_walk(
+    capture: Capture,
+    script: Script,
+    robot: Robot | None = None,
+    *,
+    began: float,
+    mass: float,
+    rules: JumpRules | None = None,
+) -> WalkFigures:
+    """Return the figures of one walk; arguments as of `pronk.evaluation.jumps.measure`."""
+    dt = capture.dt
+    start, end = (
+        min(sample_at(capture, began + t), len(capture.time)) for t in (script.start, script.stop)
+    )
+    down = fallen_at(capture)
+    last = min(down, end)
+    figures: dict[str, Any] = {
+        "fell": down < end,
+        "non_foot_contact": bool(capture.other_contact[start:last].any()),
+        "lasted": max(0, last - start) * dt,
+        "uncommanded": uncommanded_height(series_of(capture), None, rules or JumpRules()),
+    }
+    first = start + round(SETTLE_S / dt)
+    if first >= last:
+        return WalkFigures(**figures)
+    motion = (capture.velocity, capture.orientation, capture.angular_velocity)
+    velocity, orientation, turning = (part[:last] for part in motion)
+    errors, averaged = velocity_errors(
+        velocity,
+        orientation,
+        turning,
+        script.command,
+        first=first,
+        average=round(AVERAGE_S / dt),
+    )
+    rates = np.sqrt(np.mean(turning[first:, :2] ** 2, axis=0)).tolist()
+    power = float(capture.electrical_power[first:last].mean())
+    figures |= errors | {"roll_rate_rms": rates[0], "pitch_rate_rms": rates[1], "power": power}
+    path = float(np.hypot(averaged[:, 0], averaged[:, 1]).sum() * dt)
+    if path > NO_PATH and any(script.command[:2]):
+        figures["cost_of_transport"] = power * (last - first) * dt / (mass * GRAVITY * path)
+    return WalkFigures(**figures)
 
 
 def walk_script(command: Velocity, *, seconds: float = WALK_S) -> Script:
@@ -44,42 +200,16 @@ def walk_script(command: Velocity, *, seconds: float = WALK_S) -> Script:
 def add_walks(
     policies: Sequence[Path],
     *,
-    robot: Robot,
-    sim_params: SimParams,
-    out: Path,
-    about: Mapping[str, Any] | None = None,
     cases: tuple[Case, ...] = WALKS,
     runs: int = 20,
     seconds: float = WALK_S,
     seed: int = 0,
-    processes: int = 1,
-    progress: Callable[[float], None] | None = None,
+    **setup: Unpack[Setup],
 ) -> Results:
     """Let policies walk on the virtual robot and write `walk.csv` and `walk.json`.
 
     Arguments and errors as of `run_trial`; `runs` walks of `seconds` with each of `cases`.
     """
-    subjects = load_subjects(policies, robot, jump=False)
     script = walk_script(STILL, seconds=seconds)
     plan = Plan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
-    planned = plan_jobs(
-        subjects,
-        plan,
-        robot=robot,
-        sim_params=sim_params,
-        out=out,
-        keep="none",
-        measure=measure_walk,
-    )
-    build(planned[0][1])  # refuses impossible parameters
-    return run_jobs(
-        planned,
-        kind=WALK,
-        subjects=subjects,
-        plan=plan,
-        robot=robot,
-        out=out,
-        about=about,
-        processes=processes,
-        progress=progress,
-    )
+    return run_plan(policies, plan, kind=WALK, jump=False, measure=measure_walk, **setup)

@@ -15,12 +15,11 @@ from pronk.evaluation import variation as varied
 from pronk.evaluation.bodies import Bodies
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.crossing import CROSSING, Climb, climbs
-from pronk.evaluation.metrics import FIGURES
+from pronk.evaluation.jumps import FIGURES
 from pronk.evaluation.results import Cell, Results, share_interval
 from pronk.evaluation.tables import Sheet, figure_row, number, verdict
 from pronk.evaluation.variation import VARIATION, parameters_of
-from pronk.evaluation.walk import WALK
-from pronk.evaluation.walk_metrics import SETTLE_S, WALK_FIGURES
+from pronk.evaluation.walk import SETTLE_S, WALK, WALK_FIGURES
 from pronk.report import trial_figures as draw
 from pronk.report import trial_page
 from pronk.report.page import Fold, Part, Section, picture, table

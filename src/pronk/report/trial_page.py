@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from pronk.errors import ArtefactError, RobotError
 from pronk.evaluation import tables
 from pronk.evaluation.criteria import trial_checks
-from pronk.evaluation.protocol import RATES
-from pronk.evaluation.published import TABLE_III, in_paper_order
+from pronk.evaluation.protocol import RATES, TABLE_III, in_paper_order
 from pronk.evaluation.results import SUMMARY, Results, Row, Subject, load, share_interval
 from pronk.match.result import JointFit, MatchResult
 from pronk.report import match_page, style

@@ -15,8 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from pronk.evaluation.jumps import JumpRules, cosine_of_tilt
-from pronk.evaluation.metrics import FALLEN_COSINE, FALLEN_HEIGHT
+from pronk.evaluation.jumps import FALLEN_COSINE, FALLEN_HEIGHT, JumpRules, cosine_of_tilt
 from pronk.links.machine import State
 from pronk.policy.contract import COMMANDS
 from pronk.policy.runtime import Policy

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from pronk.errors import PronkError
-from pronk.evaluation.jump_events import JumpEvents
-from pronk.evaluation.jumps import heading
+from pronk.evaluation.jumps import JumpEvents, heading
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Ground
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from pronk import opengl
 from pronk.errors import PronkError
-from pronk.evaluation.jump_events import jump_events
+from pronk.evaluation.jumps import jump_events
 from pronk.evaluation.pictures.film import SCHEMA, Film, plan
 from pronk.evaluation.results import Results, Row
 from pronk.files import save_artefact

@@ -5,8 +5,11 @@
     evaluation = evaluate_policy(policy, env, plan, estimate=actor.estimate)
     save(Path("evaluation.json"), evaluation)
 
-`run` records the robots, `pronk.evaluation.jumps` and `walk_metrics` measure them, and
-`pronk.evaluation.criteria` has the acceptance criteria.
+Walking robots have one velocity from the first sample on. Jumping robots do what the paper's robot
+did (E1): stand, accelerate, jump while running, run on for a moment, stop. The jump input rises at
+each robot's own time, so that it meets every phase of the gait. `run` records the robots,
+`pronk.evaluation.jumps` and `walk` measure them; `pronk.evaluation.criteria` has the acceptance
+criteria.
 """
 
 from __future__ import annotations
@@ -21,19 +24,116 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import ArtefactError
+from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.criteria import evaluation_checks
 from pronk.evaluation.jumps import RISE, JumpRules, Series, measure_jump, steps, uncommanded_height
-from pronk.evaluation.protocol import Case
+from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.results import Spread, load_json, save_json
-from pronk.evaluation.training_sim.plan import NEVER, Plan
-from pronk.evaluation.walk_metrics import velocity_errors
+from pronk.evaluation.walk import velocity_errors
 
 if TYPE_CHECKING:
     from pronk.evaluation.training_sim.run import Estimate, Policy, Recording
 
 SCHEMA = "pronk/evaluation/2"
 Array = NDArray[np.float64]
+Samples = NDArray[np.int64]
+
+NEVER = 2**30
+"""A sample that does not come."""
+WALKS = (
+    Case(name="forward 2", command=(2.0, 0.0, 0.0)),
+    Case(name="back 2", command=(-2.0, 0.0, 0.0)),
+    Case(name="left 1", command=(0.0, 1.0, 0.0)),
+    Case(name="right 1", command=(0.0, -1.0, 0.0)),
+    Case(name="forward 3", command=(3.0, 0.0, 0.0)),
+    Case(name="back 3", command=(-3.0, 0.0, 0.0)),
+    Case(name="yaw 2", command=(0.0, 0.0, 2.0)),
+    Case(name="yaw -2", command=(0.0, 0.0, -2.0)),
+    Case(name="stand", command=(0.0, 0.0, 0.0)),
+)
+"""Velocities to keep."""
+JUMPS = PAPER_COMMANDS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The commands of an evaluation, and their times."""
+
+    robots: int = 1000
+    """Robots for each command."""
+    seed: int = 0
+    """Of noise, pushes, starts and the times of the jumps."""
+    walks: tuple[Case, ...] = WALKS
+    jumps: tuple[Case, ...] = JUMPS
+    walk_s: float = 20.0
+    """Length of a walk [s]."""
+    settle_s: float = 2.0
+    """Time to accelerate, left out of the errors [s]."""
+    average_s: float = 0.5
+    """Window of the moving average, which takes the stride out of the velocity [s]."""
+    stand_s: float = 1.0
+    """Of a jumping robot, before the velocity command [s]."""
+    run_s: float = 2.5
+    """From there to the jump input, at least [s]."""
+    spread_s: float = 0.5
+    """The jump input rises up to this much later, uniformly [s]."""
+    jump_s: float = 0.5
+    """Its length [s]."""
+    keep_s: float = 0.5
+    """From its end to the zero command [s]."""
+    rules: JumpRules = field(default_factory=JumpRules)
+
+    def __post_init__(self) -> None:
+        """Raise `PronkError` for an empty plan."""
+        if self.robots < 1:
+            raise PronkError(f"{self.robots} robots for each command; expected 1 or more.")
+
+    @property
+    def size(self) -> int:
+        """Robots in all: first those of each walk, then those of each jump."""
+        return self.robots * (len(self.walks) + len(self.jumps))
+
+    @property
+    def walkers(self) -> int:
+        """Robots that walk."""
+        return self.robots * len(self.walks)
+
+    @property
+    def jump_seconds(self) -> float:
+        """Time until the latest jump is judged [s]; a flight takes less than 1 s."""
+        latest = self.stand_s + self.run_s + self.spread_s
+        return latest + self.rules.search_s + 1.0 + self.rules.upright_s if self.jumps else 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Simulated time [s]."""
+        return max(self.walk_s if self.walks else 0.0, self.jump_seconds)
+
+    def commands(self) -> Array:
+        """The velocity command of each robot. (N, 3)."""
+        commands = [case.command for case in (*self.walks, *self.jumps)]
+        return np.repeat(np.array(commands, dtype=float), self.robots, axis=0)
+
+    def times(self, dt: float) -> dict[str, Samples]:
+        """Return `start` and `stop` of the velocity command, `on` and `off` of the jump input.
+
+        For each robot, in samples of `dt`, (N,); `NEVER` for what does not happen.
+        """
+        count = self.size - self.walkers
+        rng = np.random.default_rng(self.seed)
+        on = np.rint((self.stand_s + self.run_s + self.spread_s * rng.random(count)) / dt)
+        off = on + steps(self.jump_s, dt)
+        jumping = {
+            "start": np.full(count, steps(self.stand_s, dt)),
+            "stop": off + steps(self.keep_s, dt),
+            "on": on,
+            "off": off,
+        }
+        walking = {"start": 0, "stop": NEVER, "on": NEVER, "off": NEVER}
+        return {
+            name: np.concatenate([np.full(self.walkers, walking[name]), times]).astype(np.int64)
+            for name, times in jumping.items()
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +150,8 @@ class CommandResult:
     touchdown), `non_foot_contact` (from the jump input to then), and of those standing `single`
     (made exactly one high flight)."""
     figures: Mapping[str, Spread]
-    """As of `pronk.evaluation.jumps` and `walk_metrics`; `drift` from the end of settling to the
-    end [m], `uncommanded` the highest flight without a jump input, over standing height [m]."""
+    """As of `pronk.evaluation.jumps` and `walk`; `drift` from the end of settling to the end [m],
+    `uncommanded` the highest flight without a jump input, over standing height [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,11 +229,20 @@ def evaluate_policy(
             else _jumps(case, recording, fell_at[own], on[own], plan, run.dt)
         )
         results.append(_summary(case, measured, diverged[own], plan))
-    estimates = run.estimates.tolist()
+    *squares, right, count = run.estimates.tolist()
+    estimator = None
+    if count:
+        means = [each / count for each in squares]
+        forward, left, up = map(math.sqrt, means)
+        estimator = EstimatorResult(
+            rmse=(forward, left, up),
+            rmse_vector=math.sqrt(sum(means)),
+            contacts_right=right / count,
+        )
     return Evaluation(
         walks=tuple(results[: len(plan.walks)]),
         jumps=tuple(results[len(plan.walks) :]),
-        estimator=_estimator(estimates) if estimates[-1] else None,
+        estimator=estimator,
         plan=asdict(plan),
         seconds=time.perf_counter() - began,
         about=dict(about or {}),
@@ -141,9 +250,7 @@ def evaluate_policy(
     )
 
 
-def _robots(
-    recording: Recording, fell_at: NDArray[np.int64], dt: float
-) -> list[tuple[Series, Array]]:
+def _robots(recording: Recording, fell_at: Samples, dt: float) -> list[tuple[Series, Array]]:
     """Motion and angular velocity of each robot, up to its fall or its first number not finite."""
     found = []
     state, feet = recording.state.cpu().numpy(), recording.feet.cpu().numpy()
@@ -163,7 +270,7 @@ def _robots(
 
 
 def _walks(
-    case: Case, recording: Recording, fell_at: NDArray[np.int64], plan: Plan, dt: float
+    case: Case, recording: Recording, fell_at: Samples, plan: Plan, dt: float
 ) -> list[dict[str, float]]:
     """The figures of every robot that walks with one command."""
     first, end = steps(plan.settle_s, dt), steps(plan.walk_s, dt)
@@ -186,12 +293,7 @@ def _walks(
 
 
 def _jumps(
-    case: Case,
-    recording: Recording,
-    fell_at: NDArray[np.int64],
-    on: NDArray[np.int64],
-    plan: Plan,
-    dt: float,
+    case: Case, recording: Recording, fell_at: Samples, on: Samples, plan: Plan, dt: float
 ) -> list[dict[str, float]]:
     """The figures of every robot that jumps with one command."""
     rules, found = plan.rules, []
@@ -225,6 +327,11 @@ def _over(series: Series, on: int | None, rules: JumpRules) -> float:
 
 
 _SHARES = ("fell", "standing", "found", "upright", "non_foot_contact")
+_NEEDED = (
+    "speed_error yaw_error speed_error_averaged yaw_error_averaged forward left yaw_rate drift",
+    "height distance along lift_off_velocity delay flights high_flights",
+)
+"""Figures of a walk and of a jump that are there even if no robot has them."""
 
 
 def _summary(
@@ -235,40 +342,26 @@ def _summary(
         name: np.array([figures.get(name, math.nan) for figures in measured]) for name in names
     }
     high = columns["uncommanded"]
-    shares = {name: columns.pop(name) for name in (*_SHARES, "single") if name in columns}
-    single = shares.pop("single", np.zeros(0))
-    single = single[np.isfinite(single)]
-    jumps = {"upright", "found", "non_foot_contact", "single"} if "standing" in shares else set()
+    single = columns.pop("single", np.zeros(0))
+    shares = {name: columns.pop(name) for name in _SHARES if name in columns}
+    jumps = "standing" in shares
+    zero = ("found", "non_foot_contact", "single", "upright") if jumps else ()
+    counted = {name: float(np.nansum(values) / plan.robots) for name, values in shares.items()}
+    if np.isfinite(single).any():
+        counted["single"] = float(np.nanmean(single))
     return CommandResult(
         name=case.name,
         command=case.command,
         robots=plan.robots,
-        shares=dict.fromkeys(sorted(jumps), 0.0)
-        | {name: float(np.nansum(values) / plan.robots) for name, values in shares.items()}
-        | ({"single": float(single.mean())} if len(single) else {})
-        | {
+        shares={
+            **dict.fromkeys(zero, 0.0),
+            **counted,
             "non_finite": float(diverged.mean()),
             "uncommanded": float(np.isfinite(high).mean()),
             "too_high": float((np.nan_to_num(high, nan=-1.0) > RISE).mean()),
         },
-        figures={name: Spread.of(values) for name, values in columns.items()}
-        | {name: Spread() for name in _NEEDED[bool(jumps)].split() if name not in columns},
-    )
-
-
-_NEEDED = (
-    "speed_error yaw_error speed_error_averaged yaw_error_averaged forward left yaw_rate drift",
-    "height distance along lift_off_velocity delay flights high_flights",
-)
-"""Figures of a walk and of a jump that are there even if no robot has them."""
-
-
-def _estimator(sums: Sequence[float]) -> EstimatorResult:
-    forward, left, up, right = (each / sums[-1] for each in sums[:-1])
-    return EstimatorResult(
-        rmse=(math.sqrt(forward), math.sqrt(left), math.sqrt(up)),
-        rmse_vector=math.sqrt(forward + left + up),
-        contacts_right=right,
+        figures={name: Spread() for name in _NEEDED[jumps].split()}
+        | {name: Spread.of(values) for name, values in columns.items()},
     )
 
 

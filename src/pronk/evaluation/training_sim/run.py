@@ -1,28 +1,46 @@
-"""One pass through an evaluation plan: the environment, the commands, and the recording.
+"""One pass through an evaluation plan: environment, commands, recording, and the policy itself.
 
 Trunk and contacts are recorded at every physics step, on the device, by a metrics term of mjlab.
 mjlab's contacts lag its positions by one physics step there, so each position is kept until its
-contacts are known.
+contacts are known. A checkpoint runs in PyTorch on the device of the simulation; an exported policy
+runs in ONNX Runtime, the robots spread over the processor's cores.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Self
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
 
+import numpy as np
 import torch
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers.metrics_manager import MetricsTermCfg
 from tensordict import TensorDict
 from torch import Tensor
 
-from pronk.errors import PronkError
+from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.jumps import steps
-from pronk.evaluation.training_sim.plan import NEVER, Plan
-from pronk.policy.layout import ESTIMATE
+from pronk.evaluation.training_sim.evaluation import NEVER, Plan
+from pronk.files import sha256
+from pronk.policy.contract import check
+from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
+from pronk.policy.runtime import Inference, load_policy
+from pronk.policy.runtime import Policy as ExportedPolicy
+from pronk.robots import load_robot
+from pronk.train.gains import TrainingGains
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.randomization import Randomization
+from pronk.train.phases import phase
+from pronk.train.rl.actor import EstimatorActor
+from pronk.train.runner import checkpoint
+from pronk.train.runner.request import ROBOT
+from pronk.train.runner.run_folder import RunFolder
+from pronk.train.tasks import rl_cfg
 
 Policy = Callable[[TensorDict], Tensor]
 """Observation groups to actions (N, 12)."""
@@ -70,10 +88,6 @@ def evaluation_cfg(cfg: ManagerBasedRlEnvCfg, plan: Plan) -> ManagerBasedRlEnvCf
     """Make an environment of training one to evaluate in; changes `cfg` and returns it.
 
     As many robots as the plan has, no time-out, no rewards, and the step listener.
-
-    Args:
-        cfg: From `pronk.train.tasks.env_cfg`.
-        plan: Of the evaluation.
     """
     cfg.scene.num_envs = plan.size
     cfg.rewards = {}
@@ -87,13 +101,7 @@ class Recording:
     """Trunk and contacts of the robots of one command, at every physics step."""
 
     def __init__(self, robots: slice, samples: int, device: torch.device | str) -> None:
-        """Reserve memory: 58 bytes a robot and sample.
-
-        Args:
-            robots: Which of the environment's.
-            samples: Length.
-            device: Of the simulation.
-        """
+        """Reserve memory: 58 bytes a robot and sample."""
         shape = (samples, robots.stop - robots.start)
         self._robots = robots
         self.state = torch.zeros(*shape, 13, device=device)
@@ -118,12 +126,8 @@ class Run:
     def __init__(self, env: ManagerBasedRlEnv, plan: Plan) -> None:
         """Prepare.
 
-        Args:
-            env: Built with `evaluation_cfg`.
-            plan: Of the evaluation.
-
         Raises:
-            PronkError: The environment was not built for this plan.
+            PronkError: The environment was not built with `evaluation_cfg` for this plan.
         """
         terms = getattr(env.metrics_manager, "cfg", None) or {}
         if TERM not in terms or env.num_envs != plan.size:
@@ -163,13 +167,7 @@ class Run:
     def go(
         self, policy: Policy, estimate: Estimate | None, progress: Callable[[float], None]
     ) -> Self:
-        """Simulate the whole plan.
-
-        Args:
-            policy: Under evaluation.
-            estimate: Its estimator, if it is to be judged.
-            progress: Called with the share done, 0 to 1.
-        """
+        """Simulate the whole plan; `estimate` is the policy's estimator, if it is to be judged."""
         # Not inference mode, which would leave the environment with read-only tensors.
         with torch.no_grad():
             before, self._motion.scripted = self._motion.scripted, True
@@ -215,9 +213,7 @@ class Run:
     def _compare(self, estimate: tuple[Tensor, Tensor], target: Tensor) -> None:
         """Add the estimator's errors on walking robots that stand.
 
-        Args:
-            estimate: Contact probabilities (N, 4), velocity in the trunk's frame [m/s] (N, 3).
-            target: The true ones, contacts (0 or 1) first. (N, 7)
+        `target` has the true contacts (0 or 1) and velocity [m/s]. (N, 7)
         """
         contact, velocity = torch.split(target, list(ESTIMATE.values()), dim=-1)
         squares = (estimate[1] - velocity).square()
@@ -238,3 +234,124 @@ class Run:
         """The trunk's state, as of `Recording.state`. (N, 13)."""
         data = self._env.sim.data
         return torch.cat([data.qpos[:, :7], data.qvel[:, :6]], dim=-1)
+
+
+# ---- the policy under evaluation ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """A policy under evaluation."""
+
+    act: Policy
+    estimate: Estimate | None
+    jump: bool
+    """Whether it has the jump input."""
+    about: dict[str, Any]
+    """File, hash, and provenance."""
+
+    def knows(self, gains: TrainingGains) -> bool:
+        """Whether it was trained with these nominal gains."""
+        same = bool(self.about.get("gains") == gains.name)
+        return same and (gains.name == "naive" or self.about.get("gains_sha256") == gains.sha256)
+
+
+def load_subject(path: Path, device: str) -> Subject:
+    """Read `policy.onnx`, a checkpoint, or the last checkpoint of the folder of a run.
+
+    Raises:
+        ArtefactError: Missing, damaged, or none of these.
+    """
+    if path.suffix == ".onnx":
+        return _exported(path, device)
+    found = checkpoint.latest(RunFolder(path).checkpoints) if path.is_dir() else path
+    if found is None:
+        raise ArtefactError(
+            f"{path}: no checkpoints in it; expected the folder of a run, a checkpoint, or "
+            "an exported policy.onnx."
+        )
+    stored = checkpoint.load(found)
+    jump = phase(str(stored.about.get("phase"))).jump
+    actor = blank_actor(jump=jump)
+    try:
+        actor.load_state_dict(stored.tree["algorithm"]["actor_state_dict"])
+    except (KeyError, RuntimeError) as error:
+        reason = str(error).strip().splitlines()[-1].strip()
+        raise ArtefactError(
+            f"{found}: its actor is not that of this pronk ({reason}); train again."
+        ) from error
+    actor = actor.to(device).eval()
+    about = {"file": str(found), "sha256": sha256(found), **stored.about}
+    return Subject(act=actor, estimate=actor.estimate, jump=jump, about=about)
+
+
+def blank_actor(*, jump: bool) -> EstimatorActor:
+    """The actor as it is trained, with random weights; `jump` with the jump input."""
+    cfg = rl_cfg(jump=jump).actor
+    sizes = {"measured": MEASURED_SIZE, "jump": 1}
+    blank = TensorDict({k: torch.zeros(1, n) for k, n in sizes.items()}, batch_size=[1])
+    return EstimatorActor(
+        blank,
+        {"actor": [*sizes] if jump else ["measured"]},
+        "actor",
+        JOINTS,
+        hidden_dims=cfg.hidden_dims,
+        activation=cfg.activation,
+        obs_normalization=cfg.obs_normalization,
+        distribution_cfg=deepcopy(cfg.distribution_cfg),
+    )
+
+
+def _exported(path: Path, device: str) -> Subject:
+    policy = load_policy(path)
+    contract = policy.contract
+    try:
+        check(contract, load_robot(ROBOT))
+    except ArtefactError as error:
+        raise ArtefactError(f"{path}: {error}") from None
+    about = {
+        "file": str(path),
+        "sha256": policy.sha256,
+        **{name: getattr(contract, name) for name in ("gains", "gains_sha256", "virtual")},
+        **{name: dict(getattr(contract, name)) for name in ("provenance", "versions")},
+    }
+    runner = _Exported(policy, device)
+    return Subject(act=runner.act, estimate=runner.estimate, jump=contract.jump, about=about)
+
+
+class _Exported:
+    """An exported policy that acts for many robots at once."""
+
+    def __init__(self, policy: ExportedPolicy, device: str) -> None:
+        self._policy, self._device = policy, device
+        self._workers = os.cpu_count() or 1
+        self._pool = ThreadPoolExecutor(self._workers)
+        self._last: Tensor | None = None
+        self._inferred: list[Inference] = []
+
+    def act(self, obs: TensorDict) -> Tensor:
+        self._infer(obs)
+        # The next observations may be written into the same tensor.
+        self._last = None
+        return self._joined("action")
+
+    def estimate(self, obs: TensorDict) -> tuple[Tensor, Tensor]:
+        self._infer(obs)
+        return self._joined("contact"), self._joined("linear_velocity")
+
+    def _infer(self, obs: TensorDict) -> None:
+        """Run the network, unless it has just been run on these observations."""
+        measured = obs["measured"]
+        if measured is self._last:
+            return
+        jump = obs["jump"].cpu().numpy()
+        if not self._policy.contract.jump:
+            jump = np.zeros_like(jump)
+        parts = [np.array_split(a, self._workers) for a in (measured.cpu().numpy(), jump)]
+        rows = [(m, j) for m, j in zip(*parts, strict=True) if len(m)]
+        self._inferred = list(self._pool.map(lambda row: self._policy.infer(*row), rows))
+        self._last = measured
+
+    def _joined(self, name: str) -> Tensor:
+        whole = np.concatenate([getattr(part, name) for part in self._inferred])
+        return torch.from_numpy(whole).to(self._device)
