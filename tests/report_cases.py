@@ -300,8 +300,6 @@ def write_bodies(folder: Path) -> Bodies:
                 folder=where,
                 seed=i,
                 sha256="ef" * 32,
-                joints=gains.joints,
-                groups=gains.groups,
                 errors=tuple(
                     GainsError(gains=n, rms_db=e, joints_db={"FR_knee": e}, pairs={})
                     for n, e in errors.items()

@@ -207,14 +207,14 @@ def job(tmp_path: Path) -> Job:
     script = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=0.4)
     subjects = load_subjects([write_hopper(tmp_path / "policy.onnx")], HOPPER)
     plan = Plan(cases=(Case(name="spot", command=STILL),), jumps=1, script=script, spread_s=0.0)
-    [(_, job)] = plan_jobs(subjects, plan, robot=HOPPER, sim_params=load_sim_params(), out=tmp_path)
+    [job] = plan_jobs(subjects, plan, robot=HOPPER, sim_params=load_sim_params())
     return replace(job, keep=None)
 
 
 def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: Job) -> None:
-    before = repr(run_job(job).figures)
+    before = repr(run_job(job).row)
     recording = trial.Recording(job)
-    assert repr(run_job(job).figures) == before
+    assert repr(run_job(job).row) == before
     assert recording.replay() > 0.0
     steps, control, motors = recording.blocks[-1]
     recording.blocks[-1] = (steps - 1, control, motors)

@@ -160,7 +160,7 @@ def test_text_of_files_is_escaped(tmp_path: Path) -> None:
     write_match(tmp_path, replace(result, gains=gains))
     write_trial(tmp_path, ("matched",), CASES[:1])
     body = json.loads((tmp_path / "summary.json").read_text())
-    body["sim_params"]["file"] = body["policies"][0]["path"] = NASTY
+    body["sim_params"]["file"] = body["subjects"][0]["path"] = NASTY
     (tmp_path / "summary.json").write_text(json.dumps(body))
     text = build.write_report(tmp_path)[0].read_text(encoding="utf-8")
     assert NASTY not in text
