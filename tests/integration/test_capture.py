@@ -17,8 +17,8 @@ from pronk.links.machine import Command
 from pronk.robots import load_robot
 from pronk.virtual.capture import SCHEMA, Capture, load, save
 from pronk.virtual.ground import Start
+from pronk.virtual.plant import motor_of
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.rotor import MotorConstants
 from pronk.virtual.sim_params import load_sim_params
 
 Array = NDArray[np.float64]
@@ -122,10 +122,10 @@ def test_in_the_air_the_trunk_and_legs_fall_together(seen: Capture) -> None:
 
 def test_power_is_what_the_battery_gives(seen: Capture) -> None:
     # Before any command, current squared times resistance.
-    constants = [MotorConstants.of(joint.drive) for joint in ROBOT.joints]
+    constant, resistance = np.array([motor_of(joint.drive) for joint in ROBOT.joints]).T
     scale = np.array([SIM_PARAMS.joints[name].torque_scale for name in ROBOT.joint_names])
-    current = seen.torque[0] / (scale * np.array([c.constant for c in constants]))
-    heat = float(current**2 @ np.array([c.resistance for c in constants]))
+    current = seen.torque[0] / (scale * constant)
+    heat = float(current**2 @ resistance)
     assert seen.electrical_power[0] == pytest.approx(heat, rel=0.02)
     assert heat > 1.0
     # The open-circuit voltage less what its resistance takes, a state later.

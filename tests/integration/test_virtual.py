@@ -14,9 +14,8 @@ from scipy import signal
 from pronk.errors import HardwareError, RobotError
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
-from pronk.virtual.plant import build_plant
+from pronk.virtual.plant import build_plant, motor_of
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.rotor import MotorConstants
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
 Array = NDArray[np.float64]
@@ -200,9 +199,9 @@ def test_torque_stays_below_the_torque_speed_line_and_the_effort_limit() -> None
     )
     speed = np.array([state.velocity[2] for state in states])
     drive, scale = ROBOT.joint("FR_knee").drive, sim_params.joints["FR_knee"].torque_scale
-    motor = MotorConstants.of(drive)
-    constant = scale * motor.constant
-    line = -constant / motor.resistance * (voltage + constant * speed)
+    believed, resistance = motor_of(drive)
+    constant = scale * believed
+    line = -constant / resistance * (voltage + constant * speed)
     slack = 0.02 * np.abs(line).max()  # one physics step of acceleration
     assert (torque >= line - slack).all()
     assert (np.abs(torque) <= scale * drive.effort_limit * (1.0 + 1e-9)).all()
@@ -389,32 +388,26 @@ def test_plant_is_another_machine_than_the_model_it_came_from() -> None:
 @pytest.mark.parametrize(
     ("act", "words"),
     [
-        (lambda m: m.clamp(("tail",)), "no joint 'tail' to clamp; it has FR_hip_roll"),
-        (lambda m: m.wait(float("nan")), "wait until nan"),
-        (
-            lambda m: m.send(Command(position=POSE[:3], **gains())),
-            r"command.position has shape \(3,\)",
-        ),
-        (
-            lambda m: m.send(Command(position=POSE * np.nan, **gains())),
-            "command.position .* not finite",
-        ),
-        (lambda m: m.send(Command(position=POSE, **gains(-1.0))), "command.stiffness is negative"),
+        (lambda m: m.clamp(("tail",)), "tail"),
+        (lambda m: m.wait(float("nan")), "nan"),
+        (lambda m: m.send(Command(position=POSE[:3], **gains())), "position"),
+        (lambda m: m.send(Command(position=POSE * np.nan, **gains())), "position"),
+        (lambda m: m.send(Command(position=POSE, **gains(-1.0))), "stiffness"),
     ],
 )
 def test_refusals(act: Any, words: str) -> None:
     with pytest.raises(HardwareError, match=words):
         act(connected(SIM_PARAMS))
+    with pytest.raises(HardwareError, match="connect"):
+        act(VirtualRobot(ROBOT, SIM_PARAMS))
 
 
-def test_refusals_before_anything_runs() -> None:
-    with pytest.raises(HardwareError, match=r"not connected; call connect\(\) first"):
-        VirtualRobot(ROBOT, SIM_PARAMS).latest()
-    with pytest.raises(HardwareError, match="no leg 'XL'; it has FR, FL, HR, HL"):
-        VirtualRobot(ROBOT, SIM_PARAMS, legs=("XL",))
-    with pytest.raises(HardwareError, match="no legs"):
-        VirtualRobot(ROBOT, SIM_PARAMS, legs=())
-    with pytest.raises(HardwareError, match="log_rate_hz is 50000"):
-        VirtualRobot(ROBOT, SIM_PARAMS, log_rate_hz=50000.0)
-    with pytest.raises(RobotError, match="parameters are of 'mini_cheetah', the robot is 'so101'"):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"legs": ("XL",)}, "XL"), ({"legs": ()}, "legs"), ({"log_rate_hz": 5e4}, "log_rate_hz")],
+)
+def test_robots_that_cannot_be_made(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(HardwareError, match=words):
+        VirtualRobot(ROBOT, SIM_PARAMS, **options)
+    with pytest.raises(RobotError, match="so101"):
         VirtualRobot(load_robot("so101"), SIM_PARAMS)

@@ -1,4 +1,4 @@
-"""What a motion-capture rig and force plates would see of the virtual robot, without noise.
+"""What a motion-capture rig and force plates would record of the virtual robot, without noise.
 
 Positions, orientations and contacts of a sample are of one instant: a foot is in contact if its
 sphere overlaps the ground there, as in training. Everything is in SI units; the world is z up;
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from pronk.errors import ArtefactError
 from pronk.files import save_arrays, stored_arrays
 from pronk.virtual.plant import Plant
-from pronk.virtual.quaternion import normalized
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -106,9 +105,8 @@ class Recorder:
 
     def __init__(self, plant: Plant, period_s: float) -> None:
         """Begin empty, for a plant on the ground; the first sample is due at the clock's zero."""
-        self._plant = plant
+        self._plant, self._period = plant, period_s
         self._step_s = float(plant.model.opt.timestep)
-        self._period = period_s
         self._rows: list[Array] = []
         self._voltage: list[Array] = []
         self._begins = [0]
@@ -119,8 +117,7 @@ class Recorder:
         first = self._begins[-1]
         # One more than there can be, for the rounding of steps.
         most = math.floor((last + 0.5) * self._step_s / self._period) + 2
-        steps = self._steps(first, max(first, most)).tolist()
-        return [step for step in steps if step <= last]
+        return [step for step in self._steps(first, max(first, most)).tolist() if step <= last]
 
     def keep(self, rows: Array, voltage: Array) -> None:
         """Keep the raw states (n, state_size) and bus voltages (n,) [V] of the due steps."""
@@ -131,10 +128,8 @@ class Recorder:
 
     def _steps(self, first: int, end: int) -> NDArray[np.intp]:
         """Physics steps of samples `first` to `end` - 1."""
-        steps: NDArray[np.intp] = np.rint(
-            np.arange(first, end) * self._period / self._step_s
-        ).astype(np.intp)
-        return steps
+        steps = np.arange(first, end) * self._period / self._step_s
+        return np.asarray(np.rint(steps), dtype=np.intp)
 
     def capture(self, since: float = -math.inf) -> Capture:
         """Samples at and after a time [s]."""
@@ -152,12 +147,12 @@ class Recorder:
 def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:
     """Turn times [s] (T,), raw states (T, state_size) and bus voltages [V] (T,) into a capture."""
     place, speed, act = plant.parts(rows)
-    torque = plant.motor_torque(act)
+    torque, turn = plant.motor_torque(act), place[:, 3:7]
     feet, contact, other = _touch(plant, place)
     return Capture(
         time=time,
         position=place[:, :3].copy(),
-        orientation=normalized(place[:, 3:7]),
+        orientation=turn / np.sqrt((turn * turn).sum(axis=1, keepdims=True)),
         velocity=speed[:, :3].copy(),
         angular_velocity=speed[:, 3:6].copy(),
         foot_position=feet,
@@ -174,9 +169,7 @@ def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:
 def _touch(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
     """Feet (T, 4, 3), whether they touch (T, 4), and whether anything else does (T,).
 
-    Args:
-        plant: On the ground.
-        place: Positions of the plant. (T, nq)
+    Of a plant on the ground at positions (T, nq).
     """
     model, data = plant.model, plant.aside
     qpos, where, none = data.qpos, data.geom_xpos, len(plant.feet)

@@ -84,15 +84,13 @@ class Ground(Bounded):
 
     def height(self, x: float, y: float) -> float:
         """Height of the ground at a place [m]."""
-        return max(
-            [self.floor]
-            + [
-                box.top
-                for box in self.terrain
-                if abs(x - box.center[0]) <= box.half_size[0]
-                and abs(y - box.center[1]) <= box.half_size[1]
-            ]
+        under = (
+            box.top
+            for box in self.terrain
+            if abs(x - box.center[0]) <= box.half_size[0]
+            and abs(y - box.center[1]) <= box.half_size[1]
         )
+        return max((self.floor, *under))
 
     def add_to(self, spec: Any) -> None:
         """Put floor and blocks, which touch everything, into a mujoco.MjSpec."""
@@ -119,11 +117,7 @@ class Ground(Bounded):
     def set_down(self, model: Any, data: Any, feet: NDArray[np.intp], start: Start) -> None:
         """Put a robot with a free trunk down, its lowest foot `start.drop` above the ground.
 
-        Args:
-            model: mujoco.MjModel.
-            data: Its mujoco.MjData, the joints in their places; the trunk is placed here.
-            feet: Geoms of the feet.
-            start: Where to.
+        The joints are in their places in `data`; `feet` are geoms.
         """
         turn = 0.5 * start.yaw
         data.qpos[:3] = (*start.position, 0.0)
@@ -136,15 +130,7 @@ class Ground(Bounded):
         data.qpos[2] = start.drop - lowest
 
     def set_contact(self, model: Any, geoms: NDArray[np.intp]) -> None:
-        """Give feet their spring, damper and friction.
-
-        Args:
-            model: mujoco.MjModel with this ground in it; its feet have priority over the ground.
-            geoms: The feet's geoms.
-
-        Raises:
-            RobotError: The spring is too stiff for the physics step.
-        """
+        """Give the feet's geoms spring, damper and friction; refuse a spring too stiff to step."""
         d = _IMPEDANCE
         for geom in geoms:
             mobility = float(model.body_invweight0[model.geom_bodyid[geom], 0])
@@ -191,10 +177,9 @@ class Start:
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite, or negative where they cannot be."""
         numbers = (*self.position, self.yaw, *(self.joint_offset or ()), self.drop, self.settle_s)
-        if len(self.position) != 2 or not all(map(math.isfinite, numbers)):
-            raise RobotError(f"{self}: position has two numbers, and all are finite.")
-        if self.drop < 0.0 or self.settle_s < 0.0:
+        fits = len(self.position) == 2 and all(map(math.isfinite, numbers))
+        if not fits or self.drop < 0.0 or self.settle_s < 0.0:
             raise RobotError(
-                f"Start.drop is {self.drop:g} and Start.settle_s {self.settle_s:g}; neither may "
-                "be negative."
+                f"{self}: expected two numbers in position, all numbers finite, drop and settle_s "
+                "not negative."
             )

@@ -1,7 +1,7 @@
 """A plant that runs: commands arrive, the battery sags, samples of the capture are kept.
 
-Time is counted in physics steps from the clock's zero. Steps are taken natively in blocks; Python
-looks in where a state or a sample is due, or a command takes effect.
+Time is counted in physics steps from the clock's zero. Steps are taken natively in blocks, which
+end where a state or a sample is due, or a command takes effect.
 """
 
 from __future__ import annotations
@@ -87,37 +87,34 @@ class Physics:
         plant: Plant,
         machine: MachineParams,
         *,
+        pose: Array,
         columns: Indices,
         offset: Array,
         first_step: int,
     ) -> None:
-        """Begin with every joint and drive at zero; `data` is there to be set.
+        """Begin with links and rotors in a pose and the drives off.
 
         Args:
             plant: Built with the physics step in its model.
             machine: Transport delay and battery.
-            columns: Columns of the plant's joints in a command.
+            pose: Of all joints of the robot [rad].
+            columns: Columns of the plant's joints in a pose or command.
             offset: Reading of their encoders less the true angle [rad].
             first_step: Physics step to begin with, negative before the clock's zero.
         """
-        self.plant = plant
+        self.plant, self._machine = plant, machine
         self.data = mujoco.MjData(plant.model)
         self.step = self._first = first_step
         self.recorder: Recorder | None = None
         """Keeps the samples of a capture, if there is to be one."""
-        self._machine = machine
         self._columns, self._offset = columns, offset
         self._dt = float(plant.model.opt.timestep)
         self._voltage = machine.bus_voltage
         self._gains = b""
         self._qvel, self._act = self.data.qvel, self.data.act  # views
         plant.set_bus_voltage(self._voltage)
-
-    def place(self, pose: Array) -> None:
-        """Put the joints, links and rotors alike, where a pose of the whole robot has them."""
-        self.data.qpos[self.plant.rotor_qpos] = pose[self._columns]
-        self.data.qpos[self.plant.link_qpos] = pose[self._columns]
-        self.plant.set_clamps((), self.data.qpos, 0.0, 0.0)
+        self.data.qpos[plant.rotor_qpos] = self.data.qpos[plant.link_qpos] = pose[columns]
+        plant.set_clamps((), self.data.qpos, 0.0, 0.0)
 
     def apply(self, command: Command) -> None:
         """Let the drives act on a command, through encoders that may be off."""
@@ -131,11 +128,7 @@ class Physics:
             self.plant.set_gains(*gains[:, columns])
 
     def run(self, steps: list[int], transport: Transport) -> Block:
-        """Go on to each of some rising physics steps, and read the plant there.
-
-        Raises:
-            HardwareError: The numbers ran away.
-        """
+        """Go on to each of some rising physics steps, and read the plant there."""
         plant, data, wanted = self.plant, self.data, set(steps)
         due = [] if self.recorder is None else self.recorder.due(steps[-1])
         # Where a sample and a state are of the same step, one look does for both.
@@ -151,7 +144,13 @@ class Physics:
             if stop in wanted:
                 self._sag()
         voltage = np.array(voltages)
-        self._check()
+        # MuJoCo starts over, its time at 0, where numbers run away.
+        if data.time < (self.step - self._first - 0.5) * self._dt:
+            raise HardwareError(
+                f"the virtual robot's physics ran away by {self.step * self._dt:.3f} s at a step "
+                f"of {self._dt:g} s; look for an extreme number in its parameters or a command's "
+                "gains."
+            )
         if self.recorder is not None:
             sampled = np.searchsorted(stops, due)
             self.recorder.keep(rows[sampled], voltage[sampled])
@@ -195,12 +194,3 @@ class Physics:
         # A battery gives most at half its voltage; above that it gives no more.
         self._voltage = max(sagged, 0.5 * machine.bus_voltage)
         plant.set_bus_voltage(self._voltage)
-
-    def _check(self) -> None:
-        """MuJoCo starts over, its time at 0, where numbers run away; say so instead."""
-        if self.data.time < (self.step - self._first - 0.5) * self._dt:
-            raise HardwareError(
-                f"the virtual robot's physics ran away by {self.step * self._dt:.3f} s at a step "
-                f"of {self._dt:g} s; look for an extreme number in its parameters or a command's "
-                "gains."
-            )

@@ -3,14 +3,24 @@
 From the robot's own structure (`Robot.build_spec`) comes a plant in which every joint has two
 degrees of freedom: the link, and the rotor with the inertia reflected through the gear. A belt
 (spring and damper) couples them. Motor, encoder and friction sit on the rotor, as on the robot.
-All of it is in joint coordinates.
+All of it is in joint coordinates. On the bench the base is fixed to its stand and nothing touches
+anything; on the ground the trunk is free.
 
-`rotor.py` has the drive. On the bench the base is fixed to its stand and nothing touches anything;
-on the ground the trunk is free.
+Drive. MuJoCo's `dcmotor`, whose controller outputs volts. A drive that regulates current demands
+tau = stiffness (target - q) - damping qdot and believes in a motor constant K0; the motor has
+K = torque_scale K0, in torque as in back-EMF (one magnetic flux). The voltage that drives the
+current tau / K0 through R against the back-EMF is
+
+    V = R tau / K0 + K qdot,    torque = K (V - K qdot) / R = torque_scale tau,
+
+so the controller gains are R stiffness / K0 and R damping / K0 - K, and the clip of V at the bus
+gives the torque-speed line of the true motor. Friction is LuGre with a Stribeck peak:
+dz/dt = v - sigma0 |v| z / g(v), g = F_C + (F_S - F_C) exp(-(v/v_S)^2), torque sigma0 z +
+sigma1 dz/dt, outside the limits of the motor.
 
 Time stepping. MuJoCo's Euler step is symplectic: positions see the new speed, torques the old one.
 With the drive's derivative torque explicit, q_{n+1} - 2 q_n + q_{n-1} = -(h/I) kd (q_n - q_{n-1})
-+ ..., in which the backward difference stands for qdot - (h/2) qddot: the joint answers as if its
++ ..., in which the backward difference stands for qdot - (h/2) qddot: the joint responds as if its
 inertia were smaller by kd h / 2, an error of first order in the step h (0.13 dB at 0.25 ms). The
 rotor is therefore given that much more inertia, which leaves an error of second order; passive
 damping is implicit in MuJoCo, so its share has the other sign. The same effect, uncorrected and
@@ -28,17 +38,24 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
-from pronk.robots.robot import Robot
+from pronk.robots.robot import Drive, Robot
 from pronk.virtual.ground import Ground
-from pronk.virtual.rotor import ROTOR_MASS, MotorConstants, add_rotor
-from pronk.virtual.sim_params import SimParams
+from pronk.virtual.sim_params import JointParams, SimParams
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 # Largest angular frequency of a spring times the step; the symplectic step is stable below 2.
 _STABLE = 1.0
-
+# The rotor's inertia is the armature of its hinge; MuJoCo requires a body with mass as well, and
+# 1e-9 kg on the joint's axis is nothing beside the lightest link.
+_ROTOR_MASS = 1e-9
+# Time in which a joint that has run into its stop is pushed back, 8 physics steps [s].
+_STOP_S = 2e-3
+# Joints of a stand that gives a little, and their axes.
+_STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (0, 0, 1)}
 # Places in MuJoCo's parameter vectors of a dcmotor (MuJoCo 3.11).
 _KP, _KD, _VMAX = 4, 6, 7
 _STATE = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT
@@ -52,22 +69,20 @@ class Plant:
     """mujoco.MjModel"""
     joints: tuple[str, ...]
     """Joints that are in the plant, in file order."""
-    rotor: NDArray[np.intp]
-    """Index of each rotor in qvel."""
-    rotor_qpos: NDArray[np.intp]
-    """Index of each rotor in qpos."""
-    link: NDArray[np.intp]
-    """Index of each link in qvel."""
-    link_qpos: NDArray[np.intp]
-    """Index of each link in qpos."""
-    actuator: NDArray[np.intp]
-    """Index of each motor in ctrl."""
-    current: NDArray[np.intp]
-    """Index of each motor's current in act."""
-    stand: NDArray[np.intp]
-    """Indices of the stand's roll, pitch and yaw in qpos and qvel; empty if it is rigid, and on the
+    rotor: Indices
+    """Of each rotor in qvel."""
+    rotor_qpos: Indices
+    link: Indices
+    """Of each link in qvel."""
+    link_qpos: Indices
+    actuator: Indices
+    """Of each motor in ctrl."""
+    current: Indices
+    """Of each motor's current in act."""
+    stand: Indices
+    """Of the stand's roll, pitch and yaw in qpos and qvel; empty if it is rigid, and on the
     ground."""
-    feet: NDArray[np.intp]
+    feet: Indices
     """Geom of each leg's foot, on the ground; empty on the bench."""
     base: int
     """Id of the trunk's body."""
@@ -91,7 +106,7 @@ class Plant:
 
     @cached_property
     def aside(self) -> Any:
-        """A mujoco.MjData to compute in, beside the run's: making one takes longer than a look."""
+        """A mujoco.MjData to compute in, beside the run's."""
         return mujoco.MjData(self.model)
 
     def read(self, data: Any, row: Array) -> None:
@@ -114,16 +129,15 @@ class Plant:
         inertia = self.rotor_inertia + half_step * explicit
         self.model.dof_armature[self.rotor] = inertia
         # What MuJoCo reads in its place for a rotor whose parent cannot move.
-        self.model.dof_M0[self.rotor] = inertia + ROTOR_MASS
+        self.model.dof_M0[self.rotor] = inertia + _ROTOR_MASS
 
     def set_bus_voltage(self, voltage: float) -> None:
         """Set the voltage at which the inverters clip [V]."""
-        # Every actuator of the plant is a motor.
         self._inverters[:] = voltage
 
     @cached_property
     def _inverters(self) -> Array:
-        """View of the voltages at which they clip."""
+        """View of the voltages at which they clip; every actuator of the plant is a motor."""
         view: Array = self.model.actuator_gainprm[:, _VMAX]
         return view
 
@@ -139,11 +153,9 @@ class Plant:
         return -self.effort_limit
 
     def electrical_power(self, torque: Array, speed: Array) -> Array:
-        """Power from the bus, mechanical and heat, summed over joints [W].
+        """Power from the bus, mechanical and heat, summed over joints [W], shape (...).
 
-        Args:
-            torque: Of the motors [N m], shape (..., joints).
-            speed: Of the rotors [rad/s], shape (..., joints).
+        Of motor torques [N m] and rotor speeds [rad/s], shape (..., joints).
         """
         current = torque / self.constant
         power: Array = (torque * speed + current * current * self.resistance).sum(axis=-1)
@@ -152,16 +164,10 @@ class Plant:
     def set_clamps(
         self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float
     ) -> None:
-        """Hold links where they are with a fixture; release all others.
+        """Hold the links of `joints` where they are in `q` with a fixture; release all others.
 
-        The fixture is a spring and damper between link and body, not a constraint: its stiffness
-        has a unit that can be looked up, and it costs no solver iterations.
-
-        Args:
-            joints: Joints whose links are held; () releases all.
-            q: Generalized positions of the plant [rad].
-            stiffness: [N m/rad]
-            damping: [N m s/rad]
+        The fixture is a spring and damper [N m/rad, N m s/rad] between link and body, not a
+        constraint: it costs no solver iterations.
         """
         for name, dof, index in zip(self.joints, self.link, self.link_qpos, strict=True):
             held = name in joints
@@ -183,25 +189,90 @@ def leg_of(robot: Robot, name: str) -> str:
     return first.pop() if len(first) == 1 else limb[0]
 
 
+def motor_of(drive: Drive) -> tuple[float, float]:
+    """Constant [V s/rad] and resistance [ohm] of a motor, joint side, as its drive believes."""
+    return motor_constants(
+        stall_torque=drive.stall_torque,
+        no_load_speed=drive.no_load_speed,
+        bus_voltage=drive.bus_voltage,
+    )
+
+
+def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: float) -> None:
+    """Give a joint of a spec its rotor, belt and motor: `NAME/rotor`, `NAME/belt`, `NAME/motor`."""
+    link = spec.joint(name)
+    if link is None:
+        raise RobotError(f"the robot's model has no joint {name!r}.")
+    rotor_body = link.parent.parent.add_body(
+        name=f"{name}/rotor",
+        pos=link.parent.pos,
+        quat=link.parent.quat,
+        mass=_ROTOR_MASS,
+        inertia=[_ROTOR_MASS] * 3,
+        ipos=link.pos,
+        explicitinertial=True,
+    )
+    rotor_body.add_joint(
+        name=f"{name}/rotor",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=link.axis,
+        pos=link.pos,
+        armature=true.rotor_inertia * drive.gear_ratio**2,
+        damping=[true.viscous, 0, 0],
+        limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+    )
+    # Nothing of the training model's joint remains but its axis and its stops.
+    link.armature = link.frictionloss = 0.0
+    link.damping = link.stiffness = [0.0, 0.0, 0.0]
+    # A mechanical stop is hard: the model's gives way by 0.4 rad under the weight of the trunk.
+    link.solref_limit = [_STOP_S, 1.0]
+    belt = spec.add_tendon(
+        name=f"{name}/belt",
+        stiffness=[true.belt_stiffness, 0, 0],
+        damping=[true.belt_damping, 0, 0],
+        springlength=[0.0, 0.0],
+    )
+    belt.wrap_joint(f"{name}/rotor", 1.0)
+    belt.wrap_joint(name, -1.0)
+    believed, resistance = motor_of(drive)
+    # MuJoCo integrates the current exactly over a step h with time constant t, and applies it in
+    # that very step: late by h / (exp(h / t) - 1) at low frequency. Solved for t.
+    lag = spec.option.timestep / math.log1p(spec.option.timestep / lag_s)
+    spec.add_actuator(
+        name=f"{name}/motor", target=f"{name}/rotor", trntype=mujoco.mjtTrn.mjTRN_JOINT
+    ).set_to_dcmotor(
+        # A second constant other than zero would silently become their geometric mean.
+        motorconst=[true.torque_scale * believed, 0.0],
+        resistance=resistance,
+        saturation=[true.torque_scale * drive.effort_limit, 0.0, 0.0],
+        # kp, ki, kd, slew limit, integral limit, voltage limit; gains are set by set_gains().
+        controller=[0.0, 0.0, 0.0, 0.0, 0.0, drive.bus_voltage],
+        lugre=[
+            true.presliding_stiffness,
+            true.presliding_damping,
+            true.coulomb,
+            true.breakaway,
+            true.stribeck_speed,
+        ],
+        # Inductance over resistance stands for all that delays torque inside the drive.
+        inductance=[0.0, lag],
+        input_mode=1,  # ctrl is a position
+    )
+
+
 def _drop_legs(spec: Any, robot: Robot, kept: set[str]) -> None:
     """Delete every subtree under the base that holds no kept joint."""
     for child in list(spec.body(robot.base_body).bodies):
-        names = [joint.name for joint in child.find_all("joint")]
-        names += [joint.name for joint in child.joints]
+        names = [joint.name for joint in (*child.find_all("joint"), *child.joints)]
         if names and not any(name in kept for name in names):
             spec.delete(child)
-
-
-def _indices(joints: list[Any], of: str) -> NDArray[np.intp]:
-    return np.array([getattr(joint, of)[0] for joint in joints], dtype=np.intp)
 
 
 def _check_springs(plant: Plant, sim_params: SimParams) -> None:
     """Refuse springs that the physics step cannot follow; name the field and the largest value."""
     model = plant.model
-    data = mujoco.MjData(model)
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     mujoco.mj_forward(model, data)
-    inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
     mobility = np.diag(np.linalg.inv(inertia))
     for k, name in enumerate(plant.joints):
@@ -219,10 +290,6 @@ def _check_springs(plant: Plant, sim_params: SimParams) -> None:
                 )
 
 
-_STAND_AXES = {"stand_roll": (1, 0, 0), "stand_pitch": (0, 1, 0), "stand_yaw": (0, 0, 1)}
-"""Joints of a stand that gives a little, and their axes."""
-
-
 def _free_base(spec: Any, robot: Robot, ground: Ground) -> None:
     """Put a model's free trunk over the ground; refuse an arm."""
     base = spec.body(robot.base_body)
@@ -236,12 +303,26 @@ def _free_base(spec: Any, robot: Robot, ground: Ground) -> None:
     ground.add_to(spec)
 
 
-def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
-    """Apply the trunk's parameters to a model; constants derived from masses are left alone.
+def _fix_base(spec: Any, robot: Robot, sim_params: SimParams) -> None:
+    """Fix a model's trunk to its stand, without contacts."""
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    base = spec.body(robot.base_body)
+    for joint in list(base.joints):
+        spec.delete(joint)
+    if math.isfinite(sim_params.machine.stand_stiffness):
+        for name, axis in _STAND_AXES.items():
+            base.add_joint(
+                name=name,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=axis,
+                stiffness=[sim_params.machine.stand_stiffness, 0, 0],
+                damping=[sim_params.machine.stand_damping, 0, 0],
+                limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+            )
 
-    Raises:
-        RobotError: No body could be like that.
-    """
+
+def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
+    """Apply the trunk's parameters; refuse a body that could not be like that."""
     trunk = sim_params.trunk
     mass = float(model.body_mass[body])
     if not mass + trunk.mass_offset > 0.0:
@@ -263,23 +344,6 @@ def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
     model.body_inertia[body] = moments * (1.0 + trunk.mass_offset / mass)
     model.body_mass[body] = mass + trunk.mass_offset
     model.body_ipos[body] += trunk.com_offset
-
-
-def _fix_base(spec: Any, robot: Robot, sim_params: SimParams) -> None:
-    """Fix a model's trunk to its stand."""
-    base = spec.body(robot.base_body)
-    for joint in list(base.joints):
-        spec.delete(joint)
-    if math.isfinite(sim_params.machine.stand_stiffness):
-        for name, axis in _STAND_AXES.items():
-            base.add_joint(
-                name=name,
-                type=mujoco.mjtJoint.mjJNT_HINGE,
-                axis=axis,
-                stiffness=[sim_params.machine.stand_stiffness, 0, 0],
-                damping=[sim_params.machine.stand_damping, 0, 0],
-                limited=mujoco.mjtLimited.mjLIMITED_FALSE,
-            )
 
 
 def build_plant(
@@ -309,75 +373,64 @@ def build_plant(
         )
     sim_params.check_joints(robot.joint_names)
     joints = tuple(joint for joint in robot.joints if leg_of(robot, joint.name) in legs)
+    names = tuple(joint.name for joint in joints)
+    true = [sim_params.joints[name] for name in names]
     spec = robot.build_spec()
     spec.option.timestep = timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     for key in list(spec.keys):
         spec.delete(key)
     if ground is None:
         _fix_base(spec, robot, sim_params)
-        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     else:
         _free_base(spec, robot, ground)
-    _drop_legs(spec, robot, {joint.name for joint in joints})
-    for joint in joints:
-        add_rotor(
-            spec,
-            joint.name,
-            joint.drive,
-            sim_params.joints[joint.name],
-            sim_params.machine.drive_lag_s,
-        )
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    _drop_legs(spec, robot, set(names))
+    for joint, params in zip(joints, true, strict=True):
+        _add_rotor(spec, joint.name, joint.drive, params, sim_params.machine.drive_lag_s)
     model = spec.compile()
-    rotors, links = ([model.joint(f"{j.name}{end}") for j in joints] for end in ("/rotor", ""))
     if model.nq != model.nv + (ground is not None):
         raise RobotError(f"{robot.name}: the virtual robot knows hinge joints only.")
+    rotors, links = ([model.joint(f"{name}{end}") for name in names] for end in ("/rotor", ""))
     # Mass and inertia by the same factor: a body that was possible stays possible.
-    for joint in joints:
-        body = int(model.jnt_bodyid[model.joint(joint.name).id])
-        model.body_mass[body] *= sim_params.joints[joint.name].link_inertia_scale
-        model.body_inertia[body] *= sim_params.joints[joint.name].link_inertia_scale
-    base = model.body(robot.base_body).id
-    feet = []
+    for link, params in zip(links, true, strict=True):
+        body = int(model.jnt_bodyid[link.id])
+        model.body_mass[body] *= params.link_inertia_scale
+        model.body_inertia[body] *= params.link_inertia_scale
+    base, feet = model.body(robot.base_body).id, np.array([], dtype=np.intp)
     if ground is not None:
         _change_trunk(model, base, sim_params)
-        feet = [model.geom(f"{leg}_foot_collision").id for leg in legs]
+        feet = _ids([model.geom(f"{leg}_foot_collision").id for leg in legs])
     mujoco.mj_setConst(model, mujoco.MjData(model))
     if ground is not None:
-        ground.set_contact(model, np.array(feet, dtype=np.intp))
-    scale = np.array([sim_params.joints[joint.name].torque_scale for joint in joints])
-    motors = [MotorConstants.of(joint.drive) for joint in joints]
-    believed = np.array([motor.constant for motor in motors])
+        ground.set_contact(model, feet)
+    scale = np.array([params.torque_scale for params in true])
+    believed, resistance = np.array([motor_of(joint.drive) for joint in joints]).T.copy()
     rigid = ground is not None or not math.isfinite(sim_params.machine.stand_stiffness)
+    motors = _ids([model.actuator(f"{name}/motor").id for name in names])
+    gears = np.array([joint.drive.gear_ratio for joint in joints])
     plant = Plant(
         model=model,
-        joints=tuple(joint.name for joint in joints),
-        rotor=_indices(rotors, "dofadr"),
-        rotor_qpos=_indices(rotors, "qposadr"),
-        link=_indices(links, "dofadr"),
-        link_qpos=_indices(links, "qposadr"),
-        actuator=np.array([model.actuator(f"{j.name}/motor").id for j in joints], dtype=np.intp),
+        joints=names,
+        rotor=_ids([joint.dofadr[0] for joint in rotors]),
+        rotor_qpos=_ids([joint.qposadr[0] for joint in rotors]),
+        link=_ids([joint.dofadr[0] for joint in links]),
+        link_qpos=_ids([joint.qposadr[0] for joint in links]),
+        actuator=motors,
         # LuGre's bristle comes first among a motor's states, its current last.
-        current=np.array(
-            [
-                model.actuator_actadr[motor] + model.actuator_actnum[motor] - 1
-                for motor in (model.actuator(f"{joint.name}/motor").id for joint in joints)
-            ],
-            dtype=np.intp,
-        ),
-        stand=np.array(
-            [] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES], dtype=np.intp
-        ),
-        feet=np.array(feet, dtype=np.intp),
+        current=_ids(model.actuator_actadr[motors] + model.actuator_actnum[motors] - 1),
+        stand=_ids([] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES]),
+        feet=feet,
         base=base,
         constant=scale * believed,
         believed=believed,
-        resistance=np.array([motor.resistance for motor in motors]),
+        resistance=resistance,
         effort_limit=scale * np.array([joint.drive.effort_limit for joint in joints]),
-        rotor_inertia=np.array(
-            [sim_params.joints[j.name].rotor_inertia * j.drive.gear_ratio**2 for j in joints]
-        ),
-        viscous=np.array([sim_params.joints[joint.name].viscous for joint in joints]),
+        rotor_inertia=np.array([params.rotor_inertia for params in true]) * gears**2,
+        viscous=np.array([params.viscous for params in true]),
     )
     _check_springs(plant, sim_params)
     return plant
+
+
+def _ids(values: Any) -> Indices:
+    return np.array(values, dtype=np.intp)

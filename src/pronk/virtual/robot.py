@@ -1,9 +1,7 @@
 """The virtual robot: a stand-in for hardware, marked as such (`virtual` is True).
 
-It stands on the bench or on the ground.
-
-Physics runs in blocks (`physics.py`), and each block of raw states is turned into what sensors
-would have measured (`sensors.py`).
+It stands on the bench or on the ground. Physics runs in blocks (`physics.py`), and each block of
+raw states is turned into what sensors would have measured (`sensors.py`).
 
 The physics step is 0.25 ms, and that has converged. On the bench the Bode gains of hip_roll,
 hip_pitch and knee differ by 0.004, 0.003 and 0.002 dB at most from those at 25 us (40 kHz, the rate
@@ -36,7 +34,7 @@ from pronk.virtual.capture import Capture, Recorder
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.physics import Physics, Transport
 from pronk.virtual.plant import build_plant, legs_of
-from pronk.virtual.sensors import FreeBody, Raw, Sensors, StandingBody
+from pronk.virtual.sensors import Raw, Sensors, TrunkMotion
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
 TIMESTEP_S = 0.25e-3
@@ -93,20 +91,28 @@ class VirtualRobot:
                 base.
         """
         known = legs_of(robot)
-        _check_base(base, ground, start, legs)
-        _check_legs(robot, known, legs)
-        _check_rate("log_rate_hz", log_rate_hz, timestep_s)
-        if capture_rate_hz is not None:
-            _check_rate("capture_rate_hz", capture_rate_hz, timestep_s)
-        self.robot = robot.name
-        self._robot = robot
-        self._sim_params = sim_params
-        self._seed = seed
+        if base not in ("bench", "ground"):
+            raise HardwareError(f"base {base!r}; the virtual robot knows 'bench' and 'ground'.")
+        if base == "bench" and (ground is not None or start is not None):
+            raise HardwareError("ground or start given on the bench; take base='ground' for them.")
+        if base == "ground" and legs is not None:
+            raise HardwareError(f"legs {legs} on the ground, where all are needed; leave legs out.")
+        if legs is not None and (not legs or not set(legs) <= set(known)):
+            raise HardwareError(
+                f"legs {legs}; expected some of {', '.join(known)}, the legs of {robot.name}, or "
+                "None for all."
+            )
+        for name, rate in (("log_rate_hz", log_rate_hz), ("capture_rate_hz", capture_rate_hz)):
+            if rate is not None and not 0.0 < timestep_s * rate <= 1.0:
+                raise HardwareError(
+                    f"{name} is {rate:g}; expected above 0 and at most one per physics step "
+                    f"({1.0 / timestep_s:g} Hz)."
+                )
+        self.robot, self._robot = robot.name, robot
+        self._sim_params, self._seed = sim_params, seed
         self._ground = (ground or sim_params.ground) if base == "ground" else None
         self._start = start or Start()
-        self._rate = log_rate_hz
-        self._capture_rate = capture_rate_hz
-        self._dt = timestep_s
+        self._rate, self._capture_rate, self._dt = log_rate_hz, capture_rate_hz, timestep_s
         self._plant = build_plant(robot, sim_params, legs or known, timestep_s, self._ground)
         # Columns of the present joints in file order, and their encoders' error.
         names = robot.joint_names
@@ -127,10 +133,10 @@ class VirtualRobot:
         robot, plant, machine = self._robot, self._plant, self._sim_params.machine
         pose = np.array([joint.default_position for joint in robot.joints])
         settle = _SETTLE_S
-        self._body: StandingBody | FreeBody = StandingBody(plant)
         if self._ground is not None:
             pose, settle = pose + self._start.offset(len(pose)), self._start.settle_s
-            self._body = FreeBody(1.0 / self._rate)
+        free = self._ground is not None
+        self._trunk = TrunkMotion(plant, 1.0 / self._rate, free=free)
         self._sensors = Sensors(
             robot, self._sim_params, plant.joints, rate_hz=self._rate, seed=self._seed
         )
@@ -138,12 +144,12 @@ class VirtualRobot:
         self._physics = Physics(
             plant,
             machine,
+            pose=pose,
             columns=self._columns,
             offset=self._offset,
             # Steps are counted from the clock's zero; settling happens before it.
             first_step=-round(settle / self._dt),
         )
-        self._physics.place(pose)
         self._recorder = None
         if self._ground is not None:
             self._ground.set_down(plant.model, self._physics.data, plant.feet, self._start)
@@ -172,14 +178,7 @@ class VirtualRobot:
         return self._latest
 
     def wait(self, until: float) -> list[State]:
-        """Let time pass to `until` on the machine's clock; return the states met on the way.
-
-        Args:
-            until: [s]. A time already past returns no states.
-
-        Raises:
-            HardwareError: Not a finite time, or the physics came to no sensible end.
-        """
+        """Let time pass to `until` [s] on the machine's clock; return the states met on the way."""
         self._check_open()
         if not math.isfinite(until):
             raise HardwareError(f"wait until {until}; expected a finite time [s].")
@@ -194,11 +193,7 @@ class VirtualRobot:
         return states
 
     def send(self, command: Command) -> None:
-        """Put a command into force, after the transport delay and until it expires.
-
-        Raises:
-            HardwareError: Wrong shape, not finite, a negative gain, or a time that is none.
-        """
+        """Put a command into force, after the transport delay and until it expires."""
         self._check_open()
         check_command(command, len(self._robot.joints))
         self._transport.put(command, self._now)
@@ -228,15 +223,9 @@ class VirtualRobot:
         self._transport.put(damping_command(len(self._robot.joints)), self._now)
 
     def capture(self, since: float = 0.0) -> Capture:
-        """Motion capture so far; also after `close`.
+        """Motion capture from `since` [s] to the physics step reached; also after `close`.
 
-        It ends at the physics step reached, which is behind `now` by the measurement delay.
-
-        Args:
-            since: Leave out what is older [s].
-
-        Raises:
-            HardwareError: On the bench, without `capture_rate_hz`, or never connected.
+        The step reached is behind `now` by the measurement delay.
         """
         if self._recorder is None:
             raise HardwareError(
@@ -278,7 +267,7 @@ class VirtualRobot:
                 speed=block.qvel.take(plant.rotor, axis=1),
                 torque=block.torque,
                 voltage=block.voltage,
-                motion=self._body.motion(block.qpos, block.qvel),
+                motion=self._trunk.at(block.qpos, block.qvel),
             )
         )
 
@@ -291,41 +280,9 @@ def open_sim(
     params: str | None = None,
     **common: Any,
 ) -> VirtualRobot:
-    """Make the virtual robot of an address `sim://BASE?seed=0&params=FILE`.
+    """Make the virtual robot of an address `sim://BASE?seed=0&params=FILE`, BASE bench or ground.
 
-    Args:
-        robot: Structure.
-        interface: The base, `bench` or `ground`; None is the ground.
-        seed: Of all noise.
-        params: File of its parameters; the shipped one if None.
-        **common: Of links with a wire; of no effect.
+    What else links take (`common`) is of no effect.
     """
     base: Any = interface or "ground"
     return VirtualRobot(robot, load_sim_params(params, robot), seed=seed, base=base)
-
-
-def _check_base(
-    base: str, ground: Ground | None, start: Start | None, legs: tuple[str, ...] | None
-) -> None:
-    if base not in ("bench", "ground"):
-        raise HardwareError(f"base {base!r}; the virtual robot knows 'bench' and 'ground'.")
-    if base == "bench" and (ground is not None or start is not None):
-        raise HardwareError("ground or start given on the bench; take base='ground' for them.")
-    if base == "ground" and legs is not None:
-        raise HardwareError(f"legs {legs} on the ground, where all are needed; leave legs out.")
-
-
-def _check_legs(robot: Robot, known: tuple[str, ...], legs: tuple[str, ...] | None) -> None:
-    for leg in legs or ():
-        if leg not in known:
-            raise HardwareError(f"{robot.name} has no leg {leg!r}; it has {', '.join(known)}.")
-    if legs is not None and not legs:
-        raise HardwareError(f"no legs; name at least one of {', '.join(known)}, or None.")
-
-
-def _check_rate(name: str, rate_hz: float, timestep_s: float) -> None:
-    if not 0.0 < timestep_s * rate_hz <= 1.0:
-        raise HardwareError(
-            f"{name} is {rate_hz:g}; expected above 0 and at most one per physics step "
-            f"({1.0 / timestep_s:g} Hz)."
-        )

@@ -1,4 +1,4 @@
-"""What the sensors of the virtual robot say of what is true.
+"""Sensors of the virtual robot: states from true values.
 
 Encoders sit on the rotors and have the grid of their bits seen through the gear; their mounts
 shake slowly (coloured noise). Speed is the drive's own first difference of that grid. Torque is
@@ -7,12 +7,15 @@ since the last state, as a unit that integrates inside does. The attitude filter
 constant, by something that wanders, and by a heading that starts anywhere. Timestamps jitter.
 
 A block of ticks is read at once; reading the same ticks in other blocks gives the same numbers.
+Quaternions are rows w, x, y, z, written out because the loop runs a thousand times a second on a
+handful of rows, where a general library spends its time on preparations.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +23,57 @@ from numpy.typing import NDArray
 from pronk.links.machine import State
 from pronk.robots.robot import Robot
 from pronk.virtual.plant import Plant
-from pronk.virtual.quaternion import about_z, of_vector, product, turned_back
 from pronk.virtual.sim_params import SimParams
 
 Array = NDArray[np.float64]
 
-
 _GRAVITY = 9.81
+_AHEAD = 512
+"""Ticks of noise that are computed at once."""
+
+# Row k: what Hamilton's product makes of part k of its left factor.
+_FACTORS = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_SIGNS = np.array([[1.0, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]])
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Motion:
+def product(a: Array, b: Array) -> Array:
+    """The rotations `b`, then `a`: Hamilton's product. (n, 4) each."""
+    both: Array = np.add.reduce(a[:, :, None] * (b.take(_FACTORS, axis=1) * _SIGNS), axis=1)
+    return both
+
+
+def of_vector(rotation: Array) -> Array:
+    """Rotation vectors of any size as quaternions. (n, 3) [rad] to (n, 4)."""
+    half = 0.5 * rotation
+    # Never 0, so that sin(x) / x is 1 there.
+    angle = np.sqrt((half * half).sum(axis=1, keepdims=True) + 1e-300)
+    return np.concatenate([np.cos(angle), half * (np.sin(angle) / angle)], axis=1)
+
+
+def about_z(yaw: Array) -> Array:
+    """Rotations about the vertical. (n,) [rad] to (n, 4)."""
+    turn = np.zeros((len(yaw), 4))
+    turn[:, 0], turn[:, 3] = np.cos(0.5 * yaw), np.sin(0.5 * yaw)
+    return turn
+
+
+def turned_back(q: Array, v: Array) -> Array:
+    """World vectors in the frames of bodies, R(q)^T v. (n, 4) and (n, 3) to (n, 3)."""
+    w, u = q[:, :1], q[:, 1:]
+    # v - 2 w (u x v) + 2 u x (u x v), since the inverse has -u.
+    cross = _cross(u, v)
+    turned: Array = v - 2.0 * (w * cross - _cross(u, cross))
+    return turned
+
+
+def _cross(a: Array, b: Array) -> Array:
+    ahead = a.take(_NEXT, axis=1) * b.take(_LAST, axis=1)
+    across: Array = ahead - a.take(_LAST, axis=1) * b.take(_NEXT, axis=1)
+    return across
+
+
+class Motion(NamedTuple):
     """Of the trunk, at n instants."""
 
     orientation: Array
@@ -41,43 +84,32 @@ class Motion:
     """Specific force in the trunk's frame, its mean since the instant before [m/s^2]. (n, 3)"""
 
 
-class StandingBody:
-    """A body on the bench, still or on a stand that gives a little."""
+class TrunkMotion:
+    """Motion of the trunk, free on the ground or on its stand. Keeps the last instant."""
 
-    def __init__(self, plant: Plant) -> None:
-        """Of a plant on the bench."""
-        self._stand = plant.stand
+    def __init__(self, plant: Plant, period_s: float, *, free: bool) -> None:
+        """Begin at rest, with a period between instants [s]."""
+        self._stand, self._period, self._free = plant.stand, period_s, free
+        self._last: Array | None = None
         self._still: Motion | None = None
-        """Of a rigid stand, for as many instants as last time."""
+        """On a rigid stand, for as many instants as last time."""
 
-    def motion(self, qpos: Array, qvel: Array) -> Motion:
+    def at(self, qpos: Array, qvel: Array) -> Motion:
         """The motion at instants, from the plant's positions (n, nq) and velocities (n, nv)."""
+        if self._free:
+            orientation, velocity = qpos[:, 3:7], qvel[:, :3]
+            now = np.concatenate([orientation, velocity], axis=1)
+            path = np.concatenate([now[:1] if self._last is None else self._last, now])
+            self._last = now[-1:]
+            force = moving_force(path[:, 4:], path[:, :4], self._period)
+            return Motion(orientation, qvel[:, 3:6], force)
         if len(self._stand):
             tilt = qpos[:, self._stand]
-            rate = qvel[:, self._stand]
-            return Motion(orientation=of_vector(tilt), rate=rate, force=resting_force(tilt))
+            return Motion(of_vector(tilt), qvel[:, self._stand], resting_force(tilt))
         if self._still is None or len(self._still.rate) != len(qpos):
             tilt = np.zeros((len(qpos), 3))
-            self._still = Motion(orientation=of_vector(tilt), rate=tilt, force=resting_force(tilt))
+            self._still = Motion(of_vector(tilt), tilt, resting_force(tilt))
         return self._still
-
-
-class FreeBody:
-    """A body that moves freely. Keeps the last instant between blocks."""
-
-    def __init__(self, period_s: float) -> None:
-        """Begin at rest, with a period between instants [s]."""
-        self._period = period_s
-        self._last: Array | None = None
-
-    def motion(self, qpos: Array, qvel: Array) -> Motion:
-        """The motion at instants, from positions (n, nq) and velocities (n, nv), trunk first."""
-        orientation, velocity = qpos[:, 3:7], qvel[:, :3]
-        now = np.concatenate([orientation, velocity], axis=1)
-        path = np.concatenate([now[:1] if self._last is None else self._last, now])
-        self._last = now[-1:]
-        force = moving_force(path[:, 4:], path[:, :4], self._period)
-        return Motion(orientation=orientation, rate=qvel[:, 3:6], force=force)
 
 
 def resting_force(tilt: Array) -> Array:
@@ -89,12 +121,11 @@ def resting_force(tilt: Array) -> Array:
 def moving_force(velocity: Array, orientation: Array, period_s: float) -> Array:
     """Mean reading of an accelerometer between instants, in the body's frame (n, 3) [m/s^2].
 
-    The change of velocity less that by gravity, turned into the frame halfway; a unit that
-    integrates inside, as good ones do, gives this mean.
+    The change of velocity less that by gravity, turned into the frame halfway.
 
     Args:
         velocity: World frame [m/s], shape (n + 1, 3).
-        orientation: Body to world, unit quaternions w, x, y, z, shape (n + 1, 4).
+        orientation: Body to world, unit quaternions, shape (n + 1, 4).
         period_s: Between instants [s].
     """
     force = (velocity[1:] - velocity[:-1]) / period_s
@@ -103,12 +134,7 @@ def moving_force(velocity: Array, orientation: Array, period_s: float) -> Array:
     return turned_back(0.5 * (orientation[1:] + orientation[:-1]), force)
 
 
-_AHEAD = 512
-"""Ticks that are computed at once."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Noise:
+class Noise(NamedTuple):
     """Errors of the sensors at n ticks; joints are all of the robot's."""
 
     jitter: Array
@@ -126,9 +152,9 @@ class Noise:
     force: Array
     """With its bias [m/s^2]. (n, 3)"""
     tilt: Array
-    """Rotation of the attitude in the trunk's frame, w, x, y, z. (n, 4)"""
+    """Rotation of the attitude in the trunk's frame, quaternion. (n, 4)"""
     heading: Array
-    """Rotation of the attitude about the vertical. (n, 4)"""
+    """Rotation of the attitude about the vertical, quaternion. (n, 4)"""
 
 
 class NoiseSource:
@@ -136,53 +162,35 @@ class NoiseSource:
 
     def __init__(self, sim_params: SimParams, joints: int, *, rate_hz: float, seed: int) -> None:
         """Start the noise of all `joints` anew, at a rate [Hz], from a seed."""
-        self._machine, self._filter = sim_params.machine, sim_params.attitude
-        self._joints = joints
-        self._period = 1.0 / rate_hz
+        self._machine, self._filter = machine, off = sim_params.machine, sim_params.attitude
+        self._joints, self._period = joints, 1.0 / rate_hz
         self._rng = np.random.default_rng(seed)
-        # A stream of its own: what the joints say does not depend on the attitude.
+        # A stream of its own: noise of the joints does not depend on the attitude's.
         self._attitude_rng = np.random.default_rng([seed, 1])
         self._yaw = self._attitude_rng.uniform(-math.pi, math.pi)
         # What is left of the slow noise after a tick, and how large what is added is.
-        machine, off, each = sim_params.machine, sim_params.attitude, [joints, 3]
+        each = [joints, 3]
         corner = np.repeat([machine.position_noise_corner_hz, off.noise_corner_hz], each)
         self._keep = np.exp(-2.0 * math.pi * corner * self._period)
         size = np.repeat([machine.position_noise, off.noise], each)
         self._fresh = size * np.sqrt(1.0 - self._keep**2)
         self._last = np.zeros(joints + 3)
-        self._drawn = 0
-        # Columns side by side, so that a slice of rows is a slice of everything.
-        widths = (1, 1, joints, joints, joints, 3, 3, 4, 4)
-        ends = np.cumsum(widths).tolist()
-        self._parts = [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
-        self._table = np.empty((0, ends[-1]))
-        self._next = 0
+        self._drawn = self._next = 0
+        self._table = self._draw(_AHEAD)
 
     def take(self, count: int) -> Noise:
         """The noise of the next `count` ticks."""
-        if self._next + count > len(self._table):
-            left = self._table[self._next :]
-            self._table = np.concatenate([left, self._draw(max(count - len(left), _AHEAD))])
+        left = len(self._table.jitter) - self._next
+        if count > left:
+            more = self._draw(max(count - left, _AHEAD))
+            pairs = zip(self._table, more, strict=True)
+            self._table = Noise(*(np.concatenate([old[self._next :], new]) for old, new in pairs))
             self._next = 0
-        rows = self._table[self._next : self._next + count]
+        rows = slice(self._next, self._next + count)
         self._next += count
-        jitter, stamp, position, velocity, torque, gyro, force, tilt, heading = (
-            rows[:, part] for part in self._parts
-        )
-        return Noise(
-            jitter=jitter[:, 0],
-            stamp=stamp[:, 0],
-            position=position,
-            velocity=velocity,
-            torque=torque,
-            gyro=gyro,
-            force=force,
-            tilt=tilt,
-            heading=heading,
-        )
+        return Noise(*(part[rows] for part in self._table))
 
-    def _draw(self, n: int) -> Array:
-        """Rows of the table for the next n ticks."""
+    def _draw(self, n: int) -> Noise:
         machine, off, joints = self._machine, self._filter, self._joints
         draws = self._rng.standard_normal((n, 3 * joints + 8))
         if self._drawn == 0:
@@ -190,27 +198,21 @@ class NoiseSource:
         mount, fast, current = (draws[:, k * joints : (k + 1) * joints] for k in range(3))
         # Clipped so that neither may ever put two states out of order.
         most = 0.4 * self._period
-        jitter = np.clip(machine.sampling_jitter_s * draws[:, -1], -most, most)
-        stamp = np.clip(machine.timestamp_error_s * draws[:, -2], -most / 8, most / 8)
         normals = self._attitude_rng.standard_normal((n, 3))
         slow = self._low_passed(np.concatenate([mount, normals], axis=1))
-        shake, wander = slow[:, :joints], slow[:, joints:]
         ticks = np.arange(self._drawn, self._drawn + n) * self._period
         self._drawn += n
-        return np.concatenate(
-            [
-                jitter[:, None],
-                stamp[:, None],
-                shake,
-                machine.velocity_noise * fast,
-                machine.torque_noise * current,
-                machine.gyro_noise * draws[:, -8:-5] + np.array(machine.gyro_bias),
-                machine.accelerometer_noise * draws[:, -5:-2]
-                + np.array(machine.accelerometer_bias),
-                of_vector(wander + np.array(off.bias)),
-                about_z(np.asarray(self._yaw + off.yaw_drift * ticks, dtype=np.float64)),
-            ],
-            axis=1,
+        return Noise(
+            jitter=np.clip(machine.sampling_jitter_s * draws[:, -1], -most, most),
+            stamp=np.clip(machine.timestamp_error_s * draws[:, -2], -most / 8, most / 8),
+            position=slow[:, :joints],
+            velocity=machine.velocity_noise * fast,
+            torque=machine.torque_noise * current,
+            gyro=machine.gyro_noise * draws[:, -8:-5] + np.array(machine.gyro_bias),
+            force=machine.accelerometer_noise * draws[:, -5:-2]
+            + np.array(machine.accelerometer_bias),
+            tilt=of_vector(slow[:, joints:] + np.array(off.bias)),
+            heading=about_z(np.asarray(self._yaw + off.yaw_drift * ticks, dtype=np.float64)),
         )
 
     def _low_passed(self, normals: Array) -> Array:
@@ -266,12 +268,8 @@ class Sensors:
         gears = np.array([robot.joint(name).drive.gear_ratio for name in joints])
         self._count = 2.0 * math.pi / 2.0**machine.encoder_bits / gears
         self._noise = NoiseSource(sim_params, len(names), rate_hz=rate_hz, seed=seed)
-        self._sequence = 0
-
-    @property
-    def sequence(self) -> int:
+        self.sequence = 0
         """Number of the next state."""
-        return self._sequence
 
     def read(self, raw: Raw) -> list[State]:
         """The states of a block of ticks, joints that are absent at rest in the default pose."""
@@ -283,7 +281,10 @@ class Sensors:
         angle = raw.angle + raw.speed * late[:, None] + self._offset
         shaken = angle + self._present(noise.position)
         position = np.rint(shaken / self._count) * self._count
-        velocity = self._difference(angle, raw.speed)
+        # First difference of the encoder's grid over the drive's window.
+        window = self._machine.velocity_window_s
+        before = np.rint((angle - raw.speed * window) / self._count)
+        velocity = (np.rint(angle / self._count) - before) * self._count / window
         velocity += self._present(noise.velocity)
         torque = raw.torque / self._scale + self._present(noise.torque)
         if len(self._columns) < total:
@@ -305,10 +306,10 @@ class Sensors:
                 orientation=quaternion,
             )
             for sequence, (time, voltage, q, v, t, rate, acceleration, quaternion) in enumerate(
-                zip(stamp.tolist(), raw.voltage.tolist(), *rows, strict=True), self._sequence
+                zip(stamp.tolist(), raw.voltage.tolist(), *rows, strict=True), self.sequence
             )
         ]
-        self._sequence += len(states)
+        self.sequence += len(states)
         return states
 
     def _present(self, values: Array) -> Array:
@@ -321,10 +322,3 @@ class Sensors:
         whole[:] = absent
         whole[:, self._columns] = values
         return whole
-
-    def _difference(self, angle: Array, speed: Array) -> Array:
-        """First difference of the encoder's grid over the drive's window [rad/s]."""
-        window = self._machine.velocity_window_s
-        now = np.rint(angle / self._count)
-        before = np.rint((angle - speed * window) / self._count)
-        return np.asarray((now - before) * self._count / window)
