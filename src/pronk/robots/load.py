@@ -125,6 +125,16 @@ class SymmetryEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Joints whose coordinate has the opposite sign of the original's."""
 
 
+class AboutEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Metadata for tables; nothing depends on it."""
+
+    model: str = ""
+    """Source and licence of the model."""
+    links: tuple[str, ...] = ("sim",)
+    task: str = ""
+    """Name of the training task with mjlab."""
+
+
 class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Content of a `robot.yaml`."""
 
@@ -142,6 +152,7 @@ class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     decimation: Annotated[int, Meta(ge=1)] = 4
     grid_stiffness: _Band = (13.0, 27.0)
     grid_damping: _Band = (0.1, 0.7)
+    about: AboutEntry = AboutEntry()
 
 
 @dataclass(frozen=True)
