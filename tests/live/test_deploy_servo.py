@@ -151,8 +151,7 @@ def test_a_link_that_breaks_does_not_make_time_run_ahead(faults: FaultyLink) -> 
         run.mode(Mode.FAULT)
         end = time.monotonic() + 0.5
         run.until(lambda: time.monotonic() > end)
-        pace = run.servo._pace
-        assert pace is not None
+        pace = run.servo.pace
         # Damped tick by tick, not thousands of times in between.
         ahead = pace.deadline - time.monotonic()
         assert ahead <= 1.1 / 500.0
@@ -186,6 +185,6 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     (why,) = run.texts("lost")
     assert "Not a directory" in why or "exists" in why
     assert run.texts("mode")[-1] == "ENDED"
-    assert run.servo._machine is not None
+    assert run.servo.machine is not None
     with pytest.raises(HardwareError, match="connect"):
-        run.servo._machine.latest()
+        run.servo.machine.latest()

@@ -137,15 +137,14 @@ class Deployment:
         self._logger_end, talk = context.Pipe()
         trained = self.summary.trained_delay_s
 
-        def process(body: Callable[..., None], *arguments: Any) -> BaseProcess:
-            made: BaseProcess = context.Process(target=body, args=arguments, name=body.__name__)
-            return made
+        def process(what: str, body: Callable[..., None], *given: Any) -> BaseProcess:
+            return context.Process(target=body, args=given, name=f"pronk {what}")
 
-        self.servo = process(serve, plan, name, trained, servo_end)
+        self.servo = process("servo", serve, plan, name, trained, servo_end)
         if plan.policy is not None:
-            self.policy = process(serve_policy, plan, name, policy_end)
+            self.policy = process("policy", serve_policy, plan, name, policy_end)
         if plan.log is not None or plan.sweep is not None:
-            self.logger = process(write_log, plan, self._header, name, talk)
+            self.logger = process("log", write_log, plan, self._header, name, talk)
         self._interrupts.__enter__()
         self._open = True
         try:

@@ -180,8 +180,6 @@ class StateMachine:
     def preflighted(self, refusals: Sequence[str], t: float) -> None:
         """Leave the pre-flight checks: idle if there are refusals, else damp or begin the sweep."""
         self.refusals = tuple(refusals)
-        if self.controller is not None and refusals:
-            self._request = OperatorRequest.QUIT
         go = Mode.DAMP if self.controller is None else Mode.SWEEP
         self.enter(Mode.IDLE if refusals else go, t)
 
