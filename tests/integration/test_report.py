@@ -125,7 +125,7 @@ def test_outcomes_of_the_parts(html: str) -> None:
 def test_the_page_of_a_match(tmp_path: Path) -> None:
     result = match()
     page = match_report(write_match(tmp_path, result, prediction=True))
-    for section in ("gains", "bode", "maps", "ranges", "armature", "amplitudes", "prediction"):
+    for section in ("gains", "bode", "maps", "ranges", "armature", "prediction"):
         assert f"match-{section}" in page.ids
     assert {"match-identifiability", "match-use", "match-excitation"} < set(page.ids)
     found = match_page.verdict(result)

@@ -13,7 +13,7 @@ from command_line import invoke
 from pronk.errors import LogError
 from pronk.links.machine import State
 from pronk.report import build, deploy_page, deploy_run
-from pronk.report.deploy_run import Quantiles, delay, drive_delay
+from pronk.report.deploy_run import delay, drive_delay, quantiles
 from pronk.report.page import Part
 from pronk.robots import load_robot
 from pronk.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
@@ -118,13 +118,12 @@ def faulted(path: Path, *, end: bool = True) -> Path:
 
 
 def test_quantiles_are_those_of_the_sorted_values() -> None:
-    found = Quantiles.of(np.r_[np.arange(1000, 0, -1), np.nan])
-    assert (found.n, found.p50, found.p95, found.p99) == (1000, 500.0, 950.0, 990.0)
-    assert (found.p99_9, found.max) == (999.0, 1000.0)
-    few = Quantiles.of(np.arange(50.0))
-    assert math.isnan(few.p99)
-    assert few.p95 == 47.0
-    assert Quantiles.of(np.array([])).n == 0
+    found = quantiles(np.r_[np.arange(1000, 0, -1), np.nan])
+    assert list(found.values()) == [1000, 500.0, 950.0, 990.0, 999.0, 1000.0]
+    few = quantiles(np.arange(50.0))
+    assert math.isnan(few["p99"])
+    assert few["p95"] == 47.0
+    assert quantiles(np.array([]))["n"] == 0
 
 
 @pytest.mark.parametrize("lag", [1, 2, 4])
@@ -141,10 +140,9 @@ def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
 
 
 def test_a_delay_beyond_training_is_a_warning(tmp_path: Path) -> None:
-    log = read_deploy_log(flown(tmp_path / "run.mcap", lag=5))
-    found = delay(log, ROBOT)
-    assert found.within is False
-    assert deploy_page.has_problem(log, found)
+    made = page(flown(tmp_path / "run.mcap", lag=5))
+    assert made.figures["delay"]["within"] is False
+    assert made.warning
 
 
 def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> None:
@@ -163,8 +161,8 @@ def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> N
 def test_measures_of_a_fault(tmp_path: Path) -> None:
     log = read_deploy_log(faulted(tmp_path / "run.mcap"))
     found = deploy_run.stretches(log)
-    assert [one.mode for one in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
-    np.testing.assert_allclose([one.seconds for one in found], 0.2, atol=1e-9)
+    assert [mode for mode, _, _ in found] == [Mode.STAND, Mode.POLICY, Mode.FAULT]
+    np.testing.assert_allclose([seconds for _, _, seconds in found], 0.2, atol=1e-9)
     moved, latched = deploy_run.interventions(log)
     assert (moved.reason, moved.level, moved.ticks) == (Reason.POSITION, FilterAction.LIMIT, 100)
     assert (moved.largest, moved.joint) == (pytest.approx(0.25), ROBOT.joint_names[5])
@@ -176,8 +174,9 @@ def test_measures_of_a_fault(tmp_path: Path) -> None:
     assert math.isnan(joints["torque"][0])  # all zeros: this robot reports none
     assert len(deploy_run.times(log)["age of the state"][0]) == 201  # until the fault
     assert "0.40 s, after 0.2 s of the policy: tilted" in deploy_page.verdict(log)
-    assert "100 of 100 commands" in deploy_page.damping(log)
-    assert "100 of 200 commands" in deploy_page.filtering(log)
+    below = " ".join(deploy_page.lines(log, delay(log, ROBOT)))
+    assert "100 of 100 commands on the wire were damping" in below
+    assert "100 of 200 commands" in below
 
 
 def test_missed_ticks_are_counted_from_their_numbers(tmp_path: Path) -> None:

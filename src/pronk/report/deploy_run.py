@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -15,10 +15,10 @@ from pronk.runtime.log import DeployLog
 from pronk.runtime.safety import FilterAction, Reason
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 POLICY_MODES = (Mode.POLICY, Mode.HALT)
 """Modes in which the policy gives the targets."""
+QUANTILES = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "p99_9": 0.999}
 _MOVED = 1e-9
 """Smaller changes of a target are rounding [rad]."""
 _SHIFTS = np.arange(0.0, 0.0305, 0.00025)
@@ -34,52 +34,17 @@ _LEAST = 250
 _UNKNOWN = (float("nan"), float("nan"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Stretch:
-    """A time in one mode."""
-
-    mode: Mode
-    begin: float
-    """Since the first tick [s]."""
-    seconds: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Quantiles:
-    """Values that the given share does not exceed [s]; NaN where fewer than one lies beyond."""
-
-    n: int
-    p50: float
-    p95: float
-    p99: float
-    p99_9: float
-    max: float
-
-    @classmethod
-    def of(cls, values: Array) -> Quantiles:
-        """Compute them over the finite values."""
-        found = np.sort(values[np.isfinite(values)])
-        n = len(found)
-
-        def quantile(share: float) -> float:
-            if n * (1.0 - share) < 1.0 - 1e-9:
-                return float("nan")
-            return float(found[int(np.ceil(share * n - 1e-9)) - 1])
-
-        p50, p95, p99, p99_9 = map(quantile, (0.5, 0.95, 0.99, 0.999))
-        most = float(found[-1]) if n else float("nan")
-        return cls(n=n, p50=p50, p95=p95, p99=p99, p99_9=p99_9, max=most)
-
-    def milliseconds(self) -> dict[str, float | int | None]:
-        """Return the count, and the times in ms; None for unknown."""
-        times = asdict(self)
-        n = times.pop("n")
-        return {"n": n} | {f"{name}_ms": known(1e3 * value) for name, value in times.items()}
-
-
-def known(value: float) -> float | None:
-    """Return a number for JSON; None for NaN."""
-    return float(value) if np.isfinite(value) else None
+def quantiles(values: Array) -> dict[str, float]:
+    """Return `n`, `QUANTILES` and `max` of the finite values; NaN if fewer than one lies beyond."""
+    found = np.sort(values[np.isfinite(values)])
+    n = len(found)
+    of = {
+        name: found[int(np.ceil(share * n - 1e-9)) - 1]
+        if n * (1.0 - share) > 1.0 - 1e-9
+        else np.nan
+        for name, share in QUANTILES.items()
+    }
+    return {"n": n} | of | {"max": found[-1] if n else np.nan}
 
 
 def seconds(log: DeployLog, time: Array | float) -> Array:
@@ -87,37 +52,32 @@ def seconds(log: DeployLog, time: Array | float) -> Array:
     return np.asarray(np.asarray(time, dtype=float) - log.time[0])
 
 
-def policy_active(log: DeployLog) -> Mask:
+def policy_active(log: DeployLog) -> NDArray[np.bool_]:
     """Return the ticks in which the policy gave the targets, (T,)."""
     return np.asarray(np.isin(log.mode, POLICY_MODES))
 
 
-def stretches(log: DeployLog) -> tuple[Stretch, ...]:
-    """Return the modes one after the other."""
+def stretches(log: DeployLog) -> list[tuple[Mode, float, float]]:
+    """Return the modes one after the other, with begin since the first tick and length [s]."""
     edges = [0, *(np.flatnonzero(np.diff(log.mode)) + 1), len(log.time)]
     period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
     t = seconds(log, np.append(log.time, log.time[-1] + period))
-    return tuple(
-        Stretch(mode=Mode(int(log.mode[a])), begin=float(t[a]), seconds=float(t[b] - t[a]))
-        for a, b in pairwise(edges)
-    )
+    return [(Mode(int(log.mode[a])), float(t[a]), float(t[b] - t[a])) for a, b in pairwise(edges)]
 
 
-def faults(log: DeployLog) -> tuple[float, ...]:
+def faults(log: DeployLog) -> list[float]:
     """Return when faults began, since the first tick [s]."""
-    return tuple(float(seconds(log, one.time)) for one in log.events if one.kind == "fault")
+    return [float(seconds(log, one.time)) for one in log.events if one.kind == "fault"]
 
 
-def jumps(log: DeployLog) -> tuple[tuple[float, float], ...]:
+def jumps(log: DeployLog) -> list[tuple[float, float]]:
     """Return the begin and end of each jump input, since the first tick [s]."""
     if not len(log.step_time):
-        return ()
+        return []
     t = seconds(log, np.append(log.step_time, log.step_time[-1] + 0.02))
     edges = np.diff(np.concatenate([[0], (log.jump & log.step_live).astype(int), [0]]))
-    return tuple(
-        (float(t[a]), float(t[b]))
-        for a, b in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True)
-    )
+    ends = zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True)
+    return [(float(t[a]), float(t[b])) for a, b in ends]
 
 
 def missed(log: DeployLog) -> int:
@@ -148,30 +108,29 @@ class Intervention:
     """Joint whose target was changed most often; empty while damped."""
 
 
-def interventions(log: DeployLog) -> tuple[Intervention, ...]:
+def interventions(log: DeployLog) -> list[Intervention]:
     """Return what the filter did, by level and reason; the mildest first."""
     found = []
     with np.errstate(invalid="ignore"):
-        change = np.abs(log.sent - log.desired)
+        change = np.nan_to_num(np.abs(log.sent - log.desired))
     for level in list(FilterAction)[1:]:
         for reason in Reason:
             there = (log.level == level) & (log.reason == reason)
             if not there.any():
                 continue
-            of = change[there]
-            finite = bool(np.isfinite(of).any()) and level < FilterAction.DAMP
-            often = (of > _MOVED).sum(axis=0)
+            often = (change[there] > _MOVED).sum(axis=0)
+            moved = level < FilterAction.DAMP and bool(often.any())
             found.append(
                 Intervention(
                     reason=reason,
                     level=level,
                     ticks=int(there.sum()),
                     first=float(seconds(log, log.time[there][0])),
-                    largest=float(np.nanmax(of)) if finite else float("nan"),
-                    joint=log.joints[int(often.argmax())] if finite and often.any() else "",
+                    largest=float(change[there].max()) if moved else float("nan"),
+                    joint=log.joints[int(often.argmax())] if moved else "",
                 )
             )
-    return tuple(found)
+    return found
 
 
 def in_force(log: DeployLog) -> Array:
@@ -184,8 +143,8 @@ def in_force(log: DeployLog) -> Array:
 
 def _rms(values: Array) -> Array:
     """Of the finite values of each column; NaN without any."""
+    there = np.isfinite(values)
     with np.errstate(invalid="ignore"):
-        there = np.isfinite(values)
         return np.asarray(np.sqrt((np.where(there, values, 0.0) ** 2).sum(0) / there.sum(0)))
 
 
@@ -202,8 +161,7 @@ def tracking(log: DeployLog) -> dict[str, Array]:
     [rad]; `standing`: RMS in the mode `STAND` [rad]; `torque`, `torque_largest`: as the robot
     reports them [N m]; `speed_largest` [rad/s].
     """
-    error = in_force(log) - log.position
-    active = policy_active(log)
+    error, active = in_force(log) - log.position, policy_active(log)
     torque = log.torque if log.torque.any() else np.full_like(log.torque, np.nan)
     return {
         "standing": _rms(error[log.mode == Mode.STAND]),
@@ -221,20 +179,20 @@ class Delay:
 
     trained: tuple[float, float] | None
     """Range of the policy's training; None where the log does not hold it."""
-    command: Quantiles
-    """From a state to the first command that uses it, while the policy was active."""
+    command: Mapping[str, float]
+    """Quantiles from a state to the first command that uses it, while the policy was active."""
     drives: tuple[float, float]
     """From a command on the wire to its torque, bounds; NaN where it could not be estimated."""
 
     @property
     def total(self) -> tuple[float, float]:
         """Median of the command with the drives' least; its 95 % with the drives' most [s]."""
-        return self.command.p50 + self.drives[0], self.command.p95 + self.drives[1]
+        return self.command["p50"] + self.drives[0], self.command["p95"] + self.drives[1]
 
     @property
     def longest(self) -> float:
         """Upper end of what is known [s]: of the total, else of the commands alone."""
-        return self.total[1] if np.isfinite(self.total[1]) else self.command.p95
+        return self.total[1] if np.isfinite(self.total[1]) else self.command["p95"]
 
     @property
     def within(self) -> bool | None:
@@ -245,16 +203,11 @@ class Delay:
 
 
 def delay(log: DeployLog, robot: Robot | None) -> Delay:
-    """Measure the delay.
-
-    Args:
-        log: Of the run.
-        robot: With the gains of its drives; None leaves the drives' part unknown.
-    """
+    """Measure the delay; that of the drives with the gains of `robot`, unknown if None."""
     trained = log.header.get("policy", {}).get("delay_range_s")
     return Delay(
         trained=None if trained is None else (float(trained[0]), float(trained[1])),
-        command=Quantiles.of(log.latency[policy_active(log)]),
+        command=quantiles(log.latency[policy_active(log)]),
         drives=_UNKNOWN if robot is None else drive_delay(log, robot),
     )
 
@@ -289,26 +242,18 @@ def drive_delay(log: DeployLog, robot: Robot) -> tuple[float, float]:
     return float(good[0]), float(good[-1])
 
 
-def times(log: DeployLog) -> Mapping[str, tuple[Array, str]]:
+def times(log: DeployLog) -> dict[str, tuple[Array, str]]:
     """Return everything that was timed [s] by name, and what it is."""
     bad = log.level >= FilterAction.DAMP
     until_fault = int(bad.argmax()) + 1 if bad.any() else len(bad)
-    live = log.step_live
+    live, age = log.step_live, log.state_age[:until_fault]
+    latency = log.latency[policy_active(log)]
     found = {
         "servo tick late": (log.lateness, "from a tick's deadline to its begin"),
-        "age of the state": (
-            log.state_age[:until_fault],
-            "from the newest state to the tick's begin, until a fault",
-        ),
-        "state to command": (
-            log.latency[policy_active(log)],
-            "from the state that the policy read to the first command on the wire that uses it",
-        ),
+        "age of the state": (age, "from the newest state to the tick's begin, until a fault"),
+        "state to command": (latency, "from a state to the first command on the wire that uses it"),
         "servo's work": (log.work, "from a tick's begin until its command was on the wire"),
-        "policy step late": (
-            log.step_lateness[live],
-            "from a step's deadline to its begin, while the policy was active",
-        ),
-        "inference": (log.decision[live], "observation built and network run, the same steps"),
+        "policy step late": (log.step_lateness[live], "from a step's deadline to its begin"),
+        "inference": (log.decision[live], "observation built and network run"),
     }
     return {name: one for name, one in found.items() if np.isfinite(one[0]).any()}

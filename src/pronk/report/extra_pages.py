@@ -115,7 +115,7 @@ def walk_part(path: Path, root: Path, *, anchor: str = "walk", title: str = "Wal
 
 
 def _definitions(figures: Any) -> Sheet | None:
-    return table({"figure": f.name, "unit": f.unit, "equation": f.says} for f in figures)
+    return table("figure | unit | equation", ((f.name, f.unit, f.says) for f in figures))
 
 
 def climb_line(climb: Climb) -> Array:
@@ -312,15 +312,12 @@ def by_body(bodies: Bodies, figure: str) -> Values:
 
 def _bodies_gains(bodies: Bodies) -> Sheet | None:
     names = dict.fromkeys(one.gains for body in bodies.bodies for one in body.errors)
-    found = {body.name: {e.gains: e.rms_db for e in body.errors} for body in bodies.bodies}
+    found = [{one.gains: one.rms_db for one in body.errors} for body in bodies.bodies]
     return table(
-        (
-            {"gains": name}
-            | {body: number(errors.get(name, math.nan), 2) for body, errors in found.items()}
-            for name in names
-        ),
+        " | ".join(["gains", *(f"{body.name};2" for body in bodies.bodies)]),
+        [(name, *(errors.get(name) for errors in found)) for name in names],
+        "drive's own: those set on the drives. By group: as training would use them.",
         title="Error of gains on each robot's own sweep [dB RMS]",
-        notes=("drive's own: those set on the drives. By group: as training would use them.",),
     )
 
 

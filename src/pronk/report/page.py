@@ -28,6 +28,13 @@ class Picture:
     caption: str = ""
 
 
+@dataclass(frozen=True)
+class Code:
+    """Commands to copy."""
+
+    text: str
+
+
 class Fold:
     """Content that is closed at first; left out if empty."""
 
@@ -40,13 +47,6 @@ class Fold:
         return len(self.content)
 
 
-@dataclass(frozen=True)
-class Code:
-    """Commands to copy."""
-
-    text: str
-
-
 Content = str | Picture | Sheet | Fold | Code
 """A string is a paragraph; one of class `markupsafe.Markup` is HTML as it is."""
 
@@ -55,13 +55,7 @@ class Section:
     """A heading with what stands below it."""
 
     def __init__(self, anchor: str, title: str, *content: Content | None) -> None:
-        """Leave out what is None or empty.
-
-        Args:
-            anchor: Name within the part.
-            title: Heading.
-            content: In the order of the page.
-        """
+        """Set the anchor within the part, the heading, and the content without None."""
         self.anchor, self.title = anchor, title
         self.content = [one for one in content if one]
 
@@ -85,48 +79,45 @@ class Part:
     """A result is not as expected."""
     sections: Sequence[Section | None]
     note: str = ""
-    """What the part rests on: seeds, hashes, versions."""
+    """Seeds, hashes, versions."""
     figures: Mapping[str, Any] = field(default_factory=dict)
     """What `--json` gives of it."""
 
 
 def picture(figure: Figure, alt: str, *, dense: bool = False) -> Picture:
-    """Return a figure as part of a page.
-
-    Args:
-        figure: Drawn at page width.
-        alt: Text alternative.
-        dense: It has thousands of marks: PNG is smaller than SVG.
-    """
+    """Return a figure as part of a page; as PNG if `dense`, since many marks make a large SVG."""
     kind = "png" if dense else "svg"
     return Picture(src=style.data_uri(style.render(figure, kind), kind), alt=alt)
 
 
 def table(
-    rows: Iterable[Mapping[str, str]], title: str = "", notes: tuple[str, ...] = ()
+    columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = ""
 ) -> Sheet | None:
-    """Return a table of rows by column name, or None without a row."""
-    rows = list(rows)
-    if not rows:
-        return None
-    return Sheet(
-        title=title,
-        columns=tuple(rows[0]),
-        rows=tuple(tuple(row.values()) for row in rows),
-        notes=notes,
+    """Return a table, or None without a row.
+
+    Args:
+        columns: Headers with ` | ` between them; `;2` behind one sets the digits of its numbers,
+            3 without it.
+        rows: Cells: text, numbers, and intervals as pairs of numbers; `held` for an empty one.
+        notes: Below the table.
+        title: Above it.
+    """
+    heads = [head.partition(";") for head in columns.split(" | ")]
+    cells = tuple(
+        tuple(_cell(cell, int(head[2] or 3)) for cell, head in zip(row, heads, strict=True))
+        for row in rows
     )
+    names = tuple(head[0] for head in heads)
+    return Sheet(title=title, columns=names, rows=cells, notes=notes) if cells else None
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Format a number; a dash where it is unknown."""
+def _cell(value: Any, digits: int) -> str:
+    if isinstance(value, str | int):
+        return str(value)
+    if isinstance(value, tuple):
+        same = value[0] == value[1]
+        return "held" if same else " to ".join(_cell(one, digits) for one in value)
     return f"{value:.{digits}f}" if value is not None and np.isfinite(value) else "-"
-
-
-def interval(bounds: tuple[float, float], digits: int = 3) -> str:
-    """Format an interval; `held` for a number that was not fitted."""
-    if bounds[0] == bounds[1]:
-        return "held"
-    return f"{number(bounds[0], digits)} to {number(bounds[1], digits)}"
 
 
 def _signs(text: str) -> str:
@@ -145,5 +136,7 @@ def page(title: str, parts: Sequence[Part]) -> str:
         lstrip_blocks=True,
     )
     environment.filters["signs"] = _signs
+    # Columns of text are set to the left.
+    environment.filters["align"] = lambda rows, i: "left" * any(len(row[i]) > 24 for row in rows)
     template = environment.get_template("page.html.j2")
     return template.render(version=__version__, title=title, parts=parts)

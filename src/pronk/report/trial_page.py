@@ -242,7 +242,7 @@ def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial")
         title=title,
         source=str(path.relative_to(root)),
         virtual=trial.virtual,
-        summary=f"{first}: {passed} of {len(checks)} acceptance criteria passed.",
+        summary=f"{first}, {tables.place(trial)}: {passed} of {len(checks)} acceptance criteria passed.",
         lines=[*lines, *(f"{one[0].upper()}{one[1:]}" for one in verdicts)],
         warning=passed < len(checks),
         sections=[
@@ -272,7 +272,7 @@ def _total(trial: Results, name: str) -> str:
     )
     low, high = share_interval(landed, n)
     return (
-        f"{name}: {n} jumps commanded, {found} jumped, {landed} landed: {100 * landed / n:.1f} % "
+        f"{name}, {tables.place(trial)}: {n} jumps commanded, {found} jumped, {landed} landed: {100 * landed / n:.1f} % "
         f"(95 % interval {100 * low:.1f} to {100 * high:.1f}), {fell} fell."
     )
 
@@ -360,13 +360,8 @@ def _traces(trial: Results, seen: Captured | None) -> list[Section]:
 def _setup(trial: Results) -> Section:
     script = trial.script
     rows = [
-        {
-            "policy": subject.name,
-            "trained with": f"{subject.contract.get('gains', 'unknown')} gains: {_groups(subject)}",
-            "file": subject.path,
-            "SHA-256": subject.sha256,
-        }
-        for subject in trial.subjects
+        (one.name, one.contract.get("gains", "unknown"), _groups(one), one.path, one.sha256)
+        for one in trial.subjects
     ]
     versions = ", ".join(f"{name} {version}" for name, version in trial.versions.items())
     params = trial.sim_params
@@ -379,7 +374,7 @@ def _setup(trial: Results) -> Section:
         f"{trial.spread_s:.1f} s more, jump input {script.jump_s:.1f} s, run on "
         f"{script.keep_s:.1f} s, stop {script.stop_s:.1f} s. Heading, joint offsets and noise are "
         "drawn for each jump; all policies meet the same draws.",
-        table(rows),
+        table("policy | gains | stiffness [N m/rad] / damping [N m s/rad] | file | SHA-256", rows),
         f"Parameters: {params.get('file', 'unknown')}, SHA-256 {params.get('sha256', 'unknown')}. "
         f"Versions: {versions}. {_timing(trial.timing)}",
     )
