@@ -187,7 +187,7 @@ def test_missing_captures_are_counted(tmp_path: Path) -> None:
     (tmp_path / trial.rows[1].capture).unlink()
     found = trial_page.captured(trial, tmp_path)
     assert found is not None
-    assert (found.missing, len(found.height["matched"]["forward 1"])) == (1, 2)
+    assert (found.missing, len(found.traces["height"]["matched"]["forward 1"])) == (1, 2)
     assert "2 of 3 jumps" in report(tmp_path).text
 
 

@@ -47,12 +47,13 @@ def _part(path: Path, root: Path, origin: Results | Bodies, **fields: Any) -> Pa
     hashes = ", ".join(f"{subject.name} {subject.sha256[:12]}" for subject in origin.subjects)
     versions = ", ".join(f"{name} {version}" for name, version in origin.versions.items())
     params = str(origin.sim_params.get("sha256", "unknown"))[:12]
-    note = (
-        f"Measured on the {place(origin)}, seed {origin.seed}, parameters {params}; policies: "
-        f"{hashes}; versions: {versions}."
+    return Part(
+        source=str(path.relative_to(root)),
+        virtual=origin.virtual,
+        note=f"Measured on the {place(origin)}, seed {origin.seed}, parameters {params}; policies: "
+        f"{hashes}; versions: {versions}.",
+        **fields,
     )
-    source = str(path.relative_to(root))
-    return Part(source=source, virtual=origin.virtual, note=note, **fields)
 
 
 def walk_tables(walks: Results) -> tuple[Sheet, ...]:
@@ -78,40 +79,30 @@ def _walk_table(walks: Results, policy: str) -> Sheet:
     )
 
 
-def walk_part(path: Path, root: Path, *, anchor: str = "walk", title: str = "Walking") -> Part:
-    """Make the part of the walks in `path`, a `walk.json`."""
+def walk_part(path: Path, root: Path, **names: str) -> Part:
+    """Make the part of the walks in `path`, a `walk.json`; `names` are its anchor and title."""
     walks = results_file.load(path.parent, WALK)
     first, where = walks.subjects[0].name, place(walks)
     own = [cell for cell in walks.cells if cell.policy == first]
     own = [cell for cell in own if cell.case in PAPER_WALKS] or own
     fell, n = sum(cell.fell for cell in own), sum(cell.n for cell in own)
-    errors = trial_page.values(walks, "speed_error_averaged")
-    return _part(
-        path,
-        root,
-        walks,
-        anchor=anchor,
-        title=title,
-        summary=f"{first}, {where}: {fell} of {n} walks ended in a fall.",
-        lines=[
-            "The paper reports stable walking at 2 m/s forward and backward and at 1 m/s sideways "
-            f"(R4). Counted: {', '.join(c.case for c in own)}, {walks.script.run_s:g} s each."
-        ],
-        warning=fell > 0,
-        sections=[
-            Section(
-                "errors",
-                "Velocity errors",
-                f"{WALK_FIGURES['speed_error_averaged'].says}: every walk, mean and spread.",
-                picture(
-                    draw.cells([("speed error [m/s]", errors, {})]),
-                    f"Speed error of every walk of the {where}, by command and policy",
-                ),
-                *walk_tables(walks),
-                Fold("Definitions", _definitions(WALK_FIGURES.values())),
-            )
-        ],
+    figure = "speed_error_averaged"
+    drawn = draw.cells([("speed error [m/s]", trial_page.values(walks, figure), {})])
+    section = Section(
+        "errors",
+        "Velocity errors",
+        f"{WALK_FIGURES[figure].says}: every walk, mean and spread.",
+        picture(drawn, f"Speed error of every walk of the {where}, by command and policy"),
+        *walk_tables(walks),
+        Fold("Definitions", _definitions(WALK_FIGURES.values())),
     )
+    line = (
+        "The paper reports stable walking at 2 m/s forward and backward and at 1 m/s sideways "
+        f"(R4). Counted: {', '.join(c.case for c in own)}, {walks.script.run_s:g} s each."
+    )
+    text = f"{first}, {where}: {fell} of {n} walks ended in a fall."
+    fields = {"summary": text, "lines": [line], "warning": fell > 0, "sections": [section]}
+    return _part(path, root, walks, **fields, **names)
 
 
 def _definitions(figures: Any) -> Sheet | None:
@@ -156,8 +147,8 @@ def crossing_table(crossings: Results) -> Sheet:
     )
 
 
-def crossing_part(path: Path, root: Path, *, anchor: str, title: str = "Crossing") -> Part:
-    """Make the part of the crossings in `path`, a `crossing.json`."""
+def crossing_part(path: Path, root: Path, **names: str) -> Part:
+    """Make the part of the crossings in `path`, a `crossing.json`, as `walk_part`."""
     crossings = results_file.load(path.parent, CROSSING)
     where, first, found = place(crossings), crossings.subjects[0].name, climbs(crossings)
     panels = [
@@ -180,24 +171,16 @@ def crossing_part(path: Path, root: Path, *, anchor: str, title: str = "Crossing
     crossed = ", ".join(f"{number(climb.largest, 2)} m ({climb.case})" for climb in own)
     mark = "paper, hardware: widest gap, from video"
     figure = draw.lines(panels, columns=len(crossings.cases), mark=mark, bar="95 % interval")
-    return _part(
-        path,
-        root,
-        crossings,
-        anchor=anchor,
-        title=title,
-        summary=f"{first}, {where}: gaps crossed {crossed}." if own else f"{first}, {where}.",
-        sections=[
-            Section(
-                "sizes",
-                "Share of crossed obstacles over size",
-                "Gaps and steps in the floor; an operator who sees the robot gives the jump input. "
-                "Share of runs that crossed, with the lead that did best.",
-                picture(figure, f"Share of runs in which the {where} crossed, over obstacle size"),
-                crossing_table(crossings),
-            )
-        ],
+    section = Section(
+        "sizes",
+        "Share of crossed obstacles over size",
+        "Gaps and steps in the floor; an operator who sees the robot gives the jump input. Share "
+        "of runs that crossed, with the lead that did best.",
+        picture(figure, f"Share of runs in which the {where} crossed, over obstacle size"),
+        crossing_table(crossings),
     )
+    text = f"{first}, {where}: gaps crossed {crossed or 'none'}."
+    return _part(path, root, crossings, summary=text, sections=[section], **names)
 
 
 def by_value(variation: Results, parameter: str, policy: str) -> list[tuple[Cell, ...]]:
@@ -256,39 +239,29 @@ def variation_panels(variation: Results) -> list[Panel]:
     return found
 
 
-def variation_part(path: Path, root: Path, *, anchor: str, title: str = "Variation") -> Part:
-    """Make the part of the variation in `path`, a `variation.json`."""
+def variation_part(path: Path, root: Path, **names: str) -> Part:
+    """Make the part of the variation in `path`, a `variation.json`, as `walk_part`."""
     variation = results_file.load(path.parent, VARIATION)
     where, first = place(variation), variation.subjects[0].name
     own = [cell for cell in variation.cells if cell.policy == first]
     landed, n = sum(c.succeeded for c in own), sum(c.n for c in own)
-    parameters = parameters_of(variation)
+    parameters, panels = parameters_of(variation), variation_panels(variation)
     bar = "mean standard deviation; 95 % interval of the share"
-    figure = draw.lines(
-        variation_panels(variation), columns=len(parameters), mark="nominal", bar=bar
-    )
-    names = ", ".join(each.says for each in parameters)
+    figure = draw.lines(panels, columns=len(parameters), mark="nominal", bar=bar)
+    varying = ", ".join(each.says for each in parameters)
     trained = "; ".join(f"{each.says}: {each.trained.replace('`', '')}" for each in parameters)
-    return _part(
-        path,
-        root,
-        variation,
-        anchor=anchor,
-        title=title,
-        summary=f"{first}, {where}: {landed} of {n} jumps on varied robots landed.",
-        sections=[
-            Section(
-                "results",
-                "Results over varied parameters",
-                "One parameter of the robot is varied at a time; starts and noise are the same. "
-                "Lines are means over the commands, without those that gave no jump.",
-                picture(figure, f"Height, distance and landings on the {where} over {names}"),
-                varied.table(variation),
-                f"Training ranges: {trained}.",
-                Fold("Definitions", _definitions(FIGURES[n] for n in varied.VARIED_FIGURES)),
-            )
-        ],
+    section = Section(
+        "results",
+        "Results over varied parameters",
+        "One parameter of the robot is varied at a time; starts and noise are the same. Lines are "
+        "means over the commands, without those that gave no jump.",
+        picture(figure, f"Height, distance and landings on the {where} over {varying}"),
+        varied.table(variation),
+        f"Training ranges: {trained}.",
+        Fold("Definitions", _definitions(FIGURES[n] for n in varied.VARIED_FIGURES)),
     )
+    text = f"{first}, {where}: {landed} of {n} jumps on varied robots landed."
+    return _part(path, root, variation, summary=text, sections=[section], **names)
 
 
 def errors_db(bodies: Bodies) -> dict[str, float]:
@@ -321,19 +294,19 @@ def _bodies_gains(bodies: Bodies) -> Sheet | None:
     )
 
 
-def bodies_part(path: Path, root: Path, *, anchor: str, title: str = "Randomized robots") -> Part:
-    """Make the part of the randomized robots in `path`, a `bodies.json`."""
+def bodies_part(path: Path, root: Path, **names: str) -> Part:
+    """Make the part of the randomized robots in `path`, a `bodies.json`, as `walk_part`."""
     bodies = bodies_file.load(path.parent)
     where, errors = place(bodies), errors_db(bodies)
     cells = [cell for body in bodies.bodies for cell in body.trial.cells]
     landed, n = sum(c.succeeded for c in cells), sum(c.n for c in cells)
-    verdicts = [
-        f"{body.name}: {sum(c.passed for c in checks)} of {len(checks)} acceptance criteria passed "
-        f"by {body.trial.subjects[0].name}"
-        + "".join(f"; {verdict(body.trial, other.name)}" for other in body.trial.subjects[1:])
-        for body in bodies.bodies
-        for checks in [trial_checks(body.trial)]
-    ]
+    verdicts = []
+    for body in bodies.bodies:
+        first, *others = (subject.name for subject in body.trial.subjects)
+        checks = trial_checks(body.trial)
+        passed = f"{sum(check.passed for check in checks)} of {len(checks)}"
+        own = f"{body.name}: {passed} acceptance criteria passed by {first}"
+        verdicts.append("; ".join([own, *(verdict(body.trial, other) for other in others)]))
     sections = [
         Section(
             "summary",
@@ -352,25 +325,15 @@ def bodies_part(path: Path, root: Path, *, anchor: str, title: str = "Randomized
         text = "Each mark is a command of a policy on a robot."
         sections.append(Section("scatter", "Scatter over gain error", text, drawn))
     for name in ("height", "distance"):
+        paper, label = trial_page.published(name), f"{name} [m]"
         shown = [
-            (
-                f"{body.name}\n{name} [m]",
-                trial_page.values(body.trial, name),
-                trial_page.published(name),
-            )
-            for body in bodies.bodies
+            (f"{one.name}\n{label}", trial_page.values(one.trial, name), paper)
+            for one in bodies.bodies
         ]
-        words = f"{name.capitalize()} of every jump on each {where}, by command and policy"
-        drawn = picture(draw.cells(shown), f"{words}, with the paper's means")
+        words = f"{name.capitalize()} of every jump on each {where}, with the paper's means"
+        drawn = picture(draw.cells(shown), words)
         sections.append(Section(name, f"{name.capitalize()} on each robot", drawn))
     folders = ", ".join(body.folder for body in bodies.bodies)
-    return _part(
-        path,
-        root,
-        bodies,
-        anchor=anchor,
-        title=title,
-        summary=f"{len(bodies.bodies)} other {where}s: {landed} of {n} jumps landed.",
-        lines=[f"`pronk report FOLDER` makes a page of each folder: {folders}."],
-        sections=sections,
-    )
+    line = f"`pronk report FOLDER` makes a page of each folder: {folders}."
+    text = f"{len(bodies.bodies)} other {where}s: {landed} of {n} jumps landed."
+    return _part(path, root, bodies, summary=text, lines=[line], sections=sections, **names)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError, RobotError
@@ -64,14 +65,12 @@ def published(figure: str) -> Published:
 
 @dataclass(frozen=True, kw_only=True)
 class Captured:
-    """Traces of a trial's captures by policy and command, each (2, T): time [s] and value."""
+    """Traces of a trial's captures."""
 
-    height: dict[str, dict[str, list[Array]]]
-    """Trunk height [m] over the time since the jump input."""
-    roll: dict[str, dict[str, list[Array]]]
-    """Roll rate [rad/s] over the time since the command to run; of `RATES` alone."""
-    pitch: dict[str, dict[str, list[Array]]]
-    """Pitch rate, the same."""
+    traces: dict[str, dict[str, dict[str, list[Array]]]]
+    """By quantity, policy and command: runs as time [s] and value, each (2, T). `height` [m] over
+    the time since the jump input; `roll` and `pitch` rate [rad/s] over the time since the command
+    to run, of `RATES` alone."""
     hardest: tuple[Row, Array, Array] | None
     """The first policy's jump nearest to its drives' limits: row, joint velocities [rad/s] and
     motor torques [N m] from the jump input to `AFTER_S` later, (T, joints)."""
@@ -104,26 +103,25 @@ def captured(trial: Results, folder: Path) -> Captured | None:
     present = [(row, path) for row, path in kept if path.exists()]
     if not present:
         return None
-    found: dict[str, dict[str, dict[str, list[Array]]]] = {
+    traces: dict[str, dict[str, dict[str, list[Array]]]] = {
         what: {name: {} for name in policies(trial)} for what in ("height", "roll", "pitch")
     }
     hard = least_margin([row for row, _ in present if row.policy == trial.subjects[0].name])
     hardest = None
     for row, path in present:
         capture = capture_file.load(path)
-        time = capture.time - row.began
-        since = time - row.script.on
-        traces = {"height": _cut(since, capture.position[:, 2], -BEFORE_S, AFTER_S)}
+        time, turn = capture.time - row.began, capture.angular_velocity
+        since, run = time - row.script.on, time - row.script.start
+        found = {"height": _cut(since, capture.position[:, 2], -BEFORE_S, AFTER_S)}
         if row.case == RATES.name:
-            for i, what in enumerate(("roll", "pitch")):
-                rate = capture.angular_velocity[:, i]
-                traces[what] = _cut(time - row.script.start, rate, 0.0, row.script.run_s)
-        for what, trace in traces.items():
-            found[what][row.policy].setdefault(row.case, []).append(trace)
+            found["roll"] = _cut(run, turn[:, 0], 0.0, row.script.run_s)
+            found["pitch"] = _cut(run, turn[:, 1], 0.0, row.script.run_s)
+        for what, trace in found.items():
+            traces[what][row.policy].setdefault(row.case, []).append(trace)
         if row is hard:
             inside = (since >= 0.0) & (since <= AFTER_S)
             hardest = (row, capture.joint_velocity[inside], capture.torque[inside])
-    return Captured(**found, hardest=hardest, missing=len(kept) - len(present))
+    return Captured(traces=traces, hardest=hardest, missing=len(kept) - len(present))
 
 
 def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
@@ -230,6 +228,7 @@ def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial")
     trial, match = load(folder), match_near(folder, root)
     checks, first = trial_checks(trial), trial.subjects[0].name
     passed = sum(check.passed for check in checks)
+    where, shown = tables.place(trial), films(folder)
     verdicts = [tables.verdict(trial, other.name) for other in trial.subjects[1:]]
     lines = [_total(trial, name) for name in policies(trial)]
     if trial.virtual:
@@ -237,28 +236,24 @@ def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial")
             "Every jump on this page is of pronk's virtual robot, a simulated machine whose "
             "parameters neither match nor training can read. The paper's figures are of hardware."
         )
+    more = [Fold(f"Figures of {s.name}", tables.more(trial, s.name)) for s in trial.subjects]
+    more += [Fold("Drives", tables.drives(trial)), Fold("Definitions", tables.definitions())]
     return Part(
         anchor=anchor,
         title=title,
         source=str(path.relative_to(root)),
         virtual=trial.virtual,
-        summary=f"{first}, {tables.place(trial)}: {passed} of {len(checks)} acceptance criteria passed.",
+        summary=f"{first}, {where}: {passed} of {len(checks)} acceptance criteria passed.",
         lines=[*lines, *(f"{one[0].upper()}{one[1:]}" for one in verdicts)],
         warning=passed < len(checks),
         sections=[
             _table_iii(trial),
             Section("criteria", "Acceptance criteria", tables.criteria(trial)),
             _scatter(trial, gains_errors(trial, match) if match else {}),
-            Section("films", "Films", *shown) if (shown := films(folder)) else None,
+            Section("films", "Films", *shown) if shown else None,
             Section("landings", "Landings", tables.landings(trial)),
             *_traces(trial, captured(trial, folder)),
-            Section(
-                "figures",
-                "All figures",
-                *(Fold(f"Figures of {s.name}", tables.more(trial, s.name)) for s in trial.subjects),
-                Fold("Drives", tables.drives(trial)),
-                Fold("Definitions", tables.definitions()),
-            ),
+            Section("figures", "All figures", *more),
             _setup(trial),
         ],
         figures={"checks": [check.row() for check in checks]},
@@ -272,26 +267,21 @@ def _total(trial: Results, name: str) -> str:
     )
     low, high = share_interval(landed, n)
     return (
-        f"{name}, {tables.place(trial)}: {n} jumps commanded, {found} jumped, {landed} landed: {100 * landed / n:.1f} % "
-        f"(95 % interval {100 * low:.1f} to {100 * high:.1f}), {fell} fell."
+        f"{name}, {tables.place(trial)}: {n} jumps commanded, {found} jumped, {landed} landed "
+        f"({100 * landed / n:.1f} %, interval {100 * low:.1f} to {100 * high:.1f}), {fell} fell."
     )
 
 
 def _table_iii(trial: Results) -> Section:
-    panels = [
-        (f"{name} [m]", values(trial, name), published(name))
-        for name in ("height", "distance", "gap")
-    ]
+    names = ("height", "distance", "gap")
+    panels = [(f"{name} [m]", values(trial, name), published(name)) for name in names]
+    words = f"Height, distance and gap of every jump on the {tables.place(trial)}, and the paper's"
     return Section(
         "table",
         "Table III",
         "Every jump is a small mark, with mean and standard deviation beside. Open marks are the "
         "paper's: five jumps a cell on hardware; gaps are its widest, read off video.",
-        picture(
-            draw.cells(panels),
-            f"Height, distance and gap of every jump on the {tables.place(trial)}, by command and "
-            "policy, with the paper's means and standard deviations",
-        ),
+        picture(draw.cells(panels), words),
         *(tables.table_iii(trial, figure) for figure in ("height", "distance")),
     )
 
@@ -300,22 +290,14 @@ def _scatter(trial: Results, errors: Mapping[str, float]) -> Section | None:
     if not trial.ratios:
         return None
     panels = {f"{name} [m]": values(trial, name) for name in ("height", "distance")}
-    drawn = (
-        picture(
-            draw.scatter_over_error(errors, panels),
-            "Standard deviation of height and distance over the error of each policy's training "
-            "gains on the sweep",
-        )
-        if len(errors) > 1
-        else None
-    )
+    words = "Standard deviation of height and distance over the error of the training gains"
     return Section(
         "scatter",
         "Scatter",
         "The paper reports less scatter with matched gains. Intervals are over the jumps of these "
         "policies, not over other trainings.",
         tables.scatter(trial),
-        drawn,
+        picture(draw.scatter_over_error(errors, panels), words) if len(errors) > 1 else None,
     )
 
 
@@ -323,49 +305,47 @@ def _traces(trial: Results, seen: Captured | None) -> list[Section]:
     """Sections that need captures."""
     if seen is None:
         return []
-    where, found = tables.place(trial), []
-    if any(seen.roll.values()):
-        rates = {"roll rate [rad/s]": seen.roll, "pitch rate [rad/s]": seen.pitch}
-        words = f"Roll and pitch rate of the {where} while it accelerates to 2.25 m/s, by policy"
+    where, found, robot = tables.place(trial), [], None
+    height, roll, pitch = seen.traces.values()
+
+    def add(anchor: str, title: str, text: str, figure: Figure, words: str) -> None:
+        drawn = picture(figure, f"{words} of the {where}", dense=True)
+        found.append(Section(anchor, title, text, drawn))
+
+    if any(roll.values()):
         text = (
             f"In the trunk's frame, until the jump input, at {RATES.name} (the paper's figure 6)."
         )
-        drawn = picture(draw.rates(rates), words, dense=True)
-        found.append(Section("rates", "Roll and pitch rates", text, drawn))
-    standing = float(trial.rules.get("standing_height", np.nan))
-    count = sum(len(runs) for cases in seen.height.values() for runs in cases.values())
-    missing = f" {seen.missing} captures are missing from the folder." if seen.missing else ""
-    text = f"{count} of {len(trial.rows)} jumps, those with a capture.{missing}"
-    words = f"Trunk height of the {where} over the time since the jump input, by policy and command"
-    drawn = picture(draw.heights(seen.height, standing=standing), words, dense=True)
-    found.append(Section("heights", "Trunk height over time", text, drawn))
-    try:
+        figure = draw.rates({"roll rate [rad/s]": roll, "pitch rate [rad/s]": pitch})
+        add("rates", "Roll and pitch rates", text, figure, "Rates during acceleration")
+    count = sum(len(runs) for cases in height.values() for runs in cases.values())
+    text = f"{count} of {len(trial.rows)} jumps, those with a capture."
+    text += f" {seen.missing} captures are missing from the folder." * bool(seen.missing)
+    figure = draw.heights(height, standing=float(trial.rules.get("standing_height", np.nan)))
+    add("heights", "Trunk height over time", text, figure, "Height since the jump input")
+    with suppress(RobotError):
         robot = load_robot(trial.robot)
-    except RobotError:
-        return found
-    if seen.hardest is not None:
+    if seen.hardest is not None and robot is not None:
         row, velocity, torque = seen.hardest
         name = f"{row.policy}, {row.case}, jump {row.number}, {where}"
-        figure = draw.torque_speed(robot, velocity, torque, policy=row.policy, words=name)
-        words = f"Torque over speed of every joint in one jump of the {where}, with drive limits"
         text = (
             "The captured jump nearest to the limits of the nominal drive; the virtual robot's "
             "motors have torque constants and a bus voltage of their own."
         )
-        drawn = picture(figure, words, dense=True)
-        found.append(Section("drives", "Torque and speed of the drives", text, drawn))
+        figure = draw.torque_speed(robot, velocity, torque, policy=row.policy, words=name)
+        add("drives", "Torque and speed of the drives", text, figure, "Torque over speed")
     return found
 
 
 def _setup(trial: Results) -> Section:
-    script = trial.script
+    script, params, timing = trial.script, trial.sim_params, trial.timing
     rows = [
         (one.name, one.contract.get("gains", "unknown"), _groups(one), one.path, one.sha256)
         for one in trial.subjects
     ]
     versions = ", ".join(f"{name} {version}" for name, version in trial.versions.items())
-    params = trial.sim_params
     where = f"the virtual {trial.robot}" if trial.virtual else trial.robot
+    times = ", ".join(f"{name} {value:.0f}" for name, value in timing.items())
     return Section(
         "setup",
         "Setup",
@@ -376,16 +356,7 @@ def _setup(trial: Results) -> Section:
         "drawn for each jump; all policies meet the same draws.",
         table("policy | gains | stiffness [N m/rad] / damping [N m s/rad] | file | SHA-256", rows),
         f"Parameters: {params.get('file', 'unknown')}, SHA-256 {params.get('sha256', 'unknown')}. "
-        f"Versions: {versions}. {_timing(trial.timing)}",
-    )
-
-
-def _timing(timing: Mapping[str, Any]) -> str:
-    if not timing.get("simulated_s"):
-        return ""
-    return (
-        f"{timing['simulated_s']:.0f} s simulated in {timing.get('seconds', np.nan):.0f} s with "
-        f"{timing.get('processes', np.nan):.0f} processes."
+        f"Versions: {versions}. Timing [s, processes]: {times}.",
     )
 
 
@@ -393,7 +364,6 @@ def _groups(subject: Subject) -> str:
     """Gains that a policy was trained with, once for each joint group."""
     found: dict[str, str] = {}
     for name, (stiffness, damping) in _training_gains(subject).items():
-        leg = style.leg_of(name)
-        group = style.joint_words(name.removeprefix(f"{leg}_") if leg else name)
+        group = style.joint_words(name.removeprefix(f"{style.leg_of(name)}_"))
         found.setdefault(group, f"{group} {stiffness:.1f} / {damping:.3f}")
     return ", ".join(found.values())
