@@ -32,3 +32,21 @@ def invoke(words: Sequence[str | Path], given: str = "") -> Done:
     finally:
         sys.stdin = before
     return Done(status, out.getvalue(), err.getvalue())
+
+
+def accepted(*words: str | Path) -> str:
+    """Standard output of a command that succeeds."""
+    done = invoke(words)
+    assert done.exit_code == 0, done.stderr
+    return done.stdout
+
+
+def refused(*words: str | Path) -> str:
+    """The one sentence of a command that is refused, on the last line of standard error."""
+    done = invoke(words)
+    assert done.exit_code == 2, done.output
+    lines = done.stderr.strip().splitlines()
+    sentences = [line for line in lines if line.startswith("pronk: ")]
+    assert sentences == lines[-1:], done.stderr
+    assert "Traceback" not in done.output
+    return sentences[0]

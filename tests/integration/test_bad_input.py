@@ -1,0 +1,435 @@
+"""Bad input: one sentence, exit status 2, nothing half written, nothing unpickled."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from command_line import refused
+from pronk.errors import LogError, PronkError, RobotError
+from pronk.logs.csv_reader import write_csv
+from pronk.logs.joint_log import JointLog
+from pronk.logs.mcap_log import write_mcap
+from pronk.logs.npz_reader import write_npz
+from pronk.logs.readers import read_log, read_logs
+from pronk.robots import load_robot
+
+ROBOT = load_robot("mini_cheetah")
+OPTIONS: dict[str, dict[str, Any]] = {
+    ".csv": {"unit": "rad"},
+    ".mcap": {},
+    ".npz": {"unit": "rad", "joint_names": ["FR_knee"]},
+    ".pt": {"joint_names": ["FR_knee"]},
+}
+GOOD = ("0.00,0.1,0.1", "0.02,0.2,0.2", "0.04,0.1,0.3", "0.06,0.0,0.1")
+HEADER = "time,position.FR_knee,command.FR_knee"
+quick = settings(
+    max_examples=int(os.environ.get("PRONK_FUZZ", "80")),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+
+
+def csv(path: Path, *rows: str, header: str = HEADER) -> Path:
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8", errors="replace")
+    return path
+
+
+# --- Commands -----------------------------------------------------------------------------------
+
+SWEEP = ("sweep", "mini_cheetah", "--out", "x")
+MATCH = ("match", "a.csv", "--robot", "mini_cheetah", "--out", "x/gains.yaml")
+COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
+    "no such command": (("mach",), "mach"),
+    "no such option": (("match", ".", "--robot", "mini_cheetah", "--grids", "3"), "--grids"),
+    "a former command as a value": (
+        ("match", "bench", "--robot", "go2", "--grids", "3"),
+        "--grids",
+    ),
+    "sweep: robot": (("sweep", "mini_cheeta", "--out", "x"), "mini_cheetah"),
+    "sweep: joint": ((*SWEEP, "--joints", "FR_ankle"), "FR_knee"),
+    "sweep: amplitude": ((*SWEEP, "--joints", "FR_knee", "--amplitude", "1.4"), "amplitude"),
+    "sweep: parameters": ((*SWEEP, "--sim-params", "broken.yaml"), "broken.yaml"),
+    "sweep: port of sim": ((*SWEEP, "--port", "7801"), "port"),
+    "sweep: port of dds": ((*SWEEP, "--link", "dds", "--port", "7801"), "port"),
+    "sweep: domain of lcm": ((*SWEEP, "--link", "lcm", "--domain", "3"), "domain"),
+    "sweep: parameters of lcm": ((*SWEEP, "--link", "lcm", "--sim-params", "t"), "simulate"),
+    "sweep: link": ((*SWEEP, "--link", "serial"), "lcm"),
+    "sweep: ground": ((*SWEEP, "--link", "sim://ground"), "bench"),
+    "response: no file": (("response", "nowhere.mcap", "--out", "x"), "nowhere.mcap"),
+    "response: no unit": (("response", "a.csv", "--out", "x"), "unit"),
+    "match: robot": (("match", "a.csv", "--robot", "cheetah", "--unit", "rad"), "mini_cheetah"),
+    "match: name of the gains": ((*MATCH[:-1], "gains.txt", "--unit", "rad"), ".yaml"),
+    "match: unit": ((*MATCH, "--unit", "furlong"), "rad"),
+    "match: columns": ((*MATCH, "--unit", "rad", "--columns", "nonsense"), "NAME=VALUE"),
+    "match: scale": ((*MATCH, "--unit", "rad", "--scale", "FR_knee=big"), "big"),
+    "match: joint": (("match", "b.csv", *MATCH[2:], "--unit", "rad"), "FR_elbow"),
+    "match: not a log": (("match", "noise.mcap", *MATCH[2:]), "noise.mcap"),
+    "match: format": (("match", "notes.txt", *MATCH[2:]), "notes.txt"),
+    "match: pickle": (("match", "bomb.pt", *MATCH[2:]), "bomb.pt"),
+    "match: simulator": ((*MATCH, "--unit", "rad", "--simulator", "gazebo"), "gazebo"),
+    "predict: gains": (
+        ("predict", "a.csv", "--robot", "go2", "--gains", "no.yaml", "--unit", "rad"),
+        "pronk match",
+    ),
+    "export: gains": (("export", "no.yaml", "--to", "mjlab", "--out", "x.py"), "pronk match"),
+    "export: target": (("export", "no.yaml", "--to", "gazebo", "--out", "x.py"), "mjlab"),
+    "train: task": (("train", "run", "--out", "x"), "walk"),
+    "trial: policy": (("trial", "no.onnx", "--out", "x"), "no.onnx"),
+    "trial: own": (("trial", "no.onnx", "--out", "x", "--own", "other.onnx"), "--bodies"),
+    "trial: command": (("trial", "no.onnx", "--out", "x", "--commands", "fast"), "fast"),
+    "deploy: policy": (("deploy", "no.onnx"), "no.onnx"),
+    "simulate: robot": (("simulate", "cheetah"), "mini_cheetah"),
+    "simulate: faults": (("simulate", "--faults", "gremlins=1"), "gremlins"),
+    "simulate: domain of lcm": (("simulate", "--domain", "3"), "--port"),
+    "simulate: capture": (("simulate", "--capture", "x.npz"), "ground"),
+    "robot: model": (("robot", "new", "no.xml"), "no.xml"),
+    "robot: out": (("robot", "new", "a.csv", "--out", "x/robot.yaml"), "beside"),
+    "report: folder": (("report", "nowhere"), "nowhere"),
+    "report: empty folder": (("report", "."), "pronk match"),
+    "demo: jumps": (("demo", "--out", "x", "--jumps", "0"), "--jumps"),
+    "demo: policies": (("demo", "--out", "x", "--policies", "."), "policy.onnx"),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Files that are no good input, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    csv(tmp_path / "a.csv", *GOOD)
+    csv(tmp_path / "b.csv", *GOOD, header="time,position.FR_elbow,command.FR_elbow")
+    (tmp_path / "broken.yaml").write_text("schema: pronk/sim_params/1\nrobot: mini_cheetah\n")
+    (tmp_path / "noise.mcap").write_bytes(b"\x00" * 500)
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "bomb.pt").write_bytes(archive(pickle.dumps({"time": Bomb(tmp_path / "boom")})))
+    return tmp_path
+
+
+@pytest.mark.parametrize("case", COMMANDS)
+def test_a_command_refuses_in_one_sentence_and_writes_nothing(folder: Path, case: str) -> None:
+    words, named = COMMANDS[case]
+    before = set(folder.rglob("*"))
+    assert named in refused(*words)
+    assert set(folder.rglob("*")) == before
+
+
+# --- Random files -------------------------------------------------------------------------------
+
+
+def reads_or_refuses(path: Path, **options: Any) -> None:
+    """Read a log, or get one sentence with its name; anything else fails the test."""
+    try:
+        read_log(path, **options)
+    except PronkError as error:
+        text = str(error)
+        assert "\n" not in text
+        assert path.name in text
+        assert text.rstrip().endswith(".")
+
+
+@pytest.mark.parametrize("suffix", OPTIONS)
+@quick
+@given(data=st.binary(max_size=400))
+@example(data=b"")
+@example(data=b"\x89MCAP0\r\n")
+@example(data=b"PK\x03\x04")
+@example(data=b"time,position.a,command.a\n0,0,0\n")
+def test_random_bytes(tmp_path: Path, suffix: str, data: bytes) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(data)
+    reads_or_refuses(path, **OPTIONS[suffix])
+
+
+cell = st.one_of(
+    st.floats().map(repr),
+    st.integers(-5, 5).map(str),
+    st.text("0123456789.,;eE-+nai\"'\t", max_size=8),
+)
+
+
+@quick
+@given(
+    rows=st.lists(st.lists(cell, min_size=3, max_size=3).map(",".join), max_size=8),
+    header=st.one_of(st.sampled_from([HEADER, "t,q,u", "time,time,position.a"]), st.text()),
+)
+def test_random_csv(tmp_path: Path, rows: list[str], header: str) -> None:
+    reads_or_refuses(csv(tmp_path / "a.csv", *rows, header=header), unit="rad")
+
+
+@quick
+@given(
+    cells=st.lists(
+        st.one_of(st.just(""), st.text("[]0123456789.,eE-\"'x() ", max_size=30)), max_size=4
+    ),
+    stamp=st.one_of(st.floats(), st.text(max_size=5)),
+)
+@example(cells=["__import__('os').getcwd()"], stamp=0.0)
+@example(cells=["[1, NaN]"], stamp=0.0)
+@example(cells=["[[1, 2], [3, 4]]"], stamp=0.0)
+@example(cells=['["a", "b"]'], stamp=0.0)
+def test_random_sage_rows(tmp_path: Path, cells: list[str], stamp: float | str) -> None:
+    folder = tmp_path / "s"
+    folder.mkdir(exist_ok=True)
+    quoted = ",".join('"' + c.replace('"', '""') + '"' for c in cells)
+    states = [f'STATE_MOTOR,{2000 * k},"[0.1, 0.2]","[0, 0]","[0, 0]"' for k in range(1, 6)]
+    states.insert(2, f"STATE_MOTOR,{stamp},{quoted}")
+    (folder / "joint_list.txt").write_text("hip\nknee\n")
+    csv(folder / "state_motor.csv", *states, header="type,timestamp,positions,velocities,torques")
+    csv(folder / "control.csv", 'CONTROL,0,"[0.1, 0.2]"', header="type,timestamp,positions")
+    reads_or_refuses(folder)
+
+
+def archive(program: bytes, storages: tuple[bytes, ...] = ()) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as file:
+        file.writestr("archive/data.pkl", program)
+        for key, data in enumerate(storages):
+            file.writestr(f"archive/data/{key}", data)
+    return stream.getvalue()
+
+
+def tensors(**arrays: np.ndarray) -> tuple[bytes, tuple[bytes, ...]]:
+    """Pickle and storages that torch.save writes of a dictionary of tensors."""
+    kinds = {"<f4": b"FloatStorage", "<f8": b"DoubleStorage"}
+
+    def number(n: int) -> bytes:
+        return b"J" + n.to_bytes(4, "little")
+
+    def text(value: str) -> bytes:
+        return b"X" + len(value).to_bytes(4, "little") + value.encode()
+
+    def numbers(values: list[int]) -> bytes:
+        return b"(" + b"".join(map(number, values)) + b"t"
+
+    out = [b"\x80\x02}("]
+    for key, (name, array) in enumerate(arrays.items()):
+        out += [
+            text(name),
+            b"ctorch._utils\n_rebuild_tensor_v2\n((",
+            text("storage") + b"ctorch\n" + kinds[array.dtype.str] + b"\n" + text(str(key)),
+            text("cpu") + number(array.size) + b"tQ" + number(0),
+            numbers(list(array.shape)) + numbers([s // array.itemsize for s in array.strides]),
+            b"\x89ccollections\nOrderedDict\n)RtR",
+        ]
+    return b"".join([*out, b"u."]), tuple(array.tobytes() for array in arrays.values())
+
+
+def pace() -> tuple[bytes, tuple[bytes, ...]]:
+    time = np.arange(60) / 400.0
+    wave = np.sin(time)[:, None]
+    return tensors(time=time, dof_pos=wave.astype(np.float32), des_dof_pos=wave)
+
+
+class Files(dict[str, bytes]):
+    """Valid files by suffix, short to print."""
+
+    def __repr__(self) -> str:
+        return "Files"
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    folder, time = tmp_path_factory.mktemp("valid"), np.arange(60) / 500.0
+    log = JointLog(
+        robot="mini_cheetah",
+        joints=("FR_knee",),
+        time=time,
+        command=np.sin(time)[:, None],
+        position=np.cos(time)[:, None],
+    )
+    write_csv(folder / "v.csv", log)
+    write_npz(folder / "v.npz", log)
+    write_mcap(folder / "v.mcap", log)
+    (folder / "v.pt").write_bytes(archive(*pace()))
+    for suffix, options in OPTIONS.items():
+        kept = {} if suffix == ".npz" else options
+        assert len(read_log(folder / f"v{suffix}", robot=ROBOT, **kept).time) == 60
+    return Files({suffix: (folder / f"v{suffix}").read_bytes() for suffix in OPTIONS})
+
+
+def mutate(data: st.DataObject, original: bytes) -> bytes:
+    """Flip, cut, insert and drop bytes."""
+    mutated = bytearray(original)
+    for _ in range(data.draw(st.integers(1, 5))):
+        where = data.draw(st.integers(0, len(mutated) - 1))
+        match data.draw(st.sampled_from(["flip", "cut", "insert", "drop"])):
+            case "flip":
+                mutated[where] ^= data.draw(st.integers(1, 255))
+            case "cut":
+                mutated = mutated[: max(where, 1)]
+            case "insert":
+                mutated[where:where] = data.draw(st.binary(min_size=1, max_size=8))
+            case "drop":
+                del mutated[where : where + data.draw(st.integers(1, 8))]
+        if not mutated:
+            break
+    return bytes(mutated)
+
+
+@pytest.mark.parametrize("suffix", OPTIONS)
+@quick
+@given(data=st.data())
+def test_mutated_files(tmp_path: Path, valid: Files, suffix: str, data: st.DataObject) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(mutate(data, valid[suffix]))
+    reads_or_refuses(path, **OPTIONS[suffix])
+
+
+@quick
+@given(data=st.data())
+def test_mutated_pickles_behind_a_sound_archive(tmp_path: Path, data: st.DataObject) -> None:
+    """The checksum of the zip hides the pickle from the mutations above; this one does not."""
+    program, storages = pace()
+    path = tmp_path / "a.pt"
+    path.write_bytes(archive(mutate(data, program), storages))
+    reads_or_refuses(path, joint_names=["FR_knee"])
+
+
+# --- Pickles and sizes --------------------------------------------------------------------------
+
+
+class Bomb:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return (Path.write_text, (self.path, "boom"))
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_a_pickle_bomb_does_not_run(tmp_path: Path, protocol: int) -> None:
+    boom, path = tmp_path / "boom", tmp_path / "a.pt"
+    bomb = pickle.dumps({"time": Bomb(boom)}, protocol=protocol)
+    pickle.loads(bomb)
+    assert boom.read_text() == "boom"  # so the bomb works
+    boom.unlink()
+    for data in (archive(bomb), bomb):
+        path.write_bytes(data)
+        with pytest.raises(LogError, match=r"a\.pt"):
+            read_log(path, robot=ROBOT)
+    np.savez(tmp_path / "a.npz", time=np.array([Bomb(boom)], dtype=object))
+    with pytest.raises(LogError, match="pickled"):
+        read_log(tmp_path / "a.npz", **OPTIONS[".npz"])
+    assert not boom.exists()
+
+
+@pytest.mark.parametrize(
+    ("program", "named"),
+    [
+        (b"cos\nsystem\n(S'true'\ntR.", "os.system"),
+        (b"cbuiltins\neval\n(S'1'\ntR.", "builtins.eval"),
+        (b"cnumpy.core.multiarray\n_reconstruct\n.", "numpy.core.multiarray"),
+        (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "os.system"),
+        (b"(S'x'\nios\nsystem\n.", "INST"),
+        (b"ccollections\nOrderedDict\n}b.", "BUILD"),
+        (b"\x80\x02ccollections\nOrderedDict\n)\x81.", "NEWOBJ"),
+        (b"N.", "NoneType"),
+        (b"}.", "dof_pos"),
+        (b"r\xff\xff\xff\x7f.", "a.pt"),
+        (b"", "a.pt"),
+        # Sixty nested pairs of one tuple: 2^60 steps to hash, 200 bytes to write.
+        (b"\x80\x02})" + b"2\x86" * 60 + b"Ns.", "a.pt"),
+    ],
+)
+def test_programs_that_are_no_tensors(tmp_path: Path, program: bytes, named: str) -> None:
+    path = tmp_path / "a.pt"
+    path.write_bytes(archive(program))
+    with pytest.raises(LogError, match=named) as caught:
+        read_log(path, robot=ROBOT)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_promise_more_than_they_hold(tmp_path: Path) -> None:
+    program, storages = pace()
+    (tmp_path / "a.pt").write_bytes(archive(program, (storages[0][:40], *storages[1:])))
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
+    )
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
+        file.writestr("time.npy", header.getvalue() + bytes(80))
+    chunk = bytes(16 + 8 + 4 + 4) + (2**64 - 16).to_bytes(8, "little")
+    mcap = b"\x89MCAP0\r\n\x06" + len(chunk).to_bytes(8, "little") + chunk
+    (tmp_path / "a.mcap").write_bytes(mcap)
+    for suffix in (".pt", ".npz", ".mcap"):
+        with pytest.raises(LogError, match=f"a{suffix}"):
+            read_log(tmp_path / f"a{suffix}", **OPTIONS[suffix])
+
+
+# --- Mistakes in logs and options ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rows", "named"),
+    [
+        ((), "samples"),
+        (GOOD[:1], "at least 2"),
+        ((*GOOD[:2], "0.04,nan,0.3"), "row 4 .*nan.*position.FR_knee"),
+        ((*GOOD[:2], "0.04,,0.3"), "row 4"),
+        ((*GOOD[:2], "0.04,1e999,0.3"), "row 4 .*1e999"),
+        ((*GOOD[:2], "0.04,0.3"), "row 4 .*2 cells"),
+        ((*GOOD, "0.05,0.0,0.0"), "row 6"),
+        ((*GOOD, "0.06,0.0,0.0"), r"row 6 .*0\.06"),
+        (tuple(f"{k * 20000},{k % 3},{k % 2}" for k in range(5)), " us"),
+        (tuple(f"{k * 20},{k % 3},{k % 2}" for k in range(5)), " ms"),
+        (tuple(f"{k * 0.02},{20 * (k % 3)},{20 * (k % 2)}" for k in range(5)), "degrees"),
+    ],
+)
+def test_mistakes_in_a_csv_are_located(tmp_path: Path, rows: tuple[str, ...], named: str) -> None:
+    with pytest.raises(LogError, match=named) as caught:
+        read_log(csv(tmp_path / "a.csv", *rows), unit="rad")
+    assert "\n" not in str(caught.value)
+    assert "a.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({}, "unit"),
+        ({"unit": "grad"}, "rad, deg"),
+        ({"unit": "rad", "time_unit": "h"}, "s, ms, us, ns"),
+        ({"unit": "rad", "columns": {"time": "t"}}, "'t'"),
+        ({"unit": "rad", "columns": {"speed.FR_knee": "x"}}, "speed.FR_knee"),
+        ({"unit": "rad", "rate_hz": 100.0}, r"50\.00 Hz"),
+        ({"unit": "rad", "joint_names": ["a", "b"]}, "2 joint names"),
+        ({"unit": "rad", "command_topic": "/x"}, "command_topic"),
+        ({"units": "rad"}, "units"),
+        ({"format": "hdf5"}, "mcap, csv, sage, pace, npz"),
+    ],
+)
+def test_wrong_options_are_named(tmp_path: Path, options: dict[str, Any], named: str) -> None:
+    with pytest.raises(LogError, match=named):
+        read_log(csv(tmp_path / "a.csv", *GOOD), **options)
+
+
+def test_files_that_are_not_there(tmp_path: Path) -> None:
+    (tmp_path / "a.doc").touch()
+    for path in (tmp_path / "a.mcap", tmp_path, tmp_path / "a.doc"):
+        with pytest.raises(LogError, match=path.name):
+            read_log(path)
+    for paths in ([tmp_path], []):
+        with pytest.raises(LogError, match="no logs"):
+            read_logs(paths)
+    with pytest.raises(LogError, match=r"control\.csv"):
+        read_log(tmp_path, format="sage")
+
+
+def test_names_in_a_file_cannot_break_the_sentence(tmp_path: Path) -> None:
+    path, time = tmp_path / "a.npz", np.arange(50) / 500.0
+    wave = np.sin(time)[:, None]
+    np.savez(path, time=time, command=wave, position=wave, joints=np.array(["FR\nknee"]))
+    with pytest.raises(RobotError) as caught:
+        read_log(path, unit="rad", robot=ROBOT)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,177 @@
+"""The command line: from a sweep to gains, predictions and exports; help, exit statuses."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from command_line import accepted, invoke, refused
+from pronk import __version__
+from pronk.cli import main as cli
+from pronk.errors import PronkError
+from pronk.logs.readers import find_logs
+
+KNEE = ("--joints", "FR_knee")
+MATCH = ("--robot", "mini_cheetah", "--quick")
+
+
+def test_help_names_every_command_and_loads_no_heavy_library():
+    code = (
+        "import sys, pronk.cli.main as m; m.run(['--help']);"
+        "heavy = ('numpy', 'scipy', 'matplotlib', 'mujoco', 'jinja2', 'tyro', 'msgspec');"
+        "print([name for name in heavy if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *shown, loaded = done.stdout.strip().splitlines()
+    assert loaded == "[]"
+    words = " ".join(shown).split()
+    assert set(cli.COMMANDS) <= set(words)
+    assert accepted("--version").strip() == f"pronk {__version__}"
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_command_has_help(command):
+    shown = accepted(command, "--help")
+    assert len(shown) > 200
+    assert "--json" in shown or command == "robot"
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["twin"], "pronk simulate"),
+        (["bench"], "python -m benchmarks"),
+        (["sweep", "mini_cheetah", "--out", "x", "--link", "twin"], "'sim'"),
+        (["sweep", "mini_cheetah", "--out", "x", "--truth", "y"], "--sim-params"),
+        (["sweep", "mini_cheetah", "--out", "x", "--release"], "--disable-onboard-controller"),
+        (["match", "a.mcap", "--robot", "go2", "--free", "armature"], "--fit"),
+        (["deploy", "a.onnx", "--any-delay"], "--ignore-latency-check"),
+        (["deploy", "a.onnx", "--blend=0.1"], "--blend-time-s"),
+    ],
+)
+def test_former_names_give_a_hint(words, hint):
+    assert hint in refused(*words)
+
+
+@pytest.mark.parametrize(
+    ("raised", "status"),
+    [
+        (PronkError("got this,\nexpected that."), 2),
+        (KeyboardInterrupt(), 130),
+        (MemoryError(), 1),
+        (ZeroDivisionError("division by zero"), 1),
+    ],
+)
+def test_exit_statuses(monkeypatch, raised, status):
+    def stop(*_, **__):
+        raise raised
+
+    monkeypatch.setitem(cli.COMMANDS, "report", ("pronk.report.build:write_report", ""))
+    monkeypatch.setattr("pronk.report.build.write_report", stop)
+    monkeypatch.delenv("PRONK_DEBUG", raising=False)
+    done = invoke(["report"])
+    assert done.exit_code == status
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert ("defect" in done.stderr) == isinstance(raised, ZeroDivisionError)
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One knee of the virtual robot, swept by the command line."""
+    out = tmp_path_factory.mktemp("sweep")
+    accepted("sweep", "mini_cheetah", "--out", out, *KNEE, "--repeats", "2", "--amplitude", "0.25",
+             "--json", out / "sweep.json")  # fmt: skip
+    return out
+
+
+@pytest.fixture(scope="module")
+def matched(swept: Path) -> Path:
+    accepted("match", swept, *MATCH, "--out", swept / "gains.yaml", "--json", swept / "match.json")
+    return swept
+
+
+def test_sweep_writes_a_log_of_the_virtual_robot(swept):
+    figures = json.loads((swept / "sweep.json").read_text())
+    assert figures["virtual"] is True
+    assert [Path(p).name for p in figures["logs"]] == ["FR_knee.mcap"]
+    assert (swept / "FR_knee.mcap").stat().st_size > 1e5
+    assert figures["plan"][0]["torque_nm"] < figures["plan"][0]["effort_limit_nm"]
+    assert "FR_knee.mcap" in refused("sweep", "mini_cheetah", "--out", swept, *KNEE)
+
+
+def test_plan_only_writes_nothing(tmp_path):
+    shown = accepted("sweep", "mini_cheetah", "--out", tmp_path / "x", *KNEE, "--plan-only")
+    assert "torque [N m]" in shown
+    assert not (tmp_path / "x").exists()
+
+
+def test_response_table_and_files(swept, tmp_path):
+    figures = tmp_path / "response.json"
+    log = swept / "FR_knee.mcap"
+    shown = accepted("response", log, "--out", tmp_path, "--json", figures)
+    assert "virtual robot" in shown
+    row = json.loads(figures.read_text())["responses"][0]
+    assert row["joint"] == "FR_knee"
+    assert 5.0 < row["bandwidth_hz"] < 15.0
+    assert (tmp_path / "FR_knee.response.npz").exists()
+    assert (tmp_path / "FR_knee.response.svg").read_text().startswith("<?xml")
+
+
+def test_match_finds_table_one(matched):
+    figures = json.loads((matched / "match.json").read_text())
+    found = figures["gains"]["FR_knee"]
+    # Two cells of the paper's grid are 0.57 N m/rad and 0.024 N m s/rad.
+    assert found["stiffness"] == pytest.approx(21.8, abs=0.57)
+    assert found["damping"] == pytest.approx(0.541, abs=0.024)
+    assert found["error_db"] < 0.5 * found["naive_error_db"]
+    assert found["zero_armature_error_db"] > 5.0 * found["error_db"]
+    assert 0.002 < found["delay_s"] < 0.01
+    assert (figures["matched"], figures["joints"]) == (1, 1)
+    assert "virtual robot" in (matched / "match.html").read_text(encoding="utf-8")
+
+
+def test_files_beside_the_logs_are_no_logs(matched):
+    accepted("response", matched, "--no-plots")
+    assert (matched / "FR_knee.response.npz").exists()
+    assert [p.name for p in find_logs([matched])] == ["FR_knee.mcap"]
+
+
+def test_predict_replays_a_fresh_log_and_warns_of_a_fitted_one(matched, tmp_path):
+    fresh, figures = tmp_path / "fresh", tmp_path / "predict.json"
+    accepted("sweep", "mini_cheetah", "--out", fresh, *KNEE, "--repeats", "1", "--amplitude",
+             "0.25", "--signal", "log-chirp", "--seed", "5")  # fmt: skip
+    gains = ("--robot", "mini_cheetah", "--gains", matched / "gains.yaml")
+    accepted("predict", fresh, *gains, "--json", figures)
+    found = json.loads(figures.read_text())
+    (row,) = found["predictions"]
+    assert row["rmse_matched"] < 0.5 * row["rmse_naive"]
+    assert found["fitted_on"] == []
+    accepted("report", matched)
+    assert "FR_knee" in (matched / "report.html").read_text(encoding="utf-8")
+    log = matched / "FR_knee.mcap"
+    done = invoke(["predict", log, *gains, "--out", tmp_path / "again", "--json", figures])
+    assert done.exit_code == 0
+    assert json.loads(figures.read_text())["fitted_on"] == [str(log)]
+    assert "warning" in done.stderr
+
+
+@pytest.mark.parametrize("target", ["mjlab", "mjcf", "isaaclab"])
+def test_export(matched, tmp_path, target):
+    accepted("export", matched / "gains.yaml", "--to", target, "--out", tmp_path / "exported")
+    assert len((tmp_path / "exported").read_text()) > 200
+
+
+def test_drive_mode_fits_what_it_can_and_refuses_the_rest(matched, tmp_path):
+    log, out = matched / "FR_knee.mcap", tmp_path / "gains.yaml"
+    common = ("match", log, "--robot", "mini_cheetah", "--out", out)
+    assert "--mode drive" in refused(*common, "--fit", "armature")
+    names = ("stiffness", "armature", "damping", "frictionloss")
+    fits = [word for name in names for word in ("--fit", name)]
+    assert "FR_knee" in refused(*common, "--mode", "drive", *fits)
+    assert not out.exists()
+    shown = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay")
+    assert "held" in shown
