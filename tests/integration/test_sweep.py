@@ -97,11 +97,11 @@ def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) ->
         log = read_mcap(path)
         column = log.column(joint)
         assert log.pose is not None
-        asks = [ask for ask in plan.asks if ask.joints == (joint,)]
-        for segment, ask in zip(log.segments, asks, strict=True):
+        excitations = [each for each in plan.excitations if each.joint == joint]
+        for segment, excitation in zip(log.segments, excitations, strict=True):
             part = log.cut(segment)
             tick = np.floor((part.time - segment.start) * 50.0 + 0.05).astype(int)
-            offsets = np.pad(ask.offsets(50.0)[:, 0], (0, 26))
+            offsets = np.pad(excitation.offsets(50.0), (0, 26))
             # Every state carries the command of its tick: no edge is a sample late.
             np.testing.assert_allclose(
                 part.command[:, column], log.pose[column] + offsets[tick], atol=1e-12
@@ -274,6 +274,6 @@ def test_a_machine_of_another_robot_is_refused(tmp_path: Path) -> None:
 
 def test_the_leg_is_what_is_logged() -> None:
     leg = ("FL_hip_roll", "FL_hip_pitch", "FL_knee")
-    assert logged_joints(ROBOT, ["FL_knee"]) == leg
-    assert logged_joints(ROBOT, ["FL_hip_roll"]) == leg
-    assert len(logged_joints(load_robot("so101"), ["gripper"])) == 6
+    assert logged_joints(ROBOT, "FL_knee") == leg
+    assert logged_joints(ROBOT, "FL_hip_roll") == leg
+    assert len(logged_joints(load_robot("so101"), "gripper")) == 6

@@ -12,7 +12,7 @@ import tyro
 
 from pronk.cli import console
 from pronk.cli.options import LinkOptions
-from pronk.errors import HardwareError, PlanError
+from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
@@ -210,8 +210,6 @@ def record_virtual(
 
     params = load_sim_params(sim_params, robot)
     params.check_joints(robot.joint_names, str(sim_params or "sim_params"))
-    if len(plan.sets) != len(plan.joints):
-        raise PlanError("several joints excited at once: the virtual robot excites one at a time.")
     jobs = [
         _Limb(
             plan=plan,

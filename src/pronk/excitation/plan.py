@@ -20,7 +20,7 @@ from pronk.robots.robot import Robot
 Array = NDArray[np.float64]
 
 POSE_RAMP_S = 2.0
-"""Time to move softly to the pose before the questions of a joint [s]."""
+"""Time to move softly to the pose before the excitations of a joint [s]."""
 _FIT_ROUNDS = 10
 """Rounds of shrinking an amplitude, at most by half each, until it fits."""
 _BISECTIONS = 3
@@ -28,36 +28,21 @@ _BISECTIONS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ask:
-    """One question: a signal to each of one or several joints, at the same time."""
+class Excitation:
+    """A signal to one joint."""
 
-    joints: tuple[str, ...]
-    signals: tuple[Signal, ...]
-    """One a joint."""
+    joint: str
+    signal: Signal
     repeat: int = 0
-    """Number of this repeat of the same question, from 0."""
+    """Number of this repeat of the same excitation, from 0."""
     clamped: tuple[str, ...] = ()
     """Joints fixed mechanically meanwhile."""
-    signs: tuple[float, ...] = ()
-    """Sign of each joint's command. Mirror-image joints are excited mirrored, so that the match
-    simulates each family once; all positive if empty."""
+    sign: float = 1.0
+    """Mirror-image joints are excited mirrored, so that the match simulates each family once."""
 
     def offsets(self, rate_hz: float) -> Array:
-        """Command offsets about the pose [rad], shape (ticks, joints); shorter ones end early."""
-        waves = [signal.samples(rate_hz) for signal in self.signals]
-        offsets = np.zeros((max(len(wave) for wave in waves), len(waves)))
-        for i, wave in enumerate(waves):
-            offsets[: len(wave), i] = wave
-        return np.asarray(offsets * np.array(self.signs or (1.0,) * len(waves)))
-
-    def frequency(self, rate_hz: float) -> Array:
-        """Instantaneous frequency [Hz], shape (ticks,); NaN where there is none."""
-        return max((s.frequency(rate_hz) for s in self.signals), key=len)
-
-    @property
-    def amplitude(self) -> float:
-        """Peak of the loudest command about the pose [rad]."""
-        return max(signal.amplitude for signal in self.signals)
+        """Command offsets about the pose [rad], shape (ticks,)."""
+        return np.asarray(self.sign * self.signal.samples(rate_hz))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,18 +50,18 @@ class SweepPlan:
     """Excitations in the order of the sweep. Build it with `make_plan`."""
 
     robot: Robot
-    asks: tuple[Ask, ...]
+    excitations: tuple[Excitation, ...]
     rate_hz: float
     """Rate of the commands."""
     settle_s: float
-    """Rest after each question, logged as its part [s]."""
+    """Rest after each excitation, logged as its part [s]."""
     stiffness: Array
     """Gains on the drives [N m/rad], shape (joints,)."""
     damping: Array
     """Gains on the drives [N m s/rad], shape (joints,)."""
     uncertainty: Uncertainty
     forecasts: tuple[Forecast, ...]
-    """What the loudest question to each joint will do to it and to its neighbours, over every
+    """Worst case of the loudest excitation of each joint, for it and its neighbours, over every
     corner of the uncertainty; quieter ones of the same signal stay inside."""
 
     @property
@@ -85,50 +70,42 @@ class SweepPlan:
         return np.array([joint.default_position for joint in self.robot.joints])
 
     @property
-    def sets(self) -> tuple[tuple[str, ...], ...]:
-        """Joints that are excited together, in order; one log file each."""
-        return tuple(dict.fromkeys(ask.joints for ask in self.asks))
-
-    @property
     def joints(self) -> tuple[str, ...]:
-        """Excited joints, in order."""
-        return tuple(dict.fromkeys(name for joints in self.sets for name in joints))
+        """Excited joints, in order; one log file each."""
+        return tuple(dict.fromkeys(each.joint for each in self.excitations))
 
-    def ask_duration_s(self, ask: Ask) -> float:
-        """Time of one question, its rest included [s]."""
-        return len(ask.frequency(self.rate_hz)) / self.rate_hz + self.settle_s
+    def seconds(self, excitation: Excitation) -> float:
+        """Time of one excitation, its rest included [s]."""
+        return excitation.signal.duration_s(self.rate_hz) + self.settle_s
 
     @property
     def duration_s(self) -> float:
         """Time of the whole sweep on the machine's clock [s]."""
-        excited = sum(self.ask_duration_s(ask) for ask in self.asks)
-        return excited + len(self.sets) * (POSE_RAMP_S + 2.0 * self.settle_s)
+        excited = sum(self.seconds(each) for each in self.excitations)
+        return excited + len(self.joints) * (POSE_RAMP_S + 2.0 * self.settle_s)
 
     def rows(self) -> list[dict[str, float | str]]:
         """The forecasts as a table: a row per joint, worst case over the uncertainty."""
-        rows: list[dict[str, float | str]] = []
-        for f in self.forecasts:
-            if f.amplitude == 0.0:
-                continue
-            rows.append(
-                {
-                    "joint": f.joint,
-                    "amplitude_rad": f.amplitude,
-                    "lowest_rad": f.lowest,
-                    "highest_rad": f.highest,
-                    "range_low_rad": f.range[0],
-                    "range_high_rad": f.range[1],
-                    "speed_rad_s": f.speed,
-                    "no_load_speed_rad_s": f.no_load_speed,
-                    "torque_nm": f.torque,
-                    "effort_limit_nm": f.effort_limit,
-                    "torque_share": f.torque_share,
-                    "mechanical_power_w": f.mechanical_power,
-                    "electrical_power_w": f.electrical_power,
-                    "bus_current_a": f.bus_current,
-                }
-            )
-        return rows
+        return [
+            {
+                "joint": f.joint,
+                "amplitude_rad": f.amplitude,
+                "lowest_rad": f.lowest,
+                "highest_rad": f.highest,
+                "range_low_rad": f.range[0],
+                "range_high_rad": f.range[1],
+                "speed_rad_s": f.speed,
+                "no_load_speed_rad_s": f.no_load_speed,
+                "torque_nm": f.torque,
+                "effort_limit_nm": f.effort_limit,
+                "torque_share": f.torque_share,
+                "mechanical_power_w": f.mechanical_power,
+                "electrical_power_w": f.electrical_power,
+                "bus_current_a": f.bus_current,
+            }
+            for f in self.forecasts
+            if f.amplitude > 0.0
+        ]
 
     def check(self) -> None:
         """Refuse a sweep that could exceed a limit.
@@ -138,41 +115,33 @@ class SweepPlan:
                 (found by simulating it).
         """
         for worst in self.forecasts:
-            if not worst.breaches():
+            if not (breaches := worst.breaches()):
                 continue
             # The forecasts are of the largest amplitude, which comes first.
-            ask = next(ask for ask in self.asks if ask.joints == worst.excited)
-            words = worst.breaches()[0]
-            fits = self._fit(ask)
+            loudest = next(each for each in self.excitations if each.joint == worst.excited)
+            fits, unsure = self._fit(loudest), self.uncertainty
             way_out = (
                 f"an amplitude of {fits:.3g} rad fits"
                 if fits > 0.0
                 else "no amplitude fits, so choose other joints or another pose"
             )
             raise PlanError(
-                f"{', '.join(ask.joints)}: excited with {ask.amplitude:g} rad, {worst.joint} could "
-                f"{words} (inertia, gains and friction uncertain by "
-                f"{100 * self.uncertainty.inertia:.0f}, {100 * self.uncertainty.stiffness:.0f} and "
-                f"{100 * self.uncertainty.friction:.0f} %); {way_out}."
+                f"{worst.excited}: excited with {loudest.signal.amplitude:g} rad, {worst.joint} "
+                f"could {breaches[0]} (inertia, gains and friction uncertain by "
+                f"{100 * unsure.inertia:.0f}, {100 * unsure.stiffness:.0f} and "
+                f"{100 * unsure.friction:.0f} %); {way_out}."
             )
 
-    def _fit(self, ask: Ask) -> float:
+    def _fit(self, excitation: Excitation) -> float:
         """Largest amplitude found by shrinking and simulating again [rad]; 0 if none is."""
         rest = dict(zip(self.robot.joint_names, self.pose, strict=True))
+        amplitude = excitation.signal.amplitude
 
         def factor(share: float) -> float:
             """1 if this share of the amplitude fits, 0 if none can, else by what to shrink it."""
-            signals = tuple(s.with_amplitude(s.amplitude * share) for s in ask.signals)
-            quieter = replace(ask, signals=signals)
-            ends = _forecast_ask(
-                self.robot,
-                quieter,
-                self.rate_hz,
-                self.stiffness,
-                self.damping,
-                self.uncertainty,
-                {},
-            )
+            quieter = replace(excitation, signal=excitation.signal.scaled(share))
+            gains = (self.stiffness, self.damping)
+            ends = _forecasts(self.robot, quieter, self.rate_hz, *gains, self.uncertainty, {})
             if not any(f.breaches() for f in ends):
                 return 1.0
             linear = min(f.shrink(rest[f.joint]) for f in ends)
@@ -182,12 +151,10 @@ class SweepPlan:
         share, too_much = 1.0, 1.0
         for _ in range(_FIT_ROUNDS):
             shrink = factor(share)
-            if shrink == 1.0:
+            if shrink in (0.0, 1.0):
                 break
-            if shrink == 0.0:
-                return 0.0
             too_much, share = share, share * shrink
-        else:
+        if shrink != 1.0:
             return 0.0
         for _ in range(_BISECTIONS):
             middle = 0.5 * (share + too_much)
@@ -195,17 +162,9 @@ class SweepPlan:
                 share = middle
             else:
                 too_much = middle
-        return _floor(ask.amplitude * share)
-
-
-def _floor(value: float) -> float:
-    """Three significant digits, rounded down."""
-    scale = 10.0 ** (np.floor(np.log10(value)) - 2)
-    return float(np.floor(value / scale * (1.0 + 1e-12)) * scale)
-
-
-def _chain(robot: Robot, name: str) -> tuple[str, ...]:
-    return robot.joint(name).chain or (name,)
+        # Three significant digits, rounded down.
+        scale = 10.0 ** (np.floor(np.log10(amplitude * share)) - 2)
+        return float(np.floor(amplitude * share / scale * (1.0 + 1e-12)) * scale)
 
 
 def make_plan(
@@ -220,30 +179,30 @@ def make_plan(
     damping: Mapping[str, float] | None = None,
     uncertainty: Uncertainty | None = None,
 ) -> SweepPlan:
-    """Plan a sweep, and forecast what it will do to the robot.
+    """Plan a sweep, and forecast its effect on the robot.
 
     One joint at a time (paper F1), in the order of the robot's files; each amplitude `repeats`
-    times. Joints that the robot says must be clamped for a question are (paper F6), the others
+    times. Joints that the robot says must be clamped for an excitation are (paper F6), the others
     are held by their drives (paper F5).
 
     Args:
         robot: The robot.
         joints: Names; all of them if None.
-        signal: What to ask; its own amplitude is replaced. The paper's chirp if None.
+        signal: The excitation signal; its own amplitude is replaced. The paper's chirp if None.
         amplitudes: Peaks of the command [rad]; two or more show friction.
-        repeats: Repeats of each amplitude, one number for all or one each; three or more of
-            the largest, which is the one matched, give honest intervals.
-        settle_s: Rest after each question [s].
+        repeats: Repeats of each amplitude, one number for all or one each; intervals need three
+            or more of the largest, which is the one matched.
+        settle_s: Rest after each excitation [s].
         stiffness: Gains on the drives by joint, instead of the robot's [N m/rad].
         damping: Gains on the drives by joint, instead of the robot's [N m s/rad].
         uncertainty: How far the robot may be from its model.
 
     Returns:
-        The plan. Call its `check` before anything moves; `record` does.
+        The plan. Call its `check` before anything moves.
 
     Raises:
         RobotError: A joint is unknown.
-        PlanError: The plan is empty, or joints cannot be excited together.
+        PlanError: The plan is empty.
     """
     names = robot.joint_names if joints is None else tuple(dict.fromkeys(joints))
     for name in (*names, *(stiffness or {}), *(damping or {})):
@@ -252,7 +211,7 @@ def make_plan(
     if not names or not amplitudes or len(counts) != len(amplitudes) or min(counts) < 1:
         raise PlanError(
             f"a plan of {len(names)} joints, {len(amplitudes)} amplitudes and {repeats} repeats "
-            "asks nothing; expected at least one of each, and one number of repeats for all or "
+            "excites nothing; expected at least one of each, and one number of repeats for all or "
             "one an amplitude."
         )
     if not (np.isfinite(settle_s) and settle_s >= 0.0):
@@ -265,92 +224,76 @@ def make_plan(
             raise PlanError(
                 f"a {label} on the drives is negative or not finite; expected 0 or more."
             )
-    times = dict(zip(amplitudes, counts, strict=True))
-    loudest = dict(sorted(times.items(), reverse=True))
-    asks = _one_by_one(robot, names, signal, loudest)
-    rate = robot.policy_rate_hz
-    uncertainty = uncertainty or Uncertainty()
-    cache: dict[bytes, list[Forecast]] = {}
+    times = sorted(zip(amplitudes, counts, strict=True), reverse=True)
+    excitations = tuple(
+        Excitation(
+            joint=name,
+            signal=replace(signal, amplitude=amplitude),
+            repeat=repeat,
+            clamped=robot.joint(name).clamped,
+            sign=robot.joint(name).original[1],
+        )
+        for name in names
+        for amplitude, count in dict(times).items()
+        for repeat in range(count)
+    )
+    rate, unsure = robot.policy_rate_hz, uncertainty or Uncertainty()
+    cache: dict[str, list[Forecast]] = {}
     forecasts = [
         f
-        for ask in asks
-        if ask.repeat == 0 and ask.amplitude == max(loudest)
-        for f in _forecast_ask(robot, ask, rate, kp, kd, uncertainty, cache)
+        for each in excitations
+        if each.repeat == 0 and each.signal.amplitude == max(amplitudes)
+        for f in _forecasts(robot, each, rate, kp, kd, unsure, cache)
     ]
     return SweepPlan(
         robot=robot,
-        asks=asks,
+        excitations=excitations,
         rate_hz=rate,
         settle_s=settle_s,
         stiffness=kp,
         damping=kd,
-        uncertainty=uncertainty,
+        uncertainty=unsure,
         forecasts=tuple(forecasts),
     )
 
 
-def _one_by_one(
-    robot: Robot, names: Sequence[str], signal: Signal, times: Mapping[float, int]
-) -> tuple[Ask, ...]:
-    return tuple(
-        Ask(
-            joints=(name,),
-            signals=(signal.with_amplitude(amplitude),),
-            repeat=repeat,
-            clamped=robot.joint(name).clamped,
-            signs=(robot.joint(name).original[1],),
-        )
-        for name in names
-        for amplitude, count in times.items()
-        for repeat in range(count)
-    )
-
-
-def _forecast_ask(
+def _forecasts(
     robot: Robot,
-    ask: Ask,
+    excitation: Excitation,
     rate_hz: float,
     stiffness: Array,
     damping: Array,
     uncertainty: Uncertainty,
-    cache: dict[bytes, list[Forecast]],
+    cache: dict[str, list[Forecast]],
 ) -> list[Forecast]:
-    """Forecasts of every joint that a question moves; mirror-image legs are simulated once."""
-    kp = dict(zip(robot.joint_names, stiffness.tolist(), strict=True))
-    kd = dict(zip(robot.joint_names, damping.tolist(), strict=True))
-    offsets = dict(zip(ask.joints, ask.offsets(rate_hz).T, strict=True))
-    found: list[Forecast] = []
-    left = list(ask.joints)
-    while left:
-        # The longest chain first: it contains the other excited joints of its leg.
-        lead = max(left, key=lambda name: len(set(_chain(robot, name)) & set(left)))
-        own = _chain(robot, lead)
-        excited = [name for name in left if name in own]
-        left = [name for name in left if name not in own]
-        originals = _chain(robot, robot.joint(lead).original[0])
-        sign = {
-            name: robot.joint(name).original[1] * robot.joint(first).original[1]
-            for name, first in zip(own, originals, strict=True)
-        }
-        mirror = dict(zip(own, originals, strict=True))
-        command = {mirror[name]: sign[name] * offsets[name] for name in excited}
-        gains = [{mirror[name]: g[name] for name in own} for g in (kp, kd)]
-        key = repr((sorted(gains[0].items()), sorted(gains[1].items()))).encode() + b"".join(
-            name.encode() + wave.tobytes() for name, wave in sorted(command.items())
+    """Forecasts of every joint of the chain; mirror-image legs are simulated once."""
+    joint = robot.joint(excitation.joint)
+    original, mirrored = joint.original
+    own = joint.chain or (joint.name,)
+    firsts = robot.joint(original).chain or (original,)
+    signs = [
+        robot.joint(name).original[1] * robot.joint(first).original[1]
+        for name, first in zip(own, firsts, strict=True)
+    ]
+    names = robot.joint_names
+    kp, kd = (
+        {first: float(g[names.index(name)]) for name, first in zip(own, firsts, strict=True)}
+        for g in (stiffness, damping)
+    )
+    sign = mirrored * robot.joint(original).original[1]
+    offsets = sign * excitation.offsets(rate_hz)
+    key = f"{original} {kp} {kd} {offsets.tobytes().hex()}"
+    if key not in cache:
+        cache[key] = forecast(
+            robot,
+            original,
+            offsets,
+            rate_hz=rate_hz,
+            stiffness=kp,
+            damping=kd,
+            uncertainty=uncertainty,
         )
-        if key not in cache:
-            cache[key] = list(
-                forecast(
-                    robot,
-                    command,
-                    rate_hz=rate_hz,
-                    stiffness=gains[0],
-                    damping=gains[1],
-                    uncertainty=uncertainty,
-                ).values()
-            )
-        back = {first: name for name, first in mirror.items()}
-        for f in cache[key]:
-            name = back[f.joint]
-            found.append(replace(f.mirrored(robot, name, sign[name]), excited=ask.joints))
-    return found
+    back = {first: (name, s) for name, first, s in zip(own, firsts, signs, strict=True)}
+    return [
+        replace(f.mirrored(robot, *back[f.joint]), excited=excitation.joint) for f in cache[key]
+    ]

@@ -1,8 +1,7 @@
 """Excitation signals of a joint, as command offsets about the pose.
 
 A signal is sampled at the ticks of the policy (50 Hz) and each sample is held until the next
-tick. Every signal is ramped in and out by half a cosine and its last sample is zero, so that the
-joint is left where it was met.
+tick. Every signal is ramped in and out by half a cosine and its last sample is zero.
 """
 
 from __future__ import annotations
@@ -36,17 +35,16 @@ class Signal(ABC):
     """Length of the ramp at each end [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            PlanError: A number is not finite, not positive or out of order.
-        """
+        """Refuse numbers that are not finite, not positive or out of order."""
         self._positive("amplitude")
-        if not (np.isfinite(self.ramp_s) and self.ramp_s >= 0.0):
-            raise PlanError(
-                f"{type(self).__name__}.ramp_s is {self.ramp_s}; expected 0 s or more, for "
-                "instance 0.5."
-            )
+        self._positive("ramp_s", zero=True)
+
+    def _positive(self, *names: str, zero: bool = False) -> None:
+        for name in names:
+            value = getattr(self, name)
+            if not (np.isfinite(value) and (value > 0.0 or (zero and value == 0.0))):
+                expected = "0 or more" if zero else "a positive number"
+                raise PlanError(f"{type(self).__name__}.{name} is {value}; expected {expected}.")
 
     @property
     @abstractmethod
@@ -67,41 +65,30 @@ class Signal(ABC):
         """
         if self.band_hz[1] > 0.5 * rate_hz * (1.0 + 1e-9):
             raise PlanError(
-                f"{type(self).__name__} asks up to {self.band_hz[1]:g} Hz, but commands at "
+                f"{type(self).__name__} goes up to {self.band_hz[1]:g} Hz, but commands at "
                 f"{rate_hz:g} Hz reach {0.5 * rate_hz:g} Hz; lower the highest frequency."
             )
         return self._samples(rate_hz)
 
+    @abstractmethod
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
         """Instantaneous frequency at the ticks [Hz], shape (ticks,); NaN where there is none."""
-        return self._frequency(rate_hz)
 
     @abstractmethod
     def _samples(self, rate_hz: float) -> Array: ...
-
-    @abstractmethod
-    def _frequency(self, rate_hz: float) -> Array: ...
 
     def duration_s(self, rate_hz: float = POLICY_RATE_HZ) -> float:
         """Time from the first tick to the end of the last one [s]."""
         return len(self.frequency(rate_hz)) / rate_hz
 
-    def with_amplitude(self, amplitude: float) -> Self:
-        """The same question, louder or softer [rad]."""
-        return replace(self, amplitude=amplitude)
-
-    def _positive(self, *names: str) -> None:
-        for name in names:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise PlanError(
-                    f"{type(self).__name__}.{name} is {value}; expected a positive number."
-                )
+    def scaled(self, share: float) -> Self:
+        """The same signal with this share of the amplitude."""
+        return replace(self, amplitude=share * self.amplitude)
 
     def _ordered(self, low: float, high: float) -> None:
         if not (np.isfinite(low) and np.isfinite(high) and 0.0 < low < high):
             raise PlanError(
-                f"{type(self).__name__} asks from {low} to {high} Hz; expected two positive "
+                f"{type(self).__name__} goes from {low} to {high} Hz; expected two positive "
                 "frequencies, the lower one first, for instance 0.1 and 25."
             )
 
@@ -162,7 +149,8 @@ class Chirp(Signal):
         )
         return np.asarray(self.amplitude * wave * ramps(len(time), round(self.ramp_s * rate_hz)))
 
-    def _frequency(self, rate_hz: float) -> Array:
+    def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
+        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
         share = self._time(rate_hz) / self.length_s
         return np.asarray(self.start_hz + (self.stop_hz - self.start_hz) * share)
 
@@ -173,7 +161,8 @@ class LogChirp(Chirp):
 
     kind = "log_chirp"
 
-    def _frequency(self, rate_hz: float) -> Array:
+    def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
+        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
         share = self._time(rate_hz) / self.length_s
         return np.asarray(self.start_hz * (self.stop_hz / self.start_hz) ** share)
 
@@ -182,7 +171,7 @@ class LogChirp(Chirp):
 class Multisine(Signal):
     """Random-phase odd multisine: many sines at once, all odd harmonics of one period.
 
-    Even harmonics are left silent, so whatever answers there is nonlinearity. Of `draws` seeded
+    Even harmonics are left silent, so a response there is nonlinearity. Of `draws` seeded
     phase draws the one with the smallest crest factor (peak over root mean square) is taken. The
     ramps lie outside the whole periods. (Pintelon and Schoukens, *System Identification: A
     Frequency Domain Approach*, 2nd ed., sections 2.6 and 4.3.)
@@ -210,8 +199,7 @@ class Multisine(Signal):
         super().__post_init__()
         self._positive("length_s", "lines", "periods", "draws")
         self._ordered(self.low_hz, self.high_hz)
-        if not (np.isfinite(self.tilt) and self.tilt >= 0.0):
-            raise PlanError(f"Multisine.tilt is {self.tilt}; expected 0 or more.")
+        self._positive("tilt", zero=True)
         if any(h < 1 or h % 2 == 0 for h in self.harmonics):
             raise PlanError(
                 f"Multisine.harmonics are {self.harmonics}; expected odd positive numbers."
@@ -224,10 +212,16 @@ class Multisine(Signal):
 
     @property
     def harmonic_numbers(self) -> tuple[int, ...]:
-        """Excited odd harmonics, increasing."""
+        """Excited odd harmonics, increasing: those nearest to a logarithmic grid."""
         if self.harmonics:
             return tuple(sorted(set(self.harmonics)))
-        return odd_harmonics(self.low_hz, self.high_hz, self.length_s, self.lines)
+        low, high = self.low_hz * self.length_s, self.high_hz * self.length_s
+        lowest = 2 * int(np.ceil((low * (1.0 - 1e-9) - 1.0) / 2.0)) + 1
+        highest = 2 * int(np.floor((high * (1.0 + 1e-9) - 1.0) / 2.0)) + 1
+        if lowest > highest:
+            return ()
+        odd = 2 * np.round((np.geomspace(low, high, self.lines) - 1.0) / 2.0).astype(int) + 1
+        return tuple(int(h) for h in np.unique(np.clip(odd, lowest, highest)))
 
     @property
     def lines_hz(self) -> Array:
@@ -284,21 +278,10 @@ class Multisine(Signal):
         index = np.arange(-ramp, count + max(ramp, 1)) % ticks
         return np.asarray(self.one_period(rate_hz)[index] * ramps(len(index), ramp))
 
-    def _frequency(self, rate_hz: float) -> Array:
+    def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
+        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
         ticks, ramp = self._ticks(rate_hz)
         return np.full(self.periods * ticks + ramp + max(ramp, 1), np.nan)
-
-
-def odd_harmonics(low_hz: float, high_hz: float, period_s: float, lines: int) -> tuple[int, ...]:
-    """Odd multiples of `1 / period_s` nearest to a logarithmic grid between two frequencies."""
-    slack = 1e-9
-    lowest = 2 * int(np.ceil((low_hz * period_s * (1.0 - slack) - 1.0) / 2.0)) + 1
-    highest = 2 * int(np.floor((high_hz * period_s * (1.0 + slack) - 1.0) / 2.0)) + 1
-    wanted = np.geomspace(low_hz, high_hz, lines) * period_s
-    odd = 2 * np.round((wanted - 1.0) / 2.0).astype(int) + 1
-    if lowest > highest:
-        return ()
-    return tuple(int(h) for h in np.unique(np.clip(odd, lowest, highest)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,14 +308,12 @@ class SineSteps(Signal):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._positive("settle_cycles", "measure_cycles")
+        self._positive("settle_s", "measure_s", zero=True)
         bad = [f for f in self.frequencies_hz if not (np.isfinite(f) and f > 0.0)]
         if bad or not self.frequencies_hz:
             raise PlanError(
                 f"SineSteps.frequencies_hz are {self.frequencies_hz}; expected positive numbers."
             )
-        for name in ("settle_s", "measure_s"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise PlanError(f"SineSteps.{name} is {getattr(self, name)}; expected 0 or more.")
 
     @property
     def band_hz(self) -> tuple[float, float]:
@@ -340,15 +321,11 @@ class SineSteps(Signal):
         return min(self.frequencies_hz), max(self.frequencies_hz)
 
     def windows(self, rate_hz: float = POLICY_RATE_HZ) -> tuple[tuple[int, int, float], ...]:
-        """First tick, end tick and exact frequency [Hz] of each measurement, whole cycles.
-
-        Raises:
-            PlanError: A frequency does not lie below half the rate.
-        """
+        """First tick, end tick and exact frequency [Hz] of each measurement, whole cycles."""
         if max(self.frequencies_hz) >= 0.5 * rate_hz:
             raise PlanError(
-                f"SineSteps asks {max(self.frequencies_hz):g} Hz, but commands at {rate_hz:g} Hz "
-                f"stay below {0.5 * rate_hz:g} Hz; lower the highest frequency."
+                f"SineSteps goes up to {max(self.frequencies_hz):g} Hz, but commands at "
+                f"{rate_hz:g} Hz stay below {0.5 * rate_hz:g} Hz; lower the highest frequency."
             )
         windows, tick = [], round(self.ramp_s * rate_hz)
         for wanted in self.frequencies_hz:
@@ -360,7 +337,8 @@ class SineSteps(Signal):
             tick += settle + measured
         return tuple(windows)
 
-    def _frequency(self, rate_hz: float) -> Array:
+    def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
+        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
         windows = self.windows(rate_hz)
         ramp = round(self.ramp_s * rate_hz)
         frequency = np.full(windows[-1][1] + max(ramp, 1), np.nan)

@@ -1,7 +1,7 @@
-"""What a question will do to the robot, computed before anything moves.
+"""Worst case of an excitation, simulated before anything moves.
 
-The question is put to the bench model with the gains of the real drives, once for every corner of
-what is not known of the robot. A plan that exceeds a limit in any corner is refused.
+The bench model with the gains of the real drives is simulated once for every corner of the robot's
+uncertainty. A plan that exceeds a limit in any corner is refused.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TIMESTEP_S = 0.001
 within 2 % of those at 0.25 ms, far inside the corners below."""
 
 SETTLE_S = 0.5
-"""Rest before the question, in which the leg sags into its pose [s]."""
+"""Rest before the excitation, in which the leg sags into its pose [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,14 +52,11 @@ class Uncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class Forecast:
-    """Extremes of one joint over a question and over every corner of the uncertainty.
-
-    The `nominal_` values are those of the model itself.
-    """
+    """Extremes of one joint over an excitation and over every corner of the uncertainty."""
 
     joint: str
-    excited: tuple[str, ...] = ()
-    """Joints of the question: this one, or neighbours of it."""
+    excited: str
+    """The excited joint: this one, or a neighbour of it."""
     amplitude: float
     """Peak of the command [rad]; 0 for a joint that is only held."""
     lowest: float
@@ -73,7 +70,7 @@ class Forecast:
     no_load_speed: float
     """Speed at which back-EMF takes the whole bus voltage [rad/s]."""
     torque: float
-    """Greatest torque that the controller asks for [N m]."""
+    """Greatest torque that the controller commands [N m]."""
     effort_limit: float
     """Greatest torque that the drive gives [N m]."""
     torque_share: float
@@ -84,12 +81,6 @@ class Forecast:
     """Greatest power from the bus [W]."""
     bus_current: float
     """Greatest current from the bus [A]."""
-    nominal_excursion: float
-    """Greatest distance from the pose [rad]."""
-    nominal_speed: float
-    """[rad/s]"""
-    nominal_torque: float
-    """[N m]"""
 
     def breaches(self) -> list[str]:
         """What could be exceeded: what the joint could do, and the limit, in words."""
@@ -107,7 +98,7 @@ class Forecast:
         if self.torque_share > 1.0:
             found.append(
                 f"need {self.torque_share:.2f} times the torque that its drive gives at the speed "
-                f"of the moment (it asks for up to {self.torque:.1f} N m, the limit at standstill "
+                f"of the moment (up to {self.torque:.1f} N m, the limit at standstill "
                 f"is {self.effort_limit:.1f} N m)"
             )
         return found
@@ -138,20 +129,21 @@ class Forecast:
 
 def forecast(
     robot: Robot,
-    offsets: Mapping[str, Array],
+    joint: str,
+    offsets: Array,
     *,
     rate_hz: float,
     stiffness: Mapping[str, float],
     damping: Mapping[str, float],
     uncertainty: Uncertainty | None = None,
     timestep_s: float = TIMESTEP_S,
-) -> dict[str, Forecast]:
-    """Ask the bench model, in every corner of the uncertainty.
+) -> list[Forecast]:
+    """Simulate the bench model in every corner of the uncertainty.
 
     Args:
         robot: The robot.
-        offsets: Command offsets about the default pose by joint [rad], shape (ticks,), for the
-            joints of one chain.
+        joint: The excited joint.
+        offsets: Command offsets about the default pose [rad], shape (ticks,).
         rate_hz: Rate of the ticks.
         stiffness: Gains of the real drives by joint [N m/rad].
         damping: Gains of the real drives by joint [N m s/rad].
@@ -162,53 +154,33 @@ def forecast(
         A forecast for every joint of the chain, those that are only held included.
 
     Raises:
-        PlanError: No chain holds all of the joints, or the simulation diverges.
+        PlanError: The simulation diverges.
     """
-    lead = next((n for n in offsets if set(offsets) <= set(robot.joint(n).chain or (n,))), None)
-    if lead is None:
-        raise PlanError(
-            f"{', '.join(offsets)} cannot be excited together: one is clamped while another moves."
-        )
-    joint = robot.joint(lead)
-    chain = joint.chain or (joint.name,)
-    spec = bench_spec(
-        robot,
-        joint.name,
-        stiffness={n: stiffness[n] for n in chain},
-        damping={n: damping[n] for n in chain},
-    )
+    spec = bench_spec(robot, joint, stiffness=stiffness, damping=damping)
     spec.option.timestep = timestep_s
     model = spec.compile()
     order = [model.actuator(i).name for i in range(model.nu)]
     pose = np.array([robot.joint(n).default_position for n in order])
-    command = np.tile(pose, (len(next(iter(offsets.values()))), 1))
-    for name, values in offsets.items():
-        command[:, order.index(name)] += values
-    held = np.vstack([np.tile(pose, (round(SETTLE_S * rate_hz), 1)), command])
-    steps = np.repeat(held, round(1.0 / (rate_hz * timestep_s)), axis=0)
+    command = np.tile(pose, (round(SETTLE_S * rate_hz) + len(offsets), 1))
+    command[-len(offsets) :, order.index(joint)] += offsets
+    steps = np.repeat(command, round(1.0 / (rate_hz * timestep_s)), axis=0)
     corners = (uncertainty or Uncertainty()).corners()
-    gains = [(np.array([stiffness[n] for n in order]), np.array([damping[n] for n in order]))]
-    models = [_altered(model, robot, order, gains[0], corner) for corner in corners]
+    models = [_altered(model, robot, order, stiffness, damping, corner) for corner in corners]
     position, velocity = _roll(models, order, steps)
     if not (np.isfinite(position).all() and np.abs(velocity).max() < 1e4):
         raise PlanError(
-            f"{lead}: the simulation of the excitation diverges; its gains "
-            f"({stiffness[lead]:g} N m/rad, {damping[lead]:g} N m s/rad) are not stable."
+            f"{joint}: the simulation of the excitation diverges; its gains "
+            f"({stiffness[joint]:g} N m/rad, {damping[joint]:g} N m s/rad) are not stable."
         )
-    forecasts = {}
+    scale = np.array([corner[1] for corner in corners])[:, None]
+    forecasts = []
     for i, name in enumerate(order):
-        scale = np.array([corner[1] for corner in corners])[:, None]
+        q, v = position[..., i], velocity[..., i]
         torque = pd_torque(
-            steps[:, i],
-            position[..., i],
-            velocity[..., i],
-            stiffness=scale * stiffness[name],
-            damping=scale * damping[name],
+            steps[:, i], q, v, stiffness=scale * stiffness[name], damping=scale * damping[name]
         )
-        amplitude = float(np.abs(offsets[name]).max()) if name in offsets else 0.0
-        forecasts[name] = _extremes(
-            robot, name, amplitude, position[..., i], velocity[..., i], torque
-        )
+        amplitude = float(np.abs(offsets).max()) if name == joint else 0.0
+        forecasts.append(_extremes(robot, joint, name, amplitude, q, v, torque))
     return forecasts
 
 
@@ -216,7 +188,8 @@ def _altered(
     model: mujoco.MjModel,
     robot: Robot,
     order: Sequence[str],
-    gains: tuple[Array, Array],
+    stiffness: Mapping[str, float],
+    damping: Mapping[str, float],
     corner: tuple[float, float, float],
 ) -> mujoco.MjModel:
     """A copy of the model in one corner of the uncertainty."""
@@ -227,9 +200,9 @@ def _altered(
     altered.dof_armature[:] *= inertia
     altered.dof_frictionloss[:] *= friction
     mujoco.mj_setConst(altered, mujoco.MjData(altered))
-    for name, kp, kd in zip(order, *gains, strict=True):
-        drive = robot.joint(name).drive
-        set_drive_gains(altered, name, drive, float(torque * kp), float(torque * kd))
+    for name in order:
+        gains = torque * stiffness[name], torque * damping[name]
+        set_drive_gains(altered, name, robot.joint(name).drive, *gains)
     return altered
 
 
@@ -260,14 +233,19 @@ def _roll(
 
 
 def _extremes(
-    robot: Robot, name: str, amplitude: float, position: Array, velocity: Array, torque: Array
+    robot: Robot,
+    excited: str,
+    name: str,
+    amplitude: float,
+    position: Array,
+    velocity: Array,
+    torque: Array,
 ) -> Forecast:
-    """Extremes over time and corners; the first row is the model itself. Shapes (corners, n)."""
-    joint = robot.joint(name)
-    drive = joint.drive
+    """Extremes over time and corners, shapes (corners, n)."""
+    drive = robot.joint(name).drive
     low, high = torque_limits(velocity, drive.stall_torque, drive.no_load_speed, drive.effort_limit)
     # A drive that can give nothing at this speed exceeds its limit with any command.
-    room = np.maximum(np.where(torque >= 0.0, high, -low), 1e-6)
+    available = np.maximum(np.where(torque >= 0.0, high, -low), 1e-6)
     given = np.clip(torque, low, high)
     power = electrical_power(
         given,
@@ -279,19 +257,17 @@ def _extremes(
     )
     return Forecast(
         joint=name,
+        excited=excited,
         amplitude=amplitude,
         lowest=float(position.min()),
         highest=float(position.max()),
-        range=joint.range,
+        range=robot.joint(name).range,
         speed=float(np.abs(velocity).max()),
         no_load_speed=drive.no_load_speed,
         torque=float(np.abs(torque).max()),
         effort_limit=drive.effort_limit,
-        torque_share=float((np.abs(torque) / room).max()),
+        torque_share=float((np.abs(torque) / available).max()),
         mechanical_power=float((given * velocity).max()),
         electrical_power=float(power.max()),
         bus_current=float(bus_current(power, drive.bus_voltage).max()),
-        nominal_excursion=float(np.abs(position[0] - joint.default_position).max()),
-        nominal_speed=float(np.abs(velocity[0]).max()),
-        nominal_torque=float(np.abs(torque[0]).max()),
     )

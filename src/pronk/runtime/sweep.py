@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.excitation.plan import POSE_RAMP_S, Ask, SweepPlan
+from pronk.excitation.plan import POSE_RAMP_S, Excitation, SweepPlan
 from pronk.links.machine import Command, Machine, State, TorqueKind
 from pronk.logs.joint_log import Segment
 from pronk.logs.mcap_log import LogHeader, McapLogWriter, reason_of
@@ -62,25 +62,25 @@ class SweepTask:
     """Added to the logs' own, for instance the link."""
 
     @property
-    def sets(self) -> list[tuple[str, ...]]:
-        """Joints that are excited together; one log each."""
-        chosen = set(self.plan.joints if self.joints is None else self.joints)
-        return [names for names in self.plan.sets if set(names) & chosen]
+    def excited(self) -> list[str]:
+        """Joints that are excited, one log each."""
+        wanted = self.plan.joints if self.joints is None else self.joints
+        return [name for name in self.plan.joints if name in wanted]
 
     @property
     def paths(self) -> list[Path]:
         """Of the logs."""
-        return [self.out_dir / f"{'_and_'.join(names)}.mcap" for names in self.sets]
+        return [self.out_dir / f"{name}.mcap" for name in self.excited]
 
-    def excitations(self, index: int) -> list[Ask]:
+    def excitations(self, index: int) -> list[Excitation]:
         """Excitations of one log."""
-        return [ask for ask in self.plan.asks if ask.joints == self.sets[index]]
+        return [each for each in self.plan.excitations if each.joint == self.excited[index]]
 
     @property
     def seconds(self) -> float:
         """Of all excitations [s]."""
-        sets = self.sets
-        return sum(self.plan.ask_duration_s(ask) for ask in self.plan.asks if ask.joints in sets)
+        excited = self.excited
+        return sum(self.plan.seconds(e) for e in self.plan.excitations if e.joint in excited)
 
     def check(self) -> None:
         """Refuse a task that cannot be carried out, before anything moves.
@@ -92,7 +92,7 @@ class SweepTask:
         """
         for name in self.joints or ():
             self.plan.robot.joint(name)
-        if not self.sets:
+        if not self.excited:
             raise HardwareError(
                 f"the plan excites {', '.join(self.plan.joints)}, none of "
                 f"{', '.join(self.joints or ())}."
@@ -107,7 +107,7 @@ class SweepTask:
     def open_log(self, index: int, *, virtual: bool, torque_kind: str) -> McapLogWriter:
         """Begin one log."""
         plan, columns = self.plan, self.columns(index)
-        logged = logged_joints(plan.robot, self.sets[index])
+        logged = logged_joints(plan.robot, self.excited[index])
         header = LogHeader(
             robot=plan.robot.name,
             joints=logged,
@@ -118,7 +118,7 @@ class SweepTask:
             virtual=virtual,
             metadata={
                 "command_rate_hz": f"{plan.rate_hz:g}",
-                "excited": ", ".join(self.sets[index]),
+                "excited": self.excited[index],
                 "torque": torque_kind,
                 **self.metadata,
             },
@@ -128,23 +128,23 @@ class SweepTask:
     def columns(self, index: int) -> NDArray[np.intp]:
         """Joints of one log among the robot's."""
         names = self.plan.robot.joint_names
-        logged = logged_joints(self.plan.robot, self.sets[index])
+        logged = logged_joints(self.plan.robot, self.excited[index])
         return np.array([names.index(name) for name in logged], dtype=np.intp)
 
     def segment(self, index: int, number: int, start: float) -> Segment:
         """One excitation of a log, by its number in it; `start` on the machine's clock [s]."""
-        plan, ask = self.plan, self.excitations(index)[number]
-        bands = [signal.band_hz for signal in ask.signals]
+        plan, excitation = self.plan, self.excitations(index)[number]
+        signal = excitation.signal
         return Segment(
-            kind=ask.signals[0].kind,
-            joints=ask.joints,
+            kind=signal.kind,
+            joints=(excitation.joint,),
             start=start,
-            stop=start + plan.ask_duration_s(ask) - 1.0 / plan.rate_hz / 2.0,
-            amplitude=ask.amplitude,
-            repeat=ask.repeat,
-            band_hz=(min(low for low, _ in bands), max(high for _, high in bands)),
-            period_s=ask.signals[0].period_s,
-            clamped=ask.clamped,
+            stop=start + plan.seconds(excitation) - 1.0 / plan.rate_hz / 2.0,
+            amplitude=signal.amplitude,
+            repeat=excitation.repeat,
+            band_hz=signal.band_hz,
+            period_s=signal.period_s,
+            clamped=excitation.clamped,
         )
 
     def limits(self, torque_kind: TorqueKind, **changed: float) -> Limits:
@@ -413,9 +413,9 @@ class SweepController:
             self._check_at_pose()
             yield from self._clamp(excitations[0].clamped)
             yield from self._rest(self.plan.settle_s)
-            for number, ask in enumerate(excitations):
-                yield from self._excite(number, ask, done)
-                done += self.plan.ask_duration_s(ask)
+            for number, excitation in enumerate(excitations):
+                yield from self._excite(number, excitation, done)
+                done += self.plan.seconds(excitation)
             yield from self._clamp(())
             self.end("")
             self.progress(done / self._seconds, f"wrote {path.name}")
@@ -464,18 +464,18 @@ class SweepController:
             )
         self.limits = self.strict
 
-    def _excite(self, number: int, ask: Ask, done: float) -> Iterator[SweepStep]:
+    def _excite(self, number: int, excitation: Excitation, done: float) -> Iterator[SweepStep]:
         """One excitation and the rest after it."""
-        names, rate = self.plan.robot.joint_names, self.plan.rate_hz
-        columns = [names.index(name) for name in ask.joints]
-        frequency = ask.frequency(rate)
+        rate, signal = self.plan.rate_hz, excitation.signal
+        column = self.plan.robot.joint_names.index(excitation.joint)
+        frequency = signal.frequency(rate)
         # An excitation begins one tick after the last one's rest, so that no sample is in both.
         yield SweepStep(target=self.plan.pose)
         self._put(SampleKind.SEGMENT, number=number, time=self.now)
-        what = f"{', '.join(ask.joints)}: {ask.amplitude:g} rad, repeat {ask.repeat + 1}"
-        for k, offset in enumerate(ask.offsets(rate)):
+        what = f"{excitation.joint}: {signal.amplitude:g} rad, repeat {excitation.repeat + 1}"
+        for k, offset in enumerate(excitation.offsets(rate)):
             target = self.plan.pose.copy()
-            target[columns] += offset
+            target[column] += offset
             yield SweepStep(target=target, frequency=float(frequency[k]), segment=number)
             if k % _PROGRESS_TICKS == 0:
                 self.progress(min((done + k * self.tick) / self._seconds, 1.0), what)
@@ -561,10 +561,8 @@ def _run(controller: SweepController) -> None:
         raise
 
 
-def logged_joints(robot: Robot, excited: Sequence[str]) -> tuple[str, ...]:
-    """Joints that can move with the excited ones or are clamped: their leg, file order."""
-    wanted: set[str] = set()
-    for name in excited:
-        joint = robot.joint(name)
-        wanted |= {name, *joint.chain, *joint.clamped}
+def logged_joints(robot: Robot, excited: str) -> tuple[str, ...]:
+    """Joints that can move with the excited one or are clamped: their leg, file order."""
+    joint = robot.joint(excited)
+    wanted = {excited, *joint.chain, *joint.clamped}
     return tuple(name for name in robot.joint_names if name in wanted)
