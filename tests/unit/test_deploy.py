@@ -1,4 +1,4 @@
-"""Deployment's parts: memory, pacing, paths, state machine, pre-flight, operators, log."""
+"""Parts of the runtime: shared memory, pacing, paths, state machine, pre-flight, operators, log."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import pronk.runtime.log
 from pronk.errors import HardwareError, LogError, RobotError
 from pronk.links.machine import State
 from pronk.links.realtime import Histogram, Pace
-from pronk.logs.mcap import MOST_BYTES, DamagedError, McapWriter, records
+from pronk.logs.mcap import DamagedError, McapWriter, records
 from pronk.robots import load_robot
 from pronk.runtime.ipc import (
     EVENT,
@@ -32,6 +31,7 @@ from pronk.runtime.ipc import (
     Mailbox,
     Mode,
     OperatorRequest,
+    PolicyAction,
     Ring,
     Shared,
     block,
@@ -45,7 +45,6 @@ from pronk.runtime.safety import FilterAction, FilterState, Limits, Reason, faul
 from pronk.runtime.script import Script
 from pronk.runtime.state_machine import (
     FIRST_ACTION_S,
-    PolicyAction,
     StateMachine,
     Timing,
     folded_pose,
@@ -60,6 +59,7 @@ LIMITS = Limits.of(ROBOT)
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
 LYING = folded_pose(ROBOT)
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
+FORWARD = (1.0, 0.0, 0.0)
 
 
 def state(**changes: Any) -> State:
@@ -89,7 +89,6 @@ def pair(number: int) -> np.ndarray:
 
 @contextmanager
 def shared_block(slots: int) -> Iterator[np.ndarray]:
-    """A block in shared memory."""
     kind = block(PAIR, slots)
     memory = shared_memory.SharedMemory(create=True, size=kind.itemsize)
     try:
@@ -116,8 +115,7 @@ def test_a_mailbox_never_gives_half_a_record() -> None:
                 continue
             assert (record["b"] == record["a"]).all()
             assert record["a"] >= seen
-            seen = int(record["a"])
-            reads += 1
+            seen, reads = int(record["a"]), reads + 1
         writer.join()
         assert reads > 10
 
@@ -156,25 +154,15 @@ def test_shared_memory_is_attached_by_name_and_removed_once() -> None:
         Shared(shared.name)
 
 
-def test_a_state_survives_the_way_through_memory() -> None:
-    rng = np.random.default_rng(0)
-    one = state(
-        time=3.0,
-        sequence=7,
-        position=rng.standard_normal(12),
-        temperature=rng.standard_normal(12),
-        robot_time=5.0,
-    )
+@pytest.mark.parametrize("measured", [{}, {"temperature": np.arange(12.0), "robot_time": 5.0}])
+def test_a_state_survives_the_way_through_memory(measured: dict[str, Any]) -> None:
+    position = np.random.default_rng(0).standard_normal(12)
+    one = state(time=3.0, sequence=7, position=position, **measured)
     record = np.zeros((), dtype=TICK)
     put_state(record, one)
     back = get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
-    assert (back.time, back.sequence, back.robot_time) == (3.0, 7, 5.0)
-    for name in ("position", "temperature", "orientation", "accelerometer"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(one, name))
-    put_state(record, state())
-    back = get_state(np.frombuffer(record.tobytes(), dtype=TICK)[0])
-    assert back.temperature is None
-    assert back.robot_time is None
+    for name, value in vars(one).items():
+        np.testing.assert_array_equal(getattr(back, name), value)
 
 
 # --- Pacing -------------------------------------------------------------------------------------
@@ -193,6 +181,7 @@ def test_a_pace_leaves_out_what_has_passed() -> None:
 @given(st.lists(st.floats(1e-6, 1.0), min_size=1, max_size=300), st.floats(0.01, 1.0))
 def test_quantiles_are_those_of_the_numbers_to_a_bin(values: list[float], share: float) -> None:
     histogram = Histogram()
+    assert math.isnan(histogram.quantile(0.5))
     for value in values:
         histogram.add(value)
     exact = sorted(values)[max(1, math.ceil(share * len(values) - 1e-9)) - 1]
@@ -201,21 +190,13 @@ def test_quantiles_are_those_of_the_numbers_to_a_bin(values: list[float], share:
     assert histogram.quantile(1.0) == max(values)
 
 
-def test_an_empty_histogram_knows_nothing() -> None:
-    assert math.isnan(Histogram().quantile(0.5))
-
-
 # --- Paths --------------------------------------------------------------------------------------
 
 
-def test_minimum_jerk_by_hand() -> None:
+def test_standing_up_begins_at_the_measured_pose_and_ends_at_the_default_pose() -> None:
     assert [minimum_jerk(s) for s in (-1.0, 0.0, 0.5, 1.0, 2.0)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     assert minimum_jerk(0.25) == pytest.approx(10 / 64 - 15 / 256 + 6 / 1024)
-
-
-def test_the_way_up_begins_where_the_robot_is_and_ends_standing() -> None:
-    rng = np.random.default_rng(1)
-    measured = LYING + 0.2 * rng.standard_normal(12)
+    measured = LYING + 0.2 * np.random.default_rng(1).standard_normal(12)
     path = stand_up(ROBOT, measured, 5.0, Timing(fold_s=1.0, rise_s=2.0, ramp_s=0.5))
     np.testing.assert_array_equal(path.target(5.0), measured)
     np.testing.assert_allclose(path.target(6.0), LYING)
@@ -226,12 +207,9 @@ def test_the_way_up_begins_where_the_robot_is_and_ends_standing() -> None:
     targets = np.array([path.target(5.0 + k / 500) for k in range(1501)])
     fastest = 1.875 * max(np.abs(LYING - measured).max() / 1.0, np.abs(POSE - LYING).max() / 2.0)
     assert np.abs(np.diff(targets, axis=0)).max() * 500 <= fastest * 1.001
-
-
-def test_the_way_down_ends_folded() -> None:
-    path = sit_down(ROBOT, POSE, 0.0, Timing(sit_s=1.0))
-    np.testing.assert_allclose(path.target(2.0), LYING)
-    assert path.stiffness(0.0) == 1.0
+    down = sit_down(ROBOT, POSE, 0.0, Timing(sit_s=1.0))
+    np.testing.assert_allclose(down.target(2.0), LYING)
+    assert down.stiffness(0.0) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -241,20 +219,15 @@ def test_the_folded_pose_has_the_feet_under_the_hips(name: str, thigh: float, sh
     robot = load_robot(name)
     pose, limits = folded_pose(robot), Limits.of(robot)
     pitch, knee = pose[1], pose[2]
-    forward = -thigh * math.sin(pitch) - shank * math.sin(pitch + knee)
-    down = thigh * math.cos(pitch) + shank * math.cos(pitch + knee)
-    assert abs(forward) < 0.03
-    assert 0.09 < down < 0.16
+    assert abs(thigh * math.sin(pitch) + shank * math.sin(pitch + knee)) < 0.03
+    assert 0.09 < thigh * math.cos(pitch) + shank * math.cos(pitch + knee) < 0.16
     assert (limits.low + limits.margin < pose).all()
     assert (limits.high - limits.margin > pose).all()
 
 
-def test_an_arm_has_no_pose_to_lie_in() -> None:
+def test_an_arm_has_no_folded_pose_and_a_time_is_not_negative() -> None:
     with pytest.raises(RobotError, match="so101"):
         folded_pose(load_robot("so101"))
-
-
-def test_a_time_that_is_none_is_refused() -> None:
     with pytest.raises(RobotError, match="rise_s"):
         Timing(rise_s=-1.0)
 
@@ -263,14 +236,18 @@ def test_a_time_that_is_none_is_refused() -> None:
 
 
 class Run:
-    """A machine_state on a clock of its own."""
+    """A state machine on a clock of its own."""
 
     def __init__(self, **times: float) -> None:
-        self.machine_state = StateMachine(ROBOT, Timing(**times))
+        self.machine = StateMachine(ROBOT, Timing(**times))
         self.memory = FilterState()
         self.t = 0.0
         self.action: PolicyAction | None = None
         self.objection = ""
+
+    @property
+    def mode(self) -> Mode:
+        return self.machine.mode
 
     def tick(
         self,
@@ -280,13 +257,13 @@ class Run:
     ) -> Any:
         self.t += seconds
         if request is not OperatorRequest.NONE:
-            self.machine_state.request(request)
-        intent, self.memory = self.machine_state.step(
+            self.machine.request(request)
+        desired, self.memory = self.machine.step(
             self.t, state(position=q), self.memory, self.action, objection=self.objection
         )
         if self.memory.faulted:
-            self.machine_state.faulted(self.t)
-        return intent
+            self.machine.faulted(self.t)
+        return desired
 
     def give(self, target: np.ndarray, entry: int | None = None) -> None:
         self.action = PolicyAction(
@@ -295,140 +272,135 @@ class Run:
             state_time=self.t,
             made=self.t,
             valid_for=0.05,
-            entry=self.machine_state.entry if entry is None else entry,
+            entry=self.machine.entry if entry is None else entry,
             position=target,
         )
 
     def standing(self) -> Run:
-        self.machine_state.preflighted((), self.t)
+        self.machine.preflighted((), self.t)
         self.tick(0.0, OperatorRequest.STAND)
         self.tick(1.0)
         self.tick(2.5)
-        assert self.machine_state.mode is Mode.STAND
+        assert self.mode is Mode.STAND
         return self
 
 
 def test_nothing_is_sent_before_and_without_the_checks() -> None:
     run = Run()
     assert run.tick().silent
-    run.machine_state.enter(Mode.PREFLIGHT, run.t)
+    run.machine.enter(Mode.PREFLIGHT, run.t)
     assert run.tick(request=OperatorRequest.STAND).silent
-    run.machine_state.preflighted(("the battery is empty.",), run.t)
-    assert run.machine_state.mode is Mode.IDLE
+    run.machine.preflighted(("the battery is empty.",), run.t)
+    assert run.mode is Mode.IDLE
     assert run.tick(5.0, OperatorRequest.STAND).silent
-    assert run.machine_state.refusals == ("the battery is empty.",)
+    assert run.machine.refusals == ("the battery is empty.",)
 
 
-def test_the_whole_way() -> None:
+def test_the_whole_course() -> None:
     run = Run(blend_s=0.4, halt_s=1.0, sit_s=1.5)
-    run.machine_state.preflighted((), 0.0)
-    intent = run.tick()
-    assert not intent.silent
-    assert intent.command is None
+    run.machine.preflighted((), 0.0)
+    desired = run.tick()
+    assert not desired.silent
+    assert desired.command is None
     run.tick(0.5, OperatorRequest.STAND)
-    assert run.machine_state.mode is Mode.DAMP, "it has not sunk yet"
-    intent = run.tick(0.5)
-    assert run.machine_state.mode is Mode.STAND
-    np.testing.assert_array_equal(intent.command.position, LYING)
-    assert (intent.command.stiffness == 0.0).all()
+    assert run.mode is Mode.DAMP, "it has not sunk yet"
+    desired = run.tick(0.5)
+    assert run.mode is Mode.STAND
+    np.testing.assert_array_equal(desired.command.position, LYING)
+    assert (desired.command.stiffness == 0.0).all()
     run.tick(2.0, OperatorRequest.WALK)
-    assert run.machine_state.mode is Mode.STAND, "it is not up yet"
-    intent = run.tick(0.5)
-    assert run.machine_state.mode is Mode.POLICY
-    np.testing.assert_allclose(intent.command.position, POSE)
+    assert run.mode is Mode.STAND, "it is not up yet"
+    desired = run.tick(0.5)
+    assert run.mode is Mode.POLICY
+    np.testing.assert_allclose(desired.command.position, POSE)
     # An action for another mode is not followed; the first for this one is blended in.
-    run.give(POSE + 0.4, entry=run.machine_state.entry - 1)
+    run.give(POSE + 0.4, entry=run.machine.entry - 1)
     np.testing.assert_allclose(run.tick(0.02).command.position, POSE)
     run.give(POSE + 0.4)
     assert run.tick(0.02).blend == 0.0
     run.give(POSE + 0.4)
-    intent = run.tick(0.2)
-    assert intent.blend == pytest.approx(0.5)
-    np.testing.assert_allclose(intent.command.position, POSE + 0.2)
-    assert (intent.command.made, intent.command.state_sequence) == (run.action.made, 3)
+    desired = run.tick(0.2)
+    assert desired.blend == pytest.approx(0.5)
+    np.testing.assert_allclose(desired.command.position, POSE + 0.2)
+    assert run.action is not None
+    assert (desired.command.made, desired.command.state_sequence) == (run.action.made, 3)
     np.testing.assert_allclose(run.tick(0.2).command.position, POSE + 0.4)
     # Down: the policy first comes to a halt.
-    intent = run.tick(0.0, OperatorRequest.SIT)
-    assert run.machine_state.mode is Mode.HALT
-    assert intent.blend == 1.0
+    desired = run.tick(0.0, OperatorRequest.SIT)
+    assert (run.mode, desired.blend) == (Mode.HALT, 1.0)
     run.tick(1.0, q=POSE)
-    intent = run.tick(0.0, q=POSE)
-    assert run.machine_state.mode is Mode.SIT
-    np.testing.assert_array_equal(intent.command.position, POSE)
-    intent = run.tick(1.5, q=POSE)
-    assert run.machine_state.mode is Mode.DAMP
-    assert intent.command is None
+    desired = run.tick(0.0, q=POSE)
+    assert run.mode is Mode.SIT
+    np.testing.assert_array_equal(desired.command.position, POSE)
+    assert run.tick(1.5, q=POSE).command is None
+    assert run.mode is Mode.DAMP
 
 
-@pytest.mark.parametrize("wanted", [OperatorRequest.DAMP, OperatorRequest.QUIT])
-def test_damping_comes_at_once(wanted: OperatorRequest) -> None:
+@pytest.mark.parametrize("request_", [OperatorRequest.DAMP, OperatorRequest.QUIT])
+def test_damping_comes_at_once(request_: OperatorRequest) -> None:
     run = Run().standing()
-    assert run.tick(0.0, wanted).command is None
-    assert run.machine_state.mode is Mode.DAMP
-    assert run.machine_state.quitting() is (wanted is OperatorRequest.QUIT)
+    assert run.tick(0.0, request_).command is None
+    assert run.mode is Mode.DAMP
+    assert run.machine.quitting() is (request_ is OperatorRequest.QUIT)
 
 
-def test_a_policy_that_never_answers_is_a_fault() -> None:
+def test_a_policy_without_a_first_action_is_a_fault() -> None:
     run = Run().standing()
     run.tick(0.0, OperatorRequest.WALK)
     assert run.tick(FIRST_ACTION_S - 0.01).command is not None
     assert run.tick(0.02).command is None
-    assert (run.memory.reason, run.machine_state.mode) == (Reason.EXPIRED, Mode.FAULT)
+    assert (run.memory.reason, run.mode) == (Reason.EXPIRED, Mode.FAULT)
 
 
-@pytest.mark.parametrize("answers", [0, 1])
-def test_commanded_to_sit_at_once_the_policy_still_acts(answers: int) -> None:
+@pytest.mark.parametrize("later", [0, 1])
+def test_commanded_to_sit_at_once_the_policy_still_acts(later: int) -> None:
     run = Run(halt_s=1.0).standing()
     run.tick(0.0, OperatorRequest.WALK)
-    walking = run.machine_state.entry
+    walking = run.machine.entry
     run.give(POSE + 0.4, entry=walking - 1)
     run.tick(0.002, OperatorRequest.SIT)
-    assert (run.machine_state.mode, run.machine_state.entry) == (Mode.HALT, walking + 1)
-    # It knows nothing of the halt yet, or nothing of the walk before it.
-    run.give(POSE + 0.4, entry=walking + answers)
+    assert (run.mode, run.machine.entry) == (Mode.HALT, walking + 1)
+    # Its actions are for the halt, or still for the walk before it.
+    run.give(POSE + 0.4, entry=walking + later)
     assert run.tick(0.02).blend == 0.0
     for _ in range(20):
-        run.give(POSE + 0.4, entry=walking + answers)
-        intent = run.tick(0.02)
-        assert intent.command is not None
-    assert intent.blend == pytest.approx(1.0)
-    np.testing.assert_allclose(intent.command.position, POSE + 0.4)
+        run.give(POSE + 0.4, entry=walking + later)
+        desired = run.tick(0.02)
+        assert desired.command is not None
+    assert desired.blend == pytest.approx(1.0)
+    np.testing.assert_allclose(desired.command.position, POSE + 0.4)
     run.tick(1.0)
-    assert (run.machine_state.mode, run.memory.faulted) == (Mode.SIT, False)
+    assert (run.mode, run.memory.faulted) == (Mode.SIT, False)
 
 
-def test_an_objection_keeps_the_policy_out() -> None:
+def test_an_objection_keeps_the_policy_from_starting() -> None:
     run = Run().standing()
     run.objection = "too slow."
     run.tick(0.0, OperatorRequest.WALK)
-    assert run.machine_state.mode is Mode.STAND
-    assert run.machine_state.notice == "too slow."
+    assert (run.mode, run.machine.notice) == (Mode.STAND, "too slow.")
     run.objection = ""
     run.tick(0.1, OperatorRequest.WALK)
-    assert run.machine_state.mode is Mode.POLICY
+    assert run.mode is Mode.POLICY
 
 
-def test_the_way_back_from_a_fault() -> None:
+def test_a_latched_fault_needs_a_reset_and_another_its_second() -> None:
     run = Run().standing()
     run.memory = fault(FilterState(), FilterAction.LATCH, Reason.TILT, run.t)
     run.tick()
-    run.machine_state.faulted(run.t)
-    assert run.machine_state.mode is Mode.FAULT
+    assert run.mode is Mode.FAULT
     run.tick(2.0, OperatorRequest.STAND)
-    assert run.machine_state.mode is Mode.FAULT
-    assert "reset" in run.machine_state.notice
+    assert run.mode is Mode.FAULT
+    assert "reset" in run.machine.notice
     run.tick(0.0, OperatorRequest.RESET)
-    assert run.machine_state.mode is Mode.DAMP
-    assert not run.memory.faulted
-    # One that is not latched needs no reset, but its second.
+    assert (run.mode, run.memory.faulted) == (Mode.DAMP, False)
     run = Run(damp_s=0.0).standing()
     run.memory = fault(FilterState(), FilterAction.DAMP, Reason.DEAD_MAN, run.t)
-    run.machine_state.faulted(run.t)
+    run.machine.faulted(run.t)
     run.tick(0.5, OperatorRequest.STAND)
-    assert run.machine_state.mode is Mode.FAULT
+    assert run.mode is Mode.FAULT
     run.tick(0.6)
     run.tick(0.01)
-    assert run.machine_state.mode is Mode.STAND
+    assert run.mode is Mode.STAND
 
 
 # --- Pre-flight ---------------------------------------------------------------------------------
@@ -446,12 +418,6 @@ def found(states: list[State], now: float = 0.5) -> tuple[str, ...]:
     return refusals(states, ROBOT, LIMITS, now=now, seconds=0.5)
 
 
-def test_a_robot_that_lies_there_may_move() -> None:
-    assert found(stream()) == ()
-    warm = stream(temperature=np.full(12, 40.0), bus_voltage=0.0)
-    assert found(warm) == (), "a voltage of 0 is one that the link does not carry"
-
-
 def turned(angle: float) -> np.ndarray:
     return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
 
@@ -460,6 +426,12 @@ def at(index: int, value: float, values: np.ndarray = LYING) -> np.ndarray:
     array = values.copy()
     array[index] = value
     return array
+
+
+def test_a_robot_at_rest_may_move() -> None:
+    assert found(stream()) == ()
+    # A voltage of 0 is one that the link does not carry.
+    assert found(stream(temperature=np.full(12, 40.0), bus_voltage=0.0)) == ()
 
 
 @pytest.mark.parametrize(
@@ -471,7 +443,7 @@ def at(index: int, value: float, values: np.ndarray = LYING) -> np.ndarray:
         (stream(), 0.6, "ms old"),
         (stream(), 0.4, "ahead of now"),
         (stream(gyro=np.zeros(3)), 0.5, "no number changed"),
-        (stream(velocity=at(0, math.nan)), 0.5, "velocity holds"),
+        (stream(velocity=at(0, math.nan)), 0.5, "velocity"),
         (stream(orientation=np.zeros(4)), 0.5, "quaternion"),
         (stream(accelerometer=np.array([0.0, 0.0, 1.0])), 0.5, "accelerometer"),
         (stream(accelerometer=np.array([0.0, 0.0, -9.81])), 0.5, "disagree"),
@@ -481,81 +453,61 @@ def at(index: int, value: float, values: np.ndarray = LYING) -> np.ndarray:
             0.5,
             "tilted by 1.00",
         ),
-        (stream(position=at(2, 2.8)), 0.5, "FR_knee is at 2.80"),
-        (stream(velocity=at(3, 2.0, np.zeros(12))), 0.5, "FL_hip_roll turns"),
-        (stream(bus_voltage=18.0), 0.5, "battery gives 18.0"),
-        (stream(temperature=np.full(12, 90.0)), 0.5, "FR_hip_roll has 90"),
+        (stream(position=at(2, 2.8)), 0.5, "FR_knee"),
+        (stream(velocity=at(3, 2.0, np.zeros(12))), 0.5, "FL_hip_roll"),
+        (stream(bus_voltage=18.0), 0.5, "18.0"),
+        (stream(temperature=np.full(12, 90.0)), 0.5, "FR_hip_roll"),
     ],
 )
-def test_refusals_are_one_sentence_each(states: list[State], now: float, word: str) -> None:
+def test_a_robot_that_must_not_move_is_refused(states: list[State], now: float, word: str) -> None:
     sentences = found(states, now)
     assert any(word in sentence for sentence in sentences), sentences
-    for sentence in sentences:
-        assert sentence.endswith(".")
-        assert "\n" not in sentence
+    assert not any("\n" in sentence for sentence in sentences)
 
 
-def test_the_delay_must_be_one_that_was_trained_for() -> None:
+def test_the_delay_must_be_within_the_training_range() -> None:
     assert delay_objection(0.004, 50, (0.0, 0.01)) == ""
     assert "12.0 ms" in delay_objection(0.012, 50, (0.0, 0.01))
-    assert "no action" in delay_objection(math.nan, 0, (0.0, 0.01))
+    assert delay_objection(math.nan, 0, (0.0, 0.01))
 
 
 # --- Operators ----------------------------------------------------------------------------------
 
 
 def test_a_script_stands_walks_sits_and_leaves() -> None:
-    script = Script(
-        command=(1.0, 0.0, 0.0), stand_s=1.0, run_s=1.0, jump_s=0.5, keep_s=0.5, stop_s=1.0
-    )
+    script = Script(command=FORWARD, stand_s=1.0, run_s=1.0, jump_s=0.5, keep_s=0.5, stop_s=1.0)
     operator = ScriptedOperator([script, replace(script, command=(0.0, -1.0, 0.0))], pause_s=1.0)
     assert operator.seconds == 10.0
-    assert operator.command(0.0, Mode.PREFLIGHT).request is OperatorRequest.NONE
-    assert [operator.command(0.1 * k, Mode.DAMP).request for k in range(2)] == [
-        OperatorRequest.STAND,
-        OperatorRequest.NONE,
-    ]
+    none, stand = OperatorRequest.NONE, OperatorRequest.STAND
+    assert operator.command(0.0, Mode.PREFLIGHT).request is none
+    assert [operator.command(0.1 * k, Mode.DAMP).request for k in range(2)] == [stand, none]
     assert operator.command(1.0, Mode.STAND).request is OperatorRequest.WALK
-    commands = {
-        t: operator.command(10.0 + t, Mode.POLICY) for t in (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)
-    }
-    assert all(stick.held for stick in commands.values())
-    assert [stick.jump for stick in commands.values()] == [
-        False,
-        False,
-        True,
-        False,
-        False,
-        False,
-        True,
-    ]
-    forward = (1.0, 0.0, 0.0)
-    assert [commands[t].command == forward for t in (0, 1.5, 2.2, 2.7, 4.5)] == [
-        False,
-        *[True] * 3,
-        False,
-    ]
-    assert commands[6.5].command == (0.0, -1.0, 0.0)
+    times = (0, 1.5, 2.2, 2.7, 4.5, 6.5, 7.2)
+    given = {t: operator.command(10.0 + t, Mode.POLICY) for t in times}
+    assert all(each.held for each in given.values())
+    assert [t for t, each in given.items() if each.jump] == [2.2, 7.2]
+    assert [t for t, each in given.items() if each.command == FORWARD] == [1.5, 2.2, 2.7]
+    assert given[6.5].command == (0.0, -1.0, 0.0)
     assert not operator.finished
     assert operator.command(20.1, Mode.POLICY).request is OperatorRequest.SIT
     assert operator.finished
-    assert operator.command(22.0, Mode.SIT).request is OperatorRequest.NONE
+    assert operator.command(22.0, Mode.SIT).request is none
     assert operator.command(23.0, Mode.DAMP).request is OperatorRequest.QUIT
 
 
 @pytest.mark.parametrize("kind", ["fault", "refused", "notice"])
-def test_a_script_ends_at_the_first_trouble(kind: str) -> None:
-    operator = ScriptedOperator([Script(command=(1.0, 0.0, 0.0))])
+def test_a_script_ends_at_the_first_fault(kind: str) -> None:
+    operator = ScriptedOperator([Script(command=FORWARD)])
     operator.notified("mode", "STAND")
     assert operator.command(0.0, Mode.STAND).request is OperatorRequest.WALK
     operator.notified(kind, "no.")
     assert operator.command(0.1, Mode.STAND).request is OperatorRequest.QUIT
 
 
-def test_time_runs_out() -> None:
-    operator = TimeLimit(ScriptedOperator([Script(command=(1.0, 0.0, 0.0), stand_s=0.0)]), 0.5)
+def test_a_time_limit_sits_down_and_ends() -> None:
+    operator = TimeLimit(ScriptedOperator([Script(command=FORWARD, stand_s=0.0)]), 0.5)
     assert operator.command(0.0, Mode.STAND).request is OperatorRequest.WALK
-    assert operator.command(5.0, Mode.POLICY).command == (1.0, 0.0, 0.0)
+    assert operator.command(5.0, Mode.POLICY).command == FORWARD
     late = operator.command(5.6, Mode.POLICY)
     assert (late.request, late.held) == (OperatorRequest.SIT, True)
     assert operator.command(5.7, Mode.HALT).request is OperatorRequest.NONE
@@ -568,7 +520,6 @@ def terminal() -> Iterator[tuple[int, Keyboard]]:
     keyboard = Keyboard(RANGES, slave)
     yield master, keyboard
     keyboard.close()
-    os.close(master)
     os.close(slave)
 
 
@@ -576,33 +527,23 @@ def test_keys_of_a_terminal(terminal: tuple[int, Keyboard]) -> None:
     master, keyboard = terminal
     assert not keyboard.command(0.0, Mode.DAMP).held
     os.write(master, b" wwwad")
-    stick = keyboard.command(1.0, Mode.POLICY)
-    assert stick.held
-    assert stick.command == (0.75, 0.0, 0.0)
+    given = keyboard.command(1.0, Mode.POLICY)
+    assert (given.held, given.command) == (True, (0.75, 0.0, 0.0))
     os.write(master, b"\n2jj")
-    stick = keyboard.command(1.1, Mode.POLICY)
-    assert (stick.jump, stick.request) == (True, OperatorRequest.WALK)
-    assert stick.command[2] == pytest.approx(0.4)
+    given = keyboard.command(1.1, Mode.POLICY)
+    assert (given.jump, given.request) == (True, OperatorRequest.WALK)
+    assert given.command[2] == pytest.approx(0.4)
     # The jump's press lasts half a second, the dead-man key four fifths.
     assert keyboard.command(1.61, Mode.POLICY).jump is False
     assert keyboard.command(1.79, Mode.POLICY).held
     assert not keyboard.command(1.81, Mode.POLICY).held
     os.write(master, b"s" * 40)
-    assert keyboard.command(2.0, Mode.POLICY).command[0] == RANGES["vx"][0], "as far as was trained"
+    assert keyboard.command(2.0, Mode.POLICY).command[0] == RANGES["vx"][0]
     keyboard.notified("mode", "DAMP")
     assert keyboard.command(2.1, Mode.DAMP).command == (0.0, 0.0, 0.0)
-
-
-def test_a_terminal_that_is_gone_leaves() -> None:
-    master, slave = pty.openpty()
-    keyboard = Keyboard(RANGES, slave)
-    os.write(master, b" w")
-    assert keyboard.command(0.0, Mode.POLICY).held
     os.close(master)
     for _ in range(2):
-        assert keyboard.command(0.1, Mode.POLICY) == OperatorCommand(request=OperatorRequest.QUIT)
-    keyboard.close()
-    os.close(slave)
+        assert keyboard.command(3.0, Mode.POLICY) == OperatorCommand(request=OperatorRequest.QUIT)
 
 
 def test_without_a_terminal_there_is_no_keyboard() -> None:
@@ -619,33 +560,28 @@ def test_a_gamepad(tmp_path: Path) -> None:
     pad = Gamepad(path, RANGES)
     wire = os.open(path, os.O_WRONLY)
 
-    def say(value: int, kind: int, number: int) -> None:
+    def send(value: int, kind: int, number: int) -> None:
         os.write(wire, struct.pack("<IhBB", 0, value, kind, number))
 
-    say(0, 0x81, 4)  # what was held when it was opened is commands first, and is no press
-    say(1, 0x81, 3)
-    stick = pad.command(0.0, Mode.STAND)
-    assert (stick.held, stick.request) == (False, OperatorRequest.NONE)
-    say(1, 1, 4)
-    say(1, 1, 3)
-    say(-32767, 2, 1)
-    say(16384, 2, 0)
-    say(2000, 2, 3)  # within the dead zone
-    stick = pad.command(0.1, Mode.STAND)
-    assert (stick.held, stick.request) == (True, OperatorRequest.WALK)
-    assert stick.command == pytest.approx((3.0, -0.5, 0.0), abs=1e-3)
-    say(1, 1, 5)
+    send(0, 0x81, 4)  # the initial state of the buttons is no press
+    send(1, 0x81, 3)
+    given = pad.command(0.0, Mode.STAND)
+    assert (given.held, given.request) == (False, OperatorRequest.NONE)
+    for event_ in ((1, 1, 4), (1, 1, 3), (-32767, 2, 1), (16384, 2, 0), (2000, 2, 3)):
+        send(*event_)  # the last is within the dead zone
+    given = pad.command(0.1, Mode.STAND)
+    assert (given.held, given.request) == (True, OperatorRequest.WALK)
+    assert given.command == pytest.approx((3.0, -0.5, 0.0), abs=1e-3)
+    # The jump input of a press, short or long, lasts as long as in training.
+    send(1, 1, 5)
     assert pad.command(0.2, Mode.POLICY).jump
-    say(0, 1, 5)  # a tap asks for as long as training did, and so does a button that is held
-    assert pad.command(0.68, Mode.POLICY).jump
-    assert not pad.command(0.72, Mode.POLICY).jump
-    say(1, 1, 5)
-    assert pad.command(0.8, Mode.POLICY).jump
-    assert not pad.command(1.4, Mode.POLICY).jump
+    send(0, 1, 5)
+    assert [pad.command(t, Mode.POLICY).jump for t in (0.68, 0.72)] == [True, False]
+    send(1, 1, 5)
+    assert [pad.command(t, Mode.POLICY).jump for t in (0.8, 1.4)] == [True, False]
     os.close(wire)
-    stick = pad.command(1.5, Mode.POLICY)
-    assert not stick.held, "unplugged is let go"
-    assert stick.command == (0.0, 0.0, 0.0)
+    given = pad.command(1.5, Mode.POLICY)
+    assert (given.held, given.command) == (False, (0.0, 0.0, 0.0)), "unplugged"
     pad.close()
     with pytest.raises(HardwareError, match="js9"):
         Gamepad(tmp_path / "js9", RANGES)
@@ -654,7 +590,6 @@ def test_a_gamepad(tmp_path: Path) -> None:
 # --- The log ------------------------------------------------------------------------------------
 
 HEADER = {"robot": "mini_cheetah", "joints": list(ROBOT.joint_names)}
-PER_TICK = {"/deploy/tick"}
 
 
 def record(number: int, **changes: Any) -> np.void:
@@ -668,41 +603,46 @@ def record(number: int, **changes: Any) -> np.void:
     return np.frombuffer(one.tobytes(), dtype=TICK)[0]
 
 
-def written(path: Path) -> DeployLogWriter:
+def step(**values: Any) -> np.void:
+    one = np.zeros((), dtype=STEP)
+    for name, value in values.items():
+        one[name] = value
+    return np.frombuffer(one.tobytes(), dtype=STEP)[0]
+
+
+def test_a_log_is_read_as_it_was_written(tmp_path: Path) -> None:
+    path, count = tmp_path / "run.mcap", 600
     writer = DeployLogWriter(path, HEADER)
     text = event(0.5, "fault", "tilted", reason=Reason.TILT, level=FilterAction.LATCH)
     writer.event(np.frombuffer(text.tobytes(), dtype=EVENT)[0])
-    for k in range(100):
-        damped = {"sent": np.nan, "damped": 1} if k >= 90 else {}
-        writer.tick(record(k, mode=Mode.POLICY, **damped))
-    step = np.zeros((), dtype=STEP)
-    step["sequence"], step["begun"], step["action"], step["jump"] = 4, 0.1, 0.25, 1
-    writer.step(np.frombuffer(step.tobytes(), dtype=STEP)[0])
-    return writer
-
-
-def test_a_log_comes_back_as_it_was_written(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    written(path).end(complete=True, figures={"servo": {"ticks": 100}})
+    for k in range(count):
+        damped = {"sent": np.nan, "damped": 1} if k >= 590 else {}
+        latency = np.nan if k % 10 else k / 1e4
+        writer.tick(record(k, mode=Mode.POLICY, desired=POSE + k, latency=latency, **damped))
+        if k % 10 == 0:
+            writer.step(step(sequence=k // 10, begun=k / 500, action=k, live=1, jump=k > 300))
+        if k % 70 == 0:
+            writer.flush()
+    writer.end(complete=True, figures={"servo": {"ticks": count}})
     log = read_deploy_log(path)
-    assert log.complete
-    assert log.figures == {"servo": {"ticks": 100}}
+    assert (log.complete, log.figures) == (True, {"servo": {"ticks": count}})
     assert log.joints == ROBOT.joint_names
-    np.testing.assert_array_equal(log.tick, np.arange(100))
+    np.testing.assert_array_equal(log.tick, np.arange(count))
     np.testing.assert_allclose(log.lateness, 1e-4, atol=1e-12)
     np.testing.assert_allclose(log.work, 3e-4, atol=1e-12)
-    np.testing.assert_array_equal(log.position, np.tile(LYING, (100, 1)))
-    assert np.isnan(log.sent[90:]).all()
-    np.testing.assert_array_equal(log.sent[:90], np.tile(POSE, (90, 1)))
-    np.testing.assert_array_equal(log.damped, np.arange(100) >= 90)
+    np.testing.assert_allclose(log.state_age, 1e-4, atol=1e-12)
+    np.testing.assert_array_equal(log.position, np.tile(LYING, (count, 1)))
+    np.testing.assert_array_equal(log.desired, POSE + np.arange(count)[:, None])
+    np.testing.assert_array_equal(log.latency[::10], np.arange(0, count, 10) / 1e4)
+    assert np.isnan(log.latency).sum() == count * 9 // 10
+    assert np.isnan(log.sent[590:]).all()
+    np.testing.assert_array_equal(log.sent[:590], np.tile(POSE, (590, 1)))
+    np.testing.assert_array_equal(log.damped, np.arange(count) >= 590)
     assert (log.mode == Mode.POLICY).all()
-    assert log.jump.tolist() == [True]
-    np.testing.assert_array_equal(log.action, np.full((1, 12), 0.25))
-    assert (log.events[0].kind, log.events[0].reason, log.events[0].level) == (
-        "fault",
-        "TILT",
-        "LATCH",
-    )
+    assert log.jump.sum() == 29
+    np.testing.assert_array_equal(log.action, np.tile(np.arange(0, count, 10)[:, None], 12))
+    [first] = log.events
+    assert (first.kind, first.reason, first.level) == ("fault", "TILT", "LATCH")
     assert not log.virtual
 
 
@@ -733,47 +673,14 @@ def test_a_log_cut_anywhere_is_read_up_to_there_or_refused(
     assert log.complete or share < 1.0
 
 
-def test_a_long_log_is_read_chunk_by_chunk(tmp_path: Path) -> None:
-    path, count = tmp_path / "long.mcap", 2600
-    writer = DeployLogWriter(path, HEADER)
-    for k in range(count):
-        writer.tick(record(k, desired=POSE + k, latency=np.nan if k % 10 else k / 1e4))
-        if k % 10 == 0:
-            step = np.zeros((), dtype=STEP)
-            step["sequence"], step["action"], step["live"] = k // 10, k, 1
-            writer.step(np.frombuffer(step.tobytes(), dtype=STEP)[0])
-        if k % 70 == 0:
-            writer.flush()
-    writer.end(complete=True, figures={})
-    log = read_deploy_log(path)
-    np.testing.assert_array_equal(log.desired, POSE + np.arange(count)[:, None])
-    np.testing.assert_array_equal(log.latency[::10], np.arange(0, count, 10) / 1e4)
-    assert np.isnan(log.latency).sum() == count * 9 // 10
-    np.testing.assert_array_equal(log.action, np.tile(np.arange(0, count, 10)[:, None], 12))
-
-
-def test_a_log_of_an_hour_may_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_unpacks_to_too_much_is_damaged(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    rng, writer = np.random.default_rng(0), DeployLogWriter(path, HEADER)
+    writer = DeployLogWriter(path, HEADER)
     for k in range(100):
-        # Numbers of full length, as sensors give them.
-        names = ("position", "velocity", "torque", "desired", "sent", "gyro", "accelerometer")
-        shapes = {name: TICK[name].shape for name in names}
-        writer.tick(record(k, **{name: rng.standard_normal(of) for name, of in shapes.items()}))
+        writer.tick(record(k))
     writer.end(complete=True, figures={})
-    with path.open("rb") as file:
-        batches = list(records(file, path.stat().st_size))
-    ticks = [len(each.data) for batch in batches for each in batch if each.topic in PER_TICK]
-    assert len(ticks) == 100
-    an_hour = 3600 * 500 * sum(ticks) / 100
-    assert MOST_BYTES < an_hour < pronk.runtime.log.MOST_BYTES
-    # That is the bound that holds for it.
-    unpacked = sum(len(each.data) for batch in batches for each in batch)
-    monkeypatch.setattr("pronk.runtime.log.MOST_BYTES", unpacked // 2)
-    with pytest.raises(LogError, match="cut before the first tick"):
-        read_deploy_log(path)
     with path.open("rb") as file, pytest.raises(DamagedError, match="more than 0 MiB"):
-        list(records(file, path.stat().st_size, unpacked // 2))
+        list(records(file, path.stat().st_size, 50_000))
 
 
 @pytest.mark.parametrize(
@@ -788,24 +695,21 @@ def test_a_log_of_an_hour_may_be_read(tmp_path: Path, monkeypatch: pytest.Monkey
 )
 def test_messages_of_another_kind_are_refused(changes: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    body = {name: record(0)[name].tolist() for name in TICK.names or ()} | changes
     writer = McapWriter(path, TOPICS)
     writer.put("/deploy/header", 0.0, {"schema": SCHEMA, **HEADER})
-    writer.put("/deploy/tick", 0.0, body)
+    body = {name: record(0)[name].tolist() for name in TICK.names or ()}
+    writer.put("/deploy/tick", 0.0, body | changes)
     writer.close()
-    with pytest.raises(LogError, match="its messages are not those of"):
+    with pytest.raises(LogError, match="messages"):
         read_deploy_log(path)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     other.write_bytes(b"nothing")
-    assert not is_deploy_log(other)
-    assert not is_deploy_log(tmp_path / "none")
     for path in (other, tmp_path / "none"):
+        assert not is_deploy_log(path)
         with pytest.raises(LogError):
             read_deploy_log(path)
-    folder = tmp_path / "folder"
-    folder.mkdir()
     with pytest.raises(LogError, match="cannot be written"):
-        DeployLogWriter(folder, HEADER)
+        DeployLogWriter(tmp_path, HEADER)
