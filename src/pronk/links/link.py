@@ -134,7 +134,7 @@ class CommandWriter:
 
         Raises:
             HardwareError: No drive could follow it, and it was not sent; or the wire does not take
-                it, and it expires all the same and is followed by damping.
+                it, and it is followed by damping when it expires.
         """
         data = self._encode(command)
         expires = command.made + command.valid_for
@@ -485,14 +485,9 @@ class StreamLink(NetworkLink):
         repeat_s: float | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link; nothing is opened yet.
+        """Describe the link; `transport` opens the wire, `repeat_s` is as of `CommandWriter`.
 
-        Args:
-            robot: Names, order and limits of the joints.
-            codec: Of its messages.
-            transport: Opens the wire.
-            repeat_s: Time after which the command in force is written again; None for once.
-            **common: As `NetworkLink` takes them.
+        What else links take (`common`) is as of `NetworkLink`.
         """
         super().__init__(robot, **common)
         self.torque_kind, self.state_rate_hz = codec.torque_kind, codec.state_rate_hz

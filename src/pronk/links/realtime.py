@@ -1,7 +1,6 @@
 r"""Real-time settings, pacing by absolute deadlines, and signals of a terminal.
 
-Real-time settings are not needed for a loop to be right, only for it to be on time: what is not
-granted is reported and the loop runs without it.
+A real-time setting that is not granted is reported, and the loop runs without it.
 
 Ctrl-C, Ctrl-\, Ctrl-Z and the end of the terminal, a lost ssh connection, go to every process of
 the program in front of it. A process that moves a robot must damp the joints before it ends, so it
@@ -19,7 +18,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
@@ -58,63 +57,48 @@ def enter(wanted: Wanted) -> tuple[str, ...]:
     gc.collect()
     gc.freeze()
     gc.disable()
-    return (*_schedule(wanted.priority), *_pin(wanted.core), *_lock(wanted.lock))
+    lines = []
+    if wanted.priority is not None:
+        lines.append(f"real-time scheduling: {_granted(_schedule, wanted.priority)}")
+    if wanted.core is not None:
+        lines.append(f"core of its own: {_granted(_pin, wanted.core)}")
+    if wanted.lock:
+        lines.append(f"memory: {_granted(_lock)}")
+    return tuple(lines)
 
 
-def _schedule(priority: int | None) -> Iterator[str]:
-    if priority is None:
-        return
-    may = "the loop may be late under load"
+def _granted(request: Callable[..., str], *values: int) -> str:
+    """What a request says, or why it was refused."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except AttributeError:
-        yield f"real-time scheduling: this system has none; {may}"
-    except PermissionError:
-        yield (
-            f"real-time scheduling: refused; {may} (grant it with `rtprio 60` for your user in "
-            "/etc/security/limits.conf)"
-        )
+        return request(*values)
+    except (AttributeError, TypeError):
+        return "this system has no such setting; the loop may be late under load"
     except OSError as error:
-        yield f"real-time scheduling: refused ({error.strerror}); {may}"
-    else:
-        yield f"real-time scheduling: SCHED_FIFO {priority}"
-
-
-def _pin(core: int | None) -> Iterator[str]:
-    if core is None:
-        return
-    try:
-        cores = sorted(os.sched_getaffinity(0))
-        mine = cores[-1 - core % len(cores)]
-        if len(cores) < _LEAST_CORES:
-            yield f"core of its own: {len(cores)} cores are too few to give one away"
-            return
-        os.sched_setaffinity(0, {mine})
-    except AttributeError:
-        yield "core of its own: this system does not pin processes"
-    except OSError as error:
-        yield f"core of its own: refused ({error.strerror})"
-    else:
-        yield f"core of its own: number {mine}"
-
-
-def _lock(wanted: bool) -> Iterator[str]:
-    if not wanted:
-        return
-    try:
-        done = ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_NOW_AND_LATER)
-    except (OSError, AttributeError, TypeError):
-        yield "memory: this system cannot lock it"
-        return
-    name = os.strerror(ctypes.get_errno() or errno.EPERM)
-    yield (
-        "memory: locked"
-        if done == 0
-        else (
-            f"memory: not locked ({name}); a page fault may delay a tick (grant it with "
-            "`memlock unlimited` for your user in /etc/security/limits.conf)"
+        return (
+            f"refused ({error.strerror}); the loop may be late under load (grant it with "
+            "`rtprio 60` and `memlock unlimited` for your user in /etc/security/limits.conf)"
         )
-    )
+
+
+def _schedule(priority: int) -> str:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    return f"SCHED_FIFO {priority}"
+
+
+def _pin(core: int) -> str:
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < _LEAST_CORES:
+        return f"{len(cores)} cores are too few to give one away"
+    mine = cores[-1 - core % len(cores)]
+    os.sched_setaffinity(0, {mine})
+    return f"number {mine}"
+
+
+def _lock() -> str:
+    if ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_NOW_AND_LATER):
+        number = ctypes.get_errno() or errno.EPERM
+        raise OSError(number, os.strerror(number))
+    return "locked"
 
 
 def sleep_until(deadline: float) -> None:

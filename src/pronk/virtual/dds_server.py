@@ -1,8 +1,4 @@
-"""The robot's end of a DDS link, as of a Go2 and stricter.
-
-A message that is not a possible command (above all one with a wrong checksum) is refused and
-counted. Behind the bytes is a virtual robot of whatever kind `dds.codec` has a joint map for.
-"""
+"""The robot's end of a DDS link, as of a Go2 and stricter."""
 
 from __future__ import annotations
 
@@ -74,17 +70,7 @@ class DdsServerTransport(ServerTransport):
     """The robot's end in Unitree's messages, on loopback only."""
 
     def __init__(self, robot: Robot, network: DdsNetwork, *, mode: str = "") -> None:
-        """Join the domain.
-
-        Args:
-            robot: Names of the joints.
-            network: Where; loopback.
-            mode: The robot's own controller that holds the drives at first.
-
-        Raises:
-            HardwareError: Not loopback, an unknown mode, or a robot that does not fit behind these
-                messages.
-        """
+        """Join a domain on loopback, with the controller that holds the joints at first."""
         if not network.loopback:
             raise HardwareError(
                 f"a virtual robot does not go to {network}, where real ones listen; leave the "
@@ -139,18 +125,16 @@ class DdsServerTransport(ServerTransport):
         """The service that reports and changes which controller holds the joints."""
         if api_id == CHECK_MODE:
             return DONE, {"form": "0", "name": self.mode}
-        if api_id == RELEASE_MODE:
-            self.mode = ""
-            self.counts["mode switches"] += 1
-            return DONE, None
+        if api_id not in (RELEASE_MODE, SELECT_MODE):
+            return UNKNOWN_API, None
+        name = ""
         if api_id == SELECT_MODE:
-            name = parameter.get("name") if isinstance(parameter, dict) else None
+            name = parameter.get("name", "") if isinstance(parameter, dict) else ""
             if name not in MODES[1:]:
                 return BAD_PARAMETER, None
-            self.mode = name
-            self.counts["mode switches"] += 1
-            return DONE, None
-        return UNKNOWN_API, None
+        self.mode = name
+        self.counts["mode switches"] += 1
+        return DONE, None
 
     def _bench(self, api_id: int, parameter: Any) -> tuple[int, Any]:
         """The service that holds joints mechanically."""

@@ -1,8 +1,7 @@
 """Seeded, repeatable faults of a link.
 
-A `FaultChannel` is one direction of a link: what is put in comes out late, twice, in another order,
-or never. One number of each kind is drawn per message whether it is used or not, so that one fault
-more does not change when the others strike.
+One number of each kind is drawn per message whether it is used or not, so that one fault more does
+not change when the others strike.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from pronk.errors import HardwareError
 T = TypeVar("T")
 
 # Times in a specification may carry a unit; how many make a second.
-_UNITS = {"us": 1e6, "ms": 1e3, "s": 1.0}
+_UNITS = {"us": 1e6, "ms": 1e3, "s": 1.0, "": 1.0}
 _JITTER_SHAPE = 2.0
 """Of the gamma distribution of the jitter: few messages are on time, and some are very late."""
 
@@ -43,14 +42,11 @@ class ChannelFaults:
     """That one bit of a message is inverted."""
 
     def __post_init__(self) -> None:
-        """Refuse a negative or infinite time, and a probability out of 0 to 1."""
         for entry in fields(self):
-            value = getattr(self, entry.name)
-            if entry.name in ("delay", "jitter"):
-                if not 0.0 <= value < math.inf:
-                    raise HardwareError(f"{entry.name} is {value} s; expected 0 or more.")
-            elif not 0.0 <= value <= 1.0:
-                raise HardwareError(f"{entry.name} is {value}; expected a probability, 0 to 1.")
+            value, is_time = getattr(self, entry.name), entry.name in ("delay", "jitter")
+            if not 0.0 <= value <= (1e9 if is_time else 1.0):
+                kind = "a time of 0 s or more" if is_time else "a probability, 0 to 1"
+                raise HardwareError(f"{entry.name} is {value}; expected {kind}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,14 +69,11 @@ class Faults:
 
 
 def parse_faults(text: str) -> Faults:
-    """Read faults such as `loss=0.3,state.delay=5ms,freeze=3s:0.5s`.
+    """Read faults such as `loss=0.3,state.delay=5ms,freeze=3s:0.5s`; refuse unknown words.
 
-    `delay`, `jitter`, `loss`, `duplicate`, `reorder`, `nan`, `flip` are of both directions unless
-    `command.` or `state.` stands before them; `after=T`, `rival=T`, `freeze=T:LENGTH` and
-    `clock=T:STEP` are of the machine. Numbers without a unit are in seconds.
-
-    Raises:
-        HardwareError: A word is unknown, or a value cannot be read or is impossible.
+    Fields of `ChannelFaults` are of both directions unless `command.` or `state.` stands before
+    them; `after=T`, `rival=T`, `freeze=T:LENGTH` and `clock=T:STEP` are of the machine. Numbers
+    without a unit are in seconds.
     """
     channels: dict[str, dict[str, float]] = {"command": {}, "state": {}}
     whole: dict[str, Any] = {}
@@ -105,13 +98,9 @@ def parse_faults(text: str) -> Faults:
 
 
 def _number(word: str, text: str) -> float:
-    scale = 1.0
-    for unit, factor in _UNITS.items():
-        if text.endswith(unit):
-            text, scale = text[: -len(unit)], factor
-            break
+    unit = next(unit for unit in _UNITS if text.endswith(unit))
     try:
-        value = float(text) / scale
+        value = float(text.removesuffix(unit)) / _UNITS[unit]
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
@@ -120,14 +109,13 @@ def _number(word: str, text: str) -> float:
 
 
 class FaultChannel(Generic[T]):
-    """One direction of a link and its faults."""
+    """One direction of a link: what is put in comes out late, twice, in another order or never."""
 
     def __init__(self, faults: ChannelFaults, *, after: float, seed: int) -> None:
         """Begin empty; messages put in before `after` [s] pass unchanged."""
         self.counts: Counter[str] = Counter()
         """How many messages met each fault."""
-        self._faults = faults
-        self._after = after
+        self._faults, self._after = faults, after
         self._rng, self._corrupting = (np.random.default_rng([seed, k]) for k in range(2))
         self._idle = faults == ChannelFaults()
         self._queue: list[tuple[float, int, T]] = []

@@ -35,17 +35,7 @@ class LcmServerTransport(ServerTransport):
     """The robot's end in the messages of a layout."""
 
     def __init__(self, robot: Robot, layout: Layout, url: str, *, mode: str = "") -> None:
-        """Open the robot's end.
-
-        Args:
-            robot: Names of the joints.
-            layout: Messages and channels.
-            url: LCM's address.
-            mode: The robot's own controller that holds the drives at first.
-
-        Raises:
-            HardwareError: The mode is unknown, or the address cannot be opened.
-        """
+        """Open the robot's end at LCM's address, with the controller that holds it at first."""
         super().__init__(robot, mode, MODES.values())
         self._layout = layout
         self._lcm = open_lcm(url)

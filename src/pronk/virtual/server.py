@@ -1,8 +1,7 @@
 """The virtual robot as a machine of its own: real time, a wire, and its faults.
 
-A `ServerTransport` is the robot's end of a link. `RobotServer` runs a virtual robot on the wall
-clock, passes it the commands of the wire, and puts its states on the wire. The drives' PD runs
-inside physics at 4 kHz; nothing in here computes a torque.
+`RobotServer` runs a virtual robot on the wall clock, passes it the commands of the wire, and puts
+its states on the wire. The drives' PD runs inside physics at 4 kHz.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ TICK_S = 0.5e-3
 _CONTEND_S = 0.01
 """Between two commands of the rival and of the robot's own controller."""
 _SLIP_S = 0.1
-"""Lateness beyond which the machine's clock is put back instead of catching up: a robot that was
-stopped does not live its past at once."""
+"""Lateness beyond which the machine's clock is put back instead of catching up."""
+_BROKEN_FIELDS = ("position", "velocity", "gyro", "accelerometer", "orientation")
 
 
 class ServerTransport(ABC):
@@ -45,11 +44,7 @@ class ServerTransport(ABC):
     """
 
     def __init__(self, robot: Robot, mode: str, modes: Iterable[str]) -> None:
-        """Begin with a mode of the robot's own controller.
-
-        Raises:
-            HardwareError: There is no such mode.
-        """
+        """Begin with a mode of the robot's own controller, one of `modes`."""
         if mode not in (modes := tuple(modes)):
             raise HardwareError(
                 f"mode {mode!r}; expected one of {', '.join(filter(None, modes))}, or none for "
@@ -98,7 +93,6 @@ class Watchdog:
     """Time without a command after which they do it [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown action, and a time that is not positive."""
         if self.action not in ("hold", "zero", "damp"):
             raise HardwareError(f"silence {self.action!r}; expected hold, zero or damp.")
         if not self.after_s > 0.0:
@@ -127,30 +121,17 @@ class RobotServer:
         watchdog: Watchdog | None = None,
         seed: int = 0,
     ) -> None:
-        """Put a machine behind a wire.
+        """Put a connected virtual robot behind a wire.
 
-        Args:
-            machine: The virtual robot, connected. Its clock is the robot's own.
-            wire: The robot's end of the link.
-            hold: Command of a rival, and of the robot's own controller.
-            faults: None for none.
-            watchdog: What the drives do when commands stop.
-            seed: Of the faults.
+        `hold` is the command of a rival and of the robot's own controller, `seed` of the faults.
         """
         self.counts: Counter[str] = Counter()
         """Of the server: `commands applied`, `silences`, `slips`."""
-        self._machine = machine
-        self._wire = wire
-        self._hold = hold
-        self._faults = faults or Faults()
+        self._machine, self._wire, self._hold = machine, wire, hold
+        self._faults = known = faults or Faults()
         self._watchdog = watchdog or Watchdog()
-        after = self._faults.after
-        self._commands: FaultChannel[Command] = FaultChannel(
-            self._faults.command, after=after, seed=2 * seed
-        )
-        self._states: FaultChannel[State] = FaultChannel(
-            self._faults.state, after=after, seed=2 * seed + 1
-        )
+        self._commands = FaultChannel[Command](known.command, after=known.after, seed=2 * seed)
+        self._states = FaultChannel[State](known.state, after=known.after, seed=2 * seed + 1)
         self._now = machine.now()
         self._last_command = math.inf
         self._contended = -math.inf
@@ -214,11 +195,7 @@ class RobotServer:
         self._cpu += time.process_time() - worked
 
     def figures(self) -> dict[str, object]:
-        """Counts of server, wire and faults and lateness.
-
-        Lateness is from a tick's instant to its beginning [ms]; the share of the processor is of
-        one core, all threads of the process counted.
-        """
+        """Counts of server, wire and faults, lateness of ticks, and share of one core."""
         late = np.array(self._late or [0.0], dtype=float) * 1e3
         return {
             "virtual": True,
@@ -231,9 +208,8 @@ class RobotServer:
             "cpu_share": self._cpu / max(self._now, TICK_S),
             "ticks": len(self._late),
             "lateness_ms": {
-                "p50": float(np.percentile(late, 50)),
-                "p99": float(np.percentile(late, 99)),
-                "max": float(late.max()),
+                name: float(np.percentile(late, share))
+                for name, share in {"p50": 50, "p99": 99, "max": 100}.items()
             },
         }
 
@@ -257,9 +233,7 @@ class RobotServer:
         else:
             self._frozen = None
         if self._states.strikes("nan", now):
-            name = ("position", "velocity", "gyro", "accelerometer", "orientation")[
-                self._states.pick(5)
-            ]
+            name = _BROKEN_FIELDS[self._states.pick(len(_BROKEN_FIELDS))]
             values = getattr(state, name).copy()
             values[self._states.pick(len(values))] = math.nan
             state = replace(state, **{name: values})

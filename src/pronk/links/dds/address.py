@@ -1,7 +1,7 @@
-"""DDS domains and interfaces: loopback and a domain of pronk's own by default.
+"""DDS domains and interfaces, readers and writers.
 
-A Go2 listens on domain 0. Nothing here reaches a real network, or domain 0, without an interface
-that the user named.
+A Go2 listens on domain 0. Nothing reaches a real network, or domain 0, without an interface that
+the user named.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ LOOPBACK_DOMAIN = 77
 """pronk's own; Unitree's robots use 0, unitree_mujoco 1."""
 ROBOT_DOMAIN = 0
 _MOST_DOMAIN = 232  # the ports of higher ones would exceed 65535
-_QUEUE = 64
-"""Messages kept between two looks; at 500 Hz an eighth of a second."""
-_WRITE_NS = 1_000_000
-"""Longest time that a reader who does not keep up may hold a writer up."""
+_QUEUE = 64  # messages kept between two looks; at 500 Hz an eighth of a second
+_WRITE_NS = 1_000_000  # longest time that a reader who does not keep up may hold a writer up
 
-_GENERAL = """<CycloneDDS><Domain Id="any"><General>
-<Interfaces><NetworkInterface {where}/></Interfaces>{multicast}</General>{discovery}
-</Domain></CycloneDDS>"""
-# Loopback often has no multicast: ask the ports of the first participants one by one.
-_LOCAL_DISCOVERY = """<Discovery><ParticipantIndex>auto</ParticipantIndex>
+_NAMED = """<CycloneDDS><Domain Id="any"><General>
+<Interfaces><NetworkInterface name={}/></Interfaces></General></Domain></CycloneDDS>"""
+# Loopback often has no multicast: query the ports of the first participants one by one.
+_LOCAL = """<CycloneDDS><Domain Id="any"><General>
+<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery>"""
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 
 _domains: dict[int, tuple[DdsNetwork, Any]] = {}
 """Domains that this process has opened; the library holds one set-up for each."""
@@ -67,7 +67,6 @@ class DdsNetwork:
     """DDS domain; None for 0 where an interface is named, else pronk's own, 77."""
 
     def __post_init__(self) -> None:
-        """Fill in the domain; refuse one that there is not, and a robot's without its interface."""
         if self.domain is None:
             own = LOOPBACK_DOMAIN if self.interface is None else ROBOT_DOMAIN
             object.__setattr__(self, "domain", own)
@@ -90,14 +89,9 @@ class DdsNetwork:
     @property
     def configuration(self) -> str:
         """The set-up as Cyclone DDS reads it."""
-        if self.interface is None:
-            return _GENERAL.format(
-                where='address="127.0.0.1"',
-                multicast="<AllowMulticast>false</AllowMulticast>",
-                discovery=_LOCAL_DISCOVERY,
-            )
-        where = f"name={quoteattr(self.interface)}"
-        return _GENERAL.format(where=where, multicast="", discovery="")
+        if self.interface is not None:
+            return _NAMED.format(quoteattr(self.interface))
+        return _LOCAL
 
 
 @dataclass

@@ -46,11 +46,9 @@ TICKS_PER_S = 1000
 """Of the robot's clock in its states."""
 STATE_RATE_HZ = 500.0
 """Of `rt/lowstate`."""
-_TICKS_BACK = 1000
-"""A robot's clock that is this much earlier than the last was started again [ms]."""
-_TICKS_AHEAD = 500
-"""A robot's clock that runs ahead of this computer's by more than this between two states has
-jumped [ms]."""
+# A robot's clock that is so much earlier than the last was started again; one that runs ahead of
+# this computer's by more than this between two states has jumped [ms].
+_TICKS_BACK, _TICKS_AHEAD = 1000, 500
 _LEAST_STEP_S = 1e-6
 
 _JOINTS = 12
@@ -70,7 +68,6 @@ _VIRTUAL_ONLY = ("mini_cheetah",)
 class JointMap:
     """How a robot's joints and the motors of a message correspond."""
 
-    robot: str
     sign: Array
     """A motor's angle is sign times the joint's, shape (12,)."""
     sink_damping: float
@@ -87,7 +84,6 @@ def joint_map(robot: Robot) -> JointMap:
             f"the robots that have are {', '.join(_SIGNS)}."
         )
     return JointMap(
-        robot=robot.name,
         sign=np.tile(_SIGNS[robot.name], _JOINTS // 3),
         sink_damping=_SINK[robot.name],
         virtual_only=robot.name in _VIRTUAL_ONLY,
@@ -186,16 +182,14 @@ def encode_state(joints: JointMap, state: State) -> bytes:
 
 
 class StateDecoder:
-    """Numbers the states of `rt/lowstate`.
+    """Numbers the states of `rt/lowstate` by the robot's clock in ms, for they carry no number.
 
-    Unitree's states carry no number, but the robot's clock in milliseconds; at 500 Hz it shows how
-    many states were lost on the way. No state is made, and the reason counted, of a clock that went
-    back or stood still, and of values that repeat to the last bit, as no live sensor's do (frozen
-    data behind a live clock). A message that is refused raises RefusedError.
+    No state is made, and the reason counted, of a clock that went back or stood still (`out of
+    order`), and of values that repeat to the last bit, as no live sensor's do (`repeated`);
+    `clock jumps` are counted. A refused message raises RefusedError.
     """
 
     def __init__(self, joints: JointMap, counts: Counter[str]) -> None:
-        """Begin; `counts` gets `out of order`, `clock jumps` and `repeated`."""
         self.counts = counts
         self.virtual = False
         """Whether the last state was a virtual robot's."""

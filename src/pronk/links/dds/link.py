@@ -53,12 +53,10 @@ class Client:
         self._responses = participant.reader(f"rt/api/{service}/response", messages.Response)
 
     def call(self, api_id: int, parameter: Any, *, timeout_s: float = 2.0) -> Any | None:
-        """Call a function, again while there is no response; return its data, or None without one.
+        """Call a function by its number, again while there is no response.
 
-        Args:
-            api_id: Number of the function.
-            parameter: What JSON can hold.
-            timeout_s: How long to try in all [s].
+        Returns:
+            The response's data; None without a response within `timeout_s` [s].
 
         Raises:
             HardwareError: The service responded with another code than 0.
@@ -117,10 +115,9 @@ def check_own_controller(participant: Participant, *, release: bool, timeout_s: 
             f"the robot did not respond on its service {SWITCHER} within {timeout_s:g} s, so it is "
             "not known whether its own controller is off; check the network, and its firmware."
         )
-    name = _name(response)
-    for _ in range(_RELEASE_TRIES if release else 0):
-        if not name:
-            break
+    name, tries = _name(response), _RELEASE_TRIES if release else 0
+    while name and tries:
+        tries -= 1
         switcher.call(RELEASE_MODE, {}, timeout_s=timeout_s)
         time.sleep(_RELEASE_PAUSE_S)
         name = _name(switcher.call(CHECK_MODE, {}, timeout_s=timeout_s))
@@ -155,17 +152,9 @@ class DdsMachine(NetworkLink):
         domain: int | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link; nothing is opened yet.
+        """Describe the link on an interface and domain (`DdsNetwork`); nothing is opened yet.
 
-        Args:
-            robot: Names, order and limits of the joints.
-            interface: Network interface to a real robot; None for loopback.
-            domain: DDS domain; None for pronk's own on loopback, 0 on an interface.
-            **common: As `NetworkLink` takes them.
-
-        Raises:
-            HardwareError: The robot does not fit behind these messages, or the domain is
-                impossible.
+        What else links take (`common`) is as of `NetworkLink`.
         """
         super().__init__(robot, **common)
         self._joints = joint_map(robot)

@@ -14,12 +14,10 @@ The knee's gains. Cheetah-Software converts the knee's angle, speed and torque b
 6 / 9.33, but not its gains (`rt_spi.cpp`): a wire gain k acts as k / 0.6429^2 = 2.42 k at the
 joint. Hence a command's knee gains are multiplied by 0.6429^2 on their way to the wire.
 
-The wire has no checksum. Refused are: another fingerprint, another length, a number that is not
-finite, or one that no motor or sensor of such a machine can give.
+The wire has no checksum: a number that no motor or sensor of such a machine can give is refused.
 
-Parameters. Cheetah-Software sets its parameters by messages; `control_mode` chooses which of the
-robot's own controllers holds the joints. The virtual robot has a bench: it holds joints
-mechanically on request, and its beacon identifies it and lists the joints that it holds.
+Cheetah-Software's parameter `control_mode` chooses which of the robot's own controllers holds the
+joints. The virtual robot holds joints mechanically on request, and its beacon lists them.
 """
 
 from __future__ import annotations
@@ -27,7 +25,6 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -66,7 +63,7 @@ _NUMBER_JUMP = 1000
 """A count this far from the last is that of a robot that was started again, or a broken one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
     """Messages, their channels and fields, and how their numbers become pronk's."""
 
@@ -83,22 +80,12 @@ class Layout:
     """Of angular velocity and specific force."""
     numbered: bool
     """Commands and states carry `timestamp_us` and `id`."""
-    sign: tuple[float, float, float]
-    """Of a leg's three joints: pronk's angle is sign times the wire's."""
-    gain: tuple[float, float, float]
-    """Of a leg's three joints: the wire's stiffness and damping per the joint's own [1]."""
+    signs: Array
+    """pronk's angles are signs times the wire's, shape (12,)."""
+    gains: Array
+    """The wire's stiffness and damping per the joint's own [1], shape (12,)."""
     torque_kind: TorqueKind
     state_rate_hz: float = 500.0
-
-    @cached_property
-    def signs(self) -> Array:
-        """`sign` for every joint, shape (12,)."""
-        return np.tile(self.sign, 4)
-
-    @cached_property
-    def gains(self) -> Array:
-        """`gain` for every joint, shape (12,)."""
-        return np.tile(self.gain, 4)
 
 
 CHEETAH = Layout(
@@ -112,8 +99,8 @@ CHEETAH = Layout(
     attitude_channel="microstrain",
     imu_fields=("omega", "acc"),
     numbered=False,
-    sign=(1.0, 1.0, 1.0),
-    gain=(1.0, 1.0, KNEE_RATIO**2),
+    signs=np.ones(_JOINTS),
+    gains=np.tile([1.0, 1.0, KNEE_RATIO**2], 4),
     # spi_data_t carries none, and what leg_control_data_lcmt calls tau_est is computed from the
     # command on the host, on the knee wrongly.
     torque_kind="absent",
@@ -129,8 +116,8 @@ WTW = Layout(
     attitude_channel="state_estimator_data",
     imu_fields=("omegaBody", "aBody"),
     numbered=True,
-    sign=(1.0, -1.0, -1.0),
-    gain=(1.0, 1.0, 1.0),
+    signs=np.tile([1.0, -1.0, -1.0], 4),
+    gains=np.ones(_JOINTS),
     # Unitree's tauEst, which the motor board computes from its current.
     torque_kind="measured",
 )
@@ -210,10 +197,7 @@ def encode_state(layout: Layout, state: State) -> tuple[tuple[str, bytes], tuple
 
 
 def decode_joints(layout: Layout, data: bytes) -> tuple[dict[str, Any], int | None]:
-    """Decode the joints of a state.
-
-    Returns:
-        (fields of a `State`, the robot's own count or None where it is not filled).
+    """Decode fields of a `State`, and the robot's own count or None where it is not filled.
 
     Raises:
         RefusedError: `fingerprint`, `length`, `not finite` or `out of range`.
@@ -268,14 +252,13 @@ def decode_attitude(layout: Layout, data: bytes) -> dict[str, Array]:
 class StateDecoder:
     """Numbers the states that messages make.
 
-    No state is made, and the reason counted, of joints without a young attitude; of values that
-    repeat to the last bit, as no live sensor's do (frozen data behind a live count); of a count
-    that went backwards. A message that is refused raises RefusedError. Bus voltage is NaN, for
-    neither layout carries it.
+    No state is made, and the reason counted, of joints without a young attitude (`no attitude`); of
+    values that repeat to the last bit, as no live sensor's do (`repeated`); of a count that went
+    backwards (`out of order`). A refused message raises RefusedError. Neither layout carries the
+    bus voltage: NaN.
     """
 
     def __init__(self, layout: Layout, counts: Counter[str]) -> None:
-        """Begin; `counts` gets `no attitude`, `out of order` and `repeated`."""
         self.counts = counts
         self._layout = layout
         self._attitude: dict[str, Any] = {}

@@ -126,18 +126,9 @@ class LcmMachine(NetworkLink):
         interface: str | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link; nothing is opened yet.
+        """Describe the link in a layout (`LAYOUTS`) at an address (`url_of`); nothing is opened.
 
-        Args:
-            robot: Names, order and limits of the joints.
-            layout: `cheetah` (or `spi`) or `wtw`.
-            port: As of `url_of`.
-            interface: As of `url_of`.
-            **common: As `NetworkLink` takes them.
-
-        Raises:
-            HardwareError: The layout is unknown, the robot has not twelve joints, or the address
-                is impossible.
+        What else links take (`common`) is as of `NetworkLink`.
         """
         super().__init__(robot, **common)
         self._layout = known = layout_of(layout)
