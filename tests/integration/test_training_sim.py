@@ -22,7 +22,6 @@ from pronk.evaluation.training_sim.evaluation import (
     NEVER,
     WALKS,
     CommandResult,
-    EstimatorResult,
     Evaluation,
     Plan,
     evaluate_policy,
@@ -37,47 +36,34 @@ def spread(mean: float, std: float = 0.01) -> Spread:
     return Spread(mean=mean, std=std, p05=mean, p95=mean, most=mean, n=10)
 
 
-GOOD_WALK = {
-    "speed_error": spread(0.1),
-    "yaw_error": spread(0.1),
-    "speed_error_averaged": spread(0.04),
-    "yaw_error_averaged": spread(0.05),
-    "forward": spread(2.0),
-    "left": spread(0.0),
-    "yaw_rate": spread(0.0),
-    "drift": spread(0.1),
-    "uncommanded": Spread(),
-}
+GOOD_WALK = {"speed_error": 0.1, "yaw_error": 0.1, "speed_error_averaged": 0.04, "fell": 0.0}
 GOOD_JUMP = {
-    "height": spread(0.5),
-    "distance": spread(1.2),
-    "along": spread(1.2),
-    "lift_off_velocity": spread(2.4),
-    "delay": spread(0.2),
-    "flights": spread(1.0),
-    "high_flights": spread(1.0),
-    "uncommanded": Spread(),
+    "height": 0.5,
+    "distance": 1.2,
+    "lift_off_velocity": 2.4,
+    "delay": 0.2,
+    "upright": 1.0,
+    "single": 1.0,
 }
 
 
-def command_result(name: str, jump: bool, **changes: Any) -> CommandResult:
-    shares = {"fell": 0.0, "non_finite": 0.0, "uncommanded": 0.0, "too_high": 0.0}
-    if jump:
-        shares |= dict.fromkeys(("standing", "found", "upright", "single"), 1.0)
-        shares["non_foot_contact"] = 0.0
-    figures = dict(GOOD_JUMP if jump else GOOD_WALK)
-    for what, value in changes.items():
-        (shares if what in shares and not isinstance(value, Spread) else figures)[what] = value
-    return CommandResult(
-        name=name, command=(2.0, 0.0, 0.0), robots=10, shares=shares, figures=figures
-    )
+def command_result(name: str, jump: bool, **changes: float | Spread) -> CommandResult:
+    figures = {**(GOOD_JUMP if jump else GOOD_WALK), **changes}
+    spreads = {n: v if isinstance(v, Spread) else spread(v) for n, v in figures.items()}
+    return CommandResult(name=name, command=(2.0, 0.0, 0.0), figures=spreads)
 
 
 def evaluation(**changes: Any) -> Evaluation:
     whole = Evaluation(
         walks=tuple(command_result(case.name, jump=False) for case in WALKS),
         jumps=tuple(command_result(case.name, jump=True) for case in JUMPS),
-        estimator=EstimatorResult(rmse=(0.1, 0.1, 0.0), rmse_vector=0.14, contacts_right=0.96),
+        estimator={
+            "forward": 0.1,
+            "left": 0.1,
+            "up": 0.0,
+            "velocity": 0.14,
+            "contacts_right": 0.96,
+        },
         plan={"robots": 10, "seed": 3},
         seconds=1.0,
         about={"policy": {"file": "policy.onnx"}, "randomization": "full"},
@@ -103,21 +89,21 @@ def test_a_good_policy_meets_every_criterion() -> None:
 @pytest.mark.parametrize(
     ("name", "jump", "changes", "what"),
     [
-        ("forward 2", False, {"speed_error": spread(0.151)}, "forward 2: speed error"),
-        ("forward 2", False, {"speed_error": spread(math.nan)}, "forward 2: speed error"),
+        ("forward 2", False, {"speed_error": 0.151}, "forward 2: speed error"),
+        ("forward 2", False, {"speed_error": math.nan}, "forward 2: speed error"),
         ("forward 2", False, {"fell": 0.0051}, "forward 2: falls"),
-        ("yaw 2", False, {"yaw_error": spread(0.21)}, "yaw 2: yaw rate error"),
-        ("stand", False, {"speed_error_averaged": spread(0.06)}, "stand: speed"),
-        ("forward 3", False, {"speed_error": spread(1.0), "fell": 1.0}, None),
-        ("stand", False, {"uncommanded": spread(0.04)}, "flight without a jump input, walking"),
-        ("stand", False, {"uncommanded": spread(0.02)}, None),
-        ("forward 1", True, {"height": spread(0.44)}, "jump forward 1: height"),
+        ("yaw 2", False, {"yaw_error": 0.21}, "yaw 2: yaw rate error"),
+        ("stand", False, {"speed_error_averaged": 0.06}, "stand: speed"),
+        ("forward 3", False, {"speed_error": 1.0, "fell": 1.0}, None),
+        ("stand", False, {"uncommanded": 0.04}, "flight without a jump input, walking"),
+        ("stand", False, {"uncommanded": 0.02}, None),
+        ("forward 1", True, {"height": 0.44}, "jump forward 1: height"),
         ("forward 1", True, {"height": spread(0.5, 0.04)}, "jump forward 1: std of height"),
-        ("forward 1", True, {"distance": spread(0.69)}, "jump forward 1: distance"),
+        ("forward 1", True, {"distance": 0.69}, "jump forward 1: distance"),
         ("forward 1", True, {"upright": 0.98}, "jump forward 1: upright"),
         ("forward 1", True, {"single": 0.94}, "jump forward 1: one high flight"),
-        ("forward 1", True, {"lift_off_velocity": spread(2.1)}, "jump forward 1: lift-off vel"),
-        ("forward 1", True, {"delay": spread(0.31)}, "jump forward 1: lift-off after"),
+        ("forward 1", True, {"lift_off_velocity": 2.1}, "jump forward 1: lift-off vel"),
+        ("forward 1", True, {"delay": 0.31}, "jump forward 1: lift-off after"),
     ],
 )
 def test_a_bad_number_fails_its_criterion_and_no_other(
@@ -143,7 +129,7 @@ def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
     save(path, evaluation())
     assert load_speed_errors(path) == {case.name: 0.1 for case in WALKS}
     assert len(json.loads(path.read_text())["checks"]) == 50
-    for text in ('{"schema": "pronk/evaluation/9"}', '{"schema": "pronk/evaluation/2"}', "not"):
+    for text in ('{"schema": "pronk/evaluation/9"}', '{"schema": "pronk/evaluation/3"}', "not"):
         path.write_text(text)
         with pytest.raises(ArtefactError, match=r"evaluation\.json"):
             load_speed_errors(path)
@@ -170,26 +156,13 @@ def test_every_robot_has_its_command_and_its_times() -> None:
     assert np.array_equal(times["off"] - times["on"], np.r_[[0] * plan.walkers, [100] * 1000])
     assert set((times["stop"] - times["off"])[plan.walkers :]) == {100}
     assert set(times["start"][plan.walkers :]) == {200}
-    assert np.array_equal(on, plan.times(DT)["on"][plan.walkers :] * DT)
-    assert not np.array_equal(on, replace(plan, seed=5).times(DT)["on"][plan.walkers :] * DT)
     assert plan.seconds == 20.0
     assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"robots": 0}, "robots"),
-        ({"walks": (), "jumps": ()}, "neither"),
-        ({"walk_s": 0.0}, "walk_s"),
-        ({"keep_s": -1.0}, "keep_s"),
-        ({"settle_s": 20.0}, "settle"),
-        ({"average_s": 2.5}, "settle"),
-    ],
-)
-def test_an_impossible_plan_is_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(PronkError, match=message):
-        Plan(**changes)
+def test_an_empty_plan_is_refused() -> None:
+    with pytest.raises(PronkError, match="robots"):
+        Plan(robots=0)
 
 
 # --- A run in mjlab -----------------------------------------------------------------------------
@@ -307,8 +280,8 @@ def test_the_policy_reads_the_command_of_the_moment(observed: Observed) -> None:
 def test_figures_are_those_of_the_recorded_motion(observed: Observed) -> None:
     found = observed.evaluation
     results = (*found.walks, *found.jumps)
-    assert [r.shares["uncommanded"] for r in results] == [1.0, 1.0, 1.0]
-    highest = [r.figures["uncommanded"].most for r in results]
+    assert [r["uncommanded"].n for r in results] == [2, 2, 2]
+    highest = [r["uncommanded"].most for r in results]
     assert highest == pytest.approx([DROP] * 3, abs=2e-3)
     # The standing one of the two jumping robots.
     on = next(sample for sample, _, jump in observed.reads if jump[4])
@@ -321,16 +294,16 @@ def test_figures_are_those_of_the_recorded_motion(observed: Observed) -> None:
     )
     figures, _ = measure_jump(series, on, (0.0, 1.0), SHORT.rules)
     (jump,) = found.jumps
-    assert jump.figures["height"].mean == pytest.approx(figures["height"])
-    assert jump.shares["non_foot_contact"] == observed.other[on : on + 41, 4].any() / 2
+    assert jump["height"].mean == pytest.approx(figures["height"])
+    assert jump["non_foot_contact"].mean == observed.other[on : on + 41, 4].any() / 2
     # Walks from 0.8 to 1.5 s.
     walked = observed.state[160:300, :4]
     turns = Rotation.from_quat(np.roll(walked[..., 3:7].reshape(-1, 4), -1, axis=-1))
     velocity = turns.inv().apply(walked[..., 7:10].reshape(-1, 3))[:, :2].reshape(140, 4, 2)
     errors = np.linalg.norm(velocity - SHORT.commands()[:4, :2], axis=-1).mean(axis=0)
     for walk, expected in zip(found.walks, (errors[:2].mean(), errors[2:].mean()), strict=True):
-        assert walk.figures["speed_error"].mean == pytest.approx(expected, abs=1e-5)
-        assert walk.shares["fell"] == 0.0
+        assert walk["speed_error"].mean == pytest.approx(expected, abs=1e-5)
+        assert walk["fell"].mean == 0.0
 
 
 @pytest.mark.train
@@ -338,17 +311,15 @@ def test_a_robot_that_lies_down_is_out(observed: Observed) -> None:
     (jump,) = observed.evaluation.jumps
     assert (observed.fell_at[:5] == NEVER).all()
     assert observed.fell_at[5] < SHORT.times(DT)["on"][5]
-    assert (jump.shares["standing"], jump.figures["height"].n) == (0.5, 1)
-    assert (jump.shares["found"], jump.shares["upright"]) == (0.0, 0.0)
+    assert (jump["standing"].mean, jump["height"].n) == (0.5, 1)
+    assert (jump["found"].mean, jump["upright"].mean) == (0.0, 0.0)
 
 
 @pytest.mark.train
 def test_the_estimate_is_compared_with_the_target(observed: Observed) -> None:
     estimator = observed.evaluation.estimator
-    assert estimator is not None
-    assert estimator.rmse == pytest.approx((BIAS, 0.0, 0.0), abs=1e-6)
-    assert estimator.rmse_vector == pytest.approx(BIAS, abs=1e-6)
-    assert estimator.contacts_right == 1.0
+    expected = {"forward": BIAS, "left": 0.0, "up": 0.0, "velocity": BIAS, "contacts_right": 1.0}
+    assert estimator == pytest.approx(expected, abs=1e-6)
     assert observed.shares[0] == 0.0
     assert observed.shares[-1] == 1.0
     assert np.all(np.diff(observed.shares) > 0.0)

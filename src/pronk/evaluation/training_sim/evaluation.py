@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.criteria import evaluation_checks
-from pronk.evaluation.jumps import RISE, JumpRules, Series, measure_jump, steps, uncommanded_height
+from pronk.evaluation.jumps import JumpRules, Series, measure_jump, steps, uncommanded_height
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.results import Spread, load_json, save_json
 from pronk.evaluation.walk import velocity_errors
@@ -34,8 +34,9 @@ from pronk.evaluation.walk import velocity_errors
 if TYPE_CHECKING:
     from pronk.evaluation.training_sim.run import Estimate, Policy, Recording
 
-SCHEMA = "pronk/evaluation/2"
+SCHEMA = "pronk/evaluation/3"
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Samples = NDArray[np.int64]
 
 NEVER = 2**30
@@ -142,28 +143,18 @@ class CommandResult:
 
     name: str
     command: tuple[float, float, float]
-    robots: int
-    shares: Mapping[str, float]
-    """Of the robots. `fell`, `non_finite` (fell because its physics diverged), `uncommanded` (had
-    a flight without a jump input), `too_high` (one higher than `RISE`); of jumps `standing` (had
-    not fallen when the jump input came), `found` (jumped), `upright` (and were so 2 s after
-    touchdown), `non_foot_contact` (from the jump input to then), and of those standing `single`
-    (made exactly one high flight)."""
     figures: Mapping[str, Spread]
-    """As of `pronk.evaluation.jumps` and `walk`; `drift` from the end of settling to the end [m],
-    `uncommanded` the highest flight without a jump input, over standing height [m]."""
+    """Over the robots that have it; the mean of a flag is its share.
 
+    Numbers of `pronk.evaluation.jumps` and `walk`; `drift` from the end of settling to the end [m];
+    `uncommanded`: the highest flight without a jump input, over standing height [m]. Flags: `fell`,
+    `non_finite` (its physics diverged); of jumps `standing` (had not fallen when the jump input
+    came), `found` (jumped), `upright` (and were so 2 s after touchdown), `non_foot_contact` (from
+    the jump input to then), and of those standing `single` (made exactly one high flight)."""
 
-@dataclass(frozen=True, kw_only=True)
-class EstimatorResult:
-    """The estimator over all walks, standing included."""
-
-    rmse: tuple[float, float, float]
-    """Root mean square error of the velocity by axis, trunk's frame [m/s]."""
-    rmse_vector: float
-    """Root of the mean squared length of the error [m/s]."""
-    contacts_right: float
-    """Share of feet and policy steps at which (p > 0.5) is true."""
+    def __getitem__(self, name: str) -> Spread:
+        """Return a figure; without values if no robot has it."""
+        return self.figures.get(name, Spread())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,8 +163,10 @@ class Evaluation:
 
     walks: tuple[CommandResult, ...]
     jumps: tuple[CommandResult, ...]
-    estimator: EstimatorResult | None
-    """None if the policy has no estimator to read, or there are no walks."""
+    estimator: Mapping[str, float]
+    """Over all walks, standing included: root mean square error of the velocity [m/s] by axis
+    (`forward`, `left`, `up`) and of the vector (`velocity`), and the share of feet and policy steps
+    at which the contact estimate is right (`contacts_right`). Empty without estimator or walks."""
     plan: Mapping[str, Any]
     """Times, counts and the seed: `asdict` of the plan."""
     seconds: float
@@ -185,7 +178,7 @@ class Evaluation:
 
     def speed_errors(self) -> dict[str, float]:
         """Mean speed error by walk [m/s]."""
-        return {walk.name: walk.figures["speed_error"].mean for walk in self.walks}
+        return {walk.name: walk["speed_error"].mean for walk in self.walks}
 
 
 def evaluate_policy(
@@ -223,22 +216,29 @@ def evaluate_policy(
         zip((*plan.walks, *plan.jumps), run.recordings, strict=True)
     ):
         own = slice(i * plan.robots, (i + 1) * plan.robots)
-        measured = (
-            _walks(case, recording, fell_at[own], plan, run.dt)
-            if i < len(plan.walks)
-            else _jumps(case, recording, fell_at[own], on[own], plan, run.dt)
-        )
-        results.append(_summary(case, measured, diverged[own], plan))
+        robots = zip(_series(recording, fell_at[own], run.dt), fell_at[own], on[own], strict=True)
+        measured = [
+            (
+                _walk(case, *seen, int(fell), plan)
+                if i < len(plan.walks)
+                else _jump(case, *seen, int(fell), int(rise), plan.rules)
+            )
+            for seen, fell, rise in robots
+        ]
+        names = dict.fromkeys(name for figures in measured for name in figures)
+        figures = {n: Spread.of([each.get(n, math.nan) for each in measured]) for n in names}
+        figures["non_finite"] = Spread.of(diverged[own])
+        results.append(CommandResult(name=case.name, command=case.command, figures=figures))
     *squares, right, count = run.estimates.tolist()
-    estimator = None
+    estimator = {}
     if count:
-        means = [each / count for each in squares]
-        forward, left, up = map(math.sqrt, means)
-        estimator = EstimatorResult(
-            rmse=(forward, left, up),
-            rmse_vector=math.sqrt(sum(means)),
-            contacts_right=right / count,
-        )
+        estimator = {
+            name: math.sqrt(total / count)
+            for name, total in zip(
+                ("forward", "left", "up", "velocity"), (*squares, sum(squares)), strict=True
+            )
+        }
+        estimator["contacts_right"] = right / count
     return Evaluation(
         walks=tuple(results[: len(plan.walks)]),
         jumps=tuple(results[len(plan.walks) :]),
@@ -250,10 +250,16 @@ def evaluate_policy(
     )
 
 
-def _robots(recording: Recording, fell_at: Samples, dt: float) -> list[tuple[Series, Array]]:
-    """Motion and angular velocity of each robot, up to its fall or its first number not finite."""
-    found = []
-    state, feet = recording.state.cpu().numpy(), recording.feet.cpu().numpy()
+def _series(
+    recording: Recording, fell_at: Samples, dt: float
+) -> Iterator[tuple[Series, Array, Mask]]:
+    """Motion, angular velocity and non-foot contacts of each robot.
+
+    The motion ends at the robot's fall or at its first number that is not finite.
+    """
+    state, feet, other = (
+        getattr(recording, name).cpu().numpy() for name in ("state", "feet", "other")
+    )
     for i, fell in enumerate(fell_at):
         finite = np.isfinite(state[:, i]).all(axis=-1)
         end = min(int(fell), len(finite) if finite.all() else int(np.argmin(finite)))
@@ -265,104 +271,50 @@ def _robots(recording: Recording, fell_at: Samples, dt: float) -> list[tuple[Ser
             contact=feet[:end, i],
             dt=dt,
         )
-        found.append((series, own[:, 10:]))
-    return found
+        yield series, own[:, 10:], other[:, i]
 
 
-def _walks(
-    case: Case, recording: Recording, fell_at: Samples, plan: Plan, dt: float
-) -> list[dict[str, float]]:
-    """The figures of every robot that walks with one command."""
-    first, end = steps(plan.settle_s, dt), steps(plan.walk_s, dt)
-    found = []
-    for fell, (series, turning) in zip(fell_at, _robots(recording, fell_at, dt), strict=True):
-        figures = {"fell": float(fell <= end), "uncommanded": _over(series, None, plan.rules)}
-        if len(series.position) > first:
-            figures |= velocity_errors(
-                series.velocity,
-                series.orientation,
-                turning,
-                case.command,
-                first=first,
-                average=steps(plan.average_s, dt),
-            )[0]
-            way = series.position[-1, :2] - series.position[first, :2]
-            figures["drift"] = float(np.hypot(*way))
-        found.append(figures)
-    return found
+def _walk(
+    case: Case, series: Series, turning: Array, _: Mask, fell: int, plan: Plan
+) -> dict[str, float]:
+    """The figures of a robot that walks."""
+    first, rules = series.steps(plan.settle_s), plan.rules
+    over = uncommanded_height(series, None, rules) - rules.standing_height
+    figures = {"fell": fell <= series.steps(plan.walk_s), "uncommanded": over}
+    if len(series.position) > first:
+        figures |= velocity_errors(
+            series.velocity,
+            series.orientation,
+            turning,
+            case.command,
+            first=first,
+            average=series.steps(plan.average_s),
+        )[0]
+        way = series.position[-1, :2] - series.position[first, :2]
+        figures["drift"] = float(np.hypot(*way))
+    return figures
 
 
-def _jumps(
-    case: Case, recording: Recording, fell_at: Samples, on: Samples, plan: Plan, dt: float
-) -> list[dict[str, float]]:
-    """The figures of every robot that jumps with one command."""
-    rules, found = plan.rules, []
-    other = recording.other.cpu().numpy()
-    for i, (series, _) in enumerate(_robots(recording, fell_at, dt)):
-        count, rise = len(series.position), int(on[i])
-        standing = rise < count
-        figures: dict[str, Any] = {
-            "fell": fell_at[i] < NEVER,
-            "standing": standing,
-            "uncommanded": _over(series, rise if standing else None, rules),
-        }
-        if standing:
-            measured, main = measure_jump(series, rise, case.command, rules)
-            seconds = rules.search_s if main is None else rules.upright_s
-            judged = (rise if main is None else main.touchdown) + steps(seconds, dt)
-            # A robot that fell within that time after a jump lies on the ground.
-            lies = main is not None and count <= judged and fell_at[i] < NEVER
-            touches = bool(other[rise : min(count, judged + 1), i].any())
-            figures |= measured | {
-                "non_foot_contact": lies or touches,
-                "single": measured["high_flights"] == 1.0,
-            }
-        found.append({name: float(value) for name, value in figures.items()})
-    return found
-
-
-def _over(series: Series, on: int | None, rules: JumpRules) -> float:
-    """Highest flight without a jump input, over standing height [m]; NaN without one."""
-    return uncommanded_height(series, on, rules) - rules.standing_height
-
-
-_SHARES = ("fell", "standing", "found", "upright", "non_foot_contact")
-_NEEDED = (
-    "speed_error yaw_error speed_error_averaged yaw_error_averaged forward left yaw_rate drift",
-    "height distance along lift_off_velocity delay flights high_flights",
-)
-"""Figures of a walk and of a jump that are there even if no robot has them."""
-
-
-def _summary(
-    case: Case, measured: Sequence[Mapping[str, float]], diverged: NDArray[np.bool_], plan: Plan
-) -> CommandResult:
-    names = list(dict.fromkeys(name for figures in measured for name in figures))
-    columns = {
-        name: np.array([figures.get(name, math.nan) for figures in measured]) for name in names
-    }
-    high = columns["uncommanded"]
-    single = columns.pop("single", np.zeros(0))
-    shares = {name: columns.pop(name) for name in _SHARES if name in columns}
-    jumps = "standing" in shares
-    zero = ("found", "non_foot_contact", "single", "upright") if jumps else ()
-    counted = {name: float(np.nansum(values) / plan.robots) for name, values in shares.items()}
-    if np.isfinite(single).any():
-        counted["single"] = float(np.nanmean(single))
-    return CommandResult(
-        name=case.name,
-        command=case.command,
-        robots=plan.robots,
-        shares={
-            **dict.fromkeys(zero, 0.0),
-            **counted,
-            "non_finite": float(diverged.mean()),
-            "uncommanded": float(np.isfinite(high).mean()),
-            "too_high": float((np.nan_to_num(high, nan=-1.0) > RISE).mean()),
-        },
-        figures={name: Spread() for name in _NEEDED[jumps].split()}
-        | {name: Spread.of(values) for name, values in columns.items()},
-    )
+def _jump(
+    case: Case, series: Series, _: Array, other: Mask, fell: int, rise: int, rules: JumpRules
+) -> dict[str, float]:
+    """The figures of a robot that jumps; its jump input rises at sample `rise`."""
+    count = len(series.position)
+    standing = rise < count
+    over = uncommanded_height(series, rise if standing else None, rules) - rules.standing_height
+    flags = dict.fromkeys(("found", "upright", "non_foot_contact"), False)
+    figures = {"fell": fell < NEVER, "standing": standing, "uncommanded": over, **flags}
+    if standing:
+        measured, main = measure_jump(series, rise, case.command, rules)
+        seconds = rules.search_s if main is None else rules.upright_s
+        judged = (rise if main is None else main.touchdown) + series.steps(seconds)
+        # A robot that fell within that time after a jump lies on the ground.
+        lies = main is not None and count <= judged and fell < NEVER
+        touches = bool(other[rise : min(count, judged + 1)].any())
+        figures |= measured
+        figures["non_foot_contact"] = lies or touches
+        figures["single"] = measured["high_flights"] == 1.0
+    return figures
 
 
 def save(path: Path, evaluation: Evaluation) -> None:
