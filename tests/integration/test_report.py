@@ -85,7 +85,7 @@ def test_the_page_of_everything(tree: Path, html: str) -> None:
     assert "trial1" not in page.ids  # trials of the randomized robots belong to their part
     for section in ("table", "criteria", "scatter", "films", "landings", "rates", "heights"):
         assert f"trial-{section}" in page.ids
-    assert {"trial-drives", "trial-figures", "trial-setup", "match-gains"} < set(page.ids)
+    assert {"trial-figures", "trial-setup", "match-gains"} < set(page.ids)
     assert len(html.encode()) < 8e6
     assert len(page.pictures) > 12
     assert all(len(one["alt"]) > 20 for one in page.pictures)

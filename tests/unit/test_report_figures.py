@@ -22,7 +22,6 @@ from report_cases import (
     NOMINAL_GAINS,
     OMEGA,
     RATE,
-    ROBOT,
     crossings,
     joint_fit,
     joint_prediction,
@@ -136,7 +135,7 @@ def test_error_map_marks_grid_optimum_refined_gains_drive_and_paper(result) -> N
 
 def test_paper_gains_are_of_the_papers_robot_alone() -> None:
     assert published("so101") is None
-    axes = figures.error_maps(match(robot="so101", legs=1)).axes[0]
+    axes = figures.error_maps(match(robot="so101", legs=1), {}).axes[0]
     assert "+" not in {line.get_marker() for line in axes.lines}
 
 
@@ -211,28 +210,6 @@ def test_rates_are_of_the_acceleration_at_the_papers_speed(captured) -> None:
     figure = trial_figures.rates({name: captured.traces[name] for name in ("roll", "pitch")})
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert f"RMS {trial_figures.rms(runs):.2f} rad/s over 3 runs" in titles
-
-
-def test_torque_over_speed_is_drawn_with_the_limits_of_the_drives(captured) -> None:
-    row, velocity, torque = captured.hardest
-    assert row.policy == "matched"
-    assert np.allclose(torque, 0.5 * velocity)
-    figure = trial_figures.torque_speed(ROBOT, velocity, torque, policy="matched", words="a jump")
-    knee = next(axes for axes in figure.axes if axes.get_title(loc="left") == "knee")
-    drive = ROBOT.joint("FR_knee").drive
-    curves = [line for line in knee.lines if line.get_color() == style.MEASURED]
-    upper = max(curves, key=lambda line: float(np.sum(line.get_ydata())))
-    at = np.interp([0.0, 0.9 * drive.no_load_speed], *upper.get_data())
-    assert at == pytest.approx([drive.effort_limit, 0.1 * drive.stall_torque], rel=1e-3)
-
-
-def test_the_jump_nearest_to_the_drives_limits_has_the_least_margin(trial) -> None:
-    rows = [row for row in trial.rows if row.policy == "matched"]
-    easy = replace(rows[0], figures=replace(rows[0].figures, torque_margin=(0.5,) * 12))
-    hard = replace(rows[1], figures=replace(rows[1].figures, torque_margin=(0.9, *(0.1,) * 11)))
-    none = replace(rows[2], figures=replace(rows[2].figures, found=False))
-    assert trial_page.least_margin([easy, hard, none]) is hard
-    assert trial_page.least_margin([none]) is None
 
 
 def test_lines_are_drawn_in_order_with_bars_and_marks() -> None:

@@ -36,7 +36,12 @@ _LIMIT: dict[str, Any] = {"color": style.NAIVE, "linestyle": (0, (4, 2)), "linew
 _DESIRED: dict[str, Any] = {"color": style.NAIVE, "linestyle": (0, (2, 1)), "linewidth": 1.2}
 _ESTIMATE: dict[str, Any] = {"color": style.MEASURED_WIDE, "linewidth": 1.2}
 _COMMAND: dict[str, Any] = {"color": style.MATCHED, "linewidth": 1.4}
-_DOTS: dict[str, Any] = {"color": style.MEASURED, "linestyle": "none", "marker": "."}
+_DOTS: dict[str, Any] = {
+    "color": style.MEASURED,
+    "linestyle": "none",
+    "marker": ".",
+    "markersize": 2.5,
+}
 _MOVED = 1e-6
 """Smaller differences of desired and sent targets are not drawn [rad]."""
 WINDOW_S = 1.2
@@ -56,14 +61,8 @@ def _mark_keys(log: DeployLog) -> list[Line2D | Patch]:
     return keys + ([key("fault", **_FAULT)] if faults(log) else [])
 
 
-def _time_axis(figure: Figure, axes: Axes, t: Array) -> None:
-    axes.set_xlim(0.0, max(float(t[-1]), 1e-3))
-    axes.set_xlabel("time since the first tick [s]")
-    figure.align_ylabels()
-
-
 def overview(log: DeployLog) -> Figure:
-    """Draw the run: modes, commanded and estimated velocities, tilt, battery, temperatures."""
+    """Draw the run: modes, velocities, tilt, battery, motor temperatures, timing."""
     t, step = seconds(log, log.time), seconds(log, log.step_time)
     estimate, commanded = np.full((2, len(step), 3), np.nan)
     if len(step):
@@ -79,6 +78,10 @@ def overview(log: DeployLog) -> Figure:
         ("tilt [rad]", t, run.tilt(log), thin),
         ("battery [V]", t, volts, thin),
         ("motors [°C]", t, log.temperature, {"linewidth": 0.9}),
+        # A microsecond is about the resolution of the clock.
+        ("tick late [ms]", t, np.maximum(1e3 * log.lateness, 1e-3), _DOTS),
+        ("age of state [ms]", t, np.maximum(1e3 * log.state_age, 1e-3), _DOTS),
+        ("latency [ms]", t, np.maximum(1e3 * log.latency, 1e-3), _DOTS),
     ]
     tracks = tracks[:4] + [one for one in tracks[4:] if np.isfinite(one[2]).any()]
     limit = log.header.get("limits", {}).get("tilt") or np.nan
@@ -93,11 +96,15 @@ def overview(log: DeployLog) -> Figure:
                 axes.step(step, commanded[:, i], where="post", **_COMMAND)
                 low, high = axes.get_ylim()
                 axes.set_ylim(min(low, -0.5), max(high, 0.5))
+            if label.endswith("[ms]"):
+                axes.set_yscale("log")
             axes.set_ylabel(label)
             _mark(axes, log)
         grid[4, 0].set_ylim(bottom=0.0)
         grid[4, 0].axhline(limit, **_LIMIT)
-        _time_axis(figure, grid[-1, 0], t)
+        xlim = (0.0, max(float(t[-1]), 1e-3))
+        grid[-1, 0].set(xlim=xlim, xlabel="time since the first tick [s]")
+        figure.align_ylabels()
         keys = [key("command", **_COMMAND), key("policy's estimate; turning: gyro", **_ESTIMATE)]
         legend(figure, [*keys, key("tilt limit", **_LIMIT), *_mark_keys(log)])
     return figure
@@ -115,23 +122,6 @@ def _draw_modes(axes: Axes, log: DeployLog) -> None:
             axes.text(begin + 0.5 * length, 0.5, mode.name.lower(), **look)
     axes.set(ylim=(0.0, 1.0), yticks=[], ylabel="mode")
     axes.grid(visible=False)
-
-
-def timing(log: DeployLog) -> Figure:
-    """Draw lateness, age of the state and latency over the run, logarithmic."""
-    t = seconds(log, log.time)
-    tracks = {"tick late": log.lateness, "age of state": log.state_age}
-    tracks["state to command"] = log.latency
-    with drawing(3, height=5.2, sharex=True) as (figure, grid):
-        for axes, (label, values) in zip(grid[:, 0], tracks.items(), strict=True):
-            # A microsecond is about the resolution of the clock.
-            axes.semilogy(t, np.maximum(1e3 * values, 1e-3), markersize=2.5, **_DOTS)
-            low, high = np.log10(axes.get_ylim())
-            axes.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
-            axes.set_ylabel(f"{label} [ms]")
-            _mark(axes, log)
-        _time_axis(figure, grid[-1, 0], t)
-    return figure
 
 
 def window(log: DeployLog) -> tuple[float, float, str]:
@@ -160,8 +150,8 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure:
     with np.errstate(invalid="ignore"):
         filtered = np.where(np.abs(log.desired - log.sent) > _MOVED, log.desired, np.nan)[there]
     sent = run.in_force(log)
-    labels: dict[str, Any] = {"x_label": "time [s]", "y_label": "[rad]"}
-    with style.joint_panels(log.joints, height=1.55, sharey="row", **labels) as (figure, panels):
+    with style.joint_panels(log.joints, height=1.55, sharey="row") as (figure, panels):
+        style.label(panels, "time [s]", "[rad]")
         for i, axes in enumerate(panels[name] for name in log.joints):
             axes.plot(measured[there], log.position[there, i], **style.MEASURED_LINE)
             axes.step(t[there], filtered[:, i], where="post", **_DESIRED)
@@ -320,7 +310,7 @@ def _figures(log: DeployLog, found: Delay) -> dict[str, Any]:
 def _overview(log: DeployLog) -> Section:
     events = sorted(log.events, key=lambda event: event.time)
     rows = [(float(seconds(log, one.time)), one.kind, one.text) for one in events]
-    words = "Modes, velocities commanded and estimated, tilt and battery over the run"
+    words = "Modes, velocities commanded and estimated, tilt, battery and timing over the run"
     return Section(
         "overview",
         "Overview",
@@ -384,10 +374,8 @@ def _timing(log: DeployLog) -> Section:
         n, *rest = run.quantiles(values).values()
         rows.append((name, n, *(1e3 * value for value in rest)))
     notes = [f"{name}: {meaning}." for name, (_, meaning) in found.items()]
-    words = "Lateness, age of the state and state to command over the run"
     columns = "[ms] | n | 50 % | 95 % | 99 % | 99.9 % | max"
-    drawn = picture(timing(log), words, dense=True)
-    return Section("timing", "Timing", drawn, table(columns, rows, *notes))
+    return Section("timing", "Timing", table(columns, rows, *notes))
 
 
 def _filter(log: DeployLog) -> Section:

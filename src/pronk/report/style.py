@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -102,30 +102,28 @@ def drawing(
 
 @contextmanager
 def joint_panels(
-    names: Sequence[str],
-    *,
-    height: float,
-    x_label: str,
-    y_label: str,
-    sharey: bool | Literal["row"] = True,
+    names: Sequence[str], *, height: float, sharey: bool | Literal["row"] = True
 ) -> Iterator[tuple[Figure, dict[str, Axes]]]:
     """Make a figure with one titled panel per joint, `height` inches a row."""
     rows = grid_of_joints(names)
-    width = max(map(len, rows))
-    size = height * len(rows) + 0.7
-    with drawing(len(rows), width, height=size, sharex=True, sharey=sharey) as (figure, grid):
+    shape, size = (len(rows), max(map(len, rows))), height * len(rows) + 0.7
+    with drawing(*shape, height=size, sharex=True, sharey=sharey) as (figure, grid):
         panels = {name: grid[r, c] for r, row in enumerate(rows) for c, name in enumerate(row)}
-        for row in rows:
-            panels[row[0]].set_ylabel(y_label)
-        for c in range(width):
-            lowest = panels[[row[c] for row in rows if c < len(row)][-1]]
-            lowest.set_xlabel(x_label)
-            lowest.tick_params(labelbottom=True)
         for axes in set(grid.flat) - set(panels.values()):
             axes.set_visible(False)
         for name, axes in panels.items():
             axes.set_title(joint_words(name))
         yield figure, panels
+
+
+def label(panels: Mapping[str, Axes], x_label: str, y_label: str) -> None:
+    """Label the lowest panel of each column and the first of each row."""
+    rows = grid_of_joints(list(panels))
+    for row in rows:
+        panels[row[0]].set_ylabel(y_label)
+    for name in {c: name for row in rows for c, name in enumerate(row)}.values():
+        panels[name].set_xlabel(x_label)
+        panels[name].tick_params(labelbottom=True)
 
 
 def grid_of_joints(names: Sequence[str]) -> list[list[str]]:

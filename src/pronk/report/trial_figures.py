@@ -12,10 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from pronk.actuator.model import torque_limits
 from pronk.report import style
 from pronk.report.style import drawing, key, legend
-from pronk.robots.robot import Robot
 
 Array = NDArray[np.float64]
 Values = Mapping[str, Mapping[str, Array]]
@@ -238,34 +236,3 @@ def rms(runs: Sequence[Array]) -> float:
     """Return the root mean square over all samples of all runs; NaN without any."""
     values = np.concatenate([run[1] for run in runs]) if runs else np.empty(0)
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
-
-
-def torque_speed(
-    robot: Robot, velocity: Array, torque: Array, *, policy: str, words: str
-) -> Figure:
-    """Draw torque over speed of one jump in the limits of the drives, a panel a joint group.
-
-    Args:
-        robot: Whose drives.
-        velocity: Of the joints [rad/s], (T, joints).
-        torque: Of the motors, joint side [N m], (T, joints).
-        policy: For the colour.
-        words: Name of the jump.
-    """
-    groups = list(dict.fromkeys(joint.group for joint in robot.joints))
-    marks = {"linestyle": "none", "marker": ".", "color": looks([policy])[policy]["color"]}
-    with drawing(1, len(groups), height=3.4) as (figure, grid):
-        for axes, group in zip(grid[0], groups, strict=True):
-            inside = [i for i, joint in enumerate(robot.joints) if joint.group == group]
-            drive = robot.joints[inside[0]].drive
-            speed = np.linspace(-1.1 * drive.no_load_speed, 1.1 * drive.no_load_speed, 401)
-            limits = (drive.stall_torque, drive.no_load_speed, drive.effort_limit)
-            for limit in torque_limits(speed, *limits):
-                axes.plot(speed, limit, color=style.MEASURED, linewidth=1.3)
-            points = (velocity[:, inside].ravel(), torque[:, inside].ravel())
-            axes.plot(*points, markersize=2.2, alpha=0.5, rasterized=True, **marks)
-            axes.set(title=style.joint_words(group), xlabel="speed [rad/s]")
-        grid[0, 0].set_ylabel("torque [N m]")
-        limits_key = key("limits of the drive at nominal voltage", color=style.MEASURED)
-        legend(figure, [key(words, **marks), limits_key])
-    return figure

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,17 +11,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pronk.errors import ArtefactError, RobotError
+from pronk.errors import ArtefactError
 from pronk.evaluation import tables
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.protocol import RATES, TABLE_III, in_paper_order
-from pronk.evaluation.results import SUMMARY, Results, Row, Subject, load, share_interval
+from pronk.evaluation.results import SUMMARY, Results, Subject, load, share_interval
 from pronk.match.result import JointFit, MatchResult
 from pronk.report import match_page, style
 from pronk.report import trial_figures as draw
 from pronk.report.page import Content, Fold, Part, Picture, Section, picture, table
 from pronk.report.trial_figures import Published, Values
-from pronk.robots import load_robot
 from pronk.virtual import capture as capture_file
 
 Array = NDArray[np.float64]
@@ -71,17 +69,8 @@ class Captured:
     """By quantity, policy and command: runs as time [s] and value, each (2, T). `height` [m] over
     the time since the jump input; `roll` and `pitch` rate [rad/s] over the time since the command
     to run, of `RATES` alone."""
-    hardest: tuple[Row, Array, Array] | None
-    """The first policy's jump nearest to its drives' limits: row, joint velocities [rad/s] and
-    motor torques [N m] from the jump input to `AFTER_S` later, (T, joints)."""
     missing: int
     """Captures that the table names and the folder does not hold."""
-
-
-def least_margin(rows: Sequence[Row]) -> Row | None:
-    """Return the jump with the least torque margin of any joint; None without a jump."""
-    found = [row for row in rows if row.figures.found and len(row.figures.torque_margin)]
-    return min(found, key=lambda row: min(row.figures.torque_margin), default=None)
 
 
 def _cut(time: Array, value: Array, start: float, end: float) -> Array:
@@ -106,8 +95,6 @@ def captured(trial: Results, folder: Path) -> Captured | None:
     traces: dict[str, dict[str, dict[str, list[Array]]]] = {
         what: {name: {} for name in policies(trial)} for what in ("height", "roll", "pitch")
     }
-    hard = least_margin([row for row, _ in present if row.policy == trial.subjects[0].name])
-    hardest = None
     for row, path in present:
         capture = capture_file.load(path)
         time, turn = capture.time - row.began, capture.angular_velocity
@@ -118,10 +105,7 @@ def captured(trial: Results, folder: Path) -> Captured | None:
             found["pitch"] = _cut(run, turn[:, 1], 0.0, row.script.run_s)
         for what, trace in found.items():
             traces[what][row.policy].setdefault(row.case, []).append(trace)
-        if row is hard:
-            inside = (since >= 0.0) & (since <= AFTER_S)
-            hardest = (row, capture.joint_velocity[inside], capture.torque[inside])
-    return Captured(traces=traces, hardest=hardest, missing=len(kept) - len(present))
+    return Captured(traces=traces, missing=len(kept) - len(present))
 
 
 def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
@@ -305,7 +289,7 @@ def _traces(trial: Results, seen: Captured | None) -> list[Section]:
     """Sections that need captures."""
     if seen is None:
         return []
-    where, found, robot = tables.place(trial), [], None
+    where, found = tables.place(trial), []
     height, roll, pitch = seen.traces.values()
 
     def add(anchor: str, title: str, text: str, figure: Figure, words: str) -> None:
@@ -323,17 +307,6 @@ def _traces(trial: Results, seen: Captured | None) -> list[Section]:
     text += f" {seen.missing} captures are missing from the folder." * bool(seen.missing)
     figure = draw.heights(height, standing=float(trial.rules.get("standing_height", np.nan)))
     add("heights", "Trunk height over time", text, figure, "Height since the jump input")
-    with suppress(RobotError):
-        robot = load_robot(trial.robot)
-    if seen.hardest is not None and robot is not None:
-        row, velocity, torque = seen.hardest
-        name = f"{row.policy}, {row.case}, jump {row.number}, {where}"
-        text = (
-            "The captured jump nearest to the limits of the nominal drive; the virtual robot's "
-            "motors have torque constants and a bus voltage of their own."
-        )
-        figure = draw.torque_speed(robot, velocity, torque, policy=row.policy, words=name)
-        add("drives", "Torque and speed of the drives", text, figure, "Torque over speed")
     return found
 
 
