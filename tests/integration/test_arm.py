@@ -16,8 +16,9 @@ from pronk.match.arm import drives_of, fit_arm, match_arm
 from pronk.match.predict import predict
 from pronk.match.result import MatchResult
 from pronk.match.sample_mask import trusted_frequency, trusted_samples
+from pronk.response.grid import held_mean
 from pronk.robots import load_robot
-from pronk.simulators.chain import ChainSimulation, JointDrive, held_mean, moves_together
+from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together
 
 SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the SO-101 recordings are not here")

@@ -21,9 +21,10 @@ from pronk.match.arm import drives_of
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.measured_joint import gains_on_drive
 from pronk.match.prediction import JointPrediction, Prediction
+from pronk.response.grid import held_mean
 from pronk.robots.robot import Robot
 from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together
-from pronk.simulators.command_trace import CommandTrace, command_trace, held_mean
+from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.simulator import JointRigs, joint_rigs, play
 
 Array = NDArray[np.float64]

@@ -1,9 +1,8 @@
 """A whole chain of joints in the training simulator, all of them commanded as recorded.
 
-A test rig excites one joint and holds the rest; a recording in which every joint moves needs the
-chain as a whole, because each joint feels the others. Model and drives are those of the test rig,
-with a command for every joint, held from its measured timestamp to the next one. A joint that was
-not recorded (or not in radians) is held at its default position.
+Where several joints move at once, each is moved by the others as well. Model and drives are those
+of the test rig, with a command for every joint, held from its measured timestamp to the next one. A
+joint that was not recorded (or not in radians) is held at its default position.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
+from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import held_mean
+from pronk.simulators.mujoco import roll
 
 Array = NDArray[np.float64]
 
 MOVED_RAD = 1e-3
-"""A command that travels less than this excites nothing: it is below two counts of a 12-bit
-encoder."""
+"""Least travel of a command that excites a joint: two counts of a 12-bit encoder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,15 +44,11 @@ class JointDrive:
     delay: float = 0.0
     """Delay of the command [s]."""
     offset: float = 0.0
-    """What the encoder shows where the model's joint is at zero [rad]."""
+    """Reading of the encoder where the model's joint is at zero [rad]."""
 
     @classmethod
     def published(cls, robot: Robot, joint: str) -> JointDrive:
-        """The robot's own figures, without delay and offset.
-
-        Raises:
-            RobotError: The robot has no such joint.
-        """
+        """The robot's own figures, without delay and offset."""
         known = robot.joint(joint)
         return cls(
             stiffness=known.stiffness,
@@ -114,12 +109,7 @@ class ChainSimulation:
     """The chain with the commands of one or more logs, for many sets of drives."""
 
     def __init__(self, robot: Robot, logs: Sequence[JointLog], *, threads: int = 2) -> None:
-        """Compile the model and take in the logs.
-
-        Args:
-            robot: The robot.
-            logs: What to simulate.
-            threads: Threads of the simulator.
+        """Compile the model of the chain and prepare the commands of the logs.
 
         Raises:
             LogError: Nothing moves in radians, or joints of different chains move together.
@@ -162,29 +152,16 @@ class ChainSimulation:
             sets: Drives by joint name; joints without an entry have the robot's published ones.
 
         Returns:
-            One list per set with one array per log: position as the encoder would show it at the
-            log's timestamps [rad], shape (n, joints) in the order of `joints`; NaN from where a
+            One list per set with one array per log: reading of the encoders at the log's
+            timestamps [rad], shape (n, joints) in the order of `joints`; NaN from where a
             simulation diverged.
         """
         models = [self._with(drives) for drives in sets]
         out: list[list[Array]] = [[] for _ in sets]
         for track in self._tracks:
-            steps = track.steps
             control = np.stack([self._control(track, drives) for drives in sets])
-            state = np.zeros((len(sets), self._state_size()))
-            for row, drives in enumerate(sets):
-                state[row, 1 : 1 + self.model.nq] = track.start - self._offsets(drives)
-            trace, _ = self._pool.rollout(
-                models,
-                self._data,
-                state,
-                control,
-                nstep=steps,
-                skip_checks=False,
-                control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
-            )
-            # trace[k] is the state after step k + 1; the start is the state before the first.
-            whole = np.concatenate([state[:, None], trace], axis=1)[..., 1 : 1 + self.model.nq]
+            start = np.stack([track.start - self._offsets(drives) for drives in sets])
+            whole = roll(self._pool, models, self._data, start, control)
             for row, drives in enumerate(sets):
                 sampled = _sampled(whole[row], track.log.time, self.robot.timestep_s)
                 sampled += self._offsets(drives)
@@ -232,16 +209,11 @@ class ChainSimulation:
                 continue
             known = self.robot.joint(name).drive
             set_drive_gains(model, name, known, drive.stiffness, drive.damping)
-            set_passive(model, name, frictionloss=drive.frictionloss)
-            model.dof_armature[model.jnt_dofadr[self._rows[name]]] = drive.armature
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+            set_passive(model, name, armature=drive.armature, frictionloss=drive.frictionloss)
         return model
 
     def _offsets(self, drives: Drives) -> Array:
         return np.array([drives[name].offset if name in drives else 0.0 for name in self.chain])
-
-    def _state_size(self) -> int:
-        return int(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,8 @@
-"""The command a joint was given, at every physics step of the training simulator.
+"""The command to a joint, at every physics step of the training simulator.
 
-The log holds which command was in force at each measured instant; the simulator holds a command
-for whole physics steps, and a policy's command for `decimation` of them. The jitter of the
-timestamps (tens of microseconds) must not move a command by a whole step, so the instants at
-which the command was seen to change are fitted by the clock of the policy, and the command is
-read in the middle of each tick of that clock.
+The simulator holds a policy's command for `decimation` physics steps. The jitter of the timestamps
+(tens of microseconds) must not move a command by a whole step, so the instants at which the command
+changes are fitted by the clock of the policy, and the command is read in the middle of each tick.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ class CommandTrace:
     timestep: float
     """Physics step [s]."""
     command: Array
-    """MeasuredJoint position in force during each step [rad], shape (steps,)."""
+    """Command in force during each step [rad], shape (steps,)."""
     pose: Array
     """Position that every joint of the robot is held at, robot's order [rad], shape (joints,)."""
     amplitude: float = float("nan")
@@ -54,11 +52,7 @@ class CommandTrace:
         return np.asarray(self.start + self.timestep * np.arange(len(self.command)))
 
     def mirrored(self, robot: Robot) -> tuple[str, float, Array]:
-        """The joint to simulate, the sign between them, and the command about its own centre.
-
-        Returns:
-            Name of the original joint, sign, and `sign * (command - pose)` [rad], shape (steps,).
-        """
+        """Original joint to simulate, sign, and `sign * (command - pose)` [rad], (steps,)."""
         name, sign = robot.joint(self.joint).original
         centre = self.pose[robot.joint_names.index(self.joint)]
         return name, sign, np.asarray(sign * (self.command - centre))
@@ -66,13 +60,8 @@ class CommandTrace:
     def same_as(self, other: CommandTrace, robot: Robot, *, sign: float = 1.0) -> bool:
         """True if both lead to the same simulation of the same original joint.
 
-        One may rest longer than the other at the end. The pose of the joints of the chain must
-        agree as well, mirrored.
-
-        Args:
-            other: The trace to compare with.
-            robot: The robot.
-            sign: With -1, true if the other way round they would.
+        One may rest longer than the other at the end. With `sign` -1 the commands are compared
+        with opposite signs.
         """
         mine, theirs = self.mirrored(robot), other.mirrored(robot)
         if mine[0] != theirs[0]:
@@ -89,22 +78,14 @@ def original_pose(trace: CommandTrace, robot: Robot) -> Array:
     """Pose of the original joint's chain that mirrors the trace's pose [rad], shape (chain,)."""
     excited = robot.joint(trace.joint)
     original = robot.joint(excited.original[0])
-    index = {name: i for i, name in enumerate(robot.joint_names)}
-    pose = []
     # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
-    for own, first in zip(excited.chain, original.chain, strict=True):
-        sign = robot.joint(own).original[1] * robot.joint(first).original[1]
-        pose.append(sign * trace.pose[index[own]])
-    return np.array(pose)
+    pairs = zip(excited.chain, original.chain, strict=True)
+    signs = [robot.joint(own).original[1] * robot.joint(first).original[1] for own, first in pairs]
+    return np.array(signs) * trace.pose[[robot.joint_names.index(own) for own in excited.chain]]
 
 
 def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float]:
-    """Phase of the clock on which a held command changes.
-
-    Args:
-        time: Measured timestamps [s], shape (n,).
-        command: Command in force at each [rad], shape (n,).
-        tick: Period of the clock [s].
+    """Phase of the clock of period `tick` [s] on which a held command changes.
 
     Returns:
         An instant at which a tick begins [s], and the median distance of the changes from the
@@ -129,45 +110,8 @@ def held(time: Array, command: Array, instants: Array) -> Array:
     return np.asarray(command[np.clip(index, 0, len(time) - 1)])
 
 
-def held_mean(time: Array, command: Array, edges: Array) -> Array:
-    """Mean over each interval of a command that is held from each timestamp to the next.
-
-    The mean, not the value at the start: so the response depends smoothly on a delay that is no
-    multiple of the step, and a fit can find it.
-
-    Args:
-        time: Timestamps [s], shape (n,).
-        command: Command in force from each of them [rad], shape (n,).
-        edges: Ends of the intervals [s], shape (m + 1,).
-
-    Returns:
-        Means [rad], shape (m,).
-    """
-    area = np.concatenate([[0.0], np.cumsum(command[:-1] * np.diff(time))])
-    # Before the first timestamp the first command holds, after the last one the last.
-    before, after = min(edges[0], time[0]) - 1.0, max(edges[-1], time[-1]) + 1.0
-    times = np.concatenate([[before], time, [after]])
-    areas = np.concatenate(
-        [
-            [command[0] * (before - time[0])],
-            area,
-            [area[-1] + command[-1] * (after - time[-1])],
-        ]
-    )
-    return np.asarray(np.diff(np.interp(edges, times, areas)) / np.diff(edges))
-
-
-def command_trace(
-    log: JointLog, segment: Segment, joint: str, robot: Robot, *, until: float | None = None
-) -> CommandTrace:
-    """Command of one segment of a log at every physics step.
-
-    Args:
-        log: The log.
-        segment: The part of it to repeat.
-        joint: The joint whose command is taken; the rest are held at the pose.
-        robot: Gives the policy's rate, the physics step and the default pose.
-        until: Stop at this instant [s]; the segment's end if not given.
+def command_trace(log: JointLog, segment: Segment, joint: str, robot: Robot) -> CommandTrace:
+    """Command to one joint in one segment of a log at every physics step of the robot.
 
     Raises:
         LogError: The joint was not excited in the segment, its unit is unknown, or a joint that is
@@ -193,7 +137,7 @@ def command_trace(
     start = (
         clock + np.floor((part.time[0] - clock) / tick + 0.5) * tick if on_clock else part.time[0]
     )
-    end = part.time[-1] if until is None else min(until, float(part.time[-1]))
+    end = part.time[-1]
     if on_clock:
         ticks = int(np.ceil((end - start) / tick))
         middle = start + (np.arange(ticks) + 0.5) * tick

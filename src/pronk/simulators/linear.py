@@ -1,4 +1,4 @@
-"""The quick way: the simulator's own step, linearized, with the drive closed in closed form.
+"""The simulator's step linearized, with the drive in closed form.
 
 The 5 ms step about the pose is differentiated by MuJoCo (`mjd_transitionFD`) with a torque in
 place of the excited joint's drive. That gives the discrete transfer functions from torque to
@@ -9,7 +9,7 @@ position `P_q(z)` and speed `P_v(z)`; the explicit PD of the training simulator 
 for a whole grid of gains without simulating anything. `c = 4 f / (pi |speed|)` is the describing
 function of the joint's dry friction `f` (Gelb and Vander Velde, *Multiple-Input Describing
 Functions*, 1968, table of appendix B: ideal relay), iterated with the amplitude of the response.
-What it misses (coupling through held joints that slip, the estimator's leakage, friction near
+What it leaves out (coupling through held joints that slip, the estimator's leakage, friction near
 sticking) is a smooth ratio that simulations at the optimum correct.
 """
 
@@ -50,15 +50,10 @@ class Plant:
     def response(
         self, stiffness: ArrayLike, damping: ArrayLike, *, amplitude: float = float("nan")
     ) -> ComplexArray:
-        """Response from the held command to position, in the shared definition.
+        """Response from the held command to position, as in FrequencyResponse, shape (b, f).
 
-        Args:
-            stiffness: [N m/rad], shape (b,) or scalar.
-            damping: [N m s/rad], shape (b,) or scalar.
-            amplitude: Peak of the command [rad]; without it friction is left out.
-
-        Returns:
-            Shape (b, f).
+        Gains [N m/rad, N m s/rad] are scalars or of shape (b,); without the amplitude of the
+        command [rad] friction is left out.
         """
         kp = np.atleast_1d(np.asarray(stiffness, dtype=np.float64))[:, None]
         kd = np.atleast_1d(np.asarray(damping, dtype=np.float64))[:, None]
@@ -81,13 +76,7 @@ class Plant:
 
 
 def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
-    """Linearize a bench model about a pose.
-
-    Args:
-        rig: The excited joint's rig.
-        pose: Pose of its chain [rad], shape (chain,).
-        omega: Frequencies to evaluate [rad/s], shape (f,).
-    """
+    """Linearize a rig about the pose of its chain [rad], at frequencies `omega` [rad/s]."""
     model = rig.torque_model()
     data = mujoco.MjData(model)
     data.qpos[:] = pose

@@ -1,13 +1,11 @@
 """The training simulator with one joint excited on the test rig, and whole chains.
 
 The model is `pronk.robots.model.bench_spec`: fixed base, the joint's own chain, explicit PD at the
-start of each 5 ms step, clipped by the torque-speed curve. One native MuJoCo model holds all of
-it, so `mujoco.rollout` runs thousands of gain pairs on its threads with no Python in the loop,
-and the trajectories are those of the training environment (a test holds it).
+start of each 5 ms step, clipped by the torque-speed curve. `mujoco.rollout` runs thousands of gain
+pairs on its threads; the trajectories are those of the training environment.
 
-Only the excited joint's position is kept (a `jointpos` sensor, read at the start of each step);
-the other state columns are never stored. A joint that mirrors another is simulated as that other
-(`Joint.original`), so mirror-image legs cost one simulation.
+Only the excited joint's position is kept (a `jointpos` sensor, read at the start of each step). A
+joint that mirrors another is simulated as that other (`Joint.original`).
 """
 
 from __future__ import annotations
@@ -24,20 +22,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import PronkError, RobotError
+from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import Robot
-from pronk.simulators.command_trace import CommandTrace, held_mean, original_pose
+from pronk.simulators.command_trace import CommandTrace, original_pose
 from pronk.simulators.simulator import CHUNK, PARAMETERS, Count, SimulatorInfo, play
 
 Array = NDArray[np.float64]
 
 _SAG_ROUNDS = 4
 """Rounds of `q = target - gravity(q) / stiffness`; each gains two digits at 17 N m/rad."""
-
-
 DEVICES = ("cpu", "cuda", "warp-cpu")
 """`cpu`: `mujoco.rollout` on its threads, in double precision. `cuda`: MuJoCo Warp on the GPU, in
-single precision. `warp-cpu`: MuJoCo Warp on the processor, slow, to see what precision does."""
+single precision. `warp-cpu`: MuJoCo Warp on the processor, slow, to compare precisions."""
 
 
 def rest_position(
@@ -55,12 +52,46 @@ def rest_position(
     return np.array(data.qpos)
 
 
-class JointTestRig:
-    """One joint on the test rig, simulated with many gain pairs.
+def full_states(model: mujoco.MjModel, positions: Array) -> Array:
+    """States at rest at given positions, shapes (n, nq) to (n, state size)."""
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.zeros((len(positions), mujoco.mj_stateSize(model, full)))
+    # Full physics begins with time, then qpos, then qvel.
+    state[:, 1 : 1 + model.nq] = positions
+    return state
 
-    Built for the original of a mirrored family; positions and commands are about the pose, in
-    the original's own sign.
+
+def roll(
+    pool: mujoco.rollout.Rollout,
+    models: Sequence[mujoco.MjModel],
+    data: Sequence[mujoco.MjData],
+    positions: Array,
+    control: Array,
+) -> Array:
+    """Positions at the start of each step and after the last, shape (n, steps + 1, nq).
+
+    Args:
+        pool: Threads.
+        models: One a run.
+        data: One a thread.
+        positions: Positions at rest that the runs begin at, shape (n, nq).
+        control: Commands, shape (n, steps, nu).
     """
+    nq, state = models[0].nq, full_states(models[0], positions)
+    after, _ = pool.rollout(
+        models,
+        data,
+        state,
+        control,
+        nstep=control.shape[1],
+        skip_checks=False,
+        control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
+    )
+    return np.concatenate([state[:, None], after], axis=1)[..., 1 : 1 + nq]
+
+
+class JointTestRig:
+    """One joint on the test rig, the original of a mirrored family, with many gain pairs."""
 
     def __init__(
         self,
@@ -103,10 +134,7 @@ class JointTestRig:
             objname=joint,
         )
         self.model = spec.compile()
-        self.chain = tuple(
-            mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_JOINT, i)
-            for i in range(self.model.njnt)
-        )
+        self.chain = tuple(self.model.joint(i).name for i in range(self.model.njnt))
         if joint not in self.chain:
             raise RobotError(f"the bench model of {joint} holds {', '.join(self.chain)} instead.")
         self.index = self.chain.index(joint)
@@ -190,8 +218,7 @@ class JointTestRig:
             self._models.append(copy.copy(self.model))
         control = np.empty((size, steps, self.model.nu))
         sensor = np.empty((size, steps, self.model.nsensordata))
-        width = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        initial = np.zeros((size, width))
+        initial = full_states(self.model, np.zeros((size, self.model.nq)))
         centre = np.empty(size)
         shared = len(commands) == 1 and len(poses) == 1
         rest: dict[float, Array] = {}
@@ -233,26 +260,17 @@ class JointTestRig:
         self, model: mujoco.MjModel, i: int, armature: Array | None, frictionloss: Array | None
     ) -> None:
         """Give a model the armature and friction of simulation i, or the rig's own."""
-        dof = self.index
+        own = self.model.dof_armature[self.index], self.model.dof_frictionloss[self.index]
         set_passive(
             model,
             self.joint.name,
-            armature=float(self.model.dof_armature[dof] if armature is None else armature[i]),
-            frictionloss=float(
-                self.model.dof_frictionloss[dof] if frictionloss is None else frictionloss[i]
-            ),
+            armature=float(own[0] if armature is None else armature[i]),
+            frictionloss=float(own[1] if frictionloss is None else frictionloss[i]),
         )
 
 
 def rig_on(device: str) -> Callable[..., JointTestRig]:
-    """What builds a rig on a device; call it as `JointTestRig`.
-
-    Args:
-        device: One of `DEVICES`.
-
-    Raises:
-        PronkError: The device is unknown, MuJoCo Warp is not installed, or there is no GPU.
-    """
+    """The class of the rig for one of `DEVICES`; PronkError if it cannot be used here."""
     if device not in DEVICES:
         raise PronkError(f"device {device!r}; expected one of {', '.join(DEVICES)}.")
     if device == "cpu":
@@ -282,24 +300,9 @@ class MujocoSimulator:
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        *,
-        armature: float | None = None,
-        threads: int = 2,
-        device: str = "cpu",
+        self, robot: Robot, *, armature: float | None = None, threads: int = 2, device: str = "cpu"
     ) -> None:
-        """Take note of the robot.
-
-        Args:
-            robot: The robot.
-            armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
-            threads: Threads of the simulator.
-            device: Where large runs are simulated; see `DEVICES`.
-
-        Raises:
-            PronkError: The device is unknown or cannot be used here.
-        """
+        """Prepare for rigs with `armature` [kg m^2] at the excited joint; the drive's if None."""
         self.robot = robot
         self.info = mujoco_info(robot)
         self.joints = robot.joint_names
@@ -327,10 +330,7 @@ class MujocoSimulator:
         original = self.robot.joint(joint).original[0]
         if original not in self._rigs:
             self._rigs[original] = self._new_rig(
-                self.robot,
-                original,
-                armature=self._armature,
-                threads=self._threads,
+                self.robot, original, armature=self._armature, threads=self._threads
             )
         return self._rigs[original]
 
@@ -368,7 +368,7 @@ class MujocoSimulator:
         names = [self.joints[k] for k in columns]
         runs, steps = command.shape[:2]
         control = np.zeros((runs, steps, model.nu))
-        state = np.zeros((runs, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        rest = np.zeros((runs, model.nq))
         models = [copy.copy(model) for _ in range(runs)]
         data = mujoco.MjData(model)
         edges = self.robot.timestep_s * np.arange(steps + 1)
@@ -381,57 +381,32 @@ class MujocoSimulator:
                 kp = own.get("stiffness", joint.stiffness)
                 stiffness[address[k]] = kp
                 set_drive_gains(one, name, joint.drive, kp, own.get("damping", joint.damping))
-                set_passive(
-                    one,
-                    name,
-                    armature=own.get("armature"),
-                    frictionloss=own.get("frictionloss"),
-                )
+                passive = own.get("armature"), own.get("frictionloss")
+                set_passive(one, name, armature=passive[0], frictionloss=passive[1])
                 track = command[b, :, k]
                 if delay := own.get("delay", 0.0):
                     track = held_mean(edges[:-1], track, edges - delay)
                 control[b, :, model.actuator(name).id] = track
             target = np.empty(model.nq)
             target[address] = command[b, 0]
-            state[b, 1 : 1 + model.nq] = rest_position(one, data, target, stiffness)
-        trace, _ = mujoco.rollout.rollout(
-            models,
-            data,
-            state,
-            control,
-            nstep=steps,
-            skip_checks=False,
-            control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
-        )
-        before = np.concatenate([state[:, None], trace[:, :-1]], axis=1)
-        return np.asarray(before[..., 1 : 1 + model.nq][..., address])
+            rest[b] = rest_position(one, data, target, stiffness)
+        with mujoco.rollout.Rollout(nthread=0) as pool:
+            return roll(pool, models, [data], rest, control)[:, :-1, address]
 
     @property
     def count(self) -> Count:
         """Steps and seconds of all rigs together."""
         counts = [rig.count for rig in self._rigs.values()]
-        return Count(
-            steps=sum(count.steps for count in counts),
-            seconds=sum(count.seconds for count in counts),
-        )
+        return Count(sum(count.steps for count in counts), sum(count.seconds for count in counts))
 
 
 def simulate(
     robot: Robot, trace: CommandTrace, stiffness: ArrayLike, damping: ArrayLike, **options: Any
 ) -> Array:
-    """Simulate one command in the training simulator with many gain pairs.
+    """Simulate one command in the training simulator with many gain pairs; see `play`.
 
-    The simulation begins at rest where gravity leaves the joint with its first command.
-
-    Args:
-        robot: The robot.
-        trace: The command to repeat.
-        stiffness: Gains of the excited joint [N m/rad], shape (b,) or a scalar.
-        damping: Gains of the excited joint [N m s/rad], shape (b,) or a scalar.
-        options: Those of `JointTestRig`.
-
-    Returns:
-        Position at the start of each step [rad], shape (b, steps), at `trace.time`.
+    It begins at rest where gravity leaves the joint with its first command. Gains [N m/rad,
+    N m s/rad] are scalars or of shape (b,); `options` are those of `JointTestRig`.
     """
     kp, kd = np.broadcast_arrays(
         np.atleast_1d(np.asarray(stiffness, dtype=np.float64)),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
@@ -79,11 +79,6 @@ class Count:
 
     steps: int = 0
     seconds: float = 0.0
-
-    @property
-    def rate(self) -> float:
-        """Physics steps per second; NaN before the first."""
-        return self.steps / self.seconds if self.seconds > 0.0 else float("nan")
 
 
 class JointRig(Protocol):
@@ -154,13 +149,7 @@ class RolloutRigs:
     def __init__(
         self, simulator: Simulator, robot: Robot, *, armature: float | None = None
     ) -> None:
-        """Take a simulator.
-
-        Args:
-            simulator: The simulator.
-            robot: The robot; timestep and decimation become those of the simulator.
-            armature: Rotor inertia of the excited joint [kg m^2]; the simulator's if not given.
-        """
+        """Take a simulator, and the armature of the excited joint [kg m^2] instead of its own."""
         info = simulator.info
         self.robot = replace(robot, timestep_s=info.timestep_s, decimation=info.decimation)
         self.info = info
@@ -179,46 +168,31 @@ class RolloutRigs:
         """No-op: the simulator belongs to the caller."""
 
     def without_armature(self) -> RolloutRigs:
-        """The same with no rotor inertia at the excited joint.
-
-        Raises:
-            PronkError: The simulator cannot set the armature.
-        """
+        """The same with no rotor inertia at the excited joint."""
         return RolloutRigs(self._simulator, self.robot, armature=0.0)
 
     def rig(self, joint: str) -> RolloutRig:
-        """The rig of a joint's mirrored original.
-
-        Raises:
-            PronkError: The simulator lacks the joint, or a parameter that is set.
-        """
+        """The rig of a joint's mirrored original; PronkError if the simulator lacks it."""
         original = self.robot.joint(joint).original[0]
         if original not in self._simulator.joints:
             raise PronkError(
                 f"simulator {self.info.engine} has no joint {original!r}; its joints are "
                 f"{', '.join(self._simulator.joints)}."
             )
-        return RolloutRig(self._simulator, self.robot, original, self.count, self._armature)
+        return RolloutRig(self._simulator, self.robot, original, self._armature, self.count)
 
 
+@dataclass
 class RolloutRig:
     """One joint of any simulator, the others held at the pose."""
 
-    def __init__(
-        self,
-        simulator: Simulator,
-        robot: Robot,
-        joint: str,
-        count: Count,
-        armature: float | None = None,
-    ) -> None:
-        """Excite `joint`, an original, with its own armature [kg m^2] if one is given."""
-        self.robot = robot
-        self._simulator = simulator
-        self._joint = joint
-        self._count = count
-        self._armature = armature
-        self._chain = robot.joint(joint).chain or (joint,)
+    simulator: Simulator
+    robot: Robot
+    joint: str
+    """An original, not a mirror image."""
+    armature: float | None = None
+    """Instead of the simulator's own [kg m^2]."""
+    count: Count = field(default_factory=Count)
 
     def pose(self, trace: CommandTrace) -> Array:
         """Pose of the joint's chain [rad], shape (chain,)."""
@@ -235,61 +209,51 @@ class RolloutRig:
         frictionloss: Array | None = None,
     ) -> Iterator[tuple[slice, Array]]:
         """Yield the excited joint's positions a chunk at a time; see `JointRig.run`."""
-        names = self._simulator.joints
-        column = names.index(self._joint)
-        rest = np.array([self.robot.joint(name).default_position for name in names])
-        if armature is None and self._armature is not None:
-            armature = np.full(len(stiffness), self._armature)
+        names, can = self.simulator.joints, self.simulator.parameters
+        column = names.index(self.joint)
         joints = [self.robot.joint(name) for name in names]
+        chain = self.robot.joint(self.joint).chain or (self.joint,)
+        if armature is None and self.armature is not None:
+            armature = np.full(len(stiffness), self.armature)
         own = {
             "stiffness": [joint.stiffness for joint in joints],
             "damping": [joint.damping for joint in joints],
             "armature": [joint.drive.armature for joint in joints],
             "frictionloss": [joint.drive.frictionloss for joint in joints],
         }
-        excited = {"stiffness": stiffness, "damping": damping}
-        excited |= {"armature": armature} if armature is not None else {}
-        excited |= {"frictionloss": frictionloss} if frictionloss is not None else {}
-        can = self._simulator.parameters
+        given = (stiffness, damping, armature, frictionloss)
+        excited = {n: value for n, value in zip(own, given, strict=True) if value is not None}
         if lacking := set(excited) - can:
             raise PronkError(
-                f"simulator {self._simulator.info.engine} cannot set "
+                f"simulator {self.simulator.info.engine} cannot set "
                 f"{', '.join(sorted(lacking))}; it sets {', '.join(sorted(can))}."
             )
-        locked = tuple(name for name in names if name != self._joint)
+        locked = tuple(name for name in names if name != self.joint)
         for begin in range(0, len(stiffness), CHUNK):
             part = slice(begin, min(begin + CHUNK, len(stiffness)))
             size = part.stop - part.start
             command = np.empty((size, len(commands[0]), len(names)))
             centre = np.empty((size, 1))
             for row, i in enumerate(range(part.start, part.stop)):
-                pose = dict(zip(self._chain, poses[0 if len(poses) == 1 else i], strict=True))
-                command[row] = [pose.get(n, r) for n, r in zip(names, rest, strict=True)]
+                pose = dict(zip(chain, poses[0 if len(poses) == 1 else i], strict=True))
+                command[row] = [pose.get(j.name, j.default_position) for j in joints]
                 command[row, :, column] += commands[0 if len(commands) == 1 else i]
-                centre[row] = pose[self._joint]
+                centre[row] = pose[self.joint]
             values = {name: np.tile(own[name], (size, 1)) for name in own if name in can}
             for name, array in excited.items():
                 values[name][:, column] = array[part]
             before = time.perf_counter()
-            position = checked(self._simulator.rollout(command, values, locked=locked), command)
-            self._count.seconds += time.perf_counter() - before
-            self._count.steps += size * command.shape[1]
+            position = np.asarray(
+                self.simulator.rollout(command, values, locked=locked), dtype=np.float64
+            )
+            if position.shape != command.shape:
+                raise PronkError(
+                    f"the simulator's rollout returned shape {position.shape}; expected that of "
+                    f"the command, {command.shape} (runs, steps, joints)."
+                )
+            self.count.seconds += time.perf_counter() - before
+            self.count.steps += size * command.shape[1]
             yield part, position[:, :, column] - centre
-
-
-def checked(position: Any, command: Array) -> Array:
-    """What a rollout returned, as an array.
-
-    Raises:
-        PronkError: It has another shape than the command.
-    """
-    out = np.asarray(position, dtype=np.float64)
-    if out.shape != command.shape:
-        raise PronkError(
-            f"the simulator's rollout returned shape {out.shape}; expected that of the command, "
-            f"{command.shape} (runs, steps, joints)."
-        )
-    return out
 
 
 def play(
@@ -309,13 +273,9 @@ def play(
     sign, command = trace.mirrored(rig.robot)[1:]
     centre = trace.pose[rig.robot.joint_names.index(trace.joint)]
     out = np.empty((len(stiffness), len(command)))
+    pose = rig.pose(trace)
     for part, position in rig.run(
-        [command],
-        [rig.pose(trace)],
-        stiffness,
-        damping,
-        armature=armature,
-        frictionloss=frictionloss,
+        [command], [pose], stiffness, damping, armature=armature, frictionloss=frictionloss
     ):
         out[part] = centre + sign * position
     return out
@@ -342,19 +302,16 @@ def load_simulator(
         return MujocoSimulator(robot, threads=threads, device=device)
     if device != "cpu":
         raise PronkError(f"device {device!r} is for simulator mujoco; {choice} has its own.")
-    simulator = _factory(choice)(robot)
-    lacking = [
-        name for name in ("info", "joints", "parameters", "rollout") if not hasattr(simulator, name)
-    ]
-    if lacking:
+    simulator: Simulator = _factory(choice)(robot)
+    members = ("info", "joints", "parameters", "rollout")
+    if lacking := [name for name in members if not hasattr(simulator, name)]:
         raise PronkError(f"simulator {choice} has no {', '.join(lacking)}; see Simulator.")
     if not {"stiffness", "damping"} <= set(simulator.parameters):
         raise PronkError(
             f"simulator {choice} sets {', '.join(sorted(simulator.parameters)) or 'nothing'}; "
             "expected at least stiffness and damping."
         )
-    found: Simulator = simulator
-    return found
+    return simulator
 
 
 def joint_rigs(choice: str, robot: Robot, *, threads: int = 2, device: str = "cpu") -> JointRigs:
@@ -362,41 +319,37 @@ def joint_rigs(choice: str, robot: Robot, *, threads: int = 2, device: str = "cp
     from pronk.simulators.mujoco import MujocoSimulator
 
     simulator = load_simulator(choice, robot, threads=threads, device=device)
-    if isinstance(simulator, MujocoSimulator):
-        return simulator
-    return RolloutRigs(simulator, robot)
+    return simulator if isinstance(simulator, MujocoSimulator) else RolloutRigs(simulator, robot)
 
 
 def _factory(choice: str) -> Any:
     """The callable that a path or entry point names."""
     file, colon, name = choice.rpartition(":")
-    if colon and file.endswith(".py"):
-        path = Path(file)
-        if not path.is_file():
-            raise PronkError(f"simulator {choice}: there is no file {path}.")
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        try:
-            spec.loader.exec_module(module)
-        except Exception as error:
+    if not (colon and file.endswith(".py")):
+        known = entry_points(group=ENTRY_POINTS)
+        if choice not in known.names:
             raise PronkError(
-                f"simulator {choice}: {path} cannot be loaded ({type(error).__name__}: {error})."
-            ) from error
-        found = getattr(module, name, None)
-        if not callable(found):
-            own = [v for v in vars(module).values() if getattr(v, "__module__", "") == path.stem]
-            offers = [v.__name__ for v in own if isinstance(v, type)]
-            raise PronkError(
-                f"simulator {choice}: {path} has no {name!r} that can be called; its classes are "
-                f"{', '.join(offers) or 'none'}."
+                f"simulator {choice!r}; expected FILE.py:NAME or one of "
+                f"{', '.join(['mujoco', *sorted(known.names)])}."
             )
-        return found
-    known = entry_points(group=ENTRY_POINTS)
-    if choice not in known.names:
+        return plugins.load(known[choice])
+    path = Path(file)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise PronkError(f"simulator {choice}: there is no file {path}.")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
         raise PronkError(
-            f"simulator {choice!r}; expected FILE.py:NAME or one of "
-            f"{', '.join(['mujoco', *sorted(known.names)])}."
+            f"simulator {choice}: {path} cannot be loaded ({type(error).__name__}: {error})."
+        ) from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        own = [v for v in vars(module).values() if getattr(v, "__module__", "") == path.stem]
+        offers = [v.__name__ for v in own if isinstance(v, type)]
+        raise PronkError(
+            f"simulator {choice}: {path} has no {name!r} that can be called; its classes are "
+            f"{', '.join(offers) or 'none'}."
         )
-    return plugins.load(known[choice])
+    return found

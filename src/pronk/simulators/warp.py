@@ -1,17 +1,16 @@
 """The test rig on a GPU: thousands of gain pairs at once in MuJoCo Warp.
 
-The model and the commands are those that `pronk.simulators.mujoco.JointTestRig` rolls out on the
-processor; what differs is the arithmetic. MuJoCo Warp computes in single
-precision and stops its solver at a tolerance of 1e-6 instead of 1e-8. With the paper's chirp on
-the Mini Cheetah (measured on Warp's CPU device, all 2,500 nodes) the median node's largest
+Model and commands are those of `pronk.simulators.mujoco.JointTestRig`; MuJoCo Warp computes in
+single precision and stops its solver at a tolerance of 1e-6 instead of 1e-8. With the paper's chirp
+on the Mini Cheetah (measured on Warp's CPU device, all 2,500 nodes) the median node's largest
 difference is 3e-7 rad, the best cell is the same and its response agrees within 1e-5 dB. Only a
 stiff knee with little damping, which this chirp makes chaotic, differs visibly: by 0.09 rad and
 0.3 dB at the corner 27 N m/rad, 0.1 N m s/rad, where rounding the command to single precision
-moves the double precision just as far. Tests hold the shorter way.
+moves the double precision just as far.
 
 A step costs a GPU about the same for one simulation as for thousands. So the grid is stepped
-there, and whatever asks fewer than `LEAST` simulations (the refinement, which takes differences
-between neighbouring gains) stays on the processor, in double precision.
+there, and runs of fewer than `LEAST` simulations (the refinement, which takes differences between
+neighbouring gains) stay on the processor, in double precision.
 
 Imported only when used: it needs the extra `pronk[train]`.
 """
@@ -58,7 +57,7 @@ def _before_step(
     ctrl: wp.array2d[float],
     position: wp.array2d[float],
 ) -> None:
-    """Before a step: note where the excited joint is, and give it the command of this step.
+    """Store the excited joint's position and set the command of this step.
 
     Every world keeps its own clock, so a captured step needs nothing from the host.
     """
@@ -78,17 +77,9 @@ class WarpTestRig(JointTestRig):
     def __init__(
         self, robot: Robot, joint: str, *, device: str = "cuda", least: int = LEAST, **options: Any
     ) -> None:
-        """Compile the model and find the device.
+        """Compile the model and find the device, `cuda` or `warp-cpu`.
 
-        Args:
-            robot: The robot.
-            joint: The joint to excite; the original of a mirrored family.
-            device: `cuda`, or `warp-cpu` (slow; to compare the arithmetic without a GPU).
-            least: Fewer simulations than this run on the processor.
-            options: Those of `JointTestRig`.
-
-        Raises:
-            PronkError: There is no such device.
+        Fewer simulations than `least` run on the processor; `options` are those of `JointTestRig`.
         """
         self._device = find_device(device)
         super().__init__(robot, joint, **options)
@@ -119,10 +110,10 @@ class WarpTestRig(JointTestRig):
             return
         for begin in range(0, total, MOST):
             batch = slice(begin, min(begin + MOST, total))
-            asks = commands if len(commands) == 1 else commands[batch]
+            own = commands if len(commands) == 1 else commands[batch]
             stands = poses if len(poses) == 1 else poses[batch]
             before = time.perf_counter()
-            raw = self._step(asks, stands, stiffness[batch], damping[batch])
+            raw = self._step(own, stands, stiffness[batch], damping[batch])
             self.count.seconds += time.perf_counter() - before
             self.count.steps += raw.size
             centre = np.array([pose[self.index] for pose in stands])
@@ -147,7 +138,7 @@ class WarpTestRig(JointTestRig):
             target[:, i] = pose[self.index] + commands[0 if len(commands) == 1 else i]
         gains = np.empty((count, *self.model.actuator_gainprm.shape))
         start = np.empty((count, self.model.nq))
-        scratch = self._scratch()
+        scratch = copy.copy(self.model)
         rest: dict[float, Array] = {}
         for i, (kp, kd) in enumerate(zip(stiffness.tolist(), damping.tolist(), strict=True)):
             set_drive_gains(scratch, self.joint.name, self.joint.drive, kp, kd)
@@ -162,12 +153,6 @@ class WarpTestRig(JointTestRig):
             self._worlds = None  # gives the memory back before more is taken
             worlds = self._worlds = _Worlds(self, self._device, count, steps, shared)
         return worlds.run(start, gains, control, target)
-
-    def _scratch(self) -> mujoco.MjModel:
-        """A model of which only the gains are used."""
-        if not self._models:
-            self._models.append(copy.copy(self.model))
-        return self._models[0]
 
 
 class _Worlds:
@@ -203,16 +188,13 @@ class _Worlds:
         return self._shared == shared and count <= self._count and steps <= self._steps
 
     def run(self, start: Array, gains: Array, control: Array, target: Array) -> NDArray[np.float32]:
-        """Step all simulations through their commands.
+        """Position of the excited joint at the start of each step, shape (steps, n).
 
         Args:
             start: Positions at rest, shape (n, nq).
             gains: Parameters of the actuators, shape (n, nu, parameters).
             control: Commands of the joints that are held, shape (1 or n, nu).
             target: Commands of the excited joint, shape (steps, 1 or n).
-
-        Returns:
-            Position of the excited joint at the start of each step, shape (steps, n).
         """
         steps, count = len(target), len(start)
         # Worlds to spare repeat the last simulation; commands to spare are never reached.
@@ -256,7 +238,7 @@ class _Worlds:
             or (wp.get_cuda_driver_version() or (0, 0)) < _GRAPH_DRIVER
         ):
             return None
-        # A graph of old that is collected meanwhile would be captured being destroyed.
+        # Destroying an old graph meanwhile would be captured as well.
         collecting = gc.isenabled()
         gc.disable()
         try:
@@ -269,14 +251,7 @@ class _Worlds:
 
 
 def find_device(name: str) -> Any:
-    """The Warp device of a name.
-
-    Args:
-        name: `cuda` or `warp-cpu`.
-
-    Raises:
-        PronkError: There is no CUDA device.
-    """
+    """The Warp device called `cuda` or `warp-cpu`; PronkError if there is no CUDA device."""
     if name == "warp-cpu":
         return wp.get_device("cpu")
     if not wp.is_cuda_available():
