@@ -7,12 +7,14 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pronk
 from pronk.cli import console
+from pronk.cli.match import prediction_rows, summary
 from pronk.cli.sweep import AMPLITUDES, make, record_virtual
 from pronk.errors import PronkError
 
@@ -60,25 +62,21 @@ def demo(
     begun = time.perf_counter()
     robot = load_robot(ROBOT)
     tried = find_policies(policies, robot)
-    trial: Results | None = None
-    films: tuple[Path, ...] = ()
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
     with (
         console.progress() as report,
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
     ):
-        jumping = pool.submit(jump_and_film, tried, out / "trial", jumps=jumps, seed=seed)
-        result, replays = sweep_and_match(
-            robot, out, repeats=repeats, seed=seed, quick=quick, report=report
-        )
+        jumping = pool.submit(jump_and_film, tried, out / "trial", jumps, seed)
+        result, replays = sweep_and_match(robot, out, repeats, seed, quick, report)
         report("jumps and film", 0.0)
-        if tried:
-            trial, films = jumping.result()
+        trial, films = jumping.result()
         report("jumps and film", 1.0)
         hero = style.save(figures.hero(result), out / "hero.svg")
         page, _ = write_report(out, report)
     seconds = time.perf_counter() - begun
-    show_match(result, replays)
+    cells = cells_apart(result)
+    show_match(result, replays, cells)
     if trial is not None:
         show_trial(trial)
     console.say(
@@ -86,9 +84,14 @@ def demo(
         f"come with pronk. {seconds:.0f} s in all."
     )
     console.wrote(out / "logs", out / "gains.yaml", out / "match.npz", hero, *films, page)
-    console.write_json(
-        json_file, figures_of(result, replays, trial) | {"page": page, "seconds_total": seconds}
-    )
+    found = {
+        "cells_from_table_1": cells,
+        "predictions": prediction_rows(replays),
+        "trial": out / "trial" / "summary.json" if trial is not None else None,
+        "page": page,
+        "seconds_total": seconds,
+    }
+    console.write_json(json_file, summary(result) | found)
     console.following(
         f"open {page} in a browser",
         f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
@@ -128,7 +131,7 @@ def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
 
 
 def jump_and_film(
-    policies: Sequence[Path], out: Path, *, jumps: int, seed: int
+    policies: Sequence[Path], out: Path, jumps: int, seed: int
 ) -> tuple[Results | None, tuple[Path, ...]]:
     """Run a short trial on the shipped virtual robot and film one jump of the first policy.
 
@@ -141,10 +144,8 @@ def jump_and_film(
     Returns:
         The trial, None without policies, and the files of the film.
     """
-    from dataclasses import replace
-
-    from pronk.cli.trial import painted
-    from pronk.evaluation.trial import Plan, cores, run_trial
+    from pronk.evaluation.pictures.video import record_all
+    from pronk.evaluation.trial import VIDEOS, Plan, cores, run_trial
     from pronk.files import sha256
     from pronk.robots import load_robot
     from pronk.virtual.sim_params import SHIPPED, load_sim_params
@@ -162,11 +163,12 @@ def jump_and_film(
         processes=cores(),
     )
     first = replace(trial, subjects=trial.subjects[:1])
-    return trial, painted(first, out, report=None, at_once=1, cases=(FILMED,), slow=2.0)
+    films = record_all(first, out, out / VIDEOS, warn=console.warn, cases=(FILMED,), slow=2.0)
+    return trial, films
 
 
 def sweep_and_match(
-    robot: Robot, out: Path, *, repeats: int, seed: int, quick: bool, report: console.Reporter
+    robot: Robot, out: Path, repeats: int, seed: int, quick: bool, report: console.Reporter
 ) -> tuple[MatchResult, list[JointPrediction]]:
     """Sweep all joints, match them, and predict a sweep that was not matched.
 
@@ -214,13 +216,43 @@ def sweep_and_match(
     return result, replays
 
 
-def show_match(result: MatchResult, replays: list[JointPrediction]) -> None:
+def cells_apart(result: MatchResult) -> dict[str, list[float]]:
+    """Distance of each joint's gains from the paper's Table I, in cells of the grid."""
+    from pronk.report.paper import published
+
+    paper = published(ROBOT)
+    assert paper is not None
+    found = {}
+    for name, joint in result.joints.items():
+        grids = (joint.grid_stiffness, joint.grid_damping)
+        pairs = zip((joint.stiffness, joint.damping), paper.joints[name], grids, strict=True)
+        found[name] = [float(abs(own - its) / (grid[1] - grid[0])) for own, its, grid in pairs]
+    return found
+
+
+def show_match(
+    result: MatchResult, replays: Sequence[JointPrediction], cells: dict[str, list[float]]
+) -> None:
     """Print matched gains beside the paper's, and the errors with nominal and matched gains."""
     from pronk.report.paper import published
 
     paper = published(ROBOT)
     assert paper is not None
     by_joint = {one.joint: one for one in replays}
+    rows = [
+        [
+            name,
+            f"{gains.stiffness:.2f} / {gains.damping:.3f}",
+            "{:g} / {:g}".format(*paper.joints[name]),
+            "{:.1f} / {:.1f}".format(*cells[name]),
+            console.number(gains.naive_error_db),
+            console.number(gains.error_db),
+            console.number(by_joint[name].rmse_naive, 4),
+            console.number(by_joint[name].rmse_matched, 4),
+            console.number(result.joints[name].zero_armature_error_db),
+        ]
+        for name, gains in result.gains.joints.items()
+    ]
     made = console.table(
         "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)",
         "joint",
@@ -232,22 +264,8 @@ def show_match(result: MatchResult, replays: list[JointPrediction]) -> None:
         "fresh RMSE nominal [rad]",
         "matched [rad]",
         "no rotor inertia [dB]",
+        rows=rows,
     )
-    for name, gains in result.gains.joints.items():
-        joint, one = result.joints[name], by_joint[name]
-        cells = cells_apart(result, name, paper.joints[name])
-        console.row(
-            made,
-            name,
-            f"{gains.stiffness:.2f} / {gains.damping:.3f}",
-            "{:g} / {:g}".format(*paper.joints[name]),
-            "{:.1f} / {:.1f}".format(*cells),
-            console.number(gains.naive_error_db),
-            console.number(gains.error_db),
-            console.number(one.rmse_naive, 4),
-            console.number(one.rmse_matched, 4),
-            console.number(joint.zero_armature_error_db),
-        )
     console.show(made)
 
 
@@ -265,33 +283,3 @@ def show_trial(trial: Results) -> None:
             f"of {sum(cell.n for cell in cells)} jumps landed, {cells[0].n} with each command; "
             "`pronk trial` does 20."
         )
-
-
-def cells_apart(result: MatchResult, name: str, pair: tuple[float, float]) -> tuple[float, float]:
-    """Distance from the matched gains to another pair, in cells of the grid."""
-    joint = result.joints[name]
-    stiffness, damping = (grid[1] - grid[0] for grid in (joint.grid_stiffness, joint.grid_damping))
-    return (
-        float(abs(joint.stiffness - pair[0]) / stiffness),
-        float(abs(joint.damping - pair[1]) / damping),
-    )
-
-
-def figures_of(
-    result: MatchResult, replays: list[JointPrediction], trial: Results | None
-) -> dict[str, Any]:
-    """Collect the figures for `--json`."""
-    from pronk.cli.match import prediction_rows
-    from pronk.cli.match import summary as match_summary
-    from pronk.cli.trial import figures as trial_figures
-    from pronk.report.paper import published
-
-    paper = published(ROBOT)
-    assert paper is not None
-    return match_summary(result) | {
-        "cells_from_table_1": {
-            name: cells_apart(result, name, paper.joints[name]) for name in result.joints
-        },
-        "predictions": prediction_rows(replays),
-        "trial": trial_figures(trial) if trial is not None else None,
-    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from pronk.cli import console
+from pronk.errors import PronkError
 
 if TYPE_CHECKING:
     from pronk.evaluation.results import Results
@@ -50,15 +51,14 @@ def trial(
             follow. Give it repeatedly; "paper" is the paper's five. If left out, those,
             and a few jumps at 2.25 m/s for the figure of roll and pitch rates.
         jumps: Jumps with each command.
-        sim_params: Body of the virtual robot; the one that ships with pronk if left
-            out.
+        sim_params: Parameters of the virtual robot, instead of the shipped ones.
         seed: Of all draws.
         processes: Jumps at once; as many as there are cores if left out.
         walk: Also walk 20 s with each velocity, 20 times.
         crossing: Also cross gaps and steps of growing size.
         variation: Also vary mass, friction, delay and bus voltage, one by one.
         bodies: Also try three randomized robots, each matched by its own sweep.
-        own: A policy trained with the gains of the first body of --bodies; give it
+        own: A policy trained with the gains of the first robot of --bodies; give it
             again for the second and the third.
         video: MP4, GIF and strip of each command, where this machine can render.
         keep_captures: Keep the capture of every jump (4 MB each), not of the first of each
@@ -67,8 +67,9 @@ def trial(
         definitions: Also print the equation of every figure.
         json_file: Also write the figures to this file.
     """
-    from pronk.errors import PronkError
     from pronk.evaluation import tables
+    from pronk.evaluation.criteria import trial_checks
+    from pronk.evaluation.pictures.video import record_all
     from pronk.evaluation.protocol import parse_cases
     from pronk.evaluation.results import SUMMARY, TABLE
     from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, cores, run_trial
@@ -85,11 +86,8 @@ def trial(
         rates=0 if commands else RATES_JUMPS,
         seed=seed,
     )
-    file = sim_params or SHIPPED
-    # A wrong number of processes is refused by `run_trial`.
-    count = cores() if processes is None else processes
-    policies = [policy, *also]
-    common: dict[str, Any] = {
+    file, policies = sim_params or SHIPPED, [policy, *also]
+    setup: dict[str, Any] = {
         "robot": load_robot(ROBOT),
         "sim_params": load_sim_params(file),
         "out": out,
@@ -97,7 +95,7 @@ def trial(
             "file": str(sim_params) if sim_params else "shipped with pronk",
             "sha256": sha256(file),
         },
-        "processes": count,
+        "processes": cores() if processes is None else processes,
     }
     with console.progress() as report:
         found = run_trial(
@@ -106,137 +104,90 @@ def trial(
             keep_captures=keep_captures,
             overwrite=overwrite,
             progress=report.bar("jumping"),
-            **common,
+            **setup,
         )
-    for sheet in tables.sheets(found):
+    sheets = list(tables.sheets(found))
+    for sheet in sheets:
         if definitions or sheet.title != tables.DEFINITIONS:
             show(sheet)
     console.say(spent(found))
     console.wrote(out / TABLE, out / SUMMARY, out / CAPTURES)
-    extras = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
+    wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
+    films: tuple[Path, ...] = ()
     with console.progress() as report:
-        shown = [case.name for case in plan.cases]
-        films = painted(found, out, report=report, at_once=count, cases=shown) if video else ()
-        sheets, files = more(
-            [name for name, wanted in extras.items() if wanted],
-            policies,
-            common,
-            seed=seed,
-            jumps=jumps,
-            own=[[path] for path in own],
-            report=report,
-        )
+        if video:
+            films = record_all(
+                found,
+                out,
+                out / VIDEOS,
+                warn=console.warn,
+                cases=[case.name for case in plan.cases],
+                at_once=setup["processes"],
+                progress=report.bar("rendering videos"),
+            )
+        names = [name for name, on in wanted.items() if on]
+        extra = list(_extra_sheets(names, policies, setup, seed, jumps, own, report))
         page, _ = write_report(out, report)
-    for sheet in sheets:
+    for sheet in extra:
         show(sheet)
-    console.wrote(*([out / VIDEOS] if films else []), *files, page)
-    console.write_json(json_file, figures(found, sheets) | {"page": page, "videos": films})
+    console.wrote(*([out / VIDEOS] if films else []), page)
+    figures = {
+        "virtual": found.virtual,
+        "sheets": [asdict(sheet) for sheet in (*sheets, *extra)],
+        "checks": [check.row() for check in trial_checks(found)],
+        "cells": [asdict(cell) for cell in found.cells],
+        "ratios": [asdict(ratio) for ratio in found.ratios],
+        "timing": dict(found.timing),
+        "page": page,
+        "videos": films,
+    }
+    console.write_json(json_file, figures)
     console.following(f"open {page} in a browser", f"pronk play {policy}")
 
 
-def more(
-    extras: Sequence[str],
+def _extra_sheets(
+    names: Sequence[str],
     policies: Sequence[Path],
-    common: dict[str, Any],
-    *,
+    setup: dict[str, Any],
     seed: int,
     jumps: int,
-    own: Sequence[Sequence[Path]],
+    own: Sequence[Path],
     report: console.Reporter,
-) -> tuple[list[Sheet], list[Path]]:
-    """Run what belongs to a trial besides the jumps; return tables and files.
-
-    Args:
-        extras: Of `walk`, `crossing`, `variation` and `bodies`.
-        policies: Of the trial.
-        common: Arguments that all of them take.
-        seed: Of all draws.
-        jumps: With each command on each randomized robot.
-        own: Policies that were trained with each randomized robot's gains.
-        report: Shows the progress.
-    """
+) -> Iterator[Sheet]:
+    """Run what belongs to a trial besides its jumps, and yield the tables."""
     from pronk.evaluation import bodies, variation
-    from pronk.evaluation.crossing import CROSSING, CrossingPlan, add_crossings
+    from pronk.evaluation.crossing import CrossingPlan, add_crossings
     from pronk.evaluation.trial import Plan
-    from pronk.evaluation.walk import WALK, add_walks
+    from pronk.evaluation.walk import add_walks
     from pronk.report import extra_pages
 
-    sheets: list[Sheet] = []
-    files: list[Path] = []
-    if "walk" in extras:
-        walks = add_walks(policies, seed=seed, progress=report.bar("walking"), **common)
-        sheets += [on_virtual("walking", one) for one in extra_pages.walk_tables(walks)]
-        files.append(Path(WALK.summary))
-    if "crossing" in extras:
-        crossed = add_crossings(
-            policies, CrossingPlan(seed=seed), progress=report.bar("crossing"), **common
+    def titled(what: str, sheet: Sheet) -> Sheet:
+        return replace(sheet, title=f"Virtual robot, {what}: {sheet.title}")
+
+    if "walk" in names:
+        walks = add_walks(policies, seed=seed, progress=report.bar("walking"), **setup)
+        yield from (titled("walking", sheet) for sheet in extra_pages.walk_tables(walks))
+    if "crossing" in names:
+        plan = CrossingPlan(seed=seed)
+        crossed = add_crossings(policies, plan, progress=report.bar("crossing"), **setup)
+        yield titled("crossing", extra_pages.crossing_table(crossed))
+    if "variation" in names:
+        bar = report.bar("varying the robot")
+        plan_5 = Plan(jumps=5, seed=seed)
+        yield variation.table(variation.add_variation(policies, plan_5, progress=bar, **setup))
+    if "bodies" in names:
+        plan_n = Plan(jumps=jumps, seed=seed)
+        trained = [[path] for path in own]
+        yield bodies.table(
+            bodies.add_bodies(policies, plan_n, own=trained, seed=seed, progress=report, **setup)
         )
-        sheets.append(on_virtual("crossing", extra_pages.crossing_table(crossed)))
-        files.append(Path(CROSSING.summary))
-    if "variation" in extras:
-        plan = Plan(jumps=5, seed=seed)
-        varied = variation.add_variation(
-            policies, plan, progress=report.bar("varying the robot"), **common
-        )
-        sheets.append(variation.table(varied))
-        files.append(Path(variation.VARIATION.summary))
-    if "bodies" in extras:
-        plan = Plan(jumps=jumps, seed=seed)
-        found = bodies.add_bodies(policies, plan, own=own, seed=seed, progress=report, **common)
-        sheets.append(bodies.table(found))
-        files += [Path(bodies.FILE), Path(bodies.FOLDER)]
-    return sheets, [common["out"] / name for name in files]
-
-
-def on_virtual(what: str, sheet: Sheet) -> Sheet:
-    """Add where and what to the title of a table of the page."""
-    return replace(sheet, title=f"Virtual robot, {what}: {sheet.title}")
-
-
-def painted(
-    found: Results,
-    out: Path,
-    *,
-    report: console.Reporter | None,
-    at_once: int,
-    cases: Sequence[str] | None = None,
-    slow: float | None = None,
-) -> tuple[Path, ...]:
-    """Render the films of a trial, where this machine can; warn of what it lacks.
-
-    Args:
-        found: The trial.
-        out: Its folder.
-        report: Shows the progress.
-        at_once: Films at once.
-        cases: Names of the commands to show; all if None.
-        slow: Slow-down of the flight; the default if None.
-
-    Returns:
-        The files.
-    """
-    from pronk.evaluation.pictures.video import SLOW, record_all
-    from pronk.evaluation.trial import VIDEOS
-
-    return record_all(
-        found,
-        out,
-        out / VIDEOS,
-        warn=console.warn,
-        cases=cases,
-        slow=slow or SLOW,
-        at_once=at_once,
-        progress=report.bar("painting videos") if report else lambda _: None,
-    )
 
 
 def show(sheet: Sheet) -> None:
     """Print a table and its notes."""
-    made = console.table(sheet.title, *sheet.columns)
+    made = console.table(sheet.title, *sheet.columns, rows=sheet.rows)
     if sheet.columns[-1] == "equation":
         made.columns[-1].justify = "left"
-    for row in sheet.rows:
-        console.row(made, *row)
     console.show(made)
     for note in sheet.notes:
         console.say(f"  {note}")
@@ -251,18 +202,3 @@ def spent(found: Results) -> str:
         f"{timing['simulated_s_per_s_and_process']:.1f} simulated seconds per second and process, "
         f"{timing['simulated_s_per_cpu_s']:.1f} per second of a core"
     )
-
-
-def figures(found: Results, more: Sequence[Sheet] = ()) -> dict[str, Any]:
-    """Return what `--json` writes: tables and checks; `summary.json` has the numbers in full."""
-    from pronk.evaluation import tables
-    from pronk.evaluation.criteria import trial_checks
-
-    return {
-        "virtual": found.virtual,
-        "sheets": [asdict(sheet) for sheet in (*tables.sheets(found), *more)],
-        "checks": [check.row() for check in trial_checks(found)],
-        "cells": [asdict(cell) for cell in found.cells],
-        "ratios": [asdict(ratio) for ratio in found.ratios],
-        "timing": dict(found.timing),
-    }
