@@ -63,24 +63,17 @@ class SweepTask:
 
     @property
     def excited(self) -> list[str]:
-        """Joints that are excited, one log each."""
-        wanted = self.plan.joints if self.joints is None else self.joints
-        return [name for name in self.plan.joints if name in wanted]
+        """Excited joints, one log each."""
+        return [name for name in self.plan.joints if self.joints is None or name in self.joints]
 
     @property
     def paths(self) -> list[Path]:
         """Of the logs."""
         return [self.out_dir / f"{name}.mcap" for name in self.excited]
 
-    def excitations(self, index: int) -> list[Excitation]:
-        """Excitations of one log."""
-        return [each for each in self.plan.excitations if each.joint == self.excited[index]]
-
-    @property
-    def seconds(self) -> float:
-        """Of all excitations [s]."""
-        excited = self.excited
-        return sum(self.plan.seconds(e) for e in self.plan.excitations if e.joint in excited)
+    def excitations(self, joint: str) -> list[Excitation]:
+        """Excitations of one joint's log."""
+        return [each for each in self.plan.excitations if each.joint == joint]
 
     def check(self) -> None:
         """Refuse a task that cannot be carried out, before anything moves.
@@ -104,36 +97,91 @@ class SweepTask:
                 )
         self.plan.check()
 
-    def open_log(self, index: int, *, virtual: bool, torque_kind: str) -> McapLogWriter:
-        """Begin one log."""
-        plan, columns = self.plan, self.columns(index)
-        logged = logged_joints(plan.robot, self.excited[index])
+    def limits(self, torque_kind: TorqueKind, **changed: float) -> Limits:
+        """Limits of the filter: ranges, no-load speeds and effort limits without tolerance.
+
+        The plan's worst case keeps within them, so the filter changes no command of a valid plan;
+        margin and horizon are zero. The trunk is fixed, so its tilt is not limited. A torque that
+        is measured must keep within the effort limits too. `changed` gives other scalar values.
+        """
+        robot = self.plan.robot
+        scalars = dict.fromkeys(("hold_s", "damp_s", "latch_s"), _STALE_S) | {
+            "tilt": np.inf,
+            "margin": 1e-6,
+            "overrun": 1e-9,
+            "horizon_s": 1e-6,
+            "stiffness": max(100.0, float(self.plan.stiffness.max())),
+            "damping": max(5.0, float(self.plan.damping.max())),
+            "measured_torque": 1.0 if torque_kind == "measured" else np.inf,
+        }
+        limits = Limits.of(robot, **(scalars | changed))
+        return replace(limits, speed=np.array([j.drive.no_load_speed for j in robot.joints]))
+
+
+def logged_joints(robot: Robot, excited: str) -> tuple[str, ...]:
+    """Joints that can move with the excited one or are clamped: their leg, file order."""
+    joint = robot.joint(excited)
+    chosen = {excited, *joint.chain, *joint.clamped}
+    return tuple(name for name in robot.joint_names if name in chosen)
+
+
+class SweepLogs:
+    """Writes the logs of a task from its records (`sample_dtype`)."""
+
+    def __init__(self, task: SweepTask) -> None:
+        """Open nothing yet."""
+        self.task = task
+        self._writer: McapLogWriter | None = None
+        self._joint = ""
+        self._columns: list[int] = []
+        self._torque = True
+
+    def replay(self, record: Record) -> None:
+        """Write one record."""
+        kind, time, number = int(record["kind"]), float(record["time"]), int(record["number"])
+        writer, columns = self._writer, self._columns
+        if kind == SampleKind.OPEN:
+            torque_kind = bytes(record["text"].item()).decode("ascii")
+            self._torque = torque_kind != "absent"
+            self._open(number, virtual=bool(record["virtual"]), torque_kind=torque_kind)
+        elif writer is None:
+            return
+        elif kind == SampleKind.SEGMENT:
+            writer.segment(self._segment(number, time))
+        elif kind == SampleKind.END:
+            reason = bytes(record["text"].item()).decode("ascii")
+            self.end(complete=not reason, reason=reason)
+        else:
+            names = ("command", "position", "velocity", "torque")
+            command, position, velocity, torque = (record[name][columns] for name in names)
+            measured = torque if self._torque else None
+            frequency = float(record["frequency"])
+            writer.sample(time, command, position, velocity, measured, frequency, number)
+
+    def _open(self, index: int, *, virtual: bool, torque_kind: str) -> None:
+        plan, self._joint = self.task.plan, self.task.excited[index]
+        names = logged_joints(plan.robot, self._joint)
+        self._columns = columns = [plan.robot.joint_names.index(name) for name in names]
         header = LogHeader(
             robot=plan.robot.name,
-            joints=logged,
+            joints=names,
             stiffness=plan.stiffness[columns].tolist(),
             damping=plan.damping[columns].tolist(),
             pose=plan.pose[columns].tolist(),
-            units=("rad",) * len(logged),
+            units=("rad",) * len(names),
             virtual=virtual,
             metadata={
                 "command_rate_hz": f"{plan.rate_hz:g}",
-                "excited": self.excited[index],
+                "excited": self._joint,
                 "torque": torque_kind,
-                **self.metadata,
+                **self.task.metadata,
             },
         )
-        return McapLogWriter(self.paths[index], header)
+        self._writer = McapLogWriter(self.task.paths[index], header)
 
-    def columns(self, index: int) -> NDArray[np.intp]:
-        """Joints of one log among the robot's."""
-        names = self.plan.robot.joint_names
-        logged = logged_joints(self.plan.robot, self.excited[index])
-        return np.array([names.index(name) for name in logged], dtype=np.intp)
-
-    def segment(self, index: int, number: int, start: float) -> Segment:
-        """One excitation of a log, by its number in it; `start` on the machine's clock [s]."""
-        plan, excitation = self.plan, self.excitations(index)[number]
+    def _segment(self, number: int, start: float) -> Segment:
+        """An excitation of the open log; `start` on the machine's clock [s]."""
+        plan, excitation = self.task.plan, self.task.excitations(self._joint)[number]
         signal = excitation.signal
         return Segment(
             kind=signal.kind,
@@ -146,72 +194,6 @@ class SweepTask:
             period_s=signal.period_s,
             clamped=excitation.clamped,
         )
-
-    def limits(self, torque_kind: TorqueKind, **changed: float) -> Limits:
-        """Limits of the filter: ranges, no-load speeds and effort limits without tolerance.
-
-        The plan's worst case keeps within them, so the filter changes no command of a valid plan;
-        margin and horizon are zero. The trunk is fixed, so its tilt is not limited.
-
-        Args:
-            torque_kind: A measured torque must keep within the effort limits too.
-            changed: Other values for the scalar fields.
-        """
-        robot = self.plan.robot
-        scalars = {
-            "tilt": np.inf,
-            "margin": 1e-6,
-            "overrun": 1e-9,
-            "horizon_s": 1e-6,
-            "stiffness": max(100.0, float(self.plan.stiffness.max())),
-            "damping": max(5.0, float(self.plan.damping.max())),
-            "hold_s": _STALE_S,
-            "damp_s": _STALE_S,
-            "latch_s": _STALE_S,
-            "measured_torque": 1.0 if torque_kind == "measured" else np.inf,
-        }
-        limits = Limits.of(robot, **(scalars | changed))
-        return replace(limits, speed=np.array([j.drive.no_load_speed for j in robot.joints]))
-
-
-class SweepLogs:
-    """Writes the logs of a task from its records (`sample_dtype`)."""
-
-    def __init__(self, task: SweepTask) -> None:
-        """Open nothing yet."""
-        self.task = task
-        self._writer: McapLogWriter | None = None
-        self._index = 0
-        self._columns: NDArray[np.intp] = np.arange(0)
-        self._torque = True
-
-    def replay(self, record: Record) -> None:
-        """Write one record."""
-        kind, time, number = int(record["kind"]), float(record["time"]), int(record["number"])
-        writer, columns = self._writer, self._columns
-        if kind == SampleKind.OPEN:
-            torque_kind = bytes(record["text"].item()).decode("ascii")
-            self._index, self._columns = number, self.task.columns(number)
-            self._torque = torque_kind != "absent"
-            virtual = bool(record["virtual"])
-            self._writer = self.task.open_log(number, virtual=virtual, torque_kind=torque_kind)
-        elif writer is None:
-            return
-        elif kind == SampleKind.SEGMENT:
-            writer.segment(self.task.segment(self._index, number, time))
-        elif kind == SampleKind.END:
-            reason = bytes(record["text"].item()).decode("ascii")
-            self.end(complete=not reason, reason=reason)
-        else:
-            writer.sample(
-                time,
-                record["command"][columns],
-                record["position"][columns],
-                record["velocity"][columns],
-                record["torque"][columns] if self._torque else None,
-                float(record["frequency"]),
-                number,
-            )
 
     def end(self, *, complete: bool, reason: str = "") -> None:
         """End the log; ending twice has no effect."""
@@ -241,9 +223,9 @@ class SweepStep(NamedTuple):
 class SweepController:
     """The commands of a sweep, tick by tick, and the log of the response.
 
-    For each set of joints: free all clamps, move softly to the pose, clamp what the excitation
-    needs, excite, rest. The other joints are held at the pose with the plan's gains, and all joints
-    of the same leg are logged.
+    For each joint: free all clamps, move softly to the pose, clamp what the excitation needs,
+    excite, rest. The other joints are held at the pose with the plan's gains, and all joints of the
+    same leg are logged.
     """
 
     def __init__(
@@ -271,8 +253,8 @@ class SweepController:
         self.task, self.plan, self.machine = task, task.plan, machine
         self.progress = progress
         self.tick = 1.0 / self.plan.rate_hz
-        self._seconds = task.seconds
-        self.target = state.position.copy()
+        excited = [each for name in task.excited for each in task.excitations(name)]
+        self._seconds = sum(self.plan.seconds(each) for each in excited)
         self.strict = task.limits(machine.torque_kind, **(limits or {}))
         q, low, high = state.position, self.strict.low, self.strict.high
         self.limits = replace(
@@ -282,12 +264,11 @@ class SweepController:
         )
         """Of the filter: until the joints are at the pose, as wide as they were at first."""
         self._sink = sink
-        record = np.zeros((), dtype=sample_dtype(len(self.plan.robot.joints)))
-        record["virtual"] = machine.virtual
-        self._record: NDArray[Any] = record
+        self._record: NDArray[Any] = np.zeros((), dtype=sample_dtype(len(q)))
+        self._record["virtual"] = machine.virtual
         self._real_time = real_time
         self._state = state
-        self._step = SweepStep(target=self.target, stiffness=0.0 if real_time else 1.0)
+        self._step = SweepStep(q.copy(), stiffness=0.0 if real_time else 1.0)
         self._steps = self._all()
         self._start: float | None = None
         self._ticks = 0
@@ -329,14 +310,14 @@ class SweepController:
         self._log(t)
         step = next(self._steps, None)
         if step is not None:
-            self._step, self.target = step, step.target
+            self._step = step
             self._ticks += 1
         return step
 
     def command(self, t: float, valid_for: float = np.inf) -> Command:
-        """The command of the present tick, requested of the filter at `t` [s]."""
+        """The command of the present tick, made at `t` [s]."""
         return Command(
-            position=self.target,
+            position=self._step.target,
             stiffness=self.plan.stiffness * self._step.stiffness,
             damping=self.plan.damping,
             made=t,
@@ -380,8 +361,7 @@ class SweepController:
         if not self._logging:
             self._waiting.clear()
             return
-        edge = until - self._half
-        record = self._record
+        edge, record = until - self._half, self._record
         for state in self._waiting:
             # A number that is not finite ends the sweep, and would make the log unreadable.
             if state.time >= edge or not np.isfinite([state.position, state.velocity]).all():
@@ -400,19 +380,19 @@ class SweepController:
     def _all(self) -> Iterator[SweepStep]:
         ticks = round(_STIFFEN_S / self.tick) if self._real_time else 0
         for k in range(1, ticks + 1):
-            yield SweepStep(target=self.target, stiffness=k / ticks)
-        done, pose = 0.0, self.plan.pose
-        for index, path in enumerate(self.task.paths):
-            excitations = self.task.excitations(index)
+            yield SweepStep(self._step.target, stiffness=k / ticks)
+        done = 0.0
+        for index, (joint, path) in enumerate(zip(self.task.excited, self.task.paths, strict=True)):
+            excitations = self.task.excitations(joint)
             self._waiting.clear()
             self._put(SampleKind.OPEN, number=index, text=self.machine.torque_kind)
             self._logging = True
             yield from self._clamp(())
-            yield from self._move(pose)
-            yield from self._rest(self.plan.settle_s)
+            yield from self._move(self.plan.pose)
+            yield from self._rest()
             self._check_at_pose()
             yield from self._clamp(excitations[0].clamped)
-            yield from self._rest(self.plan.settle_s)
+            yield from self._rest()
             for number, excitation in enumerate(excitations):
                 yield from self._excite(number, excitation, done)
                 done += self.plan.seconds(excitation)
@@ -420,18 +400,17 @@ class SweepController:
             self.end("")
             self.progress(done / self._seconds, f"wrote {path.name}")
 
-    def _rest(self, seconds: float, segment: int = -1) -> Iterator[SweepStep]:
-        for _ in range(round(seconds / self.tick)):
-            yield SweepStep(target=self.target, segment=segment)
+    def _rest(self, segment: int = -1) -> Iterator[SweepStep]:
+        for _ in range(round(self.plan.settle_s / self.tick)):
+            yield SweepStep(self.plan.pose, segment=segment)
 
     def _move(self, goal: Array) -> Iterator[SweepStep]:
         """Half a cosine from the present target to the goal."""
-        start = self.target
+        start = self._step.target
         seconds = max(POSE_RAMP_S, float(np.abs(goal - start).max()) / _SOFT_SPEED)
         ticks = round(seconds / self.tick)
         for k in range(1, ticks + 1):
-            share = 0.5 * (1.0 - np.cos(np.pi * k / ticks))
-            yield SweepStep(target=start + (goal - start) * share)
+            yield SweepStep(start + (goal - start) * (0.5 * (1.0 - np.cos(np.pi * k / ticks))))
 
     def _clamp(self, joints: tuple[str, ...]) -> Iterator[SweepStep]:
         """Clamp joints; in real time they are held meanwhile."""
@@ -440,16 +419,16 @@ class SweepController:
             return
         failed: list[BaseException] = []
 
-        def fix() -> None:
+        def clamp() -> None:
             try:
                 self.machine.clamp(joints)
             except BaseException as error:
                 failed.append(error)
 
-        thread = threading.Thread(target=fix, name="pronk sweep clamps", daemon=True)
+        thread = threading.Thread(target=clamp, name="pronk sweep clamps", daemon=True)
         thread.start()
         while thread.is_alive():
-            yield SweepStep(target=self.target)
+            yield SweepStep(self._step.target)
         if failed:
             raise failed[0]
 
@@ -470,17 +449,16 @@ class SweepController:
         column = self.plan.robot.joint_names.index(excitation.joint)
         frequency = signal.frequency(rate)
         # An excitation begins one tick after the last one's rest, so that no sample is in both.
-        yield SweepStep(target=self.plan.pose)
+        yield SweepStep(self.plan.pose)
         self._put(SampleKind.SEGMENT, number=number, time=self.now)
         what = f"{excitation.joint}: {signal.amplitude:g} rad, repeat {excitation.repeat + 1}"
         for k, offset in enumerate(excitation.offsets(rate)):
             target = self.plan.pose.copy()
             target[column] += offset
-            yield SweepStep(target=target, frequency=float(frequency[k]), segment=number)
+            yield SweepStep(target, frequency=float(frequency[k]), segment=number)
             if k % _PROGRESS_TICKS == 0:
                 self.progress(min((done + k * self.tick) / self._seconds, 1.0), what)
-        for _ in range(round(self.plan.settle_s / self.tick)):
-            yield SweepStep(target=self.plan.pose, segment=number)
+        yield from self._rest(segment=number)
 
 
 def record(
@@ -510,16 +488,8 @@ def record(
     task.check()
     machine.connect()
     try:
-        _run(
-            SweepController(
-                task,
-                machine,
-                SweepLogs(task).replay,
-                state=machine.latest(),
-                real_time=False,
-                progress=progress,
-            )
-        )
+        sink, state = SweepLogs(task).replay, machine.latest()
+        _run(SweepController(task, machine, sink, state=state, real_time=False, progress=progress))
     finally:
         # In every case, the interrupt key included, the joints are damped.
         machine.damp()
@@ -534,14 +504,9 @@ def _run(controller: SweepController) -> None:
     states: list[State] = []
     try:
         while controller.advance(machine.now()) is not None:
-            t = machine.now()
+            t, limits = machine.now(), controller.limits
             sent, decision, memory = filtered(
-                machine.latest(),
-                controller.command(t),
-                memory,
-                controller.limits,
-                t,
-                earlier=states[:-1],
+                machine.latest(), controller.command(t), memory, limits, t, earlier=states[:-1]
             )
             if sent is None:
                 raise HardwareError(f"{decision.text}; the joints were damped.")
@@ -559,10 +524,3 @@ def _run(controller: SweepController) -> None:
         machine.damp()
         controller.end(reason_of(error))
         raise
-
-
-def logged_joints(robot: Robot, excited: str) -> tuple[str, ...]:
-    """Joints that can move with the excited one or are clamped: their leg, file order."""
-    joint = robot.joint(excited)
-    wanted = {excited, *joint.chain, *joint.clamped}
-    return tuple(name for name in robot.joint_names if name in wanted)
