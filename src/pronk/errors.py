@@ -1,14 +1,13 @@
-"""Errors a user can mend.
+"""Errors of bad input: what was given, what was expected, and the way out, in one sentence.
 
-Every error names what was got, what was expected and the way out; the command line prints it
-as one sentence and ends with exit status 2. Anything else that escapes is a defect of pronk.
+The command line prints them and ends with exit status 2.
 """
 
 from __future__ import annotations
 
 
 class PronkError(Exception):
-    """Base of every error that the caller can mend."""
+    """Base of every error that the caller can fix."""
 
 
 class LogError(PronkError):
@@ -24,7 +23,7 @@ class PlanError(PronkError):
 
 
 class IdentifiabilityError(PronkError):
-    """The data cannot tell the parameters apart; the message names the missing experiment."""
+    """The data cannot separate the parameters; the message names the missing experiment."""
 
 
 class ArtefactError(PronkError):

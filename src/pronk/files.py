@@ -23,10 +23,7 @@ T = TypeVar("T")
 def written_whole(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder; rename it to `path` when the block succeeds.
 
-    A block that raises, or a process that dies, leaves `path` as it was.
-
-    Args:
-        path: Where the finished file shall be. Its folder is made if it is missing.
+    A block that raises, or a process that dies, leaves `path` as it was. Missing folders are made.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
@@ -57,13 +54,7 @@ def sha256(path: Path) -> str:
 
 
 def save_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Any]) -> None:
-    """Write named arrays and a JSON header to one `.npz`, whole or not at all; no pickle.
-
-    Args:
-        path: Where to.
-        header: What JSON can hold; its `schema` names the kind of file.
-        arrays: Name to array.
-    """
+    """Write named arrays and a JSON header with a `schema` to one `.npz`; no pickle."""
     with written_whole(path) as aside, aside.open("wb") as file:
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
@@ -81,7 +72,7 @@ def stored_arrays(
         writer: The command that writes one, for errors.
 
     Raises:
-        ArtefactError: Missing, damaged or of another schema, also where the block finds so.
+        ArtefactError: Missing, damaged, of another schema, or the block fails.
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
@@ -102,13 +93,7 @@ def stored_arrays(
 
 
 def save_artefact(path: Path, value: Any, schema: str) -> None:
-    """Write a dataclass with arrays in it to one `.npz`, whole or not at all; no pickle.
-
-    Args:
-        path: Where to.
-        value: A dataclass of numbers, text, arrays and further dataclasses.
-        schema: What the file is, with its version.
-    """
+    """Write a dataclass of numbers, text, arrays and further dataclasses to one `.npz`."""
     arrays: dict[str, Any] = {}
 
     def hook(item: Any) -> Any:
@@ -122,28 +107,13 @@ def save_artefact(path: Path, value: Any, schema: str) -> None:
 
 
 def load_artefact(path: Path, kind: type[T], schema: str, *, what: str, writer: str) -> T:
-    """Read what `save_artefact` wrote.
-
-    Args:
-        path: The file.
-        kind: The dataclass.
-        schema: The schema that this pronk reads.
-        what: What the file is, for errors, as in `a match file`.
-        writer: The command that writes one, for errors.
-
-    Raises:
-        ArtefactError: Missing, damaged, of another schema, or a field has another type.
-    """
+    """Read what `save_artefact` wrote; arguments and errors are those of `stored_arrays`."""
     with stored_arrays(path, schema, what=what, writer=writer) as (header, arrays):
         return converted(header["content"], kind, path, lambda _, key: arrays[key])
 
 
 def converted(data: Any, kind: type[T], path: Path, hook: Any = None) -> T:
-    """Make a dataclass of what YAML or JSON gave; unknown fields are refused.
-
-    Raises:
-        ArtefactError: A field is missing, unknown or of another type; the message names it.
-    """
+    """Make a dataclass of YAML or JSON data; ArtefactError names a wrong or unknown field."""
     try:
         out = msgspec.convert(data, kind, dec_hook=hook)
     except msgspec.ValidationError as error:

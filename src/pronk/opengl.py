@@ -1,7 +1,7 @@
-"""Which OpenGL paints, kept out of the processes that paint nothing.
+"""OpenGL for rendering, kept out of processes that do not render.
 
 MuJoCo loads the OpenGL that MUJOCO_GL names as it is imported, and cannot be imported where that is
-missing. Of pronk only the process that paints needs one (`pronk.evaluation.pictures.render`).
+missing. Only the rendering process needs one (`pronk.evaluation.pictures.render`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 _MUJOCO = "MUJOCO_GL"
 _REQUESTED = "PRONK_GL"
 _NONE = "disable"
-"""MuJoCo's word for no OpenGL."""
+"""MuJoCo's name for no OpenGL."""
 
 
 def keep_out() -> None:

@@ -9,11 +9,7 @@ from pronk.errors import PronkError
 
 
 def load(point: EntryPoint) -> Any:
-    """Import what an entry point names.
-
-    Raises:
-        PronkError: It cannot be imported; names the entry point and its group.
-    """
+    """Import what an entry point names; PronkError if it cannot be imported."""
     try:
         return point.load()
     except Exception as error:  # Code of another package may fail in any way.
