@@ -63,11 +63,11 @@ def test_json_gives_the_same_contract_back(changes: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "field"),
+    ("changes", "name"),
     [
+        # Contradictions.
         ({"default_position": (0.0,) * 11}, "default_position"),
         ({"action_scale": (0.35,) * 11 + (0.0,)}, "action_scale"),
-        ({"stiffness": (math.nan,) * 12}, "stiffness"),
         ({"damping": (0.4,) * 11 + (-0.1,)}, "damping"),
         ({"gains": "best"}, "gains"),
         ({"gains_sha256": ""}, "gains_sha256"),
@@ -77,18 +77,9 @@ def test_json_gives_the_same_contract_back(changes: dict[str, Any]) -> None:
         ({"delay_range_s": (0.02, 0.01)}, "delay_range_s"),
         ({"command_ranges": {"vx": (-1.0, 1.0)}}, "command_ranges"),
         ({"command_ranges": {"vx": (1, -1), "vy": (0, 0), "yaw_rate": (0, 0)}}, "of vx"),
-        ({"jump": False, "lift_off_velocity": 2.5}, "lift_off_velocity"),
+        ({"jump": False}, "lift_off_velocity"),
         ({"lift_off_velocity": None}, "lift_off_velocity"),
-    ],
-)
-def test_a_contract_that_contradicts_itself_is_refused(changes: dict[str, Any], field: str) -> None:
-    with pytest.raises(ArtefactError, match=f"contract's {field}|{field} is"):
-        contract(**changes)
-
-
-@pytest.mark.parametrize(
-    ("changes", "name"),
-    [
+        # Other types, fields and schemas.
         ({"schema": "pronk/policy/9"}, "pronk/policy/9"),
         ({"mass": 1.0}, "mass"),
         ({"joint_names": "FR"}, "joint_names"),
@@ -100,14 +91,18 @@ def test_a_contract_that_contradicts_itself_is_refused(changes: dict[str, Any], 
         ({"delay_range_s": [0.0]}, "delay_range_s"),
         ({"versions": []}, "versions"),
         ({"observation": [{"name": "command"}]}, "observation"),
-        ({"damping": [-1.0] * 12}, "damping"),
         ({"waits_for_stride": True}, "waits_for_stride"),
     ],
 )
-def test_a_contract_that_cannot_be_read_is_refused(changes: dict[str, Any], name: str) -> None:
+def test_a_contract_that_cannot_be_run_is_refused(changes: dict[str, Any], name: str) -> None:
     text = json.dumps(json.loads(to_json(contract())) | changes)
     with pytest.raises(ArtefactError, match=f"^policy.onnx: .*{name}"):
         from_json(text, source="policy.onnx")
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(ArtefactError, match="stiffness"):
+        contract(stiffness=(math.nan,) * 12)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}"])
