@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from pronk.evaluation import bodies, results, variation, walk
-from pronk.evaluation.bodies import Bodies, Body, GainsError
+from pronk.evaluation.bodies import Bodies, Body
 from pronk.evaluation.crossing import CROSSING, CrossingFigures
 from pronk.evaluation.jumps import JumpFigures, JumpRules, measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
@@ -300,10 +300,7 @@ def write_bodies(folder: Path) -> Bodies:
                 folder=where,
                 seed=i,
                 sha256="ef" * 32,
-                errors=tuple(
-                    GainsError(gains=n, rms_db=e, joints_db={"FR_knee": e}, pairs={})
-                    for n, e in errors.items()
-                ),
+                errors=errors,
                 trial=write_trial(folder / where / "trial", cases=CASES[:2]),
             )
         )

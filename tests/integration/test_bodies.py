@@ -100,13 +100,10 @@ def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
         )
     ]
     gains = {"naive": {"FR_hip_roll": (17.0, 0.4)}, "own": {"FR_hip_roll": pairs}}
-    off, right = gains_errors(logs, ROBOT, gains, settings=QUICK)
-    assert right.rms_db < 0.01
+    found = gains_errors(logs, ROBOT, gains, settings=QUICK)
+    assert found["own"] < 0.01
     matched = match_logs(logs, ROBOT, settings=QUICK).gains.joints["FR_hip_roll"]
-    assert off.rms_db == off.joints_db["FR_hip_roll"]
-    assert off.rms_db == pytest.approx(matched.naive_error_db, rel=1e-4)
-    with pytest.raises(PronkError, match="FR_hip_roll"):
-        gains_errors(logs, ROBOT, {"empty": {}}, settings=QUICK)
+    assert found["naive"] == pytest.approx(matched.naive_error_db, rel=1e-4)
 
 
 # --- One number at a time -----------------------------------------------------------------------

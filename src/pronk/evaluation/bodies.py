@@ -33,7 +33,7 @@ import numpy as np
 from pronk.errors import PronkError
 from pronk.evaluation.results import Results, Subject, load_json, save_json
 from pronk.evaluation.results import load as load_results
-from pronk.evaluation.tables import Sheet, number
+from pronk.evaluation.tables import Sheet, number, sheet
 from pronk.evaluation.trial import Plan, in_processes, load_subjects, run_trial, versions
 from pronk.evaluation.variation import GROUP_TORQUE, TOLERANCES, draw_robot, save_sim_params
 from pronk.excitation.plan import SweepPlan, make_plan
@@ -53,7 +53,7 @@ from pronk.virtual.plant import legs_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
-SCHEMA = "pronk/trial-bodies/3"
+SCHEMA = "pronk/trial-bodies/4"
 FILE = "bodies.json"
 FOLDER = "bodies"
 WRITER = "pronk trial POLICY --bodies"
@@ -74,19 +74,6 @@ Pairs = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class GainsError:
-    """One set of gains on one robot's sweep."""
-
-    gains: str
-    """`training gains of POLICY`, or one of `NAIVE`, `MATCHED`, `TRAINABLE`."""
-    rms_db: float
-    """Error of the simulated gain, RMS over bands and joints [dB]."""
-    joints_db: Mapping[str, float]
-    """RMS over the band of each joint [dB]."""
-    pairs: Pairs
-
-
-@dataclass(frozen=True, kw_only=True)
 class Body:
     """One randomized robot, and its results."""
 
@@ -97,7 +84,9 @@ class Body:
     """Of its draw and of its sweep's noise."""
     sha256: str
     """Of its sim_params file."""
-    errors: tuple[GainsError, ...]
+    errors: Mapping[str, float]
+    """Of the simulated gain, RMS over bands and joints [dB], by gains: `training gains of POLICY`,
+    `NAIVE`, `MATCHED`, `TRAINABLE`."""
     trial: Results
 
 
@@ -281,8 +270,8 @@ def gains_errors(
     gains: Mapping[str, Pairs],
     *,
     settings: MatchSettings = SETTINGS,
-) -> tuple[GainsError, ...]:
-    """Return the errors of several sets of gains, by a name, on one robot's sweep.
+) -> dict[str, float]:
+    """Return the errors of several sets of gains, by name, on one robot's sweep [dB RMS].
 
     The largest amplitude of each joint is compared; `robot` is that of the training simulator,
     `settings` are those of the match.
@@ -290,7 +279,6 @@ def gains_errors(
     Raises:
         LogError: The logs excite no joint or cannot be used.
         IdentifiabilityError: A joint's band is mostly incoherent.
-        PronkError: A set lacks the gains of an excited joint.
     """
     goals = [
         max(
@@ -299,28 +287,20 @@ def gains_errors(
         )
         for joint, sources in logs_by_joint(logs, robot).items()
     ]
-    missing = [(n, g.joint) for n, pairs in gains.items() for g in goals if g.joint not in pairs]
-    for name, joint in missing:
-        raise PronkError(
-            f"the gains {name!r} have none for {joint}; give a pair for every excited joint."
-        )
     requests = [SimRequest(goal, *pairs[goal.joint]) for pairs in gains.values() for goal in goals]
     with MujocoSimulator(robot, threads=settings.threads, device=settings.device) as simulator:
         simulated = iter(responses(simulator, requests))
-    found = []
-    for name, pairs in gains.items():
-        rms = {
-            goal.joint: float(np.sqrt(np.mean(goal.error_db(next(simulated)) ** 2)))
-            for goal in goals
-        }
-        whole = float(np.sqrt(np.mean(np.square(list(rms.values())))))
-        found.append(GainsError(gains=name, rms_db=whole, joints_db=rms, pairs=pairs))
-    return tuple(found)
+    return {
+        name: float(
+            np.sqrt(np.mean([np.mean(goal.error_db(next(simulated)) ** 2) for goal in goals]))
+        )
+        for name in gains
+    }
 
 
 def _errors(
     robot: Robot, logs: Sequence[JointLog], matched: MatchedGains, subjects: Sequence[Subject]
-) -> tuple[GainsError, ...]:
+) -> dict[str, float]:
     """The errors of the gains of the policies, of the robot's drives, and of its own match."""
     pairs: dict[str, Pairs] = {}
     for subject in subjects:
@@ -366,27 +346,22 @@ def table(found: Bodies) -> Sheet:
     """Every robot: the error of gains on it, and the jumps."""
     rows = []
     for body in found.bodies:
-        errors = {one.gains: one.rms_db for one in body.errors}
         for name in (subject.name for subject in body.trial.subjects):
             cells = [cell for cell in body.trial.cells if cell.policy == name]
             best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
-            landed = f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}"
-            own, trained = errors[MATCHED], errors[f"training gains of {name}"]
+            trained = body.errors[f"training gains of {name}"]
             rows.append(
-                (f"{body.name}: {name}", number(own), number(trained), landed, number(best))
+                {
+                    "body: policy": f"{body.name}: {name}",
+                    "error of its match [dB]": number(body.errors[MATCHED]),
+                    "error of the policy's training gains [dB]": number(trained),
+                    "landed": f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}",
+                    "best mean height [m]": number(best),
+                }
             )
-    return Sheet(
-        title="Randomized virtual robots, each matched by its own sweep",
-        columns=(
-            "body: policy",
-            "error of its match [dB]",
-            "error of the policy's training gains [dB]",
-            "landed",
-            "best mean height [m]",
-        ),
-        rows=tuple(rows),
-        notes=(
-            "The policies were trained with the gains of another robot; the drives of all robots "
-            "have their own gains, 17 / 0.4.",
-        ),
+    return sheet(
+        "Randomized virtual robots, each matched by its own sweep",
+        rows,
+        "The policies were trained with the gains of another robot; the drives of all robots have "
+        "their own gains, 17 / 0.4.",
     )

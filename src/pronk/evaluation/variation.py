@@ -19,7 +19,7 @@ import yaml
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpFigures
 from pronk.evaluation.results import Cell, Kind, Results
-from pronk.evaluation.tables import Sheet, number
+from pronk.evaluation.tables import Sheet, number, sheet
 from pronk.evaluation.trial import Plan, Setup, run_plan
 from pronk.files import write_text
 from pronk.robots.robot import Robot
@@ -158,18 +158,19 @@ def table(results: Results) -> Sheet:
                 lines = (line(results, each.name, policy, case.name) for case in results.cases)
                 cells = [cell for cells in lines for cell in cells if cell.value == value]
                 known = [cell.figures for cell in cells if cell.found]
-                height, distance = (
-                    number(float(np.mean([one[name].mean for one in known])) if known else math.nan)
-                    for name in ("height", "distance")
-                )
-                landed = f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}"
-                what = f"{value:g} {each.unit}".removesuffix(" 1")
-                rows.append((f"{each.says}, {policy}", what, landed, height, distance))
-    return Sheet(
-        title="Virtual robot, one parameter varied at a time",
-        columns=("parameter, policy", "value", "landed", "height [m]", "distance [m]"),
-        rows=tuple(rows),
-        notes=("Means of the commands' means, over the jumps that there were.",),
+                row = {
+                    "parameter, policy": f"{each.says}, {policy}",
+                    "value": f"{value:g} {each.unit}".removesuffix(" 1"),
+                    "landed": f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}",
+                }
+                for name in ("height", "distance"):
+                    mean = sum(one[name].mean for one in known) / len(known) if known else math.nan
+                    row[f"{name} [m]"] = number(mean)
+                rows.append(row)
+    return sheet(
+        "Virtual robot, one parameter varied at a time",
+        rows,
+        "Means of the commands' means, over the jumps that there were.",
     )
 
 

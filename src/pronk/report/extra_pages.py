@@ -267,10 +267,10 @@ def variation_part(path: Path, root: Path, **names: str) -> Part:
 def errors_db(bodies: Bodies) -> dict[str, float]:
     """Return the error of training gains on each robot's sweep, by `POLICY, BODY` [dB RMS]."""
     return {
-        f"{one.gains.removeprefix(_OF_POLICY)}, {body.name}": one.rms_db
+        f"{gains.removeprefix(_OF_POLICY)}, {body.name}": error
         for body in bodies.bodies
-        for one in body.errors
-        if one.gains.startswith(_OF_POLICY)
+        for gains, error in body.errors.items()
+        if gains.startswith(_OF_POLICY)
     }
 
 
@@ -284,8 +284,8 @@ def by_body(bodies: Bodies, figure: str) -> Values:
 
 
 def _bodies_gains(bodies: Bodies) -> Sheet | None:
-    names = dict.fromkeys(one.gains for body in bodies.bodies for one in body.errors)
-    found = [{one.gains: one.rms_db for one in body.errors} for body in bodies.bodies]
+    names = dict.fromkeys(gains for body in bodies.bodies for gains in body.errors)
+    found = [body.errors for body in bodies.bodies]
     return table(
         " | ".join(["gains", *(f"{body.name};2" for body in bodies.bodies)]),
         [(name, *(errors.get(name) for errors in found)) for name in names],
