@@ -52,9 +52,9 @@ def trial(folder):
 
 @pytest.fixture(scope="module")
 def captured(trial, folder):
-    found = trial_page.captured(trial, folder)
-    assert found is not None
-    return found
+    traces, missing = trial_page.captured(trial, folder)
+    assert missing == 0
+    return traces
 
 
 def legend(figure):
@@ -185,7 +185,7 @@ def test_cells_draw_mean_spread_and_the_paper(trial) -> None:
 
 
 def test_height_traces_begin_before_the_jump_input(captured) -> None:
-    time, height = captured.traces["height"]["matched"]["forward 1"][0]
+    time, height = captured["height"]["matched"]["forward 1"][0]
     assert time[0] == pytest.approx(-trial_page.BEFORE_S, abs=DT)
     assert time[-1] <= trial_page.AFTER_S + 1e-9
     assert np.allclose(np.diff(time), 1.0 / trial_page.TRACE_RATE_HZ)
@@ -194,20 +194,20 @@ def test_height_traces_begin_before_the_jump_input(captured) -> None:
     t = time[inside] - 0.2
     expected = Z_OFF + lift_off(FLIGHTS["matched"][0]) * t - 0.5 * G * t**2
     assert np.allclose(height[inside], expected, atol=1e-6)
-    axes = trial_figures.heights(captured.traces["height"], standing=0.29).axes[0]
+    axes = trial_figures.heights(captured["height"], standing=0.29).axes[0]
     assert len(axes.lines) == 4
     assert axes.lines[-1].get_ydata()[0] == 0.29
 
 
 def test_rates_are_of_the_acceleration_at_the_papers_speed(captured) -> None:
-    assert set(captured.traces["roll"]["naive"]) == {CASES[2].name}
-    runs = captured.traces["roll"]["naive"][CASES[2].name]
+    assert set(captured["roll"]["naive"]) == {CASES[2].name}
+    runs = captured["roll"]["naive"][CASES[2].name]
     time, rate = runs[0]
     assert time[[0, -1]] == pytest.approx([0.0, SCRIPT.run_s])
     assert np.allclose(rate, 2.0 * RATE * np.sin(OMEGA * time), atol=1e-6)
     # A sine over nearly whole periods.
     assert trial_figures.rms(runs) == pytest.approx(2.0 * RATE / math.sqrt(2.0), rel=0.02)
-    figure = trial_figures.rates({name: captured.traces[name] for name in ("roll", "pitch")})
+    figure = trial_figures.rates({name: captured[name] for name in ("roll", "pitch")})
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert f"RMS {trial_figures.rms(runs):.2f} rad/s over 3 runs" in titles
 

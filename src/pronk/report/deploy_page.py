@@ -42,6 +42,7 @@ _DOTS: dict[str, Any] = {
     "marker": ".",
     "markersize": 2.5,
 }
+_PROBLEMS = ("fault", "refused")
 _MOVED = 1e-6
 """Smaller differences of desired and sent targets are not drawn [rad]."""
 WINDOW_S = 1.2
@@ -127,20 +128,15 @@ def _draw_modes(axes: Axes, log: DeployLog) -> None:
 def window(log: DeployLog) -> tuple[float, float, str]:
     """Return begin and end of the close-up since the first tick [s], and what it shows.
 
-    The time before the first fault; else about the first jump input; else the middle of the time
-    in which the policy was active, or of the whole run.
+    About the first fault, or else the first jump input, or else the begin of the policy's time.
     """
     if ends := faults(log):
-        begin = max(ends[0] - 0.8 * WINDOW_S, 0.0)
-        return begin, ends[0] + 0.2 * WINDOW_S, "about the first fault"
+        return max(ends[0] - 0.8 * WINDOW_S, 0.0), ends[0] + 0.2 * WINDOW_S, "about the first fault"
     if inputs := jumps(log):
-        begin = inputs[0][0] - 0.15
-        return begin, begin + WINDOW_S, "about the first jump input"
+        return inputs[0][0] - 0.15, inputs[0][0] + WINDOW_S - 0.15, "about the first jump input"
     active = run.policy_active(log)
-    t = seconds(log, log.time[active] if active.any() else log.time)
-    words = "while the policy is active" if active.any() else "in the middle of the run"
-    middle = 0.5 * float(t[0] + t[-1])
-    return middle - 0.5 * WINDOW_S, middle + 0.5 * WINDOW_S, words
+    begin = float(seconds(log, log.time[active][0])) if active.any() else 0.0
+    return begin, begin + WINDOW_S, "of the policy" if active.any() else "of the run"
 
 
 def joints(log: DeployLog, begin: float, end: float) -> Figure:
@@ -183,7 +179,7 @@ def verdict(log: DeployLog) -> str:
 
 def lines(log: DeployLog, found: Delay) -> Iterator[str]:
     """Yield what stands below the outcome."""
-    for event in [event for event in log.events if event.kind in ("fault", "refused")][1:]:
+    for event in [event for event in log.events if event.kind in _PROBLEMS][1:]:
         yield f"Then {event.kind} at {float(seconds(log, event.time)):.2f} s: {event.text}"
     bad = log.level >= FilterAction.DAMP
     if faults(log) and bad.any():
@@ -227,11 +223,8 @@ def delay_words(found: Delay) -> str:
     if found.trained is None:
         return f"{words}; the log does not hold the delays of the policy's training."
     where = {True: "within", False: "BEYOND", None: "beside"}[found.within]
-    return f"{words}: {where} the training range of {_range(found.trained)} ms."
-
-
-def _range(bounds: tuple[float, float]) -> str:
-    return f"{1e3 * bounds[0]:g} to {1e3 * bounds[1]:g}"
+    low, high = found.trained
+    return f"{words}: {where} the training range of {1e3 * low:g} to {1e3 * high:g} ms."
 
 
 def part(path: Path, root: Path, *, anchor: str = "deploy", title: str = "Deployment") -> Part:
@@ -246,7 +239,7 @@ def part(path: Path, root: Path, *, anchor: str = "deploy", title: str = "Deploy
         robot = known if known.joint_names == log.joints else None
     found, policy = run.delay(log, robot), log.header.get("policy", {})
     versions = ", ".join(f"{k} {v}" for k, v in log.header.get("versions", {}).items())
-    bad = any(event.kind in ("fault", "refused") for event in log.events)
+    bad = any(event.kind in _PROBLEMS for event in log.events)
     return Part(
         anchor=anchor,
         title=title,
@@ -264,46 +257,23 @@ def part(path: Path, root: Path, *, anchor: str = "deploy", title: str = "Deploy
     )
 
 
-def _milliseconds(values: Array) -> dict[str, float | None]:
-    found = run.quantiles(values)
-    n = found.pop("n")
-    return {"n": n} | {f"{name}_ms": _known(1e3 * value) for name, value in found.items()}
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _figures(log: DeployLog, found: Delay) -> dict[str, Any]:
-    """Return what `--json` gives; times in ms."""
+    """Return what `--json` gives; times in s."""
+    of_kind = {kind: [e.text for e in log.events if e.kind == kind] for kind in _PROBLEMS}
     return {
         "kind": "deploy",
         "robot": log.header["robot"],
         "virtual": log.virtual,
         "complete": log.complete,
         "verdict": verdict(log),
-        "modes": [
-            {"mode": mode.name, "begin_s": begin, "seconds": length}
-            for mode, begin, length in run.stretches(log)
-        ],
-        "faults": [event.text for event in log.events if event.kind == "fault"],
-        "refusals": [event.text for event in log.events if event.kind == "refused"],
+        "modes": [(mode.name, begin, length) for mode, begin, length in run.stretches(log)],
+        "faults": of_kind["fault"],
+        "refusals": of_kind["refused"],
         "missed_ticks": run.missed(log),
-        "times": {name: _milliseconds(one) for name, (one, _) in run.times(log).items()},
-        "delay": {
-            "trained_ms": None if found.trained is None else [1e3 * one for one in found.trained],
-            "state_to_command_ms": _milliseconds(log.latency[run.policy_active(log)]),
-            "drives_ms": [_known(1e3 * one) for one in found.drives],
-            "within": found.within,
-        },
-        "interventions": [
-            {"reason": one.reason.name, "level": one.level.name, "ticks": one.ticks}
-            | {"largest_rad": _known(one.largest)}
-            for one in run.interventions(log)
-        ],
-        "tracking_rms_rad": dict(
-            zip(log.joints, map(_known, run.tracking(log)["error"]), strict=True)
-        ),
+        "times": {name: run.quantiles(values) for name, (values, _) in run.times(log).items()},
+        "delay": vars(found) | {"within": found.within},
+        "interventions": [vars(one) for one in run.interventions(log)],
+        "tracking_rms_rad": dict(zip(log.joints, run.tracking(log)["error"], strict=True)),
     }
 
 
@@ -312,7 +282,6 @@ def _overview(log: DeployLog) -> Section:
     rows = [(float(seconds(log, one.time)), one.kind, one.text) for one in events]
     words = "Modes, velocities commanded and estimated, tilt, battery and timing over the run"
     return Section(
-        "overview",
         "Overview",
         "Velocities are the policy's own estimate; turning is the gyro's.",
         picture(overview(log), words, dense=True),
@@ -330,12 +299,8 @@ def _joints(log: DeployLog, robot: Robot | None) -> Section:
         (joint_words(name), *(values[i] for values in found), effort[i], speed[i])
         for i, name in enumerate(log.joints)
     ]
-    t, words = seconds(log, log.time), f"{end - begin:.1f} s {words}."
-    drawn = (
-        picture(joints(log, begin, end), f"Targets and positions of all joints, {words}")
-        if ((t >= begin) & (t <= end)).any()
-        else None
-    )
+    words = f"{end - begin:.1f} s {words}."
+    drawn = picture(joints(log, begin, end), f"Targets and positions of all joints, {words}")
     columns = "joint | error standing, RMS [rad] | error, RMS [rad] | largest error [rad]"
     columns += " | torque, RMS [N m];1 | largest torque [N m];1 | largest speed [rad/s];1"
     note = (
@@ -343,7 +308,7 @@ def _joints(log: DeployLog, robot: Robot | None) -> Section:
         "the first column: while the policy was active. Torques as the robot reports them."
     )
     columns += " | effort limit [N m];0 | speed limit [rad/s];0"
-    return Section("joints", "Joints", words, drawn, table(columns, rows, note))
+    return Section("Joints", words, drawn, table(columns, rows, note))
 
 
 def _delay(found: Delay) -> Section:
@@ -364,7 +329,7 @@ def _delay(found: Delay) -> Section:
         "reports no torques, or targets and gains do not explain them."
     )
     content = (table("delay | from [ms];1 | to [ms];1 | source", scaled), how)
-    return Section("delay", "Delay", delay_words(found), *(content if found.command["n"] else ()))
+    return Section("Delay", delay_words(found), *(content if found.command["n"] else ()))
 
 
 def _timing(log: DeployLog) -> Section:
@@ -375,14 +340,14 @@ def _timing(log: DeployLog) -> Section:
         rows.append((name, n, *(1e3 * value for value in rest)))
     notes = [f"{name}: {meaning}." for name, (_, meaning) in found.items()]
     columns = "[ms] | n | 50 % | 95 % | 99 % | 99.9 % | max"
-    return Section("timing", "Timing", table(columns, rows, *notes))
+    return Section("Timing", table(columns, rows, *notes))
 
 
 def _filter(log: DeployLog) -> Section:
     rows = [
-        (one.level.name.lower(), one.ticks, one.first, one.largest, one.joint, one.reason.text)
+        (one.level.lower(), one.ticks, one.first, one.largest, one.joint, one.why)
         for one in run.interventions(log)
     ]
     columns = "action | ticks | first at [s];2 | largest change [rad] | joint | reason"
     note = "joint: the one whose target was changed most often for this reason."
-    return Section("filter", "Safety filter", filtering(log), table(columns, rows, note))
+    return Section("Safety filter", filtering(log), table(columns, rows, note))

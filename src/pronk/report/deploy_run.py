@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,12 +93,15 @@ def tilt(log: DeployLog) -> Array:
         return np.asarray(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y) / size**2, -1.0, 1.0)))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Intervention:
     """Action of the safety filter for one reason."""
 
-    reason: Reason
-    level: FilterAction
+    level: str
+    """Name of a `FilterAction`."""
+    reason: str
+    """Name of a `Reason`."""
+    why: str
     ticks: int
     first: float
     """Since the first tick [s]."""
@@ -113,23 +116,16 @@ def interventions(log: DeployLog) -> list[Intervention]:
     found = []
     with np.errstate(invalid="ignore"):
         change = np.nan_to_num(np.abs(log.sent - log.desired))
-    for level in list(FilterAction)[1:]:
-        for reason in Reason:
-            there = (log.level == level) & (log.reason == reason)
-            if not there.any():
-                continue
+    for level, reason in product(list(FilterAction)[1:], Reason):
+        there = (log.level == level) & (log.reason == reason)
+        if there.any():
+            first = float(seconds(log, log.time[there][0]))
             often = (change[there] > _MOVED).sum(axis=0)
             moved = level < FilterAction.DAMP and bool(often.any())
-            found.append(
-                Intervention(
-                    reason=reason,
-                    level=level,
-                    ticks=int(there.sum()),
-                    first=float(seconds(log, log.time[there][0])),
-                    largest=float(change[there].max()) if moved else float("nan"),
-                    joint=log.joints[int(often.argmax())] if moved else "",
-                )
-            )
+            largest = float(change[there].max()) if moved else float("nan")
+            joint = log.joints[int(often.argmax())] if moved else ""
+            what = (level.name, reason.name, reason.text, int(there.sum()))
+            found.append(Intervention(*what, first, largest, joint))
     return found
 
 

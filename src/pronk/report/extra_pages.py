@@ -89,7 +89,6 @@ def walk_part(path: Path, root: Path, **names: str) -> Part:
     figure = "speed_error_averaged"
     drawn = draw.cells([("speed error [m/s]", trial_page.values(walks, figure), {})])
     section = Section(
-        "errors",
         "Velocity errors",
         f"{WALK_FIGURES[figure].says}: every walk, mean and spread.",
         picture(drawn, f"Speed error of every walk of the {where}, by command and policy"),
@@ -172,7 +171,6 @@ def crossing_part(path: Path, root: Path, **names: str) -> Part:
     mark = "paper, hardware: widest gap, from video"
     figure = draw.lines(panels, columns=len(crossings.cases), mark=mark, bar="95 % interval")
     section = Section(
-        "sizes",
         "Share of crossed obstacles over size",
         "Gaps and steps in the floor; an operator who sees the robot gives the jump input. Share "
         "of runs that crossed, with the lead that did best.",
@@ -251,7 +249,6 @@ def variation_part(path: Path, root: Path, **names: str) -> Part:
     varying = ", ".join(each.says for each in parameters)
     trained = "; ".join(f"{each.says}: {each.trained.replace('`', '')}" for each in parameters)
     section = Section(
-        "results",
         "Results over varied parameters",
         "One parameter of the robot is varied at a time; starts and noise are the same. Lines are "
         "means over the commands, without those that gave no jump.",
@@ -309,7 +306,6 @@ def bodies_part(path: Path, root: Path, **names: str) -> Part:
         verdicts.append("; ".join([own, *(verdict(body.trial, other) for other in others)]))
     sections = [
         Section(
-            "summary",
             "Each robot, matched by its own sweep",
             "The policies were trained with the gains of another robot. The match of each gives "
             "the error of those gains on it.",
@@ -323,7 +319,7 @@ def bodies_part(path: Path, root: Path, **names: str) -> Part:
         words = f"Standard deviation of height and distance on each {where} over the gain error"
         drawn = picture(draw.scatter_over_error(errors, panels), words)
         text = "Each mark is a command of a policy on a robot."
-        sections.append(Section("scatter", "Scatter over gain error", text, drawn))
+        sections.append(Section("Scatter over gain error", text, drawn))
     for name in ("height", "distance"):
         paper, label = trial_page.published(name), f"{name} [m]"
         shown = [
@@ -332,7 +328,7 @@ def bodies_part(path: Path, root: Path, **names: str) -> Part:
         ]
         words = f"{name.capitalize()} of every jump on each {where}, with the paper's means"
         drawn = picture(draw.cells(shown), words)
-        sections.append(Section(name, f"{name.capitalize()} on each robot", drawn))
+        sections.append(Section(f"{name.capitalize()} on each robot", drawn))
     folders = ", ".join(body.folder for body in bodies.bodies)
     line = f"`pronk report FOLDER` makes a page of each folder: {folders}."
     text = f"{len(bodies.bodies)} other {where}s: {landed} of {n} jumps landed."

@@ -203,7 +203,7 @@ def _gains(gains: MatchedGains, in_time: bool) -> Section:
             "Table I was measured on the paper's robot; the virtual robot's hidden parameters were "
             "set so that a match lands near it."
         )
-    return Section("gains", "Matched gains", table(columns, rows, *notes))
+    return Section("Matched gains", table(columns, rows, *notes))
 
 
 def _bode(fits: Mapping[str, JointFit], in_time: bool) -> Section:
@@ -220,7 +220,6 @@ def _bode(fits: Mapping[str, JointFit], in_time: bool) -> Section:
         for name in names
     )
     return Section(
-        "bode",
         "Bode plots",
         f"From the held position command to the position of {where}. Numbers in the corners: gain "
         f"error with nominal and with matched gains. {compared}",
@@ -233,7 +232,6 @@ def _bode(fits: Mapping[str, JointFit], in_time: bool) -> Section:
 def _maps(result: MatchResult) -> Section:
     figure = figures.error_maps(result, drive_gains(result.gains))
     return Section(
-        "maps",
         "Error maps",
         "Error of the simulated gain at every pair of the grid. A long valley means that the data "
         "determine a combination of stiffness and damping better than either alone.",
@@ -258,7 +256,6 @@ def _ranges(gains: MatchedGains) -> Section:
     )
     words = "Matched gains of the joints of each group and the ranges that training draws from"
     return Section(
-        "ranges",
         "Training ranges",
         "The box covers the intervals of all joints of a group, in the paper's steps (0.5 N m/rad "
         "and 0.05 N m s/rad); the smallest ellipse leaves out its corners, which no joint has.",
@@ -282,7 +279,6 @@ def _without_armature(fits: Mapping[str, JointFit]) -> Section | None:
     columns = "joint | best error without rotor inertia [dB];2 | matched error [dB];2 | ratio;1"
     figure = figures.zero_armature(fits[figures.knees_first(drawn)[0]])
     return Section(
-        "armature",
         "Without rotor inertia",
         "The same search with zero armature. Through the gear the rotor is much of the inertia of "
         "a light link, and no gains make up for it; a heavy link hides it.",
@@ -315,7 +311,7 @@ def _predictions(folder: Path) -> Section | None:
             picture(figures.prediction(first, virtual=found.virtual), words),
             table(columns, rows),
         ]
-    return Section("prediction", "Prediction of fresh logs", *content) if content else None
+    return Section("Prediction of fresh logs", *content) if content else None
 
 
 def _identifiability(gains: MatchedGains, in_time: bool) -> Section:
@@ -343,7 +339,6 @@ def _identifiability(gains: MatchedGains, in_time: bool) -> Section:
         "motion, except where gravity loads the joint."
     )
     return Section(
-        "identifiability",
         "What cannot be identified",
         in_time_text if in_time else text,
         table(
@@ -368,7 +363,6 @@ def _use(gains: MatchedGains, name: str) -> Section:
     commands = [f"pronk export {name} --to {to}" for to in ("mjlab", "mjcf", "isaaclab")]
     commands.append(f"pronk predict LOG --robot {gains.robot} --gains {name}")
     return Section(
-        "use",
         "Use the gains",
         text.format(one.engine, one.version, *settings, name),
         Code("\n".join(commands)),
@@ -392,7 +386,6 @@ def _excitation(gains: MatchedGains, fits: Mapping[str, JointFit]) -> Section:
     at = "joint | amplitude [rad] | stiffness [N m/rad];2 | damping [N m s/rad]"
     why = "Dry friction and backlash weigh more in small motions."
     return Section(
-        "excitation",
         "Excitation",
         f"Logs of {_where(gains.virtual)} ({gains.robot}). {'; '.join(sorted(used))}.",
         table(columns, rows),

@@ -54,9 +54,9 @@ Content = str | Picture | Sheet | Fold | Code
 class Section:
     """A heading with what stands below it."""
 
-    def __init__(self, anchor: str, title: str, *content: Content | None) -> None:
-        """Set the anchor within the part, the heading, and the content without None."""
-        self.anchor, self.title = anchor, title
+    def __init__(self, title: str, *content: Content | None) -> None:
+        """Set the heading, the anchor within the part, and the content without None."""
+        self.title, self.anchor = title, title.lower().replace(" ", "-")
         self.content = [one for one in content if one]
 
 

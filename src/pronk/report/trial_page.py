@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError
@@ -29,6 +27,10 @@ BEFORE_S, AFTER_S = 0.5, 2.0
 """Window of the height traces about the jump input [s]."""
 TRACE_RATE_HZ = 250.0
 """Rate of drawn traces."""
+Captured = dict[str, dict[str, dict[str, list[Array]]]]
+"""By quantity, policy and command: runs as time [s] and value, each (2, T). `height` [m] over the
+time since the jump input; `roll` and `pitch` rate [rad/s] over the time since the command to run,
+of `RATES` alone."""
 _PAPER_GAPS: Published = {
     "matched": {
         case: (gap, float("nan"))
@@ -61,18 +63,6 @@ def published(figure: str) -> Published:
     }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Captured:
-    """Traces of a trial's captures."""
-
-    traces: dict[str, dict[str, dict[str, list[Array]]]]
-    """By quantity, policy and command: runs as time [s] and value, each (2, T). `height` [m] over
-    the time since the jump input; `roll` and `pitch` rate [rad/s] over the time since the command
-    to run, of `RATES` alone."""
-    missing: int
-    """Captures that the table names and the folder does not hold."""
-
-
 def _cut(time: Array, value: Array, start: float, end: float) -> Array:
     """Return `value` between two times, thinned to `TRACE_RATE_HZ`, as (2, T)."""
     inside = np.flatnonzero((time >= start) & (time <= end))
@@ -82,8 +72,8 @@ def _cut(time: Array, value: Array, start: float, end: float) -> Array:
     return np.stack([time[inside], value[inside]])
 
 
-def captured(trial: Results, folder: Path) -> Captured | None:
-    """Read the captures of a trial; None if there are none.
+def captured(trial: Results, folder: Path) -> tuple[Captured, int] | None:
+    """Read the captures of a trial, and count missing ones; None if there are none.
 
     Raises:
         ArtefactError: A capture is damaged.
@@ -92,7 +82,7 @@ def captured(trial: Results, folder: Path) -> Captured | None:
     present = [(row, path) for row, path in kept if path.exists()]
     if not present:
         return None
-    traces: dict[str, dict[str, dict[str, list[Array]]]] = {
+    traces: Captured = {
         what: {name: {} for name in policies(trial)} for what in ("height", "roll", "pitch")
     }
     for row, path in present:
@@ -105,7 +95,7 @@ def captured(trial: Results, folder: Path) -> Captured | None:
             found["pitch"] = _cut(run, turn[:, 1], 0.0, row.script.run_s)
         for what, trace in found.items():
             traces[what][row.policy].setdefault(row.case, []).append(trace)
-    return Captured(traces=traces, missing=len(kept) - len(present))
+    return traces, len(kept) - len(present)
 
 
 def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
@@ -121,14 +111,11 @@ def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
     from scipy.interpolate import RectBivariateSpline
 
     k, d = joint.grid_stiffness, joint.grid_damping
-    if not joint.grid_error.size or min(len(k), len(d)) < 2:
-        return float("nan")
-    if not (k[0] <= stiffness <= k[-1] and d[0] <= damping <= d[-1]):
+    if min(len(k), len(d)) < 4 or not (k[0] <= stiffness <= k[-1] and d[0] <= damping <= d[-1]):
         return float("nan")
     # The square of the error is smooth between nodes; its root has a cusp at a match.
-    kx, ky = min(3, len(k) - 1), min(3, len(d) - 1)
-    surface = RectBivariateSpline(k, d, joint.grid_error, kx=kx, ky=ky)
-    return float(np.sqrt(max(float(surface.ev([stiffness], [damping])[0]), 0.0)))
+    square = float(RectBivariateSpline(k, d, joint.grid_error).ev([stiffness], [damping])[0])
+    return float(np.sqrt(max(square, 0.0)))
 
 
 def gains_errors(trial: Results, result: MatchResult) -> dict[str, float]:
@@ -232,12 +219,12 @@ def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial")
         warning=passed < len(checks),
         sections=[
             _table_iii(trial),
-            Section("criteria", "Acceptance criteria", tables.criteria(trial)),
+            Section("Acceptance criteria", tables.criteria(trial)),
             _scatter(trial, gains_errors(trial, match) if match else {}),
-            Section("films", "Films", *shown) if shown else None,
-            Section("landings", "Landings", tables.landings(trial)),
+            Section("Films", *shown) if shown else None,
+            Section("Landings", tables.landings(trial)),
             *_traces(trial, captured(trial, folder)),
-            Section("figures", "All figures", *more),
+            Section("All figures", *more),
             _setup(trial),
         ],
         figures={"checks": [check.row() for check in checks]},
@@ -261,7 +248,6 @@ def _table_iii(trial: Results) -> Section:
     panels = [(f"{name} [m]", values(trial, name), published(name)) for name in names]
     words = f"Height, distance and gap of every jump on the {tables.place(trial)}, and the paper's"
     return Section(
-        "table",
         "Table III",
         "Every jump is a small mark, with mean and standard deviation beside. Open marks are the "
         "paper's: five jumps a cell on hardware; gaps are its widest, read off video.",
@@ -276,7 +262,6 @@ def _scatter(trial: Results, errors: Mapping[str, float]) -> Section | None:
     panels = {f"{name} [m]": values(trial, name) for name in ("height", "distance")}
     words = "Standard deviation of height and distance over the error of the training gains"
     return Section(
-        "scatter",
         "Scatter",
         "The paper reports less scatter with matched gains. Intervals are over the jumps of these "
         "policies, not over other trainings.",
@@ -285,29 +270,27 @@ def _scatter(trial: Results, errors: Mapping[str, float]) -> Section | None:
     )
 
 
-def _traces(trial: Results, seen: Captured | None) -> list[Section]:
+def _traces(trial: Results, seen: tuple[Captured, int] | None) -> list[Section]:
     """Sections that need captures."""
     if seen is None:
         return []
+    traces, missing = seen
     where, found = tables.place(trial), []
-    height, roll, pitch = seen.traces.values()
-
-    def add(anchor: str, title: str, text: str, figure: Figure, words: str) -> None:
-        drawn = picture(figure, f"{words} of the {where}", dense=True)
-        found.append(Section(anchor, title, text, drawn))
+    height, roll, pitch = traces.values()
 
     if any(roll.values()):
         text = (
             f"In the trunk's frame, until the jump input, at {RATES.name} (the paper's figure 6)."
         )
         figure = draw.rates({"roll rate [rad/s]": roll, "pitch rate [rad/s]": pitch})
-        add("rates", "Roll and pitch rates", text, figure, "Rates during acceleration")
+        drawn = picture(figure, f"Rates of the {where} while it accelerates", dense=True)
+        found.append(Section("Roll and pitch rates", text, drawn))
     count = sum(len(runs) for cases in height.values() for runs in cases.values())
     text = f"{count} of {len(trial.rows)} jumps, those with a capture."
-    text += f" {seen.missing} captures are missing from the folder." * bool(seen.missing)
+    text += f" {missing} captures are missing from the folder." * bool(missing)
     figure = draw.heights(height, standing=float(trial.rules.get("standing_height", np.nan)))
-    add("heights", "Trunk height over time", text, figure, "Height since the jump input")
-    return found
+    drawn = picture(figure, f"Trunk height of the {where} since the jump input", dense=True)
+    return [*found, Section("Trunk height over time", text, drawn)]
 
 
 def _setup(trial: Results) -> Section:
@@ -320,7 +303,6 @@ def _setup(trial: Results) -> Section:
     where = f"the virtual {trial.robot}" if trial.virtual else trial.robot
     times = ", ".join(f"{name} {value:.0f}" for name, value in timing.items())
     return Section(
-        "setup",
         "Setup",
         f"{len(trial.cases)} commands, {len(trial.rows)} jumps on {where}, seed {trial.seed}. "
         f"Each: stand {script.stand_s:.1f} s, run {script.run_s:.1f} s and up to "
