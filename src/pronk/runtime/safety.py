@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,8 @@ class Reason(IntEnum):
 
 Array = NDArray[np.float64]
 
-_ARRAYS = ("low", "high", "speed", "torque", "stall", "no_load", "loss")
+_UNLIMITED = ("tilt", "measured_torque")
+"""Limits that may be infinite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,20 +143,16 @@ class Limits:
     steps at 500 Hz."""
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
-            values = getattr(self, name)
-            if np.shape(values) != (len(self.joints),) or not np.isfinite(values).all():
-                raise RobotError(
-                    f"Limits.{name} is {values}; expected {len(self.joints)} finite numbers."
-                )
+        n = len(self.joints)
+        for field in fields(self)[1:]:
+            value = getattr(self, field.name)
+            if field.type == "Array":
+                if np.shape(value) != (n,) or not np.isfinite(value).all():
+                    raise RobotError(f"Limits.{field.name} is {value}; expected {n} numbers.")
+            elif not value > 0 or (math.isinf(value) and field.name not in _UNLIMITED):
+                raise RobotError(f"Limits.{field.name} is {value}; it must be positive.")
         if not (self.high - self.low > 2.0 * self.margin).all():
             raise RobotError("Limits.margin leaves nothing between low and high; make it smaller.")
-        for field in fields(self)[1 + len(_ARRAYS) :]:
-            value = getattr(self, field.name)
-            if not value > 0 or (
-                math.isinf(value) and field.name not in ("tilt", "measured_torque")
-            ):
-                raise RobotError(f"Limits.{field.name} is {value}; it must be positive.")
         if not self.hold_s <= self.damp_s <= self.latch_s:
             raise RobotError(
                 f"ages {self.hold_s}, {self.damp_s}, {self.latch_s} s to hold, damp and latch; "
@@ -168,24 +166,18 @@ class Limits:
         `changed` gives other values for the scalar fields.
         """
         drives = [joint.drive for joint in robot.joints]
-        loss = [
-            winding_loss(
-                1.0,
-                gear_ratio=drive.gear_ratio,
-                torque_constant=drive.torque_constant,
-                stall_torque=drive.stall_torque,
-                bus_voltage=drive.bus_voltage,
-            )
-            for drive in drives
-        ]
+        constants = ("gear_ratio", "torque_constant", "stall_torque", "bus_voltage")
+        loss = [winding_loss(1.0, **{name: getattr(d, name) for name in constants}) for d in drives]
+        low, high = np.array([joint.range for joint in robot.joints], dtype=float).T
+        no_load = np.array([drive.no_load_speed for drive in drives])
         return cls(
             joints=robot.joint_names,
-            low=np.array([joint.range[0] for joint in robot.joints]),
-            high=np.array([joint.range[1] for joint in robot.joints]),
-            speed=np.array([1.2 * drive.no_load_speed for drive in drives]),
+            low=low,
+            high=high,
+            speed=1.2 * no_load,
             torque=np.array([drive.effort_limit for drive in drives]),
             stall=np.array([drive.stall_torque for drive in drives]),
-            no_load=np.array([drive.no_load_speed for drive in drives]),
+            no_load=no_load,
             loss=np.array(loss, dtype=float),
             **changed,  # type: ignore[arg-type]
         )
@@ -203,7 +195,7 @@ _NO_STIFFNESS = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyInput:
-    """Input of the rules. Scalars have the leading shape (...,) or broadcast to it."""
+    """Input of the rules. Arrays (..., n) have a number a joint, scalars broadcast to (...,)."""
 
     position: Array
     """Measured [rad]. (..., n)"""
@@ -211,14 +203,13 @@ class SafetyInput:
     """Measured [rad/s]. (..., n)"""
     torque: Array
     """Measured [N m]; NaN where it is not. (..., n)"""
+    temperature: Array
+    """Of the motors [deg C]; NaN where it is not measured. (..., n)"""
     orientation: Array
     """Trunk to world, unit quaternion w, x, y, z. (..., 4)"""
     gyro: Array
     """[rad/s] (..., 3)"""
-    temperature: Array
-    """Of the motors [deg C]; NaN where it is not measured. (..., n)"""
     state_age: Array | float
-    """Since the newest state was measured [s]."""
     target: Array
     """Commanded position [rad]. (..., n)"""
     stiffness: Array
@@ -226,7 +217,6 @@ class SafetyInput:
     damping: Array
     """[N m s/rad] (..., n)"""
     command_age: Array | float
-    """Since the command was made [s]."""
     valid_for: Array | float
     """The command's own validity [s]."""
     lag: Array | float
@@ -237,16 +227,12 @@ class SafetyInput:
     """Whether the dead-man button is held."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SafetyResult:
-    """Output of the rules."""
+class SafetyResult(NamedTuple):
+    """Output of the rules: `FilterAction`, `Reason` (...,); the target if it is sent (..., n)."""
 
     level: NDArray[np.int64]
-    """A `FilterAction`. (...,)"""
     reason: NDArray[np.int64]
-    """A `Reason`. (...,)"""
     target: Array
-    """To be sent where the level is below `DAMP` [rad]. (..., n)"""
 
 
 def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
@@ -273,45 +259,31 @@ def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
     fitted, why, possible = fit(q, v, target, last, kp, kd, limits)
 
     damp, latch = FilterAction.DAMP, FilterAction.LATCH
+    # A quaternion far from unit length is no attitude. What is not measured is NaN, and NaN is
+    # within every limit.
+    state_wrong = ~fine[..., :measured].all(axis=-1) | np.isnan(state_age)
+    state_wrong |= np.abs(square - 1.0) > 0.1
+    command_wrong = ~fine[..., measured:].all(axis=-1) | np.isnan(command_age)
+    gains = (kp < 0.0) | (kp > limits.stiffness) | (kd < 0.0) | (kd > limits.damping)
+    overrun = (q < limits.low - limits.overrun) | (q > limits.high + limits.overrun)
+    overload = np.abs(given.torque) > limits.torque * limits.measured_torque
     faults: tuple[tuple[Reason, FilterAction, Mask], ...] = (
-        # A quaternion far from unit length is no attitude.
-        (
-            Reason.STATE_NOT_FINITE,
-            latch,
-            ~fine[..., :measured].all(axis=-1) | (np.abs(square - 1.0) > 0.1) | np.isnan(state_age),
-        ),
-        (
-            Reason.COMMAND_NOT_FINITE,
-            latch,
-            ~fine[..., measured:].all(axis=-1) | np.isnan(command_age) | np.isnan(given.valid_for),
-        ),
-        (
-            Reason.GAINS,
-            latch,
-            ((kp < 0.0) | (kp > limits.stiffness) | (kd < 0.0) | (kd > limits.damping)).any(-1),
-        ),
+        (Reason.STATE_NOT_FINITE, latch, state_wrong),
+        (Reason.COMMAND_NOT_FINITE, latch, command_wrong | np.isnan(given.valid_for)),
+        (Reason.GAINS, latch, gains.any(axis=-1)),
         (Reason.CLOCK, latch, np.minimum(state_age, command_age) < -limits.future_s),
         (Reason.EXPIRED, latch, command_age > np.minimum(given.valid_for, limits.expiry_s)),
         (Reason.STATE_LOST, latch, state_age > limits.latch_s),
         (Reason.NO_STATE, damp, state_age > limits.damp_s),
         (Reason.LAG, latch, np.asarray(given.lag > limits.lag)),
-        (
-            Reason.OVERRUN,
-            latch,
-            ((q < limits.low - limits.overrun) | (q > limits.high + limits.overrun)).any(-1),
-        ),
+        (Reason.OVERRUN, latch, overrun.any(axis=-1)),
         (Reason.TILT, latch, upright < math.cos(min(limits.tilt, math.pi)) - _SLACK),
-        (Reason.SPEED, latch, (np.abs(v) > limits.speed).any(-1)),
-        # Not measured is NaN, and NaN is not hot.
-        (Reason.TEMPERATURE, latch, (given.temperature > limits.temperature).any(-1)),
+        (Reason.SPEED, latch, (np.abs(v) > limits.speed).any(axis=-1)),
+        (Reason.TEMPERATURE, latch, (given.temperature > limits.temperature).any(axis=-1)),
         # After the measurements, which explain more.
         (Reason.IMPOSSIBLE, latch, ~possible),
         (Reason.DEAD_MAN, damp, np.logical_not(given.held)),
-        (
-            Reason.OVERLOAD,
-            latch,
-            (np.abs(given.torque) > limits.torque * limits.measured_torque).any(-1),
-        ),
+        (Reason.OVERLOAD, latch, overload.any(axis=-1)),
     )
     found = np.empty((*why.shape, len(faults)), dtype=np.bool_)
     for k, (_, _, met) in enumerate(faults):
@@ -385,18 +357,9 @@ def fit(
     scaled = np.minimum(np.maximum(scaled, low), high)
     fitted = np.where(much[..., None] & stiff, scaled, fitted)
     why = np.where(much, Reason.POWER, why)
-    possible &= power(q, v, fitted, kp, kd, limits) <= limits.power_w * (1.0 + _SLACK)
+    work, loss = _work_and_loss(v, _given(q, v, fitted, kp, kd, limits), limits)
+    possible &= work + loss <= limits.power_w * (1.0 + _SLACK)
     return fitted, why, possible
-
-
-def power(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limits) -> Array:
-    """Bus power of targets: work done on the joints and winding losses [W]. (...,).
-
-    Computed from the torques that the drives can give at the joints' speeds with the nominal bus
-    voltage; power returned by braking joints is not counted.
-    """
-    work, loss = _work_and_loss(v, _given(q, v, target, kp, kd, limits), limits)
-    return work + loss
 
 
 def _given(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limits) -> Array:
@@ -406,6 +369,7 @@ def _given(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limi
 
 
 def _work_and_loss(v: Array, torque: Array, limits: Limits) -> tuple[Array, Array]:
+    """Power done on the joints, nothing recovered from braking ones, and winding losses [W]."""
     work: Array = np.maximum(torque * v, 0.0).sum(axis=-1)
     loss: Array = (torque * torque * limits.loss).sum(axis=-1)
     return work, loss
@@ -436,12 +400,11 @@ class FilterState:
 
 @dataclass(frozen=True, kw_only=True)
 class FilterDecision:
-    """What the filter did with a command."""
+    """The filter's action on a command, and `detail`: joint and numbers of a new fault."""
 
     level: FilterAction
     reason: Reason
     detail: str = ""
-    """Joint and numbers of a new fault."""
 
     @property
     def text(self) -> str:
