@@ -17,8 +17,10 @@ from pronk.runtime.plan import Link, Paced
 
 
 @dataclass(frozen=True, kw_only=True)
-class FaultyLink:
+class FaultyLink(Link):
     """Opens the virtual robot on its stand, with faults that events switch on."""
+
+    robot: str = "mini_cheetah"
 
     wire: Path
     """Gets one line for each write: when, and what."""
@@ -32,7 +34,6 @@ class FaultyLink:
     """Event: the link complains at every look; None for never."""
     loss: float = 0.0
     """Share of the states that is lost."""
-    robot: str = "mini_cheetah"
 
     def __call__(self, clamp_operator: object = None) -> Faulty:
         return Faulty(Link(robot=self.robot, address=Address.parse("sim://bench"))(), self)

@@ -29,7 +29,7 @@ from pronk.links.machine import Command, Machine
 from pronk.robots import load_robot
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.log import read_deploy_log
-from pronk.runtime.plan import Plan
+from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import Deployment
 from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import OperatorCommand
@@ -51,10 +51,9 @@ DAMPED_S = 0.060
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatientLink:
-    """Opens a link that a busy computer may be slow on. Implements `Opener`."""
+class PatientLink(Link):
+    """Opens a link that a busy computer may be slow on."""
 
-    address: Address
     robot: str = ROBOT.name
 
     def __call__(self, clamp_operator: object = None) -> Machine:

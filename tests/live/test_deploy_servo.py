@@ -32,8 +32,8 @@ NOWHERE = Path("policy.onnx")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unopened:
-    """A link that cannot even be made. Implements `Opener`."""
+class Unopened(Link):
+    """A link that cannot even be made."""
 
     robot: str = "mini_cheetah"
 

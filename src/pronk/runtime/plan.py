@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
 
 from pronk.errors import HardwareError
 from pronk.links.address import Address
@@ -24,20 +23,9 @@ SERVO_PRIORITY, POLICY_PRIORITY = 60, 50
 """Of SCHED_FIFO: the servo before the policy, both below the kernel's own threads at 99."""
 
 
-class Opener(Protocol):
-    """Makes a machine, not yet connected. It is pickled and sent to the servo's process."""
-
-    @property
-    def robot(self) -> str:
-        """Name of the robot that it opens."""
-
-    def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
-        """Make the machine; `clamp_operator` clamps joints on a real bench."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """A robot at an address. Implements `Opener`."""
+    """A robot at an address. It is pickled and sent to the servo's process."""
 
     robot: str
     address: Address = field(default_factory=Address)
@@ -48,6 +36,8 @@ class Link:
 
     def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
         """Make the machine, not yet connected; the virtual robot in real time.
+
+        `clamp_operator` clamps joints on a real bench.
 
         Raises:
             HardwareError: The link's library is not installed.
@@ -67,9 +57,8 @@ class Link:
 class Paced:
     """The virtual robot in real time, on CLOCK_MONOTONIC. Implements `Machine`.
 
-    `wait` first lets the physics run to the given time and then sleeps until that time comes.
-    Nothing can be sent in between, so the result is the same as if both passed together, and the
-    time that the physics takes does not delay the loop.
+    `wait` first runs the physics to the given time and then sleeps until that time comes; nothing
+    can be sent in between. So the time that the physics takes does not delay the loop.
     """
 
     virtual = True
@@ -81,11 +70,8 @@ class Paced:
         self.torque_kind: TorqueKind = inner.torque_kind
         self.send, self.clamp = inner.send, inner.clamp
         self.damp, self.close = inner.damp, inner.close
+        self.now = time.monotonic
         self._offset = 0.0
-
-    def now(self) -> float:
-        """CLOCK_MONOTONIC [s]."""
-        return time.monotonic()
 
     def connect(self) -> None:
         """Start both clocks."""
@@ -110,7 +96,7 @@ class Paced:
 class Plan:
     """One run: a policy or a sweep on a machine."""
 
-    link: Opener
+    link: Link
     policy: Path | None = None
     sweep: SweepTask | None = None
     """Instead of a policy."""
