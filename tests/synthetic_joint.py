@@ -110,31 +110,24 @@ def make_log(
     reads its state and puts the command of that row into force at the moved instant.
     """
     rng = np.random.default_rng(seed)
-    start = 3.0
-    columns: list[tuple[Array, Array, Array, Array]] = []
-    segments = []
+    start, columns, segments = 3.0, [], []
     for repeat, (time, command, frequency) in enumerate(signals):
         rate = round(1.0 / float(time[1] - time[0]))
-        moved, position = time, np.empty(0)
-        if jitter:
-            # The motion between samples, on a grid forty times as fine.
-            fine = 40
-            index = np.round((np.arange(len(time)) + jitter * rng.random(len(time))) * fine)
-            index = (index - index[0]).astype(int)
-            moved = index / (rate * fine)
-            dense = np.repeat(command, np.diff(np.append(index, index[-1] + 1)))
-            position = joint(dense, rate * fine)[index]
-        else:
-            position = joint(command, rate)
-        position = position + noise * rng.standard_normal(len(time))
+        # The motion between samples is simulated on a grid forty times as fine.
+        fine = 40 if jitter else 1
+        index = np.round((np.arange(len(time)) + jitter * rng.random(len(time))) * fine)
+        index = (index - index[0]).astype(int)
+        moved = start + index / (rate * fine)
+        dense = np.repeat(command, np.diff(np.append(index, index[-1] + 1)))
+        position = joint(dense, rate * fine)[index] + noise * rng.standard_normal(len(time))
         hz = np.full(len(time), np.nan) if frequency is None else frequency
-        columns.append((start + moved, command, position, hz))
+        columns.append((moved, command, position, hz))
         segments.append(
             Segment(
                 kind=kind,
                 joints=("knee",),
-                start=float(start + moved[0]),
-                stop=float(start + moved[-1]),
+                start=float(moved[0]),
+                stop=float(moved[-1]),
                 amplitude=amplitude,
                 repeat=repeat,
                 period_s=period,
