@@ -111,7 +111,8 @@ def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
     from scipy.interpolate import RectBivariateSpline
 
     k, d = joint.grid_stiffness, joint.grid_damping
-    if min(len(k), len(d)) < 4 or not (k[0] <= stiffness <= k[-1] and d[0] <= damping <= d[-1]):
+    inside = k[0] <= stiffness <= k[-1] and d[0] <= damping <= d[-1] if len(k) else False
+    if not inside or min(joint.grid_error.shape) < 4:
         return float("nan")
     # The square of the error is smooth between nodes; its root has a cusp at a match.
     square = float(RectBivariateSpline(k, d, joint.grid_error).ev([stiffness], [damping])[0])
