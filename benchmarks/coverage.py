@@ -18,10 +18,10 @@ from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
+from pronk.match.fit import GAINS
 from pronk.match.measured_joint import measured_joints
-from pronk.match.refine import refine
+from pronk.match.response_fit import interval, refine
 from pronk.match.settings import MatchSettings
-from pronk.match.uncertainty import interval
 from pronk.report.paper import published
 from pronk.response.estimate import operators
 from pronk.robots import load_robot
@@ -105,7 +105,7 @@ def run(
                     bounds = interval(fit)
                     gains[k] = fit.stiffness, fit.damping
                     for i in range(2):
-                        low[k, i], high[k, i] = bounds.around(gains[k, i], i)
+                        low[k, i], high[k, i] = bounds.ci95[GAINS[i]]
                 progress("trials", (index + (begin + count) / trials) / len(JOINTS))
         expected = np.array(known)
 

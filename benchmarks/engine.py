@@ -16,9 +16,8 @@ from benchmarks.runner import Progress, table
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.excitation.signals import Chirp
-from pronk.match.grid import axes
+from pronk.match.grid import axes, quick_search
 from pronk.match.measured_joint import DB, SimRequest, measured_joints, responses
-from pronk.match.quick import quick_search
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.robots.robot import Robot

@@ -22,10 +22,9 @@ from benchmarks.runner import Progress, table
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.excitation.signals import Chirp
-from pronk.match.grid import GridSearch, alike, axes, search
+from pronk.match.grid import GridSearch, alike, axes, quick_search, search
 from pronk.match.measured_joint import MeasuredJoint, measured_joints
-from pronk.match.quick import quick_search
-from pronk.match.refine import refine
+from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
 from pronk.report.paper import published
 from pronk.robots import load_robot

@@ -18,10 +18,9 @@ from pronk.evaluation.results import Kind, Results, Row, Subject
 from pronk.evaluation.variation import NOMINAL, VARIATION
 from pronk.evaluation.walk import WALK, WalkFigures, walk_script
 from pronk.match import gains as gains_file
-from pronk.match import prediction as prediction_file
 from pronk.match import result as match_file
 from pronk.match.gains import GroupGains, MatchedGains
-from pronk.match.prediction import JointPrediction, Prediction
+from pronk.match.predict import JointPrediction, Prediction, save_prediction
 from pronk.match.result import JointFit, MatchResult
 from pronk.response.response import FrequencyResponse
 from pronk.robots import load_robot
@@ -177,7 +176,7 @@ def write_match(folder: Path, result: MatchResult, *, prediction: bool = False) 
         one = Prediction(
             joints=(joint_prediction(),), virtual=result.gains.virtual, source="fresh.mcap"
         )
-        prediction_file.save(folder / "fresh.prediction.npz", one)
+        save_prediction(folder / "fresh.prediction.npz", one)
     return folder
 
 

@@ -13,9 +13,9 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.readers import read_log
 from pronk.match import gains as gains_file
 from pronk.match.arm import drives_of, fit_arm, match_arm
+from pronk.match.measured_joint import trusted_frequency, trusted_samples
 from pronk.match.predict import predict
 from pronk.match.result import MatchResult
-from pronk.match.sample_mask import trusted_frequency, trusted_samples
 from pronk.response.grid import held_mean
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together

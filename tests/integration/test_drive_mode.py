@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pronk.match.drive import match_drives
 
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog
-from pronk.match.drive import match_drives
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

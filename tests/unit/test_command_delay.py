@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pronk.match.diagnostics import command_delay
+from pronk.match.pipeline import command_delay
 from report_cases import joint_fit
 
 

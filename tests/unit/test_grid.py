@@ -17,12 +17,12 @@ from pronk.match.grid import (
     axes,
     coarse_search,
     mean_square,
+    quick_search,
     search,
     search_all,
     weights,
 )
 from pronk.match.measured_joint import MeasuredJoint, SimRequest, measured_joints, merged, responses
-from pronk.match.quick import quick_search
 from pronk.match.settings import MatchSettings
 from pronk.response.response import Estimator
 from pronk.robots import load_robot

@@ -10,10 +10,9 @@ import pytest
 
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.excitation.signals import Chirp
-from pronk.match.grid import axes, search
+from pronk.match.grid import axes, quick_search, search
 from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, measured_joints, responses
-from pronk.match.quick import quick_search
-from pronk.match.refine import refine
+from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
 from pronk.simulators.linear import plant

@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import JointGains, MatchedGains
-from pronk.match.predict import predict
-from pronk.match.prediction import r2, rmse
+from pronk.match.predict import predict, r2, rmse
 from pronk.robots import load_robot
 from pronk.simulators.command_trace import command_trace
 from pronk.simulators.mujoco import simulate

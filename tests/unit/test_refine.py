@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pronk.match.uncertainty import interval, measurement_error_db
 from scipy.signal import lfilter
 
 from benchmarks.engine import engine_gap
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.errors import IdentifiabilityError
 from pronk.excitation.signals import Chirp
-from pronk.match.diagnostics import amplitude_flags, amplitude_gains
 from pronk.match.measured_joint import MeasuredJoint, measured_joints
-from pronk.match.refine import refine
+from pronk.match.pipeline import amplitude_flags, amplitude_gains
+from pronk.match.response_fit import refine
 from pronk.match.result import amplitude_spread
 from pronk.match.settings import MatchSettings
-from pronk.match.uncertainty import interval, measurement_error_db
 from pronk.response.estimate import operators
 from pronk.response.response import Estimator
 from pronk.robots import load_robot

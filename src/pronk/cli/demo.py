@@ -20,7 +20,7 @@ from pronk.errors import PronkError
 
 if TYPE_CHECKING:
     from pronk.evaluation.results import Results
-    from pronk.match.prediction import JointPrediction
+    from pronk.match.predict import JointPrediction
     from pronk.match.result import MatchResult
     from pronk.robots.robot import Robot
 
@@ -176,10 +176,9 @@ def sweep_and_match(
     """
     from pronk.logs.readers import read_logs
     from pronk.match import gains as gains_file
-    from pronk.match import prediction as prediction_file
     from pronk.match import result as result_file
     from pronk.match.pipeline import match_logs
-    from pronk.match.predict import predict
+    from pronk.match.predict import Prediction, predict, save_prediction
     from pronk.match.settings import MatchSettings
     from pronk.response import save as save_responses
 
@@ -209,9 +208,9 @@ def sweep_and_match(
         for log in read_logs(fresh, robot=robot)
         for one in predict(log, robot, result.gains).joints
     ]
-    prediction_file.save(
+    save_prediction(
         out / "fresh.prediction.npz",
-        prediction_file.Prediction(joints=tuple(replays), source="fresh", virtual=True),
+        Prediction(joints=tuple(replays), source="fresh", virtual=True),
     )
     return result, replays
 

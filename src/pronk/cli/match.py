@@ -15,11 +15,10 @@ from pronk.cli.options import Reading
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.match.prediction import JointPrediction
+    from pronk.match.predict import JointPrediction
     from pronk.match.result import MatchResult
 
 Mode = Literal["gains", "drive"]
-Interval = Literal["student", "bootstrap"]
 Target = Literal["mjlab", "mjcf", "isaaclab"]
 
 
@@ -31,8 +30,6 @@ def match(
     quick: bool = False,
     zero_armature: bool = True,
     free: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
-    interval: Interval = "student",
-    phase: bool = False,
     simulator: str = "mujoco",
     device: str = "cpu",
     reading: Reading = Reading(),  # noqa: B008
@@ -49,8 +46,6 @@ def match(
         quick: Search the linearized model, verify by simulation.
         zero_armature: Repeat the search without rotor inertia.
         free: drive: fit this instead; repeat it. What the sweeps cannot tell apart is refused.
-        interval: 95 % intervals over repeats; the bootstrap needs eight.
-        phase: Refine on the phase too, with a free delay.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
             pronk[train]).
@@ -75,8 +70,6 @@ def match(
     settings = MatchSettings(
         method="quick" if quick else "grid",
         zero_armature=zero_armature,
-        use_phase=phase,
-        interval=interval,
         device=device,
         simulator=simulator,
     )
@@ -234,8 +227,8 @@ def predict(
         json_file: Also write the figures to this file.
     """
     from pronk.match import gains as gains_file
-    from pronk.match import prediction as prediction_file
     from pronk.match.predict import predict as predict_log
+    from pronk.match.predict import save_prediction
     from pronk.report import figures, style
     from pronk.robots import load_robot
 
@@ -253,7 +246,7 @@ def predict(
             excluded |= found.excluded
             stem = Path(log.source or "log").stem
             path = folder / f"{stem}.prediction.npz"
-            prediction_file.save(path, replace(found, source=Path(log.source).name))
+            save_prediction(path, replace(found, source=Path(log.source).name))
             written.append(path)
             for one in found.joints:
                 name = stem if stem == one.joint else f"{stem}.{one.joint}"

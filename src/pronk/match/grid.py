@@ -12,13 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.match.measured_joint import MeasuredJoint
+from pronk.errors import PronkError
+from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
+from pronk.match.response_fit import Fit, refine
 from pronk.robots.robot import Robot
+from pronk.simulators.linear import Plant, plant
+from pronk.simulators.mujoco import JointTestRig
 from pronk.simulators.simulator import JointRig, JointRigs
 
 Array = NDArray[np.float64]
@@ -30,6 +33,10 @@ _NEAR_DB = 0.2
 hip_roll differ by 0.03 dB around the best."""
 _STRIDES = (7, 3, 1)
 """Every how many nodes the coarse search looks, from far to close."""
+_VERIFIED = 3
+"""Nodes of the corrected map that are simulated."""
+_STEP = 1e-3
+"""Step of the closed form's derivative in the logarithm of a gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +48,7 @@ class GridSearch:
     damping: Array
     """Axis [N m s/rad], shape (b,)."""
     error: Array
-    """Mean squared error of the gain [dB^2], shape (a, b); NaN where it was not looked at."""
+    """Mean squared error of the gain [dB^2], shape (a, b); NaN where it was not simulated."""
 
     @property
     def cell(self) -> tuple[int, int]:
@@ -71,18 +78,12 @@ def axes(robot: Robot, points: int = 50) -> tuple[Array, Array]:
     return np.linspace(*robot.grid_stiffness, points), np.linspace(*robot.grid_damping, points)
 
 
-def weights(goal: MeasuredJoint, weighting: Literal["none", "coherence"]) -> Array:
-    """Weights of the frequencies inside the band, summing to one, shape (inside,)."""
-    count = int(goal.fit_mask.sum())
-    raw = np.ones(count) if weighting == "none" else goal.deviation_db() ** -2.0
-    return np.asarray(raw / raw.sum())
-
-
-def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128], weight: Array) -> Array:
-    """Weighted mean square of the gain error [dB^2], shape (...), for (..., inside)."""
+def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128]) -> Array:
+    """Mean square of the gain error [dB^2], shape (...), for responses of shape (..., inside)."""
     error = goal.error_db(simulated)
     error = np.where(np.isfinite(error), np.clip(error, -DIVERGED_DB, DIVERGED_DB), DIVERGED_DB)
-    return np.asarray(error**2 @ weight)
+    count = error.shape[-1]
+    return np.asarray(error**2 @ np.full(count, 1.0 / count))
 
 
 def alike(targets: Sequence[MeasuredJoint], robot: Robot) -> list[list[MeasuredJoint]]:
@@ -103,35 +104,29 @@ def errors(
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    weighting: Literal["none", "coherence"] = "none",
     progress: Callable[[float], None] | None = None,
 ) -> Array:
-    """Mean squared errors of several targets that share one simulation.
+    """Mean squared errors of targets that share one simulation [dB^2], shape (group, b).
 
     Args:
         rig: The rig of the group's original joint.
-        group: Targets whose questions are the same after mirroring.
+        group: Targets whose commands are the same after mirroring.
         stiffness: [N m/rad], shape (b,).
         damping: [N m s/rad], shape (b,).
-        weighting: Weights of the frequencies.
         progress: Called with the share done, 0 to 1.
-
-    Returns:
-        Mean squared error of the gain [dB^2], shape (group, b).
     """
     # One may rest longer than the others at the end.
-    question = max(
+    longest = max(
         (g.trace for g in group if g.trace.same_as(group[0].trace, rig.robot)),
         key=lambda one: len(one.command),
     )
-    command = question.mirrored(rig.robot)[2]
+    command = longest.mirrored(rig.robot)[2]
     steps = max(goal.steps for goal in group)
     command = np.pad(command, (0, max(0, steps - len(command))), mode="edge")
-    weight = [weights(goal, weighting) for goal in group]
     out = np.empty((len(group), len(stiffness)))
-    for part, position in rig.run([command[:steps]], [rig.pose(question)], stiffness, damping):
+    for part, position in rig.run([command[:steps]], [rig.pose(longest)], stiffness, damping):
         for k, goal in enumerate(group):
-            out[k, part] = mean_square(goal, goal.fit_response(position), weight[k])
+            out[k, part] = mean_square(goal, goal.fit_response(position))
         if progress is not None:
             progress(part.stop / len(stiffness))
     return out
@@ -142,13 +137,12 @@ def search(
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    weighting: Literal["none", "coherence"] = "none",
     progress: Callable[[float], None] | None = None,
 ) -> list[GridSearch]:
     """Simulate the whole grid for targets that share one simulation; arguments as `errors`."""
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
     shape = (len(stiffness), len(damping))
-    found = errors(rig, group, kp, kd, weighting, progress)
+    found = errors(rig, group, kp, kd, progress)
     return [
         GridSearch(stiffness=stiffness, damping=damping, error=row.reshape(shape)) for row in found
     ]
@@ -159,27 +153,17 @@ def search_all(
     targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    weighting: Literal["none", "coherence"] = "none",
     progress: Callable[[float], None] | None = None,
 ) -> list[GridSearch]:
     """The whole grid for any number of targets, each family of mirrored joints simulated once.
 
     Joints excited alike share a simulation. So do, nearly, joints excited the other way round
-    (a left hip_roll moved to the same side as the right one): only gravity and the pose tell the
-    sides apart. Their maps are read off the shared simulation, then every node within `_NEAR_DB`
+    (a left hip_roll moved to the same side as the right one): only gravity and the pose distinguish
+    the sides. Their maps are read off the shared simulation, then every node within `_NEAR_DB`
     of the best is simulated for itself. Should any of those have been wrong by half of that, all
     nodes are.
 
-    Args:
-        simulator: The training simulator.
-        targets: What to match.
-        stiffness: Axis [N m/rad], shape (a,).
-        damping: Axis [N m s/rad], shape (b,).
-        weighting: Weights of the frequencies.
-        progress: Called with the share done, 0 to 1.
-
-    Returns:
-        One search a target, in their order.
+    Returns one search a target, in their order.
     """
     robot = simulator.robot
     families: list[list[list[MeasuredJoint]]] = []
@@ -194,24 +178,23 @@ def search_all(
     for k, family in enumerate(families):
         rig = simulator.rig(family[0][0].joint)
 
-        def tell(share: float, k: int = k) -> None:
+        def report(share: float, k: int = k) -> None:
             if progress is not None:
                 progress((k + share) / len(families))
 
         members = [goal for group in family for goal in group]
-        maps = search(rig, members, stiffness, damping, weighting, tell)
+        maps = search(rig, members, stiffness, damping, report)
         found |= {id(goal): one for goal, one in zip(members, maps, strict=True)}
         for group in family[1:]:
-            looked = _look_again(rig, group, [found[id(goal)] for goal in group], weighting)
-            found |= {id(goal): one for goal, one in zip(group, looked, strict=True)}
+            done = _simulate_near(rig, group, [found[id(goal)] for goal in group])
+            found |= {id(goal): one for goal, one in zip(group, done, strict=True)}
     return [found[id(goal)] for goal in targets]
 
 
-def _look_again(
+def _simulate_near(
     rig: JointRig,
     group: Sequence[MeasuredJoint],
     shared: Sequence[GridSearch],
-    weighting: Literal["none", "coherence"],
 ) -> list[GridSearch]:
     """Simulate a group's own command wherever its shared maps could be the best."""
     maps = np.array([one.error for one in shared])
@@ -219,13 +202,13 @@ def _look_again(
     near = (levels < levels.min(axis=(1, 2), keepdims=True) + _NEAR_DB).any(axis=0)
     first = shared[0]
 
-    def look(nodes: NDArray[np.bool_]) -> None:
+    def simulate(nodes: NDArray[np.bool_]) -> None:
         i, j = np.nonzero(nodes)
-        maps[:, i, j] = errors(rig, group, first.stiffness[i], first.damping[j], weighting)
+        maps[:, i, j] = errors(rig, group, first.stiffness[i], first.damping[j])
 
-    look(near)
+    simulate(near)
     if np.abs(np.sqrt(maps) - levels).max() > 0.5 * _NEAR_DB:
-        look(~near)
+        simulate(~near)
     return [replace(one, error=row) for one, row in zip(shared, maps, strict=True)]
 
 
@@ -234,30 +217,29 @@ def coarse_search(
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    weighting: Literal["none", "coherence"] = "none",
 ) -> list[GridSearch]:
-    """Look at every seventh node and the border, then ever closer around the best.
+    """Simulate every seventh node and the border, then ever closer around the best.
 
-    Each stride looks around the best node so far until that no longer moves, so the search
+    Each stride goes around the best node so far until that no longer moves, so the search
     follows a narrow valley to its bottom. Enough to show that no node fits (paper F13) at a
-    twentieth of the cost; nodes not looked at are NaN in the error map.
+    twentieth of the cost; nodes not simulated are NaN in the error map.
     """
     shape = (len(stiffness), len(damping))
-    looked = np.zeros(shape, dtype=bool)
+    done = np.zeros(shape, dtype=bool)
     maps = np.full((len(group), *shape), np.nan)
 
-    def look(nodes: NDArray[np.bool_]) -> bool:
-        i, j = np.nonzero(nodes & ~looked)
+    def simulate(nodes: NDArray[np.bool_]) -> bool:
+        i, j = np.nonzero(nodes & ~done)
         if len(i):
-            maps[:, i, j] = errors(rig, group, stiffness[i], damping[j], weighting)
-        looked[i, j] = True
+            maps[:, i, j] = errors(rig, group, stiffness[i], damping[j])
+        done[i, j] = True
         return len(i) > 0
 
     first = np.zeros(shape, dtype=bool)
     first[np.ix_(*(np.unique([*range(0, n, _STRIDES[0]), n - 1]) for n in shape))] = True
-    look(first)
+    simulate(first)
     for reach, stride in pairwise(_STRIDES):
-        while look(_around(maps, reach, stride)):
+        while simulate(_around(maps, reach, stride)):
             pass
     return [GridSearch(stiffness=stiffness, damping=damping, error=row) for row in maps]
 
@@ -274,3 +256,89 @@ def _around(maps: Array, reach: int, stride: int) -> NDArray[np.bool_]:
         ]
         close[np.ix_(*near)] = True
     return close
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuickSearch:
+    """What the quick way found for one joint."""
+
+    grid: GridSearch
+    """Corrected map; the nodes around its best are simulated."""
+    fit: Fit
+    """Optimum off the grid, found and verified by simulation."""
+
+
+def quick_search(
+    simulator: JointRigs,
+    targets: Sequence[MeasuredJoint],
+    stiffness: Array,
+    damping: Array,
+) -> list[QuickSearch]:
+    """Search the grid linearized everywhere and simulated where it matters; one result a target.
+
+    1. The closed form (`pronk.simulators.linear`) over the whole grid gives a first cell.
+    2. Gauss-Newton with the simulator goes from there to the optimum off the grid.
+    3. The simulated value and slope there correct the closed form (manifold space mapping: Bandler
+       et al., *Space mapping: the state of the art*, IEEE Trans. MTT 52(1), 2004), and the
+       corrected map is searched again. Its best few nodes are simulated, and the simulator decides
+       between them.
+
+    Raises:
+        PronkError: The simulator is not MuJoCo.
+    """
+    kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
+    shape = (len(stiffness), len(damping))
+    plants = [_plant(simulator, goal) for goal in targets]
+    logs = [
+        np.log(np.abs(p.response(kp, kd, amplitude=goal.trace.amplitude)))
+        for p, goal in zip(plants, targets, strict=True)
+    ]
+    first = [
+        int(np.argmin(mean_square(goal, np.exp(log).astype(np.complex128))))
+        for goal, log in zip(targets, logs, strict=True)
+    ]
+    start = [(float(kp[k]), float(kd[k])) for k in first]
+    fits = refine(simulator, targets, start)
+    maps, requests = [], []
+    for goal, p, log, fit in zip(targets, plants, logs, fits, strict=True):
+        corrected = log + _correction(p, fit, kp, kd)
+        maps.append(mean_square(goal, np.exp(corrected).astype(np.complex128)))
+        requests += [SimRequest(goal, kp[k], kd[k]) for k in np.argsort(maps[-1])[:_VERIFIED]]
+    simulated = responses(simulator, requests)
+    found = []
+    for i, (goal, fit) in enumerate(zip(targets, fits, strict=True)):
+        best = np.argsort(maps[i])[:_VERIFIED]
+        mine = simulated[_VERIFIED * i : _VERIFIED * (i + 1)]
+        verified = [float(mean_square(goal, response)) for response in mine]
+        # The simulator decides among them; no node without a simulation may win.
+        floor = min(verified)
+        maps[i] = np.maximum(maps[i], floor * (1.0 + 1e-9))
+        maps[i][best] = verified
+        grid = GridSearch(stiffness=stiffness, damping=damping, error=maps[i].reshape(shape))
+        found.append(QuickSearch(grid=grid, fit=fit))
+    return found
+
+
+def _plant(simulator: JointRigs, goal: MeasuredJoint) -> Plant:
+    rig = simulator.rig(goal.joint)
+    if not isinstance(rig, JointTestRig):
+        raise PronkError(
+            f"the quick search linearizes MuJoCo; with simulator {simulator.info.engine} search "
+            "the grid."
+        )
+    return plant(rig, rig.pose(goal.trace), goal.omega)
+
+
+def _correction(linear: Plant, fit: Fit, stiffness: Array, damping: Array) -> Array:
+    """Log gain of the simulator over that of the closed form, to first order, shape (b, f)."""
+    goal = fit.target
+    amplitude = goal.trace.amplitude
+    at = np.array([fit.stiffness, fit.damping])
+    near = at * np.exp(_STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    closed = np.log(np.abs(linear.response(near[:, 0], near[:, 1], amplitude=amplitude)))
+    simulated = fit.solution.jacobian * goal.deviation_db()[:, None] / DB
+    slope = simulated - (closed[1:] - closed[0]).T / _STEP
+    measured = np.log(np.abs(goal.measured.response[goal.fit_mask]))
+    value = fit.gain_db / DB + measured - closed[0]
+    away = np.log(np.column_stack([stiffness, damping])) - np.log(at)
+    return np.asarray(value + away @ slope.T)

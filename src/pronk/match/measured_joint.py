@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
@@ -35,6 +36,16 @@ frequencies outvote the band, though the model itself is not better than this.""
 _TAIL = 2e-4
 """Absolute error of gain that leaving out the end of the log would cause in a joint that follows
 its command: 0.002 dB at gain 1. Over the paper's grid it was 0.001 dB; nodes differ by 0.02 dB."""
+_COHERENT = 0.95
+_SEGMENT_S = 5.0
+_EXCITED = 1e-3
+"""Power of the command, over its largest, from which on a frequency counts as excited."""
+_WIDE = 8.0
+"""A recording shows where coherence ends only if it was coherent over three octaves below: a sweep
+does; a few lines or a motion that mostly sticks do not."""
+_WINDOW_S = 2.0
+_AT_LIMIT = 0.25
+"""Share of its power that a sine at the limit keeps, filtered forwards and backwards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +62,7 @@ class MeasuredJoint:
     """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
     fit_matrix: Array
     """The part of `matrix` that the fit needs, real and imaginary columns side by side (one real
-    product is faster than one of complex numbers), shape (steps heard, 2 inside). The estimator
+    product is faster than one of complex numbers), shape (steps, 2 inside). The estimator
     gets nothing of these frequencies from later steps, so they need not be simulated."""
 
     warnings: tuple[str, ...] = ()
@@ -73,13 +84,10 @@ class MeasuredJoint:
         return len(self.fit_matrix)
 
     def fit_response(self, position: Array) -> ComplexArray:
-        """Response at the frequencies inside, in this joint's coordinate.
+        """Response at the frequencies inside, in this joint's coordinate, shape (..., inside).
 
-        Args:
-            position: Of the joint simulated, about the pose, shape (..., at least `steps`) [rad].
-
-        Returns:
-            Shape (..., inside).
+        `position` is that of the joint simulated, about the pose, shape (..., at least `steps`)
+        [rad].
         """
         # The mean is removed; without it nothing is cut off where the steps end at rest.
         moved = position[..., : self.steps] - position[..., :1]
@@ -107,22 +115,27 @@ class MeasuredJoint:
         return np.asarray(np.hypot(DB * relative, FLOOR_DB))
 
     def error_db(self, simulated: ComplexArray) -> Array:
-        """Gain of a simulation over the measured one, inside the band [dB], shape (..., inside).
-
-        Args:
-            simulated: Response, shape (..., inside).
-        """
+        """Gain over the measured one [dB] of a simulated response, both of shape (..., inside)."""
         measured = np.abs(self.measured.response[self.fit_mask])
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(DB * (np.log(np.abs(simulated)) - np.log(measured)))
 
+    def rms_db(self, simulated: ComplexArray) -> float:
+        """Root mean square of `error_db`, frequencies counting alike [dB]."""
+        return float(np.sqrt(np.mean(self.error_db(simulated) ** 2)))
+
+    def measurement_error_db(self) -> float:
+        """Root mean square half-width of the measured gain's own 95 % interval in the band [dB]."""
+        relative = self.measured.relative_error(0.95)[self.fit_mask]
+        return float(DB * np.sqrt(np.mean(relative**2)))
+
 
 def logs_by_joint(logs: Sequence[JointLog], robot: Robot) -> dict[str, list[JointLog]]:
-    """Which logs ask which joint, joints in the robot's order.
+    """Logs that excite each joint, joints in the robot's order.
 
     Raises:
-        LogError: No log asks any joint.
-        RobotError: A log asks a joint that the robot has not.
+        LogError: No log excites any joint.
+        RobotError: A log excites a joint that the robot has not.
     """
     where: dict[str, list[JointLog]] = {}
     for log in logs:
@@ -154,19 +167,10 @@ def measured_joints(
     joint: str,
     robot: Robot,
     settings: MatchSettings,
-    *,
-    band_hz: tuple[float, float] | None = None,
 ) -> list[MeasuredJoint]:
     """Estimate a joint's responses and prepare each for comparison, largest amplitude first.
 
     Sine steps are left out: they are read step by step and have no single matrix.
-
-    Args:
-        log: The log.
-        joint: The joint; the log must hold questions to it.
-        robot: The robot.
-        settings: Estimator and coherence limit.
-        band_hz: Frequencies to compare; the joint's band if not given.
 
     Raises:
         LogError: The joint was not excited or did not move, or its unit is unknown.
@@ -188,7 +192,7 @@ def measured_joints(
     for repeats, response in zip(parts, measured, strict=True):
         operator = build_operator(repeats[0], joint, settings.estimator, rate_hz)
         try:
-            found.append(target(repeats[0], operator, response, robot, settings, band_hz=band_hz))
+            found.append(_prepared(repeats[0], operator, response, robot, settings))
         except IdentifiabilityError as error:
             # The largest amplitude must be usable; a smaller one only checks it.
             if not found:
@@ -198,24 +202,14 @@ def measured_joints(
     return found
 
 
-def target(
+def _prepared(
     part: JointLog,
     operator: H1Operator,
     measured: FrequencyResponse,
     robot: Robot,
     settings: MatchSettings,
-    *,
-    band_hz: tuple[float, float] | None = None,
 ) -> MeasuredJoint:
-    """Prepare the comparison of one measured response.
-
-    Args:
-        part: The question, one segment; of several repeats any one, their commands being the same.
-        operator: The estimate of that question as a matrix.
-        measured: The response.
-        robot: The robot.
-        settings: Coherence limit.
-        band_hz: Frequencies to compare; the joint's band if not given.
+    """Prepare the comparison of one measured response to one segment (of repeats any one).
 
     Raises:
         LogError: The unit is unknown, or a clamped joint stood elsewhere.
@@ -224,7 +218,7 @@ def target(
     joint = measured.joint
     trace = command_trace(part, part.segments[0], joint, robot)
     matrix = operator.matrix(trace.time)
-    low, high = band_hz or robot.joint(joint).band_hz
+    low, high = robot.joint(joint).band_hz
     inside = _inside(measured, low, high, settings, part.source or "log")
     return MeasuredJoint(
         trace=trace,
@@ -237,13 +231,10 @@ def target(
 
 
 def merged(found: Sequence[Sequence[MeasuredJoint]]) -> list[MeasuredJoint]:
-    """Targets of one joint from several logs, repeats of the same question put together.
+    """Join repeats of the same excitation from several logs; one an amplitude, largest first.
 
-    Args:
-        found: Targets of each log.
-
-    Returns:
-        One target an amplitude, largest first.
+    Raises:
+        LogError: The same amplitude has different frequencies in several logs.
     """
     groups: dict[tuple[object, ...], list[MeasuredJoint]] = {}
     for goal in (goal for row in found for goal in row):
@@ -280,9 +271,9 @@ def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
     inside = np.logical_and.reduce([goal.fit_mask for goal in goals])
     first = goals[0]
     kept = inside[first.fit_mask]
-    heard = first.fit_matrix[:, np.concatenate([kept, kept])]
+    matrix = first.fit_matrix[:, np.concatenate([kept, kept])]
     warnings = tuple(dict.fromkeys(one for goal in goals for one in goal.warnings))
-    return replace(first, measured=measured, fit_mask=inside, fit_matrix=heard, warnings=warnings)
+    return replace(first, measured=measured, fit_mask=inside, fit_matrix=matrix, warnings=warnings)
 
 
 def _inside(
@@ -317,11 +308,6 @@ def _fit_matrix(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array)
     A chirp leaves the band long before it ends; the windows of the segments after that hold next
     to nothing of the band's frequencies. The rows end where all remaining positions together move
     no gain by `_TAIL`, judged by a joint that follows its command perfectly.
-
-    Args:
-        matrix: Shape (steps, f).
-        inside: Frequencies of the fit, shape (f,).
-        command: Command about the pose [rad], shape (steps,).
     """
     chosen = matrix[:, inside]
     tail = np.abs(np.cumsum((chosen * command[:, None])[::-1], axis=0)[::-1]).max(axis=1)
@@ -332,17 +318,25 @@ def _fit_matrix(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array)
 
 @dataclass(frozen=True)
 class SimRequest:
-    """One simulation: a target's question with one pair of gains."""
+    """One simulation: the command of a measured response, with some parameters of the joint."""
 
     target: MeasuredJoint
     stiffness: float
     damping: float
+    armature: float | None = None
+    """[kg m^2]; None: the simulator's."""
+    frictionloss: float | None = None
+    """[N m]; None: the simulator's."""
+    delay: float = 0.0
+    """Delay of the command [s]."""
 
 
 def responses(
     simulator: JointRigs, requests: Sequence[SimRequest], *, whole: bool = False
 ) -> list[ComplexArray]:
-    """Simulated responses, one a request.
+    """Simulate requests; those whose joints mirror one original joint share a rollout.
+
+    Armature and friction are given for all requests of one original joint, or for none.
 
     Args:
         simulator: The training simulator.
@@ -350,41 +344,82 @@ def responses(
         whole: All frequencies of the target instead of those inside its band.
 
     Returns:
-        Each of shape (inside,), or (f,) if `whole`. NaN where a simulation diverged.
+        One response a request, of shape (inside,), or (f,) if `whole`; NaN where a simulation
+        diverged.
     """
+    robot = simulator.robot
     out: list[ComplexArray] = [np.empty(0, dtype=np.complex128)] * len(requests)
     by_original: dict[str, list[int]] = {}
     for i, request in enumerate(requests):
-        original = simulator.robot.joint(request.target.joint).original[0]
-        by_original.setdefault(original, []).append(i)
-    for indices in by_original.values():
-        _simulate_family(simulator, [requests[i] for i in indices], indices, out, whole)
+        by_original.setdefault(robot.joint(request.target.joint).original[0], []).append(i)
+    for original, indices in by_original.items():
+        rig = simulator.rig(original)
+        goals = [requests[i].target for i in indices]
+        longest = max(len(goal.matrix) if whole else goal.steps for goal in goals)
+        commands = []
+        for goal in goals:
+            command = goal.trace.mirrored(robot)[2][:longest]
+            # Shorter commands rest at the pose until the longest has ended.
+            commands.append(np.pad(command, (0, longest - len(command))))
+        poses = [rig.pose(goal.trace) for goal in goals]
+        values = {
+            name: np.array([getattr(requests[i], name) for i in indices])
+            for name in ("stiffness", "damping", "armature", "frictionloss")
+            if getattr(requests[indices[0]], name) is not None
+        }
+        for part, position in rig.run(commands, poses, **values):
+            for row, k in enumerate(range(part.start, part.stop)):
+                goal, delay = goals[k], requests[indices[k]].delay
+                read = goal.full_response if whole else goal.fit_response
+                response = read(position[row])
+                if delay:
+                    omega = goal.measured.omega if whole else goal.omega
+                    response = response * np.exp(-1j * omega * delay)
+                out[indices[k]] = response
     return out
 
 
-def _simulate_family(
-    simulator: JointRigs,
-    requests: Sequence[SimRequest],
-    indices: Sequence[int],
-    out: list[ComplexArray],
-    whole: bool,
-) -> None:
-    """Simulate requests whose joints mirror one original joint, in one rollout."""
-    rig = simulator.rig(requests[0].target.joint)
-    lengths = [
-        len(request.target.matrix) if whole else request.target.steps for request in requests
-    ]
-    longest = max(lengths)
-    commands, poses = [], []
-    for request in requests:
-        command = request.target.trace.mirrored(simulator.robot)[2][:longest]
-        # Shorter questions rest at the pose until the longest has ended.
-        commands.append(np.pad(command, (0, longest - len(command))))
-        poses.append(rig.pose(request.target.trace))
-    stiffness = np.array([request.stiffness for request in requests])
-    damping = np.array([request.damping for request in requests])
-    for part, position in rig.run(commands, poses, stiffness, damping):
-        for row, i in enumerate(range(part.start, part.stop)):
-            goal = requests[i].target
-            read = goal.full_response if whole else goal.fit_response
-            out[indices[i]] = read(position[row])
+def trusted_frequency(time: Array, command: Array, position: Array) -> float:
+    """Frequency at which the coherence of a sweep falls below 0.95 [Hz], from arrays of shape (n,).
+
+    A servo has limits of its own (acceleration, speed, torque) that no gain describes. Beyond them
+    the response is no longer a linear joint's, and the coherence of a sweep that runs into them
+    falls. Infinity if it does not, or if the recording is too narrow to show it.
+    """
+    rate = (len(time) - 1) / (time[-1] - time[0])
+    width = min(round(_SEGMENT_S * rate), len(time))
+    hz, power = signal.welch(command, rate, nperseg=width)
+    excited = power > _EXCITED * power.max()
+    if power.max() == 0.0 or np.ptp(position) == 0.0:
+        return float("inf")
+    _, coherence = signal.coherence(command, position, rate, nperseg=width)
+    excited[0] = False  # each segment's mean is removed, so 0 Hz is not excited
+    good = excited & (coherence >= _COHERENT)
+    if not good.any():
+        return float("inf")
+    first = int(np.argmax(good))
+    fallen = np.flatnonzero(excited[first:] & ~good[first:])
+    if len(fallen) == 0:
+        return float("inf")
+    last = hz[first + fallen[0] - 1]
+    return float(hz[first + fallen[0]]) if last >= _WIDE * hz[first] else float("inf")
+
+
+def trusted_samples(log: JointLog, joint: str) -> tuple[NDArray[np.bool_], float]:
+    """Samples that a fit may use, and the trusted frequency [Hz].
+
+    The mask, shape (n,), is false where, over two seconds, the command is mostly above the trusted
+    frequency.
+    """
+    column = log.column(joint)
+    command = log.command[:, column]
+    limit = trusted_frequency(log.time, command, log.position[:, column])
+    rate = log.rate_hz
+    if not limit < 0.45 * rate:
+        return np.ones(len(log.time), dtype=bool), limit
+    about = command - command.mean()
+    high = signal.sosfiltfilt(signal.butter(4, limit, "highpass", fs=rate, output="sos"), about)
+    window = np.ones(max(round(_WINDOW_S * rate), 1))
+    share = signal.fftconvolve(high**2, window, "same")
+    whole = signal.fftconvolve(about**2, window, "same")
+    return np.asarray(share <= _AT_LIMIT * np.maximum(whole, 0.0)), limit

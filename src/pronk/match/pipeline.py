@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,17 +13,9 @@ from numpy.typing import NDArray
 
 from pronk.errors import PronkError
 from pronk.logs.joint_log import JointLog
-from pronk.match.arm import match_arm
-from pronk.match.diagnostics import (
-    amplitude_flags,
-    amplitude_gains,
-    armature_flags,
-    command_delay,
-    missing,
-    warnings,
-)
-from pronk.match.drive import match_drives
-from pronk.match.grid import GridSearch, alike, axes, coarse_search, search_all
+from pronk.match.arm import fit_whole_arm
+from pronk.match.fit import DRIVE_MODE, GAINS_MODE, checked_names
+from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
     MeasuredJoint,
     SimRequest,
@@ -33,44 +25,30 @@ from pronk.match.measured_joint import (
     merged,
     responses,
 )
-from pronk.match.parameters import DRIVE_MODE
-from pronk.match.quick import quick_search
 from pronk.match.ranges import matched_gains
-from pronk.match.refine import Fit, refine
-from pronk.match.result import JointFit, MatchResult
+from pronk.match.response_fit import FREE, Fit, fit_drive, interval, refine, require_sweeps
+from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult, amplitude_spread
 from pronk.match.settings import MatchSettings
-from pronk.match.uncertainty import interval
+from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import Robot
 from pronk.simulators.chain import moves_together
-from pronk.simulators.simulator import JointRigs, joint_rigs
+from pronk.simulators.mujoco import mujoco_info
+from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 Progress = Callable[[str, float], None]
 
-
-@dataclass
-class _Measured:
-    """One joint and all that was measured of it."""
-
-    targets: list[MeasuredJoint]
-    naive: tuple[float, float]
-    """Gains on the real drive while the log was made."""
-
-    @property
-    def main(self) -> MeasuredJoint:
-        """The response that is matched: that of the largest amplitude."""
-        return self.targets[0]
-
-
-@dataclass
-class _Found:
-    """What the search brought for one joint."""
-
-    grid: GridSearch
-    fit: Fit
-    others: list[Fit] = field(default_factory=list)
-    """Fits of the smaller amplitudes."""
-    zero: GridSearch | None = None
+NO_MATCH_DB = 1.0
+"""Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
+of a good log stays below."""
+NO_MATCH_INTERVALS = 3.0
+"""A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
+NO_ARMATURE_RATIO = 5.0
+"""Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
+SPREAD_MAX = 0.05
+"""Relative change of stiffness between amplitudes that is worth a flag; the paper's own
+randomization is 2 N m/rad on 20 (D3), twice that."""
 
 
 def match_logs(
@@ -92,7 +70,7 @@ def match_logs(
         robot: The robot.
         mode: `gains` finds stiffness and damping (the paper's); `drive` takes the stiffness for
             known and fits damping, armature, dry friction and delay.
-        free: Parameters to fit in mode `drive` instead.
+        free: Parameters to fit in mode `drive` instead, out of `FREE`.
         settings: How to match; the paper's search if not given.
         progress: Called with the stage and the share of it that is done, 0 to 1.
 
@@ -107,53 +85,45 @@ def match_logs(
         raise PronkError(f"mode {mode!r}; expected gains or drive.")
     if free and mode != "drive":
         raise PronkError("parameters to fit can be named in mode drive only.")
+    clock = _Clock(progress)
     if any(moves_together(log) for log in logs):
         if chosen.simulator != "mujoco":
             raise PronkError(
                 f"simulator {chosen.simulator}: several joints of these logs move at once, which "
                 "only simulator mujoco matches; record one joint at a time."
             )
-        return match_arm(logs, robot, mode=mode, threads=chosen.threads, progress=progress)
-    if mode == "drive":
-        return match_drives(
-            logs, robot, free=free or DRIVE_MODE, settings=chosen, progress=progress
-        )
-    return _match_gains(logs, robot, chosen, progress)
-
-
-def _match_gains(
-    logs: Sequence[JointLog], robot: Robot, chosen: MatchSettings, progress: Progress | None
-) -> MatchResult:
-    """The paper's search, its refinement and intervals, joint by joint."""
-    clock = _Clock(progress)
+        with clock.stage("fit"):
+            names = GAINS_MODE if mode == "gains" else DRIVE_MODE
+            joints, excluded = fit_whole_arm(
+                logs, robot, names, threads=chosen.threads, progress=clock.report
+            )
+        return _result(logs, robot, mujoco_info(robot), joints, clock, excluded=excluded)
     # The simulator first: a device that is missing must not cost the user an estimate.
-    with joint_rigs(
-        chosen.simulator, robot, threads=chosen.threads, device=chosen.device
-    ) as simulator:
-        robot = simulator.robot
-        with clock.stage("estimate"):
-            excited = _collect(logs, robot, chosen, clock)
-        found, rate = _search(simulator, excited, chosen, clock)
-        with clock.stage("amplitudes"):
-            _fit_amplitudes(simulator, excited, found, chosen)
-        with clock.stage("responses"):
-            matched, naive = _final_responses(simulator, excited, found)
-        zero: dict[str, NDArray[np.complex128]] = {}
-        if chosen.zero_armature and "armature" in simulator.parameters:
-            with clock.stage("zero armature"):
-                zero = _without_armature(simulator, excited, found, chosen, clock)
-    joints = {
-        name: _joint_fit(
-            robot, item, found[name], matched[name], naive[name], zero.get(name), chosen
-        )
-        for name, item in excited.items()
-    }
+    with joint_rigs(chosen.simulator, robot, threads=chosen.threads, device=chosen.device) as rigs:
+        if mode == "drive":
+            joints = _drives(rigs, logs, checked_names(free or DRIVE_MODE, FREE), chosen, clock)
+            return _result(logs, rigs.robot, rigs.info, joints, clock)
+        joints, rate = _gains(rigs, logs, chosen, clock)
+        return _result(logs, rigs.robot, rigs.info, joints, clock, rate=rate)
+
+
+def _result(
+    logs: Sequence[JointLog],
+    robot: Robot,
+    info: SimulatorInfo,
+    joints: Mapping[str, JointFit],
+    clock: _Clock,
+    *,
+    rate: float = float("nan"),
+    excluded: Mapping[str, str] | None = None,
+) -> MatchResult:
     gains = {name: joint.gains() for name, joint in joints.items()}
     return MatchResult(
-        gains=matched_gains(robot, gains, logs, simulator.info),
-        joints=joints,
+        gains=matched_gains(robot, gains, logs, info),
+        joints={name: joint for name, joint in joints.items() if joint.responses},
         seconds=clock.seconds,
         grid_steps_per_second=rate,
+        excluded=excluded or {},
     )
 
 
@@ -176,174 +146,246 @@ class _Clock:
         self.report(1.0)
 
     def report(self, share: float) -> None:
-        """Share of the stage that is done."""
+        """Report the share of the stage that is done."""
         if self._progress is not None:
             self._progress(self._stage, share)
 
 
+@dataclass
+class _Joint:
+    """One joint: what was measured and what the search found."""
+
+    targets: list[MeasuredJoint]
+    """Largest amplitude, the one that is matched, first."""
+    on_drive: tuple[float, float]
+    """Gains on the real drive while the log was made."""
+    fits: list[Fit] = field(default_factory=list)
+    """One an amplitude."""
+    grid: GridSearch | None = None
+    zero: GridSearch | None = None
+    """The search without rotor inertia."""
+    matched: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
+    naive: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
+    zero_response: ComplexArray | None = None
+
+
 def _collect(
     logs: Sequence[JointLog], robot: Robot, settings: MatchSettings, clock: _Clock
-) -> dict[str, _Measured]:
-    """Responses of every joint excited, in the robot's order."""
-    where = logs_by_joint(logs, robot)
-    excited: dict[str, _Measured] = {}
-    for i, (name, sources) in enumerate(where.items()):
-        excited[name] = _Measured(
-            targets=merged([measured_joints(log, name, robot, settings) for log in sources]),
-            naive=gains_on_drive(sources[0], name, robot),
-        )
-        clock.report((i + 1) / len(where))
-    return excited
+) -> dict[str, _Joint]:
+    """Responses of every excited joint, in the robot's order."""
+    out = {}
+    with clock.stage("estimate"):
+        for name, sources in (where := logs_by_joint(logs, robot)).items():
+            out[name] = _Joint(
+                targets=merged([measured_joints(log, name, robot, settings) for log in sources]),
+                on_drive=gains_on_drive(sources[0], name, robot),
+            )
+            clock.report(len(out) / len(where))
+    return out
 
 
-def _search(
-    simulator: JointRigs, excited: dict[str, _Measured], settings: MatchSettings, clock: _Clock
-) -> tuple[dict[str, _Found], float]:
-    """Best node and optimum off the grid of every joint; physics steps per second of the grid."""
-    main = [item.main for item in excited.values()]
-    stiffness, damping = axes(simulator.robot, settings.grid_points)
+def _drives(
+    rigs: JointRigs,
+    logs: Sequence[JointLog],
+    names: tuple[str, ...],
+    settings: MatchSettings,
+    clock: _Clock,
+) -> dict[str, JointFit]:
+    """Mode drive: fit the drive of every joint, if the sweeps can tell its parameters apart."""
+    found = _collect(logs, rigs.robot, settings, clock)
+    for name, one in found.items():
+        require_sweeps(rigs.robot, name, one.targets, names)
+    joints = {}
+    with clock.stage("fit"):
+        for name, one in found.items():
+            joints[name] = fit_drive(rigs, one.targets, one.on_drive, names)
+            clock.report(len(joints) / len(found))
+    return joints
+
+
+def _gains(
+    rigs: JointRigs, logs: Sequence[JointLog], settings: MatchSettings, clock: _Clock
+) -> tuple[dict[str, JointFit], float]:
+    """The paper's search and its refinement; physics steps per second of the grid."""
+    found = _collect(logs, rigs.robot, settings, clock)
+    joints = list(found.values())
+    main = [one.targets[0] for one in joints]
+    stiffness, damping = axes(rigs.robot, settings.grid_points)
+    rate = float("nan")
     if settings.method == "quick":
         with clock.stage("quick search"):
-            quick = quick_search(
-                simulator,
-                main,
-                stiffness,
-                damping,
-                weighting=settings.grid_weighting,
-                use_phase=settings.use_phase,
-            )
-        return {
-            goal.joint: _Found(grid=one.grid, fit=one.fit)
-            for goal, one in zip(main, quick, strict=True)
-        }, float("nan")
-    with clock.stage("grid"):
-        begin = time.perf_counter()
-        grids = search_all(
-            simulator, main, stiffness, damping, settings.grid_weighting, clock.report
-        )
-        # Everything the search does counts, not the simulator alone.
-        rate = simulator.count.steps / (time.perf_counter() - begin)
-    with clock.stage("refine"):
-        fits = refine(
-            simulator,
-            main,
-            [grid.gains for grid in grids],
-            use_phase=settings.use_phase,
-        )
-    return {
-        goal.joint: _Found(grid=grid, fit=fit)
-        for goal, grid, fit in zip(main, grids, fits, strict=True)
-    }, rate
+            for one, quick in zip(
+                joints, quick_search(rigs, main, stiffness, damping), strict=True
+            ):
+                one.grid, one.fits = quick.grid, [quick.fit]
+    else:
+        with clock.stage("grid"):
+            begin = time.perf_counter()
+            grids = search_all(rigs, main, stiffness, damping, clock.report)
+            # Everything the search does counts, not the simulator alone.
+            rate = rigs.count.steps / (time.perf_counter() - begin)
+        with clock.stage("refine"):
+            fits = refine(rigs, main, [grid.gains for grid in grids])
+        for one, grid, fit in zip(joints, grids, fits, strict=True):
+            one.grid, one.fits = grid, [fit]
+    with clock.stage("amplitudes"):
+        others = [goal for one in joints for goal in one.targets[1:]]
+        best = [_pair(found[goal.joint].fits[0]) for goal in others]
+        for fit in refine(rigs, others, best):
+            found[fit.target.joint].fits.append(fit)
+    with clock.stage("responses"):
+        requests = [SimRequest(one.targets[0], *_pair(one.fits[0])) for one in joints]
+        requests += [SimRequest(one.targets[0], *one.on_drive) for one in joints]
+        simulated = responses(rigs, requests, whole=True)
+        for k, one in enumerate(joints):
+            one.matched, one.naive = simulated[k], simulated[len(joints) + k]
+    if settings.zero_armature and "armature" in rigs.parameters:
+        with clock.stage("zero armature"):
+            _without_armature(rigs, found, stiffness, damping, clock)
+    return {name: _joint_fit(rigs.robot, one) for name, one in found.items()}, rate
 
 
-def _fit_amplitudes(
-    simulator: JointRigs,
-    excited: dict[str, _Measured],
-    found: dict[str, _Found],
-    settings: MatchSettings,
-) -> None:
-    """Fit the smaller amplitudes, each by itself."""
-    others = [goal for item in excited.values() for goal in item.targets[1:]]
-    start = [(found[goal.joint].fit.stiffness, found[goal.joint].fit.damping) for goal in others]
-    for fit in refine(simulator, others, start, use_phase=settings.use_phase):
-        found[fit.target.joint].others.append(fit)
-
-
-def _final_responses(
-    simulator: JointRigs, excited: dict[str, _Measured], found: dict[str, _Found]
-) -> tuple[dict[str, NDArray[np.complex128]], dict[str, NDArray[np.complex128]]]:
-    """Whole responses with the matched and with the naive gains."""
-    main = [item.main for item in excited.values()]
-    requests = [
-        SimRequest(goal, found[goal.joint].fit.stiffness, found[goal.joint].fit.damping)
-        for goal in main
-    ]
-    requests += [SimRequest(item.main, *item.naive) for item in excited.values()]
-    simulated = responses(simulator, requests, whole=True)
-    names = list(excited)
-    return (
-        dict(zip(names, simulated[: len(names)], strict=True)),
-        dict(zip(names, simulated[len(names) :], strict=True)),
-    )
+def _pair(fit: Fit) -> tuple[float, float]:
+    return fit.stiffness, fit.damping
 
 
 def _without_armature(
     simulator: JointRigs,
-    excited: dict[str, _Measured],
-    found: dict[str, _Found],
-    settings: MatchSettings,
+    found: Mapping[str, _Joint],
+    stiffness: Array,
+    damping: Array,
     clock: _Clock,
-) -> dict[str, NDArray[np.complex128]]:
-    """The search without rotor inertia (F13); whole responses at its best nodes."""
-    stiffness, damping = axes(simulator.robot, settings.grid_points)
-    groups = alike([item.main for item in excited.values()], simulator.robot)
+) -> None:
+    """The search without rotor inertia (F13), and whole responses at its best nodes."""
+    groups = alike([one.targets[0] for one in found.values()], simulator.robot)
     requests = []
     with simulator.without_armature() as rigs:
         for k, group in enumerate(groups):
-            rig = rigs.rig(group[0].joint)
-            for goal, grid in zip(
-                group,
-                coarse_search(rig, group, stiffness, damping, settings.grid_weighting),
-                strict=True,
-            ):
+            grids = coarse_search(rigs.rig(group[0].joint), group, stiffness, damping)
+            for goal, grid in zip(group, grids, strict=True):
                 found[goal.joint].zero = grid
                 requests.append(SimRequest(goal, *grid.gains))
             clock.report((k + 1) / len(groups))
-        simulated = responses(rigs, requests, whole=True)
-    return {
-        request.target.joint: response
-        for request, response in zip(requests, simulated, strict=True)
-    }
+        for request, response in zip(requests, responses(rigs, requests, whole=True), strict=True):
+            found[request.target.joint].zero_response = response
 
 
-def _joint_fit(
-    robot: Robot,
-    item: _Measured,
-    found: _Found,
-    matched: NDArray[np.complex128],
-    naive: NDArray[np.complex128],
-    zero: NDArray[np.complex128] | None,
-    settings: MatchSettings,
-) -> JointFit:
+def _joint_fit(robot: Robot, found: _Joint) -> JointFit:
     """Put one joint's findings together."""
-    goal, fit, grid = item.main, found.fit, found.grid
+    goal, fit, grid = found.targets[0], found.fits[0], found.grid
+    assert grid is not None
     joint = robot.joint(goal.joint)
-    bounds = interval(fit, level=settings.level, method=settings.interval)
-    per_amplitude = amplitude_gains([fit, *found.others])
-    naive_db = float(np.sqrt(np.mean(goal.error_db(naive[goal.fit_mask]) ** 2)))
+    uncertainty = interval(fit)
+    per_amplitude = amplitude_gains(found.fits)
     zero_db = float("nan") if found.zero is None else found.zero.error_db
     band = goal.measured.band(*joint.band_hz)
     return JointFit(
         joint=goal.joint,
-        responses=tuple(one.measured for one in item.targets),
+        responses=tuple(one.measured for one in found.targets),
         stiffness=fit.stiffness,
         damping=fit.damping,
         armature=joint.drive.armature,
-        delay_s=command_delay(goal.measured, matched, joint.band_hz),
-        ci95={
-            "stiffness": bounds.around(fit.stiffness, 0),
-            "damping": bounds.around(fit.damping, 1),
-        },
-        covariance=bounds.covariance,
+        delay_s=command_delay(goal.measured, found.matched, joint.band_hz),
+        ci95=uncertainty.ci95,
+        covariance=uncertainty.covariance,
         band_hz=joint.band_hz,
         error_db=fit.error_db,
-        naive_error_db=naive_db,
+        naive_error_db=goal.rms_db(found.naive[goal.fit_mask]),
         coherence_min=float(goal.measured.coherence[band].min()),
-        matched=matched,
-        naive=naive,
+        matched=found.matched,
+        naive=found.naive,
         grid_stiffness=grid.stiffness,
         grid_damping=grid.damping,
         grid_error=grid.error,
         zero_armature_error_db=zero_db,
-        zero_armature=zero,
-        repeat_gains=bounds.repeat_gains,
+        zero_armature=found.zero_response,
+        repeat_gains=uncertainty.repeat_gains,
         amplitude_gains=per_amplitude,
         flags=(
-            *warnings(goal, fit, grid, settings),
-            *bounds.flags,
+            *_warnings(fit, grid),
+            *uncertainty.flags,
             *amplitude_flags(per_amplitude),
-            *missing(goal, band),
+            *_left_out(goal, band),
             *goal.warnings,
-            *armature_flags(fit, zero_db, settings),
+            *_armature_flags(fit, zero_db),
         ),
     )
+
+
+def _no_match_db(fit: Fit) -> float:
+    """Error in the band above which gains are no match [dB]."""
+    return max(NO_MATCH_DB, NO_MATCH_INTERVALS * fit.target.measurement_error_db())
+
+
+def _warnings(fit: Fit, grid: GridSearch) -> Iterator[str]:
+    """What speaks against the optimum."""
+    limit = _no_match_db(fit)
+    if not fit.error_db <= limit:
+        yield (
+            f"no match: the best gains miss the measured response by {fit.error_db:.2g} dB RMS, "
+            f"more than {limit:.2g} dB; the model lacks something that the robot has"
+        )
+    if grid.at_edge:
+        yield (
+            f"at the edge of the grid ({grid.gains[0]:.3g} N m/rad, {grid.gains[1]:.3g} N m s/rad)"
+        )
+    if not fit.solution.settled:
+        yield "the refinement did not settle; take the gains of the grid"
+    if not fit.target.trace.policy_held:
+        yield "the command does not change at the policy's rate; each physics step holds its own"
+
+
+def _left_out(goal: MeasuredJoint, band: NDArray[np.bool_]) -> Iterator[str]:
+    """Frequencies of the band that the fit did not use."""
+    left, whole = int(band.sum()) - int(goal.fit_mask.sum()), int(band.sum())
+    if left:
+        yield f"{left} of {whole} frequencies left out for low coherence"
+
+
+def _armature_flags(fit: Fit, zero_db: float) -> Iterator[str]:
+    """What the search without rotor inertia found (F13)."""
+    if not np.isfinite(zero_db):
+        return
+    ratio = zero_db / max(fit.error_db, 1e-6)
+    if ratio >= NO_ARMATURE_RATIO and zero_db > _no_match_db(fit):
+        verdict = "no match, the best node misses"
+    else:
+        # A light rotor on a heavy link: other gains make up for it.
+        verdict = "not ruled out by this joint, its best node misses"
+    yield f"{ZERO_ARMATURE}{verdict} by {zero_db:.2g} dB RMS, {ratio:.3g} times the match"
+
+
+def amplitude_gains(fits: Sequence[Fit]) -> Array:
+    """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
+    rows = [(fit.target.measured.amplitude, *_pair(fit)) for fit in fits]
+    return np.array(rows).reshape(-1, 3)
+
+
+def amplitude_flags(gains: Array) -> tuple[str, ...]:
+    """Warn of gains, shape (m, 3), that change with the amplitude, as dry friction makes them."""
+    spread = amplitude_spread(gains)
+    if not spread > SPREAD_MAX:
+        return ()
+    largest, smallest = gains[:, 0].max(), gains[:, 0].min()
+    return (
+        f"friction: stiffness changes by {100.0 * spread:.0f} % between {smallest:.3g} and "
+        f"{largest:.3g} rad; give the simulator the joint's dry friction, or match at the "
+        "amplitude that the policy will use",
+    )
+
+
+def command_delay(
+    measured: FrequencyResponse, matched: ComplexArray, band_hz: tuple[float, float]
+) -> float:
+    """Delay of the measured response behind the matched one [s], never negative.
+
+    The magnitude gives the gains (paper F9); phase = -omega * delay is a straight line through
+    zero. Least squares over the joint's band: every frequency with enough coherence counts alike.
+    Zero where none has.
+    """
+    band = measured.band(*band_hz, 0.8)
+    if not band.any():
+        return 0.0
+    omega = measured.omega[band]
+    lag = -np.unwrap(np.angle(measured.response[band] / matched[band]))
+    return max(0.0, float(omega @ lag / (omega @ omega)))

@@ -19,18 +19,10 @@ class MatchSettings:
     by simulation at the optimum."""
     grid_points: int = 50
     """Points of each axis of the grid (paper F7)."""
-    grid_weighting: Literal["none", "coherence"] = "none"
-    """Weights of the frequencies in the grid search; the paper names none (F10)."""
-    use_phase: bool = False
-    """Let the refinement see the phase too, with a free delay; the paper disregards it (F9)."""
     zero_armature: bool = True
     """Repeat the search without rotor inertia (paper F13)."""
     coherence_min: float = 0.8
     """Frequencies below are left out of the fit; a joint with most of its band below is refused."""
-    level: float = 0.95
-    """Level of the intervals."""
-    interval: Literal["student", "bootstrap"] = "student"
-    """Intervals over repeats: Student's t, or a bootstrap where there are eight or more."""
     threads: int = 2
     """Threads of the simulator."""
     device: str = "cpu"
@@ -47,19 +39,12 @@ class MatchSettings:
         Raises:
             PronkError: A value is outside its range; the message gives the range.
         """
-        if self.method not in ("grid", "quick"):
-            raise PronkError(f"method {self.method!r}; expected grid or quick.")
-        if self.grid_weighting not in ("none", "coherence"):
-            raise PronkError(f"grid_weighting {self.grid_weighting!r}; expected none or coherence.")
-        if self.interval not in ("student", "bootstrap"):
-            raise PronkError(f"interval {self.interval!r}; expected student or bootstrap.")
-        if self.grid_points < 3:
-            raise PronkError(f"grid_points is {self.grid_points}; expected 3 or more.")
-        if not 0.0 <= self.coherence_min < 1.0:
-            raise PronkError(f"coherence_min is {self.coherence_min}; expected 0 to below 1.")
-        if not 0.0 < self.level < 1.0:
-            raise PronkError(f"level is {self.level}; expected between 0 and 1, for instance 0.95.")
-        if self.device not in DEVICES:
-            raise PronkError(f"device {self.device!r}; expected one of {', '.join(DEVICES)}.")
-        if self.threads < 1:
-            raise PronkError(f"threads is {self.threads}; expected 1 or more.")
+        for name, good, expected in (
+            ("method", self.method in ("grid", "quick"), "grid or quick"),
+            ("grid_points", self.grid_points >= 3, "3 or more"),
+            ("coherence_min", 0.0 <= self.coherence_min < 1.0, "0 to below 1"),
+            ("device", self.device in DEVICES, f"one of {', '.join(DEVICES)}"),
+            ("threads", self.threads >= 1, "1 or more"),
+        ):
+            if not good:
+                raise PronkError(f"{name} is {getattr(self, name)!r}; expected {expected}.")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pronk.match.gains import MatchedGains
-from pronk.match.prediction import JointPrediction
+from pronk.match.predict import JointPrediction
 from pronk.match.result import JointFit, MatchResult
 from pronk.report import style
 from pronk.report.paper import published

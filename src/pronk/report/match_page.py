@@ -13,9 +13,9 @@ from markupsafe import Markup
 from pronk.errors import ArtefactError, RobotError
 from pronk.files import write_text
 from pronk.match import gains as gains_file
-from pronk.match import prediction as prediction_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
+from pronk.match.predict import load_prediction
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult
 from pronk.report import figures
 from pronk.report.page import Code, Content, Fold, Part, Section, page, picture, table
@@ -292,7 +292,7 @@ def _predictions(folder: Path) -> Section | None:
     columns = "joint | unit | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4"
     columns += " | matched / nominal;2 | R² nominal | R² matched"
     for path in sorted(folder.glob("*.prediction.npz")):
-        found = prediction_file.load(path)
+        found = load_prediction(path)
         if not found.joints:
             continue
         by_joint = {one.joint: one for one in found.joints}
