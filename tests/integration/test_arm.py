@@ -12,9 +12,11 @@ from pronk.errors import IdentifiabilityError, LogError, PronkError
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.readers import read_log
 from pronk.match import gains as gains_file
-from pronk.match.arm import drives_of, fit_arm, match_arm
+from pronk.match import match_logs
+from pronk.match.arm import fit_whole_arm
+from pronk.match.fit import DRIVE_MODE
 from pronk.match.measured_joint import trusted_frequency, trusted_samples
-from pronk.match.predict import predict
+from pronk.match.predict import drives_of, predict
 from pronk.match.result import MatchResult
 from pronk.response.grid import held_mean
 from pronk.robots import load_robot
@@ -69,35 +71,31 @@ def recorded_with(log: JointLog, known: dict[str, JointDrive]) -> JointLog:
 
 def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
     log = recorded_with(commands(65.0, (0.15, 8.0), 0.35), KNOWN)
-    fit = fit_arm([log], ARM)
+    joints, _ = fit_whole_arm([log], ARM, DRIVE_MODE, most_held=0)
     for name, known in KNOWN.items():
-        joint = fit.joints[name]
-        assert joint.drive.stiffness == known.stiffness
-        assert joint.drive.damping == pytest.approx(known.damping, rel=0.03)
-        assert joint.drive.armature == pytest.approx(known.armature, rel=0.08)
-        assert joint.drive.frictionloss == pytest.approx(known.frictionloss, rel=0.05)
-        assert joint.drive.delay == pytest.approx(known.delay, abs=1e-3)
+        joint = joints[name]
+        assert joint.stiffness == known.stiffness
+        assert joint.damping == pytest.approx(known.damping, rel=0.03)
+        assert joint.armature == pytest.approx(known.armature, rel=0.08)
+        assert joint.frictionloss == pytest.approx(known.frictionloss, rel=0.05)
+        assert joint.delay_s == pytest.approx(known.delay, abs=1e-3)
         assert joint.rmse < 1e-3 < joint.published_rmse
 
 
 def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
     log = recorded_with(commands(65.0, (0.05, 0.4), 0.1), KNOWN)
-    with pytest.raises(IdentifiabilityError) as refused:
-        fit_arm([log], ARM)
-    assert "armature" in str(refused.value)
-    assert "a sweep to higher frequencies" in str(refused.value)
+    with pytest.raises(IdentifiabilityError, match=r"armature.*a sweep to higher frequencies"):
+        fit_whole_arm([log], ARM, DRIVE_MODE, most_held=0)
 
 
 def test_too_short_and_misspelled_are_refused() -> None:
     log = commands(30.0, (0.2, 3.0), 0.2)
     with pytest.raises(LogError, match="at least 3"):
-        fit_arm([log], ARM)
+        match_logs([log], ARM)
     with pytest.raises(PronkError, match="stiffness, damping"):
-        fit_arm([log], ARM, parameters=("kd",))
+        fit_whole_arm([log], ARM, ("kd",))
     with pytest.raises(LogError, match="at least one"):
-        fit_arm([], ARM)
-    with pytest.raises(PronkError, match="gains or drive"):
-        match_arm([log], ARM, mode="both")  # type: ignore[arg-type]
+        fit_whole_arm([], ARM, DRIVE_MODE)
 
 
 def test_still_arm_is_refused() -> None:
@@ -128,7 +126,7 @@ def test_moving_together_differs_from_taking_turns() -> None:
     assert moves_together(replace(log, segments=both))
 
 
-def test_sweep_is_believed_up_to_where_it_breaks() -> None:
+def test_sweep_is_used_up_to_where_it_breaks() -> None:
     time = np.arange(0.0, 120.0, 0.02)
     hz = 0.1 * 50.0 ** (time / time[-1])
     phase = 2.0 * np.pi * np.cumsum(hz) * 0.02
@@ -151,7 +149,7 @@ def test_sweep_is_believed_up_to_where_it_breaks() -> None:
 
 @pytest.fixture(scope="module")
 def matched() -> MatchResult:
-    return match_arm([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM)
+    return match_logs([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM)
 
 
 @recorded
