@@ -7,8 +7,9 @@ which is exact because the H1 estimate is linear in the position.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.stats import binom
@@ -36,21 +37,6 @@ BATCH = 50
 REST_S = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class Coverage:
-    """Trials of one joint; pairs are of stiffness and damping."""
-
-    joint: str
-    known: tuple[float, float]
-    trials: int
-    covered: tuple[int, int]
-    """Trials whose interval holds the known value."""
-    bias_percent: tuple[float, float]
-    deviation_percent: tuple[float, float]
-    half_width_percent: tuple[float, float]
-    """Mean half-width of the interval."""
-
-
 def run(
     trials: int,
     seed: int,
@@ -59,16 +45,12 @@ def run(
     repeats: int = 3,
     length_s: float = 20.0,
     threads: int = 2,
-) -> list[Coverage]:
+) -> dict[str, dict[str, Any]]:
     """Trials for one joint of each group.
 
-    Args:
-        trials: Logs of each joint.
-        seed: Of the noise.
-        progress: Called with the stage and the share done.
-        repeats: Chirps in each log.
-        length_s: Length of the chirp [s].
-        threads: Threads of the simulator.
+    Returns:
+        By joint, pairs for stiffness and damping: `covered` (trials whose interval holds the known
+        value), bias, standard deviation and mean half-width of the interval.
 
     Raises:
         PronkError: Fewer than one trial or than two repeats.
@@ -81,7 +63,7 @@ def run(
     chirp = Excitation(offsets=Chirp(length_s=length_s).samples(), repeats=repeats, settle_s=REST_S)
     samples = round((length_s + 2.0 * REST_S + 1.0) * RATE_HZ)
     noise = partial(coloured_noise, deviation=NOISE_RAD, corner_hz=NOISE_CORNER_HZ, rate_hz=RATE_HZ)
-    found = []
+    found = {}
     for index, name in enumerate(JOINTS):
         rng, known = np.random.default_rng([seed, index]), paper.joints[name]
         log = synthetic_log(
@@ -108,22 +90,13 @@ def run(
                         low[k, i], high[k, i] = bounds.ci95[GAINS[i]]
                 progress("trials", (index + (begin + count) / trials) / len(JOINTS))
         expected = np.array(known)
-
-        def pair(values: np.ndarray) -> tuple[float, float]:
-            return float(values[0]), float(values[1])
-
-        inside = ((low <= expected) & (expected <= high)).sum(axis=0)
-        found.append(
-            Coverage(
-                joint=name,
-                known=known,
-                trials=trials,
-                covered=(int(inside[0]), int(inside[1])),
-                bias_percent=pair(100.0 * (gains.mean(axis=0) / expected - 1.0)),
-                deviation_percent=pair(100.0 * gains.std(axis=0, ddof=1) / expected),
-                half_width_percent=pair(50.0 * (high - low).mean(axis=0) / expected),
-            )
-        )
+        pairs = {
+            "covered": ((low <= expected) & (expected <= high)).sum(axis=0),
+            "bias_percent": 100.0 * (gains.mean(axis=0) / expected - 1.0),
+            "deviation_percent": 100.0 * gains.std(axis=0, ddof=1) / expected,
+            "half_width_percent": 50.0 * (high - low).mean(axis=0) / expected,
+        }
+        found[name] = {"known": known, "trials": trials, **pairs}
     return found
 
 
@@ -140,13 +113,13 @@ def coverage(trials: int = 200, seed: int = 0, json_file: console.JsonFile = Non
         found = run(trials, seed, report, repeats=repeats)
     rows = [
         (
-            one.joint,
-            "{} / {} of {}".format(*one.covered, one.trials),
-            "{:+.3f} / {:+.3f}".format(*one.bias_percent),
-            "{:.3f} / {:.3f}".format(*one.deviation_percent),
-            "{:.3f} / {:.3f}".format(*one.half_width_percent),
+            joint,
+            "{} / {} of {}".format(*one["covered"], trials),
+            "{:+.3f} / {:+.3f}".format(*one["bias_percent"]),
+            "{:.3f} / {:.3f}".format(*one["deviation_percent"]),
+            "{:.3f} / {:.3f}".format(*one["half_width_percent"]),
         )
-        for one in found
+        for joint, one in found.items()
     ]
     low, high = binom(trials, 0.95).interval(0.95)
     caption = (
@@ -157,4 +130,4 @@ def coverage(trials: int = 200, seed: int = 0, json_file: console.JsonFile = Non
     title = "95 % intervals under coloured noise (stiffness / damping)"
     columns = ("joint", "hold the known value", "bias [%]", "scatter [%]", "half-width [%]")
     console.show(table(title, columns, rows, caption))
-    console.write_json(json_file, {one.joint: asdict(one) for one in found})
+    console.write_json(json_file, found)

@@ -12,7 +12,7 @@ import resource
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from typing import Any
 
 import mujoco
 import mujoco.rollout
@@ -39,44 +39,6 @@ BARE_PAIRS = 500
 ROBOT = "mini_cheetah"
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointFound:
-    """The known gains of one joint, and what the searches found."""
-
-    joint: str
-    known: Gains
-    grid: Gains
-    nearest_cell: bool
-    """The grid's best node is the node nearest to the known gains."""
-    refined: Gains
-    quick: Gains
-    quick_same_cell: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class GridBench:
-    """What one run gave."""
-
-    joints: tuple[JointFound, ...]
-    pairs: int
-    """Gain pairs of the grid, for each joint."""
-    simulations: int
-    """Families of mirror-image joints that were simulated."""
-    steps: int
-    grid_s: float
-    """Wall time of the grid, everything included [s]."""
-    refine_s: float
-    quick_s: float
-    bare_steps_per_second: float
-    """Of the bare loop, weighted as the grid's own steps are."""
-    memory_mb: float
-    """Largest resident memory of the process [MB]."""
-    steps_per_second: float
-    """Of the grid, everything included."""
-    ratio: float
-    """Speed of the grid over that of the bare loop."""
-
-
 def bare_rollout(rig: JointTestRig, goal: MeasuredJoint, pairs: int, threads: int) -> float:
     """Steps per second of `mujoco.rollout` alone over a rig's model and a target's command."""
     command = goal.trace.mirrored(rig.robot)[2][: goal.steps]
@@ -100,15 +62,20 @@ def run(
     length_s: float = 20.0,
     threads: int = 2,
     joints: Sequence[str] | None = None,
-) -> GridBench:
+) -> dict[str, Any]:
     """Search the grid for every joint, beside the bare loop; then the linearized search.
 
     Args:
         progress: Called with the stage and the share done.
-        points: Points of each axis of the grid; the paper has 50.
+        points: Points of each axis of the grid.
         length_s: Length of the chirp [s].
         threads: Threads of both.
         joints: All of them if not given.
+
+    Returns:
+        `joints`, a row each (gains in N m/rad, N m s/rad; `nearest_cell`: the grid's best node is
+        the one nearest to the known gains), the wall times, `bare_steps_per_second` weighted as the
+        grid's own steps are, `ratio` of the grid's speed to it, and the largest resident memory.
     """
     robot, paper = load_robot(ROBOT), published(ROBOT)
     assert paper is not None
@@ -147,34 +114,37 @@ def run(
         quick = quick_search(simulator, goals, stiffness, damping)
     quick_s = time.perf_counter() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in bytes on macOS, else in kB
-    return GridBench(
-        joints=tuple(
-            JointFound(
-                joint=goal.joint,
-                known=known[goal.joint],
-                grid=grids[goal.joint].gains,
-                nearest_cell=grids[goal.joint].cell
-                == tuple(
-                    int(np.argmin(np.abs(axis - value)))
-                    for axis, value in zip((stiffness, damping), known[goal.joint], strict=True)
-                ),
-                refined=(fit.stiffness, fit.damping),
-                quick=(one.fit.stiffness, one.fit.damping),
-                quick_same_cell=one.grid.cell == grids[goal.joint].cell,
-            )
-            for goal, fit, one in zip(goals, fits, quick, strict=True)
-        ),
-        pairs=points**2,
-        simulations=len(groups),
-        steps=steps,
-        grid_s=grid_s,
-        refine_s=refine_s,
-        quick_s=quick_s,
-        bare_steps_per_second=steps / bare_s,
-        memory_mb=peak / (2.0**20 if sys.platform == "darwin" else 2.0**10),
-        steps_per_second=steps / grid_s,
-        ratio=bare_s / grid_s,
-    )
+    rows = []
+    for goal, fit, one in zip(goals, fits, quick, strict=True):
+        gains, best = known[goal.joint], grids[goal.joint]
+        nearest = tuple(
+            int(np.argmin(np.abs(axis - value)))
+            for axis, value in zip((stiffness, damping), gains, strict=True)
+        )
+        rows.append(
+            {
+                "joint": goal.joint,
+                "known": gains,
+                "grid": best.gains,
+                "nearest_cell": best.cell == nearest,
+                "refined": (fit.stiffness, fit.damping),
+                "quick": (one.fit.stiffness, one.fit.damping),
+                "quick_same_cell": one.grid.cell == best.cell,
+            }
+        )
+    return {
+        "joints": rows,
+        "pairs": points**2,
+        "simulations": len(groups),
+        "steps": steps,
+        "grid_s": grid_s,
+        "refine_s": refine_s,
+        "quick_s": quick_s,
+        "bare_steps_per_second": steps / bare_s,
+        "memory_mb": peak / (2.0**20 if sys.platform == "darwin" else 2.0**10),
+        "steps_per_second": steps / grid_s,
+        "ratio": bare_s / grid_s,
+    }
 
 
 def _measured(
@@ -203,23 +173,27 @@ def grid(points: int = 50, json_file: console.JsonFile = None) -> None:
         found = run(report, points=points)
     rows = [
         (
-            one.joint,
-            f"{one.known[0]:g} / {one.known[1]:g}",
-            f"{one.grid[0]:.2f} / {one.grid[1]:.3f}",
-            "yes" if one.nearest_cell else "NO",
-            _percent(one.refined, one.known),
-            _percent(one.quick, one.refined) + ("" if one.quick_same_cell else " (another cell)"),
+            one["joint"],
+            "{:g} / {:g}".format(*one["known"]),
+            "{:.2f} / {:.3f}".format(*one["grid"]),
+            "yes" if one["nearest_cell"] else "NO",
+            _percent(one["refined"], one["known"]),
+            _percent(one["quick"], one["refined"])
+            + ("" if one["quick_same_cell"] else " (another cell)"),
         )
-        for one in found.joints
+        for one in found["joints"]
     ]
     caption = (
-        f"{len(found.joints)} joints x {found.pairs} pairs, {found.simulations} simulated "
-        f"families: {found.grid_s:.1f} s, {found.steps_per_second / 1e3:.0f} k steps/s = "
-        f"{100 * found.ratio:.0f} % of a bare mujoco.rollout loop; refinement "
-        f"{found.refine_s:.1f} s; quick way {found.quick_s:.1f} s; memory "
-        f"{found.memory_mb:.0f} MB"
+        "{n} joints x {pairs} pairs, {simulations} simulated families: {grid_s:.1f} s, "
+        "{speed:.0f} k steps/s = {percent:.0f} % of a bare mujoco.rollout loop; refinement "
+        "{refine_s:.1f} s; quick way {quick_s:.1f} s; memory {memory_mb:.0f} MB"
+    ).format(
+        n=len(rows),
+        speed=found["steps_per_second"] / 1e3,
+        percent=100.0 * found["ratio"],
+        **found,
     )
     columns = ("joint", "known", "grid", "nearest cell", "refined off by [%]", "quick off [%]")
     title = "Known gains (Table I, training simulator, no noise)"
     console.show(table(title, columns, rows, caption))
-    console.write_json(json_file, asdict(found))
+    console.write_json(json_file, found)

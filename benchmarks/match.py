@@ -74,35 +74,6 @@ SCENARIOS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """One tool in one scenario. Errors are relative to the known gains [%]."""
-
-    scenario: str
-    tool: str
-    free: str
-    """Free parameters."""
-    trials: int
-    stiffness_bias: float
-    stiffness_sd: float
-    """Standard deviation over the trials; NaN for one trial."""
-    damping_bias: float
-    damping_sd: float
-    intervals: int
-    """Intervals given, two a trial; 0 for a tool without."""
-    covered: int
-    """Those that hold the known gain."""
-    stiffness_half_width: float
-    """Mean half-width of the 95 % intervals; NaN without."""
-    damping_half_width: float
-    seconds: float
-    """Mean wall time of a fit [s]."""
-    delay_ms: float
-    """Mean delay found; NaN where none was fitted [ms]."""
-    estimates: tuple[tuple[float, float], ...]
-    """(stiffness, damping) of each trial [N m/rad, N m s/rad]."""
-
-
 def known_log(
     robot: Robot,
     scenario: Scenario,
@@ -191,7 +162,7 @@ def run(
     length_s: float = 20.0,
     full_grid: bool = True,
     threads: int = 2,
-) -> list[Row]:
+) -> list[dict[str, Any]]:
     """Run every tool on every log.
 
     Args:
@@ -199,8 +170,8 @@ def run(
         seed: Of the noise.
         progress: Called with the stage and the share done.
         scenarios: Disturbances.
-        repeats: Chirps in each log.
-        length_s: Length of each chirp [s].
+        repeats: Chirps in each log, of `length_s` [s].
+        length_s: Length of each chirp.
         full_grid: Also time the paper's whole grid, on the first log.
         threads: Threads of the simulator, the same for every tool.
 
@@ -229,58 +200,60 @@ def run(
     return [summary(*key, estimates) for key, estimates in found.items()]
 
 
-def summary(scenario: str, tool: str, free: str, estimates: Sequence[Estimate]) -> Row:
-    """Mean errors, spread and coverage of one tool in one scenario."""
+def summary(scenario: str, tool: str, free: str, estimates: Sequence[Estimate]) -> dict[str, Any]:
+    """Errors and coverage of one tool in one scenario; NaN where there is nothing to average.
+
+    Returns:
+        Pairs for stiffness and damping, relative to the known gains [%]: `bias`, `sd` over the
+        trials, `half_width` of the 95 % intervals. `intervals` were given, `covered` of them hold
+        the known gain. Means of `seconds` and `delay_ms`; `estimates` in N m/rad, N m s/rad.
+    """
     gains, known = np.array([(one.stiffness, one.damping) for one in estimates]), np.array(KNOWN)
     error = 100.0 * (gains / known - 1.0)
-    sd = error.std(axis=0, ddof=1) if len(estimates) > 1 else np.full(2, np.nan)
-    given = [one.interval for one in estimates if one.interval is not None]
-    bounds = np.array(given).reshape(-1, 2, 2)
+    nan = np.full(2, np.nan)
+    bounds = np.array([one.interval for one in estimates if one.interval]).reshape(-1, 2, 2)
     half = 50.0 * np.diff(bounds, axis=-1)[..., 0] / known
-    widths = half.mean(axis=0) if given else np.full(2, np.nan)
     delays = [one.delay_s for one in estimates if one.delay_s is not None]
-    return Row(
-        scenario=scenario,
-        tool=tool,
-        free=free,
-        trials=len(estimates),
-        stiffness_bias=float(error[:, 0].mean()),
-        stiffness_sd=float(sd[0]),
-        damping_bias=float(error[:, 1].mean()),
-        damping_sd=float(sd[1]),
-        intervals=2 * len(given),
-        covered=int(((bounds[..., 0] <= known) & (known <= bounds[..., 1])).sum()),
-        stiffness_half_width=float(widths[0]),
-        damping_half_width=float(widths[1]),
-        seconds=float(np.mean([one.seconds for one in estimates])),
-        delay_ms=1e3 * float(np.mean(delays)) if delays else float("nan"),
-        estimates=tuple((one.stiffness, one.damping) for one in estimates),
-    )
+    return {
+        "scenario": scenario,
+        "tool": tool,
+        "free": free,
+        "trials": len(estimates),
+        "bias": error.mean(axis=0),
+        "sd": error.std(axis=0, ddof=1) if len(estimates) > 1 else nan,
+        "intervals": 2 * len(bounds),
+        "covered": int(((bounds[..., 0] <= known) & (known <= bounds[..., 1])).sum()),
+        "half_width": half.mean(axis=0) if len(bounds) else nan,
+        "seconds": float(np.mean([one.seconds for one in estimates])),
+        "delay_ms": 1e3 * float(np.mean(delays)) if delays else float("nan"),
+        "estimates": gains,
+    }
 
 
-def show(rows: Sequence[Row], title: str, caption: str) -> Table:
+def show(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
     """A section for each scenario."""
-
-    def error(bias: float, sd: float) -> str:
-        return f"{bias:+.2f}" if np.isnan(sd) else f"{bias:+.2f} +/- {sd:.2f}"
-
     columns = ["tool", "logs", "stiffness [%]", "damping [%]", "coverage", "half-widths [%]"]
     made = table(title, [*columns, "fit [s]", "delay [ms]"], caption=caption)
-    for scenario in dict.fromkeys(one.scenario for one in rows):
-        made.add_section()
-        made.add_row(f"[bold]{scenario}[/]")
-        for one in (one for one in rows if one.scenario == scenario):
-            halves = f"{one.stiffness_half_width:.2f} / {one.damping_half_width:.2f}"
-            made.add_row(
-                one.tool,
-                str(one.trials),
-                error(one.stiffness_bias, one.stiffness_sd),
-                error(one.damping_bias, one.damping_sd),
-                f"{one.covered} of {one.intervals}" if one.intervals else "no intervals",
-                halves if one.intervals else "",
-                f"{one.seconds:.2f}",
-                "" if np.isnan(one.delay_ms) else f"{one.delay_ms:.1f}",
-            )
+    scenario = None
+    for one in rows:
+        if one["scenario"] != scenario:
+            scenario = one["scenario"]
+            made.add_section()
+            made.add_row(f"[bold]{scenario}[/]")
+        errors = [
+            f"{bias:+.2f}" if np.isnan(sd) else f"{bias:+.2f} +/- {sd:.2f}"
+            for bias, sd in zip(one["bias"], one["sd"], strict=True)
+        ]
+        given = one["intervals"] > 0
+        made.add_row(
+            one["tool"],
+            str(one["trials"]),
+            *errors,
+            f"{one['covered']} of {one['intervals']}" if given else "no intervals",
+            "{:.2f} / {:.2f}".format(*one["half_width"]) if given else "",
+            f"{one['seconds']:.2f}",
+            "" if np.isnan(one["delay_ms"]) else f"{one['delay_ms']:.1f}",
+        )
     return made
 
 
@@ -310,7 +283,7 @@ def match(trials: int = 5, seed: int = 0, json_file: console.JsonFile = None) ->
         f"{computer['mujoco']}, Python {computer['python']}; {seconds:.0f} s in all."
     )
     console.show(show(rows, title, caption))
-    body = {"schema": "pronk/bench-match/1", "rows": [asdict(one) for one in rows]}
+    body = {"schema": "pronk/bench-match/2", "rows": rows}
     known = {"joint": JOINT, "known": KNOWN, "scenarios": [asdict(one) for one in SCENARIOS]}
     about = {"trials": trials, "seed": seed, "machine": computer, "seconds": seconds}
     console.write_json(json_file, body | known | about)
