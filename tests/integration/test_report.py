@@ -66,7 +66,7 @@ def report(folder: Path) -> Checker:
 
 
 def match_report(folder: Path) -> Checker:
-    return Checker(match_page.write_page(folder).read_text(encoding="utf-8"))
+    return Checker(match_page.write_page(folder)[0].read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -22,6 +22,9 @@ from rich.table import Table
 from rich.text import Text
 
 from pronk.errors import HardwareError
+
+if TYPE_CHECKING:
+    from pronk.evaluation.tables import Sheet
 
 JsonFile = Annotated[Path | None, tyro.conf.arg(name="json")]
 
@@ -77,7 +80,17 @@ def row(made: Table, *cells: str) -> None:
 def show(made: Table) -> None:
     """Print a table; a stream that is not a terminal gets the width the table needs."""
     console = Console(highlight=False)
-    (console if console.is_terminal else Console(highlight=False, width=160)).print(made)
+    (console if console.is_terminal else Console(highlight=False, width=200)).print(made)
+
+
+def show_sheet(sheet: Sheet | None, title: str = "") -> None:
+    """Print a table of the report package and its notes."""
+    if sheet is not None:
+        made = table(sheet.title or title, *sheet.columns, rows=sheet.rows)
+        made.columns[-1].justify = "left" if sheet.columns[-1] == "equation" else "right"
+        show(made)
+        for note in sheet.notes:
+            say(f"  {note}")
 
 
 def number(value: float, digits: int = 2) -> str:

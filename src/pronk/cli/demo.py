@@ -233,48 +233,38 @@ def show_match(
     result: MatchResult, replays: Sequence[JointPrediction], cells: dict[str, list[float]]
 ) -> None:
     """Print matched gains beside the paper's, and the errors with nominal and matched gains."""
+    from pronk.report.page import table
     from pronk.report.paper import published
 
     paper = published(ROBOT)
     assert paper is not None
     by_joint = {one.joint: one for one in replays}
+    columns = "joint | matched | Table I | grid cells apart | gain error nominal [dB];2"
+    columns += " | matched [dB];2 | fresh RMSE nominal [rad];4 | matched [rad];4"
     rows = [
-        [
+        (
             name,
             f"{gains.stiffness:.2f} / {gains.damping:.3f}",
             "{:g} / {:g}".format(*paper.joints[name]),
             "{:.1f} / {:.1f}".format(*cells[name]),
-            console.number(gains.naive_error_db),
-            console.number(gains.error_db),
-            console.number(by_joint[name].rmse_naive, 4),
-            console.number(by_joint[name].rmse_matched, 4),
-            console.number(result.joints[name].zero_armature_error_db),
-        ]
+            gains.naive_error_db,
+            gains.error_db,
+            by_joint[name].rmse_naive,
+            by_joint[name].rmse_matched,
+            result.joints[name].zero_armature_error_db,
+        )
         for name, gains in result.gains.joints.items()
     ]
-    made = console.table(
-        "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)",
-        "joint",
-        "matched",
-        "Table I",
-        "grid cells apart",
-        "gain error nominal [dB]",
-        "matched [dB]",
-        "fresh RMSE nominal [rad]",
-        "matched [rad]",
-        "no rotor inertia [dB]",
-        rows=rows,
-    )
-    console.show(made)
+    title = "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)"
+    console.show_sheet(table(f"{columns} | no rotor inertia [dB];2", rows, title=title))
 
 
 def show_trial(trial: Results) -> None:
     """Print heights, distances and landings."""
-    from pronk.cli.trial import show
     from pronk.evaluation import tables
 
     for figure in ("height", "distance"):
-        show(tables.table_iii(trial, figure))
+        console.show_sheet(tables.table_iii(trial, figure))
     for subject in trial.subjects:
         cells = [cell for cell in trial.cells if cell.policy == subject.name]
         console.say(

@@ -145,6 +145,7 @@ def _notify(event: Event) -> None:
 
 def _report(summary: RunSummary) -> None:
     """Print the figures of the run."""
+    from pronk.report.page import table
     from pronk.runtime.ipc import REAL, VIRTUAL
 
     servo, policy = summary.servo, summary.policy
@@ -156,18 +157,11 @@ def _report(summary: RunSummary) -> None:
         "policy's decision": policy.get("decision"),
         "the network alone": policy.get("network"),
     }
-    keys = ("p50_ms", "p95_ms", "p99_ms", "p99_9_ms", "max_ms")
-    made = console.table(
-        f"Deployment on {VIRTUAL if servo.get('virtual') else REAL}",
-        "what [ms]",
-        *("n", "median", "95 %", "99 %", "99.9 %", "largest"),
-        rows=(
-            [name, str(one["n"]), *(console.number(one[key], 3) for key in keys)]
-            for name, one in times.items()
-            if one and one["n"]
-        ),
-    )
-    console.show(made)
+    keys = ("n", "p50_ms", "p95_ms", "p99_ms", "p99_9_ms", "max_ms")
+    rows = [(name, *(one[key] for key in keys)) for name, one in times.items() if one and one["n"]]
+    columns = "what [ms] | n | median | 95 % | 99 % | 99.9 % | largest"
+    title = f"Deployment on {VIRTUAL if servo.get('virtual') else REAL}"
+    console.show_sheet(table(columns, rows, title=title))
     met = ", ".join(f"{name} {count}" for name, count in servo.get("interventions", {}).items())
     console.say(f"safety filter: {met or 'no intervention'} (ticks of {servo.get('ticks', 0)})")
     if dropped := sum(servo.get("dropped", {}).values()):

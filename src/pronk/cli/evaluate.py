@@ -69,7 +69,6 @@ def evaluate(
     drives = training_gains(gains, load_robot(ROBOT), like=like)
     where = "cuda:0" if find_devices(device).device == "cuda" else "cpu"
 
-    from pronk.cli.trial import show
     from pronk.evaluation.tables import evaluation_sheets
     from pronk.evaluation.training_sim.evaluation import load_speed_errors, save
     from pronk.evaluation.training_sim.run import load_subject
@@ -87,7 +86,7 @@ def evaluate(
     found = run(subject, drives, plan, where, randomization, errors)
     save(out, found)
     for sheet in evaluation_sheets(found):
-        show(sheet)
+        console.show_sheet(sheet)
     console.wrote(out)
 
 

@@ -52,11 +52,13 @@ def match(
         reading: How logs are read.
         json_file: Also write the figures to this file.
     """
+    from pronk.evaluation.tables import Sheet
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.report.match_page import write_page
+    from pronk.report.page import table
     from pronk.robots import load_robot
 
     known = load_robot(robot)
@@ -78,19 +80,28 @@ def match(
         gains_file.save(out, result.gains)
         result_file.save(out.parent / "match.npz", result)
         report("page", 0.0)
-        page = write_page(out.parent, gains=out.name)
+        page, part = write_page(out.parent, gains=out.name)
         report("page", 1.0)
-    show(result)
+    console.say(f"{part.summary} {part.lines[0]}")
+    for name, flags in part.figures["flags"].items():
+        console.say(f"{name}: {'; '.join(flags)}")
+    for section in part.sections:
+        if section is not None and section.title in ("Matched gains", "Training ranges"):
+            for content in section.content:
+                if isinstance(content, Sheet):
+                    console.show_sheet(content, section.title)
     figures = summary(result)
+    joints = result.joints.items()
     if any(np.isfinite(joint.rmse) for joint in result.joints.values()):
-        show_arm(result)
-        joints = result.joints.items()
+        rows = [(name, joint.published_rmse, joint.rmse) for name, joint in joints]
+        columns = "joint | RMSE published [rad];4 | RMSE matched [rad];4"
+        title = "Several joints moved at once, so the whole arm was fitted in time"
+        console.show_sheet(table(columns, rows, title=title))
+        for name, reason in result.excluded.items():
+            console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
         figures["mode"] = mode
         figures["held"] = {name: joint.held for name, joint in joints if joint.held}
-        figures["rmse"] = {
-            name: {"published": joint.published_rmse, "matched": joint.rmse}
-            for name, joint in joints
-        }
+        figures["rmse"] = {name: {"published": a, "matched": b} for name, a, b in rows}
     console.wrote(out, out.parent / "match.npz", page)
     console.write_json(json_file, figures)
     console.following(
@@ -123,89 +134,6 @@ def summary(result: MatchResult) -> dict[str, Any]:
     }
 
 
-def show(result: MatchResult) -> None:
-    """Print the gains, with the paper's beside them where there are any."""
-    from pronk.report.match_page import failure_flags
-    from pronk.report.paper import published
-
-    paper = published(result.gains.robot)
-    where = "the virtual robot" if result.gains.virtual else "the robot"
-    rows, flags = [], []
-    for name, gains in result.gains.joints.items():
-        failures = failure_flags(result, name)
-        flags += [f"* {name}: {flag}" for flag in failures]
-        known = paper.joints.get(name) if paper else None
-        rows.append(
-            [
-                name + (" *" if failures else ""),
-                f"{gains.stiffness:.2f}",
-                _interval(gains.stiffness_ci95, 2),
-                f"{gains.damping:.3f}",
-                _interval(gains.damping_ci95, 3),
-                *([f"{known[0]:g} / {known[1]:g}" if known else "-"] if paper else []),
-                console.number(gains.naive_error_db),
-                console.number(gains.error_db),
-            ]
-        )
-    made = console.table(
-        f"Gains of the simulator that responds like {where} ({result.gains.robot})",
-        "joint",
-        "stiffness [N m/rad]",
-        "95 %",
-        "damping [N m s/rad]",
-        "95 %",
-        *(["paper, Table I"] if paper else []),
-        "gain error nominal [dB]",
-        "matched [dB]",
-        rows=rows,
-    )
-    console.show(made)
-    groups = (
-        [
-            name,
-            f"{group.stiffness:g} +- {group.stiffness_range:g}",
-            f"{group.damping:g} +- {group.damping_range:g}",
-        ]
-        for name, group in result.gains.groups.items()
-    )
-    columns = ("group", "stiffness [N m/rad]", "damping [N m s/rad]")
-    console.show(console.table("For training", *columns, rows=groups))
-    for flag in flags:
-        console.say(flag)
-
-
-def _interval(bounds: tuple[float, float], digits: int) -> str:
-    low, high = (console.number(bound, digits) for bound in bounds)
-    return "held" if bounds[0] == bounds[1] else f"{low} to {high}"
-
-
-def show_arm(result: MatchResult) -> None:
-    """Print what belongs to the gains of an arm that was fitted in time, and its error."""
-    made = console.table(
-        "Several joints moved at once, so the whole arm was fitted in time",
-        "joint",
-        "armature [kg m^2]",
-        "dry friction [N m]",
-        "command delay [ms]",
-        "RMSE published [rad]",
-        "RMSE matched [rad]",
-        rows=(
-            [
-                name,
-                console.number(joint.armature, 4),
-                console.number(joint.frictionloss, 3),
-                console.number(1000.0 * joint.delay_s, 1),
-                console.number(joint.published_rmse, 4),
-                console.number(joint.rmse, 4),
-            ]
-            for name, joint in result.joints.items()
-        ),
-    )
-    console.show(made)
-    for name, reason in result.excluded.items():
-        console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
-
-
 def predict(
     paths: tyro.conf.Positional[tuple[Path, ...]],
     robot: str,
@@ -230,6 +158,7 @@ def predict(
     from pronk.match.predict import predict as predict_log
     from pronk.match.predict import save_prediction
     from pronk.report import figures, style
+    from pronk.report.page import table
     from pronk.robots import load_robot
 
     known, matched = load_robot(robot), gains_file.load(gains)
@@ -255,33 +184,24 @@ def predict(
             rows += [row | {"log": log.source} for row in prediction_rows(found.joints)]
             done((i + 1) / len(logs))
     virtual = any(log.virtual for log in logs)
-    made = console.table(
-        "Replayed logs of the virtual robot" if virtual else "Replayed logs",
-        "joint",
-        "signal",
-        "RMSE nominal",
-        "nominal with the delay",
-        "RMSE matched",
-        "unit",
-        "matched / nominal",
-        "R2 nominal",
-        "R2 matched",
-        rows=(
-            [
-                row["joint"],
-                row["signal"].replace("_", " "),
-                console.number(row["rmse_naive"], 4),
-                console.number(row["rmse_naive_delayed"], 4),
-                console.number(row["rmse_matched"], 4),
-                row["unit"],
-                console.number(row["rmse_matched"] / (row["rmse_naive"] or float("nan"))),
-                console.number(row["r2_naive"], 3),
-                console.number(row["r2_matched"], 3),
-            ]
-            for row in rows
-        ),
-    )
-    console.show(made)
+    columns = "joint | signal | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4 | unit"
+    cells = [
+        (
+            row["joint"],
+            row["signal"].replace("_", " "),
+            row["rmse_naive"],
+            row["rmse_naive_delayed"],
+            row["rmse_matched"],
+            row["unit"],
+            row["rmse_matched"] / (row["rmse_naive"] or float("nan")),
+            row["r2_naive"],
+            row["r2_matched"],
+        )
+        for row in rows
+    ]
+    title = "Replayed logs of the virtual robot" if virtual else "Replayed logs"
+    columns += " | matched / nominal;2 | R2 nominal | R2 matched"
+    console.show_sheet(table(columns, cells, title=title))
     for source in fitted:
         console.warn(f"{source} was used by these gains: this is a check of the fit.")
     for reason in excluded.values():

@@ -130,34 +130,25 @@ def bandwidth_hz(found: FrequencyResponse) -> float:
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Print the table of responses."""
-    virtual = any(row["virtual"] for row in rows)
-    cells = (
-        [
+    from pronk.report.page import table
+
+    columns = f"joint | amplitude [rad];3 | repeats | coherence >= {COHERENT} [Hz];1 | least there"
+    columns += " | peak [dB];2 | at [Hz];2 | -3 dB at [Hz];2 | command delay [ms];1"
+    cells = [
+        (
             row["joint"],
-            f"{row['amplitude_rad']:.3g}",
-            str(row["repeats"]),
-            "{:.2g} to {:.3g}".format(*row["coherent_hz"]) if row["coherent_hz"] else "none",
-            console.number(row["coherence_min"], 3),
-            console.number(row["peak_db"]),
-            console.number(row["peak_hz"]),
-            console.number(row["bandwidth_hz"]),
-            console.number(1000.0 * row["delay_s"], 1),
-            console.number(100.0 * row["third_harmonic"], 1),
-        ]
+            row["amplitude_rad"],
+            row["repeats"],
+            tuple(row["coherent_hz"] or ()) or "none",
+            row["coherence_min"],
+            row["peak_db"],
+            row["peak_hz"],
+            row["bandwidth_hz"],
+            1000.0 * row["delay_s"],
+            100.0 * row["third_harmonic"],
+        )
         for row in rows
-    )
-    made = console.table(
-        "Responses of the virtual robot" if virtual else "Responses",
-        "joint",
-        "amplitude [rad]",
-        "repeats",
-        f"coherence >= {COHERENT} [Hz]",
-        "least there",
-        "peak [dB]",
-        "at [Hz]",
-        "-3 dB at [Hz]",
-        "command delay [ms]",
-        "third harmonic [%]",
-        rows=cells,
-    )
-    console.show(made)
+    ]
+    virtual = any(row["virtual"] for row in rows)
+    title = "Responses of the virtual robot" if virtual else "Responses"
+    console.show_sheet(table(f"{columns} | third harmonic [%];1", cells, title=title))

@@ -44,6 +44,7 @@ def robot(
 
 
 def _check(path: Path) -> None:
+    from pronk.report.page import table
     from pronk.robots import load_robot
     from pronk.robots.model import bench_spec
 
@@ -52,26 +53,18 @@ def _check(path: Path) -> None:
     for joint in found.joints:
         bench_spec(found, joint.name).compile()
         low, high = joint.range
-        rows.append(
-            [
-                joint.name,
-                joint.group,
-                f"{low:.2f} to {high:.2f}",
-                f"{joint.default_position:.2f}",
-                f"{joint.drive.effort_limit:.3g}",
-                " ".join(joint.chain),
-                " ".join(joint.clamped),
-            ]
-        )
+        chain, clamped = " ".join(joint.chain), " ".join(joint.clamped)
+        effort, default = joint.drive.effort_limit, joint.default_position
+        rows.append((joint.name, joint.group, joint.range, default, effort, chain, clamped))
         if not low < joint.default_position < high:
             problems.append(f"poses.default of {joint.name} is outside of its range")
         if not joint.drive.armature:
             problems.append(f"the rotor inertia (armature) of {joint.name} is 0")
         if not joint.drive.frictionloss:
             problems.append(f"the dry friction (frictionloss) of {joint.name} is 0")
-    columns = ("group", "range [rad]", "default [rad]", "effort limit [N m]", "chain", "clamped")
+    columns = "joint | group | range [rad];2 | default [rad];2 | effort limit [N m]"
     title = f"{found.name}: {len(found.joints)} joints"
-    console.show(console.table(title, "joint", *columns, rows=rows))
+    console.show_sheet(table(f"{columns} | chain | clamped", rows, title=title))
     for problem in problems:
         console.warn(problem)
     console.say(f"{len(problems)} to check" if problems else "nothing is inconsistent")

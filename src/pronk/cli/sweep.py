@@ -148,21 +148,27 @@ def make(
 
 def show_plan(plan: SweepPlan) -> None:
     """Print what the sweep will do to each joint, against its limits."""
-    columns = {
-        "joint": "{joint}",
-        "amplitude [rad]": "{amplitude_rad:g}",
-        "position [rad]": "{lowest_rad:.2f} to {highest_rad:.2f}",
-        "of range": "{range_low_rad:.2f} to {range_high_rad:.2f}",
-        "speed [rad/s]": "{speed_rad_s:.1f}",
-        "of no-load": "{no_load_speed_rad_s:.1f}",
-        "torque [N m]": "{torque_nm:.1f}",
-        "of limit": "{effort_limit_nm:.1f}",
-        "power [W]": "{electrical_power_w:.0f}",
-        "bus [A]": "{bus_current_a:.1f}",
-    }
-    rows = [[cell.format(**row) for cell in columns.values()] for row in plan.rows()]
+    from pronk.report.page import table
+
+    columns = "joint | amplitude [rad] | position [rad];2 | of range;2 | speed [rad/s];1"
+    columns += " | of no-load;1 | torque [N m];1 | of limit;1 | power [W];0 | bus [A];1"
+    rows = [
+        (
+            row["joint"],
+            row["amplitude_rad"],
+            (row["lowest_rad"], row["highest_rad"]),
+            (row["range_low_rad"], row["range_high_rad"]),
+            row["speed_rad_s"],
+            row["no_load_speed_rad_s"],
+            row["torque_nm"],
+            row["effort_limit_nm"],
+            row["electrical_power_w"],
+            row["bus_current_a"],
+        )
+        for row in plan.rows()
+    ]
     title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
-    console.show(console.table(title, *columns, rows=rows))
+    console.show_sheet(table(columns, rows, title=title))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -109,7 +109,7 @@ def trial(
     sheets = list(tables.sheets(found))
     for sheet in sheets:
         if definitions or sheet.title != tables.DEFINITIONS:
-            show(sheet)
+            console.show_sheet(sheet)
     console.say(spent(found))
     console.wrote(out / TABLE, out / SUMMARY, out / CAPTURES)
     wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
@@ -129,7 +129,7 @@ def trial(
         extra = list(_extra_sheets(names, policies, setup, seed, jumps, own, report))
         page, _ = write_report(out, report)
     for sheet in extra:
-        show(sheet)
+        console.show_sheet(sheet)
     console.wrote(*([out / VIDEOS] if films else []), page)
     figures = {
         "virtual": found.virtual,
@@ -181,16 +181,6 @@ def _extra_sheets(
         yield bodies.table(
             bodies.add_bodies(policies, plan_n, own=trained, seed=seed, progress=report, **setup)
         )
-
-
-def show(sheet: Sheet) -> None:
-    """Print a table and its notes."""
-    made = console.table(sheet.title, *sheet.columns, rows=sheet.rows)
-    if sheet.columns[-1] == "equation":
-        made.columns[-1].justify = "left"
-    console.show(made)
-    for note in sheet.notes:
-        console.say(f"  {note}")
 
 
 def spent(found: Results) -> str:

@@ -115,8 +115,8 @@ def part(path: Path, root: Path, *, anchor: str = "match", title: str = "Match")
     return replace(made, anchor=anchor, title=title, source=str(path.relative_to(root)))
 
 
-def write_page(out_dir: Path, *, gains: str | None = None) -> Path:
-    """Write the page of the match in `out_dir` and return its path.
+def write_page(out_dir: Path, *, gains: str | None = None) -> tuple[Path, Part]:
+    """Write the page of the match in `out_dir`; return its path and its part.
 
     Args:
         out_dir: Folder with the gains and `match.npz`.
@@ -128,9 +128,9 @@ def write_page(out_dir: Path, *, gains: str | None = None) -> Path:
     path = out_dir / gains if gains else find_gains(out_dir)
     result = result_file.load(out_dir / "match.npz", gains_file.load(path))
     written = out_dir / PAGE_NAME
-    text = page(f"match of {result.gains.robot}", [_part(result, out_dir, path.name)])
-    write_text(written, text)
-    return written
+    made = _part(result, out_dir, path.name)
+    write_text(written, page(f"match of {result.gains.robot}", [made]))
+    return written, made
 
 
 def _where(virtual: bool) -> str:
