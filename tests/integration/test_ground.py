@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pronk.errors import HardwareError, RobotError
-from pronk.links.machine import Command, State, damping_command
+from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 from pronk.virtual.ground import Box, Ground, Start
 from pronk.virtual.physics import Transport
@@ -30,34 +30,12 @@ from pronk.virtual.sim_params import (
     load_sim_params,
     with_changes,
 )
+from virtual_robot import POSE, ROBOT, SIM_PARAMS, gains, quiet
 
 Array = NDArray[np.float64]
 
-ROBOT = load_robot("mini_cheetah")
-POSE = np.array([joint.default_position for joint in ROBOT.joints])
-SIM_PARAMS = load_sim_params()
 GRAVITY = 9.81
 STEP = 0.25e-3
-NOISES = (
-    "sampling_jitter_s",
-    "timestamp_error_s",
-    "velocity_noise",
-    "position_noise",
-    "torque_noise",
-    "gyro_noise",
-    "accelerometer_noise",
-)
-
-
-def quiet(**changes: Any) -> SimParams:
-    """The shipped sim_params with perfect sensors and no delays."""
-    machine = replace(
-        SIM_PARAMS.machine,
-        **dict.fromkeys((*NOISES, "command_delay_s", "measurement_delay_s"), 0.0),
-        gyro_bias=(0.0, 0.0, 0.0),
-        accelerometer_bias=(0.0, 0.0, 0.0),
-    )
-    return replace(SIM_PARAMS, machine=machine, attitude=AttitudeParams(), **changes)
 
 
 def frictionless() -> SimParams:
@@ -65,7 +43,7 @@ def frictionless() -> SimParams:
     nothing = dict.fromkeys(("presliding_damping", "viscous", "belt_damping"), 0.0)
     nothing |= dict.fromkeys(("coulomb", "breakaway"), 1e-9) | {"presliding_stiffness": 1e-3}
     joints = {name: replace(joint, **nothing) for name, joint in SIM_PARAMS.joints.items()}
-    return quiet(joints=joints)
+    return replace(quiet(), joints=joints)
 
 
 def aligned(sim_params: SimParams) -> SimParams:
@@ -81,9 +59,7 @@ def standing(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot
 
 
 def hold(position: Array = POSE, **options: Any) -> Command:
-    return Command(
-        position=position, stiffness=np.full(12, 17.0), damping=np.full(12, 0.4), **options
-    )
+    return Command(position=position, **gains(), **options)
 
 
 def falling(sim_params: SimParams, **options: Any) -> VirtualRobot:
@@ -225,20 +201,9 @@ def test_it_stands_on_blocks_over_a_gap() -> None:
     assert seen.foot_position[-1, 2:, 2].max() < 0.0
 
 
-def test_without_torque_it_sinks_to_its_belly_and_goes_on() -> None:
-    machine = standing()
-    machine.damp()
-    machine.wait(3.0)
-    seen = machine.capture()
-    assert seen.other_contact[-1]
-    assert seen.position[-1, 2] < 0.13
-    assert np.abs(seen.velocity[-1]).max() < 0.05
-
-
 def test_the_battery_never_gives_more_than_it_can() -> None:
     machine = standing(with_changes(quiet(), bus_resistance=0.5))
-    gains = {"stiffness": np.full(12, 100.0), "damping": np.full(12, 0.4)}
-    machine.send(Command(position=0.3 * POSE, **gains))
+    machine.send(Command(position=0.3 * POSE, **gains(100.0)))
     voltage = [state.bus_voltage for state in machine.wait(0.2)]
     assert min(voltage) == 0.5 * SIM_PARAMS.machine.bus_voltage
 
@@ -311,7 +276,7 @@ def test_bias_and_noise_are_as_large_as_their_parameters() -> None:
 
 def test_attitude_is_off_by_bias_and_wander_and_its_heading_starts_anywhere() -> None:
     attitude = AttitudeParams(bias=(0.05, -0.03, 0.0), noise=0.01, noise_corner_hz=20.0)
-    sim_params = quiet(trunk=TrunkParams())
+    sim_params = replace(quiet(), trunk=TrunkParams())
     headings = []
     for seed in range(3):
         machine = standing(replace(sim_params, attitude=attitude), seed=seed)
@@ -324,9 +289,6 @@ def test_attitude_is_off_by_bias_and_wander_and_its_heading_starts_anywhere() ->
         turned = Rotation.from_quat(states[0].orientation, scalar_first=True)
         headings.append(turned.as_euler("ZYX")[0])
     assert np.ptp(headings) > 0.3
-
-
-def test_heading_drifts() -> None:
     states = falling(replace(aligned(quiet()), attitude=AttitudeParams(yaw_drift=0.2))).wait(0.5)
     turn = Rotation.from_quat([s.orientation for s in (states[0], states[-1])], scalar_first=True)
     drift = (turn[1] * turn[0].inv()).as_rotvec()
@@ -434,12 +396,9 @@ def test_a_command_that_comes_when_the_last_expires_is_obeyed() -> None:
     way.put(second, 0.010)
     assert [(way.take(50) or (0, second))[0] for _ in range(3)] == [0, 10, 10]
     assert way.take(50) is None  # the last one never expires
-
-
-def test_a_command_that_is_stale_on_arrival_is_followed_by_damping_at_once() -> None:
-    way = Transport(12, 0.0, 0.001)
+    # One that is stale on arrival is followed by damping at once.
     way.put(hold(made=0.0, valid_for=0.005), 0.020)
-    arrived = [way.take(50) or (0, damping_command(12)) for _ in range(2)]
+    arrived = [way.take(50) or (0, second) for _ in range(2)]
     assert arrived[0][0] == 20
     assert not arrived[1][1].stiffness.any()
 
@@ -498,49 +457,24 @@ def test_changes_one_by_one() -> None:
 # --- Refusals -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("sim_params", "words"),
-    [
-        (
-            replace(SIM_PARAMS, trunk=TrunkParams(mass_offset=-20.0)),
-            "mass_offset",
-        ),
-        (
-            replace(SIM_PARAMS, trunk=TrunkParams(inertia_scale=(1.0, 1.0, 3.0))),
-            "inertia_scale",
-        ),
-        (
-            replace(SIM_PARAMS, ground=Ground(stiffness=5e6)),
-            "stiffness",
-        ),
-    ],
-)
-def test_impossible_bodies_are_refused_before_the_first_step(
-    sim_params: SimParams, words: str
-) -> None:
-    with pytest.raises(RobotError, match=words) as caught:
-        VirtualRobot(ROBOT, sim_params, base="ground")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"base": "sky"}, "sky"),
-        ({"base": "bench", "ground": Ground()}, "bench"),
-        ({"base": "bench", "start": Start()}, "bench"),
-        ({"base": "ground", "legs": ("FR",)}, "ground"),
-        ({"base": "ground", "capture_rate_hz": 1e5}, "capture_rate_hz"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(HardwareError, match=words):
-        VirtualRobot(ROBOT, SIM_PARAMS, **options)
+def over(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
+    return VirtualRobot(ROBOT, sim_params, **{"base": "ground", **options})
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: over(replace(SIM_PARAMS, trunk=TrunkParams(mass_offset=-20.0))), "mass_offset"),
+        (
+            lambda: over(replace(SIM_PARAMS, trunk=TrunkParams(inertia_scale=(1.0, 1.0, 3.0)))),
+            "inertia_scale",
+        ),
+        (lambda: over(replace(SIM_PARAMS, ground=Ground(stiffness=5e6))), "stiffness"),
+        (lambda: over(base="sky"), "sky"),
+        (lambda: over(base="bench", ground=Ground()), "bench"),
+        (lambda: over(base="bench", start=Start()), "bench"),
+        (lambda: over(legs=("FR",)), "ground"),
+        (lambda: over(capture_rate_hz=1e5), "capture_rate_hz"),
         (lambda: standing(start=Start(joint_offset=(0.0, 0.0, 0.0))), "joint_offset"),
         (lambda: Start(drop=-1.0), "drop"),
         (lambda: Start(yaw=math.inf), "finite"),
@@ -549,9 +483,10 @@ def test_what_does_not_go_together_is_refused(options: dict[str, Any], words: st
         (lambda: Ground(friction=0.0), "friction"),
     ],
 )
-def test_impossible_scenes_are_refused(make: Callable[[], object], words: str) -> None:
-    with pytest.raises(RobotError, match=words):
+def test_impossible_bodies_and_scenes_are_refused(make: Callable[[], object], words: str) -> None:
+    with pytest.raises((HardwareError, RobotError), match=words) as caught:
         make()
+    assert "\n" not in str(caught.value)
 
 
 def test_impossible_requests_are_refused() -> None:
@@ -565,10 +500,8 @@ def test_impossible_requests_are_refused() -> None:
 
 def test_an_arm_does_not_stand() -> None:
     arm = load_robot("so101")
-    joint = next(iter(SIM_PARAMS.joints.values()))
-    sim_params = replace(SIM_PARAMS, robot="so101", joints=dict.fromkeys(arm.joint_names, joint))
     with pytest.raises(RobotError, match="so101"):
-        VirtualRobot(arm, sim_params, base="ground")
+        VirtualRobot(arm, load_sim_params(None, arm), base="ground")
 
 
 def test_physics_that_runs_away_is_an_error() -> None:

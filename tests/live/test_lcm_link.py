@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,7 @@ from pronk.links.lcm.codec import (
     mode_request,
 )
 from pronk.links.lcm.link import LcmMachine, url_of
-from pronk.links.link import CommandWriter, Freshness
+from pronk.links.link import Freshness
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 from pronk.virtual.server import hold_of
@@ -36,7 +35,6 @@ pytestmark = pytest.mark.live
 
 lcm = pytest.importorskip("lcm")
 
-DAMPING = 1.0
 LIMIT_S = 300.0
 """A busy computer may take long; nothing here is a measure of speed."""
 ROBOT = load_robot("mini_cheetah")
@@ -55,7 +53,7 @@ class Process:
     """A server of its own."""
 
     layout: str
-    folder: Path
+    json: Path
     port: int = field(default_factory=free_port)
 
     def __post_init__(self) -> None:
@@ -70,14 +68,6 @@ class Process:
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
 
-    @property
-    def json(self) -> Path:
-        return self.folder / f"{self.layout}.json"
-
-    def ready(self) -> str:
-        assert self.running.stdout is not None
-        return self.running.stdout.readline()
-
     def machine(self, **options: object) -> LcmMachine:
         # A computer that runs tests side by side is busy; what is tested here is not that.
         fresh = Freshness(share=0.02, longest_gap_s=10.0)
@@ -88,22 +78,17 @@ class Process:
 @pytest.fixture(scope="module")
 def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Process]]:
     folder = tmp_path_factory.mktemp("servers")
-    made = {layout: Process(layout, folder) for layout in ("cheetah", "wtw")}
+    made = {layout: Process(layout, folder / f"{layout}.json") for layout in ("cheetah", "wtw")}
     try:
         for process in made.values():
-            assert process.ready().startswith("ready: the virtual mini_cheetah on the bench")
+            assert process.running.stdout is not None
+            assert process.running.stdout.readline().startswith("ready")
         yield made
     finally:
         for process in made.values():
             if process.running.poll() is None:
                 process.running.kill()
             process.running.wait()
-
-
-def moved_knee(angle: float) -> np.ndarray:
-    target = HOLD.position.copy()
-    target[KNEE] += angle
-    return target
 
 
 def follow(
@@ -132,7 +117,7 @@ def test_a_joint_moves_as_commanded_and_is_left_damped(
         before = machine.latest()
         np.testing.assert_allclose(before.position, HOLD.position, atol=0.1)
         assert (before.robot_time is None) == (layout == "cheetah")
-        command = replace(HOLD, position=moved_knee(0.3))
+        command = replace(HOLD, position=HOLD.position + 0.3 * (np.arange(12) == KNEE))
         states = follow(machine, command, lambda q: abs(q[KNEE] - command.position[KNEE]) < 0.03)
         times = [state.time for state in states]
         assert times == sorted(times)
@@ -171,7 +156,7 @@ def test_a_command_that_expires_is_followed_by_damping(servers: dict[str, Proces
     assert len(received) == 6
     for command in received[1:]:
         np.testing.assert_array_equal(command.stiffness, 0.0)
-        np.testing.assert_allclose(command.damping, DAMPING, rtol=1e-6)
+        np.testing.assert_allclose(command.damping, 1.0, rtol=1e-6)
     # One that is late already is not sent at all.
     machine.send(replace(HOLD, made=machine.now() - 1.0, valid_for=0.5))
     while listener.handle_timeout(0) > 0:
@@ -229,67 +214,6 @@ def test_the_wrong_layout_is_refused(servers: dict[str, Process]) -> None:
     machine = LcmMachine(ROBOT, layout="wtw", port=servers["cheetah"].port)
     with pytest.raises(HardwareError, match="leg_control_data"):
         machine.connect()
-
-
-def test_a_link_that_was_never_opened_closes() -> None:
-    machine = LcmMachine(ROBOT, port=free_port())
-    # Never opened: nothing to damp, nothing to close.
-    machine.damp()
-    machine.close()
-    with pytest.raises(HardwareError, match="so101 has 6 joints"):
-        LcmMachine(load_robot("so101"))
-
-
-def test_the_writer_repeats_damping_and_nothing_else() -> None:
-    written: list[bytes] = []
-    writer = CommandWriter(partial(encode_command, CHEETAH), written.append)
-    writer.send(HOLD)
-    time.sleep(0.05)
-    assert written == [encode_command(CHEETAH, HOLD)]
-    writer.damp()
-    while len(written) < 5:
-        time.sleep(0.01)
-    assert len(set(written[1:])) == 1
-    writer.send(HOLD)
-    count = len(written)
-    time.sleep(0.05)
-    assert len(written) == count
-    writer.stop()
-    writer.damp()
-    assert len(written) == count
-
-
-def test_a_wire_that_fails_never_ends_the_damping() -> None:
-    wire: list[bytes] = []
-    cut = threading.Event()
-
-    def publish(data: bytes) -> None:
-        if cut.is_set():
-            raise OSError(101, "Network is unreachable")
-        wire.append(data)
-
-    writer = CommandWriter(partial(encode_command, CHEETAH), publish)
-    try:
-        writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
-        cut.set()
-        # It expires while the wire takes nothing; only the writer can damp.
-        until = time.monotonic() + LIMIT_S
-        while writer.counts["not written"] < 5 and time.monotonic() < until:
-            time.sleep(0.01)
-        assert (len(wire), writer.counts["expired"]) == (1, 1)
-        # The sender of a command gets the error; damping never raises.
-        with pytest.raises(HardwareError, match="Errno 101"):
-            writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
-        writer.damp()
-        cut.clear()
-        while len(wire) < 5 and time.monotonic() < until:
-            time.sleep(0.01)
-        assert len(wire) >= 5
-        assert len(set(wire[1:])) == 1
-        assert decode_command(CHEETAH, wire[1]).stiffness.max() == 0.0
-        assert writer.counts["commands"] == 1
-    finally:
-        writer.stop()
 
 
 def test_a_server_that_dies_leaves_a_link_that_still_closes(servers: dict[str, Process]) -> None:

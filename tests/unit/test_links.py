@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -34,6 +36,7 @@ from pronk.virtual.robot import VirtualRobot
 
 ROBOT = load_robot("mini_cheetah")
 DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
+HOLD = Command(position=DEFAULT, stiffness=np.full(12, 17.0), damping=np.full(12, 0.4))
 
 
 class Clock:
@@ -154,6 +157,56 @@ def test_a_robot_is_left_at_rest(
 ) -> None:
     await_rest(lambda: newest(clock.now))
     assert clock.now == pytest.approx(takes, abs=0.01)
+
+
+# --- The writer ---------------------------------------------------------------------------------
+
+
+def test_the_writer_repeats_damping_and_nothing_else() -> None:
+    written: list[bytes] = []
+    hold, damped = (b"\x01", b"\x00")
+    writer = CommandWriter(lambda command: bytes([bool(command.stiffness.any())]), written.append)
+    writer.send(HOLD)
+    time.sleep(0.05)
+    assert written == [hold]
+    writer.damp()
+    assert wait_for(lambda: len(written) >= 5, 60.0)
+    assert set(written[1:]) == {damped}
+    writer.send(HOLD)
+    count = len(written)
+    time.sleep(0.05)
+    assert len(written) == count
+    writer.stop()
+    writer.damp()
+    assert len(written) == count
+
+
+def test_a_wire_that_fails_never_ends_the_damping() -> None:
+    wire: list[bytes] = []
+    cut = threading.Event()
+
+    def publish(data: bytes) -> None:
+        if cut.is_set():
+            raise OSError(101, "Network is unreachable")
+        wire.append(data)
+
+    writer = CommandWriter(lambda command: bytes([bool(command.stiffness.any())]), publish)
+    try:
+        writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
+        cut.set()
+        # It expires while the wire takes nothing; only the writer can damp.
+        assert wait_for(lambda: writer.counts["not written"] >= 5, 60.0)
+        assert (len(wire), writer.counts["expired"]) == (1, 1)
+        # The sender of a command gets the error; damping never raises.
+        with pytest.raises(HardwareError, match="101"):
+            writer.send(replace(HOLD, made=time.monotonic(), valid_for=0.2))
+        writer.damp()
+        cut.clear()
+        assert wait_for(lambda: len(wire) >= 5, 60.0)
+        assert set(wire[1:]) == {b"\x00"}
+        assert writer.counts["commands"] == 1
+    finally:
+        writer.stop()
 
 
 # --- Addresses ----------------------------------------------------------------------------------

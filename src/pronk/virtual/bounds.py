@@ -1,4 +1,4 @@
-"""Parameter classes whose annotations hold bounds, and their reader.
+"""Parameter dataclasses whose annotations hold bounds, and their reader.
 
 A field is `Annotated[float, Meta(ge=LOW, le=HIGH)]`, or a tuple of those.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
+from functools import cache
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -17,11 +18,13 @@ from pronk.errors import RobotError
 T = TypeVar("T", bound="Bounded")
 
 
-def _hints(kind: type) -> dict[str, Any]:
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
 
 
-def _bounds(kind: type) -> dict[str, tuple[float, float]]:
+@cache
+def _bounds(kind: Any) -> dict[str, tuple[float, float]]:
     """Lowest and highest value by field; of a tuple, of each part."""
     found = {}
     for name, hint in _hints(kind).items():
@@ -36,12 +39,9 @@ class Bounded:
     """Base of a parameter dataclass."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of their bounds, and NaN.
-
-        Raises:
-            RobotError: Names the field.
-        """
-        for name, (low, high) in _bounds(type(self)).items():
+        """Refuse values out of their bounds, and NaN; name the field."""
+        kind: Any = type(self)
+        for name, (low, high) in _bounds(kind).items():
             value = getattr(self, name)
             for part in value if isinstance(value, tuple) else (value,):
                 if not low <= part <= high:
@@ -58,16 +58,10 @@ def plain(error: msgspec.ValidationError) -> str:
 
 
 def read(kind: type[T], where: str, entry: Any, without: tuple[str, ...] = ()) -> T:
-    """Build a parameter class from a mapping of its fields.
+    """Build a parameter class from a mapping of its fields, except those in `without`.
 
-    Args:
-        kind: The class, a dataclass.
-        where: What to call the mapping in errors.
-        entry: From a file.
-        without: Fields that files do not have.
-
-    Raises:
-        RobotError: A field is missing, unknown, of another type or out of its bounds.
+    RobotErrors name `where` and the field that is missing, unknown, of another type or out of its
+    bounds.
     """
     if not isinstance(entry, Mapping):
         raise RobotError(f"{where} is {entry!r}; expected a mapping of its fields.")
@@ -76,10 +70,11 @@ def read(kind: type[T], where: str, entry: Any, without: tuple[str, ...] = ()) -
         if name not in known:
             raise RobotError(f"{where}.{name} is unknown; the fields are {', '.join(known)}.")
     values: dict[str, Any] = {}
+    hints = get_type_hints(kind, include_extras=True)
     for name, part in known.items():
         if name in entry:
             try:
-                values[name] = msgspec.convert(entry[name], _hints(kind)[name])
+                values[name] = msgspec.convert(entry[name], hints[name])
             except msgspec.ValidationError as error:
                 raise RobotError(f"{where}.{name} is {entry[name]!r}; {plain(error)}.") from None
         elif part.default is MISSING:

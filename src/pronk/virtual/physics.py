@@ -96,11 +96,11 @@ class Physics:
 
         Args:
             plant: Built with the physics step in its model.
-            machine: Transport delay and battery.
+            machine: Battery.
             pose: Of all joints of the robot [rad].
-            columns: Columns of the plant's joints in a pose or command.
+            columns: Of the plant's joints in a pose or command.
             offset: Reading of their encoders less the true angle [rad].
-            first_step: Physics step to begin with, negative before the clock's zero.
+            first_step: To begin with, negative before the clock's zero.
         """
         self.plant, self._machine = plant, machine
         self.data = mujoco.MjData(plant.model)

@@ -34,7 +34,7 @@ from pronk.virtual.capture import Capture, Recorder
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.physics import Physics, Transport
 from pronk.virtual.plant import build_plant, legs_of
-from pronk.virtual.sensors import Raw, Sensors, TrunkMotion
+from pronk.virtual.sensors import Sensors, TrunkMotion
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
 TIMESTEP_S = 0.25e-3
@@ -80,15 +80,9 @@ class VirtualRobot:
             log_rate_hz: States per second.
             capture_rate_hz: Samples per second of `capture`, on the ground; None keeps none, for
                 runs without end (a second takes 0.7 MB at 1 kHz).
-            legs: Legs to simulate on the bench; None for all. On a rigid bench legs do not feel
-                each other, but for the sag of their common battery; joints of absent legs report
-                their default position and no speed.
+            legs: Legs to simulate on the bench; None for all. Joints of absent legs report their
+                default position and no speed.
             timestep_s: Physics step.
-
-        Raises:
-            RobotError: The parameters are not of this robot, or of a body that cannot exist.
-            HardwareError: A leg is unknown, a rate impossible, or something does not go with the
-                base.
         """
         known = legs_of(robot)
         if base not in ("bench", "ground"):
@@ -137,9 +131,7 @@ class VirtualRobot:
             pose, settle = pose + self._start.offset(len(pose)), self._start.settle_s
         free = self._ground is not None
         self._trunk = TrunkMotion(plant, 1.0 / self._rate, free=free)
-        self._sensors = Sensors(
-            robot, self._sim_params, plant.joints, rate_hz=self._rate, seed=self._seed
-        )
+        self._sensors = Sensors(robot, self._sim_params, plant, rate_hz=self._rate, seed=self._seed)
         self._transport = Transport(len(pose), machine.command_delay_s, self._dt)
         self._physics = Physics(
             plant,
@@ -253,23 +245,14 @@ class VirtualRobot:
 
     def _run(self, count: int) -> list[State]:
         """Advance over the next `count` ticks and return what the sensors say of them."""
-        plant, first = self._plant, self._sensors.sequence
+        first = self._sensors.sequence
         ticks = np.arange(first, first + count) / self._rate
         # A state was measured some time before its timestamp.
         delay = self._sim_params.machine.measurement_delay_s
         steps = np.rint((ticks - delay) / self._dt).astype(int)
         block = self._physics.run(steps.tolist(), self._transport)
-        return self._sensors.read(
-            Raw(
-                tick=ticks,
-                instant=steps * self._dt,
-                angle=block.qpos.take(plant.rotor_qpos, axis=1),
-                speed=block.qvel.take(plant.rotor, axis=1),
-                torque=block.torque,
-                voltage=block.voltage,
-                motion=self._trunk.at(block.qpos, block.qvel),
-            )
-        )
+        motion = self._trunk.at(block.qpos, block.qvel)
+        return self._sensors.read(ticks, steps * self._dt, block, motion)
 
 
 def open_sim(

@@ -14,7 +14,6 @@ handful of rows, where a general library spends its time on preparations.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from pronk.links.machine import State
 from pronk.robots.robot import Robot
+from pronk.virtual.physics import Block
 from pronk.virtual.plant import Plant
 from pronk.virtual.sim_params import SimParams
 
@@ -226,26 +226,6 @@ class NoiseSource:
         return slow
 
 
-@dataclass(frozen=True, kw_only=True)
-class Raw:
-    """True values at the physics steps nearest to a block of ticks. Joints: those present."""
-
-    tick: Array
-    """Nominal instants of the states on the machine's clock [s], shape (n,)."""
-    instant: Array
-    """Instants of the physics steps on the same clock [s], shape (n,)."""
-    angle: Array
-    """Of the rotors [rad], shape (n, present)."""
-    speed: Array
-    """Of the rotors [rad/s], shape (n, present)."""
-    torque: Array
-    """Of the motors, without friction [N m], shape (n, present)."""
-    voltage: Array
-    """Of the bus [V], shape (n,)."""
-    motion: Motion
-    """Of the trunk."""
-
-
 class Sensors:
     """Turns true values into states."""
 
@@ -253,14 +233,15 @@ class Sensors:
         self,
         robot: Robot,
         sim_params: SimParams,
-        joints: tuple[str, ...],
+        plant: Plant,
         *,
         rate_hz: float,
         seed: int,
     ) -> None:
-        """Start anew, with the noise of a seed, for the joints that are present, in file order."""
-        self._machine = machine = sim_params.machine
-        names = robot.joint_names
+        """Start anew, with the noise of a seed, for the joints that are in the plant."""
+        machine = sim_params.machine
+        self._machine, self._plant = machine, plant
+        names, joints = robot.joint_names, plant.joints
         self._columns = np.array([names.index(name) for name in joints], dtype=np.intp)
         self._default = np.array([joint.default_position for joint in robot.joints])
         self._offset = np.array([sim_params.joints[name].encoder_offset for name in joints])
@@ -271,27 +252,36 @@ class Sensors:
         self.sequence = 0
         """Number of the next state."""
 
-    def read(self, raw: Raw) -> list[State]:
-        """The states of a block of ticks, joints that are absent at rest in the default pose."""
-        noise, total = self._noise.take(len(raw.tick)), len(self._default)
-        stamp = raw.tick + noise.jitter + noise.stamp
+    def read(self, tick: Array, instant: Array, block: Block, motion: Motion) -> list[State]:
+        """The states of a block of ticks, joints that are absent at rest in the default pose.
+
+        Args:
+            tick: Nominal instants of the states on the machine's clock [s], shape (n,).
+            instant: Of the physics steps nearest to the measurements [s], shape (n,).
+            block: The plant at those steps.
+            motion: Of the trunk at those steps.
+        """
+        noise, total = self._noise.take(len(tick)), len(self._default)
+        stamp = tick + noise.jitter + noise.stamp
         # To first order from the physics step to the instant of sampling, at most half a step plus
         # the jitter away: 1e-5 rad of error at 500 rad/s^2.
-        late = raw.tick - self._machine.measurement_delay_s + noise.jitter - raw.instant
-        angle = raw.angle + raw.speed * late[:, None] + self._offset
+        late = tick - self._machine.measurement_delay_s + noise.jitter - instant
+        true = block.qpos.take(self._plant.rotor_qpos, axis=1)
+        speed = block.qvel.take(self._plant.rotor, axis=1)
+        angle = true + speed * late[:, None] + self._offset
         shaken = angle + self._present(noise.position)
         position = np.rint(shaken / self._count) * self._count
         # First difference of the encoder's grid over the drive's window.
         window = self._machine.velocity_window_s
-        before = np.rint((angle - raw.speed * window) / self._count)
+        before = np.rint((angle - speed * window) / self._count)
         velocity = (np.rint(angle / self._count) - before) * self._count / window
         velocity += self._present(noise.velocity)
-        torque = raw.torque / self._scale + self._present(noise.torque)
+        torque = block.torque / self._scale + self._present(noise.torque)
         if len(self._columns) < total:
             position = self._spread(position, self._default)
             velocity, torque = self._spread(velocity, 0.0), self._spread(torque, 0.0)
-        gyro, force = raw.motion.rate + noise.gyro, raw.motion.force + noise.force
-        orientation = product(noise.heading, product(raw.motion.orientation, noise.tilt))
+        gyro, force = motion.rate + noise.gyro, motion.force + noise.force
+        orientation = product(noise.heading, product(motion.orientation, noise.tilt))
         rows = (position, velocity, torque, gyro, force, orientation)
         states = [
             State(
@@ -306,7 +296,7 @@ class Sensors:
                 orientation=quaternion,
             )
             for sequence, (time, voltage, q, v, t, rate, acceleration, quaternion) in enumerate(
-                zip(stamp.tolist(), raw.voltage.tolist(), *rows, strict=True), self.sequence
+                zip(stamp.tolist(), block.voltage.tolist(), *rows, strict=True), self.sequence
             )
         ]
         self.sequence += len(states)

@@ -169,11 +169,7 @@ class SimParams:
     ground: Ground = field(default_factory=Ground)
 
     def check_joints(self, names: Iterable[str], source: str = "sim_params") -> None:
-        """Check that the parameters hold exactly these joints.
-
-        Raises:
-            RobotError: A joint is missing or unknown.
-        """
+        """Refuse parameters that do not hold exactly these joints."""
         wanted = tuple(names)
         for missing in (name for name in wanted if name not in self.joints):
             raise RobotError(f"{source}: joints.{missing} is missing; {self.robot} has that joint.")
@@ -185,15 +181,10 @@ class SimParams:
 
 
 def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
-    """Copy parameters with a few numbers changed.
+    """Copy parameters with a few numbers changed; refuse an unknown name or an impossible value.
 
-    Args:
-        sim_params: To start from.
-        changes: `trunk_mass_offset` [kg], `friction` (of the ground), or any number of
-            `MachineParams`, as `command_delay_s` or `bus_voltage`.
-
-    Raises:
-        RobotError: A name is unknown, or a value is out of its bounds.
+    `changes` are `trunk_mass_offset` [kg], `friction` (of the ground), or numbers of
+    `MachineParams`, as `command_delay_s` or `bus_voltage`.
     """
     numbers = [f.name for f in fields(MachineParams) if not f.name.endswith("_bias")]
     places = {"trunk_mass_offset": ("trunk", "mass_offset"), "friction": ("ground", "friction")}
@@ -220,15 +211,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 def parse_sim_params(body: Any, source: str) -> SimParams:
-    """Read parameters from the content of a YAML file.
-
-    Args:
-        body: The parsed document.
-        source: What to call it in errors, usually its path.
-
-    Raises:
-        RobotError: Another schema; a field missing, unknown, of another type or out of its bounds.
-    """
+    """Read parameters from the content of a YAML file, which errors call `source`."""
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         got = body.get("schema") if isinstance(body, dict) else type(body).__name__
         hint = " The fields of pronk/truth/1 are the same." if got == "pronk/truth/1" else ""
@@ -257,15 +240,10 @@ _FIELDS = [entry.name for entry in msgspec.structs.fields(_File)]
 
 
 def load_sim_params(path: Path | str | None = None, robot: Robot | None = None) -> SimParams:
-    """Read a parameter file.
+    """Read a parameter file; None is the shipped one, whose match is the paper's Table I.
 
-    Args:
-        path: The file; None for the shipped one, whose match is the paper's Table I.
-        robot: Whose parameters to derive (`default_sim_params`) where no file is given and the
-            shipped one is of another robot.
-
-    Raises:
-        RobotError: The file is missing, not YAML, or `parse_sim_params` refuses it.
+    Without a file, parameters of a `robot` other than the shipped one's are derived
+    (`default_sim_params`).
     """
     if path is None and robot is not None and robot.name != SHIPPED_ROBOT:
         return default_sim_params(robot)

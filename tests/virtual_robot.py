@@ -1,0 +1,39 @@
+"""The Mini Cheetah's virtual robot, and its parameters with perfect sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pronk.robots import load_robot
+from pronk.virtual.sim_params import AttitudeParams, SimParams, load_sim_params
+
+ROBOT = load_robot("mini_cheetah")
+POSE = np.array([joint.default_position for joint in ROBOT.joints])
+SIM_PARAMS = load_sim_params()
+_ERRORS = (
+    "sampling_jitter_s",
+    "timestamp_error_s",
+    "velocity_noise",
+    "position_noise",
+    "torque_noise",
+    "gyro_noise",
+    "accelerometer_noise",
+    "command_delay_s",
+    "measurement_delay_s",
+)
+
+
+def quiet(**machine: Any) -> SimParams:
+    """The shipped parameters with perfect sensors and no delays, and changes of the machine."""
+    nothing: dict[str, Any] = dict.fromkeys(_ERRORS, 0.0)
+    nothing |= dict.fromkeys(("gyro_bias", "accelerometer_bias"), (0.0, 0.0, 0.0))
+    changed = replace(SIM_PARAMS.machine, **nothing | machine)
+    return replace(SIM_PARAMS, machine=changed, attitude=AttitudeParams())
+
+
+def gains(stiffness: float = 17.0, damping: float = 0.4) -> dict[str, Any]:
+    """Equal gains of all joints for a Command."""
+    return {"stiffness": np.full(12, stiffness), "damping": np.full(12, damping)}
