@@ -37,7 +37,6 @@ from pronk.virtual.sim_params import load_sim_params
 from seen_jump import DELAY, SCRIPT, changed, seen_jump
 
 FORWARD, BACK, LEFT = (2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-GAP = Obstacle(kind="gap", size=0.3)
 # At 2 m/s the trunk of `seen_jump` is at 4.0 m at the jump input and at 4.4 m at lift-off; the
 # flight of 2 * 2.0 / g = 0.408 s takes it to 5.216 m. Feet stand 0.21 m before and behind it.
 SEEN = seen_jump(up=2.0, speed=2.0)
@@ -45,13 +44,22 @@ TOOK_OFF, LANDED = 4.398 + 0.21, 5.216 - 0.21
 EDGE = 4.65
 
 
-def judged(
-    seen: Capture,
-    obstacle: Obstacle = GAP,
+def obstacle(
+    kind: crossing.Shape = "gap",
+    size: float = 0.3,
     command: tuple[float, float, float] = FORWARD,
-    triggered: float | None = SCRIPT.on,
+    edge: float = EDGE,
+) -> Obstacle:
+    return Obstacle(kind=kind, size=size, command=command, edge=edge)
+
+
+GAP = obstacle()
+
+
+def judged(
+    seen: Capture, obstacle: Obstacle = GAP, triggered: float | None = SCRIPT.on
 ) -> CrossingFigures:
-    return judge(seen, obstacle, command, edge=EDGE, triggered=triggered, rules=JumpRules())
+    return judge(seen, obstacle, triggered=triggered, rules=JumpRules())
 
 
 # --- The course ---------------------------------------------------------------------------------
@@ -71,14 +79,14 @@ def test_the_floor_is_where_it_should_be(
     way: tuple[int, int],
 ) -> None:
     own = Ground(friction=0.55, stiffness=20e3)
-    ground = Obstacle(kind=kind, size=0.3).on(own, command, 2.0)
+    ground = obstacle(kind, command=command, edge=2.0).on(own)
     assert (ground.friction, ground.stiffness) == (0.55, 20e3)
     places = {0.0: before, 1.99: before, 2.01: between, 2.29: between, 2.31: after, 8.0: after}
     for side in (0.0, 3.0):
         for s, expected in places.items():
             x, y = s * way[0] + side * way[1], s * way[1] + side * way[0]
             assert ground.height(x, y) == pytest.approx(expected)
-    assert Obstacle(kind="flat").on(Ground(), command, 2.0) == Ground()
+    assert obstacle("flat", command=command).on(Ground()) == Ground()
 
 
 @pytest.mark.parametrize("command", [(1.0, 1.0, 0.0), STILL])
@@ -90,7 +98,7 @@ def test_a_course_leads_straight_on(command: tuple[float, float, float]) -> None
 def test_the_operator_looks_at_the_trunk() -> None:
     script = Script(command=FORWARD, stand_s=1.0, jump_s=0.4, keep_s=0.2)
     place = 5.0  # where it stands does not matter before it runs
-    operator = Operator(script, edge=2.0, lead=0.5, where=lambda: place)
+    operator = Operator(script, trigger_at=1.5, where=lambda: place)
     assert operator(0.5) == (STILL, False)
     place = 1.49
     assert operator(1.0) == (FORWARD, False)
@@ -114,7 +122,7 @@ def test_a_gap_that_was_crossed() -> None:
     assert found.reach == pytest.approx(2.0 * (DELAY - 1e-3) + 0.21)
     assert found.landing == pytest.approx(LANDED - EDGE - 0.3, abs=2e-3)
     assert found.speed == pytest.approx(2.0)
-    aside = judged(seen_jump(up=2.0, speed=2.0, yaw=math.pi / 2), command=LEFT)
+    aside = judged(seen_jump(up=2.0, speed=2.0, yaw=math.pi / 2), obstacle(command=LEFT))
     assert aside.landing == pytest.approx(found.landing)
 
 
@@ -141,7 +149,7 @@ LAY = changed(SEEN, "orientation", span(4.5, 4.6), [0.7, 0.714, 0.0, 0.0])
     ],
 )
 def test_a_gap_that_was_not_crossed(seen: Capture, size: float, why: str) -> None:
-    assert judged(seen, Obstacle(kind="gap", size=size)).why == why
+    assert judged(seen, obstacle(size=size)).why == why
 
 
 def test_what_happens_elsewhere_does_not_count() -> None:
@@ -150,20 +158,14 @@ def test_what_happens_elsewhere_does_not_count() -> None:
     assert judged(changed(low, "other_contact", span(0.0, 2.9), True)).success
     assert judged(SEEN, triggered=None).why == crossing.NOT_TRIGGERED
     # Steps have no bottom to fall into.
-    assert judged(LOW, Obstacle(kind="down", size=0.3)).success
-    up = judged(LOW, Obstacle(kind="up", size=0.3))
+    assert judged(LOW, obstacle("down")).success
+    up = judged(LOW, obstacle("up"))
     assert up.landing == pytest.approx(LANDED - EDGE, abs=2e-3)
 
 
 def test_a_lost_run_is_seen_at_once() -> None:
-    up = Obstacle(kind="up", size=0.3)
-    cases = ((SEEN, GAP), (LAY, GAP), (LOW, GAP), (LOW, up))
-    assert [lost(seen, obstacle, FORWARD, EDGE) for seen, obstacle in cases] == [
-        False,
-        True,
-        True,
-        False,
-    ]
+    cases = ((SEEN, GAP), (LAY, GAP), (LOW, GAP), (LOW, obstacle("up")))
+    assert [lost(*case) for case in cases] == [False, True, True, False]
 
 
 # --- The search ---------------------------------------------------------------------------------

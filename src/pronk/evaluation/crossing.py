@@ -96,31 +96,41 @@ FELL = "not upright 2 s later"
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """A gap or a step."""
+    """A gap or a step on the way of a command."""
 
     kind: Shape
     size: float = 0.0
     """Width of a gap, height of a step [m]."""
+    command: Velocity
+    """Straight forward, back or to a side."""
+    edge: float
+    """Where it begins, along the course [m]."""
 
     @property
     def far(self) -> float:
-        """From the edge to where the floor goes on [m]."""
-        return self.size if self.kind == "gap" else 0.0
+        """Where the floor goes on, along the course [m]."""
+        return self.edge + (self.size if self.kind == "gap" else 0.0)
 
-    def on(self, ground: Ground, command: Velocity, edge: float) -> Ground:
-        """Put the obstacle on a ground, whose friction and stiffness stay.
-
-        It begins at `edge` [m] in the direction of the command, along x or along y.
-        """
+    def on(self, ground: Ground) -> Ground:
+        """Put the obstacle on a ground, whose friction and stiffness stay."""
         if self.kind == "flat":
             return replace(ground, floor=0.0, terrain=())
-        before, after = (-BEHIND, edge), (edge + self.far, edge + self.far + BEYOND)
         floor = {"gap": -DEPTH, "up": 0.0, "down": -self.size}[self.kind]
-        boxes = [] if self.kind == "up" else [_box(before, floor, 0.0, command)]
+        boxes = [] if self.kind == "up" else [self._box(-BEHIND, self.edge, floor, 0.0)]
         if self.kind != "down":
             top = self.size if self.kind == "up" else 0.0
-            boxes.append(_box(after, floor, top, command))
+            boxes.append(self._box(self.far, self.far + BEYOND, floor, top))
         return replace(ground, floor=floor, terrain=tuple(boxes))
+
+    def _box(self, begin: float, end: float, low: float, high: float) -> Box:
+        """A block between two places of the course and two heights."""
+        along = direction(self.command)
+        x, y = (0.5 * (begin + end) * along).tolist()
+        across = np.where(along != 0.0, 0.5 * (end - begin), WIDE).tolist()
+        return Box(
+            center=(x, y, 0.5 * (low + high)),
+            half_size=(across[0], across[1], 0.5 * (high - low)),
+        )
 
 
 def direction(command: Velocity) -> Array:
@@ -137,29 +147,15 @@ def direction(command: Velocity) -> Array:
     return np.array([np.sign(forward), np.sign(left)])
 
 
-def _box(span: tuple[float, float], low: float, high: float, command: Velocity) -> Box:
-    """A block between two heights, from one place of the course to another."""
-    along = direction(command)
-    middle, half = 0.5 * (span[0] + span[1]), 0.5 * (span[1] - span[0])
-    x, y = middle * along
-    across = np.where(along != 0.0, half, WIDE)
-    return Box(
-        center=(float(x), float(y), 0.5 * (low + high)),
-        half_size=(float(across[0]), float(across[1]), 0.5 * (high - low)),
-    )
-
-
 # ---- one run ----
 
 
 class Operator:
-    """The command over time: run, and jump when the trunk is `lead` before the edge."""
+    """The command over time: run, and jump when the trunk is at `trigger_at`."""
 
-    def __init__(
-        self, script: Script, *, edge: float, lead: float, where: Callable[[], float]
-    ) -> None:
+    def __init__(self, script: Script, *, trigger_at: float, where: Callable[[], float]) -> None:
         """Begin before the first tick; `where` returns the trunk's place along the course [m]."""
-        self._script, self._where, self._trigger_at = script, where, edge - lead
+        self._script, self._where, self._trigger_at = script, where, trigger_at
         self.triggered: float | None = None
         """When the jump input rose, since the policy took over [s]."""
 
@@ -207,37 +203,24 @@ CROSSING = Kind(
 )
 
 
-def lost(seen: Capture, obstacle: Obstacle, command: Velocity, edge: float) -> bool:
+def lost(seen: Capture, obstacle: Obstacle) -> bool:
     """Whether a run has failed already: a sample leans too far, or a foot stepped in."""
     fallen = cosine_of_tilt(seen.orientation) < FALLEN_COSINE
-    return bool(fallen.any() or _stepped_in(seen, obstacle, command, edge).any())
+    return bool(fallen.any() or _stepped_in(seen, obstacle).any())
 
 
 def judge(
-    seen: Capture,
-    obstacle: Obstacle,
-    command: Velocity,
-    *,
-    edge: float,
-    triggered: float | None,
-    rules: JumpRules,
+    seen: Capture, obstacle: Obstacle, *, triggered: float | None, rules: JumpRules
 ) -> CrossingFigures:
     """Decide whether an obstacle was crossed, and measure it.
 
-    Args:
-        seen: The recorded run.
-        obstacle: What lay in the way.
-        command: Forward, left [m/s].
-        edge: Where it began, along the course [m].
-        triggered: When the jump input rose, on the capture's clock [s]; None for never.
-        rules: Of flights, and of an upright robot.
+    `triggered` is when the jump input rose, on the capture's clock [s]; None for never.
     """
     if triggered is None:
         return CrossingFigures(why=NOT_TRIGGERED)
-    along, count = direction(command), len(seen.time)
+    along, count, far = direction(obstacle.command), len(seen.time), obstacle.far
     on = min(sample_at(seen, triggered), count - 1)
     feet, trunk = seen.foot_position[:, :, :2] @ along, seen.position[:, :2] @ along
-    far = edge + obstacle.far
     behind = seen.contact & (feet >= far)
     first = np.where(behind[on:].any(axis=0), on + behind[on:].argmax(axis=0), count)
     landed = int(first.max())
@@ -251,12 +234,13 @@ def judge(
         front = float(np.where(before.any(axis=0), stood, -np.inf).max())
         figures["reach"] = front - float(trunk[on])
         if obstacle.kind != "flat":
-            figures["take_off"] = edge - front
+            figures["take_off"] = obstacle.edge - front
     if landed < count and obstacle.kind != "flat":
         figures["landing"] = float(feet[first, legs].min()) - far
     end, cosine = min(judged + 1, count), cosine_of_tilt(seen.orientation)
     upright = judged < count and cosine[judged] >= rules.upright_cosine
-    if _stepped_in(seen, obstacle, command, edge)[:end].any():
+    why = ""
+    if _stepped_in(seen, obstacle)[:end].any():
         why = STEPPED_IN
     elif seen.other_contact[on:end].any():
         why = NON_FOOT_CONTACT
@@ -266,19 +250,13 @@ def judge(
         why = FELL
     elif min(trunk[judged], feet[judged].min()) < far:
         why = NOT_OVER
-    else:
-        why = ""
     return CrossingFigures(why=why, **figures)
 
 
-def _stepped_in(
-    seen: Capture, obstacle: Obstacle, command: Velocity, edge: float
-) -> NDArray[np.bool_]:
+def _stepped_in(seen: Capture, obstacle: Obstacle) -> NDArray[np.bool_]:
     """Samples with the centre of a foot below the floor between the edges of a gap. (T,)."""
-    if obstacle.kind != "gap":
-        return np.zeros(len(seen.time), dtype=bool)
-    feet = seen.foot_position[:, :, :2] @ direction(command)
-    between = (feet > edge) & (feet < edge + obstacle.size)
+    feet = seen.foot_position[:, :, :2] @ direction(obstacle.command)
+    between = (feet > obstacle.edge) & (feet < obstacle.far)  # empty but for a gap
     return np.asarray((between & (seen.foot_position[:, :, 2] < 0.0)).any(axis=1))
 
 
@@ -289,8 +267,6 @@ class Attempt:
     job: Job
     """Its script has the command and the times `stand_s`, `jump_s` and `keep_s`."""
     obstacle: Obstacle
-    edge: float
-    """Where it begins, along the course [m]."""
     lead: float
     """From the trunk to it when the jump input rises [m]."""
 
@@ -298,14 +274,12 @@ class Attempt:
 def attempt(task: Attempt) -> Row:
     """Run once at an obstacle and measure it."""
     job, script, rules, obstacle = task.job, task.job.row.script, task.job.rules, task.obstacle
-    along = direction(script.command)
-    machine = set_down(job)
-    operator = Operator(
-        script,
-        edge=task.edge,
-        lead=task.lead,
-        where=lambda: float(machine.snapshot().position[0, :2] @ along),
-    )
+    along, machine = direction(script.command), set_down(job)
+
+    def where() -> float:
+        return float(machine.snapshot().position[0, :2] @ along)
+
+    operator = Operator(script, trigger_at=obstacle.edge - task.lead, where=where)
     # Time to lift off, to fly and land on all feet, and to stand.
     after = rules.search_s + 1.0 + rules.upright_s
     late = script.stand_s + LATE * (RUN_UP_S + PHASE_S)
@@ -314,18 +288,10 @@ def attempt(task: Attempt) -> Row:
         if operator.triggered is None:
             if tick.since > late:
                 break
-        elif tick.since > operator.triggered + after or lost(
-            machine.snapshot(), obstacle, script.command, task.edge
-        ):
+        elif tick.since > operator.triggered + after or lost(machine.snapshot(), obstacle):
             break
-    figures = judge(
-        machine.capture(),
-        obstacle,
-        script.command,
-        edge=task.edge,
-        triggered=None if operator.triggered is None else began + operator.triggered,
-        rules=rules,
-    )
+    triggered = None if operator.triggered is None else began + operator.triggered
+    figures = judge(machine.capture(), obstacle, triggered=triggered, rules=rules)
     measured = replace(figures, obstacle=obstacle.kind, size=obstacle.size, lead=task.lead)
     return replace(job.row, figures=measured)
 
@@ -386,7 +352,8 @@ class CrossingPlan:
 def attempts(
     subject: Subject,
     case: Case,
-    obstacle: Obstacle,
+    kind: Shape,
+    size: float,
     *,
     lead: float,
     runs: int,
@@ -396,7 +363,7 @@ def attempts(
 ) -> list[Attempt]:
     """Return runs at one obstacle; their starts are alike for all obstacles and leads."""
     speed, found = math.hypot(*case.command[:2]), []
-    edge = RUN_UP_S * speed
+    obstacle = Obstacle(kind=kind, size=size, command=case.command, edge=RUN_UP_S * speed)
     for count in range(runs):
         rng = case_rng(plan.seed, case, count)
         x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
@@ -417,10 +384,10 @@ def attempts(
             robot=robot.name,
             sim_params=sim_params,
             start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
-            ground=obstacle.on(sim_params.ground, case.command, edge),
+            ground=obstacle.on(sim_params.ground),
             rules=plan.rules,
         )
-        found.append(Attempt(job=job, obstacle=obstacle, edge=edge, lead=lead))
+        found.append(Attempt(job=job, obstacle=obstacle, lead=lead))
     return found
 
 
@@ -433,10 +400,10 @@ def search(
     run: Callable[[list[Attempt]], list[Row]],
 ) -> list[Row]:
     """Practise, then climb all ladders at once, a rung of each in every round; `run` runs one."""
-    who = {"plan": plan, "robot": robot, "sim_params": sim_params}
+    who: Any = {"plan": plan, "robot": robot, "sim_params": sim_params}
     pairs = [(subject, case) for subject in subjects for case in plan.cases]
-    flat, count = Obstacle(kind="flat"), plan.practice
-    rows = run([a for s, c in pairs for a in attempts(s, c, flat, lead=0.0, runs=count, **who)])  # type: ignore[arg-type]
+    practice: Any = {"lead": 0.0, "runs": plan.practice, **who}
+    rows = run([task for s, c in pairs for task in attempts(s, c, "flat", 0.0, **practice)])
     reach: dict[tuple[str, str], float] = {}
     for subject, case in pairs:
         own = [row for row in rows if (row.policy, row.case) == (subject.name, case.name)]
@@ -457,10 +424,11 @@ def search(
             for task in attempts(
                 subject,
                 case,
-                Obstacle(kind=kind, size=plan.ladders[kind].size(rung)),
+                kind,
+                plan.ladders[kind].size(rung),
                 lead=round(reach[policy, command] + lead, 4),
                 runs=plan.runs,
-                **who,  # type: ignore[arg-type]
+                **who,
             )
         ]
         found = run(tasks)
