@@ -1,6 +1,9 @@
-"""The bench model: what it holds, and that it is the training simulator."""
+"""The model of a joint on its test rig: what it holds, and that it is the training simulator."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import mujoco
 import mujoco.rollout
@@ -118,21 +121,15 @@ def test_bench_is_the_free_robot_with_its_base_held(name: str) -> None:
     np.testing.assert_allclose(small.site(foot).xpos, large.site(foot).xpos, atol=1e-12)
 
 
+def changed_knee(**changes: Any) -> Robot:
+    knee = replace(CHEETAH.joint("FR_knee"), **changes)
+    joints = (knee if j.name == knee.name else j for j in CHEETAH.joints)
+    return replace(CHEETAH, joints=tuple(joints))
+
+
 def test_chain_that_leaves_out_a_moving_joint_is_refused() -> None:
-    from dataclasses import replace
-
-    knee = replace(CHEETAH.joint("FR_knee"), clamped=("FR_hip_roll",))
-    robot = replace(
-        CHEETAH, joints=tuple(knee if j.name == "FR_knee" else j for j in CHEETAH.joints)
-    )
     with pytest.raises(RobotError, match=r"FR_hip_pitch .*FR_knee"):
-        bench_spec(robot, "FR_knee")
-
-
-@pytest.mark.parametrize("keyword", ["stiffness", "damping", "armature", "frictionloss"])
-def test_misspelled_joint_is_refused(keyword: str) -> None:
-    with pytest.raises(RobotError, match="no joint 'FR_kneee'"):
-        bench_spec(CHEETAH, "FR_knee", **{keyword: {"FR_kneee": 1.0}})
+        bench_spec(changed_knee(clamped=("FR_hip_roll",)), "FR_knee")
 
 
 # --- Editing a compiled model -------------------------------------------------------------------
@@ -145,44 +142,33 @@ def assert_equal_models(a: mujoco.MjModel, b: mujoco.MjModel) -> None:
             np.testing.assert_array_equal(value, getattr(b, field), err_msg=field)
 
 
-@pytest.mark.parametrize("name", ["FR_knee", "HL_hip_pitch"])
-def test_set_drive_gains_is_recompilation(name: str) -> None:
-    model = bench_spec(CHEETAH, name).compile()
-    set_drive_gains(model, name, CHEETAH.joint(name).drive, 21.8, 0.541)
-    again = bench_spec(CHEETAH, name, stiffness={name: 21.8}, damping={name: 0.541}).compile()
-    assert_equal_models(model, again)
+def recompiled(name: str, **parameters: float) -> mujoco.MjModel:
+    return bench_spec(CHEETAH, name, **{k: {name: v} for k, v in parameters.items()}).compile()
 
 
-@pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll"])
+@pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll", "HL_hip_pitch"])
 @pytest.mark.parametrize("armature", [0.0, 0.005484])
-def test_set_passive_is_recompilation(name: str, armature: float) -> None:
-    model = bench_spec(CHEETAH, name).compile()
+def test_edited_model_is_the_recompiled_one(name: str, armature: float) -> None:
+    model = recompiled(name, frictionloss=0.0)
+    set_drive_gains(model, name, CHEETAH.joint(name).drive, 21.8, 0.541)
     set_passive(model, name, armature=armature, frictionloss=0.35)
-    again = bench_spec(
-        CHEETAH, name, armature={name: armature}, frictionloss={name: 0.35}
-    ).compile()
-    assert_equal_models(model, again)
+    again = recompiled(name, stiffness=21.8, damping=0.541, armature=armature, frictionloss=0.35)
+    for field in dir(model):
+        value = getattr(model, field)
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            np.testing.assert_array_equal(value, getattr(again, field), err_msg=field)
     command = commands(model, name, held_chirp(CHEETAH, 1.0, 0.1))
     np.testing.assert_array_equal(simulate(model, command), simulate(again, command))
 
 
-def test_friction_can_be_switched_on_in_a_compiled_model() -> None:
-    smooth = bench_spec(CHEETAH, "FR_knee", frictionloss={"FR_knee": 0.0}).compile()
-    command = commands(smooth, "FR_knee", held_chirp(CHEETAH, 1.0, 0.1))
-    before = simulate(smooth, command)
-    set_passive(smooth, "FR_knee", frictionloss=0.2)
-    rough = bench_spec(CHEETAH, "FR_knee").compile()
-    after = simulate(smooth, command)
-    np.testing.assert_array_equal(after, simulate(rough, command))
-    assert np.abs(after - before).max() > 1e-3
-
-
 def test_editing_an_absent_joint_lists_those_there_are() -> None:
     model = bench_spec(CHEETAH, "FR_knee").compile()
-    with pytest.raises(RobotError, match=r"no drive 'FL_knee'; its drives are FR_knee"):
+    with pytest.raises(RobotError, match=r"FL_knee.*FR_knee"):
         set_drive_gains(model, "FL_knee", CHEETAH.joint("FL_knee").drive, 17.0, 0.4)
-    with pytest.raises(RobotError, match=r"no joint 'FL_knee'; its joints are FR_knee"):
+    with pytest.raises(RobotError, match=r"FL_knee.*FR_knee"):
         set_passive(model, "FL_knee", armature=0.0)
+    with pytest.raises(RobotError, match="FR_kneee"):
+        bench_spec(CHEETAH, "FR_knee", stiffness={"FR_kneee": 1.0})
 
 
 # --- Physics ------------------------------------------------------------------------------------
@@ -230,13 +216,8 @@ def test_native_model_is_the_explicit_law(name: str, amplitude: float, stiffness
 
 def test_torque_speed_line_binds_as_in_the_explicit_law() -> None:
     """A weak motor, so that back-EMF rather than the effort limit is what saturates."""
-    from dataclasses import replace
-
     weak = replace(CHEETAH.joint("FR_knee").drive, stall_torque=12.0, no_load_speed=10.0)
-    knee = replace(CHEETAH.joint("FR_knee"), drive=weak)
-    robot = replace(
-        CHEETAH, joints=tuple(knee if j.name == "FR_knee" else j for j in CHEETAH.joints)
-    )
+    robot = changed_knee(drive=weak)
     spec = bench_spec(robot, "FR_knee", stiffness={"FR_knee": 40.0})
     model = spec.compile()
     command = commands(model, "FR_knee", held_chirp(robot, 4.0, 0.5))
@@ -259,14 +240,6 @@ def test_mirror_claim_by_simulation(joint: object) -> None:
     column = CHEETAH.joint(name).chain.index(name)
     assert np.ptp(here[:, column]) > 0.1
     np.testing.assert_allclose(here[:, column], sign * there[:, column], atol=1e-9)
-
-
-def test_wrong_mirror_sign_would_be_noticed() -> None:
-    offset = held_chirp(CHEETAH, 2.0, 0.25)
-    right, left = (bench_spec(CHEETAH, n).compile() for n in ("FR_hip_roll", "FL_hip_roll"))
-    here = simulate(left, commands(left, "FL_hip_roll", offset))[:, 0]
-    there = simulate(right, commands(right, "FR_hip_roll", offset))[:, 0]
-    assert np.abs(here - there).max() > 1e-3
 
 
 def test_whole_arm_moves_at_once() -> None:

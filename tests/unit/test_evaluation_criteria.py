@@ -1,0 +1,161 @@
+"""The acceptance criteria and the plan of an evaluation in the training simulator."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pronk.errors import ArtefactError, PronkError
+from pronk.evaluation.criteria import cost_of_jumping, evaluation_checks
+from pronk.evaluation.results import Spread
+from pronk.evaluation.training_sim.evaluation import (
+    JUMPS,
+    NEVER,
+    WALKS,
+    CommandResult,
+    Evaluation,
+    Plan,
+    load_speed_errors,
+    save,
+)
+
+DT = 0.005
+
+
+def spread(mean: float, std: float = 0.01) -> Spread:
+    return Spread(mean=mean, std=std, p05=mean, p95=mean, most=mean, n=10)
+
+
+GOOD_WALK = {"speed_error": 0.1, "yaw_error": 0.1, "speed_error_averaged": 0.04, "fell": 0.0}
+GOOD_JUMP = {
+    "height": 0.5,
+    "distance": 1.2,
+    "lift_off_velocity": 2.4,
+    "delay": 0.2,
+    "upright": 1.0,
+    "single": 1.0,
+}
+
+
+def command_result(name: str, jump: bool, **changes: float | Spread) -> CommandResult:
+    figures = {**(GOOD_JUMP if jump else GOOD_WALK), **changes}
+    spreads = {n: v if isinstance(v, Spread) else spread(v) for n, v in figures.items()}
+    return CommandResult(name=name, command=(2.0, 0.0, 0.0), figures=spreads)
+
+
+def evaluation(**changes: Any) -> Evaluation:
+    whole = Evaluation(
+        walks=tuple(command_result(case.name, jump=False) for case in WALKS),
+        jumps=tuple(command_result(case.name, jump=True) for case in JUMPS),
+        estimator={
+            "forward": 0.1,
+            "left": 0.1,
+            "up": 0.0,
+            "velocity": 0.14,
+            "contacts_right": 0.96,
+        },
+        plan={"robots": 10, "seed": 3},
+        seconds=1.0,
+        about={"policy": {"file": "policy.onnx"}, "randomization": "full"},
+    )
+    return replace(whole, **changes)
+
+
+def failed(whole: Evaluation) -> list[str]:
+    return [check.what for check in evaluation_checks(whole) if not check.passed]
+
+
+# --- Acceptance criteria ------------------------------------------------------------------------
+
+
+def test_a_good_policy_meets_every_criterion() -> None:
+    found = evaluation_checks(evaluation(before={case.name: 0.1 for case in WALKS}))
+    assert [check.what for check in found if not check.passed] == []
+    # 4 walks of two, 2 turns, standing; 5 jumps of seven; 2 of flights without a jump input; 2 of
+    # the estimator; the cost.
+    assert len(found) == 8 + 2 + 1 + 5 * 7 + 2 + 2 + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "jump", "changes", "what"),
+    [
+        ("forward 2", False, {"speed_error": 0.151}, "forward 2: speed error"),
+        ("forward 2", False, {"speed_error": math.nan}, "forward 2: speed error"),
+        ("forward 2", False, {"fell": 0.0051}, "forward 2: falls"),
+        ("yaw 2", False, {"yaw_error": 0.21}, "yaw 2: yaw rate error"),
+        ("stand", False, {"speed_error_averaged": 0.06}, "stand: speed"),
+        ("forward 3", False, {"speed_error": 1.0, "fell": 1.0}, None),
+        ("stand", False, {"uncommanded": 0.04}, "flight without a jump input, walking"),
+        ("stand", False, {"uncommanded": 0.02}, None),
+        ("forward 1", True, {"height": 0.44}, "jump forward 1: height"),
+        ("forward 1", True, {"height": spread(0.5, 0.04)}, "jump forward 1: std of height"),
+        ("forward 1", True, {"distance": 0.69}, "jump forward 1: distance"),
+        ("forward 1", True, {"upright": 0.98}, "jump forward 1: upright"),
+        ("forward 1", True, {"single": 0.94}, "jump forward 1: one high flight"),
+        ("forward 1", True, {"lift_off_velocity": 2.1}, "jump forward 1: lift-off vel"),
+        ("forward 1", True, {"delay": 0.31}, "jump forward 1: lift-off after"),
+    ],
+)
+def test_a_bad_number_fails_its_criterion_and_no_other(
+    name: str, jump: bool, changes: dict[str, Any], what: str | None
+) -> None:
+    one = (command_result(name, jump, **changes),)
+    found = failed(evaluation(jumps=one) if jump else evaluation(walks=one))
+    assert len(found) == (what is not None)
+    assert what is None or found[0].startswith(what)
+
+
+def test_the_cost_of_jumping_is_the_growth_of_the_mean_error() -> None:
+    before = dict.fromkeys(("forward 2", "back 2", "left 1", "right 1"), 0.1)
+    assert cost_of_jumping(before, dict.fromkeys(before, 0.12)) == pytest.approx(1.2)
+    assert math.isnan(cost_of_jumping({"forward 2": 0.1}, before))
+    assert failed(evaluation(before=dict.fromkeys(before, 0.09))) == [
+        "speed error over that before jumping"
+    ]
+
+
+def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
+    path = tmp_path / "evaluation.json"
+    save(path, evaluation())
+    assert load_speed_errors(path) == {case.name: 0.1 for case in WALKS}
+    assert len(json.loads(path.read_text())["checks"]) == 50
+    for text in ('{"schema": "pronk/evaluation/9"}', '{"schema": "pronk/evaluation/3"}', "not"):
+        path.write_text(text)
+        with pytest.raises(ArtefactError, match=r"evaluation\.json"):
+            load_speed_errors(path)
+
+
+# --- The plan -----------------------------------------------------------------------------------
+
+
+def test_every_robot_has_its_command_and_its_times() -> None:
+    plan = Plan(robots=200, seed=4)
+    assert plan.size == 14 * 200
+    commands = plan.commands()
+    assert commands[0].tolist() == [2.0, 0.0, 0.0]
+    assert commands[plan.walkers - 1].tolist() == [0.0, 0.0, 0.0]
+    assert commands[-1].tolist() == [-2.0, 0.0, 0.0]
+    times = plan.times(DT)
+    walking = {name: set(values[: plan.walkers].tolist()) for name, values in times.items()}
+    assert walking == {"start": {0}, "stop": {NEVER}, "on": {NEVER}, "off": {NEVER}}
+    on = times["on"][plan.walkers :] * DT
+    # 1 s of standing, 2.5 s of running, up to half a second more, evenly.
+    assert 3.5 <= on.min() < 3.51
+    assert 3.99 < on.max() <= 4.0
+    assert on.mean() == pytest.approx(3.75, abs=0.02)
+    assert np.array_equal(times["off"] - times["on"], np.r_[[0] * plan.walkers, [100] * 1000])
+    assert set((times["stop"] - times["off"])[plan.walkers :]) == {100}
+    assert set(times["start"][plan.walkers :]) == {200}
+    assert plan.seconds == 20.0
+    assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
+
+
+def test_an_empty_plan_is_refused() -> None:
+    with pytest.raises(PronkError, match="robots"):
+        Plan(robots=0)
