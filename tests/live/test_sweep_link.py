@@ -132,7 +132,7 @@ class Ear:
 def swept(robot: Robot, plan: SweepPlan, out: Path, port: int) -> Recorded:
     address = Address.parse("lcm", port=port)
     plan = replace(plan, robot=robot)
-    return record_wire(robot, plan, out, address, limits=PATIENT, fresh=FRESH, real_time=True)
+    return record_wire(plan, out, address, limits=PATIENT, fresh=FRESH, real_time=True)
 
 
 def await_(what: Callable[[], bool], seconds: float = 60.0) -> None:

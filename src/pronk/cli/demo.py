@@ -185,14 +185,8 @@ def sweep_and_match(
     def record(folder: str, signal: Any, amplitudes: Any, counts: Any, seed: int) -> list[Path]:
         plan = make(robot, None, signal, amplitudes, counts)
         plan.check()
-        return record_virtual(
-            robot,
-            plan,
-            out / folder,
-            seed=seed,
-            overwrite=True,
-            progress=report.bar(f"sweep ({folder})"),
-        )
+        bar = report.bar(f"sweep ({folder})")
+        return record_virtual(plan, out / folder, seed=seed, overwrite=True, progress=bar)
 
     paths = record("logs", "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])), seed)
     fresh = record("fresh", "log-chirp", AMPLITUDES[:1], 1, seed + 1)

@@ -54,24 +54,14 @@ RENAMED = {
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command line and return its exit status.
-
-    Args:
-        arguments: The words after `pronk`.
-    """
+    """Run the command line of the words after `pronk`; return its exit status."""
     return run_commands(COMMANDS, arguments, "pronk")
 
 
 def run_commands(
     commands: Mapping[str, tuple[str, str]], arguments: Sequence[str], program: str
 ) -> int:
-    """Run one of `commands` and return its exit status.
-
-    Args:
-        commands: The commands to choose from.
-        arguments: The words after the program's name.
-        program: Name of the program.
-    """
+    """Run one of `commands`, of the program of that name; return its exit status."""
     try:
         return _dispatch(commands, list(arguments), program)
     except PronkError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from pronk.robots.robot import Robot
     from pronk.runtime.ipc import Event
     from pronk.runtime.run import Recorded
+    from pronk.runtime.sweep import SweepTask
     from pronk.virtual.sim_params import SimParams
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
@@ -91,7 +91,6 @@ def sweep(
         if virtual:
             params = address.options.get("params")
             figures["logs"] = record_virtual(
-                known,
                 plan,
                 out,
                 sim_params=None if params is None else Path(str(params)),
@@ -101,7 +100,6 @@ def sweep(
             )
         else:
             recorded = record_wire(
-                known,
                 plan,
                 out,
                 address,
@@ -171,21 +169,7 @@ def show_plan(plan: SweepPlan) -> None:
     console.show_sheet(table(columns, rows, title=title))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Limb:
-    """The part of a sweep that moves one limb of the virtual robot."""
-
-    plan: SweepPlan
-    sim_params: SimParams
-    limb: str
-    joints: tuple[str, ...]
-    out: Path
-    seed: int
-    overwrite: bool
-
-
 def record_virtual(
-    robot: Robot,
     plan: SweepPlan,
     out: Path,
     *,
@@ -194,63 +178,47 @@ def record_virtual(
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> list[Path]:
-    """Excite the virtual robot faster than real time, limbs side by side in processes.
+    """Excite the virtual robot faster than real time; return the logs in the order of its joints.
 
-    On a rigid bench limbs do not affect each other, so each process simulates one.
+    On a rigid bench limbs do not affect each other, so each is simulated in a process of its own.
 
     Args:
-        robot: The robot.
         plan: What to excite; checked by the caller.
         out: Folder for the logs.
         sim_params: sim_params file; the shipped one if None.
         seed: Of all noise; each limb derives its own.
         overwrite: Replace logs that exist.
         progress: Called with the share done, 0 to 1.
-
-    Returns:
-        The logs, in the order of the robot's joints.
     """
     from pronk.evaluation.trial import in_processes
+    from pronk.runtime.sweep import SweepTask
     from pronk.virtual.plant import leg_of, legs_of
     from pronk.virtual.sim_params import load_sim_params
 
+    robot, metadata = plan.robot, {"link": "virtual robot, in this program"}
     params = load_sim_params(sim_params, robot)
     params.check_joints(robot.joint_names, str(sim_params or "sim_params"))
-    jobs = [
-        _Limb(
-            plan=plan,
-            sim_params=params,
-            limb=limb,
-            joints=joints,
-            out=out,
-            seed=seed * 1000 + index,
-            overwrite=overwrite,
+    jobs = []
+    for index, limb in enumerate(legs_of(robot)):
+        joints = tuple(name for name in plan.joints if leg_of(robot, name) == limb)
+        task = SweepTask(
+            plan=plan, out_dir=out, joints=joints, overwrite=overwrite, metadata=metadata
         )
-        for index, limb in enumerate(legs_of(robot))
-        if (joints := tuple(name for name in plan.joints if leg_of(robot, name) == limb))
-    ]
+        jobs += [(task, params, limb, 1000 * seed + index)] if joints else []
     logs = in_processes(_record_limb, jobs, processes=os.cpu_count() or 1, progress=progress)
     order = {name: i for i, name in enumerate(robot.joint_names)}
     return sorted((path for paths in logs for path in paths), key=lambda path: order[path.stem])
 
 
-def _record_limb(job: _Limb) -> list[Path]:
-    from pronk.runtime.sweep import SweepTask, record
+def _record_limb(job: tuple[SweepTask, SimParams, str, int]) -> list[Path]:
+    from pronk.runtime.sweep import record
     from pronk.virtual.robot import VirtualRobot
 
-    robot = job.plan.robot
-    task = SweepTask(
-        plan=job.plan,
-        out_dir=job.out,
-        joints=job.joints,
-        overwrite=job.overwrite,
-        metadata={"link": "virtual robot, in this program"},
-    )
-    return record(VirtualRobot(robot, job.sim_params, seed=job.seed, legs=(job.limb,)), task)
+    task, params, limb, seed = job
+    return record(VirtualRobot(task.plan.robot, params, seed=seed, legs=(limb,)), task)
 
 
 def record_wire(
-    robot: Robot,
     plan: SweepPlan,
     out: Path,
     address: Address,
@@ -265,10 +233,9 @@ def record_wire(
     """Sweep a robot in real time, all joints over one connection of the servo's process.
 
     Args:
-        robot: The robot.
         plan: What to excite; checked by the caller.
         out: Folder for the logs.
-        address: Where it is.
+        address: Where the robot is.
         release: Make its own controller let go of the joints first.
         overwrite: Replace logs that exist.
         real_time: Request real-time scheduling, and print what was granted.
@@ -284,9 +251,10 @@ def record_wire(
     from pronk.runtime.run import run_sweep
     from pronk.runtime.sweep import SweepTask
 
+    robot = plan.robot.source or plan.robot.name
     metadata = {"link": str(address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
-    link = Link(robot=robot.source or robot.name, address=address, release=release, fresh=fresh)
+    link = Link(robot=robot, address=address, release=release, fresh=fresh)
     whole: list[str] = []
 
     def notify(event: Event) -> None:
