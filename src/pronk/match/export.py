@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-import yaml
 
 from pronk.errors import PronkError
 from pronk.match.gains import MatchedGains
@@ -101,76 +100,40 @@ def mjlab_text(gains: MatchedGains, robot: Robot) -> str:
     their place in `ACTUATORS`, so keep the order.
     """
     drives = group_drives(gains, robot)
-    actuators, events = [], []
-    for index, drive in enumerate(drives):
-        delay = (
+    actuators = "".join(
+        f"    DcMotorActuatorCfg(  # {drive.group}\n"
+        f"        target_names_expr={_names(drive.joints)},\n"
+        f"{_fields(drive, 'frictionloss', viscous_damping='viscous_damping')}"
+        + (
             f"        delay_min_lag={drive.delay_steps},  # physics steps\n"
             f"        delay_max_lag={drive.delay_steps},\n"
             if drive.delay_steps
             else ""
         )
-        actuators.append(
-            f"    DcMotorActuatorCfg(  # {drive.group}\n"
-            f"        target_names_expr={_names(drive.joints)},\n"
-            f"        stiffness={_number(drive.stiffness)},\n"
-            f"        damping={_number(drive.damping)},\n"
-            f"        armature={_number(drive.armature)},\n"
-            f"        frictionloss={_number(drive.frictionloss)},\n"
-            f"        viscous_damping={_number(drive.viscous_damping)},\n"
-            f"        effort_limit={_number(drive.effort_limit)},\n"
-            f"        saturation_effort={_number(drive.stall_torque)},\n"
-            f"        velocity_limit={_number(drive.no_load_speed)},\n"
-            f"{delay}    ),"
-        )
-        events.append(
-            f'    "{drive.group}_gains": EventTermCfg(\n'
-            f"        func=dr.pd_gains,\n"
-            f'        mode="startup",\n'
-            f"        params={{\n"
-            f'            "asset_cfg": SceneEntityCfg("robot", actuator_ids=[{index}]),\n'
-            f'            "kp_range": {_pair(drive.stiffness_range)},\n'
-            f'            "kd_range": {_pair(drive.damping_range)},\n'
-            f'            "operation": "abs",\n'
-            f"        }},\n"
-            f"    ),"
-        )
-    return "\n".join(
-        [
-            _comment(_header(gains), "# "),
-            "",
-            "from mjlab.actuator import DcMotorActuatorCfg",
-            "from mjlab.envs.mdp import dr",
-            "from mjlab.managers.event_manager import EventTermCfg",
-            "from mjlab.managers.scene_entity_config import SceneEntityCfg",
-            "",
-            "ACTUATORS = (",
-            *actuators,
-            ")",
-            "",
-            "EVENTS = {",
-            *events,
-            "}",
-            "",
-        ]
-    )
-
-
-def events_text(gains: MatchedGains, robot: Robot) -> str:
-    """The randomization as YAML: absolute ranges for mjlab's `dr.pd_gains`, one entry a group."""
-    drives = group_drives(gains, robot)
-    body = {
-        f"{drive.group}_gains": {
-            "func": "mjlab.envs.mdp.dr.pd_gains",
-            "mode": "startup",
-            "joints": list(drive.joints),
-            "kp_range": list(drive.stiffness_range),
-            "kd_range": list(drive.damping_range),
-            "operation": "abs",
-            "distribution": "uniform",
-        }
+        + "    ),\n"
         for drive in drives
-    }
-    return _comment(_header(gains), "# ") + "\n" + yaml.safe_dump(body, sort_keys=False)
+    )
+    events = "".join(
+        f'    "{drive.group}_gains": EventTermCfg(\n'
+        f"        func=dr.pd_gains,\n"
+        f'        mode="startup",\n'
+        f"        params={{\n"
+        f'            "asset_cfg": SceneEntityCfg("robot", actuator_ids=[{index}]),\n'
+        f'            "kp_range": {_pair(drive.stiffness_range)},\n'
+        f'            "kd_range": {_pair(drive.damping_range)},\n'
+        f'            "operation": "abs",\n'
+        f"        }},\n"
+        f"    ),\n"
+        for index, drive in enumerate(drives)
+    )
+    return (
+        f"{_comment(_header(gains))}\n\n"
+        "from mjlab.actuator import DcMotorActuatorCfg\n"
+        "from mjlab.envs.mdp import dr\n"
+        "from mjlab.managers.event_manager import EventTermCfg\n"
+        "from mjlab.managers.scene_entity_config import SceneEntityCfg\n\n"
+        f"ACTUATORS = (\n{actuators})\n\nEVENTS = {{\n{events}}}\n"
+    )
 
 
 def mjcf_text(gains: MatchedGains, robot: Robot) -> str:
@@ -211,57 +174,50 @@ def isaaclab_text(gains: MatchedGains, robot: Robot) -> str:
 
     Isaac Lab runs PhysX; its first line is a warning that the gains must be matched there anew.
     """
-    drives = group_drives(gains, robot)
-    entries = []
-    for drive in drives:
-        entries.append(
-            f'    "{drive.group}": DCMotorCfg(\n'
-            f"        joint_names_expr={list(drive.joints)!r},\n"
-            f"        stiffness={_number(drive.stiffness)},\n"
-            f"        damping={_number(drive.damping)},\n"
-            f"        armature={_number(drive.armature)},\n"
-            f"        friction={_number(drive.frictionloss)},\n"
-            f"        effort_limit={_number(drive.effort_limit)},\n"
-            f"        saturation_effort={_number(drive.stall_torque)},\n"
-            f"        velocity_limit={_number(drive.no_load_speed)},\n"
-            f"    ),  # draw stiffness from {_pair(drive.stiffness_range)}, "
-            f"damping from {_pair(drive.damping_range)}"
-        )
+    entries = "".join(
+        f'    "{drive.group}": DCMotorCfg(\n'
+        f"        joint_names_expr={list(drive.joints)!r},\n"
+        f"{_fields(drive, 'friction')}"
+        f"    ),  # draw stiffness from {_pair(drive.stiffness_range)}, "
+        f"damping from {_pair(drive.damping_range)}\n"
+        for drive in group_drives(gains, robot)
+    )
     warning = (
         "NOT MATCHED IN THIS SIMULATOR. Isaac Lab runs PhysX, whose integrator and joint friction "
         "are not MuJoCo's:\nwith the same numbers the joints respond differently. Take them as a "
         "start, sweep the joints in\nIsaac Lab with the log's own commands, and match again."
     )
-    return "\n".join(
-        [
-            _comment(warning + "\n\n" + _header(gains), "# "),
-            "",
-            "from isaaclab.actuators import DCMotorCfg",
-            "",
-            "ACTUATORS = {",
-            *entries,
-            "}",
-            "",
-        ]
+    return (
+        f"{_comment(f'{warning}{chr(10) * 2}{_header(gains)}')}\n\n"
+        f"from isaaclab.actuators import DCMotorCfg\n\nACTUATORS = {{\n{entries}}}\n"
     )
+
+
+def _fields(drive: GroupDrive, friction: str, **extra: str) -> str:
+    """Arguments of an actuator, by the simulator's names, one a line."""
+    names = {
+        "stiffness": "stiffness",
+        "damping": "damping",
+        "armature": "armature",
+        friction: "frictionloss",
+        **extra,
+        "effort_limit": "effort_limit",
+        "saturation_effort": "stall_torque",
+        "velocity_limit": "no_load_speed",
+    }
+    return "".join(f"        {n}={_number(getattr(drive, f))},\n" for n, f in names.items())
 
 
 EXPORTS: Mapping[str, Callable[[MatchedGains, Robot], str]] = {
     "mjlab": mjlab_text,
     "mjcf": mjcf_text,
     "isaaclab": isaaclab_text,
-    "events": events_text,
 }
 """What `export_text` can write."""
 
 
 def export_text(gains: MatchedGains, target: str, robot: Robot | None = None) -> str:
-    """The gains as text for one simulator.
-
-    Args:
-        gains: Matched gains.
-        target: One of `EXPORTS`.
-        robot: The robot; by the name in the gains if None.
+    """The gains as text for one of `EXPORTS`; the robot is found by its name if not given.
 
     Raises:
         PronkError: The target is unknown, or the gains hold no group.
@@ -288,8 +244,8 @@ def _header(gains: MatchedGains) -> str:
     return "\n".join(lines)
 
 
-def _comment(text: str, mark: str) -> str:
-    return "\n".join((mark + line).rstrip() for line in text.splitlines())
+def _comment(text: str) -> str:
+    return "\n".join(f"# {line}".rstrip() for line in text.splitlines())
 
 
 def _about(centre: float, half: float) -> tuple[float, float]:

@@ -13,32 +13,25 @@ D4) and does not state how it rounded from the matched joints to the group. pron
 From the paper's own matched gains this gives its training gains in all three groups. The
 undamped, damped and resonance frequencies and those of -3 dB, -45 and -90 degrees in step 2 do
 not, and neither do mean, median or mid-range of the stiffness: the rule was chosen because it
-does, and is no more than a statable reading of three pairs of numbers.
-
-The rule `paper` differs in step 3 only: one range for all groups, the largest needed, rounded to
-the nearest. It gives +-2.0 and +-0.05 and, like the paper, leaves one joint out (reading A13).
+does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pronk.errors import RobotError
 from pronk.logs.joint_log import JointLog
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
-from pronk.robots.model import bench_spec
+from pronk.match.identifiability import bench_inertia
 from pronk.robots.robot import Robot
 from pronk.simulators.simulator import SimulatorInfo
 
 Array = NDArray[np.float64]
-Rule = Literal["cover", "paper"]
 
 STIFFNESS_STEP = 0.5
 """Lattice of the paper's training stiffnesses: 20, 17.5, 21.5 N m/rad (Table I)."""
@@ -52,47 +45,31 @@ _SLACK = 1e-6
 """A range that is too small by rounding of the last binary digit still covers."""
 
 
-def group_gains(
-    robot: Robot, joints: Mapping[str, JointGains], *, rule: Rule = "cover"
-) -> dict[str, GroupGains]:
+def group_gains(robot: Robot, joints: Mapping[str, JointGains]) -> dict[str, GroupGains]:
     """Training gains, ranges and joint ellipsoids of every group with a matched joint.
 
-    Args:
-        robot: Gives the groups and the inertias.
-        joints: Matched gains by joint name.
-        rule: `cover` gives each group the smallest range that covers all its joints; `paper` one
-            range for all groups, rounded to the nearest (see the module).
-
-    Returns:
-        By group name, in the robot's order.
-
     Raises:
-        RobotError: A joint is not one of the robot's, or the rule is unknown.
+        RobotError: A joint is not one of the robot's.
     """
-    if rule not in ("cover", "paper"):
-        raise RobotError(f"rule {rule!r}; expected cover or paper.")
-    members = _members(robot, joints)
-    centres = {name: _centre(robot, group) for name, group in members.items()}
-    needed = {name: _needed(centres[name], group) for name, group in members.items()}
-    common = np.max(list(needed.values()), axis=0) if needed else np.zeros(2)
+    for name in joints:
+        robot.joint(name)
     out = {}
-    for name, group in members.items():
-        stiffness, damping = centres[name]
-        if rule == "cover":
-            ranges = [_up(n, s) for n, s in zip(needed[name], _STEPS, strict=True)]
-        else:
-            ranges = [_nearest(n, s) for n, s in zip(common, _STEPS, strict=True)]
-        centre, shape = enclosing(np.concatenate([interval_points(g) for g in group.values()]))
+    for name in robot.groups:
+        group = {j.name: joints[j.name] for j in robot.group(name) if j.name in joints}
+        if not group:
+            continue
+        centre = _centre(robot, group)
+        bounds = np.array([_bounds(gains) for gains in group.values()])
+        needed = np.maximum(bounds.max(axis=(0, 2)) - centre, centre - bounds.min(axis=(0, 2)))
+        middle, shape = enclosing(np.concatenate([interval_points(g) for g in group.values()]))
+        (a, b), (c, d) = shape.tolist()
         out[name] = GroupGains(
-            stiffness=stiffness,
-            damping=damping,
-            stiffness_range=ranges[0],
-            damping_range=ranges[1],
-            ellipsoid=(
-                (float(shape[0, 0]), float(shape[0, 1])),
-                (float(shape[1, 0]), float(shape[1, 1])),
-            ),
-            ellipsoid_center=(float(centre[0]), float(centre[1])),
+            stiffness=centre[0],
+            damping=centre[1],
+            stiffness_range=_up(float(needed[0]), STIFFNESS_STEP),
+            damping_range=_up(float(needed[1]), DAMPING_STEP),
+            ellipsoid=((a, b), (c, d)),
+            ellipsoid_center=(float(middle[0]), float(middle[1])),
         )
     return out
 
@@ -103,14 +80,7 @@ def matched_gains(
     logs: Sequence[JointLog],
     info: SimulatorInfo,
 ) -> MatchedGains:
-    """The artefact: gains of the joints, what training draws from, and what they rest on.
-
-    Args:
-        robot: The robot.
-        joints: Matched gains.
-        logs: The logs that went in.
-        info: The simulator that the gains hold for.
-    """
+    """Make the artefact of matched joints, the logs and the simulator that they hold for."""
     return MatchedGains(
         robot=robot.name,
         simulator=info,
@@ -121,49 +91,6 @@ def matched_gains(
     )
 
 
-def coverage(
-    robot: Robot, groups: Mapping[str, GroupGains], joints: Mapping[str, JointGains]
-) -> dict[str, tuple[str, ...]]:
-    """List what the ranges of the groups leave out (reading A13).
-
-    Args:
-        robot: Gives each joint's group.
-        groups: Training gains and ranges.
-        joints: Matched gains by joint name.
-
-    Returns:
-        By joint name, a sentence for each gain whose value, or else whose 95 % interval, is not
-        inside its group's range; joints that are covered do not appear.
-    """
-    out: dict[str, tuple[str, ...]] = {}
-    for name, group in _members(robot, joints).items():
-        if name not in groups:
-            continue
-        drawn = groups[name]
-        spans = (
-            ("stiffness", drawn.stiffness, drawn.stiffness_range, "N m/rad"),
-            ("damping", drawn.damping, drawn.damping_range, "N m s/rad"),
-        )
-        for joint, gains in group.items():
-            words = []
-            for (what, centre, half, unit), value, bounds in zip(
-                spans, (gains.stiffness, gains.damping), _bounds(gains), strict=True
-            ):
-                if abs(value - centre) > half + _SLACK:
-                    words.append(
-                        f"{what} {value:.4g} {unit} lies outside the {name} range "
-                        f"{centre:.4g} +- {half:.4g}"
-                    )
-                elif max(bounds[1] - centre, centre - bounds[0]) > half + _SLACK:
-                    words.append(
-                        f"{what} {value:.4g} {unit} lies inside the {name} range {centre:.4g} +- "
-                        f"{half:.4g}, its interval {bounds[0]:.4g} to {bounds[1]:.4g} does not"
-                    )
-            if words:
-                out[joint] = tuple(words)
-    return out
-
-
 def characteristic_frequency(robot: Robot, joint_name: str, damping: float) -> float:
     """Half-width of a joint's resonance, `damping / (2 inertia)` [rad/s].
 
@@ -172,28 +99,8 @@ def characteristic_frequency(robot: Robot, joint_name: str, damping: float) -> f
     Raises:
         RobotError: The robot has no such joint.
     """
-    original = robot.joint(joint_name).original[0]
-    model = bench_spec(robot, original).compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    inertia = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, inertia)
-    dof = int(model.jnt_dofadr[model.joint(original).id])
-    return float(damping / (2.0 * inertia[dof, dof]))
-
-
-_STEPS = (STIFFNESS_STEP, DAMPING_STEP)
-
-
-def _members(robot: Robot, joints: Mapping[str, JointGains]) -> dict[str, dict[str, JointGains]]:
-    for name in joints:
-        robot.joint(name)
-    groups = {
-        group: {j.name: joints[j.name] for j in robot.group(group) if j.name in joints}
-        for group in robot.groups
-    }
-    return {name: group for name, group in groups.items() if group}
+    inertia, _ = bench_inertia(robot, robot.joint(joint_name).original[0])
+    return damping / (2.0 * inertia)
 
 
 def _bounds(gains: JointGains) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -223,13 +130,6 @@ def _centre(robot: Robot, group: Mapping[str, JointGains]) -> tuple[float, float
     return _nearest(kept, STIFFNESS_STEP), damping
 
 
-def _needed(centre: tuple[float, float], group: Mapping[str, JointGains]) -> tuple[float, float]:
-    """Half-widths that cover every joint's interval."""
-    bounds = [_bounds(gains) for gains in group.values()]
-    out = [max(max(b[i][1] - centre[i], centre[i] - b[i][0]) for b in bounds) for i in range(2)]
-    return out[0], out[1]
-
-
 def _nearest(value: float, step: float) -> float:
     """Nearest multiple of a step, at least one step, free of binary dust."""
     return round(max(round(value / step), 1) * step, 9)
@@ -243,13 +143,8 @@ def _up(value: float, step: float) -> float:
 def interval_points(gains: JointGains, level: float = 0.95) -> Array:
     """Points on the ellipse that holds a joint's true gains with probability `level`.
 
-    Args:
-        gains: Matched gains and their covariance; where it is not finite, as without repeats,
-            the gains are taken for exact.
-        level: Probability, for two gains jointly.
-
-    Returns:
-        (stiffness, damping) [N m/rad, N m s/rad], shape (24, 2).
+    (stiffness, damping) [N m/rad, N m s/rad], shape (24, 2). Where the covariance is not finite,
+    as without repeats, the gains are taken for exact.
     """
     centre = np.array([gains.stiffness, gains.damping])
     covariance = np.array(gains.covariance, dtype=np.float64)
