@@ -64,7 +64,7 @@ def fresh(env: Any) -> Any:
     env.common_step_counter = 0
     motion_command(env)._motion_step = -1  # what was measured in that step was another's
     env.reset(seed=0)
-    env.termination_manager.compute()  # nobody fell
+    env.termination_manager.compute()  # no robot fell
     return env
 
 

@@ -67,7 +67,7 @@ def falling(sim_params: SimParams, **options: Any) -> VirtualRobot:
 
 
 def down(state: State) -> Array:
-    """Direction of gravity in the trunk's frame, as the machine believes."""
+    """Direction of gravity in the trunk's frame, as the machine reports."""
     w = Rotation.from_quat(state.orientation, scalar_first=True)
     return np.asarray(w.inv().apply([0.0, 0.0, -1.0]))
 

@@ -128,7 +128,7 @@ def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
     assert set(samples[0]) == {
         *("t", "command", "position", "velocity", "torque", "frequency", "segment")
     }
-    # In time order the question is announced before its first sample.
+    # In time order the excitation is announced before its first sample.
     order = [(topic, body.get("segment")) for topic, body in messages]
     assert order.index((SEGMENT, None)) < order.index((SAMPLE, 0))
 

@@ -84,7 +84,7 @@ def test_sweep_match_predict_export(
         assert run(line) == 0, (line, capsys.readouterr())
     matched = yaml.safe_load(gains.read_text())
     drive = load_robot(robot).joint(joint)
-    # The virtual robot gives a tenth more torque than its drive believes.
+    # The virtual robot gives a tenth more torque than its drive computes.
     found = matched["joints"][joint]["stiffness"]
     assert 0.7 * drive.stiffness < found < 1.6 * drive.stiffness
 

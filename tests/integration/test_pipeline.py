@@ -30,12 +30,12 @@ KNOWN = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": 
 
 def log_of(joint: str, known: tuple[float, float], *, seed: int = 0, **more: object) -> JointLog:
     rng = np.random.default_rng(seed)
-    asks = [
+    chirps = [
         Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples(), repeats=3)
         for a in (0.25, 0.125)
     ]
     noise = list(0.001 * rng.standard_normal((6, 6000)))
-    log = synthetic_log(ROBOT, joint, asks, *known, noise=noise, **more)  # type: ignore[arg-type]
+    log = synthetic_log(ROBOT, joint, chirps, *known, noise=noise, **more)  # type: ignore[arg-type]
     return replace(log, source=f"/somewhere/{joint}.mcap", sha256=f"{seed:064x}")
 
 
@@ -151,9 +151,9 @@ def test_a_joint_of_another_kind_is_no_match() -> None:
 
 def test_a_small_amplitude_that_noise_drowns_is_left_out() -> None:
     rng = np.random.default_rng(0)
-    asks = [Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples()) for a in (0.25, 0.01)]
+    chirps = [Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples()) for a in (0.25, 0.01)]
     noise = [np.zeros(6000), 0.1 * rng.standard_normal(6000)]
-    log = synthetic_log(ROBOT, "FR_knee", asks, 20.0, 0.5, noise=noise)
+    log = synthetic_log(ROBOT, "FR_knee", chirps, 20.0, 0.5, noise=noise)
     found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
     assert any(f.startswith("the response at 0.01 rad is left out") for f in found.flags)
     assert np.isnan(found.amplitude_spread)
@@ -162,8 +162,8 @@ def test_a_small_amplitude_that_noise_drowns_is_left_out() -> None:
 
 def test_a_multisine_is_matched_through_its_lines() -> None:
     signal = Multisine(amplitude=0.25)
-    ask = Excitation(offsets=signal.samples(), kind="multisine", band_hz=signal.band_hz)
-    log = synthetic_log(ROBOT, "FR_knee", [ask], 21.0, 0.5)
+    chirp = Excitation(offsets=signal.samples(), kind="multisine", band_hz=signal.band_hz)
+    log = synthetic_log(ROBOT, "FR_knee", [chirp], 21.0, 0.5)
     log = replace(log, segments=tuple(replace(s, period_s=signal.period_s) for s in log.segments))
     found = match_logs([log], ROBOT, settings=QUICK).gains.joints["FR_knee"]
     assert (found.stiffness, found.damping) == pytest.approx((21.0, 0.5), rel=5e-3)

@@ -96,7 +96,7 @@ def test_a_command_moves_the_machine() -> None:
 def test_what_the_drives_do_when_commands_stop(action: str) -> None:
     server, wire, _ = made(watchdog=Watchdog(action=action, after_s=0.1))  # type: ignore[arg-type]
     live(server, 0.0, 0.5)
-    # Nobody has commanded yet: the drives hold what they held.
+    # Before the first command: the drives hold what they held.
     assert "silences" not in server.counts
     for k in range(20):
         wire.inbox.append(RAISED)

@@ -231,8 +231,8 @@ def test_a_hundred_thousand_mutated_commands_move_nothing() -> None:
     """Refused and counted, or the same command: the bytes between the numbers carry nothing."""
     wire = DdsServerTransport(ROBOT, own_network(1))
     data = encode_command(JOINTS, turned(0.3))
-    honest = wire.receive(data)
-    assert honest is not None
+    intact = wire.receive(data)
+    assert intact is not None
     rng = np.random.default_rng(0)
     same = 0
     for _ in range(100_000):
@@ -240,7 +240,7 @@ def test_a_hundred_thousand_mutated_commands_move_nothing() -> None:
         if met is not None:
             same += 1
             for name in ("position", "stiffness", "damping"):
-                np.testing.assert_array_equal(getattr(met, name), getattr(honest, name))
+                np.testing.assert_array_equal(getattr(met, name), getattr(intact, name))
     refused = sum(count for name, count in wire.counts.items() if name.startswith("refused"))
     assert wire.counts["commands"] == same + 1 < 2000
     assert refused + same == 100_000

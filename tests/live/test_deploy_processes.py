@@ -163,7 +163,7 @@ def test_loss_and_killed_processes(running: tuple[Deployment, Path, Path]) -> No
     hold(deployment, 2.0, Mode.FAULT)
     hold(deployment, 0.2)
     assert first_damping(wire, killed) <= DAMPED_S
-    # It does not come back by itself, nor by asking to stand: the fault is latched.
+    # It does not come back by itself, nor by a request to stand: the fault is latched.
     hold(deployment, 1.2, None, OperatorRequest.STAND)
     assert deployment.mode is Mode.FAULT
     deployment.close()

@@ -62,7 +62,7 @@ class PatientLink(Link):
 
 
 class Wire:
-    """Hears every command on a wire, and speaks on it as another program would."""
+    """Records every command on a wire, and sends on it as another program would."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class Wire:
     def hush(self) -> None:
         self._speaking.clear()
 
-    def heard(self) -> tuple[np.ndarray, np.ndarray]:
+    def received(self) -> tuple[np.ndarray, np.ndarray]:
         """When each command that is not its own came [s], and whether it damps."""
         met = [(when, self._decode(data)) for when, data in self._met]
         others = [
@@ -124,22 +124,22 @@ def over_lcm(port: int) -> Wire:
     from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
     from pronk.links.lcm.link import url_of
 
-    mouth, ear = (lcm.LCM(url_of(port=port)) for _ in range(2))
+    sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))
     met: list[tuple[float, bytes]] = []
 
-    def hear(_: str, data: bytes) -> None:
+    def receive(_: str, data: bytes) -> None:
         met.append((time.monotonic(), data))
 
     def listen() -> list[tuple[float, bytes]]:
-        ear.handle_timeout(20)
+        listener.handle_timeout(20)
         found = met.copy()
         met.clear()
         return found
 
-    ear.subscribe(CHEETAH.command_channel, hear).set_queue_capacity(500)
+    listener.subscribe(CHEETAH.command_channel, receive).set_queue_capacity(500)
     data = encode_command(CHEETAH, OTHER)
     return Wire(
-        lambda: mouth.publish(CHEETAH.command_channel, data),
+        lambda: sender.publish(CHEETAH.command_channel, data),
         listen,
         lambda data: decode_command(CHEETAH, data),
     )
@@ -151,25 +151,27 @@ def over_dds(domain: int) -> Wire:
     from pronk.links.dds.codec import decode_command, encode_command, joint_map
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
-    mouth = own.writer(COMMANDS, idl.LowCmd, raw=True)
-    ear = own.reader(COMMANDS, idl.LowCmd, raw=True, own=False)
+    sender = own.writer(COMMANDS, idl.LowCmd, raw=True)
+    listener = own.reader(COMMANDS, idl.LowCmd, raw=True, own=False)
     counts: Counter[str] = Counter()
     # Every sample says when it was written, by the wall clock.
     wall = time.time() - time.monotonic()
 
     def listen() -> list[tuple[float, bytes]]:
         time.sleep(0.002)
-        return [(m.sample_info.source_timestamp * 1e-9 - wall, m.data) for m in take(ear, counts)]
+        return [
+            (m.sample_info.source_timestamp * 1e-9 - wall, m.data) for m in take(listener, counts)
+        ]
 
     data = encode_command(joints, OTHER)
     return Wire(
-        lambda: write(mouth, data, counts), listen, lambda data: decode_command(joints, data)
+        lambda: write(sender, data, counts), listen, lambda data: decode_command(joints, data)
     )
 
 
 @pytest.fixture(scope="module", params=["lcm", "dds"])
 def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
-    """A virtual robot of its own, and another program's ear and mouth at its wire."""
+    """A virtual robot of its own, and another program's listener and sender at its wire."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         port = int(probe.getsockname()[1])
@@ -234,7 +236,7 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
     with pytest.raises(HardwareError, match="was not opened: another program commands the joints"):
         refused.__enter__()
     wire.hush()
-    assert len(wire.heard()[0]) == 0
+    assert len(wire.received()[0]) == 0
     assert len(refused.summary.refusals) == 1
 
     # It comes up while the policy runs.
@@ -249,12 +251,12 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
         hold(deployment, Mode.FAULT)
         until = time.monotonic() + 0.3
         while time.monotonic() < until:
-            # It does not come back by itself, nor by asking to stand.
+            # It does not come back by itself, nor by a request to stand.
             deployment.write(OperatorCommand(request=OperatorRequest.STAND, held=True))
             time.sleep(0.01)
         assert deployment.mode is Mode.FAULT
     wire.hush()
-    when, damps = wire.heard()
+    when, damps = wire.received()
     assert not damps[(when < wire.began) & (when > wire.began - 0.2)].any()
     first = when[damps & (when > wire.began)][0]
     assert first - wire.began <= DAMPED_S

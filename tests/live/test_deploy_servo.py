@@ -77,14 +77,14 @@ class Run:
             assert time.monotonic() < end, (self.servo.machine_state.mode, self.said)
             stick["time"], stick["held"] = time.monotonic(), 1
             self.shared.operator.write(stick)
-            self.hear()
+            self.receive()
             time.sleep(0.005)
-        self.hear()
+        self.receive()
 
     def mode(self, mode: Mode, request: OperatorRequest = OperatorRequest.NONE) -> None:
         self.until(lambda: self.servo.machine_state.mode is mode, request)
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         self.said += [
             (each["kind"].decode(), each["text"].decode())
             for each in self.shared.events_seen.take()
@@ -111,7 +111,7 @@ def flown(link: Any, **more: Any) -> Iterator[Run]:
         run.servo.stop()
         run.leave()
         shared.close()
-        # What the servo asks of its process, this one does not want.
+        # Real-time scheduling is left out here.
         sys.setswitchinterval(before)
         gc.unfreeze()
         gc.enable()
@@ -127,7 +127,7 @@ def test_a_link_that_cannot_be_opened_says_why() -> None:
 def test_without_any_state_requests_are_read(faults: FaultyLink) -> None:
     faults.freeze.set()
     with flown(faults) as run:
-        # Whoever waits for the servo's first word gets it, and a sentence with it.
+        # A process that waits for the servo's start gets the error.
         run.until(lambda: run.shared.state.written > 0)
         run.until(lambda: bool(run.texts("refused")))
         run.mode(Mode.IDLE)

@@ -51,12 +51,12 @@ class Flight:
 
     def says(self, word: str) -> None:
         assert self.process.stdout is not None
-        heard = []
+        received = []
         for line in self.process.stdout:
-            heard.append(line.strip())
-            if heard[-1] == word:
+            received.append(line.strip())
+            if received[-1] == word:
                 return
-        pytest.fail(f"{word} was not said: {heard}")
+        pytest.fail(f"{word} was not printed: {received}")
 
     def signal(self, number: signal.Signals) -> None:
         """As a terminal does: to every process in front of it."""
@@ -99,7 +99,7 @@ def test_a_lost_connection_and_impatient_keys_damp_and_keep_the_log(
 ) -> None:
     with flown(policy, tmp_path / "run.mcap") as flight:
         flight.signal(signal.SIGHUP)
-        # Whoever presses Ctrl-C again and again breaks into nothing.
+        # Repeated Ctrl-C does not interrupt the end.
         for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGINT, signal.SIGTERM, signal.SIGINT):
             time.sleep(0.2)
             flight.signal(number)
@@ -114,7 +114,7 @@ def test_a_lost_connection_and_impatient_keys_damp_and_keep_the_log(
 
 def test_a_stopped_program_damps_and_can_be_ended_later(policy: Path, tmp_path: Path) -> None:
     with flown(policy, tmp_path / "run.mcap") as flight:
-        # As Ctrl-Z does; that itself stops nobody whose terminal is not a shell's.
+        # As Ctrl-Z does in a shell's terminal.
         stopped = time.monotonic()
         flight.signal(signal.SIGSTOP)
         time.sleep(1.0)
@@ -144,7 +144,7 @@ def test_a_killed_program_damps_and_the_log_holds_it(policy: Path, tmp_path: Pat
             time.sleep(0.1)
     assert not log.complete
     assert log.figures == {}
-    # That nobody holds the stick any more is found by itself too.
+    # A released dead-man button is found as well.
     assert course(log) in ([Mode.POLICY, Mode.DAMP], [Mode.POLICY, Mode.DAMP, Mode.FAULT])
     assert damped_at_the_end(log) >= DAMPED_S
     texts = [event.text for event in log.events]

@@ -70,7 +70,7 @@ def slow(limit: float) -> Robot:
 
 @pytest.fixture(scope="module")
 def port() -> Iterator[int]:
-    """Where a virtual robot of its own is heard."""
+    """Address of a virtual robot of its own."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         number = int(probe.getsockname()[1])
@@ -90,18 +90,18 @@ def port() -> Iterator[int]:
         running.communicate()
 
 
-class Ear:
-    """Hears the commands on the wire."""
+class Listener:
+    """Records the commands on the wire."""
 
     def __init__(self, port: int) -> None:
-        self.heard: list[tuple[float, Command]] = []
+        self.received: list[tuple[float, Command]] = []
         """Each with the time at which it came [s]."""
         self._lcm = lcm.LCM(url_of(port=port))
         self._lcm.subscribe(CHEETAH.command_channel, self._hear)
         self._open = True
         self._thread = threading.Thread(target=self._listen)
 
-    def __enter__(self) -> Ear:
+    def __enter__(self) -> Listener:
         self._thread.start()
         return self
 
@@ -112,17 +112,19 @@ class Ear:
     @property
     def commanded(self) -> float:
         """When joints were last held, not damped [s]."""
-        return max((when for when, command in self.heard if command.stiffness.any()), default=-1e9)
+        return max(
+            (when for when, command in self.received if command.stiffness.any()), default=-1e9
+        )
 
     def damped(self, fault: float) -> float:
         """When damping came after a fault, for a second, and nothing else since [s]."""
-        first = min(when for when, c in self.heard if when > fault and not c.stiffness.any())
+        first = min(when for when, c in self.received if when > fault and not c.stiffness.any())
         assert self.commanded < first
-        assert self.heard[-1][0] - first >= 0.95  # as far as this thread can tell
+        assert self.received[-1][0] - first >= 0.95  # as far as this thread can tell
         return first
 
     def _hear(self, _: str, data: bytes) -> None:
-        self.heard.append((time.monotonic(), decode_command(CHEETAH, data)))
+        self.received.append((time.monotonic(), decode_command(CHEETAH, data)))
 
     def _listen(self) -> None:
         while self._open:
@@ -164,7 +166,7 @@ def once_written(path: Path, what: Callable[[], None]) -> threading.Thread:
 
 def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
     plan = plan_of("FR_knee")
-    with Ear(port) as ear:
+    with Listener(port) as listener:
         recorded = swept(ROBOT, plan, tmp_path, port)
     assert recorded.virtual
     assert recorded.servo["n"] > 100
@@ -185,19 +187,19 @@ def test_a_knee_is_swept_over_lcm(port: int, tmp_path: Path) -> None:
     assert log.segments[0].clamped == ("FR_hip_roll", "FR_hip_pitch")
     assert np.unique(part.command[:, knee]).size > 20
     # It is left damped.
-    np.testing.assert_array_equal(ear.heard[-1][1].stiffness, 0.0)
+    np.testing.assert_array_equal(listener.received[-1][1].stiffness, 0.0)
 
 
 def test_a_breach_damps_and_keeps_a_log_that_reads(
     port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with Ear(port) as ear, pytest.raises(HardwareError, match="rad/s"):
+    with Listener(port) as listener, pytest.raises(HardwareError, match="rad/s"):
         swept(slow(3.0), plan_of("FR_hip_roll"), tmp_path, port)
     log = read_mcap(tmp_path / "FR_hip_roll.mcap")
     assert not log.complete
     assert "rad/s" in log.notes[0]
     assert "FR_hip_roll.mcap" in capsys.readouterr().err
-    np.testing.assert_array_equal(ear.heard[-1][1].stiffness, 0.0)
+    np.testing.assert_array_equal(listener.received[-1][1].stiffness, 0.0)
 
 
 def test_who_else_commands_later_ends_the_sweep(port: int, tmp_path: Path) -> None:
@@ -232,17 +234,17 @@ def test_a_command_that_is_killed_leaves_the_joints_damped_and_a_log(
 ) -> None:
     path = tmp_path / "FR_hip_roll.mcap"
     running = get_context("spawn").Process(target=owner, args=(tmp_path, port))
-    with Ear(port) as ear:
+    with Listener(port) as listener:
         running.start()
         await_(lambda: bool((log := written(path)) and log.segments))
         killed = time.monotonic()
         running.kill()
         running.join()
-        # The system takes its memory away before anybody can know: 15 ms if it is not busy.
+        # The system frees its memory before the end is noticed: 15 ms if it is not busy.
         gone = time.monotonic()
-        # The servo is nobody's child now; when it is silent it has gone.
-        await_(lambda: time.monotonic() - ear.heard[-1][0] > 0.2)
-    assert ear.damped(killed) - gone < DAMPED_S
+        # The servo has no parent now; when it is silent it has ended.
+        await_(lambda: time.monotonic() - listener.received[-1][0] > 0.2)
+    assert listener.damped(killed) - gone < DAMPED_S
     log = read_mcap(path)
     assert not log.complete
     # The logger outlives the program that started it.
@@ -260,7 +262,7 @@ def test_a_servo_that_is_killed_is_said_and_the_log_ends(
         (servo,) = (child for child in active_children() if child.name == "pronk servo")
         servo.kill()
 
-    with Ear(port) as ear:
+    with Listener(port) as listener:
         killer = once_written(path, kill)
         with pytest.raises(HardwareError, match="servo's process was killed"):
             swept(ROBOT, plan_of("FR_hip_roll"), tmp_path, port)
@@ -269,7 +271,7 @@ def test_a_servo_that_is_killed_is_said_and_the_log_ends(
     assert not log.complete
     assert "servo's process was killed" in log.notes[0]
     # To the last of what it did.
-    assert ear.commanded - log.time[-1] < 0.1
+    assert listener.commanded - log.time[-1] < 0.1
     assert "FR_hip_roll.mcap" in capsys.readouterr().err
 
 
@@ -281,16 +283,16 @@ def test_the_interrupt_key_damps_and_keeps_the_log(port: int, tmp_path: Path) ->
         pressed.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
-    with Ear(port) as ear:
+    with Listener(port) as listener:
         finger = once_written(path, press)
         with pytest.raises(KeyboardInterrupt):
             swept(ROBOT, plan_of("FR_hip_roll"), tmp_path, port)
         finger.join()
-    assert ear.damped(pressed[0]) - pressed[0] < DAMPED_S
+    assert listener.damped(pressed[0]) - pressed[0] < DAMPED_S
     log = read_mcap(path)
     assert not log.complete
     assert "interrupted" in log.notes[0]
-    assert abs(log.time[-1] - ear.commanded) < 0.1
+    assert abs(log.time[-1] - listener.commanded) < 0.1
     assert not active_children()
 
 
@@ -317,7 +319,7 @@ def test_a_person_clamps_joints_when_requested(
         person(())
         assert "free FR_hip_roll, FR_hip_pitch" in capsys.readouterr().out
         hand.close()
-        with pytest.raises(HardwareError, match="nobody is there"):
+        with pytest.raises(HardwareError, match="no person is there"):
             person(("FR_knee",))
 
 

@@ -187,12 +187,12 @@ def test_knee_alone_is_the_second_order_joint_of_the_paper() -> None:
     time = np.arange(len(steps)) * 1e-4
     decay, natural = damping / (2 * inertia), np.sqrt(stiffness / inertia)
     ringing = np.sqrt(natural**2 - decay**2)
-    truth = 0.1 * (
+    expected = 0.1 * (
         1
         - np.exp(-decay * time)
         * (np.cos(ringing * time) + decay / ringing * np.sin(ringing * time))
     )
-    np.testing.assert_allclose(position, truth, atol=3e-4)
+    np.testing.assert_allclose(position, expected, atol=3e-4)
 
 
 @pytest.mark.parametrize(
@@ -207,11 +207,11 @@ def test_native_model_is_the_explicit_law(name: str, amplitude: float, stiffness
     }
     model = bench_spec(CHEETAH, name, **gains).compile()
     command = commands(model, name, held_chirp(CHEETAH, 4.0, amplitude))
-    truth, clipped = explicit_law(
+    expected, clipped = explicit_law(
         CHEETAH, bench_spec(CHEETAH, name, **gains), stiffness, 0.4, command
     )
     assert (clipped > 0.2) == (stiffness == 90.0), "one case is deep in saturation, two are not"
-    np.testing.assert_allclose(simulate(model, command), truth, atol=1e-9 if clipped else 1e-12)
+    np.testing.assert_allclose(simulate(model, command), expected, atol=1e-9 if clipped else 1e-12)
 
 
 def test_torque_speed_line_binds_as_in_the_explicit_law() -> None:
@@ -221,11 +221,11 @@ def test_torque_speed_line_binds_as_in_the_explicit_law() -> None:
     spec = bench_spec(robot, "FR_knee", stiffness={"FR_knee": 40.0})
     model = spec.compile()
     command = commands(model, "FR_knee", held_chirp(robot, 4.0, 0.5))
-    truth, clipped = explicit_law(robot, spec, 40.0, 0.4, command)
-    speed = np.abs(np.diff(truth[:, 0])).max() / robot.timestep_s
+    expected, clipped = explicit_law(robot, spec, 40.0, 0.4, command)
+    speed = np.abs(np.diff(expected[:, 0])).max() / robot.timestep_s
     assert clipped > 0.1
     assert 8.0 < speed < 11.0, "it ran into the no-load speed"
-    np.testing.assert_allclose(simulate(model, command), truth, atol=1e-9)
+    np.testing.assert_allclose(simulate(model, command), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("joint", CHEETAH.joints, ids=lambda joint: joint.name)
@@ -248,8 +248,8 @@ def test_whole_arm_moves_at_once() -> None:
     command = np.tile(model.key("default").ctrl, (len(offset), 1)) + offset[:, None]
     position = simulate(model, command)
     assert np.all(np.ptp(position, axis=0) > 0.05)
-    truth, _ = explicit_law(ARM, bench_spec(ARM, "elbow_flex"), 17.8, 0.6, command)
-    np.testing.assert_allclose(position, truth, atol=1e-9)
+    expected, _ = explicit_law(ARM, bench_spec(ARM, "elbow_flex"), 17.8, 0.6, command)
+    np.testing.assert_allclose(position, expected, atol=1e-9)
 
 
 # --- mjlab --------------------------------------------------------------------------------------

@@ -46,9 +46,9 @@ def gains_of(joint: str) -> tuple[float, float]:
 def known(
     joint: str, *, length_s: float = 20.0, settings: MatchSettings = SETTINGS
 ) -> MeasuredJoint:
-    ask = Excitation(offsets=Chirp(length_s=length_s).samples())
+    chirp = Excitation(offsets=Chirp(length_s=length_s).samples())
     return measured_joints(
-        synthetic_log(ROBOT, joint, [ask], *gains_of(joint)), joint, ROBOT, settings
+        synthetic_log(ROBOT, joint, [chirp], *gains_of(joint)), joint, ROBOT, settings
     )[0]
 
 
@@ -76,11 +76,11 @@ def test_table_1_is_found_again_by_every_joint() -> None:
 def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
     """All 2,500 pairs simulated, two mirror-image knees at once (a short chirp to 18 Hz)."""
     quick = MatchSettings(estimator=Estimator(segment_s=2.0))
-    ask = Excitation(offsets=Chirp(length_s=4.0, stop_hz=18.0).samples(), settle_s=0.2)
+    chirp = Excitation(offsets=Chirp(length_s=4.0, stop_hz=18.0).samples(), settle_s=0.2)
     goals = [
-        measured_joints(synthetic_log(ROBOT, joint, [ask], *gains_of(joint)), joint, ROBOT, quick)[
-            0
-        ]
+        measured_joints(
+            synthetic_log(ROBOT, joint, [chirp], *gains_of(joint)), joint, ROBOT, quick
+        )[0]
         for joint in ("FR_knee", "HL_knee")
     ]
     assert len(alike(goals, ROBOT)) == 1
@@ -114,8 +114,8 @@ def test_rolls_moved_to_the_same_side_share_most_of_a_simulation() -> None:
 
 
 def test_the_edge_of_the_grid_is_noticed() -> None:
-    ask = Excitation(offsets=Chirp(length_s=8.0).samples())
-    log = synthetic_log(ROBOT, "FR_knee", [ask], 32.0, 0.6)
+    chirp = Excitation(offsets=Chirp(length_s=8.0).samples())
+    log = synthetic_log(ROBOT, "FR_knee", [chirp], 32.0, 0.6)
     goal = measured_joints(log, "FR_knee", ROBOT, SETTINGS)[0]
     with MujocoSimulator(ROBOT) as simulator:
         found = search(simulator.rig("FR_knee"), [goal], *axes(ROBOT, 8))[0]
@@ -175,9 +175,9 @@ def test_the_band_is_that_of_the_joint() -> None:
 
 def test_an_incoherent_band_is_refused() -> None:
     rng = np.random.default_rng(0)
-    ask = Excitation(offsets=Chirp(length_s=10.0, amplitude=0.02).samples())
+    chirp = Excitation(offsets=Chirp(length_s=10.0, amplitude=0.02).samples())
     log = synthetic_log(
-        ROBOT, "FR_knee", [ask], 20.0, 0.5, noise=[0.1 * rng.standard_normal(20_000)]
+        ROBOT, "FR_knee", [chirp], 20.0, 0.5, noise=[0.1 * rng.standard_normal(20_000)]
     )
     with pytest.raises(IdentifiabilityError, match=r"FR_knee is coherent .* larger amplitude"):
         measured_joints(log, "FR_knee", ROBOT, SETTINGS)

@@ -23,15 +23,15 @@ SETTINGS = MatchSettings()
 
 
 def known(joint: str, stiffness: float, damping: float, *, length_s: float = 10.0) -> MeasuredJoint:
-    ask = Excitation(offsets=Chirp(length_s=length_s).samples())
+    chirp = Excitation(offsets=Chirp(length_s=length_s).samples())
     return measured_joints(
-        synthetic_log(ROBOT, joint, [ask], stiffness, damping), joint, ROBOT, SETTINGS
+        synthetic_log(ROBOT, joint, [chirp], stiffness, damping), joint, ROBOT, SETTINGS
     )[0]
 
 
 def test_without_friction_the_closed_form_is_the_simulation() -> None:
-    ask = Excitation(offsets=Chirp().samples())
-    log = synthetic_log(ROBOT, "FR_knee", [ask], 20.0, 0.5, frictionloss=0.0)
+    chirp = Excitation(offsets=Chirp().samples())
+    log = synthetic_log(ROBOT, "FR_knee", [chirp], 20.0, 0.5, frictionloss=0.0)
     measured = measured_joints(log, "FR_knee", ROBOT, SETTINGS)[0].measured
     with JointTestRig(ROBOT, "FR_knee", frictionloss=0.0) as rig:
         closed = plant(rig, np.array([1.6]), measured.omega).response(20.0, 0.5)[0]
@@ -87,8 +87,8 @@ def test_the_quick_way_finds_what_simulating_everything_finds() -> None:
     joints = {"FR_hip_pitch": (17.7, 0.406), "FR_knee": (22.0, 0.523)}
     goals = []
     for joint, gains in joints.items():
-        ask = Excitation(offsets=Chirp(length_s=8.0).samples())
-        log = synthetic_log(ROBOT, joint, [ask], *gains, frictionloss=0.4)
+        chirp = Excitation(offsets=Chirp(length_s=8.0).samples())
+        log = synthetic_log(ROBOT, joint, [chirp], *gains, frictionloss=0.4)
         goals.append(measured_joints(log, joint, ROBOT, SETTINGS)[0])
     grid = axes(ROBOT, 18)
     with MujocoSimulator(ROBOT) as simulator:
@@ -110,7 +110,7 @@ def test_the_quick_way_finds_what_simulating_everything_finds() -> None:
 
 
 def test_the_horizon_changes_no_gain() -> None:
-    """Steps that the estimator does not hear of in the band are left out: 0.003 dB at most."""
+    """Steps without effect on the estimate in the band are left out: 0.003 dB at most."""
     goal = known("FR_hip_pitch", 17.0, 0.4, length_s=20.0)
     assert goal.steps < 0.8 * len(goal.matrix)
     with MujocoSimulator(ROBOT) as simulator:

@@ -257,7 +257,7 @@ def test_the_virtual_robot_has_an_address() -> None:
         Address.parse("sim://no_base").machine(ROBOT)
 
 
-# --- A link of somebody else --------------------------------------------------------------------
+# --- A link of another package --------------------------------------------------------------------
 
 
 class Serial:

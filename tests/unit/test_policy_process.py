@@ -37,7 +37,7 @@ def running() -> Iterator[PolicyProcess]:
 
 
 def states(count: int) -> list[State]:
-    """Of a robot that fidgets."""
+    """Of a robot that moves a little."""
     still = standing(load_policy(POLICY).contract)
     rng = np.random.default_rng(3)
     return [
@@ -122,7 +122,7 @@ def test_a_state_that_is_none_gives_no_order_and_one_complaint() -> None:
         assert process.shared.actions.read() is None
         (last_error,) = process.shared.policy_events.take()
         assert b"velocity" in bytes(last_error["text"])
-        # The next good state is answered.
+        # The next good state gives an action.
         publish(process, states(1)[0], Mode.POLICY, 1)
         process.step(Pace(50.0))
         assert process.shared.actions.read() is not None
@@ -147,11 +147,11 @@ def test_warm_ups_lie_in_the_last_two_milliseconds(took: float) -> None:
         most = max(most, count)
         if most >= (1 if took > LEAD_S else 2):
             break
-    # One that takes longer than there is room is not done a second time.
+    # One that takes longer than the time left is not done a second time.
     assert most == 1 if took > LEAD_S else most >= 2
 
 
 def test_nothing_is_rehearsed_for_a_deadline_that_has_passed() -> None:
     assert warm_up_until(time.monotonic() - 1.0, pytest.fail) == 0  # type: ignore[arg-type]
-    # Nor where there is less room than the first one needs.
+    # Nor where there is less time than the first one needs.
     assert warm_up_until(time.monotonic() + 5e-4, pytest.fail) == 0  # type: ignore[arg-type]

@@ -194,10 +194,10 @@ def test_a_fault_lasts_a_second_and_a_latched_one_until_somebody_says_so() -> No
         assert sent is None
         assert found.level == memory.level
         assert after.faulted
-        assert released(memory, 10.0 + LEAST_DAMPING_S - 1e-6, mended=True).faulted
+        assert released(memory, 10.0 + LEAST_DAMPING_S - 1e-6, acknowledged=True).faulted
     assert not released(soft, 10.0 + LEAST_DAMPING_S).faulted
     assert released(hard, 1e6).faulted
-    assert not released(hard, 10.0 + LEAST_DAMPING_S, mended=True).faulted
+    assert not released(hard, 10.0 + LEAST_DAMPING_S, acknowledged=True).faulted
 
 
 def test_a_fault_can_only_become_worse() -> None:
@@ -212,7 +212,7 @@ def test_a_fault_can_only_become_worse() -> None:
 
 
 def test_torque_is_limited_by_moving_the_target() -> None:
-    # By hand: 17 N m at 17 N m/rad is 1 rad, and 0.4 N m s/rad at 2.5 rad/s is 1 N m more room.
+    # By hand: 17 N m at 17 N m/rad is 1 rad, and 0.4 N m s/rad at 2.5 rad/s is 1 N m more.
     v = np.zeros(N)
     v[0] = 2.5
     target = POSE.copy()

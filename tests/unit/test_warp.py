@@ -66,8 +66,8 @@ def positions(rig: JointTestRig, commands: list[Array], poses: list[Array], rows
 def test_positions_agree_within_single_precision(joint: str, frictionloss: float | None) -> None:
     pytest.importorskip("mujoco_warp")
     with both(joint, frictionloss=frictionloss) as (known, warped):
-        ask = ([command(2.0)], [default_pose(known)])
-        expected, got = positions(known, *ask), positions(warped, *ask)
+        request = ([command(2.0)], [default_pose(known)])
+        expected, got = positions(known, *request), positions(warped, *request)
         assert warped.count.steps == expected.size
     assert np.ptp(expected, axis=1).min() > 0.1
     # Equal would mean that both ran on the processor.
@@ -80,10 +80,10 @@ def test_simulations_with_their_own_command_and_pose() -> None:
     with both("FR_hip_roll") as (known, warped):
         shared = ([command(1.0)], [default_pose(known)])
         first = positions(warped, *shared)
-        asks = [command(1.0, amplitude) for amplitude in (0.25, -0.2, 0.15)]
+        commands = [command(1.0, amplitude) for amplitude in (0.25, -0.2, 0.15)]
         poses = [default_pose(known) + np.array(turn) for turn in np.eye(3) * 0.1]
-        expected = positions(known, asks, poses, rows=3)
-        assert np.abs(positions(warped, asks, poses, rows=3) - expected).max() < ROUNDING
+        expected = positions(known, commands, poses, rows=3)
+        assert np.abs(positions(warped, commands, poses, rows=3) - expected).max() < ROUNDING
         # Nothing of one run is left in the next, nor of a larger one in a smaller.
         assert np.array_equal(positions(warped, *shared), first)
         assert np.array_equal(positions(warped, *shared, rows=2), first[:2])
@@ -93,8 +93,8 @@ def test_simulations_with_their_own_command_and_pose() -> None:
 def test_few_simulations_stay_in_double_precision() -> None:
     pytest.importorskip("mujoco_warp")
     with both("FR_knee", least=6) as (known, warped):
-        ask = ([command(1.0)], [default_pose(known)])
-        assert np.array_equal(positions(known, *ask), positions(warped, *ask))
+        request = ([command(1.0)], [default_pose(known)])
+        assert np.array_equal(positions(known, *request), positions(warped, *request))
 
 
 @pytest.mark.train

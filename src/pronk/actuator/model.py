@@ -1,6 +1,6 @@
 """Motor and gearbox physics as pure functions.
 
-Everything is at the joint (output of the gear) unless a name says motor, in SI units, and
+Everything is at the joint (output of the gear) unless a name contains motor, in SI units, and
 broadcasts over arrays. Signs: torque is what the drive puts on the joint, positive along the
 joint axis; power and current are positive when drawn from the bus, negative when the drive
 brakes hard enough to feed the bus (regeneration).

@@ -160,7 +160,7 @@ def confirm(robot: str, where: str) -> None:
         HardwareError: Another word was typed.
     """
     say(
-        f"A real {robot} at {where} is about to move. Keep everybody out of its reach; the first "
+        f"A real {robot} at {where} is about to move. Keep people out of its reach; the first "
         "time, hang it up."
     )
     try:
@@ -198,7 +198,7 @@ class Person:
             pass
         if not sys.stdin.readline():
             raise HardwareError(
-                "nobody is there to fix joints by hand; sweep joints that need no clamp "
+                "no person is there to fix joints by hand; sweep joints that need no clamp "
                 "(--joints), or run this from a terminal."
             )
         self._fixed = joints

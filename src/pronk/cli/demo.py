@@ -101,7 +101,7 @@ def demo(
 
 
 def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
-    """Return the policies to try, the matched one first; a warning says why there are none.
+    """Return the policies to try, the matched one first; a warning if there are none.
 
     Args:
         folder: Searched with its folders; the policies of pronk's source if None.

@@ -45,7 +45,7 @@ def match(
             delay at known stiffness.
         quick: Search the linearized model, verify by simulation.
         zero_armature: Repeat the search without rotor inertia.
-        free: drive: fit this instead; repeat it. What the sweeps cannot tell apart is refused.
+        free: drive: fit this instead; repeat it. What the sweeps cannot separate is refused.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
             pronk[train]).

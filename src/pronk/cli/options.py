@@ -39,7 +39,7 @@ class LinkOptions:
     domain: int | None = None
     """Domain of DDS."""
     release: Annotated[bool, tyro.conf.arg(name="disable-onboard-controller")] = False
-    """Make the robot's own controller let go of the joints."""
+    """Switch off the robot's own controller."""
     real_time: bool = True
     """Request real-time scheduling (by wire)."""
     sim_params: Path | None = None

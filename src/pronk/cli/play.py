@@ -28,7 +28,7 @@ def play(
         sim_params: Body of the virtual robot; the one that ships with pronk if left
             out.
         port: Of the page; the next one that is free.
-        host: Address to bind to. 0.0.0.0 lets everybody on your networks play.
+        host: Address to bind to. 0.0.0.0 admits every computer on your networks.
         gamepad: Use a gamepad that is plugged into this machine; if there is one, if
             left out.
         seed: Of the virtual robot's noise.

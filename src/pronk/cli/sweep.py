@@ -236,7 +236,7 @@ def record_wire(
         plan: What to excite; checked by the caller.
         out: Folder for the logs.
         address: Where the robot is.
-        release: Make its own controller let go of the joints first.
+        release: Switch off the robot's own controller first.
         overwrite: Replace logs that exist.
         real_time: Request real-time scheduling, and print what was granted.
         limits: Other values for scalar limits of the safety filter.

@@ -360,7 +360,7 @@ class JumpFigures:
         "1",
         "least distance over c .. e of the motor torque from the drive's torque-speed curve at "
         "nominal bus voltage and that speed, as a share of the effort limit; 0 on the curve, "
-        "negative beyond it, as where a motor gives more than its drive believes",
+        "negative beyond it, where a motor gives more than its drive computes",
     )
 
     @property

@@ -91,7 +91,7 @@ TABLE_III: Mapping[str, PaperCell] = {
 that with `forward 2`, digit by digit: most likely an error of the table (reading A4)."""
 
 PAPER_RATIOS = {"height": 1.48, "distance": 2.08}
-"""Ratio of the mean standard deviations, naive over matched, as Table III gives it; the text says
+"""Ratio of the mean standard deviations, naive over matched, as Table III gives it; the text has
 2.30 for the distance (reading A4)."""
 
 

@@ -239,7 +239,7 @@ def scatter(trial: Results, other: str | None = None) -> Sheet:
         f"Standard deviations, {other} over {first}, with 95 % bootstrap intervals",
         rows,
         f"all: ratio of the means over {', '.join(trial.pooled)}.",
-        "paper: naive over matched; its Table III gives 2.08 in distance, its text says 2.30 "
+        "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30 "
         "(reading A4).",
         verdict(trial, other),
     )

@@ -182,7 +182,7 @@ def make_plan(
     """Plan a sweep, and forecast its effect on the robot.
 
     One joint at a time (paper F1), in the order of the robot's files; each amplitude `repeats`
-    times. Joints that the robot says must be clamped for an excitation are (paper F6), the others
+    times. Joints that the robot's file clamps for an excitation are clamped (paper F6), the others
     are held by their drives (paper F5).
 
     Args:

@@ -40,7 +40,7 @@ class Uncertainty:
     """Masses, link inertias and armature. The paper's own gains amount to 3 to 29 % (reading
     A10); Cheetah-Software's rotor is 13 % lighter than the paper's (reading A11)."""
     stiffness: float = 0.1
-    """Torque constant and with it both gains. An assumption: no data sheet says."""
+    """Torque constant and with it both gains. An assumption: no data sheet gives it."""
     friction: float = 1.0
     """Dry friction: from none to twice the model's."""
 

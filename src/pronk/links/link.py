@@ -234,7 +234,7 @@ class NetworkLink(ABC):
         Args:
             robot: Names, order and limits of the joints.
             clamp_operator: Fixes joints on a real bench; None without one.
-            release: Make the robot's own controller let go of the joints first; a standing robot
+            release: Switch off the robot's own controller first; a standing robot
                 falls then.
             exclusive_s: How long the topic of commands must be silent before pronk writes [s].
             fresh: How fresh states must be; None for what moving a robot takes.
@@ -314,7 +314,7 @@ class NetworkLink(ABC):
             self._clamp_operator(joints)
         elif joints:
             raise HardwareError(
-                f"{', '.join(joints)} must be fixed mechanically and nobody is at the bench; "
+                f"{', '.join(joints)} must be fixed mechanically and no person is at the bench; "
                 "choose joints that need no clamp, or have someone there who confirms it."
             )
 

@@ -68,7 +68,7 @@ def enter(wanted: Wanted) -> tuple[str, ...]:
 
 
 def _granted(request: Callable[..., str], *values: int) -> str:
-    """What a request says, or why it was refused."""
+    """The request, or why it was refused."""
     try:
         return request(*values)
     except (AttributeError, TypeError):

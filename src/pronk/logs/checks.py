@@ -185,7 +185,7 @@ def check_motion(log: JointLog, joint: str) -> None:
     """Refuse a joint that was not excited or did not move.
 
     Raises:
-        LogError: Says which, with the numbers.
+        LogError: Names the check and its numbers.
     """
     where, column = log.source or "log", log.column(joint)
     position = log.position[:, column]

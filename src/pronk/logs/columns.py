@@ -48,7 +48,7 @@ class Columns:
     time_unit: str = "s"
     """One of `TIME_UNITS`."""
     units: tuple[str, ...] = ()
-    """Unit of each joint, where the format says that one is not an angle."""
+    """Unit of each joint, where the format declares that one is not an angle."""
     names: Names | None = None
     """Joint names that the format's own stand for."""
     row: Callable[[int], str] = "sample {}".format
@@ -208,7 +208,7 @@ def _factors(
             raise LogError(f"{columns.where}: the scale of {joint} is {value}; expected a number.")
     units = columns.units or ("rad",) * len(joints)
     own = [factor if unit == "rad" else 1.0 for unit in units]
-    # A scale says what a unit of position is; the velocity beside it may be an angle already.
+    # A scale defines the unit of position; the velocity beside it may be an angle already.
     return (
         np.array([scale.get(joint, f) for joint, f in zip(joints, own, strict=True)]),
         np.array([1.0 if joint in scale else f for joint, f in zip(joints, own, strict=True)]),

@@ -154,7 +154,7 @@ class JointLog:
             ) from None
 
     def unit(self, joint: str) -> str:
-        """Unit of a joint's position, `rad` unless the log says otherwise."""
+        """Unit of a joint's position, `rad` unless the log declares another."""
         return self.units[self.column(joint)] if self.units else "rad"
 
     @property

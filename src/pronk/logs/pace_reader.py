@@ -1,7 +1,7 @@
 """Recordings of PACE: a `.pt` file with `time`, `dof_pos` and `des_dof_pos`.
 
 A `.pt` file is a zip archive of raw numbers and a pickle that arranges them. A pickle is a program,
-so it is not run: an unpickler interprets its opcodes and knows three names, each replaced by a
+so it is not run: an unpickler interprets its opcodes and accepts three names, each replaced by a
 function of this module that can only build an array. Anything else is refused by name. PyTorch is
 not needed.
 """

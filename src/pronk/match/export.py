@@ -2,7 +2,7 @@
 
 Every export names the simulator the gains hold for: the same numbers in another engine, at
 another timestep or with another actuator law are another joint. Delays are rounded to physics
-steps where a simulator knows no others.
+whole steps where a simulator has no other delay.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def mjcf_text(gains: MatchedGains, robot: Robot) -> str:
     Its torque is the PD law with the groups' gains, clipped by the torque-speed line and the
     effort limit. MuJoCo treats native drives explicitly under Euler only, so the integrator is
     Euler: it gives the trajectories of the training simulator (see `pronk.robots.model`). Joints
-    that were not matched have the robot's published gains. MuJoCo knows no delay of a position
+    that were not matched have the robot's published gains. MuJoCo has no delay of a position
     command in its drives; a matched delay is named in the comment.
     """
     drives = group_drives(gains, robot)

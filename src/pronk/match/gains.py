@@ -93,7 +93,7 @@ def _represent_flow(dumper: yaml.SafeDumper, data: _Flow) -> yaml.Node:
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that knows `_Flow`."""
+    """SafeDumper for `_Flow`."""
 
 
 _Dumper.add_representer(_Flow, _represent_flow)

@@ -1,4 +1,4 @@
-"""What a set of experiments can tell apart, before anything is fitted (reading A10).
+"""Parameters that a set of experiments can separate, before anything is fitted (reading A10).
 
 A linear joint with position command responds with
 
@@ -164,7 +164,7 @@ def require_identifiable(
     if cures:
         known = "any of these would: " + "; ".join(cures)
     one = len(confused) == 1
-    words = "do not identify" if one else "cannot tell apart"
+    words = "do not identify" if one else "cannot separate"
     raise IdentifiabilityError(
         f"these data {words} {', '.join(confused)} (condition {result.condition:.1e}; fitted: "
         f"{', '.join(parameters)}); {known}; or hold one of them at a known value."

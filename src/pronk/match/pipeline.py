@@ -191,7 +191,7 @@ def _drives(
     settings: MatchSettings,
     clock: _Clock,
 ) -> dict[str, JointFit]:
-    """Mode drive: fit the drive of every joint, if the sweeps can tell its parameters apart."""
+    """Mode drive: fit the drive of every joint, if the sweeps can separate its parameters."""
     found = _collect(logs, rigs.robot, settings, clock)
     for name, one in found.items():
         require_sweeps(rigs.robot, name, one.targets, names)
@@ -318,7 +318,7 @@ def _no_match_db(fit: Fit) -> float:
 
 
 def _warnings(fit: Fit, grid: GridSearch) -> Iterator[str]:
-    """What speaks against the optimum."""
+    """Flags of the optimum."""
     limit = _no_match_db(fit)
     if not fit.error_db <= limit:
         yield (

@@ -267,7 +267,7 @@ def interval(fit: Fit) -> Estimate:
 def require_sweeps(
     robot: Robot, joint: str, goals: Sequence[MeasuredJoint], free: tuple[str, ...]
 ) -> None:
-    """Refuse what sweeps cannot tell apart, before anything is fitted.
+    """Refuse what sweeps cannot separate, before anything is fitted.
 
     Raises:
         IdentifiabilityError: Names the parameters and the experiments that would help.

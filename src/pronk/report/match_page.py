@@ -150,7 +150,7 @@ def _part(result: MatchResult, folder: Path, gains_name: str) -> Part:
     if gains.virtual:
         lines.append(
             "Every measured number on this page is of pronk's virtual robot, a simulated machine "
-            "that stands in for hardware. It says nothing about a real robot."
+            "that stands in for hardware, not for a real robot."
         )
     lines += [f"{joint_words(name)}: {'; '.join(flags)}." for name, flags in found["flags"].items()]
     fits = {name: fit for name, fit in result.joints.items() if fit.responses}

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Drive:
-    """Motor, gearbox and inverter of one joint. Joint side unless the name says motor."""
+    """Motor, gearbox and inverter of one joint. Joint side unless the name contains motor."""
 
     gear_ratio: float
     """Motor revolutions per joint revolution."""
@@ -31,7 +31,7 @@ class Drive:
     no_load_speed: float
     """Speed at which back-EMF equals the bus voltage [rad/s]."""
     effort_limit: float
-    """Largest torque the inverter is allowed to ask for [N m]."""
+    """Largest torque that the inverter may command [N m]."""
     frictionloss: float
     """Dry (Coulomb) friction [N m]."""
     viscous_damping: float

@@ -491,17 +491,17 @@ def fault(memory: FilterState, level: FilterAction, reason: Reason, t: float) ->
     return FilterState(level=level, reason=reason, since=memory.since if memory.faulted else t)
 
 
-def released(memory: FilterState, t: float, *, mended: bool = False) -> FilterState:
-    """Clear a fault that has lasted long enough; a latched one only if the operator says `mended`.
+def released(memory: FilterState, t: float, *, acknowledged: bool = False) -> FilterState:
+    """Clear a fault that has lasted long enough; a latched one only if `acknowledged`.
 
     Args:
         memory: With or without a fault.
         t: Now [s].
-        mended: The operator has reset the fault.
+        acknowledged: The operator has reset the fault.
     """
     if not memory.faulted or t - memory.since < LEAST_DAMPING_S:
         return memory
-    return FilterState() if mended or memory.level is FilterAction.DAMP else memory
+    return FilterState() if acknowledged or memory.level is FilterAction.DAMP else memory
 
 
 def _detail(reason: Reason, state: State, command: Command, limits: Limits, t: float) -> str:

@@ -256,7 +256,7 @@ class StateMachine:
         elif request is OperatorRequest.SIT and mode is Mode.STAND:
             self._sit(t, state)
         elif request in (stand, reset) and mode is Mode.FAULT:
-            memory = released(memory, t, mended=request is reset)
+            memory = released(memory, t, acknowledged=request is reset)
             if not memory.faulted:
                 self.enter(Mode.DAMP, t)
             elif memory.level is FilterAction.LATCH and request is stand:

@@ -172,7 +172,7 @@ class TimeLimit(Operator):
 
 
 HELP = """\
-  hold SPACE   dead-man: let go and the joints are damped
+  hold SPACE   dead-man: releasing it damps the joints
   1 stand up   2 start the policy   3 sit down   0 damp at once   r reset a fault   q quit
   w s forward and back   a d left and right   j l turn   x stand still   ENTER jump"""
 """Keys of the keyboard."""
@@ -292,7 +292,7 @@ _AXES = (1, 0, 3)
 """Forward, left, turn."""
 
 PAD_HELP = """\
-  hold LB      dead-man: let go and the joints are damped
+  hold LB      dead-man: releasing it damps the joints
   A stand up   Y start the policy   X sit down   B damp at once   START reset a fault   BACK quit
   left stick forward and sideways   right stick turn   RB jump"""
 """Buttons of the gamepad."""

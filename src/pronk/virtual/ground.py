@@ -161,7 +161,7 @@ class Start:
     """What the drives hold beside the default pose, until the first command, in file order [rad];
     None is zeros."""
     drop: float = 0.0
-    """Height of the lowest foot over the ground when the robot is let go [m]."""
+    """Height of the lowest foot over the ground when the robot is released [m]."""
     settle_s: float = 1.5
     """Time that it is given to come to rest, before the clock starts [s]."""
 

@@ -7,7 +7,7 @@ All of it is in joint coordinates. On the bench the base is fixed to its stand a
 anything; on the ground the trunk is free.
 
 Drive. MuJoCo's `dcmotor`, whose controller outputs volts. A drive that regulates current demands
-tau = stiffness (target - q) - damping qdot and believes in a motor constant K0; the motor has
+tau = stiffness (target - q) - damping qdot and assumes a motor constant K0; the motor has
 K = torque_scale K0, in torque as in back-EMF (one magnetic flux). The voltage that drives the
 current tau / K0 through R against the back-EMF is
 
@@ -89,11 +89,11 @@ class Plant:
     constant: Array
     """True motor constants K [V s/rad]."""
     believed: Array
-    """Motor constants K0 that the drives believe [V s/rad]."""
+    """Motor constants K0 that the drives assume [V s/rad]."""
     resistance: Array
     """[ohm]"""
     effort_limit: Array
-    """Largest torque that the motors give when the drives believe to be at theirs [N m]."""
+    """Largest torque that the motors give when the drives compute their own limit [N m]."""
     rotor_inertia: Array
     """True, reflected through the gear [kg m^2]."""
     viscous: Array
@@ -190,7 +190,7 @@ def leg_of(robot: Robot, name: str) -> str:
 
 
 def motor_of(drive: Drive) -> tuple[float, float]:
-    """Constant [V s/rad] and resistance [ohm] of a motor, joint side, as its drive believes."""
+    """Constant [V s/rad] and resistance [ohm] of a motor, joint side, as its drive assumes."""
     return motor_constants(
         stall_torque=drive.stall_torque,
         no_load_speed=drive.no_load_speed,
@@ -389,7 +389,7 @@ def build_plant(
         _add_rotor(spec, joint.name, joint.drive, params, sim_params.machine.drive_lag_s)
     model = spec.compile()
     if model.nq != model.nv + (ground is not None):
-        raise RobotError(f"{robot.name}: the virtual robot knows hinge joints only.")
+        raise RobotError(f"{robot.name}: the virtual robot has hinge joints only.")
     rotors, links = ([model.joint(f"{name}{end}") for name in names] for end in ("/rotor", ""))
     # Mass and inertia by the same factor: a body that was possible stays possible.
     for link, params in zip(links, true, strict=True):

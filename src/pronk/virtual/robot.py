@@ -86,7 +86,7 @@ class VirtualRobot:
         """
         known = legs_of(robot)
         if base not in ("bench", "ground"):
-            raise HardwareError(f"base {base!r}; the virtual robot knows 'bench' and 'ground'.")
+            raise HardwareError(f"base {base!r}; expected 'bench' or 'ground'.")
         if base == "bench" and (ground is not None or start is not None):
             raise HardwareError("ground or start given on the bench; take base='ground' for them.")
         if base == "ground" and legs is not None:

@@ -2,7 +2,7 @@
 
 Encoders sit on the rotors and have the grid of their bits seen through the gear; their mounts
 shake slowly (coloured noise). Speed is the drive's own first difference of that grid. Torque is
-current times the constant that the drive believes. The accelerometer gives the mean over the time
+current times the constant that the drive assumes. The accelerometer gives the mean over the time
 since the last state, as a unit that integrates inside does. The attitude filter is off by a
 constant, by something that wanders, and by a heading that starts anywhere. Timestamps jitter.
 

@@ -5,8 +5,8 @@ matched and trained in; `pronk.match` and `pronk.train` cannot import this modul
 `trunk`, `attitude` and `ground` matter off the bench only; a file may leave them, or some of their
 fields, at their defaults.
 
-Joint quantities are in joint coordinates (through the gear) unless the name says motor. Vectors are
-in the trunk's frame: x forward, y left, z up.
+Joint quantities are in joint coordinates (through the gear) unless the name contains motor.
+Vectors are in the trunk's frame: x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class JointParams(Bounded):
     """One joint of the virtual robot. Bounds exclude slips of the pen (a factor of ten)."""
 
     torque_scale: Annotated[float, Meta(ge=0.1, le=10.0)]
-    """Torque that the motor gives per torque that its drive believes to give [1]."""
+    """Torque that the motor gives per torque that its drive computes [1]."""
     link_inertia_scale: Annotated[float, Meta(ge=0.1, le=10.0)]
     """Mass and inertia of the link this joint moves, relative to the model's [1]."""
     rotor_inertia: Annotated[float, Meta(ge=1e-9, le=1.0)]

@@ -1,1 +1,1 @@
-"""Unitree's low-level messages over DDS, and the virtual robot that speaks them."""
+"""Unitree's low-level messages over DDS, and the virtual robot behind them."""

@@ -3,7 +3,7 @@
 Joints. Slots 0 to 11 are FR, FL, RR, RL, each hip, thigh, calf: pronk's own order, FR FL HR HL,
 each hip_roll, hip_pitch, knee. On a Go2 the hip turns about +x, thigh and calf about +y, all zero
 with the leg straight down. The Mini Cheetah's hip_pitch and knee turn about -y, with the same
-zeros, so behind these messages (where there is only its virtual double: the real one speaks LCM)
+zeros, so behind these messages (where there is only its virtual double: the real one uses LCM)
 
     hip = hip_roll,  thigh = -hip_pitch,  calf = -knee
 
@@ -73,7 +73,7 @@ class JointMap:
     sink_damping: float
     """Damping with which the joints sink softly [N m s/rad]."""
     virtual_only: bool
-    """True where no real robot of this name speaks these messages."""
+    """True where no real robot of this name uses these messages."""
 
 
 def joint_map(robot: Robot) -> JointMap:

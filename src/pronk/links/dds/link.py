@@ -92,7 +92,7 @@ class Client:
         except ValueError:
             raise HardwareError(
                 f"the robot's service {self._service} returned {response.data[:60]!r} for function "
-                f"{api_id}, expected JSON; is its firmware one that pronk knows?"
+                f"{api_id}, expected JSON; is its firmware supported?"
             ) from None
 
 
@@ -123,7 +123,7 @@ def check_own_controller(participant: Participant, *, release: bool, timeout_s: 
         name = _name(switcher.call(CHECK_MODE, {}, timeout_s=timeout_s))
     if name and release:
         raise HardwareError(
-            f"the robot's own controller {name!r} did not let go of the joints after "
+            f"the robot's own controller {name!r} was not switched off after "
             f"{_RELEASE_TRIES} requests; switch it off by the robot's app."
         )
     if name:
@@ -186,14 +186,14 @@ class DdsMachine(NetworkLink):
         if self._joints.virtual_only and not self.virtual:
             raise HardwareError(
                 f"the robot in {self._network} is not pronk's virtual robot, and no real "
-                f"{self.robot} speaks Unitree's messages; name the robot that it is."
+                f"{self.robot} sends Unitree's messages; give the robot's name."
             )
         check_own_controller(self._participant, release=self._release, timeout_s=ANSWER_S)
 
     def _confirm(self) -> None:
         if len(self._senders) > 1:
             raise HardwareError(
-                f"{len(self._senders)} robots speak on {STATES} in {self._network}, expected one; "
+                f"{len(self._senders)} robots send on {STATES} in {self._network}, expected one; "
                 "switch the others off, or take another domain."
             )
 

@@ -1,1 +1,1 @@
-"""Low-level messages over LCM, and the virtual robot that speaks them."""
+"""Low-level messages over LCM, and the virtual robot behind them."""
