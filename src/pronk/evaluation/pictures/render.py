@@ -3,8 +3,8 @@
     python -m pronk.evaluation.pictures.render [FILM [FILE.mp4|FILE.gif|FILE.png ...]]
 
 `video` starts it with a GL backend (MUJOCO_GL), which must be chosen before mujoco is imported.
-It prints the share that is done, and on failure one line to standard error. Without a film it
-renders one small image, as a check of the backend.
+A failure is one line on standard error. Without a film it renders one small image, as a check of
+the backend.
 """
 
 from __future__ import annotations
@@ -192,7 +192,6 @@ def render(film: Film, files: dict[str, Path]) -> None:
             if movie is not None:
                 overlay.draw_frame(image, film, index)
                 movie.send(image.tobytes())
-            print((index + 1) / count, flush=True)  # noqa: T201
         if ".gif" in files:
             write_gif(aside[".gif"], animation)
         if ".png" in files:

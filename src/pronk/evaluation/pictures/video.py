@@ -14,7 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Container, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from pronk import opengl
@@ -89,20 +89,13 @@ def environment(backend: str) -> dict[str, str]:
     return {"LP_NUM_THREADS": "1"} | kept | ({"MUJOCO_GL": backend} if backend else {})
 
 
-def record(
-    film: Film,
-    stem: Path,
-    *,
-    warn: Callable[[str], None],
-    progress: Callable[[float], None] = lambda share: None,
-) -> tuple[Path, ...]:
+def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path, ...]:
     """Write `stem`.mp4, `stem`.gif and, of a jump, `stem`.png, as far as this machine can.
 
     Args:
         film: From `pronk.evaluation.pictures.film.plan`.
         stem: Path of the files without their endings.
         warn: Called with one sentence: what is missing.
-        progress: Called with the share that is done, 0 to 1.
 
     Returns:
         The files, each whole; none where nothing can be rendered.
@@ -113,42 +106,31 @@ def record(
     else:
         endings.insert(0, ".mp4")
     files = tuple(stem.with_name(f"{stem.name}{ending}") for ending in endings)
-    try:
-        backend = find_gl()
-        with tempfile.TemporaryDirectory() as folder:
-            save_artefact(Path(folder) / "film.npz", film, SCHEMA)
-            _render([str(Path(folder) / "film.npz"), *map(str, files)], backend, progress)
-    except VideoError as error:
-        warn(str(error))
+    with tempfile.TemporaryDirectory() as folder:
+        plan_file = Path(folder) / "film.npz"
+        save_artefact(plan_file, film, SCHEMA)
+        try:
+            backend = find_gl()
+        except VideoError as error:
+            warn(str(error))
+            return ()
+        done = subprocess.run(
+            [sys.executable, "-m", _MODULE, plan_file, *files],
+            env=environment(backend),
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+    if done.returncode:
+        lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+        last = lines[-1].rstrip(".") if lines else f"the process ended with {done.returncode}"
+        warn(
+            f"rendering with MUJOCO_GL={backend or 'its default'} failed ({last}); another one "
+            "may do: set MUJOCO_GL to egl or osmesa."
+        )
         return ()
     return files
-
-
-def _render(words: list[str], backend: str, progress: Callable[[float], None]) -> None:
-    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-m", _MODULE, *words],
-            env=environment(backend),
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-        )
-        try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                progress(float(line))
-            status = process.wait()
-        finally:
-            process.kill()
-            process.wait()
-        if status:
-            errors.seek(0)
-            lines = [line.strip() for line in errors if line.strip()]
-            last = lines[-1].rstrip(".") if lines else f"the process ended with {status}"
-            raise VideoError(
-                f"rendering with MUJOCO_GL={backend or 'its default'} failed ({last}); another one "
-                "may do: set MUJOCO_GL to egl or osmesa."
-            )
 
 
 def films_of(
@@ -168,31 +150,30 @@ def films_of(
     Raises:
         ArtefactError: A capture is missing or damaged.
     """
-    for subject in found.subjects:
-        for case in found.cases:
-            if cases is None or case.name in cases:
-                kept = [row for row in found.of(subject.name, case.name) if row.capture]
-                for row in kept[:1]:
-                    # Without what a shell or a link would trip over.
-                    stem = re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{row.policy}_{row.case}")
-                    yield stem, _film(found, row, folder, slow)
-
-
-def _film(found: Results, row: Row, folder: Path, slow: float) -> Film:
-    capture = captures.load(folder / row.capture)
-    events = jump_events(capture, row.script, began=row.began)
-    on = row.began + row.script.on
-    return plan(
-        capture,
-        robot=found.robot,
-        title=row.case if "," in row.case else f"{row.case} m/s",
-        note=f"policy: {row.policy}" + ("" if events else ", no jump"),
-        virtual=found.virtual,
-        events=events,
-        start=None if events else on - _BEFORE_S,
-        end=None if events else on + _AFTER_S,
-        slow=slow,
-    )
+    first: dict[tuple[str, str], Row] = {}
+    for row in found.rows:
+        if row.capture and (cases is None or row.case in cases):
+            first.setdefault((row.policy, row.case), row)
+    policies = {subject.name for subject in found.subjects}
+    for row in (row for row in first.values() if row.policy in policies):
+        capture = captures.load(folder / row.capture)
+        events = jump_events(capture, row.script, began=row.began)
+        on = row.began + row.script.on
+        # The name is without what a shell or a link would trip over.
+        yield (
+            re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{row.policy}_{row.case}"),
+            plan(
+                capture,
+                robot=found.robot,
+                title=row.case if "," in row.case else f"{row.case} m/s",
+                note=f"policy: {row.policy}" + ("" if events else ", no jump"),
+                virtual=found.virtual,
+                events=events,
+                start=None if events else on - _BEFORE_S,
+                end=None if events else on + _AFTER_S,
+                slow=slow,
+            ),
+        )
 
 
 def record_all(
@@ -224,18 +205,14 @@ def record_all(
         warn(str(error))
         return ()
     planned = dict(films_of(found, folder, cases=cases, slow=slow))
-    shares = dict.fromkeys(planned, 0.0)
     warnings: dict[str, None] = {}
-
-    def render(stem: str) -> tuple[Path, ...]:
-        def share(part: float) -> None:
-            shares[stem] = part
-            progress(sum(shares.values()) / len(shares))
-
-        return record(planned[stem], out / stem, warn=warnings.setdefault, progress=share)
-
+    files: list[Path] = []
     with ThreadPoolExecutor(max(1, at_once)) as threads:
-        files = [path for paths in threads.map(render, planned) for path in paths]
+        work = partial(record, warn=warnings.setdefault)
+        stems = [out / name for name in planned]
+        for count, written in enumerate(threads.map(work, planned.values(), stems), start=1):
+            files += written
+            progress(count / len(planned))
     for text in warnings:
         warn(text)
     return tuple(files)
