@@ -8,13 +8,17 @@ Times are CLOCK_MONOTONIC in seconds, the same for all processes of a computer.
 
 from __future__ import annotations
 
+import signal
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from multiprocessing import shared_memory
+from multiprocessing.connection import Connection
 from typing import Any, Self
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
 from pronk.links.machine import State
@@ -254,13 +258,19 @@ VIRTUAL, REAL = "the virtual robot", "a real robot"
 """Text of the event `robot`."""
 
 
+def fill(record: NDArray[Any], **values: Any) -> None:
+    """Set fields of a record."""
+    for name, value in values.items():
+        record[name] = value
+
+
 def event(
     time: float, kind: str, text: str, *, reason: int = 0, level: int = 0
 ) -> np.ndarray[Any, Any]:
     """Make a record of `EVENT`; the text is cut to `TEXT` characters."""
     record = np.zeros((), dtype=EVENT)
-    record["time"], record["kind"], record["reason"], record["level"] = time, kind, reason, level
-    record["text"] = text.encode("ascii", "replace")[:TEXT]
+    data = text.encode("ascii", "replace")[:TEXT]
+    fill(record, time=time, kind=kind, reason=reason, level=level, text=data)
     return record
 
 
@@ -306,6 +316,18 @@ class Event:
         """Read a record of `EVENT`."""
         kind, text = (bytes(record[name]).decode("ascii") for name in ("kind", "text"))
         return cls(time=float(record["time"]), kind=kind, text=text, level=int(record["level"]))
+
+
+def serve(process: Any, shared: Shared, end: Connection) -> None:
+    """Run a process (`run`, `stop`, `figures`) to its end; send its figures, JSON."""
+    signal.signal(signal.SIGTERM, lambda *_: process.stop())
+    try:
+        process.run()
+    finally:
+        with suppress(OSError):  # the parent has ended
+            end.send_bytes(orjson.dumps(process.figures()))
+        end.close()
+        shared.close()
 
 
 @dataclass(frozen=True, kw_only=True)

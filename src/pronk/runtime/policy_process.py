@@ -14,15 +14,12 @@ warm-up step recovers half of that, 2 ms of them all but a few hundredths of a m
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-import orjson
 
 from pronk.errors import PronkError
 from pronk.links.machine import State
@@ -30,7 +27,7 @@ from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
 from pronk.policy.contract import Contract
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy
-from pronk.runtime.ipc import ACTIONS, STEP, Mode, Shared, event, get_state
+from pronk.runtime.ipc import ACTIONS, STEP, Mode, Shared, event, fill, get_state, serve
 from pronk.runtime.plan import POLICY_PRIORITY, Plan
 from pronk.runtime.rollout import PolicyRunner, measurement
 from pronk.runtime.script import STILL, Commanded
@@ -88,16 +85,9 @@ def serve_policy(plan: Plan, name: str, end: Connection) -> None:
     assert plan.policy is not None
     shared = Shared(name)
     process = PolicyProcess(plan, shared, load_policy(plan.policy))
-    signal.signal(signal.SIGTERM, lambda *_: process.stop())
     for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
         shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))
-    try:
-        process.run()
-    finally:
-        with suppress(OSError):  # the parent has ended
-            end.send_bytes(orjson.dumps(process.figures()))
-        end.close()
-        shared.close()
+    serve(process, shared, end)
 
 
 def standing(contract: Contract) -> State:
@@ -144,7 +134,7 @@ class PolicyProcess:
         self._stopping = False
         self._parent = os.getppid()
         self._last_error = ""
-        self._order = np.zeros((), dtype=ACTIONS)
+        self._action = np.zeros((), dtype=ACTIONS)
         self._step = np.zeros((), dtype=STEP)
         self._count = 0
         for _ in range(WARM_UP):
@@ -215,12 +205,9 @@ class PolicyProcess:
         inferred = time.monotonic()
         self.decision.add(inferred - now)
         self.network.add(self.runner.policy.network_s)
-        action = self._order
-        action["sequence"] = self._count
-        action["state_sequence"], action["state_time"] = state.sequence, state.time
-        action["made"], action["valid_for"] = begun, self.plan.action_valid_s
-        action["entry"] = self._entry
-        action["position"] = command.position
+        action, of = self._action, {"state_sequence": state.sequence, "state_time": state.time}
+        fill(action, **of, sequence=self._count, entry=self._entry, position=command.position)
+        fill(action, made=begun, valid_for=self.plan.action_valid_s)
         self.shared.actions.write(action)
         done = time.monotonic()
         self._count += 1
@@ -228,14 +215,10 @@ class PolicyProcess:
         observation = self._history.observe(measurement(state), velocity)
         self._history.acted(tick.action.astype(np.float32))
         step = self._step
-        step["observation"] = observation
-        step["sequence"], step["deadline"], step["begun"] = action["sequence"], deadline, begun
-        step["observed"], step["inferred"], step["done"] = now, inferred, done
-        step["state_sequence"], step["state_time"] = state.sequence, state.time
-        step["live"] = self._mode in _LIVE
-        step["command"], step["jump"] = velocity, jump
-        step["action"], step["target"] = tick.action, tick.target
-        step["contact"], step["linear_velocity"] = tick.contact, tick.linear_velocity
+        fill(step, **of, sequence=action["sequence"], observation=observation)
+        fill(step, deadline=deadline, begun=begun, observed=now, inferred=inferred, done=done)
+        fill(step, live=self._mode in _LIVE, command=velocity, jump=jump, action=tick.action)
+        fill(step, target=tick.target, contact=tick.contact, linear_velocity=tick.linear_velocity)
         self.shared.steps.put(step)
         self._last_error = ""
 

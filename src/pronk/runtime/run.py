@@ -21,11 +21,11 @@ from pronk.links.link import ClampOperator
 from pronk.links.realtime import Interrupts, unheard
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
-from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared
+from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared, fill
 from pronk.runtime.log import READY, write_log
 from pronk.runtime.plan import Plan
 from pronk.runtime.policy_process import serve_policy
-from pronk.runtime.servo import serve
+from pronk.runtime.servo import serve_robot
 from pronk.runtime.teleop import BenchOperator, Operator, OperatorCommand
 
 _RATE_HZ = 50.0
@@ -140,7 +140,7 @@ class Deployment:
         def process(what: str, body: Callable[..., None], *given: Any) -> BaseProcess:
             return context.Process(target=body, args=given, name=f"pronk {what}")
 
-        self.servo = process("servo", serve, plan, name, trained, servo_end)
+        self.servo = process("servo", serve_robot, plan, name, trained, servo_end)
         if plan.policy is not None:
             self.policy = process("policy", serve_policy, plan, name, policy_end)
         if plan.log is not None or plan.sweep is not None:
@@ -199,8 +199,7 @@ class Deployment:
         if command.request is not OperatorRequest.NONE:
             record["request"] = command.request
             record["requests"] += 1
-        record["time"] = time.monotonic()
-        record["held"], record["jump"] = command.held, command.jump
+        fill(record, time=time.monotonic(), held=command.held, jump=command.jump)
         record["command"] = command.command
         self.shared.operator.write(record)
 

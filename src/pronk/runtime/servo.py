@@ -8,18 +8,15 @@ and sent goes into a queue that never makes it wait. Whatever ends it, the joint
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import threading
 import time
 from collections import Counter
-from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-import orjson
 
 from pronk.errors import HardwareError, PronkError
 from pronk.links.machine import Command, Machine, State
@@ -46,7 +43,7 @@ _DECIDING = (Mode.STAND, Mode.POLICY, Mode.HALT)
 """Modes in which the policy's latency is measured; while standing its actions are not used."""
 
 
-def serve(plan: Plan, name: str, trained: tuple[float, float], end: Connection) -> None:
+def serve_robot(plan: Plan, name: str, trained: tuple[float, float], end: Connection) -> None:
     """Body of the servo's process.
 
     Args:
@@ -57,15 +54,7 @@ def serve(plan: Plan, name: str, trained: tuple[float, float], end: Connection) 
     """
     leave()  # the operator's process decides
     shared = Shared(name)
-    servo = Servo(plan, shared, trained)
-    signal.signal(signal.SIGTERM, lambda *_: servo.stop())
-    try:
-        servo.run()
-    finally:
-        with suppress(OSError):  # the parent has ended
-            end.send_bytes(orjson.dumps(servo.figures()))
-        end.close()
-        shared.close()
+    ipc.serve(Servo(plan, shared, trained), shared, end)
 
 
 class Servo:
@@ -186,9 +175,8 @@ class Servo:
         record = self._state_record
         if state is not None:
             ipc.put_state(record, state)
-        record["now"], record["start"] = now, self.pace.start
-        record["progress"] = self._progress
-        record["mode"], record["entry"] = self.machine_state.mode, self.machine_state.entry
+        ipc.fill(record, now=now, start=self.pace.start, progress=self._progress)
+        ipc.fill(record, mode=self.machine_state.mode, entry=self.machine_state.entry)
         self.shared.state.write(record)
 
     # --- the loop ---------------------------------------------------------------------------------
@@ -364,17 +352,15 @@ class Servo:
         """Put a tick into the logger's queue."""
         tick, action = self._tick_record, self.action
         ipc.put_state(tick, state)
-        tick["tick"], tick["deadline"] = self.pace.tick, self.pace.deadline
-        tick["begun"], tick["done"] = begun, done
-        tick["mode"], tick["blend"] = self.machine_state.mode, desired.blend
+        at = {"tick": self.pace.tick, "deadline": self.pace.deadline, "begun": begun, "done": done}
+        ipc.fill(tick, **at, mode=self.machine_state.mode, blend=desired.blend, latency=latency)
+        ipc.fill(tick, level=decision.level, reason=decision.reason)
         tick["desired"] = np.nan if desired.command is None else desired.command.position
         tick["sent"] = np.nan if sent is None else sent.position
         tick["stiffness"] = 0.0 if sent is None else desired.stiffness
         tick["damped"] = sent is None and not desired.silent
-        tick["level"], tick["reason"] = decision.level, decision.reason
         tick["action"] = -1 if action is None else action.sequence
         tick["action_state"] = -1 if action is None else action.state_sequence
-        tick["latency"] = latency
         self.shared.ticks.put(tick)
 
     def _close(self, machine: Machine) -> None:
