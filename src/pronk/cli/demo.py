@@ -49,6 +49,7 @@ def demo(
         quick: Search the linearized model instead of the grid.
         json_file: Also write the figures to this file.
     """
+    from pronk.evaluation import tables
     from pronk.report import figures, style
     from pronk.report.build import write_report
     from pronk.robots import load_robot
@@ -78,7 +79,9 @@ def demo(
     cells = cells_apart(result)
     show_match(result, replays, cells)
     if trial is not None:
-        show_trial(trial)
+        sheets = (tables.table_iii(trial, figure) for figure in ("height", "distance"))
+        for sheet in (*sheets, tables.landings(trial)):
+            console.show_sheet(sheet)
     console.say(
         "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`. The policies "
         f"come with pronk. {seconds:.0f} s in all."
@@ -101,14 +104,10 @@ def demo(
 
 
 def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
-    """Return the policies to try, the matched one first; a warning if there are none.
-
-    Args:
-        folder: Searched with its folders; the policies of pronk's source if None.
-        robot: The robot that they must fit.
+    """Return the policies of a folder, or of pronk's source if None; the matched one first.
 
     Raises:
-        PronkError: A given folder has none, or one of them cannot be used.
+        PronkError: A given folder has none, or one of them is not for the robot.
     """
     from pronk.evaluation.trial import load_subjects
 
@@ -120,13 +119,13 @@ def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
             f"--policies {folder}: no policy.onnx in it or in a folder in it; give one that "
             "`pronk train` wrote to, or leave the option out."
         )
-    if not found:
-        console.warn(f"no jumps: there are no policies in {place}; --policies DIR names others.")
-    elif folder is None and importlib.util.find_spec("onnxruntime") is None:
+    if folder is None and importlib.util.find_spec("onnxruntime") is None:
         console.warn("no jumps: onnxruntime is missing; `pip install 'pronk[policy]'`.")
         return []
     if found:
         load_subjects(found, robot)
+    else:
+        console.warn(f"no jumps: there are no policies in {place}; --policies DIR names others.")
     return found
 
 
@@ -135,14 +134,7 @@ def jump_and_film(
 ) -> tuple[Results | None, tuple[Path, ...]]:
     """Run a short trial on the shipped virtual robot and film one jump of the first policy.
 
-    Args:
-        policies: From `find_policies`.
-        out: Folder of the trial; an existing trial is replaced.
-        jumps: With each of the paper's commands.
-        seed: Of starts and noise.
-
-    Returns:
-        The trial, None without policies, and the files of the film.
+    An existing trial is replaced. Without policies the results are None and no film.
     """
     from pronk.evaluation.pictures.video import record_all
     from pronk.evaluation.trial import VIDEOS, Plan, cores, run_trial
@@ -251,18 +243,3 @@ def show_match(
     ]
     title = "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)"
     console.show_sheet(table(f"{columns} | no rotor inertia [dB];2", rows, title=title))
-
-
-def show_trial(trial: Results) -> None:
-    """Print heights, distances and landings."""
-    from pronk.evaluation import tables
-
-    for figure in ("height", "distance"):
-        console.show_sheet(tables.table_iii(trial, figure))
-    for subject in trial.subjects:
-        cells = [cell for cell in trial.cells if cell.policy == subject.name]
-        console.say(
-            f"{subject.name} policy on the virtual robot: {sum(cell.succeeded for cell in cells)} "
-            f"of {sum(cell.n for cell in cells)} jumps landed, {cells[0].n} with each command; "
-            "`pronk trial` does 20."
-        )

@@ -98,15 +98,9 @@ def run(
     randomization: str,
     before: dict[str, float],
 ) -> Evaluation:
-    """Build the simulator and evaluate in it.
+    """Build the simulator on a device, `cpu` or `cuda:0`, and evaluate in it.
 
-    Args:
-        subject: The policy.
-        gains: Of the simulated drives.
-        plan: Commands and times.
-        device: `cpu` or `cuda:0`.
-        randomization: One of `training_sim.run.RANDOMIZATIONS`.
-        before: Speed errors to compare with; empty for none.
+    `before` has speed errors to compare with; `randomization` is a key of `RANDOMIZATIONS`.
     """
     from mjlab.envs import ManagerBasedRlEnv
 

@@ -113,9 +113,10 @@ def simulate(
         machine.close()
     _report(figures)
     console.write_json(json_file, figures)
-    options = {"layout": layout if layout != "cheetah" else None, "port": port, "domain": domain}
-    words = [f"--{name} {value}" for name, value in options.items() if value is not None]
-    way = " ".join([f"--link {link}", *words])
+    options: dict[str, str | int | None]
+    options = {"link": link, "layout": layout if link == "lcm" else None}
+    options |= {"port": port, "domain": domain}
+    way = " ".join(f"--{name} {value}" for name, value in options.items() if value is not None)
     console.following(f"pronk sweep {robot} {way} --out DIR   # while a virtual robot runs")
 
 

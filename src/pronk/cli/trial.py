@@ -13,7 +13,6 @@ from pronk.cli import console
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
-    from pronk.evaluation.results import Results
     from pronk.evaluation.tables import Sheet
 
 ROBOT = "mini_cheetah"
@@ -110,7 +109,12 @@ def trial(
     for sheet in sheets:
         if definitions or sheet.title != tables.DEFINITIONS:
             console.show_sheet(sheet)
-    console.say(spent(found))
+    timing = found.timing
+    console.say(
+        f"{len(found.rows)} jumps, {timing['simulated_s']:.0f} s of the virtual robot in "
+        f"{timing['seconds']:.0f} s on {timing['processes']:.0f} processes; "
+        f"{timing['simulated_s_per_cpu_s']:.1f} simulated seconds per second of a core"
+    )
     console.wrote(out / TABLE, out / SUMMARY, out / CAPTURES)
     wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
     films: tuple[Path, ...] = ()
@@ -137,7 +141,7 @@ def trial(
         "checks": [check.row() for check in trial_checks(found)],
         "cells": [asdict(cell) for cell in found.cells],
         "ratios": [asdict(ratio) for ratio in found.ratios],
-        "timing": dict(found.timing),
+        "timing": dict(timing),
         "page": page,
         "videos": films,
     }
@@ -181,14 +185,3 @@ def _extra_sheets(
         yield bodies.table(
             bodies.add_bodies(policies, plan_n, own=trained, seed=seed, progress=report, **setup)
         )
-
-
-def spent(found: Results) -> str:
-    """The computing time, in words."""
-    timing = found.timing
-    return (
-        f"{len(found.rows)} jumps, {timing['simulated_s']:.0f} s of the virtual robot in "
-        f"{timing['seconds']:.0f} s on {timing['processes']:.0f} processes; "
-        f"{timing['simulated_s_per_s_and_process']:.1f} simulated seconds per second and process, "
-        f"{timing['simulated_s_per_cpu_s']:.1f} per second of a core"
-    )
