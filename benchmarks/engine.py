@@ -20,7 +20,7 @@ from pronk.match.grid import axes, quick_search
 from pronk.match.measured_joint import DB, SimRequest, measured_joints, responses
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import MujocoSimulator
 
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
@@ -43,7 +43,7 @@ class EngineGap:
 
 
 def engine_gap(
-    robot: Robot,
+    robot: RobotSpec,
     joint: str,
     *,
     fine_timestep_s: float = FINE_TIMESTEP_S,

@@ -28,7 +28,7 @@ from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
 from pronk.report.paper import published
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
 
 Gains = tuple[float, float]
@@ -148,7 +148,7 @@ def run(
 
 
 def _measured(
-    robot: Robot, name: str, gains: Gains, length_s: float, settings: MatchSettings
+    robot: RobotSpec, name: str, gains: Gains, length_s: float, settings: MatchSettings
 ) -> MeasuredJoint:
     """A joint's chirp in the training simulator; mirrored joints get a mirrored command."""
     sign = robot.joint(name).original[1]

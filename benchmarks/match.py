@@ -32,7 +32,7 @@ from pronk.logs.joint_log import JointLog
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 ROBOT = "mini_cheetah"
 JOINT = "FR_knee"
@@ -75,7 +75,7 @@ SCENARIOS = (
 
 
 def known_log(
-    robot: Robot,
+    robot: RobotSpec,
     scenario: Scenario,
     rng: np.random.Generator,
     *,
@@ -111,7 +111,7 @@ def known_log(
     )
 
 
-def fit_pronk(log: JointLog, *, robot: Robot, method: Any, threads: int) -> Estimate:
+def fit_pronk(log: JointLog, *, robot: RobotSpec, method: Any, threads: int) -> Estimate:
     """Match a log the way `pronk match` does, by the method `grid` or `quick`."""
     before = time.perf_counter()
     settings = MatchSettings(method=method, zero_armature=False, threads=threads)
@@ -125,7 +125,7 @@ def fit_pronk(log: JointLog, *, robot: Robot, method: Any, threads: int) -> Esti
 
 
 def tools(
-    robot: Robot, scenario: Scenario, *, seed: int, threads: int
+    robot: RobotSpec, scenario: Scenario, *, seed: int, threads: int
 ) -> dict[str, tuple[str, Callable[[JointLog], Estimate]]]:
     """The tools of a scenario: name to free parameters and fit."""
     joint = robot.joint(JOINT)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.robots.model import bench_spec, set_drive_gains
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 Bounds = tuple[tuple[float, float], tuple[float, float]]
@@ -83,7 +83,7 @@ def import_peers() -> tuple[Any, Any]:
 class Replay:
     """A log as time-domain tools need it: commands and positions at the physics steps."""
 
-    def __init__(self, log: JointLog, joint: str, robot: Robot) -> None:
+    def __init__(self, log: JointLog, joint: str, robot: RobotSpec) -> None:
         """Read a log; joints that are held stand at their default position.
 
         Args:
@@ -164,7 +164,7 @@ class Replay:
 def fit_sysid(
     log: JointLog,
     joint: str,
-    robot: Robot,
+    robot: RobotSpec,
     *,
     bounds: Bounds,
     start: tuple[float, float],
@@ -241,7 +241,7 @@ def fit_sysid(
 def fit_cma(
     log: JointLog,
     joint: str,
-    robot: Robot,
+    robot: RobotSpec,
     *,
     bounds: Bounds,
     start: tuple[float, float],

@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
 from pronk.simulators.simulator import JointRigs, play
@@ -53,7 +53,7 @@ def coloured_noise(
 
 
 def synthetic_log(
-    robot: Robot,
+    robot: RobotSpec,
     joint: str,
     excitations: Sequence[Excitation],
     stiffness: float | Array,

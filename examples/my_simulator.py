@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import PARAMETERS, SimulatorInfo
 
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ LINK_INERTIA = 0.006
 class Pendulum:
     """Joints of a robot that do not feel each other."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: RobotSpec) -> None:
         """Take the joints of a robot and their parameters."""
         self.info = SimulatorInfo(
             engine="numpy", version="1", timestep_s=0.002, decimation=10, integrator="euler"

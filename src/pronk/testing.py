@@ -15,7 +15,7 @@ from pronk.links.link import Codec, Transport
 from pronk.links.machine import Command, RefusedError, damping_command
 from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import Reader
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import PARAMETERS, Simulator
 
 
@@ -79,7 +79,9 @@ def check_simulator(simulator: Simulator) -> None:
         _require(float(effect) > 1e-5, f"parameters: {name} has an effect")
 
 
-def check_reader(chosen: Reader, path: Path, *, robot: Robot | None = None, **options: Any) -> None:
+def check_reader(
+    chosen: Reader, path: Path, *, robot: RobotSpec | None = None, **options: Any
+) -> None:
     """Check a log reader on a file that it should read.
 
     The log has two samples or more, one command and one position a joint, finite and increasing
@@ -111,7 +113,7 @@ def check_reader(chosen: Reader, path: Path, *, robot: Robot | None = None, **op
 
 
 def check_link(
-    robot: Robot,
+    robot: RobotSpec,
     codec: Codec,
     states: Sequence[bytes],
     transport: Callable[[], Transport] | None = None,

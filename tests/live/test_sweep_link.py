@@ -35,7 +35,7 @@ from pronk.links.link import Freshness
 from pronk.links.machine import Command
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_log import read_mcap
-from pronk.robots import Robot, load_robot
+from pronk.robots import RobotSpec, load_robot
 from pronk.runtime.run import Recorded
 from pronk.virtual.server import hold_of
 
@@ -59,7 +59,7 @@ def plan_of(joint: str) -> SweepPlan:
     return make_plan(ROBOT, [joint], signal, amplitudes=(0.2,), repeats=1, settle_s=0.1)
 
 
-def slow(limit: float) -> Robot:
+def slow(limit: float) -> RobotSpec:
     """The robot with a lower no-load speed [rad/s]."""
     joints = (replace(j, drive=replace(j.drive, no_load_speed=limit)) for j in ROBOT.joints)
     return replace(ROBOT, joints=tuple(joints))
@@ -131,7 +131,7 @@ class Listener:
             self._lcm.handle_timeout(50)
 
 
-def swept(robot: Robot, plan: SweepPlan, out: Path, port: int) -> Recorded:
+def swept(robot: RobotSpec, plan: SweepPlan, out: Path, port: int) -> Recorded:
     address = Address.parse("lcm", port=port)
     plan = replace(plan, robot=robot)
     return record_wire(plan, out, address, limits=PATIENT, fresh=FRESH, real_time=True)

@@ -16,13 +16,13 @@ from pronk.actuator.model import clip_torque, pd_torque
 from pronk.errors import RobotError
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec, free_spec, set_drive_gains, set_passive
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 CHEETAH, ARM = load_robot("mini_cheetah"), load_robot("so101")
 
 
-def held_chirp(robot: Robot, seconds: float, amplitude: float) -> Array:
+def held_chirp(robot: RobotSpec, seconds: float, amplitude: float) -> Array:
     """Linear chirp .1 to 25 Hz held at policy rate, one value a physics step."""
     ticks = np.arange(round(seconds * robot.policy_rate_hz)) / robot.policy_rate_hz
     signal = amplitude * chirp(ticks, 0.1, seconds, 25.0, phi=-90)
@@ -54,7 +54,7 @@ def simulate(model: mujoco.MjModel, command: Array) -> Array:
 
 
 def explicit_law(
-    robot: Robot, spec: mujoco.MjSpec, stiffness: float, damping: float, command: Array
+    robot: RobotSpec, spec: mujoco.MjSpec, stiffness: float, damping: float, command: Array
 ) -> tuple[Array, float]:
     """The training law written out: PD clipped by drive.py, torque motors, implicitfast.
 
@@ -88,7 +88,7 @@ def explicit_law(
 
 
 @pytest.mark.parametrize("robot", [CHEETAH, ARM], ids=lambda robot: robot.name)
-def test_bench_holds_the_chain_and_nothing_else(robot: Robot) -> None:
+def test_bench_holds_the_chain_and_nothing_else(robot: RobotSpec) -> None:
     for joint in robot.joints:
         model = bench_spec(robot, joint.name).compile()
         assert tuple(model.joint(i).name for i in range(model.njnt)) == joint.chain
@@ -121,7 +121,7 @@ def test_bench_is_the_free_robot_with_its_base_held(name: str) -> None:
     np.testing.assert_allclose(small.site(foot).xpos, large.site(foot).xpos, atol=1e-12)
 
 
-def changed_knee(**changes: Any) -> Robot:
+def changed_knee(**changes: Any) -> RobotSpec:
     knee = replace(CHEETAH.joint("FR_knee"), **changes)
     joints = (knee if j.name == knee.name else j for j in CHEETAH.joints)
     return replace(CHEETAH, joints=tuple(joints))

@@ -30,7 +30,7 @@ from pronk.links.link import (
 )
 from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.testing import check_link
 from pronk.virtual.robot import VirtualRobot
 
@@ -303,7 +303,7 @@ class Loop:
     def close(self) -> None: ...
 
 
-def serial(robot: Robot, *, interface: str | None = None, speed: int = 9600, **common: object):  # type: ignore[no-untyped-def]
+def serial(robot: RobotSpec, *, interface: str | None = None, speed: int = 9600, **common: object):  # type: ignore[no-untyped-def]
     link = StreamLink(robot, Serial(), Loop, **common)  # type: ignore[arg-type]
     link.counts = Counter(speed=speed)
     return link

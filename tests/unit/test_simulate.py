@@ -17,7 +17,7 @@ from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace, policy_clock
 from pronk.simulators.mujoco import JointTestRig, simulate
 
@@ -25,7 +25,7 @@ ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
 
 
-def trace_of(joint: str, offsets: np.ndarray, robot: Robot = ROBOT) -> CommandTrace:
+def trace_of(joint: str, offsets: np.ndarray, robot: RobotSpec = ROBOT) -> CommandTrace:
     centre = robot.joint(joint).default_position
     return CommandTrace(
         joint=joint,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pronk.evaluation.results import Results
     from pronk.match.predict import JointPrediction
     from pronk.match.result import MatchResult
-    from pronk.robots.robot import Robot
+    from pronk.robots.robot import RobotSpec
 
 ROBOT = "mini_cheetah"
 FILMED = "forward 2"
@@ -103,7 +103,7 @@ def demo(
     )
 
 
-def find_policies(folder: Path | None, robot: Robot) -> list[Path]:
+def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
     """Return the policies of a folder, or of pronk's source if None; the matched one first.
 
     Raises:
@@ -160,7 +160,7 @@ def jump_and_film(
 
 
 def sweep_and_match(
-    robot: Robot, out: Path, repeats: int, seed: int, quick: bool, report: console.Reporter
+    robot: RobotSpec, out: Path, repeats: int, seed: int, quick: bool, report: console.Reporter
 ) -> tuple[MatchResult, list[JointPrediction]]:
     """Sweep all joints, match them, and predict a sweep that was not matched.
 

@@ -39,7 +39,7 @@ def match(
 
     Args:
         paths: Logs, or folders of logs.
-        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF.
+        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF.
         out: The gains file.
         mode: gains: stiffness and damping (the paper's). drive: damping, armature, friction and
             delay at known stiffness.
@@ -147,7 +147,7 @@ def predict(
 
     Args:
         paths: Logs, or folders of logs.
-        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF.
+        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF.
         gains: gains.yaml of `pronk match`.
         out: Folder for replays and figures; beside the gains.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
@@ -231,7 +231,7 @@ def export(
         gains: gains.yaml of `pronk match`.
         to: What reads the file.
         out: The file to write.
-        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF; the gains' if left out.
+        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF; the gains' if left out.
         json_file: Also write the figures to this file.
     """
     from pronk.files import write_text

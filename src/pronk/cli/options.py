@@ -15,7 +15,7 @@ from pronk.errors import HardwareError, PronkError
 if TYPE_CHECKING:
     from pronk.links.address import Address
     from pronk.logs.joint_log import JointLog
-    from pronk.robots.robot import Robot
+    from pronk.robots.robot import RobotSpec
 
 Layout = Literal["cheetah", "wtw"]
 """Messages on LCM: Cheetah-Software's, or walk-these-ways'."""
@@ -99,7 +99,7 @@ class Reading:
     reader_options: Annotated[tuple[str, ...], tyro.conf.arg(name="reader-option")] = ()
     """NAME=VALUE for a reader of another package; repeat it."""
 
-    def read(self, paths: Sequence[Path], robot: Robot | None) -> list[JointLog]:
+    def read(self, paths: Sequence[Path], robot: RobotSpec | None) -> list[JointLog]:
         """Read every log that some paths stand for, on all cores.
 
         Raises:

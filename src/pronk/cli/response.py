@@ -31,7 +31,7 @@ def response(
 
     Args:
         paths: Logs, or folders of logs.
-        robot: Robot: a name, or a path to its robot.yaml, MJCF or URDF; the log's if left out.
+        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF; the log's if left out.
         out: Folder for what is written; beside the log if left out.
         plots: Draw Bode plots.
         reading: How logs are read.

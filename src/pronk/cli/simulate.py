@@ -14,7 +14,7 @@ from pronk.cli.options import Base, Layout
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
-    from pronk.robots.robot import Robot
+    from pronk.robots.robot import RobotSpec
     from pronk.virtual.server import RobotServer, ServerTransport
 
 _PRIORITY = 30
@@ -49,7 +49,7 @@ def simulate(
     Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
 
     Args:
-        robot: Robot, for instance mini_cheetah.
+        robot: RobotSpec, for instance mini_cheetah.
         link: The wire.
         layout: Messages on LCM: Cheetah-Software's, or walk-these-ways'.
         base: bench: the trunk is fixed; ground: it stands and moves freely.
@@ -121,7 +121,12 @@ def simulate(
 
 
 def _open_wire(
-    link: WireLink, robot: Robot, layout: Layout, port: int | None, domain: int | None, mode: str
+    link: WireLink,
+    robot: RobotSpec,
+    layout: Layout,
+    port: int | None,
+    domain: int | None,
+    mode: str,
 ) -> tuple[ServerTransport, str]:
     """The robot's end of the wire, and its address in words."""
     if link == "lcm":

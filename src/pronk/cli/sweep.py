@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
     from pronk.links.address import Address
     from pronk.links.link import Freshness
-    from pronk.robots.robot import Robot
+    from pronk.robots.robot import RobotSpec
     from pronk.runtime.ipc import Event
     from pronk.runtime.run import Recorded
     from pronk.runtime.sweep import SweepTask
@@ -44,7 +44,7 @@ def sweep(
     """Excite every joint: plan, check against the limits, excite, record.
 
     Args:
-        robot: Robot, for instance mini_cheetah.
+        robot: RobotSpec, for instance mini_cheetah.
         out: Folder for the logs, one MCAP per joint.
         machine: The machine.
         joints: Joints to excite; repeat it. All if left out.
@@ -125,7 +125,7 @@ def sweep(
 
 
 def make(
-    robot: Robot,
+    robot: RobotSpec,
     joints: Sequence[str] | None,
     signal: SignalName,
     amplitudes: Sequence[float],

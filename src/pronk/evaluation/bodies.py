@@ -46,7 +46,7 @@ from pronk.match.gains import MatchedGains
 from pronk.match.measured_joint import SimRequest, logs_by_joint, measured_joints, responses
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.sweep import SweepTask, record
 from pronk.simulators.mujoco import MujocoSimulator
 from pronk.virtual.plant import legs_of
@@ -111,7 +111,7 @@ def add_bodies(
     policies: Sequence[Path],
     plan: Plan | None = None,
     *,
-    robot: Robot,
+    robot: RobotSpec,
     sim_params: SimParams,
     out: Path,
     about: Mapping[str, Any] | None = None,
@@ -212,7 +212,7 @@ def _sweep_leg(leg: tuple[str, int, SweepPlan, SimParams, Path]) -> list[Path]:
 
 
 def match_body(
-    robot: Robot,
+    robot: RobotSpec,
     sim_params: SimParams,
     folder: Path,
     *,
@@ -266,7 +266,7 @@ def _is_matched(folder: Path, sim_params: SimParams) -> bool:
 
 def gains_errors(
     logs: Sequence[JointLog],
-    robot: Robot,
+    robot: RobotSpec,
     gains: Mapping[str, Pairs],
     *,
     settings: MatchSettings = SETTINGS,
@@ -299,7 +299,7 @@ def gains_errors(
 
 
 def _errors(
-    robot: Robot, logs: Sequence[JointLog], matched: MatchedGains, subjects: Sequence[Subject]
+    robot: RobotSpec, logs: Sequence[JointLog], matched: MatchedGains, subjects: Sequence[Subject]
 ) -> dict[str, float]:
     """The errors of the gains of the policies, of the robot's drives, and of its own match."""
     pairs: dict[str, Pairs] = {}

@@ -62,7 +62,7 @@ from pronk.evaluation.trial import (
     versions,
 )
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import ticks
 from pronk.runtime.script import STILL, Commanded, Script, Velocity
 from pronk.virtual.capture import Capture
@@ -358,7 +358,7 @@ def attempts(
     lead: float,
     runs: int,
     plan: CrossingPlan,
-    robot: Robot,
+    robot: RobotSpec,
     sim_params: SimParams,
 ) -> list[Attempt]:
     """Return runs at one obstacle; their starts are alike for all obstacles and leads."""
@@ -395,7 +395,7 @@ def search(
     subjects: Sequence[Subject],
     plan: CrossingPlan,
     *,
-    robot: Robot,
+    robot: RobotSpec,
     sim_params: SimParams,
     run: Callable[[list[Attempt]], list[Row]],
 ) -> list[Row]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pronk.actuator import model as drive
 from pronk.robots.legged import legged
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
 
@@ -413,7 +413,7 @@ def jump_events(capture: Capture, script: Script, *, began: float = 0.0) -> Jump
 def measure(
     capture: Capture,
     script: Script,
-    robot: Robot,
+    robot: RobotSpec,
     *,
     began: float,
     mass: float,
@@ -488,7 +488,7 @@ def _run(capture: Capture, script: Script, start: int, on: int, *, mass: float) 
     return figures
 
 
-def _loads(capture: Capture, robot: Robot, on: int, end: int) -> dict[str, tuple[float, ...]]:
+def _loads(capture: Capture, robot: RobotSpec, on: int, end: int) -> dict[str, tuple[float, ...]]:
     """Peaks of each joint, and how near to its torque-speed curve they come."""
     # Links ring on their belts at 100 Hz and more; what the motors turn at is the average.
     half = max(1, round(0.5 * AVERAGE_S / capture.dt))

@@ -40,7 +40,7 @@ from pronk.evaluation.results import JUMPS, SUMMARY, TABLE, Kind, Results, Row, 
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import check_standing, ticks
 from pronk.runtime.script import STILL, Script
 from pronk.virtual import capture as captures
@@ -65,7 +65,7 @@ _LEFT_OUT = ("observation", "provenance")
 class Setup(TypedDict):
     """What every kind of trial runs on."""
 
-    robot: Robot
+    robot: RobotSpec
     """Of the policies."""
     sim_params: SimParams
     """Of the virtual robot."""
@@ -124,7 +124,7 @@ def case_rng(seed: int, case: Case, number: int) -> np.random.Generator:
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "little"), number])
 
 
-def draw(plan: Plan, case: Case, number: int, robot: Robot) -> tuple[Script, Start, int]:
+def draw(plan: Plan, case: Case, number: int, robot: RobotSpec) -> tuple[Script, Start, int]:
     """Draw the script, the start and the noise seed of one jump, numbered from 0."""
     rng = case_rng(plan.seed, case, number)
     ticks = int(rng.integers(round(plan.spread_s * robot.policy_rate_hz) + 1))
@@ -303,7 +303,7 @@ def plan_jobs(
     subjects: Sequence[Subject],
     plan: Plan,
     *,
-    robot: Robot,
+    robot: RobotSpec,
     sim_params: SimParams,
     out: Path | None = None,
     keep: Keep = "none",
@@ -440,7 +440,9 @@ def run_trial(
     return run_plan(policies, plan, keep=keep, overwrite=overwrite, **setup)
 
 
-def load_subjects(paths: Sequence[Path], robot: Robot, *, jump: bool = True) -> tuple[Subject, ...]:
+def load_subjects(
+    paths: Sequence[Path], robot: RobotSpec, *, jump: bool = True
+) -> tuple[Subject, ...]:
     """Open, check and name policies.
 
     A policy is named after the gains of its training; two of a kind, after their files.

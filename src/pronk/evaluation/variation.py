@@ -22,7 +22,7 @@ from pronk.evaluation.results import Cell, Kind, Results
 from pronk.evaluation.tables import Sheet, number, sheet
 from pronk.evaluation.trial import Plan, Setup, run_plan
 from pronk.files import write_text
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.virtual.sim_params import SCHEMA, JointParams, SimParams, with_changes
 
 VARIATION = Kind(
@@ -246,7 +246,7 @@ _DIGITS = 5
 """Of a drawn number, so that a written file holds it exactly."""
 
 
-def draw_robot(sim_params: SimParams, robot: Robot, *, seed: int) -> SimParams:
+def draw_robot(sim_params: SimParams, robot: RobotSpec, *, seed: int) -> SimParams:
     """Draw a random robot: every number of `TOLERANCES` anew about given parameters.
 
     Raises:

@@ -31,7 +31,7 @@ from pronk.evaluation.jumps import (
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Kind, Results
 from pronk.evaluation.trial import Plan, Setup, run_plan
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import STILL, Script, Velocity
 from pronk.virtual.capture import Capture
 
@@ -151,7 +151,7 @@ def velocity_errors(
 def measure_walk(
     capture: Capture,
     script: Script,
-    robot: Robot | None = None,
+    robot: RobotSpec | None = None,
     *,
     began: float,
     mass: float,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pronk.errors import PlanError
 from pronk.excitation.signals import Chirp, Signal
 from pronk.excitation.worst_case import Forecast, Uncertainty, forecast
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class Excitation:
 class SweepPlan:
     """Excitations in the order of the sweep. Build it with `make_plan`."""
 
-    robot: Robot
+    robot: RobotSpec
     excitations: tuple[Excitation, ...]
     rate_hz: float
     """Rate of the commands."""
@@ -168,7 +168,7 @@ class SweepPlan:
 
 
 def make_plan(
-    robot: Robot,
+    robot: RobotSpec,
     joints: Sequence[str] | None = None,
     signal: Signal | None = None,
     *,
@@ -258,7 +258,7 @@ def make_plan(
 
 
 def _forecasts(
-    robot: Robot,
+    robot: RobotSpec,
     excitation: Excitation,
     rate_hz: float,
     stiffness: Array,

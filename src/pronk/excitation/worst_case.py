@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pronk.actuator.model import bus_current, electrical_power, pd_torque, torque_limits
 from pronk.errors import PlanError
 from pronk.robots.model import bench_spec, set_drive_gains
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -103,7 +103,7 @@ class Forecast:
             )
         return found
 
-    def mirrored(self, robot: Robot, joint: str, sign: float) -> Forecast:
+    def mirrored(self, robot: RobotSpec, joint: str, sign: float) -> Forecast:
         """The same for the joint that mirrors this one, `sign` between their coordinates."""
         ends = sorted((sign * self.lowest, sign * self.highest))
         own = robot.joint(joint)
@@ -128,7 +128,7 @@ class Forecast:
 
 
 def forecast(
-    robot: Robot,
+    robot: RobotSpec,
     joint: str,
     offsets: Array,
     *,
@@ -186,7 +186,7 @@ def forecast(
 
 def _altered(
     model: mujoco.MjModel,
-    robot: Robot,
+    robot: RobotSpec,
     order: Sequence[str],
     stiffness: Mapping[str, float],
     damping: Mapping[str, float],
@@ -233,7 +233,7 @@ def _roll(
 
 
 def _extremes(
-    robot: Robot,
+    robot: RobotSpec,
     excited: str,
     name: str,
     amplitude: float,

@@ -23,7 +23,7 @@ from pronk import plugins
 from pronk.errors import HardwareError
 from pronk.links.link import ClampOperator, Freshness
 from pronk.links.machine import Machine
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 SIM = "sim"
 BUILT_IN = {
@@ -105,7 +105,7 @@ class Address:
 
     def machine(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         *,
         clamp_operator: ClampOperator | None = None,
         release: bool = False,

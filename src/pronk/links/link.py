@@ -30,7 +30,7 @@ import numpy as np
 
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, RefusedError, State, TorqueKind, damping_command
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 ClampOperator = Callable[[tuple[str, ...]], None]
 """A person at the bench: receives the joints to fix and returns when they are."""
@@ -222,7 +222,7 @@ class NetworkLink(ABC):
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         *,
         clamp_operator: ClampOperator | None = None,
         release: bool = False,
@@ -478,7 +478,7 @@ class StreamLink(NetworkLink):
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         codec: Codec,
         transport: Callable[[], Transport],
         *,

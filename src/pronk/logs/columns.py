@@ -18,7 +18,7 @@ from pronk.logs.checks import (
     examine,
 )
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Columns:
 
 def import_columns(
     columns: Columns,
-    robot: Robot | None = None,
+    robot: RobotSpec | None = None,
     *,
     unit: str | None = None,
     time_unit: str | None = None,
@@ -161,7 +161,7 @@ def import_columns(
     )
 
 
-def _named(columns: Columns, robot: Robot | None, names: Names | None) -> tuple[str, ...]:
+def _named(columns: Columns, robot: RobotSpec | None, names: Names | None) -> tuple[str, ...]:
     """Names of the joints, as many as there are columns."""
     where, joints = columns.where, columns.joints
     shape = (len(columns.time), columns.position.shape[-1])

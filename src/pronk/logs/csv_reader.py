@@ -13,7 +13,7 @@ from pronk.errors import LogError
 from pronk.files import sha256, write_text
 from pronk.logs.columns import Columns
 from pronk.logs.joint_log import JointLog
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def read_csv(
-    path: Path, *, robot: Robot | None = None, columns: Mapping[str, str] | None = None
+    path: Path, *, robot: RobotSpec | None = None, columns: Mapping[str, str] | None = None
 ) -> Columns:
     """Read a CSV file.
 

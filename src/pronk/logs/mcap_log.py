@@ -37,7 +37,7 @@ from pronk.logs.mcap import (
     records,
 )
 from pronk.logs.rosbag_reader import read_joint_states
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 Floats = Sequence[float] | Array
@@ -202,7 +202,7 @@ def write_mcap(path: Path, log: JointLog) -> None:
 def read_mcap(
     path: Path,
     *,
-    robot: Robot | None = None,
+    robot: RobotSpec | None = None,
     measured_topic: str | None = None,
     command_topic: str | None = None,
     command_field: str = "position",

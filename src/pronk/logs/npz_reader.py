@@ -16,7 +16,7 @@ from pronk.errors import LogError
 from pronk.files import sha256, written_whole
 from pronk.logs.columns import Columns
 from pronk.logs.joint_log import JointLog
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 SCHEMA = "pronk/sweep-npz/1"
 
@@ -35,7 +35,7 @@ def write_npz(path: Path, log: JointLog) -> None:
         np.savez_compressed(file, header=np.array(orjson.dumps(header).decode()), **arrays)
 
 
-def read_npz(path: Path, *, robot: Robot | None = None) -> Columns | JointLog:
+def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns | JointLog:
     """Read what `write_npz` wrote, or the arrays `time`, `command`, `position` of another tool.
 
     Raises:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import Columns
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 KEYS = ("time", "dof_pos", "des_dof_pos")
 
@@ -189,7 +189,7 @@ def load_tensors(path: Path) -> dict[str, NDArray[Any]]:
     return {k[:40]: v for k, v in found.items() if isinstance(v, np.ndarray)}
 
 
-def read_pace(path: Path, *, robot: Robot | None = None) -> Columns:
+def read_pace(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     """Read a PACE recording: `time` (n,), `dof_pos` and `des_dof_pos` (n, joints).
 
     Raises:

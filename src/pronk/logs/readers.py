@@ -25,7 +25,7 @@ from pronk.logs.mcap_log import read_mcap
 from pronk.logs.npz_reader import read_npz
 from pronk.logs.pace_reader import read_pace
 from pronk.logs.sage_reader import is_sage, read_sage
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 GROUP = "pronk.readers"
 """Entry points of readers from other packages; each is a function decorated with `reader`."""
@@ -63,7 +63,7 @@ class Reader:
         """Names of the options."""
         return tuple(self.parameters)
 
-    def read(self, path: Path, *, robot: Robot | None = None, **options: Any) -> JointLog:
+    def read(self, path: Path, *, robot: RobotSpec | None = None, **options: Any) -> JointLog:
         """Read a file; a reader that returns `Columns` has them checked and converted."""
         own = _parameters(self.function)
         given = {name: value for name, value in options.items() if name in own}
@@ -129,7 +129,7 @@ _WORTH_PROCESSES = 4
 def read_log(
     path: Path | str,
     *,
-    robot: Robot | None = None,
+    robot: RobotSpec | None = None,
     format: str | None = None,
     rate_hz: float | None = None,
     **options: Any,
@@ -192,7 +192,7 @@ def _typed(path: Path, chosen: Reader, name: str, value: Any) -> Any:
 
 
 def _checked(
-    path: Path, chosen: Reader, log: JointLog, robot: Robot | None, rate_hz: float | None
+    path: Path, chosen: Reader, log: JointLog, robot: RobotSpec | None, rate_hz: float | None
 ) -> JointLog:
     """Check what all logs must pass."""
     if not isinstance(log, JointLog):

@@ -18,7 +18,7 @@ from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import Columns, in_force
 from pronk.logs.csv_reader import read_rows, read_text
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def is_sage(path: Path) -> bool:
     return path.is_dir() and all((path / name).is_file() for name in FILES)
 
 
-def read_sage(path: Path, *, robot: Robot | None = None) -> Columns:
+def read_sage(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     """Read a SAGE folder.
 
     The command in force at a state is the last one at or before its timestamp. Joints of the

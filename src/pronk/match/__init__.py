@@ -19,7 +19,7 @@ from pronk.match.pipeline import match_logs
 from pronk.match.predict import predict
 from pronk.match.result import MatchResult
 from pronk.match.settings import MatchSettings
-from pronk.robots import Robot
+from pronk.robots import RobotSpec
 
 __all__ = ["MatchResult", "MatchSettings", "match_logs", "predict"]
 
@@ -27,7 +27,7 @@ __all__ = ["MatchResult", "MatchSettings", "match_logs", "predict"]
 class _Package(ModuleType):
     """Make `pronk.match(logs, robot)` call `match_logs`."""
 
-    def __call__(self, logs: Sequence[JointLog], robot: Robot, **options: Any) -> MatchResult:
+    def __call__(self, logs: Sequence[JointLog], robot: RobotSpec, **options: Any) -> MatchResult:
         return match_logs(logs, robot, **options)
 
 

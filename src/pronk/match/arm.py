@@ -37,7 +37,7 @@ from pronk.match.measured_joint import DB, trusted_samples
 from pronk.match.result import JointFit
 from pronk.response.estimate import estimate as estimate_response
 from pronk.response.response import FrequencyResponse
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, Drives, JointDrive, excited_joints
 
 Array = NDArray[np.float64]
@@ -147,7 +147,7 @@ class TimeProblem:
 
 def fit_whole_arm(
     logs: Sequence[JointLog],
-    robot: Robot,
+    robot: RobotSpec,
     names: Sequence[str],
     *,
     most_held: int = 2,

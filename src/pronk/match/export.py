@@ -17,7 +17,7 @@ from pronk.errors import PronkError
 from pronk.match.gains import MatchedGains
 from pronk.robots import load_robot
 from pronk.robots.model import add_drives, free_spec
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class GroupDrive:
     """Command delay in physics steps."""
 
 
-def group_drives(gains: MatchedGains, robot: Robot) -> list[GroupDrive]:
+def group_drives(gains: MatchedGains, robot: RobotSpec) -> list[GroupDrive]:
     """The matched groups, in the robot's order. Fitted friction and delay are averaged.
 
     Raises:
@@ -93,7 +93,7 @@ def group_drives(gains: MatchedGains, robot: Robot) -> list[GroupDrive]:
     return out
 
 
-def mjlab_text(gains: MatchedGains, robot: Robot) -> str:
+def mjlab_text(gains: MatchedGains, robot: RobotSpec) -> str:
     """Python source for mjlab: `ACTUATORS`, a tuple of configs, and `EVENTS`, a dict of events.
 
     The events draw absolute gains for every environment (D3, D4); they address the actuators by
@@ -136,7 +136,7 @@ def mjlab_text(gains: MatchedGains, robot: Robot) -> str:
     )
 
 
-def mjcf_text(gains: MatchedGains, robot: Robot) -> str:
+def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
     """The whole robot as MJCF with a native `dcmotor` for every joint.
 
     Its torque is the PD law with the groups' gains, clipped by the torque-speed line and the
@@ -169,7 +169,7 @@ def mjcf_text(gains: MatchedGains, robot: Robot) -> str:
     return f"<!--\n{comment}\n-->\n{spec.to_xml()}"
 
 
-def isaaclab_text(gains: MatchedGains, robot: Robot) -> str:
+def isaaclab_text(gains: MatchedGains, robot: RobotSpec) -> str:
     """Python source for Isaac Lab: `ACTUATORS`, a dict of `DCMotorCfg` by group.
 
     Isaac Lab runs PhysX; its first line is a warning that the gains must be matched there anew.
@@ -208,7 +208,7 @@ def _fields(drive: GroupDrive, friction: str, **extra: str) -> str:
     return "".join(f"        {n}={_number(getattr(drive, f))},\n" for n, f in names.items())
 
 
-EXPORTS: Mapping[str, Callable[[MatchedGains, Robot], str]] = {
+EXPORTS: Mapping[str, Callable[[MatchedGains, RobotSpec], str]] = {
     "mjlab": mjlab_text,
     "mjcf": mjcf_text,
     "isaaclab": isaaclab_text,
@@ -216,7 +216,7 @@ EXPORTS: Mapping[str, Callable[[MatchedGains, Robot], str]] = {
 """What `export_text` can write."""
 
 
-def export_text(gains: MatchedGains, target: str, robot: Robot | None = None) -> str:
+def export_text(gains: MatchedGains, target: str, robot: RobotSpec | None = None) -> str:
     """The gains as text for one of `EXPORTS`; the robot is found by its name if not given.
 
     Raises:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pronk.errors import PronkError
 from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
 from pronk.match.response_fit import Fit, refine
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant, plant
 from pronk.simulators.mujoco import JointTestRig
 from pronk.simulators.simulator import JointRig, JointRigs
@@ -73,7 +73,7 @@ class GridSearch:
         return any(k in (0, n - 1) for k, n in zip(self.cell, self.error.shape, strict=True))
 
 
-def axes(robot: Robot, points: int = 50) -> tuple[Array, Array]:
+def axes(robot: RobotSpec, points: int = 50) -> tuple[Array, Array]:
     """Axes of the robot's grid (paper F7: 13 to 27 N m/rad and 0.1 to 0.7 N m s/rad, 50 each)."""
     return np.linspace(*robot.grid_stiffness, points), np.linspace(*robot.grid_damping, points)
 
@@ -86,7 +86,7 @@ def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128]) -> Array
     return np.asarray(error**2 @ np.full(count, 1.0 / count))
 
 
-def alike(targets: Sequence[MeasuredJoint], robot: Robot) -> list[list[MeasuredJoint]]:
+def alike(targets: Sequence[MeasuredJoint], robot: RobotSpec) -> list[list[MeasuredJoint]]:
     """Targets gathered by simulation: mirror-image joints excited alike share one."""
     groups: list[list[MeasuredJoint]] = []
     for goal in targets:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.robots.model import bench_spec
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -171,7 +171,7 @@ def require_identifiable(
     )
 
 
-def bench_inertia(robot: Robot, joint: str) -> tuple[float, float]:
+def bench_inertia(robot: RobotSpec, joint: str) -> tuple[float, float]:
     """Inertia and gravity of a joint in the bench model at the default pose.
 
     Returns:
@@ -196,7 +196,7 @@ def bench_inertia(robot: Robot, joint: str) -> tuple[float, float]:
     return float(inertia[dof, dof]), (pull[0] - pull[1]) / (2.0 * step)
 
 
-def bench_experiment(robot: Robot, joint_name: str) -> tuple[Experiment, dict[str, float]]:
+def bench_experiment(robot: RobotSpec, joint_name: str) -> tuple[Experiment, dict[str, float]]:
     """The paper's sweep of one joint, and nominal values of every parameter.
 
     Raises:

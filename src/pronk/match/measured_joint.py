@@ -21,7 +21,7 @@ from pronk.response.averaged import H1Operator
 from pronk.response.estimate import estimate, excitations, log_rate
 from pronk.response.estimate import operator as build_operator
 from pronk.response.response import FrequencyResponse
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.simulator import JointRigs
 
@@ -130,7 +130,7 @@ class MeasuredJoint:
         return float(DB * np.sqrt(np.mean(relative**2)))
 
 
-def logs_by_joint(logs: Sequence[JointLog], robot: Robot) -> dict[str, list[JointLog]]:
+def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[JointLog]]:
     """Logs that excite each joint, joints in the robot's order.
 
     Raises:
@@ -153,7 +153,7 @@ def logs_by_joint(logs: Sequence[JointLog], robot: Robot) -> dict[str, list[Join
     return {name: where[name] for name in robot.joint_names if name in where}
 
 
-def gains_on_drive(log: JointLog, joint: str, robot: Robot) -> tuple[float, float]:
+def gains_on_drive(log: JointLog, joint: str, robot: RobotSpec) -> tuple[float, float]:
     """Stiffness and damping on the real drive: the log's if it has them, else the robot's."""
     known, column = robot.joint(joint), log.column(joint)
     return (
@@ -165,7 +165,7 @@ def gains_on_drive(log: JointLog, joint: str, robot: Robot) -> tuple[float, floa
 def measured_joints(
     log: JointLog,
     joint: str,
-    robot: Robot,
+    robot: RobotSpec,
     settings: MatchSettings,
 ) -> list[MeasuredJoint]:
     """Estimate a joint's responses and prepare each for comparison, largest amplitude first.
@@ -206,7 +206,7 @@ def _prepared(
     part: JointLog,
     operator: H1Operator,
     measured: FrequencyResponse,
-    robot: Robot,
+    robot: RobotSpec,
     settings: MatchSettings,
 ) -> MeasuredJoint:
     """Prepare the comparison of one measured response to one segment (of repeats any one).

@@ -30,7 +30,7 @@ from pronk.match.response_fit import FREE, Fit, fit_drive, interval, refine, req
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult, amplitude_spread
 from pronk.match.settings import MatchSettings
 from pronk.response.response import FrequencyResponse
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together
 from pronk.simulators.mujoco import mujoco_info
 from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
@@ -53,7 +53,7 @@ randomization is 2 N m/rad on 20 (D3), twice that."""
 
 def match_logs(
     logs: Sequence[JointLog],
-    robot: Robot,
+    robot: RobotSpec,
     *,
     mode: Literal["gains", "drive"] = "gains",
     free: Sequence[str] = (),
@@ -109,7 +109,7 @@ def match_logs(
 
 def _result(
     logs: Sequence[JointLog],
-    robot: Robot,
+    robot: RobotSpec,
     info: SimulatorInfo,
     joints: Mapping[str, JointFit],
     clock: _Clock,
@@ -170,7 +170,7 @@ class _Joint:
 
 
 def _collect(
-    logs: Sequence[JointLog], robot: Robot, settings: MatchSettings, clock: _Clock
+    logs: Sequence[JointLog], robot: RobotSpec, settings: MatchSettings, clock: _Clock
 ) -> dict[str, _Joint]:
     """Responses of every excited joint, in the robot's order."""
     out = {}
@@ -270,7 +270,7 @@ def _without_armature(
             found[request.target.joint].zero_response = response
 
 
-def _joint_fit(robot: Robot, found: _Joint) -> JointFit:
+def _joint_fit(robot: RobotSpec, found: _Joint) -> JointFit:
     """Put one joint's findings together."""
     goal, fit, grid = found.targets[0], found.fits[0], found.grid
     assert grid is not None

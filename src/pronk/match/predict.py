@@ -23,7 +23,7 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.measured_joint import gains_on_drive
 from pronk.response.grid import held_mean
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.simulator import JointRigs, joint_rigs, play
@@ -121,7 +121,7 @@ def load_prediction(path: Path) -> Prediction:
 
 def predict(
     log: JointLog,
-    robot: Robot,
+    robot: RobotSpec,
     gains: MatchedGains,
     *,
     threads: int = 2,
@@ -156,12 +156,12 @@ def predict(
         return _joint_by_joint(log, rigs, gains)
 
 
-def drives_of(robot: Robot, gains: MatchedGains) -> dict[str, JointDrive]:
+def drives_of(robot: RobotSpec, gains: MatchedGains) -> dict[str, JointDrive]:
     """Drives of the matched joints."""
     return {name: _drive(robot, name, joint) for name, joint in gains.joints.items()}
 
 
-def _drive(robot: Robot, name: str, joint: JointGains) -> JointDrive:
+def _drive(robot: RobotSpec, name: str, joint: JointGains) -> JointDrive:
     known = robot.joint(name).drive.frictionloss
     return JointDrive(
         stiffness=joint.stiffness,
@@ -172,7 +172,7 @@ def _drive(robot: Robot, name: str, joint: JointGains) -> JointDrive:
     )
 
 
-def _arm(log: JointLog, robot: Robot, gains: MatchedGains, threads: int) -> Prediction:
+def _arm(log: JointLog, robot: RobotSpec, gains: MatchedGains, threads: int) -> Prediction:
     """The whole arm at once."""
     matched = drives_of(robot, gains)
     with ChainSimulation(robot, [log], threads=threads) as rig:
@@ -236,7 +236,7 @@ def _delayed(trace: CommandTrace, delay: float) -> CommandTrace:
     return replace(trace, command=held_mean(trace.time, trace.command, edges))
 
 
-def _on_drive(log: JointLog, robot: Robot, name: str) -> JointDrive:
+def _on_drive(log: JointLog, robot: RobotSpec, name: str) -> JointDrive:
     """The published drive, with the gains that were on it."""
     stiffness, damping = gains_on_drive(log, name, robot)
     return replace(JointDrive.published(robot, name), stiffness=stiffness, damping=damping)

@@ -28,7 +28,7 @@ from scipy import stats
 from pronk.logs.joint_log import JointLog
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.match.identifiability import bench_inertia
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import SimulatorInfo
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ _SLACK = 1e-6
 """A range that is too small by rounding of the last binary digit still covers."""
 
 
-def group_gains(robot: Robot, joints: Mapping[str, JointGains]) -> dict[str, GroupGains]:
+def group_gains(robot: RobotSpec, joints: Mapping[str, JointGains]) -> dict[str, GroupGains]:
     """Training gains, ranges and joint ellipsoids of every group with a matched joint.
 
     Raises:
@@ -75,7 +75,7 @@ def group_gains(robot: Robot, joints: Mapping[str, JointGains]) -> dict[str, Gro
 
 
 def matched_gains(
-    robot: Robot,
+    robot: RobotSpec,
     joints: Mapping[str, JointGains],
     logs: Sequence[JointLog],
     info: SimulatorInfo,
@@ -91,7 +91,7 @@ def matched_gains(
     )
 
 
-def characteristic_frequency(robot: Robot, joint_name: str, damping: float) -> float:
+def characteristic_frequency(robot: RobotSpec, joint_name: str, damping: float) -> float:
     """Half-width of a joint's resonance, `damping / (2 inertia)` [rad/s].
 
     The inertia is the joint's own in the bench model at the default pose, armature included.
@@ -115,7 +115,7 @@ def _bounds(gains: JointGains) -> tuple[tuple[float, float], tuple[float, float]
     return out[0], out[1]
 
 
-def _centre(robot: Robot, group: Mapping[str, JointGains]) -> tuple[float, float]:
+def _centre(robot: RobotSpec, group: Mapping[str, JointGains]) -> tuple[float, float]:
     """Training stiffness and damping of a group (steps 1 and 2)."""
     bounds = [_bounds(gains) for gains in group.values()]
     low, high = min(b[1][0] for b in bounds), max(b[1][1] for b in bounds)

@@ -31,7 +31,7 @@ from pronk.match.fit import (
 from pronk.match.identifiability import EXPERIMENTS, bench_experiment, require_identifiable
 from pronk.match.measured_joint import DB, FLOOR_DB, MeasuredJoint, SimRequest, responses
 from pronk.match.result import JointFit
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
@@ -265,7 +265,7 @@ def interval(fit: Fit) -> Estimate:
 
 
 def require_sweeps(
-    robot: Robot, joint: str, goals: Sequence[MeasuredJoint], free: tuple[str, ...]
+    robot: RobotSpec, joint: str, goals: Sequence[MeasuredJoint], free: tuple[str, ...]
 ) -> None:
     """Refuse what sweeps cannot separate, before anything is fitted.
 

@@ -14,7 +14,7 @@ import msgspec
 
 from pronk.errors import ArtefactError
 from pronk.policy.layout import ACTIONS, HISTORY, MEASURED
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 SCHEMA = "pronk/policy/1"
 METADATA_KEY = "pronk.contract"
@@ -189,7 +189,7 @@ def from_json(text: str, *, source: object) -> Contract:
         ) from None
 
 
-def check(contract: Contract, robot: Robot, *, gains_sha256: str | None = None) -> None:
+def check(contract: Contract, robot: RobotSpec, *, gains_sha256: str | None = None) -> None:
     """Refuse a policy that is not for this robot.
 
     Args:

@@ -21,7 +21,7 @@ from pronk.report.deploy_run import Delay, faults, jumps, seconds
 from pronk.report.page import Fold, Part, Section, picture, table
 from pronk.report.style import drawing, joint_words, key, legend
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import REAL, VIRTUAL, Mode
 from pronk.runtime.log import DeployLog, read_deploy_log
 from pronk.runtime.safety import FilterAction
@@ -289,7 +289,7 @@ def _overview(log: DeployLog) -> Section:
     )
 
 
-def _joints(log: DeployLog, robot: Robot | None) -> Section:
+def _joints(log: DeployLog, robot: RobotSpec | None) -> Section:
     begin, end, words = window(log)
     unknown = [np.nan] * len(log.joints)
     effort = unknown if robot is None else [joint.drive.effort_limit for joint in robot.joints]

@@ -9,7 +9,7 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import Mode
 from pronk.runtime.log import DeployLog
 from pronk.runtime.safety import FilterAction, Reason
@@ -198,7 +198,7 @@ class Delay:
         return bool(self.longest <= self.trained[1])
 
 
-def delay(log: DeployLog, robot: Robot | None) -> Delay:
+def delay(log: DeployLog, robot: RobotSpec | None) -> Delay:
     """Measure the delay; that of the drives with the gains of `robot`, unknown if None."""
     trained = log.header.get("policy", {}).get("delay_range_s")
     return Delay(
@@ -208,7 +208,7 @@ def delay(log: DeployLog, robot: Robot | None) -> Delay:
     )
 
 
-def drive_delay(log: DeployLog, robot: Robot) -> tuple[float, float]:
+def drive_delay(log: DeployLog, robot: RobotSpec) -> tuple[float, float]:
     """Return the delays with which targets explain torques best, least and most [s].
 
     NaN where there is too little to fit, where torques are not measured, where the law explains

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pronk import plugins
 from pronk.errors import RobotError
-from pronk.robots.robot import Drive, Joint, Robot
+from pronk.robots.robot import Drive, Joint, RobotSpec
 
 ROBOT_NAMES: tuple[str, ...] = ("mini_cheetah", "go2", "so101")
 """The robots that pronk brings."""
@@ -20,7 +20,7 @@ _FILES = (".yaml", ".yml")
 _MODELS = (".xml", ".mjcf", ".urdf")
 
 
-def load_robot(name: str | Path) -> Robot:
+def load_robot(name: str | Path) -> RobotSpec:
     """Load a robot.
 
     Args:
@@ -54,7 +54,7 @@ def load_robot(name: str | Path) -> Robot:
 
 
 @lru_cache
-def _load(path: Path, _changed: int) -> Robot:
+def _load(path: Path, _changed: int) -> RobotSpec:
     if path.suffix in _MODELS:
         from pronk.robots.bare import robot_of_model
 
@@ -64,4 +64,4 @@ def _load(path: Path, _changed: int) -> Robot:
     return read_robot(path)
 
 
-__all__ = ["ROBOT_NAMES", "Drive", "Joint", "Robot", "load_robot"]
+__all__ = ["ROBOT_NAMES", "Drive", "Joint", "RobotSpec", "load_robot"]

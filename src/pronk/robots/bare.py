@@ -10,7 +10,7 @@ import numpy as np
 
 from pronk.errors import RobotError
 from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, RobotFile, make_robot, read_model
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 NATURAL_HZ, DAMPING_RATIO = 3.0, 0.7
 """Of the joint under its nominal gains, where the model has no position servo."""
@@ -94,7 +94,7 @@ def file_of_model(path: Path) -> RobotFile:
     )
 
 
-def robot_of_model(path: Path) -> Robot:
+def robot_of_model(path: Path) -> RobotSpec:
     """Make a robot of a bare model; see `file_of_model`."""
     return make_robot(file_of_model(path), read_model(path), str(path))
 

@@ -24,7 +24,7 @@ from msgspec import Meta
 
 from pronk.actuator.model import no_load_speed, stall_torque
 from pronk.errors import RobotError
-from pronk.robots.robot import Drive, Joint, Robot
+from pronk.robots.robot import Drive, Joint, RobotSpec
 
 SCHEMA = "pronk/robot/1"
 _MIRROR_TOLERANCE = 1e-9
@@ -205,7 +205,7 @@ def read_model(path: Path) -> Model:
         raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
 
 
-def read_robot(path: Path) -> Robot:
+def read_robot(path: Path) -> RobotSpec:
     """Read a `robot.yaml`.
 
     Raises:
@@ -224,7 +224,7 @@ def read_robot(path: Path) -> Robot:
     return make_robot(file, read_model(path.parent / file.model), str(path))
 
 
-def make_robot(file: RobotFile, build: Model, source: str) -> Robot:
+def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
     """Join a robot file with its model.
 
     Raises:
@@ -310,7 +310,7 @@ def make_robot(file: RobotFile, build: Model, source: str) -> Robot:
                 mirror=mirror,
             )
         )
-    robot = Robot(
+    robot = RobotSpec(
         name=file.name,
         joints=tuple(joints),
         build_spec=build,
@@ -349,7 +349,7 @@ def _position(
     return float(values.get(joint, values.get(group, 0.0)))
 
 
-def _verify_mirrors(robot: Robot, model: mujoco.MjModel, source: str) -> None:
+def _verify_mirrors(robot: RobotSpec, model: mujoco.MjModel, source: str) -> None:
     """Compare mass matrix and bias forces of each limb with those of its original."""
     mirrored = [joint for joint in robot.joints if joint.mirror]
     if not mirrored:

@@ -31,7 +31,7 @@ import numpy as np
 
 from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
-from pronk.robots.robot import Drive, Robot
+from pronk.robots.robot import Drive, RobotSpec
 
 _POSITION_INPUT = 1  # dcmotor input_mode: control is a position command
 _KP, _KD = 4, 6  # where MuJoCo 3.11 packs controller[0] and controller[2] in actuator_gainprm
@@ -40,7 +40,7 @@ Values = Mapping[str, float]
 
 
 def free_spec(
-    robot: Robot, *, armature: Values | None = None, frictionloss: Values | None = None
+    robot: RobotSpec, *, armature: Values | None = None, frictionloss: Values | None = None
 ) -> mujoco.MjSpec:
     """The robot as it stands, without floor and without actuators.
 
@@ -63,7 +63,7 @@ def free_spec(
 
 
 def bench_spec(
-    robot: Robot,
+    robot: RobotSpec,
     joint_name: str,
     *,
     stiffness: Values | None = None,
@@ -143,7 +143,7 @@ def remove_geoms(spec: mujoco.MjSpec) -> None:
 
 def add_drives(
     spec: mujoco.MjSpec,
-    robot: Robot,
+    robot: RobotSpec,
     joint_names: Iterable[str],
     *,
     stiffness: Values | None = None,
@@ -263,14 +263,14 @@ def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[floa
     return resistance * stiffness / constant, resistance * damping / constant - constant
 
 
-def _set_options(spec: mujoco.MjSpec, robot: Robot, integrator: Any) -> None:
+def _set_options(spec: mujoco.MjSpec, robot: RobotSpec, integrator: Any) -> None:
     spec.option.timestep = robot.timestep_s
     spec.option.integrator = integrator
 
 
 def _set_passive(
     spec: mujoco.MjSpec,
-    robot: Robot,
+    robot: RobotSpec,
     names: Iterable[str],
     armature: Values | None,
     frictionloss: Values | None,
@@ -284,7 +284,7 @@ def _set_passive(
         joint.damping = [drive.viscous_damping, 0.0, 0.0]
 
 
-def _check_names(robot: Robot, *overrides: Values | None) -> None:
+def _check_names(robot: RobotSpec, *overrides: Values | None) -> None:
     for values in overrides:
         for name in values or ():
             robot.joint(name)
@@ -325,7 +325,7 @@ def _weld(spec: mujoco.MjSpec, joint_name: str, angle: float) -> None:
     spec.delete(joint)
 
 
-def _add_default_key(spec: mujoco.MjSpec, robot: Robot, *, with_command: bool) -> None:
+def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec, *, with_command: bool) -> None:
     """Keyframe `default`: the default pose, the base where the model puts it."""
     model = spec.compile()
     qpos = model.qpos0.copy()

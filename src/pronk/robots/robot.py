@@ -1,6 +1,6 @@
 """What a robot is, as far as its joints are concerned.
 
-A `Robot` is data: its joints in the order of every file and table, the drive of each joint, the
+A `RobotSpec` is data: its joints in the order of every file and table, the drive of each joint, the
 gains on those drives, and how a bench test of each joint is set up. The physics that these
 numbers enter is in `pronk.actuator.model`; the MuJoCo model built from them is in
 `pronk.robots.model`.
@@ -102,7 +102,7 @@ class Joint:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Robot:
+class RobotSpec:
     """A robot: joints in file order, timing, and a recipe for its MuJoCo model."""
 
     name: str
@@ -176,3 +176,7 @@ class Robot:
                 f"{self.name} has no joint group {name!r}; its groups are {', '.join(self.groups)}."
             )
         return members
+
+
+Robot = RobotSpec
+"""The former name."""

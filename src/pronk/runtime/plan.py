@@ -13,7 +13,7 @@ from pronk.links.link import ClampOperator, Freshness
 from pronk.links.machine import Machine, State, TorqueKind
 from pronk.links.realtime import Wanted, sleep_until
 from pronk.robots import load_robot
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.safety import Limits
 from pronk.runtime.state_machine import Timing
 from pronk.runtime.sweep import SweepTask
@@ -125,7 +125,7 @@ class Plan:
                 raise HardwareError(f"Plan.{name} is {getattr(self, name)}; it must be positive.")
 
     @property
-    def robot(self) -> Robot:
+    def robot(self) -> RobotSpec:
         """The robot of the link."""
         return load_robot(self.link.robot) if self.sweep is None else self.sweep.plan.robot
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pronk.links.machine import State
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import projected_gravity
 from pronk.runtime.safety import Limits, tilt
 
@@ -35,7 +35,7 @@ BATTERY_SHARE = 0.85
 
 
 def refusals(
-    states: Sequence[State], robot: Robot, limits: Limits, *, now: float, seconds: float
+    states: Sequence[State], robot: RobotSpec, limits: Limits, *, now: float, seconds: float
 ) -> tuple[str, ...]:
     """Why the robot must not move; empty if it may.
 
@@ -112,7 +112,7 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
         )
 
 
-def _joints(last: State, robot: Robot, limits: Limits) -> Iterator[str]:
+def _joints(last: State, robot: RobotSpec, limits: Limits) -> Iterator[str]:
     for i, joint in enumerate(robot.joints):
         q, v = float(last.position[i]), float(last.velocity[i])
         if not limits.low[i] - OVERRUN <= q <= limits.high[i] + OVERRUN:
@@ -124,7 +124,7 @@ def _joints(last: State, robot: Robot, limits: Limits) -> Iterator[str]:
             yield f"{joint.name} turns at {v:.1f} rad/s; let the robot come to rest first."
 
 
-def _supply(states: Sequence[State], robot: Robot, limits: Limits) -> Iterator[str]:
+def _supply(states: Sequence[State], robot: RobotSpec, limits: Limits) -> Iterator[str]:
     least = BATTERY_SHARE * max(joint.drive.bus_voltage for joint in robot.joints)
     volts = float(np.mean([state.bus_voltage for state in states]))
     # A link that does not carry the voltage gives 0 or NaN.

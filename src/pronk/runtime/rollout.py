@@ -23,7 +23,7 @@ from pronk.links.machine import Command, Machine, State
 from pronk.policy.contract import check
 from pronk.policy.observation import Measurement
 from pronk.policy.runtime import Policy
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import Commanded, Velocity
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def measurement(state: State) -> Measurement:
     )
 
 
-def check_standing(robot: Robot, state: State) -> None:
+def check_standing(robot: RobotSpec, state: State) -> None:
     """Check that a policy can start.
 
     Raises:
@@ -102,7 +102,7 @@ class Tick:
 class PolicyRunner:
     """A policy on one robot: a state in, a command out."""
 
-    def __init__(self, policy: Policy, robot: Robot) -> None:
+    def __init__(self, policy: Policy, robot: RobotSpec) -> None:
         """Check that the policy is for this robot, and reset it.
 
         Raises:
@@ -164,7 +164,7 @@ class PolicyRunner:
 
 
 def ticks(
-    machine: Machine, policy: Policy, robot: Robot, source: Source, *, seconds: float = math.inf
+    machine: Machine, policy: Policy, robot: RobotSpec, source: Source, *, seconds: float = math.inf
 ) -> Iterator[Tick]:
     """Run a policy on a connected, standing machine; yields each tick after its command is sent.
 

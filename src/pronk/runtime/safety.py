@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pronk.actuator.model import voltage_limits, winding_loss
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 
 class FilterAction(IntEnum):
@@ -160,7 +160,7 @@ class Limits:
             )
 
     @classmethod
-    def of(cls, robot: Robot, **changed: float) -> Limits:
+    def of(cls, robot: RobotSpec, **changed: float) -> Limits:
         """The robot's ranges and effort limits, speeds 1.2 times the no-load speed (impacts).
 
         `changed` gives other values for the scalar fields.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import Mode, OperatorRequest, PolicyAction
 from pronk.runtime.safety import FilterAction, FilterState, Reason, released
 
@@ -99,12 +99,12 @@ class Path:
         return t >= self.began + sum(self.seconds)
 
 
-def default_pose(robot: Robot) -> Array:
+def default_pose(robot: RobotSpec) -> Array:
     """[rad], (joints,)."""
     return np.array([joint.default_position for joint in robot.joints])
 
 
-def folded_pose(robot: Robot) -> Array:
+def folded_pose(robot: RobotSpec) -> Array:
     """[rad], (joints,).
 
     Raises:
@@ -119,7 +119,7 @@ def folded_pose(robot: Robot) -> Array:
     return np.array(pose, dtype=float)
 
 
-def stand_up(robot: Robot, measured: Array, began: float, timing: Timing) -> Path:
+def stand_up(robot: RobotSpec, measured: Array, began: float, timing: Timing) -> Path:
     """From the measured pose through the folded to the default pose, with growing stiffness."""
     return Path(
         began=began,
@@ -129,7 +129,7 @@ def stand_up(robot: Robot, measured: Array, began: float, timing: Timing) -> Pat
     )
 
 
-def sit_down(robot: Robot, measured: Array, began: float, timing: Timing) -> Path:
+def sit_down(robot: RobotSpec, measured: Array, began: float, timing: Timing) -> Path:
     """From the measured pose to the folded pose."""
     return Path(began=began, poses=(measured.copy(), folded_pose(robot)), seconds=(timing.sit_s,))
 
@@ -150,7 +150,7 @@ class DesiredCommand:
 class StateMachine:
     """The modes of one run, a policy's or a sweep's."""
 
-    def __init__(self, robot: Robot, timing: Timing) -> None:
+    def __init__(self, robot: RobotSpec, timing: Timing) -> None:
         """Begin idle."""
         self.robot = robot
         self.timing = timing

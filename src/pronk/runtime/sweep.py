@@ -25,7 +25,7 @@ from pronk.excitation.plan import POSE_RAMP_S, Excitation, SweepPlan
 from pronk.links.machine import Command, Machine, State, TorqueKind
 from pronk.logs.joint_log import Segment
 from pronk.logs.mcap_log import LogHeader, McapLogWriter, reason_of
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import TEXT, Record, SampleKind, sample_dtype
 from pronk.runtime.safety import FilterState, Limits, filtered
 
@@ -118,7 +118,7 @@ class SweepTask:
         return replace(limits, speed=np.array([j.drive.no_load_speed for j in robot.joints]))
 
 
-def logged_joints(robot: Robot, excited: str) -> tuple[str, ...]:
+def logged_joints(robot: RobotSpec, excited: str) -> tuple[str, ...]:
     """Joints that can move with the excited one or are clamped: their leg, file order."""
     joint = robot.joint(excited)
     chosen = {excited, *joint.chain, *joint.clamped}

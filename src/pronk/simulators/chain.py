@@ -20,7 +20,7 @@ from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import roll
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class JointDrive:
     """Reading of the encoder where the model's joint is at zero [rad]."""
 
     @classmethod
-    def published(cls, robot: Robot, joint: str) -> JointDrive:
+    def published(cls, robot: RobotSpec, joint: str) -> JointDrive:
         """The robot's own figures, without delay and offset."""
         known = robot.joint(joint)
         return cls(
@@ -61,7 +61,7 @@ class JointDrive:
 Drives = Mapping[str, JointDrive]
 
 
-def excited_joints(log: JointLog, robot: Robot) -> tuple[tuple[str, ...], dict[str, str]]:
+def excited_joints(log: JointLog, robot: RobotSpec) -> tuple[tuple[str, ...], dict[str, str]]:
     """Which joints of a log can be simulated, and why the others cannot.
 
     Returns:
@@ -108,7 +108,7 @@ def moves_together(log: JointLog) -> bool:
 class ChainSimulation:
     """The chain with the commands of one or more logs, for many sets of drives."""
 
-    def __init__(self, robot: Robot, logs: Sequence[JointLog], *, threads: int = 2) -> None:
+    def __init__(self, robot: RobotSpec, logs: Sequence[JointLog], *, threads: int = 2) -> None:
         """Compile the model of the chain and prepare the commands of the logs.
 
         Raises:

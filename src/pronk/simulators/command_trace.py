@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -51,13 +51,13 @@ class CommandTrace:
         """Start of each step, on the clock of the log [s], shape (steps,)."""
         return np.asarray(self.start + self.timestep * np.arange(len(self.command)))
 
-    def mirrored(self, robot: Robot) -> tuple[str, float, Array]:
+    def mirrored(self, robot: RobotSpec) -> tuple[str, float, Array]:
         """Original joint to simulate, sign, and `sign * (command - pose)` [rad], (steps,)."""
         name, sign = robot.joint(self.joint).original
         centre = self.pose[robot.joint_names.index(self.joint)]
         return name, sign, np.asarray(sign * (self.command - centre))
 
-    def same_as(self, other: CommandTrace, robot: Robot, *, sign: float = 1.0) -> bool:
+    def same_as(self, other: CommandTrace, robot: RobotSpec, *, sign: float = 1.0) -> bool:
         """True if both lead to the same simulation of the same original joint.
 
         One may rest longer than the other at the end. With `sign` -1 the commands are compared
@@ -74,7 +74,7 @@ class CommandTrace:
         )
 
 
-def original_pose(trace: CommandTrace, robot: Robot) -> Array:
+def original_pose(trace: CommandTrace, robot: RobotSpec) -> Array:
     """Pose of the original joint's chain that mirrors the trace's pose [rad], shape (chain,)."""
     excited = robot.joint(trace.joint)
     original = robot.joint(excited.original[0])
@@ -110,7 +110,7 @@ def held(time: Array, command: Array, instants: Array) -> Array:
     return np.asarray(command[np.clip(index, 0, len(time) - 1)])
 
 
-def command_trace(log: JointLog, segment: Segment, joint: str, robot: Robot) -> CommandTrace:
+def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec) -> CommandTrace:
     """Command to one joint in one segment of a log at every physics step of the robot.
 
     Raises:
@@ -172,7 +172,7 @@ def _early_ticks(values: Array) -> int:
     return 0 if rest < 2 else -(-(rest + 2) // 5) * 5 - rest
 
 
-def _pose(log: JointLog, joint: str, robot: Robot) -> Array:
+def _pose(log: JointLog, joint: str, robot: RobotSpec) -> Array:
     """Pose of every joint of the robot.
 
     The log's; where it has none, the first command of each of its joints, and the default

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from pronk.errors import PronkError, RobotError
 from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, original_pose
 from pronk.simulators.simulator import CHUNK, PARAMETERS, Count, SimulatorInfo, play
 
@@ -95,7 +95,7 @@ class JointTestRig:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         joint: str,
         *,
         armature: float | None = None,
@@ -286,7 +286,7 @@ def rig_on(device: str) -> Callable[..., JointTestRig]:
     return partial(WarpTestRig, device=device)
 
 
-def mujoco_info(robot: Robot) -> SimulatorInfo:
+def mujoco_info(robot: RobotSpec) -> SimulatorInfo:
     """Describe the training simulator of a robot."""
     return SimulatorInfo(
         version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
@@ -300,7 +300,12 @@ class MujocoSimulator:
     """
 
     def __init__(
-        self, robot: Robot, *, armature: float | None = None, threads: int = 2, device: str = "cpu"
+        self,
+        robot: RobotSpec,
+        *,
+        armature: float | None = None,
+        threads: int = 2,
+        device: str = "cpu",
     ) -> None:
         """Prepare for rigs with `armature` [kg m^2] at the excited joint; the drive's if None."""
         self.robot = robot
@@ -401,7 +406,7 @@ class MujocoSimulator:
 
 
 def simulate(
-    robot: Robot, trace: CommandTrace, stiffness: ArrayLike, damping: ArrayLike, **options: Any
+    robot: RobotSpec, trace: CommandTrace, stiffness: ArrayLike, damping: ArrayLike, **options: Any
 ) -> Array:
     """Simulate one command in the training simulator with many gain pairs; see `play`.
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pronk import plugins
 from pronk.errors import PronkError
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, original_pose
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ class Count:
 class JointRig(Protocol):
     """One joint excited with many parameter sets, the other joints held."""
 
-    robot: Robot
+    robot: RobotSpec
 
     def pose(self, trace: CommandTrace) -> Array:
         """Pose at which the joint's chain is held for a trace [rad], shape (chain,)."""
@@ -119,7 +119,7 @@ class JointRig(Protocol):
 class JointRigs(Protocol):
     """The rigs of all joints of a robot in one simulator."""
 
-    robot: Robot
+    robot: RobotSpec
     info: SimulatorInfo
     parameters: frozenset[str]
 
@@ -147,7 +147,7 @@ class RolloutRigs:
     """Rigs of any simulator, made from its `rollout`."""
 
     def __init__(
-        self, simulator: Simulator, robot: Robot, *, armature: float | None = None
+        self, simulator: Simulator, robot: RobotSpec, *, armature: float | None = None
     ) -> None:
         """Take a simulator, and the armature of the excited joint [kg m^2] instead of its own."""
         info = simulator.info
@@ -187,7 +187,7 @@ class RolloutRig:
     """One joint of any simulator, the others held at the pose."""
 
     simulator: Simulator
-    robot: Robot
+    robot: RobotSpec
     joint: str
     """An original, not a mirror image."""
     armature: float | None = None
@@ -282,7 +282,7 @@ def play(
 
 
 def load_simulator(
-    choice: str, robot: Robot, *, threads: int = 2, device: str = "cpu"
+    choice: str, robot: RobotSpec, *, threads: int = 2, device: str = "cpu"
 ) -> Simulator:
     """Make a simulator of a robot.
 
@@ -314,7 +314,9 @@ def load_simulator(
     return simulator
 
 
-def joint_rigs(choice: str, robot: Robot, *, threads: int = 2, device: str = "cpu") -> JointRigs:
+def joint_rigs(
+    choice: str, robot: RobotSpec, *, threads: int = 2, device: str = "cpu"
+) -> JointRigs:
     """Rigs of a robot's joints in a simulator; arguments and errors are `load_simulator`'s."""
     from pronk.simulators.mujoco import MujocoSimulator
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import PronkError
 from pronk.robots.model import set_drive_gains
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import JointTestRig
 
 Array = NDArray[np.float64]
@@ -75,7 +75,13 @@ class WarpTestRig(JointTestRig):
     """A rig whose large runs are stepped by MuJoCo Warp."""
 
     def __init__(
-        self, robot: Robot, joint: str, *, device: str = "cuda", least: int = LEAST, **options: Any
+        self,
+        robot: RobotSpec,
+        joint: str,
+        *,
+        device: str = "cuda",
+        least: int = LEAST,
+        **options: Any,
     ) -> None:
         """Compile the model and find the device, `cuda` or `warp-cpu`.
 

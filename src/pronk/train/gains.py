@@ -19,7 +19,7 @@ import mujoco
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
 from pronk.match.gains import GroupGains, MatchedGains, load
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import SimulatorInfo
 
 NAIVE = "naive"
@@ -67,7 +67,9 @@ class TrainingGains:
             raise PronkError(f"the command delay is {self.delay_s} s; it must be 0 or more.")
 
 
-def training_gains(choice: str | Path, robot: Robot, *, like: Path | None = None) -> TrainingGains:
+def training_gains(
+    choice: str | Path, robot: RobotSpec, *, like: Path | None = None
+) -> TrainingGains:
     """The gains to train with.
 
     Args:
@@ -112,7 +114,7 @@ def training_gains(choice: str | Path, robot: Robot, *, like: Path | None = None
     )
 
 
-def _naive(robot: Robot, group: str) -> GroupGains:
+def _naive(robot: RobotSpec, group: str) -> GroupGains:
     pairs = {(joint.stiffness, joint.damping) for joint in robot.group(group)}
     if len(pairs) > 1:
         raise PronkError(
@@ -143,7 +145,7 @@ def _about(nominal: GroupGains, ranges: GroupGains) -> GroupGains:
     )
 
 
-def _matched(path: Path, robot: Robot) -> MatchedGains:
+def _matched(path: Path, robot: RobotSpec) -> MatchedGains:
     gains = load(path)
     if gains.robot != robot.name:
         raise ArtefactError(
@@ -160,7 +162,7 @@ def _matched(path: Path, robot: Robot) -> MatchedGains:
     return gains
 
 
-def _check_simulator(simulator: SimulatorInfo, robot: Robot, path: Path) -> None:
+def _check_simulator(simulator: SimulatorInfo, robot: RobotSpec, path: Path) -> None:
     """Gains hold for the simulator that they were matched in, and for no other."""
     used = SimulatorInfo(
         version=_minor(mujoco.__version__),

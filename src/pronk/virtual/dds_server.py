@@ -23,7 +23,7 @@ from pronk.links.dds.link import (
     UNKNOWN_API,
 )
 from pronk.links.machine import Command, RefusedError, State
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.virtual.server import ServerTransport
 
 MODES = ("", "normal", "ai", "advanced", "mcf")
@@ -69,7 +69,7 @@ class Server:
 class DdsServerTransport(ServerTransport):
     """The robot's end in Unitree's messages, on loopback only."""
 
-    def __init__(self, robot: Robot, network: DdsNetwork, *, mode: str = "") -> None:
+    def __init__(self, robot: RobotSpec, network: DdsNetwork, *, mode: str = "") -> None:
         """Join a domain on loopback, with the controller that holds the joints at first."""
         if not network.loopback:
             raise HardwareError(

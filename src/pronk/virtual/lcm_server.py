@@ -22,7 +22,7 @@ from pronk.links.lcm.codec import (
 )
 from pronk.links.lcm.link import open_lcm
 from pronk.links.machine import Command, RefusedError, State
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.virtual.server import ServerTransport
 
 _BEACON_STATES = 50
@@ -34,7 +34,7 @@ _QUEUE = 1000
 class LcmServerTransport(ServerTransport):
     """The robot's end in the messages of a layout."""
 
-    def __init__(self, robot: Robot, layout: Layout, url: str, *, mode: str = "") -> None:
+    def __init__(self, robot: RobotSpec, layout: Layout, url: str, *, mode: str = "") -> None:
         """Open the robot's end at LCM's address, with the controller that holds it at first."""
         super().__init__(robot, mode, MODES.values())
         self._layout = layout

@@ -1,6 +1,6 @@
 """The different machine: rotors behind compliant belts, driven by DC motors.
 
-From the robot's own structure (`Robot.build_spec`) comes a plant in which every joint has two
+From the robot's own structure (`RobotSpec.build_spec`) comes a plant in which every joint has two
 degrees of freedom: the link, and the rotor with the inertia reflected through the gear. A belt
 (spring and damper) couples them. Motor, encoder and friction sit on the rotor, as on the robot.
 All of it is in joint coordinates. On the bench the base is fixed to its stand and nothing touches
@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
-from pronk.robots.robot import Drive, Robot
+from pronk.robots.robot import Drive, RobotSpec
 from pronk.virtual.ground import Ground
 from pronk.virtual.sim_params import JointParams, SimParams
 
@@ -176,12 +176,12 @@ class Plant:
             self.model.qpos_spring[index] = q[index] if held else 0.0
 
 
-def legs_of(robot: Robot) -> tuple[str, ...]:
+def legs_of(robot: RobotSpec) -> tuple[str, ...]:
     """Names of the robot's limbs in file order; see `leg_of`."""
     return tuple(dict.fromkeys(leg_of(robot, joint.name) for joint in robot.joints))
 
 
-def leg_of(robot: Robot, name: str) -> str:
+def leg_of(robot: RobotSpec, name: str) -> str:
     """Name the limb of a joint: the first part that its joints' names share, or its first joint."""
     joint = robot.joint(name)
     limb = [n for n in robot.joint_names if n in (name, *joint.chain, *joint.clamped)]
@@ -260,7 +260,7 @@ def _add_rotor(spec: Any, name: str, drive: Drive, true: JointParams, lag_s: flo
     )
 
 
-def _drop_legs(spec: Any, robot: Robot, kept: set[str]) -> None:
+def _drop_legs(spec: Any, robot: RobotSpec, kept: set[str]) -> None:
     """Delete every subtree under the base that holds no kept joint."""
     for child in list(spec.body(robot.base_body).bodies):
         names = [joint.name for joint in (*child.find_all("joint"), *child.joints)]
@@ -290,7 +290,7 @@ def _check_springs(plant: Plant, sim_params: SimParams) -> None:
                 )
 
 
-def _free_base(spec: Any, robot: Robot, ground: Ground) -> None:
+def _free_base(spec: Any, robot: RobotSpec, ground: Ground) -> None:
     """Put a model's free trunk over the ground; refuse an arm."""
     base = spec.body(robot.base_body)
     if [joint.type for joint in base.joints] != [mujoco.mjtJoint.mjJNT_FREE]:
@@ -303,7 +303,7 @@ def _free_base(spec: Any, robot: Robot, ground: Ground) -> None:
     ground.add_to(spec)
 
 
-def _fix_base(spec: Any, robot: Robot, sim_params: SimParams) -> None:
+def _fix_base(spec: Any, robot: RobotSpec, sim_params: SimParams) -> None:
     """Fix a model's trunk to its stand, without contacts."""
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     base = spec.body(robot.base_body)
@@ -347,7 +347,7 @@ def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
 
 
 def build_plant(
-    robot: Robot,
+    robot: RobotSpec,
     sim_params: SimParams,
     legs: tuple[str, ...],
     timestep_s: float,

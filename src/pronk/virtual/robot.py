@@ -29,7 +29,7 @@ import numpy as np
 
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, State, TorqueKind, check_command, damping_command
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.virtual.capture import Capture, Recorder
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.physics import Physics, Transport
@@ -56,7 +56,7 @@ class VirtualRobot:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         sim_params: SimParams,
         *,
         seed: int = 0,
@@ -256,7 +256,7 @@ class VirtualRobot:
 
 
 def open_sim(
-    robot: Robot,
+    robot: RobotSpec,
     *,
     interface: str | None = None,
     seed: int = 0,

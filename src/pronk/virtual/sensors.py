@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.links.machine import State
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.virtual.physics import Block
 from pronk.virtual.plant import Plant
 from pronk.virtual.sim_params import SimParams
@@ -231,7 +231,7 @@ class Sensors:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         sim_params: SimParams,
         plant: Plant,
         *,

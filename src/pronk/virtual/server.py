@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, Machine, RefusedError, State, damping_command
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.virtual.faults import FaultChannel, Faults, flip_bit
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class ServerTransport(ABC):
     counted under its reason.
     """
 
-    def __init__(self, robot: Robot, mode: str, modes: Iterable[str]) -> None:
+    def __init__(self, robot: RobotSpec, mode: str, modes: Iterable[str]) -> None:
         """Begin with a mode of the robot's own controller, one of `modes`."""
         if mode not in (modes := tuple(modes)):
             raise HardwareError(
@@ -99,7 +99,7 @@ class Watchdog:
             raise HardwareError(f"silence after {self.after_s} s; expected a time above 0.")
 
 
-def hold_of(robot: Robot) -> Command:
+def hold_of(robot: RobotSpec) -> Command:
     """The default pose at the drives' own gains."""
     return Command(
         position=np.array([joint.default_position for joint in robot.joints]),

@@ -25,7 +25,7 @@ from msgspec import Meta
 
 from pronk.errors import RobotError
 from pronk.robots.model import bench_spec
-from pronk.robots.robot import Joint, Robot
+from pronk.robots.robot import Joint, RobotSpec
 from pronk.virtual.bounds import Bounded, plain, read
 from pronk.virtual.ground import Ground
 
@@ -239,7 +239,7 @@ def parse_sim_params(body: Any, source: str) -> SimParams:
 _FIELDS = [entry.name for entry in msgspec.structs.fields(_File)]
 
 
-def load_sim_params(path: Path | str | None = None, robot: Robot | None = None) -> SimParams:
+def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = None) -> SimParams:
     """Read a parameter file; None is the shipped one, whose match is the paper's Table I.
 
     Without a file, parameters of a `robot` other than the shipped one's are derived
@@ -263,7 +263,7 @@ _PRESLIDING_RAD = 1e-3
 """Deflection at which dry friction breaks away."""
 
 
-def default_sim_params(robot: Robot) -> SimParams:
+def default_sim_params(robot: RobotSpec) -> SimParams:
     """Derive the hidden parameters of a robot that has no file of its own, for the bench.
 
     Tolerances between drawing and machine, of the size that the virtual Mini Cheetah has:
@@ -287,7 +287,7 @@ def default_sim_params(robot: Robot) -> SimParams:
     return SimParams(robot=robot.name, machine=machine, joints=joints)
 
 
-def _default_joint(robot: Robot, joint: Joint) -> JointParams:
+def _default_joint(robot: RobotSpec, joint: Joint) -> JointParams:
     model = bench_spec(robot, joint.name).compile()
     data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)

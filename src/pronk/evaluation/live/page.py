@@ -17,7 +17,7 @@ import numpy as np
 from pronk.errors import PronkError
 from pronk.evaluation.live.play import Gauge, Joystick
 from pronk.policy.contract import COMMANDS
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import STILL
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Ground
@@ -83,7 +83,7 @@ class WebPage:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         ground: Ground,
         joystick: Joystick,
         *,

@@ -19,7 +19,7 @@ from pronk.evaluation.jumps import FALLEN_COSINE, FALLEN_HEIGHT, JumpRules, cosi
 from pronk.links.machine import State
 from pronk.policy.contract import COMMANDS
 from pronk.policy.runtime import Policy
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.rollout import ticks
 from pronk.runtime.script import STILL, Commanded, Script, Velocity
@@ -186,7 +186,7 @@ class Played:
 
 
 def play(
-    robot: Robot,
+    robot: RobotSpec,
     policy: Policy,
     sim_params: SimParams,
     joystick: Joystick,

@@ -27,7 +27,7 @@ from pronk.errors import HardwareError
 from pronk.links.dds import messages
 from pronk.links.dds.messages import pack, record, unpack
 from pronk.links.machine import Command, RefusedError, State, check_command
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class JointMap:
     """True where no real robot of this name uses these messages."""
 
 
-def joint_map(robot: Robot) -> JointMap:
+def joint_map(robot: RobotSpec) -> JointMap:
     """The map of a robot; refuse one that does not fit behind Unitree's messages."""
     if robot.name not in _SIGNS:
         raise HardwareError(

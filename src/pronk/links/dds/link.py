@@ -22,7 +22,7 @@ from pronk.links.dds import messages
 from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take, write
 from pronk.links.dds.codec import STATE_RATE_HZ, StateDecoder, encode_command, joint_map
 from pronk.links.link import ANSWER_S, CommandWriter, NetworkLink
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
 OLDER, SERVICE_SWITCH = "robot_state", 1001
@@ -146,7 +146,7 @@ class DdsMachine(NetworkLink):
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         *,
         interface: str | None = None,
         domain: int | None = None,

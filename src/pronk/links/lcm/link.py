@@ -33,7 +33,7 @@ from pronk.links.lcm.codec import (
     read_clamp_message,
 )
 from pronk.links.link import ANSWER_S, CommandWriter, NetworkLink, wait_for
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 GROUP = "239.255.76.67"
 """LCM's multicast group, that of every robot too."""
@@ -119,7 +119,7 @@ class LcmMachine(NetworkLink):
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         *,
         layout: str = "cheetah",
         port: int | None = None,

@@ -16,7 +16,7 @@ from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
 from pronk.robots.legged import legged
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.train.gains import TrainingGains
 from pronk.train.mdp.actions import HeldJointPosition
 from pronk.train.mdp.guidance import guidance
@@ -46,7 +46,7 @@ class NominalDrive:
     """[N m]"""
 
     @classmethod
-    def of(cls, robot: Robot, gains: TrainingGains) -> Self:
+    def of(cls, robot: RobotSpec, gains: TrainingGains) -> Self:
         """Of a robot with the gains it is trained with."""
         groups = [gains.groups[joint.group] for joint in robot.joints]
         return cls(

@@ -19,7 +19,7 @@ from mjlab.actuator import DcMotorActuator, DcMotorActuatorCfg
 from torch import Tensor
 
 from pronk.errors import PronkError, RobotError
-from pronk.robots.robot import Drive, Robot
+from pronk.robots.robot import Drive, RobotSpec
 from pronk.train.gains import TrainingGains
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class PositionDrive(DcMotorActuator[PositionDriveCfg]):
         return torch.addcmul(torque, back_emf, cmd.vel, value=-1.0).clamp(-limit, limit)
 
 
-def actuators(robot: Robot, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
+def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
     """One actuator per joint group, in the robot's order of groups.
 
     Commands are delayed before they come here (`pronk.train.mdp.actions`).
@@ -88,7 +88,7 @@ def actuators(robot: Robot, gains: TrainingGains) -> tuple[PositionDriveCfg, ...
     return tuple(_actuator(robot, group, gains) for group in robot.groups)
 
 
-def _actuator(robot: Robot, group: str, gains: TrainingGains) -> PositionDriveCfg:
+def _actuator(robot: RobotSpec, group: str, gains: TrainingGains) -> PositionDriveCfg:
     drive = _drive(robot, group)
     return PositionDriveCfg(
         target_names_expr=tuple(joint.name for joint in robot.group(group)),
@@ -103,7 +103,7 @@ def _actuator(robot: Robot, group: str, gains: TrainingGains) -> PositionDriveCf
     )
 
 
-def _drive(robot: Robot, group: str) -> Drive:
+def _drive(robot: RobotSpec, group: str) -> Drive:
     drives = [joint.drive for joint in robot.group(group)]
     if any(drive != drives[0] for drive in drives):
         raise RobotError(

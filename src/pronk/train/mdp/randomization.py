@@ -18,7 +18,7 @@ from mjlab.utils.noise import UniformNoiseCfg
 from torch import Tensor, empty_like
 
 from pronk.errors import PronkError
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.train.gains import TrainingGains
 from pronk.train.mdp.draws import (
     ENTITY,
@@ -159,7 +159,7 @@ def noise(randomization: Randomization) -> dict[str, UniformNoiseCfg | None]:
 
 
 def delay_steps(
-    robot: Robot, gains: TrainingGains, randomization: Randomization
+    robot: RobotSpec, gains: TrainingGains, randomization: Randomization
 ) -> tuple[int, int]:
     """Smallest and largest command delay, for `pronk.train.mdp.actions` [physics steps]."""
     centre = round(gains.delay_s / robot.timestep_s)
@@ -167,7 +167,7 @@ def delay_steps(
 
 
 def events(
-    robot: Robot, gains: TrainingGains, randomization: Randomization
+    robot: RobotSpec, gains: TrainingGains, randomization: Randomization
 ) -> dict[str, EventTermCfg]:
     """Event terms of mjlab for all draws but delay and noise.
 

@@ -13,7 +13,7 @@ from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
 
 from pronk.robots.legged import legged
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 
 BODY = legged("mini_cheetah")
 
@@ -32,7 +32,7 @@ landing robot sink by 19 to 28 mm, so that its shanks touch the floor; less than
 step MuJoCo does not take."""
 
 
-def robot_entity(robot: Robot, actuators: tuple[DcMotorActuatorCfg, ...]) -> EntityCfg:
+def robot_entity(robot: RobotSpec, actuators: tuple[DcMotorActuatorCfg, ...]) -> EntityCfg:
     """The free robot in its default pose, with the drives of training.
 
     Args:
@@ -51,7 +51,7 @@ def robot_entity(robot: Robot, actuators: tuple[DcMotorActuatorCfg, ...]) -> Ent
     )
 
 
-def _on_firm_feet(robot: Robot) -> mujoco.MjSpec:
+def _on_firm_feet(robot: RobotSpec) -> mujoco.MjSpec:
     spec = robot.build_spec()
     for name in FOOT_GEOMS:
         spec.geom(name).solref = FOOT_CONTACT
@@ -89,7 +89,7 @@ def scene(entity: EntityCfg, num_envs: int) -> SceneCfg:
     )
 
 
-def simulation(robot: Robot) -> SimulationCfg:
+def simulation(robot: RobotSpec) -> SimulationCfg:
     """The training simulator: MuJoCo Warp at the timestep that gains are matched for."""
     return SimulationCfg(
         # At most 4 feet, 8 limb capsules with two points each and 4 trunk corners touch; each

@@ -24,7 +24,7 @@ from pronk.files import written_whole
 from pronk.policy.contract import COMMANDS, METADATA_KEY, Contract, measured_layout, to_json
 from pronk.policy.layout import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
 from pronk.policy.runtime import load_policy
-from pronk.robots.robot import Robot
+from pronk.robots.robot import RobotSpec
 from pronk.train.gains import TrainingGains
 from pronk.train.rl.actor import EstimatorActor
 from pronk.train.runner.provenance import versions
@@ -35,7 +35,7 @@ TOLERANCE = 1e-5
 
 
 def contract_for(
-    robot: Robot,
+    robot: RobotSpec,
     gains: TrainingGains,
     *,
     action_scale: float,
