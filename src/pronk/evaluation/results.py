@@ -80,7 +80,7 @@ class Subject:
     path: str
     sha256: str
     contract: Mapping[str, Any]
-    """RobotSpec, gains with their hash, rates, delays, ranges."""
+    """Robot, gains with their hash, rates, delays, ranges."""
 
 
 @dataclass(frozen=True, kw_only=True)
