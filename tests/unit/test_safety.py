@@ -1,9 +1,8 @@
-"""The safety filter: no output breaks a limit, ever; damping is always allowed."""
+"""The safety filter: no output exceeds a limit; damping is always allowed."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,23 +61,35 @@ def command(**changes: Any) -> Command:
     return Command(**(whole | changes))
 
 
-def decision(
+def found(
     s: State, c: Command, t: float = 0.0, memory: FilterState | None = None, **more: Any
 ) -> tuple[FilterAction, Reason]:
-    found = filtered(s, c, memory or FilterState(), LIMITS, t, **more)[1]
-    return found.level, found.reason
+    decision = filtered(s, c, memory or FilterState(), LIMITS, t, **more)[1]
+    return decision.level, decision.reason
 
 
-def test_what_is_fine_goes_through_untouched() -> None:
+def at(values: Any, value: float, index: int = -1) -> np.ndarray:
+    array = np.array(values, dtype=float)
+    array[index] = value
+    return array
+
+
+def turned(angle: float) -> np.ndarray:
+    return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
+
+
+def test_a_command_within_all_limits_passes_unchanged() -> None:
     target = POSE + 0.1
-    sent, found, memory = filtered(state(), command(position=target), FilterState(), LIMITS, 0.001)
+    sent, decision, memory = filtered(
+        state(), command(position=target), FilterState(), LIMITS, 0.001
+    )
     assert sent is not None
-    assert (found.level, found.reason) == (FilterAction.PASS, Reason.NONE)
-    np.testing.assert_array_equal(sent.position, target)
+    assert memory.last is not None
+    assert (decision.level, decision.reason) == (FilterAction.PASS, Reason.NONE)
+    for values in (sent.position, memory.last):
+        np.testing.assert_array_equal(values, target)
     assert sent.stiffness is KP
     assert sent.damping is KD
-    assert memory.last is not None
-    np.testing.assert_array_equal(memory.last, target)
 
 
 @pytest.mark.parametrize(
@@ -95,47 +106,33 @@ def test_what_is_fine_goes_through_untouched() -> None:
 def test_an_old_state_holds_then_damps_then_latches(
     age_s: float, level: FilterAction, reason: Reason
 ) -> None:
-    assert decision(state(), command(made=age_s), age_s) == (level, reason)
-
-
-def test_hold_sends_the_last_target() -> None:
     last = POSE + 0.2
-    desired = command(position=POSE + 0.4, made=0.03)
-    sent, _, memory = filtered(state(), desired, FilterState(last=last), LIMITS, 0.03)
-    assert sent is not None
-    np.testing.assert_array_equal(sent.position, last)
-    assert memory.last is not None
-    np.testing.assert_array_equal(memory.last, last)
-
-
-def spoilt(values: Any, wrong: float) -> np.ndarray:
-    array = np.array(values, dtype=float)
-    array[-1] = wrong
-    return array
+    desired, memory = command(position=POSE + 0.4, made=age_s), FilterState(last=last)
+    sent, decision, _ = filtered(state(), desired, memory, LIMITS, age_s)
+    assert (decision.level, decision.reason) == (level, reason)
+    if level is FilterAction.HOLD:
+        assert sent is not None
+        np.testing.assert_array_equal(sent.position, last)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("part", ["position", "velocity", "gyro", "orientation"])
-def test_a_state_that_is_no_number_latches(part: str, wrong: float) -> None:
-    s = state(**{part: spoilt(getattr(state(), part), wrong)})
-    assert decision(s, command()) == (FilterAction.LATCH, Reason.STATE_NOT_FINITE)
-
-
-@pytest.mark.parametrize("wrong", [math.nan, math.inf])
-@pytest.mark.parametrize("part", ["position", "stiffness", "damping"])
-def test_a_command_that_is_no_number_latches(part: str, wrong: float) -> None:
-    c = command(**{part: spoilt(getattr(command(), part), wrong)})
-    assert decision(state(), c) == (FilterAction.LATCH, Reason.COMMAND_NOT_FINITE)
+@pytest.mark.parametrize(
+    "part", ["position", "velocity", "gyro", "orientation", "target", "stiffness", "damping"]
+)
+def test_what_is_not_a_number_latches(part: str, wrong: float) -> None:
+    s, c, reason = state(), command(), Reason.STATE_NOT_FINITE
+    if part in ("position", "velocity", "gyro", "orientation"):
+        s = state(**{part: at(getattr(s, part), wrong)})
+    else:
+        name = part.replace("target", "position")
+        c, reason = command(**{name: at(getattr(c, name), wrong)}), Reason.COMMAND_NOT_FINITE
+    assert found(s, c) == (FilterAction.LATCH, reason)
 
 
 @pytest.mark.parametrize("shape", [np.zeros(N + 1), np.zeros((2, N)), None, "legs"])
 def test_a_command_of_another_shape_latches(shape: Any) -> None:
     c = command(position=shape)
-    assert decision(state(), c) == (FilterAction.LATCH, Reason.COMMAND_NOT_FINITE)
-
-
-def turned(angle: float) -> np.ndarray:
-    return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
+    assert found(state(), c) == (FilterAction.LATCH, Reason.COMMAND_NOT_FINITE)
 
 
 @pytest.mark.parametrize(
@@ -150,49 +147,49 @@ def turned(angle: float) -> np.ndarray:
         (state(), command(stiffness=KP - 20.0), Reason.GAINS),
         (state(), command(stiffness=KP + 100.0), Reason.GAINS),
         (state(), command(damping=KD + 5.0), Reason.GAINS),
-        (state(position=spoilt(POSE, 2.76)), command(), Reason.OVERRUN),
+        (state(position=at(POSE, 2.76)), command(), Reason.OVERRUN),
         (state(orientation=turned(0.81)), command(), Reason.TILT),
         (state(orientation=turned(-3.0)), command(), Reason.TILT),
         (state(orientation=np.zeros(4)), command(), Reason.STATE_NOT_FINITE),
-        (state(velocity=spoilt(np.zeros(N), -31.0)), command(), Reason.SPEED),
-        (state(temperature=spoilt(np.full(N, 40.0), 81.0)), command(), Reason.TEMPERATURE),
+        (state(velocity=at(np.zeros(N), -31.0)), command(), Reason.SPEED),
+        (state(temperature=at(np.full(N, 40.0), 81.0)), command(), Reason.TEMPERATURE),
     ],
 )
-def test_faults_latch_and_say_why(s: State, c: Command, reason: Reason) -> None:
-    sent, found, memory = filtered(s, c, FilterState(), LIMITS, 0.0)
+def test_faults_latch_with_their_reason(s: State, c: Command, reason: Reason) -> None:
+    sent, decision, memory = filtered(s, c, FilterState(), LIMITS, 0.0)
     assert sent is None
-    assert (found.level, found.reason) == (FilterAction.LATCH, reason)
+    assert (decision.level, decision.reason) == (FilterAction.LATCH, reason)
     assert memory.faulted
     assert memory.last is None
-    assert reason.text in found.text
-    assert "\n" not in found.text
+    assert reason.text in decision.text
+    assert "\n" not in decision.text
+    # In an earlier state of the tick it counts too.
+    if s.sequence == 100 and s.time == 0.0:
+        assert found(state(), c, earlier=[s]) == (FilterAction.LATCH, reason)
 
 
-def test_what_is_just_within_does_not_fault() -> None:
+def test_just_within_the_limits_is_no_fault() -> None:
     s = state(
-        position=spoilt(POSE, 2.69),
+        position=at(POSE, 2.69),
         orientation=turned(0.79),
-        velocity=spoilt(np.zeros(N), -5.0),
-        temperature=spoilt(np.full(N, np.nan), 79.0),
+        velocity=at(np.zeros(N), -5.0),
+        temperature=at(np.full(N, np.nan), 79.0),
         sequence=130,
     )
     last = np.minimum(s.position, 2.5)
-    assert decision(s, command(position=last), 0.0, FilterState(last=last))[0] <= FilterAction.LIMIT
+    assert found(s, command(position=last), 0.0, FilterState(last=last))[0] <= FilterAction.LIMIT
+    assert found(state(), command(), held=False) == (FilterAction.DAMP, Reason.DEAD_MAN)
 
 
-def test_letting_go_of_the_dead_man_damps() -> None:
-    assert decision(state(), command(), held=False) == (FilterAction.DAMP, Reason.DEAD_MAN)
-
-
-def test_a_fault_lasts_a_second_and_a_latched_one_until_somebody_says_so() -> None:
+def test_a_fault_lasts_a_second_and_a_latched_one_until_it_is_reset() -> None:
     soft, hard = (
         fault(FilterState(), level, Reason.TILT, 10.0)
         for level in (FilterAction.DAMP, FilterAction.LATCH)
     )
     for memory in (soft, hard):
-        sent, found, after = filtered(state(time=10.0), command(made=10.0), memory, LIMITS, 10.0)
+        sent, decision, after = filtered(state(time=10.0), command(made=10.0), memory, LIMITS, 10.0)
         assert sent is None
-        assert found.level == memory.level
+        assert decision.level == memory.level
         assert after.faulted
         assert released(memory, 10.0 + LEAST_DAMPING_S - 1e-6, acknowledged=True).faulted
     assert not released(soft, 10.0 + LEAST_DAMPING_S).faulted
@@ -203,82 +200,60 @@ def test_a_fault_lasts_a_second_and_a_latched_one_until_somebody_says_so() -> No
 def test_a_fault_can_only_become_worse() -> None:
     _, _, memory = filtered(state(), command(made=0.06), FilterState(), LIMITS, 0.06)
     assert (memory.level, memory.reason) == (FilterAction.DAMP, Reason.NO_STATE)
-    _, found, memory = filtered(state(), command(made=0.11), memory, LIMITS, 0.11)
+    _, decision, memory = filtered(state(), command(made=0.11), memory, LIMITS, 0.11)
     assert (memory.level, memory.reason) == (FilterAction.LATCH, Reason.STATE_LOST)
     assert memory.since == 0.06
-    assert found.level is FilterAction.LATCH
-    same = fault(memory, FilterAction.DAMP, Reason.DEAD_MAN, 0.2)
-    assert same is memory
+    assert decision.level is FilterAction.LATCH
+    assert fault(memory, FilterAction.DAMP, Reason.DEAD_MAN, 0.2) is memory
 
 
-def test_torque_is_limited_by_moving_the_target() -> None:
-    # By hand: 17 N m at 17 N m/rad is 1 rad, and 0.4 N m s/rad at 2.5 rad/s is 1 N m more.
-    v = np.zeros(N)
-    v[0] = 2.5
-    target = POSE.copy()
-    target[0] = 1.4
-    s = state(velocity=v)
-    memory = FilterState(last=np.concatenate([[0.9], POSE[1:]]))
-    sent, found, _ = filtered(s, command(position=target), memory, LIMITS, 0.0)
+def moved(
+    s: State, target: np.ndarray, last: np.ndarray | None = None, limits: Limits = LIMITS
+) -> tuple[np.ndarray, Reason]:
+    """The target that is sent, and why it was moved."""
+    memory = FilterState(last=last)
+    sent, decision, _ = filtered(s, command(position=target), memory, limits, 0.0)
     assert sent is not None
-    assert (found.level, found.reason) == (FilterAction.LIMIT, Reason.TORQUE)
-    assert sent.position[0] == pytest.approx(1.0 + 1.0 / 17.0)
-    np.testing.assert_array_equal(sent.position[1:], POSE[1:])
+    assert decision.level is FilterAction.LIMIT
+    return sent.position, decision.reason
 
 
-def test_a_target_changes_by_so_much_in_a_tick() -> None:
-    sent, found, _ = filtered(
-        state(), command(position=POSE - 0.9), FilterState(last=POSE + 0.5), LIMITS, 0.0
-    )
-    assert sent is not None
-    assert found.reason is Reason.CHANGE
-    np.testing.assert_allclose(sent.position, POSE + 0.5 - LIMITS.change)
+def test_targets_are_moved_into_each_limit() -> None:
+    # By hand: 17 N m at 17 N m/rad is 1 rad, and 0.4 N m s/rad at 2.5 rad/s adds 1 N m.
+    s = state(velocity=at(np.zeros(N), 2.5, 0))
+    target, reason = moved(s, at(POSE, 1.4, 0), at(POSE, 0.9, 0))
+    assert reason is Reason.TORQUE
+    assert target[0] == pytest.approx(1.0 + 1.0 / 17.0)
+    np.testing.assert_array_equal(target[1:], POSE[1:])
 
+    target, reason = moved(state(), POSE - 0.9, POSE + 0.5)
+    assert reason is Reason.CHANGE
+    np.testing.assert_allclose(target, POSE + 0.5 - LIMITS.change)
 
-def test_a_joint_on_its_way_out_is_not_driven_further() -> None:
     # In 20 ms at 10 rad/s the knee would pass its margin, 2.55 rad.
-    q, v = POSE.copy(), np.zeros(N)
-    q[2], v[2] = 2.4, 10.0
-    sent, found, _ = filtered(
-        state(position=q, velocity=v),
-        command(position=spoilt_at(q, 2, 2.5)),
-        FilterState(),
-        LIMITS,
-        0.0,
-    )
-    assert sent is not None
-    assert found.reason is Reason.POSITION
-    assert sent.position[2] == 2.4
+    q = at(POSE, 2.4, 2)
+    s = state(position=q, velocity=at(np.zeros(N), 10.0, 2))
+    target, reason = moved(s, at(q, 2.5, 2))
+    assert (target[2], reason) == (2.4, Reason.POSITION)
 
-
-def spoilt_at(values: np.ndarray, index: int, value: float) -> np.ndarray:
-    array = values.copy()
-    array[index] = value
-    return array
-
-
-def test_power_is_limited_by_scaling_all_torques() -> None:
-    limits = Limits.of(ROBOT, power_w=1000.0)
-    target = POSE + 0.8
-    sent, found, _ = filtered(state(), command(position=target), FilterState(), limits, 0.0)
-    assert sent is not None
-    assert found.reason is Reason.POWER
-    torque = KP * (sent.position - POSE)
     # At rest all power is winding loss: the torques are equal still, and give the limit exactly.
+    target, reason = moved(state(), POSE + 0.8, limits=Limits.of(ROBOT, power_w=1000.0))
+    torque = KP * (target - POSE)
+    assert reason is Reason.POWER
     np.testing.assert_allclose(torque, torque[0])
     assert float(torque**2 @ LIMITS.loss) == pytest.approx(1000.0)
-
-
-def test_loss_is_that_of_the_drive() -> None:
     # V / (gear kt stall torque), by hand for the hips: 24 / (6 0.05 62.43).
     stall = 1.5 * 6 * 0.05 * 24 / 0.173
     assert LIMITS.loss[0] == pytest.approx(24 / (6 * 0.05 * stall))
 
 
-def test_limits_that_limit_nothing_are_refused() -> None:
-    for name, value in (("power_w", 0.0), ("change", math.inf), ("margin", 3.0), ("hold_s", 9.0)):
-        with pytest.raises(RobotError):
-            Limits.of(ROBOT, **{name: value})
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("power_w", 0.0), ("change", math.inf), ("margin", 3.0), ("hold_s", 9.0)],
+)
+def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
+    with pytest.raises(RobotError):
+        Limits.of(ROBOT, **{name: value})
     assert Limits.of(ROBOT, tilt=math.inf).tilt == math.inf
 
 
@@ -367,19 +342,19 @@ def test_a_million_states_and_commands_break_no_limit() -> None:
     limits = Limits.of(ROBOT, power_w=2000.0)
     for _ in range(200):
         given = wild(rng, chunk)
-        found = apply_rules(given, limits)
-        met += np.bincount(found.reason, minlength=len(Reason))
-        passed += np.bincount(found.level, minlength=5)
-        sent = found.level < FilterAction.DAMP
+        result = apply_rules(given, limits)
+        met += np.bincount(result.reason, minlength=len(Reason))
+        passed += np.bincount(result.level, minlength=5)
+        sent = result.level < FilterAction.DAMP
         with np.errstate(invalid="ignore", over="ignore"):
-            for name, wrong in broken(given, found.target, limits).items():
+            for name, wrong in broken(given, result.target, limits).items():
                 assert not (wrong & sent).any(), name
         # A command that is passed is the one that was requested, to the last bit.
-        same = found.level == FilterAction.PASS
-        np.testing.assert_array_equal(found.target[same], given.target[same])
-        held = found.level == FilterAction.HOLD
+        same = result.level == FilterAction.PASS
+        np.testing.assert_array_equal(result.target[same], given.target[same])
+        held = result.level == FilterAction.HOLD
         assert (given.state_age[held] > limits.hold_s).all()
-    # Every rule had its say, and enough went through for the test to mean something.
+    # Every rule acted, and enough passed for the test to mean something.
     silent = {Reason(i) for i in np.flatnonzero(met == 0)}
     assert silent <= {Reason.CLOCK, Reason.STATE_LOST, Reason.ENDED, Reason.LINK, Reason.OVERLOAD}
     assert passed.min() > 1000
@@ -395,7 +370,7 @@ numbers = st.floats(allow_nan=True, allow_infinity=True, width=64)
     sequences=st.tuples(st.integers(-5, 200), st.integers(-5, 200)),
     held=st.booleans(),
 )
-def test_whatever_comes_the_filter_answers_and_damping_is_allowed(
+def test_any_input_gives_a_command_within_the_limits_or_damping(
     values: list[float],
     ages: tuple[float, float, float],
     sequences: tuple[int, int],
@@ -416,8 +391,8 @@ def test_whatever_comes_the_filter_answers_and_damping_is_allowed(
         valid_for=ages[2],
         state_sequence=sequences[1],
     )
-    sent, found, memory = filtered(s, c, FilterState(), LIMITS, 0.0, held=held)
-    assert (sent is None) == (found.level >= FilterAction.DAMP) == memory.faulted
+    sent, decision, memory = filtered(s, c, FilterState(), LIMITS, 0.0, held=held)
+    assert (sent is None) == (decision.level >= FilterAction.DAMP) == memory.faulted
     if sent is not None:
         assert np.isfinite(sent.position).all()
         assert (sent.position >= LIMITS.low).all()
@@ -426,6 +401,4 @@ def test_whatever_comes_the_filter_answers_and_damping_is_allowed(
 
 
 def test_every_reason_has_a_line() -> None:
-    texts = {reason.text for reason in Reason}
-    assert len(texts) == len(Reason)
-    assert replace(FilterState(), last=POSE).faulted is False
+    assert len({reason.text for reason in Reason if reason.text}) == len(Reason)
