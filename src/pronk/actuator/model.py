@@ -1,13 +1,12 @@
-"""Motor and gearbox physics as pure functions.
+"""Motor and gearbox physics as pure functions that broadcast over arrays, in SI units.
 
-Everything is at the joint (output of the gear) unless a name contains motor, in SI units, and
-broadcasts over arrays. Signs: torque is what the drive puts on the joint, positive along the
-joint axis; power and current are positive when drawn from the bus, negative when the drive
-brakes hard enough to feed the bus (regeneration).
+Everything is at the joint (output of the gear) unless a name contains motor. Signs: torque is what
+the drive puts on the joint, positive along the joint axis; power and current are positive when
+drawn from the bus, negative when the drive brakes hard enough to feed it.
 
-Factors of a three-phase motor with peak currents, as in Cheetah-Software's ActuatorModel.h:
-torque = 1.5 kt i, and the back-EMF that must fit under the bus voltage is 2 kt omega. A brushed
-motor has 1 and 1.
+Torque constant kt: torque per ampere at the motor [N m/A]. Of a three-phase motor with peak
+currents, as in Cheetah-Software's ActuatorModel.h, torque = 1.5 kt i, and the back-EMF that fits
+under the bus voltage is 2 kt omega. A brushed motor has 1 and 1.
 """
 
 from __future__ import annotations
@@ -16,11 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-
-THREE_PHASE_TORQUE = 1.5
-"""Torque per peak phase current, over kt."""
-THREE_PHASE_EMF = 2.0
-"""Bus voltage that the back-EMF takes, over kt times motor speed."""
 
 
 def pd_torque(
@@ -31,15 +25,7 @@ def pd_torque(
     stiffness: ArrayLike,
     damping: ArrayLike,
 ) -> Array:
-    """Controller torque for target velocity zero (paper M1 with reading A9) [N m].
-
-    Args:
-        command: Position command [rad].
-        position: Joint position [rad].
-        velocity: Joint velocity [rad/s].
-        stiffness: [N m/rad]
-        damping: [N m s/rad]
-    """
+    """Controller torque for target velocity zero (paper M1 with reading A9) [N m]."""
     error = np.subtract(command, position)
     return np.asarray(np.multiply(stiffness, error) - np.multiply(damping, velocity))
 
@@ -50,47 +36,26 @@ def stall_torque(
     torque_constant: float,
     resistance: float,
     bus_voltage: float,
-    torque_factor: float = THREE_PHASE_TORQUE,
+    torque_factor: float = 1.5,
 ) -> float:
-    """Torque at standstill with the bus voltage across the winding [N m].
-
-    Args:
-        gear_ratio: Motor revolutions per joint revolution.
-        torque_constant: kt at the motor [N m/A].
-        resistance: Phase resistance [ohm].
-        bus_voltage: [V]
-        torque_factor: 1.5 for three phases, 1 for a brushed motor.
-    """
+    """Torque at standstill with the bus voltage across the phase resistance [N m]."""
     return torque_factor * gear_ratio * torque_constant * bus_voltage / resistance
 
 
 def no_load_speed(
-    *,
-    gear_ratio: float,
-    torque_constant: float,
-    bus_voltage: float,
-    emf_factor: float = THREE_PHASE_EMF,
+    *, gear_ratio: float, torque_constant: float, bus_voltage: float, emf_factor: float = 2.0
 ) -> float:
-    """Joint speed at which back-EMF takes the whole bus voltage [rad/s].
-
-    Args:
-        gear_ratio: Motor revolutions per joint revolution.
-        torque_constant: kt at the motor [N m/A] = [V s/rad].
-        bus_voltage: [V]
-        emf_factor: 2 for three phases, 1 for a brushed motor.
-    """
+    """Joint speed at which back-EMF takes the whole bus voltage [rad/s]."""
     return bus_voltage / (emf_factor * gear_ratio * torque_constant)
 
 
 def motor_constants(
     *, stall_torque: float, no_load_speed: float, bus_voltage: float
 ) -> tuple[float, float]:
-    """Constants of the gearless one-phase motor with this torque-speed line.
+    """Constants of the gearless one-phase motor with this torque-speed line, joint side.
 
-    `K = V / no_load_speed`, `R = K V / stall_torque`, so that `torque = K (V - K speed) / R`.
-
-    Returns:
-        (K [N m/A] = [V s/rad], R [ohm]), joint side.
+    `K = V / no_load_speed` [N m/A] = [V s/rad] and `R = K V / stall_torque` [ohm], so that
+    `torque = K (V - K speed) / R`.
     """
     constant = bus_voltage / no_load_speed
     return constant, constant * bus_voltage / stall_torque
@@ -108,29 +73,14 @@ def voltage_limits(
 
 
 def torque_limits(
-    speed: ArrayLike,
-    stall_torque: float,
-    no_load_speed: float,
-    effort_limit: float,
+    speed: ArrayLike, stall_torque: float, no_load_speed: float, effort_limit: float
 ) -> tuple[Array, Array]:
-    """Least and greatest torque the drive can give at a speed [N m].
+    """Least and greatest torque the drive can give at a speed: both limits in force [N m].
 
-    Bus voltage less back-EMF drives the current: `stall_torque (1 - speed / no_load_speed)` above
-    and its mirror image below, both held within the effort limit. Beyond the no-load speed the
-    greatest torque is negative: back-EMF brakes.
-
-    Args:
-        speed: Joint speed [rad/s].
-        stall_torque: [N m]
-        no_load_speed: [rad/s]
-        effort_limit: [N m]
-
-    Returns:
-        (low, high), each of the shape of `speed`.
+    Beyond the no-load speed the greatest torque is negative: back-EMF brakes.
     """
     low, high = voltage_limits(speed, stall_torque, no_load_speed)
-    low, high = (np.clip(limit, -effort_limit, effort_limit) for limit in (low, high))
-    return np.asarray(low), np.asarray(high)
+    return np.clip(low, -effort_limit, effort_limit), np.clip(high, -effort_limit, effort_limit)
 
 
 def clip_torque(
@@ -157,49 +107,20 @@ def winding_loss(
 
     Factor and resistance enter through the stall torque, `factor gear kt V / resistance`, so the
     loss is `torque^2 V / (gear kt stall_torque)` for three-phase and brushed motors alike.
-
-    Args:
-        torque: Joint torque [N m].
-        gear_ratio: Motor revolutions per joint revolution.
-        torque_constant: kt at the motor [N m/A].
-        stall_torque: At the joint and at `bus_voltage` [N m].
-        bus_voltage: [V]
     """
     return np.asarray(
         np.square(torque) * (bus_voltage / (gear_ratio * torque_constant * stall_torque))
     )
 
 
-def electrical_power(
-    torque: ArrayLike,
-    speed: ArrayLike,
-    *,
-    gear_ratio: float,
-    torque_constant: float,
-    stall_torque: float,
-    bus_voltage: float,
-) -> Array:
+def electrical_power(torque: ArrayLike, speed: ArrayLike, **drive: float) -> Array:
     """Power drawn from the bus: mechanical power and winding loss [W].
 
-    Negative when the drive brakes and the joint gives more than the winding turns to heat.
-    Inverter and iron losses are left out.
-
-    Args:
-        torque: Joint torque of the motor, before friction [N m].
-        speed: Joint speed [rad/s].
-        gear_ratio: Motor revolutions per joint revolution.
-        torque_constant: kt at the motor [N m/A].
-        stall_torque: At the joint and at `bus_voltage` [N m].
-        bus_voltage: [V]
+    Negative when the drive brakes and the joint gives more than the winding turns to heat. Torque
+    is that of the motor, before friction; `drive` as in `winding_loss`. Inverter and iron losses
+    are left out.
     """
-    loss = winding_loss(
-        torque,
-        gear_ratio=gear_ratio,
-        torque_constant=torque_constant,
-        stall_torque=stall_torque,
-        bus_voltage=bus_voltage,
-    )
-    return np.asarray(np.multiply(torque, speed) + loss)
+    return np.asarray(np.multiply(torque, speed) + winding_loss(torque, **drive))
 
 
 def bus_current(power: ArrayLike, bus_voltage: float) -> Array:

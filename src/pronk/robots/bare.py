@@ -116,18 +116,19 @@ def yaml_of_model(path: Path) -> str:
         "",
         "drives:  # CHECK against the data sheet: limits, torque-speed line, rotor inertia",
     ]
+    fields = (
+        "effort_limit",
+        "stall_torque",
+        "no_load_speed",
+        "bus_voltage",
+        "gear_ratio",
+        "armature",
+        "frictionloss",
+        "viscous_damping",
+    )
     for name, drive in file.drives.items():
-        lines += [
-            f"  {name}:",
-            f"    effort_limit: {drive.effort_limit}",
-            f"    stall_torque: {drive.stall_torque}",
-            f"    no_load_speed: {drive.no_load_speed}",
-            f"    bus_voltage: {drive.bus_voltage}",
-            f"    gear_ratio: {drive.gear_ratio}",
-            f"    armature: {drive.armature}",
-            f"    frictionloss: {drive.frictionloss}",
-            f"    viscous_damping: {drive.viscous_damping}",
-        ]
+        lines.append(f"  {name}:")
+        lines += [f"    {field}: {getattr(drive, field)}" for field in fields]
     lines += [
         "",
         "groups:  # CHECK: gains on the real drives; joints built alike may share a group, with",
@@ -142,8 +143,8 @@ def yaml_of_model(path: Path) -> str:
     lines += [
         "",
         "poses:  # CHECK: the pose of the sweep; a robot that stands up needs `folded` too",
+        "  default:",
     ]
-    lines += ["  default:"]
     lines += [f"    {name}: {value}" for name, value in file.poses["default"].items()]
     return "\n".join(lines) + "\n"
 

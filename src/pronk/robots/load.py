@@ -24,6 +24,7 @@ from msgspec import Meta
 
 from pronk.actuator.model import no_load_speed, stall_torque
 from pronk.errors import RobotError
+from pronk.robots.model import set_inertia
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
 SCHEMA = "pronk/robot/1"
@@ -66,22 +67,13 @@ class DriveEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         torque_factor, emf_factor = _TORQUE_FACTOR[self.phases], _EMF_FACTOR[self.phases]
         rotor = (self.armature or 0.0) / gear**2
         constant, resistance = self.torque_constant, self.resistance
-        stall, free = self.stall_torque, self.no_load_speed
-        if self.joint_torque_constant is not None and resistance is not None:
+        if self.joint_torque_constant is not None:
             constant = self.joint_torque_constant / gear
-            stall = torque_factor * self.joint_torque_constant * volts / resistance
-            free = volts / (emf_factor * self.joint_torque_constant)
-        elif constant is not None and resistance is not None:
-            stall = stall_torque(
-                gear_ratio=gear,
-                torque_constant=constant,
-                resistance=resistance,
-                bus_voltage=volts,
-                torque_factor=torque_factor,
-            )
-            free = no_load_speed(
-                gear_ratio=gear, torque_constant=constant, bus_voltage=volts, emf_factor=emf_factor
-            )
+        stall, free = self.stall_torque, self.no_load_speed
+        if constant is not None and resistance is not None:
+            motor = {"gear_ratio": gear, "torque_constant": constant, "bus_voltage": volts}
+            stall = stall_torque(resistance=resistance, torque_factor=torque_factor, **motor)
+            free = no_load_speed(emf_factor=emf_factor, **motor)
         elif stall is not None and free is not None:
             constant = volts / (emf_factor * gear * free)
             resistance = torque_factor * gear * constant * volts / stall
@@ -186,11 +178,8 @@ def read_model(path: Path) -> Model:
         compiler.fusestatic = False
         model = spec.compile()
         for body in spec.bodies[1:]:
-            if body.explicitinertial:
-                continue
-            body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
-            body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
-            body.explicitinertial = True
+            if not body.explicitinertial:
+                set_inertia(body, model)
         for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_MESH]:
             spec.delete(geom)
         for part in (spec.pairs, spec.sensors, spec.keys, spec.actuators, spec.skins, spec.meshes):

@@ -16,9 +16,6 @@ native model with no Python in the loop, so `mujoco.rollout` can run it on every
   the stiffness and kd_V = R damping / K - K the damping, once back-EMF has added its own K^2/R;
   the voltage clipped at V is the torque clipped at stall_torque (+-1 - qdot / no_load_speed), and
   the actuator's saturation is the effort limit.
-
-A test holds the equivalence, in and out of saturation, against the law written out, and another
-against mjlab itself.
 """
 
 from __future__ import annotations
@@ -47,16 +44,14 @@ def free_spec(
     Joints have their armature, dry friction and viscous damping; the timestep is the training
     simulator's, the integrator implicitfast; keyframe `default` is the default pose.
 
-    Args:
-        robot: Which robot.
-        armature: Reflected rotor inertia by joint name, instead of the drive's [kg m^2].
-        frictionloss: Dry friction by joint name, instead of the drive's [N m].
+    Values by joint name replace the drive's.
 
     Raises:
         RobotError: A joint is unknown.
     """
     spec = robot.build_spec()
-    _set_options(spec, robot, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    spec.option.timestep = robot.timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     _set_passive(spec, robot, robot.joint_names, armature, frictionloss)
     _add_default_key(spec, robot, with_command=False)
     return spec
@@ -78,20 +73,15 @@ def bench_spec(
     by their own drives. Contacts are off, gravity is on. Geoms are left out (the bench is
     computed, not drawn). Keyframe `default` is the default pose with the commands that hold it.
 
-    Args:
-        robot: Which robot.
-        joint_name: The excited joint.
-        stiffness: Gain by joint name, instead of the one on the robot's drive [N m/rad].
-        damping: Gain by joint name, instead of the one on the robot's drive [N m s/rad].
-        armature: Reflected rotor inertia by joint name, instead of the drive's [kg m^2].
-        frictionloss: Dry friction by joint name, instead of the drive's [N m].
+    Values by joint name replace those of the robot's drives.
 
     Raises:
         RobotError: A joint is unknown, or something outside the chain could move with it.
     """
     joint = robot.joint(joint_name)
     spec = robot.build_spec()
-    _set_options(spec, robot, mujoco.mjtIntegrator.mjINT_EULER)
+    spec.option.timestep = robot.timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     remove_geoms(spec)
     base = spec.body(robot.base_body)
@@ -113,6 +103,16 @@ def bench_spec(
     return spec
 
 
+def set_inertia(body: Any, model: mujoco.MjModel) -> None:
+    """Give a body of a spec the inertia that it has in the compiled model as an explicit one."""
+    body.mass = model.body_mass[body.id]
+    body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+    body.inertia = model.body_inertia[body.id]
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.fullinertia = [np.nan] * 6
+    body.explicitinertial = True
+
+
 def remove_geoms(spec: mujoco.MjSpec) -> None:
     """Delete all geoms; bodies whose inertia comes from them keep it as an explicit one.
 
@@ -127,13 +127,7 @@ def remove_geoms(spec: mujoco.MjSpec) -> None:
         except ValueError as error:
             raise RobotError(f"the model does not compile: {error}.") from None
         for body in inferred:
-            body.mass = model.body_mass[body.id]
-            body.ipos = model.body_ipos[body.id]
-            body.iquat = model.body_iquat[body.id]
-            body.inertia = model.body_inertia[body.id]
-            body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-            body.fullinertia = [np.nan] * 6
-            body.explicitinertial = True
+            set_inertia(body, model)
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for pair in list(spec.pairs):
         spec.delete(pair)
@@ -155,14 +149,7 @@ def add_drives(
 
     Actuators have the names of their joints and take position commands [rad].
 
-    Args:
-        spec: Model to change.
-        robot: Where drives and default gains come from.
-        joint_names: Joints to drive, in the order of the actuators.
-        stiffness: Gain by joint name, instead of the one on the robot's drive [N m/rad].
-        damping: Gain by joint name, instead of the one on the robot's drive [N m s/rad].
-        armature: Reflected rotor inertia by joint name, instead of the drive's [kg m^2].
-        frictionloss: Dry friction by joint name, instead of the drive's [N m].
+    Values by joint name [N m/rad, N m s/rad, kg m^2, N m] replace those of the robot's drives.
 
     Raises:
         RobotError: A joint is unknown.
@@ -173,7 +160,7 @@ def add_drives(
     for name in names:
         joint = robot.joint(name)
         drive = joint.drive
-        constant, resistance = _electrical(drive)
+        constant, resistance = _constants(drive)
         kp, kd = _voltage_gains(
             drive,
             (stiffness or {}).get(name, joint.stiffness),
@@ -194,13 +181,6 @@ def set_drive_gains(
 ) -> None:
     """Change the gains of one drive in a compiled model, exactly as compiling anew would.
 
-    Args:
-        model: Model from a spec with drives.
-        joint_name: Whose drive.
-        drive: The drive the model was built with.
-        stiffness: [N m/rad]
-        damping: [N m s/rad]
-
     Raises:
         RobotError: The model has no drive of that name.
     """
@@ -217,19 +197,11 @@ def set_passive(
     *,
     armature: float | None = None,
     frictionloss: float | None = None,
-    viscous_damping: float | None = None,
 ) -> None:
-    """Change armature, dry friction or viscous damping of one joint in a compiled model.
+    """Change armature [kg m^2] or dry friction [N m] of one joint in a compiled model.
 
     Constants that MuJoCo derives from them are computed anew, so the model is the one that
-    compiling with these values would give.
-
-    Args:
-        model: Model to change.
-        joint_name: Which joint.
-        armature: Reflected rotor inertia [kg m^2]; None leaves it.
-        frictionloss: Dry friction [N m]; None leaves it.
-        viscous_damping: Passive viscous friction [N m s/rad]; None leaves it.
+    compiling with these values would give. None leaves a value.
 
     Raises:
         RobotError: The model has no joint of that name.
@@ -241,15 +213,12 @@ def set_passive(
     dof = model.jnt_dofadr[index]
     if frictionloss is not None:
         model.dof_frictionloss[dof] = frictionloss
-    if viscous_damping is not None:
-        model.dof_damping[dof] = viscous_damping
     if armature is not None:
         model.dof_armature[dof] = armature
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _electrical(drive: Drive) -> tuple[float, float]:
-    """Motor constant [N m/A] and resistance [ohm] of the equivalent gearless DC motor."""
+def _constants(drive: Drive) -> tuple[float, float]:
     return motor_constants(
         stall_torque=drive.stall_torque,
         no_load_speed=drive.no_load_speed,
@@ -259,13 +228,8 @@ def _electrical(drive: Drive) -> tuple[float, float]:
 
 def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[float, float]:
     """Controller gains in volts that make the torque law `stiffness`, `damping`."""
-    constant, resistance = _electrical(drive)
+    constant, resistance = _constants(drive)
     return resistance * stiffness / constant, resistance * damping / constant - constant
-
-
-def _set_options(spec: mujoco.MjSpec, robot: RobotSpec, integrator: Any) -> None:
-    spec.option.timestep = robot.timestep_s
-    spec.option.integrator = integrator
 
 
 def _set_passive(
@@ -333,8 +297,8 @@ def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec, *, with_command: boo
         name = model.joint(index).name
         if name in robot.joint_names:
             qpos[model.jnt_qposadr[index]] = robot.joint(name).default_position
-    command = [robot.joint(model.actuator(i).name).default_position for i in range(model.nu)]
     if with_command:
+        command = [robot.joint(model.actuator(i).name).default_position for i in range(model.nu)]
         spec.add_key(name="default", qpos=qpos, ctrl=command)
     else:
         spec.add_key(name="default", qpos=qpos)

@@ -1,10 +1,4 @@
-"""What a robot is, as far as its joints are concerned.
-
-A `RobotSpec` is data: its joints in the order of every file and table, the drive of each joint, the
-gains on those drives, and how a bench test of each joint is set up. The physics that these
-numbers enter is in `pronk.actuator.model`; the MuJoCo model built from them is in
-`pronk.robots.model`.
-"""
+"""A robot as data: joints, drives, the gains on them, and the bench test of each joint."""
 
 from __future__ import annotations
 
@@ -49,12 +43,12 @@ class Drive:
         Raises:
             RobotError: A value that must be positive is not, or friction is negative.
         """
-        for name in ("gear_ratio", "stall_torque", "no_load_speed", "effort_limit", "bus_voltage"):
-            if not getattr(self, name) > 0.0:
-                raise RobotError(f"Drive.{name} is {getattr(self, name)}; it must be positive.")
-        for name in ("rotor_inertia", "frictionloss", "viscous_damping"):
-            if not getattr(self, name) >= 0.0:
-                raise RobotError(f"Drive.{name} is {getattr(self, name)}; it must not be negative.")
+        positive = ("gear_ratio", "stall_torque", "no_load_speed", "effort_limit", "bus_voltage")
+        for name in (*positive, "rotor_inertia", "frictionloss", "viscous_damping"):
+            value = getattr(self, name)
+            if not (value > 0.0 if name in positive else value >= 0.0):
+                expected = "positive" if name in positive else "0 or more"
+                raise RobotError(f"Drive.{name} is {value}; expected {expected}.")
 
     @property
     def armature(self) -> float:
