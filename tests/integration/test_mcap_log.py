@@ -1,4 +1,4 @@
-"""MCAP logs: round trips, and what is left of a cut file."""
+"""MCAP logs: round trips, foreign readers, and what is left of a cut or damaged file."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import os
 import signal
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -19,19 +19,12 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from pronk.errors import LogError
+from pronk.logs import mcap_log
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.logs.mcap_log import (
-    END,
-    HEADER,
-    SAMPLE,
-    SEGMENT,
-    LogHeader,
-    McapLogWriter,
-    read_mcap,
-    write_mcap,
-)
+from pronk.logs.mcap_log import LogHeader, McapLogWriter, read_mcap, write_mcap
 from pronk.logs.readers import read_log
 
+TIMELESS = ("robot", "joints", "segments", "units", "virtual", "metadata", "complete")
 ARRAYS = ("time", "command", "position", "velocity", "torque", "frequency", "stiffness", "pose")
 
 
@@ -40,29 +33,30 @@ def example(n: int = 2000, joints: int = 3) -> JointLog:
     seconds = np.arange(n) / 500.0 + rng.uniform(0.0, 1e-5, n)
     frequency = np.linspace(0.1, 25.0, n)
     frequency[: n // 10] = np.nan
+    segments = tuple(
+        Segment(
+            kind="multisine",
+            joints=("j0",),
+            start=seconds[-1] * k / 4.0 + 0.01,
+            stop=seconds[-1] * (k + 1) / 4.0,
+            amplitude=0.25,
+            repeat=k,
+            band_hz=(0.1, 25.0),
+            period_s=10.0,
+            clamped=("j1",),
+        )
+        for k in range(4)
+    )
+    columns = {
+        name: rng.normal(size=(n, joints)) for name in ("command", "position", "velocity", "torque")
+    }
     return JointLog(
         robot="mini_cheetah",
         joints=tuple(f"j{i}" for i in range(joints)),
         time=seconds,
-        command=rng.normal(size=(n, joints)),
-        position=rng.normal(size=(n, joints)),
-        velocity=rng.normal(size=(n, joints)),
-        torque=rng.normal(size=(n, joints)),
+        **columns,
         frequency=frequency,
-        segments=tuple(
-            Segment(
-                kind="multisine",
-                joints=("j0",),
-                start=seconds[-1] * k / 4.0 + 0.01,
-                stop=seconds[-1] * (k + 1) / 4.0,
-                amplitude=0.25,
-                repeat=k,
-                band_hz=(0.1, 25.0),
-                period_s=10.0,
-                clamped=("j1",),
-            )
-            for k in range(4)
-        ),
+        segments=segments,
         stiffness=np.full(joints, 17.0),
         damping=np.full(joints, 0.4),
         pose=np.linspace(-1.0, 1.0, joints),
@@ -73,36 +67,29 @@ def example(n: int = 2000, joints: int = 3) -> JointLog:
 
 
 def assert_same(a: JointLog, b: JointLog) -> None:
-    for name in ARRAYS:
-        one, other = getattr(a, name), getattr(b, name)
-        assert (one is None) == (other is None), name
-        if one is not None:
-            np.testing.assert_array_equal(one, other, err_msg=name)
-    for name in ("robot", "joints", "segments", "units", "virtual", "metadata", "complete"):
-        assert getattr(a, name) == getattr(b, name), name
+    for name in (*ARRAYS, *TIMELESS):
+        np.testing.assert_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
-    log = example()
-    write_mcap(tmp_path / "a.mcap", log)
-    back = read_mcap(tmp_path / "a.mcap")
-    assert_same(log, back)
-    assert len(back.sha256) == 64
+    write_mcap(tmp_path / "a.mcap", example())
+    assert_same(example(), read_mcap(tmp_path / "a.mcap"))
+    with pytest.raises(LogError, match="leave them out"):
+        read_log(tmp_path / "a.mcap", command_topic="/sweep/sample")
 
 
 @settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_any_log_survives(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     n, width = data.draw(st.integers(2, 40)), data.draw(st.integers(1, 4))
-    values = st.floats(-1e6, 1e6, allow_nan=False)
+    matrix = arrays(float, (n, width), elements=st.floats(-1e6, 1e6, allow_nan=False))
+    names = st.lists(st.text(min_size=1), min_size=width, max_size=width, unique=True)
     log = JointLog(
         robot=data.draw(st.text(max_size=20)),
-        joints=tuple(
-            data.draw(st.lists(st.text(min_size=1), min_size=width, max_size=width, unique=True))
-        ),
+        joints=tuple(data.draw(names)),
         time=np.cumsum(data.draw(arrays(float, n, elements=st.floats(1e-6, 10.0)))),
-        command=data.draw(arrays(float, (n, width), elements=values)),
-        position=data.draw(arrays(float, (n, width), elements=values)),
+        command=data.draw(matrix),
+        position=data.draw(matrix),
     )
     path = tmp_path_factory.mktemp("any") / "a.mcap"
     write_mcap(path, log)
@@ -115,33 +102,28 @@ def test_another_reader_sees_named_topics_with_schemas(tmp_path: Path) -> None:
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None
-        assert summary.statistics is not None
-        assert {c.topic for c in summary.channels.values()} == {HEADER, SEGMENT, SAMPLE, END}
+        assert {c.topic for c in summary.channels.values()} == set(mcap_log.TOPICS)
         assert all(c.message_encoding == "json" for c in summary.channels.values())
         for schema in summary.schemas.values():
             assert schema.encoding == "jsonschema"
             assert json.loads(schema.data)["type"] == "object"
         messages = [(c.topic, json.loads(m.data)) for _, c, m in reader.iter_messages()]
-    samples = [body for topic, body in messages if topic == SAMPLE]
+    samples = [body for topic, body in messages if topic == mcap_log.SAMPLE]
     assert len(samples) == 2000
     assert samples[0]["frequency"] is None
-    assert set(samples[0]) == {
-        *("t", "command", "position", "velocity", "torque", "frequency", "segment")
-    }
     # In time order the excitation is announced before its first sample.
     order = [(topic, body.get("segment")) for topic, body in messages]
-    assert order.index((SEGMENT, None)) < order.index((SAMPLE, 0))
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointLog, bytes, Path]:
-    folder = tmp_path_factory.mktemp("cut")
-    log = example()
-    write_mcap(folder / "whole.mcap", log)
-    return log, (folder / "whole.mcap").read_bytes(), folder
+    assert order.index((mcap_log.SEGMENT, None)) < order.index((mcap_log.SAMPLE, 0))
 
 
 Whole = tuple[JointLog, bytes, Path]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    folder, log = tmp_path_factory.mktemp("cut"), example()
+    write_mcap(folder / "whole.mcap", log)
+    return log, (folder / "whole.mcap").read_bytes(), folder
 
 
 def read_or_one_sentence(path: Path) -> JointLog | None:
@@ -166,7 +148,6 @@ def test_a_file_cut_anywhere_is_a_shorter_log_or_one_sentence(whole: Whole, shar
         assert share < 0.25
         return
     assert not short.complete
-    assert "cut short" in short.notes[0]
     count = len(short.time)
     np.testing.assert_array_equal(short.time, log.time[:count])
     np.testing.assert_array_equal(short.position, log.position[:count])
@@ -186,40 +167,37 @@ def test_a_damaged_file_never_gives_wrong_numbers(whole: Whole, data: st.DataObj
         bad[data.draw(st.integers(0, len(bad) - 1))] ^= data.draw(st.integers(1, 255))
     path = folder / "bad.mcap"
     path.write_bytes(bytes(bad))
-    found = read_or_one_sentence(path)
-    if found is None:
-        return
-    count = len(found.time)
-    np.testing.assert_array_equal(found.time, log.time[:count])
-    np.testing.assert_array_equal(found.command, log.command[:count])
+    if (found := read_or_one_sentence(path)) is not None:
+        count = len(found.time)
+        np.testing.assert_array_equal(found.time, log.time[:count])
+        np.testing.assert_array_equal(found.command, log.command[:count])
+
+
+KILLED = """
+import time
+from pathlib import Path
+from pronk.logs.joint_log import Segment
+from pronk.logs.mcap_log import LogHeader, McapLogWriter
+writer = McapLogWriter(Path({path!r}), LogHeader(robot="mini_cheetah", joints=("knee",)))
+writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))
+for k in range(1, 1000):
+    writer.sample(k / 500.0, [0.1], [0.2], segment=0)
+print("ready", flush=True)
+time.sleep(60.0)
+"""
 
 
 def test_a_killed_recorder_leaves_a_valid_log(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    code = f"""
-        import time
-        from pathlib import Path
-        from pronk.logs.joint_log import Segment
-        from pronk.logs.mcap_log import LogHeader
-        from pronk.logs.mcap_log import McapLogWriter
-        header = LogHeader(robot="mini_cheetah", joints=("knee",))
-        writer = McapLogWriter(Path({str(path)!r}), header)
-        writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=99.0, amplitude=0.2))
-        for k in range(1, 1000):
-            writer.sample(k / 500.0, [0.1], [0.2], segment=0)
-        print("ready", flush=True)
-        time.sleep(60.0)
-    """
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True
-    )
+    code = KILLED.format(path=str(path))
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     log = read_mcap(path)
     assert not log.complete
-    assert len(log.time) == 768  # whole chunks of 256 samples
+    assert len(log.time) == 768  # Whole chunks of 256 samples.
     assert log.segments[0].kind == "chirp"
     assert log.segments[0].stop == pytest.approx(768 / 500.0)
 
@@ -235,39 +213,26 @@ def test_the_reason_of_an_early_end_is_kept(tmp_path: Path) -> None:
         write()
     log = read_mcap(tmp_path / "a.mcap")
     assert not log.complete
-    assert log.notes == ("the recording was cut short (ValueError: the belt broke)",)
+    assert "the belt broke" in log.notes[0]
 
 
 def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
-    import zstandard
-
     path = tmp_path / "bomb.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         schema = writer.register_schema("x", "jsonschema", b"{}")
-        channel = writer.register_channel("/x", "json", schema)
-        writer.add_message(channel, 0, b"x" * 1000, 0)
+        writer.add_message(writer.register_channel("/x", "json", schema), 0, b"x" * 1000, 0)
         writer.finish()
     data = path.read_bytes()
-    bomb = zstandard.compress(bytes(300 * 2**20))
-    start = data.index(b"\x06")  # the chunk record
-    assert len(bomb) < 100_000
-    record = (
-        (0).to_bytes(16, "little")
-        + (300 * 2**20).to_bytes(8, "little")
-        + bytes(4)
-        + (4).to_bytes(4, "little")
-        + b"zstd"
-        + len(bomb).to_bytes(8, "little")
-        + bomb
-    )
-    path.write_bytes(data[:start] + b"\x06" + len(record).to_bytes(8, "little") + record)
+    size = 300 * 2**20
+    bomb = zstandard.compress(bytes(size))
+
+    def number(value: int, width: int = 8) -> bytes:
+        return value.to_bytes(width, "little")
+
+    record = number(0, 16) + number(size) + bytes(4) + number(4, 4) + b"zstd" + number(len(bomb))
+    start = data.index(b"\x06")  # The chunk record.
+    path.write_bytes(data[:start] + b"\x06" + number(len(record + bomb)) + record + bomb)
     with pytest.raises(LogError, match="300 MiB"):
         read_mcap(path)
-
-
-def test_topics_mean_nothing_to_a_log_of_pronk(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "a.mcap", example())
-    with pytest.raises(LogError, match="leave them out"):
-        read_log(tmp_path / "a.mcap", command_topic="/sweep/sample")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer as RosWriter
 
+from command_line import invoke
 from pronk.errors import LogError
 from pronk.logs.readers import read_log
 
@@ -35,30 +35,21 @@ def bag(path: Path, *, stamped: bool = True, command: str = "/joint_command") ->
     with path.open("wb") as stream, RosWriter(stream) as writer:
         state = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
         plain = writer.register_msgdef("std_msgs/msg/Float64MultiArray", ARRAY)
-
-        def joint_state(names: list[str], values: list[float], when: float) -> dict[str, Any]:
-            stamp = {"sec": int(when), "nanosec": round(when % 1.0 * 1e9)} if stamped else {}
-            return {
-                "header": {"stamp": stamp or {"sec": 0, "nanosec": 0}, "frame_id": ""},
-                "name": names,
-                "position": values,
-                "velocity": [],
-                "effort": [],
-            }
-
         for k in range(400):
             when = 100.0 + k / 200.0
             nano = round(when * 1e9)
+            stamp = {"sec": int(when), "nanosec": round(when % 1.0 * 1e9)}
+            header = {"stamp": stamp if stamped else {"sec": 0, "nanosec": 0}, "frame_id": ""}
+            message = {"header": header, "velocity": [], "effort": []}
             if k >= 8 and k % 4 == 0:
                 values = [np.sin(0.1 * k), 2.0]
                 if command == "/array":
                     writer.write_message(command, plain, {"data": values}, nano, nano)
                 else:
-                    message = joint_state(["knee", "hip"], values[::-1], when)
-                    message["name"] = ["hip", "knee"]
-                    writer.write_message(command, state, message, nano, nano)
-            message = joint_state(["knee", "hip"], [np.sin(0.1 * k - 0.2), 2.1], when)
-            writer.write_message("/joint_states", state, message, nano, nano)
+                    order = {"name": ["hip", "knee"], "position": values[::-1]}
+                    writer.write_message(command, state, message | order, nano, nano)
+            states = {"name": ["knee", "hip"], "position": [np.sin(0.1 * k - 0.2), 2.1]}
+            writer.write_message("/joint_states", state, message | states, nano, nano)
 
 
 def test_a_bag_with_two_joint_state_topics(tmp_path: Path) -> None:
@@ -107,3 +98,11 @@ def test_a_wrong_topic_or_field_lists_what_there_is(
     assert "\n" not in str(caught.value)
     if "topic" in words:
         assert "/joint_states (sensor_msgs/msg/JointState)" in str(caught.value)
+
+
+def test_the_topics_are_options_of_the_command_line(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    bag(path)
+    done = invoke(["response", path, "--command-topic", "/elsewhere"])
+    assert done.exit_code == 2
+    assert "no commands on /elsewhere" in done.stderr

@@ -1,4 +1,4 @@
-"""The quick way: the closed form against the simulator, and the search that rests on it."""
+"""The linearized simulator against the simulator, and the quick search that uses it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ SETTINGS = MatchSettings()
 
 def known(joint: str, stiffness: float, damping: float, *, length_s: float = 10.0) -> MeasuredJoint:
     chirp = Excitation(offsets=Chirp(length_s=length_s).samples())
-    return measured_joints(
-        synthetic_log(ROBOT, joint, [chirp], stiffness, damping), joint, ROBOT, SETTINGS
-    )[0]
+    log = synthetic_log(ROBOT, joint, [chirp], stiffness, damping)
+    return measured_joints(log, joint, ROBOT, SETTINGS)[0]
 
 
 def test_without_friction_the_closed_form_is_the_simulation() -> None:
@@ -78,7 +77,7 @@ def test_with_friction_it_is_close_enough_to_start_from(joint: str) -> None:
     assert np.mean(error**2) < np.mean(bare**2)
 
 
-def test_the_quick_way_finds_what_simulating_everything_finds() -> None:
+def test_the_quick_search_finds_what_simulating_everything_finds() -> None:
     """Same node of the grid, and the refined gains within 0.1 %, off the nodes and off the model.
 
     The measured joints have twice the simulator's dry friction, so no gains fit exactly and the
@@ -110,7 +109,7 @@ def test_the_quick_way_finds_what_simulating_everything_finds() -> None:
 
 
 def test_the_horizon_changes_no_gain() -> None:
-    """Steps without effect on the estimate in the band are left out: 0.003 dB at most."""
+    """Steps without effect on the band are left out: 0.003 dB at most."""
     goal = known("FR_hip_pitch", 17.0, 0.4, length_s=20.0)
     assert goal.steps < 0.8 * len(goal.matrix)
     with MujocoSimulator(ROBOT) as simulator:
