@@ -75,7 +75,7 @@ def sweep(
     figures: dict[str, Any] = {
         "robot": known.name,
         "link": str(address),
-        "virtual": virtual,
+        "virtual": virtual or None,  # by wire not known before the first state
         "duration_s": plan.duration_s,
         "plan": plan.rows(),
         "logs": [],

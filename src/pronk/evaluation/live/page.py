@@ -91,15 +91,7 @@ class WebPage:
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
-        """Start the server.
-
-        Args:
-            robot: What is drawn.
-            ground: What it stands on.
-            joystick: Set by the page.
-            title: Of the page, Markdown.
-            host: Address to bind to; 127.0.0.1 is this machine alone.
-            port: The first one that is free from here on is taken.
+        """Start the server, at the first free port from `port` on; `title` is Markdown.
 
         Raises:
             PronkError: viser or mjviser is not installed, or `free_port` finds none.

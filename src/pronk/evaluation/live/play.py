@@ -197,14 +197,7 @@ def play(
 ) -> Played:
     """Run the robot in real time until Ctrl-C; a fallen one goes on until it is reset.
 
-    Args:
-        robot: Structure.
-        policy: Its contract fits the robot.
-        sim_params: Parameters of the virtual robot.
-        joystick: Operator command.
-        page: Where it is shown.
-        seed: Of all noise.
-        until: Called with the simulated time [s]; true ends the run.
+    `until`, called with the simulated time [s], ends the run as well.
 
     Raises:
         ArtefactError: The contract does not fit.

@@ -12,7 +12,6 @@ from scipy.ndimage import gaussian_filter1d
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpEvents, heading
 from pronk.virtual.capture import Capture
-from pronk.virtual.ground import Ground
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.intp]
@@ -47,7 +46,6 @@ class Film:
     virtual: bool
     """Of the virtual robot; the frames are labelled accordingly."""
     events: JumpEvents | None
-    ground: Ground
     origin: tuple[float, float]
     """Zero of the tape on the floor: the trunk at lift-off, or at the start [m]."""
     direction: float
@@ -84,24 +82,14 @@ def plan(
     note: str = "",
     virtual: bool = True,
     events: JumpEvents | None = None,
-    ground: Ground | None = None,
     start: float | None = None,
     end: float | None = None,
     slow: float = 1.0,
 ) -> Film:
-    """Plan a film of a capture.
+    """Plan a film of a capture, which shows the flight `slow` times slower than real time.
 
-    Args:
-        capture: The recorded run.
-        robot: Name of the robot.
-        title: The command.
-        note: Second line of the title.
-        virtual: Whether it was the virtual robot.
-        events: Of the jump; None for a robot that only walks.
-        ground: Floor and blocks; None for a bare floor.
-        start: First moment [s]; None: 1 s before lift-off, or the first sample.
-        end: Last moment [s]; None: 1.2 s after touchdown, or the last sample.
-        slow: How many times slower than real time the flight is shown.
+    Without `start` and `end` [s] it is from 1 s before lift-off to 1.2 s after touchdown; without
+    `events`, those of the jump, it is the whole capture.
 
     Raises:
         PronkError: No frame is left, or `slow` is below 1.
@@ -131,7 +119,6 @@ def plan(
         note=note,
         virtual=virtual,
         events=events,
-        ground=ground or Ground(),
         origin=(float(capture.position[zero, 0]), float(capture.position[zero, 1])),
         direction=direction,
         azimuth=direction + 0.5 * math.pi + math.copysign(_QUARTER, facing),

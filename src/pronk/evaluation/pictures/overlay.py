@@ -33,14 +33,9 @@ _REFERENCE = 400.0
 
 
 def tape_points(film: Film, side: float) -> dict[int, Array]:
-    """Points on the tapes under the film, by distance from lift-off in units of 0.2 m.
+    """Points on the tapes under the film [m], by distance from lift-off in units of 0.2 m.
 
-    Args:
-        film: The film.
-        side: Across a tape: -1 and 1 are its right and left end.
-
-    Returns:
-        World coordinates [m], (3,), each.
+    `side` is the place across a tape: -1 and 1 are its right and left end.
     """
     along = np.array([math.cos(film.direction), math.sin(film.direction), 0.0])
     across = np.array([-along[1], along[0], 0.0])
@@ -81,8 +76,7 @@ def draw_frame(image: Image.Image, film: Film, frame: int) -> None:
     scale = image.height / _REFERENCE
     pad = 10.0 * scale
     draw = ImageDraw.Draw(image, "RGBA")
-    if not film.ground.terrain:
-        _distances(draw, film, frame, image.size)
+    _distances(draw, film, frame, image.size)
     _title(draw, film, image.width)
     bottom, height = image.height - pad, film.qpos[frame, 2]
     if film.events:
@@ -127,16 +121,9 @@ def _label(
     fill: tuple[int, int, int, int] = _PANEL,
     ink: tuple[int, int, int, int] = _INK,
 ) -> float:
-    """Write text in a box and return the box's right edge [px].
+    """Write lines of text of a size [px] in a box and return the box's right edge [px].
 
-    Args:
-        draw: On the image.
-        text: One or more lines.
-        corner: Point of the box that `anchor` names [px].
-        anchor: l, m or r, and a (top) or d (bottom).
-        size: Of the font [px].
-        fill: Colour of the box.
-        ink: Colour of the text.
+    `anchor` names the point of the box that is at `corner`: l, m or r, and a (top) or d (bottom).
     """
     inner, lines = 0.45 * size, text.count("\n") + 1
     left, _, right, _ = draw.multiline_textbbox((0, 0), text, font=_font(size))

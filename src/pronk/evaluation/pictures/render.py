@@ -42,9 +42,6 @@ _GIF_SKIP = 2
 """A GIF has one frame of so many."""
 _OVERSAMPLE = 2
 """Pixels rendered for each pixel of the image, each way."""
-_DRAWN = {"contype": 0, "conaffinity": 0, "group": 2}
-"""A geom for drawing only."""
-
 _WORLD = f"""
 <mujoco>
   <statistic extent="1" center="0 0 .3"/>
@@ -81,26 +78,22 @@ def stage(film: Film) -> Any:
         mujoco.MjModel
     """
     spec = mujoco.MjSpec.from_string(_WORLD)
-    spec.geom("floor").pos = (0.0, 0.0, film.ground.floor)
     right = np.array([math.sin(film.azimuth), -math.cos(film.azimuth), 0.0])
     ahead = np.array([math.cos(film.azimuth), math.sin(film.azimuth), 0.0])
     sun = spec.light("sun")
     sun.dir = 0.18 * right + 0.32 * ahead + (0.0, 0.0, -1.0)
     sun.pos = -3.0 * np.array(sun.dir)
-    boxes = [
-        {"size": box.half_size, "pos": box.center, "rgba": (0.62, 0.55, 0.45, 1.0)}
-        for box in film.ground.terrain
-    ] or [
-        {
-            "size": (0.012 if mark % 5 == 0 else 0.006, TAPE_HALF_M, 0.0005),
-            "pos": place + np.array([0.0, 0.0, 0.0008]),
-            "quat": (math.cos(0.5 * film.direction), 0.0, 0.0, math.sin(0.5 * film.direction)),
-            "rgba": (0.93, 0.93, 0.9, 1.0) if mark else (1.0, 0.55, 0.1, 1.0),
-        }
-        for mark, place in overlay.tape_points(film, 0.0).items()
-    ]
-    for box in boxes:
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **box, **_DRAWN)
+    for mark, place in overlay.tape_points(film, 0.0).items():
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(0.012 if mark % 5 == 0 else 0.006, TAPE_HALF_M, 0.0005),
+            pos=place + np.array([0.0, 0.0, 0.0008]),
+            quat=(math.cos(0.5 * film.direction), 0.0, 0.0, math.sin(0.5 * film.direction)),
+            rgba=(0.93, 0.93, 0.9, 1.0) if mark else (1.0, 0.55, 0.1, 1.0),
+            contype=0,
+            conaffinity=0,
+            group=2,
+        )
     spec.attach(load_robot(film.robot).build_spec(), prefix="", frame=spec.worldbody.add_frame())
     return spec.compile()
 

@@ -90,15 +90,9 @@ def environment(backend: str) -> dict[str, str]:
 
 
 def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path, ...]:
-    """Write `stem`.mp4, `stem`.gif and, of a jump, `stem`.png, as far as this machine can.
+    """Write `stem`.mp4, `stem`.gif and, of a jump, `stem`.png, each whole, and return them.
 
-    Args:
-        film: From `pronk.evaluation.pictures.film.plan`.
-        stem: Path of the files without their endings.
-        warn: Called with one sentence: what is missing.
-
-    Returns:
-        The files, each whole; none where nothing can be rendered.
+    `warn` is called with one sentence about what this machine lacks.
     """
     endings = [".gif", ".png"] if film.labels else [".gif"]
     if lack := no_encoder():
@@ -136,16 +130,9 @@ def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path
 def films_of(
     found: Results, folder: Path, *, cases: Container[str] | None = None, slow: float = SLOW
 ) -> Iterator[tuple[str, Film]]:
-    """Plan a film of each policy with each command, also of a robot that did not jump.
+    """Plan a film of each policy with each command, or those of `cases`, and a name for its files.
 
-    Args:
-        found: The trial.
-        folder: Where its captures are.
-        cases: Names of the commands; all if None.
-        slow: How many times slower than real time the flight is shown.
-
-    Yields:
-        A name for the files, and the film.
+    A robot that did not jump is shown as well. `folder` has the captures.
 
     Raises:
         ArtefactError: A capture is missing or damaged.
@@ -187,17 +174,10 @@ def record_all(
     at_once: int = 1,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Path, ...]:
-    """Write the files of each of `films_of`, as far as this machine can, and return them.
+    """Write the files of each of `films_of` into `out`, as far as this machine can.
 
-    Args:
-        found: The trial.
-        folder: Where its captures are.
-        out: Where the files go.
-        warn: Called once with each sentence on what is missing.
-        cases: Names of the commands; all if None.
-        slow: How many times slower than real time the flight is shown.
-        at_once: Films rendered at once.
-        progress: Called with the share that is done, 0 to 1.
+    `warn` is called once with each sentence about what is missing; `at_once` films are rendered at
+    the same time.
     """
     try:
         find_gl()
