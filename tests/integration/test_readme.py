@@ -47,6 +47,16 @@ def test_every_command_of_the_documentation_exists() -> None:
     assert set(COMMANDS) - {"demo"} <= named
 
 
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))])
+def test_every_file_that_a_page_names_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(r"`((?:\w+/)+[\w.]+\.(?:py|yaml))`", text)
+    missing = [n for n in named if not any((ROOT / at / n).exists() for at in ("", "src/pronk"))]
+    links = [link for link in re.findall(r"\]\(([^)#:]+)\)", text)]
+    missing += [link for link in links if not (page.parent / link).exists()]
+    assert not missing
+
+
 def test_the_readme_is_at_most_900_words() -> None:
     assert len(README.split()) <= 900
 
