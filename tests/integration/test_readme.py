@@ -52,7 +52,7 @@ def test_every_file_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     named = re.findall(r"`((?:\w+/)+[\w.]+\.(?:py|yaml))`", text)
     missing = [n for n in named if not any((ROOT / at / n).exists() for at in ("", "src/pronk"))]
-    links = [link for link in re.findall(r"\]\(([^)#:]+)\)", text)]
+    links = re.findall(r"\]\(([^)#:]+)\)", text)
     missing += [link for link in links if not (page.parent / link).exists()]
     assert not missing
 
