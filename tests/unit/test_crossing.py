@@ -23,8 +23,8 @@ from pronk.evaluation.crossing import (
     add_crossings,
     climbs,
     direction,
-    judge,
     lost,
+    measure_crossing,
     search,
 )
 from pronk.evaluation.jumps import JumpRules
@@ -56,10 +56,10 @@ def obstacle(
 GAP = obstacle()
 
 
-def judged(
+def settled(
     seen: Capture, obstacle: Obstacle = GAP, triggered: float | None = SCRIPT.on
 ) -> CrossingFigures:
-    return judge(seen, obstacle, triggered=triggered, rules=JumpRules())
+    return measure_crossing(seen, obstacle, triggered=triggered, rules=JumpRules())
 
 
 # --- The course ---------------------------------------------------------------------------------
@@ -115,14 +115,14 @@ def test_the_operator_looks_at_the_trunk() -> None:
 
 
 def test_a_gap_that_was_crossed() -> None:
-    found = judged(SEEN)
+    found = settled(SEEN)
     assert found.success
     assert found.take_off == pytest.approx(EDGE - TOOK_OFF, abs=1e-9)
     assert found.reach == pytest.approx(TOOK_OFF - 4.0, abs=1e-9)
     assert found.reach == pytest.approx(2.0 * (DELAY - 1e-3) + 0.21)
     assert found.landing == pytest.approx(LANDED - EDGE - 0.3, abs=2e-3)
     assert found.speed == pytest.approx(2.0)
-    aside = judged(seen_jump(up=2.0, speed=2.0, yaw=math.pi / 2), obstacle(command=LEFT))
+    aside = settled(seen_jump(up=2.0, speed=2.0, yaw=math.pi / 2), obstacle(command=LEFT))
     assert aside.landing == pytest.approx(found.landing)
 
 
@@ -149,17 +149,17 @@ LAY = changed(SEEN, "orientation", span(4.5, 4.6), [0.7, 0.714, 0.0, 0.0])
     ],
 )
 def test_a_gap_that_was_not_crossed(seen: Capture, size: float, why: str) -> None:
-    assert judged(seen, obstacle(size=size)).why == why
+    assert settled(seen, obstacle(size=size)).why == why
 
 
 def test_what_happens_elsewhere_does_not_count() -> None:
     # A foot pressed into the floor beside the gap, a shank that touched before the jump.
     low = changed(SEEN, "foot_position", (span(3.7, 3.75), 0, 2), -0.001)
-    assert judged(changed(low, "other_contact", span(0.0, 2.9), True)).success
-    assert judged(SEEN, triggered=None).why == crossing.NOT_TRIGGERED
+    assert settled(changed(low, "other_contact", span(0.0, 2.9), True)).success
+    assert settled(SEEN, triggered=None).why == crossing.NOT_TRIGGERED
     # Steps have no bottom to fall into.
-    assert judged(LOW, obstacle("down")).success
-    up = judged(LOW, obstacle("up"))
+    assert settled(LOW, obstacle("down")).success
+    up = settled(LOW, obstacle("up"))
     assert up.landing == pytest.approx(LANDED - EDGE, abs=2e-3)
 
 

@@ -144,7 +144,7 @@ def test_a_jump_lifts_off_within_the_search_time() -> None:
     assert not jump_of(series(ground(100), hop(80)), 90).found  # it has not ended
 
 
-def test_upright_is_judged_two_seconds_after_touchdown() -> None:
+def test_upright_is_measured_two_seconds_after_touchdown() -> None:
     whole = series(ground(100), hop(80), ground(401))
     for degrees in (29.0, 31.0):
         half = math.radians(degrees) / 2

@@ -56,6 +56,7 @@ from pronk.evaluation.trial import (
     build,
     case_rng,
     in_processes,
+    job_of,
     load_subjects,
     opened,
     set_down,
@@ -209,7 +210,7 @@ def lost(seen: Capture, obstacle: Obstacle) -> bool:
     return bool(fallen.any() or _stepped_in(seen, obstacle).any())
 
 
-def judge(
+def measure_crossing(
     seen: Capture, obstacle: Obstacle, *, triggered: float | None, rules: JumpRules
 ) -> CrossingFigures:
     """Decide whether an obstacle was crossed, and measure it.
@@ -224,7 +225,7 @@ def judge(
     behind = seen.contact & (feet >= far)
     first = np.where(behind[on:].any(axis=0), on + behind[on:].argmax(axis=0), count)
     landed = int(first.max())
-    judged = landed + round(rules.upright_s / seen.dt)
+    settled = landed + round(rules.upright_s / seen.dt)
     legs = np.arange(feet.shape[1])
     figures: dict[str, Any] = {"speed": float(seen.velocity[on, :2] @ along)}
     main = jump_flights(series_of(seen, whole=True), on, rules).main
@@ -237,8 +238,8 @@ def judge(
             figures["take_off"] = obstacle.edge - front
     if landed < count and obstacle.kind != "flat":
         figures["landing"] = float(feet[first, legs].min()) - far
-    end, cosine = min(judged + 1, count), cosine_of_tilt(seen.orientation)
-    upright = judged < count and cosine[judged] >= rules.upright_cosine
+    end, cosine = min(settled + 1, count), cosine_of_tilt(seen.orientation)
+    upright = settled < count and cosine[settled] >= rules.upright_cosine
     why = ""
     if _stepped_in(seen, obstacle)[:end].any():
         why = STEPPED_IN
@@ -248,7 +249,7 @@ def judge(
         why = NOT_OVER
     elif not upright or (cosine[:end] < FALLEN_COSINE).any():
         why = FELL
-    elif min(trunk[judged], feet[judged].min()) < far:
+    elif min(trunk[settled], feet[settled].min()) < far:
         why = NOT_OVER
     return CrossingFigures(why=why, **figures)
 
@@ -291,7 +292,7 @@ def attempt(task: Attempt) -> Row:
         elif tick.since > operator.triggered + after or lost(machine.snapshot(), obstacle):
             break
     triggered = None if operator.triggered is None else began + operator.triggered
-    figures = judge(machine.capture(), obstacle, triggered=triggered, rules=rules)
+    figures = measure_crossing(machine.capture(), obstacle, triggered=triggered, rules=rules)
     measured = replace(figures, obstacle=obstacle.kind, size=obstacle.size, lead=task.lead)
     return replace(job.row, figures=measured)
 
@@ -369,24 +370,11 @@ def attempts(
         x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
         offset = rng.uniform(-plan.joint_offset, plan.joint_offset, len(robot.joints))
         yaw = float(rng.uniform(-STEERED, STEERED))
-        row = Row(
-            policy=subject.name,
-            case=case.name,
-            number=count,
-            seed=int(rng.integers(2**31)),
-            figures=None,
-            script=replace(plan.script, command=case.command),
-        )
-        job = Job(
-            row=row,
-            policy=Path(subject.path),
-            sha256=subject.sha256,
-            robot=robot.name,
-            sim_params=sim_params,
-            start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
-            ground=obstacle.on(sim_params.ground),
-            rules=plan.rules,
-        )
+        script = replace(plan.script, command=case.command)
+        start = Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist()))
+        seed = int(rng.integers(2**31))
+        job = job_of(subject, case, count, script, start, seed, robot, sim_params, plan.rules)
+        job = replace(job, ground=obstacle.on(sim_params.ground))
         found.append(Attempt(job=job, obstacle=obstacle, lead=lead))
     return found
 

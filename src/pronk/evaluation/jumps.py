@@ -237,13 +237,13 @@ def measure_jump(
         return figures | {"height": float(np.ptp(window))}, None
     up, down = main.liftoff, main.touchdown
     end = down + series.steps(rules.tail_s) + 1
-    judged = down + series.steps(rules.upright_s)
+    settled = down + series.steps(rules.upright_s)
     displacement, vertical = plane[down] - plane[up], float(series.velocity[up, 2])
     before, after = on + int(np.argmin(z[on : up + 1])), down + int(np.argmin(z[down:end]))
     apex = float(z[up:down].max())
     return figures | {
         "upright": bool(
-            judged < len(z) and cosine_of_tilt(series.orientation[judged]) >= rules.upright_cosine
+            settled < len(z) and cosine_of_tilt(series.orientation[settled]) >= rules.upright_cosine
         ),
         "height": float(np.ptp(z[on:end])),
         "apex_gain": apex - rules.standing_height,
@@ -310,7 +310,7 @@ class JumpFigures:
         "m", "max z over l .. d-1, less the height of the trunk in the default pose"
     )
     rise: float = number("m", "max z over l .. d-1, less z_l")
-    ballistic: float = number("m", "v_z^2 / 2g with v_z at l: what a stone would rise")
+    ballistic: float = number("m", "v_z^2 / 2g with v_z at l: the rise of a ballistic flight")
     clearance: float = number(
         "m",
         "max over l .. d-1 of min over the feet of (height of f_i - r): all feet are this high at "
@@ -360,7 +360,7 @@ class JumpFigures:
         "1",
         "least distance over c .. e of the motor torque from the drive's torque-speed curve at "
         "nominal bus voltage and that speed, as a share of the effort limit; 0 on the curve, "
-        "negative beyond it, where a motor gives more than its drive computes",
+        "negative beyond it, where a motor gives more than the model of its drive",
     )
 
     @property
@@ -439,9 +439,9 @@ def measure(
     seconds = rules.search_s if main is None else rules.tail_s
     last = (on if main is None else main.touchdown) + series.steps(seconds)
     end = min(last, len(series.position) - 1)
-    judged = (main.touchdown + series.steps(rules.upright_s)) if main else end
+    settled = (main.touchdown + series.steps(rules.upright_s)) if main else end
     figures |= {
-        "non_foot_contact": bool(capture.other_contact[on : judged + 1].any()),
+        "non_foot_contact": bool(capture.other_contact[on : settled + 1].any()),
         "energy": float(capture.electrical_power[on : end + 1].sum() * capture.dt),
     }
     figures |= _rates(capture, run, on)

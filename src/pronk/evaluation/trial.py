@@ -63,18 +63,17 @@ _LEFT_OUT = ("observation", "provenance")
 
 
 class Setup(TypedDict):
-    """What every kind of trial runs on."""
+    """What every kind of trial runs on: the policies' robot, the virtual robot, the folder.
+
+    `about` is the source of the parameters, kept with the results; `processes` are the runs at
+    once, on which no number depends.
+    """
 
     robot: RobotSpec
-    """Of the policies."""
     sim_params: SimParams
-    """Of the virtual robot."""
     out: Path
-    """Folder for tables, summaries and captures."""
     about: NotRequired[Mapping[str, Any] | None]
-    """Source of the parameters, kept with the results."""
     processes: NotRequired[int]
-    """Runs at once; the numbers do not depend on it."""
     progress: NotRequired[Progress | None]
 
 
@@ -107,10 +106,8 @@ class Plan:
             raise PronkError(f"seed {self.seed}; expected 0 or more.")
         names = [case.name for case in self.tried]
         if not names or len(set(names)) != len(names):
-            raise PronkError(
-                f"the commands are {', '.join(names) or 'none'}; expected one or more, all "
-                "different."
-            )
+            shown = ", ".join(names) or "none"
+            raise PronkError(f"the commands are {shown}; expected one or more, all different.")
 
     @property
     def tried(self) -> tuple[Case, ...]:
@@ -163,13 +160,11 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """One run with its figures, and its cost."""
+    """One run with its figures, its wall time and its processor time [s]."""
 
     row: Row
     seconds: float
-    """Wall time [s]."""
     cpu_s: float
-    """Processor time [s]."""
 
 
 @lru_cache(maxsize=4)
@@ -263,10 +258,9 @@ def in_processes(
     processes: int = 1,
     progress: Progress | None = None,
 ) -> list[R]:
-    """Do every job and return the results in the order of the jobs.
+    """Do every job, in this process or in several, and return the results in the order of the jobs.
 
-    `work` is a function of a module, that other processes can import; jobs are pickled. With one
-    process everything happens in this one.
+    `work` is a function of a module; jobs are pickled.
 
     Raises:
         PronkError: Fewer than one process, or one was killed; and what `work` raises.
@@ -299,13 +293,37 @@ def in_processes(
     return [future.result() for future in futures]
 
 
+def job_of(
+    subject: Subject,
+    case: Case,
+    number: int,
+    script: Script,
+    start: Start,
+    seed: int,
+    robot: RobotSpec,
+    sim_params: SimParams,
+    rules: JumpRules,
+) -> Job:
+    """Return one run of a policy with one command."""
+    who: Any = {"policy": subject.name, "case": case.name, "number": number, "seed": seed}
+    return Job(
+        row=Row(**who, figures=None, script=script),
+        policy=Path(subject.path),
+        sha256=subject.sha256,
+        robot=robot.name,
+        sim_params=sim_params,
+        start=start,
+        rules=rules,
+    )
+
+
 def plan_jobs(
     subjects: Sequence[Subject],
     plan: Plan,
     *,
     robot: RobotSpec,
     sim_params: SimParams,
-    out: Path | None = None,
+    out: Path = Path(),
     keep: Keep = "none",
     measure: Callable[..., Any] = measure,
 ) -> list[Job]:
@@ -315,36 +333,22 @@ def plan_jobs(
     kept in `out`.
     """
     found = []
-    for subject in subjects:
-        for case in plan.tried:
-            for number in range(plan.jumps if case in plan.cases else plan.rates):
-                stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
-                some = number == 0 or case not in plan.cases
-                kept = out is not None and (keep == "all" or (keep == "some" and some))
-                capture = f"{CAPTURES}/{stem}.npz" if kept else ""
-                script, start, seed = draw(plan, case, number, robot)
-                row = Row(
-                    policy=subject.name,
-                    case=case.name,
-                    number=number,
-                    seed=seed,
-                    figures=None,
-                    script=script,
-                    capture=capture,
-                )
-                found.append(
-                    Job(
-                        row=row,
-                        policy=Path(subject.path),
-                        sha256=subject.sha256,
-                        robot=robot.name,
-                        sim_params=sim_params,
-                        start=start,
-                        rules=plan.rules,
-                        keep=out / capture if out is not None and kept else None,
-                        measure=measure,
-                    )
-                )
+    runs = [
+        (subject, case, number)
+        for subject in subjects
+        for case in plan.tried
+        for number in range(plan.jumps if case in plan.cases else plan.rates)
+    ]
+    for subject, case, number in runs:
+        stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
+        some = number == 0 or case not in plan.cases
+        kept = out if keep == "all" or (keep == "some" and some) else None
+        capture = f"{CAPTURES}/{stem}.npz" if kept else ""
+        script, start, seed = draw(plan, case, number, robot)
+        job = job_of(subject, case, number, script, start, seed, robot, sim_params, plan.rules)
+        row = replace(job.row, capture=capture)
+        where = kept / capture if kept else None
+        found.append(replace(job, row=row, keep=where, measure=measure))
     return found
 
 
@@ -361,25 +365,17 @@ def run_plan(
     measure: Callable[..., Any] = measure,
     **setup: Unpack[Setup],
 ) -> Results:
-    """Run, measure, save and return all jobs of a plan; see `run_trial`.
+    """Run, measure, save and return all jobs of a plan, as `run_trial` does.
 
-    Args:
-        policies: `policy.onnx` of each.
-        plan: Commands and draws.
-        kind: Files and figures.
-        jump: The policies need the jump input.
-        varied: Parameter, value and body, for every body; the one of `setup` if empty.
-        settings: What else is kept with the results.
-        keep: Which captures are kept.
-        overwrite: Whether a trial in the folder is replaced; None adds to the folder.
-        measure: From capture to figures; a function of a module.
-        setup: What it runs on.
+    With `jump` the policies need the jump input. `varied` has parameter, value and body of every
+    body, if there are more than that of `setup`. With `overwrite` None the results are added to the
+    folder. `measure` is as in `Job`.
     """
     robot, out, processes = setup["robot"], setup["out"], setup.get("processes", 1)
     subjects, jobs = load_subjects(policies, robot, jump=jump), []
+    how: Any = {"robot": robot, "out": out, "keep": keep, "measure": measure}
     for parameter, value, params in varied or [("", math.nan, setup["sim_params"])]:
-        kept = {"out": out, "keep": keep, "measure": measure}
-        made = plan_jobs(subjects, plan, robot=robot, sim_params=params, **kept)  # type: ignore[arg-type]
+        made = plan_jobs(subjects, plan, sim_params=params, **how)
         build(made[0])  # refuses impossible parameters
         jobs += [replace(j, row=replace(j.row, parameter=parameter, value=value)) for j in made]
     if overwrite is not None:

@@ -101,7 +101,7 @@ class Plan:
 
     @property
     def jump_seconds(self) -> float:
-        """Time until the latest jump is judged [s]; a flight takes less than 1 s."""
+        """Time until the latest jump is measured [s]; a flight takes less than 1 s."""
         latest = self.stand_s + self.run_s + self.spread_s
         return latest + self.rules.search_s + 1.0 + self.rules.upright_s if self.jumps else 0.0
 
@@ -198,7 +198,7 @@ def evaluate_policy(
         env: Built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
             random generators of the process are seeded with the plan's seed.
         plan: Of the evaluation.
-        estimate: The policy's estimator, to be judged as well.
+        estimate: The policy's estimator, to be evaluated as well.
         progress: Called with the share done, 0 to 1.
         about: Kept with the result: where policy and gains come from.
         before: Speed errors of the policy before the jump phases, `Evaluation.speed_errors`.
@@ -307,10 +307,10 @@ def _jump(
     if standing:
         measured, main = measure_jump(series, rise, case.command, rules)
         seconds = rules.search_s if main is None else rules.upright_s
-        judged = (rise if main is None else main.touchdown) + series.steps(seconds)
+        settled = (rise if main is None else main.touchdown) + series.steps(seconds)
         # A robot that fell within that time after a jump lies on the ground.
-        lies = main is not None and count <= judged and fell < NEVER
-        touches = bool(other[rise : min(count, judged + 1)].any())
+        lies = main is not None and count <= settled and fell < NEVER
+        touches = bool(other[rise : min(count, settled + 1)].any())
         figures |= measured
         figures["non_foot_contact"] = lies or touches
         figures["single"] = measured["high_flights"] == 1.0

@@ -167,7 +167,7 @@ class Run:
     def go(
         self, policy: Policy, estimate: Estimate | None, progress: Callable[[float], None]
     ) -> Self:
-        """Simulate the whole plan; `estimate` is the policy's estimator, if it is to be judged."""
+        """Simulate the whole plan; `estimate` is the policy's estimator, if it is evaluated."""
         # Not inference mode, which would leave the environment with read-only tensors.
         with torch.no_grad():
             before, self._motion.scripted = self._motion.scripted, True
