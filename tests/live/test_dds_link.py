@@ -20,9 +20,17 @@ pytest.importorskip("cyclonedds")
 from broken_message import mutated
 from pronk.errors import HardwareError, RobotError
 from pronk.links.dds import messages as idl
-from pronk.links.dds.address import COMMANDS, DdsNetwork, Message, Participant, take
 from pronk.links.dds.codec import encode_command, joint_map
-from pronk.links.dds.link import SWITCHER, Client, DdsMachine
+from pronk.links.dds.link import (
+    COMMANDS,
+    SWITCHER,
+    Client,
+    DdsMachine,
+    DdsNetwork,
+    Message,
+    Participant,
+    take,
+)
 from pronk.links.link import Freshness
 from pronk.links.machine import Command
 from pronk.robots import load_robot

@@ -147,8 +147,8 @@ def over_lcm(port: int) -> Wire:
 
 def over_dds(domain: int) -> Wire:
     from pronk.links.dds import messages as idl
-    from pronk.links.dds.address import COMMANDS, DdsNetwork, Participant, take, write
     from pronk.links.dds.codec import decode_command, encode_command, joint_map
+    from pronk.links.dds.link import COMMANDS, DdsNetwork, Participant, take, write
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
     sender = own.writer(COMMANDS, idl.LowCmd, raw=True)

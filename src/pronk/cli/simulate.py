@@ -139,7 +139,7 @@ def _open_wire(
         url = url_of(port=port)
         wire = LcmServerTransport(robot, layout_of(layout), url, mode=mode)
         return wire, f"LCM, messages of {layout}, {url}"
-    from pronk.links.dds.address import DdsNetwork
+    from pronk.links.dds.link import DdsNetwork
     from pronk.virtual.dds_server import DdsServerTransport
 
     if port is not None:

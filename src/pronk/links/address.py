@@ -112,12 +112,7 @@ class Address:
         exclusive_s: float = 1.0,
         fresh: Freshness | None = None,
     ) -> Machine:
-        """Make the machine, not yet connected; arguments as of `NetworkLink`.
-
-        Raises:
-            HardwareError: The link's library is not installed, the address is impossible, or the
-                robot does not fit behind its messages.
-        """
+        """Make the machine, not yet connected; arguments as of `NetworkLink`."""
         return find_link(self.kind)(
             robot,
             interface=self.interface,

@@ -110,12 +110,12 @@ class CommandWriter:
         """Start the thread that watches the expiry; nothing is written yet.
 
         Args:
-            encode: Command to bytes; refuses what no drive could follow.
+            encode: Refuses what no drive could follow.
             publish: Puts bytes on the wire; only called by one thread at a time.
             joints: Of a command.
             damping: Of the joints while they are damped [N m s/rad].
             repeat_s: Time after which the command in force is written again; None for once.
-            counts: Where `commands`, `repeats`, `expired` and `not written` are counted.
+            counts: Gets `commands`, `repeats`, `expired` and `not written`.
         """
         self.counts: Counter[str] = Counter() if counts is None else counts
         self.wrote = False
@@ -251,8 +251,7 @@ class NetworkLink(ABC):
     def connect(self) -> None:
         """Open the link and check that states come and no other program commands. 1 or 2 s.
 
-        Raises:
-            HardwareError: A check failed; nothing was written to the robot's joints.
+        Nothing is written to the joints before; a check that fails raises HardwareError.
         """
         self.close()
         self.virtual, self._latest, self._last_error = False, None, ""
@@ -274,8 +273,7 @@ class NetworkLink(ABC):
 
     def latest(self) -> State:
         """The newest state, without waiting."""
-        self._opened()
-        if self._latest is None:
+        if self._writer is None or self._latest is None:
             raise self._not_open()
         return self._latest
 
@@ -287,18 +285,15 @@ class NetworkLink(ABC):
         return [self._states.popleft() for _ in range(len(self._states))]
 
     def send(self, command: Command) -> None:
-        """Put a command into force, until the next or until it expires.
-
-        Raises:
-            HardwareError: Not connected, not possible, or another program has commanded since.
-        """
-        writer = self._opened()
+        """Put a command into force, until the next or until it expires; refuse a second writer."""
+        if self._writer is None:
+            raise self._not_open()
         if foreign := self.foreign_commands:
             raise HardwareError(
                 f"another program commands the joints on {self._command_topic} "
                 f"({foreign} commands met); stop it, and connect again."
             )
-        writer.send(command)
+        self._writer.send(command)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
         """Have joints fixed: by the virtual robot itself, or by a person; () frees all."""
@@ -324,10 +319,7 @@ class NetworkLink(ABC):
             self._writer.damp()
 
     def close(self) -> None:
-        """Leave the robot damped and at rest, and close; closing twice does no harm.
-
-        Takes 1 s of damping at least, 3 s at most; no time at all if nothing was ever sent.
-        """
+        """Leave the robot damped and at rest (1 to 3 s if anything was sent), and close."""
         writer = self._writer
         if writer is None:
             return
@@ -403,11 +395,6 @@ class NetworkLink(ABC):
             self._latest = state
             self._states.append(state)
             self.counts["states"] += 1
-
-    def _opened(self) -> CommandWriter:
-        if self._writer is None:
-            raise self._not_open()
-        return self._writer
 
     def _not_open(self) -> HardwareError:
         return HardwareError(

@@ -69,7 +69,7 @@ class Command:
     sequence: int = 0
     """Counts commands; a link that puts a number on the wire uses this one."""
     state_sequence: int = -1
-    """`State.sequence` that the command follows from; -1 for none."""
+    """`State.sequence` that it was computed from; -1 for none."""
     made: float = 0.0
     """When it was decided, on the machine's clock [s]."""
     valid_for: float = math.inf

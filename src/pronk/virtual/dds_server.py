@@ -9,18 +9,23 @@ from typing import Any
 
 from pronk.errors import HardwareError
 from pronk.links.dds import messages
-from pronk.links.dds.address import COMMANDS, STATES, DdsNetwork, Participant, take, write
 from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
 from pronk.links.dds.link import (
     BAD_PARAMETER,
     BENCH,
     CHECK_MODE,
     CLAMP,
+    COMMANDS,
     DONE,
     RELEASE_MODE,
     SELECT_MODE,
+    STATES,
     SWITCHER,
     UNKNOWN_API,
+    DdsNetwork,
+    Participant,
+    take,
+    write,
 )
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import RobotSpec

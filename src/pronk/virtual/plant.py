@@ -358,13 +358,9 @@ def build_plant(
     Args:
         robot: Structure, masses and drives to start from.
         sim_params: In what the machine differs.
-        legs: Legs to keep in the plant, of `legs_of(robot)`.
+        legs: To keep in the plant, of `legs_of(robot)`.
         timestep_s: Physics step [s].
         ground: What it stands on; None is the bench.
-
-    Raises:
-        RobotError: The parameters are of another robot, a joint is missing in the model or in them,
-            the trunk is none that could exist, or a spring is too stiff for the step.
     """
     if sim_params.robot != robot.name:
         raise RobotError(

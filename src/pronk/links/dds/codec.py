@@ -57,14 +57,9 @@ _POS_STOP = float(np.float32(POS_STOP))
 # Plausible targets and gains [rad, N m/rad, N m s/rad]: no joint turns twice, and these gains are
 # ten times what anyone uses.
 _MOST = {"position": 4.0 * math.pi, "stiffness": 1000.0, "damping": 100.0}
-# Of a leg's three joints, and how softly they sink [N m s/rad]: Unitree's own deployments damp a
-# Go2 with 3 to 8, pronk's Mini Cheetah sinks in about a second with 1.
-_SIGNS = {"go2": (1.0, 1.0, 1.0), "mini_cheetah": (1.0, -1.0, -1.0)}
-_SINK = {"go2": 3.0, "mini_cheetah": 1.0}
-_VIRTUAL_ONLY = ("mini_cheetah",)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class JointMap:
     """How a robot's joints and the motors of a message correspond."""
 
@@ -72,22 +67,28 @@ class JointMap:
     """A motor's angle is sign times the joint's, shape (12,)."""
     sink_damping: float
     """Damping with which the joints sink softly [N m s/rad]."""
-    virtual_only: bool
+    virtual_only: bool = False
     """True where no real robot of this name uses these messages."""
+
+
+_MAPS = {
+    # Unitree's own deployments damp a Go2 with 3 to 8.
+    "go2": JointMap(sign=np.ones(_JOINTS), sink_damping=3.0),
+    # It sinks in about a second.
+    "mini_cheetah": JointMap(
+        sign=np.tile([1.0, -1.0, -1.0], 4), sink_damping=1.0, virtual_only=True
+    ),
+}
 
 
 def joint_map(robot: RobotSpec) -> JointMap:
     """The map of a robot; refuse one that does not fit behind Unitree's messages."""
-    if robot.name not in _SIGNS:
+    if robot.name not in _MAPS:
         raise HardwareError(
             f"{robot.name} has no place in Unitree's messages; "
-            f"the robots that have are {', '.join(_SIGNS)}."
+            f"the robots that have are {', '.join(_MAPS)}."
         )
-    return JointMap(
-        sign=np.tile(_SIGNS[robot.name], _JOINTS // 3),
-        sink_damping=_SINK[robot.name],
-        virtual_only=robot.name in _VIRTUAL_ONLY,
-    )
+    return _MAPS[robot.name]
 
 
 def encode_command(joints: JointMap, command: Command) -> bytes:

@@ -29,19 +29,11 @@ from functools import cache
 from typing import Any, get_type_hints
 
 import numpy as np
+from cyclonedds.idl import make_idl_struct, types
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
-from pronk.errors import HardwareError
 from pronk.links.machine import RefusedError
-
-try:
-    from cyclonedds.idl import make_idl_struct, types
-except ImportError:
-    raise HardwareError(
-        "the DDS link needs the package cyclonedds, which is not installed; "
-        "install it with: pip install 'pronk[hardware]'."
-    ) from None
 
 HEADER = b"\x00\x01\x00\x00"
 """Of a serialized message: CDR version 1, little-endian, no options."""

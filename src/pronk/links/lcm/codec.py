@@ -48,10 +48,10 @@ _MOST_SPEED, _MOST_TORQUE, _MOST_TURN, _MOST_FORCE = 65.0, 170.0, 35.0, 160.0
 _JOINTS = 12
 _SPI_JOINTS = ("abad", "hip", "knee")
 
+# Where parameters are set and confirmed (`HardwareBridge.cpp`).
 REQUEST_CHANNEL, RESPONSE_CHANNEL = "interface_request", "interface_response"
-"""Where parameters are set and confirmed (`HardwareBridge.cpp`)."""
+# Requests for clamps to the virtual robot, and its beacon.
 BENCH_CHANNEL, BEACON_CHANNEL = "pronk_bench", "pronk_virtual"
-"""Requests for clamps to the virtual robot, and its beacon."""
 MODES = {0: "", 1: "stand_up", 3: "balance_stand", 4: "locomotion", 6: "recovery_stand"}
 """`control_mode` (`FSM_State.h`); 0 is passive, the joints are free for others."""
 _MODE = b"control_mode"

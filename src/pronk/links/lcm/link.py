@@ -35,10 +35,8 @@ from pronk.links.lcm.codec import (
 from pronk.links.link import ANSWER_S, CommandWriter, NetworkLink, wait_for
 from pronk.robots.robot import RobotSpec
 
-GROUP = "239.255.76.67"
-"""LCM's multicast group, that of every robot too."""
-ROBOT_PORT = 7667
-"""LCM's port, that of every robot too."""
+# LCM's multicast group and port, those of every robot too.
+GROUP, ROBOT_PORT = "239.255.76.67", 7667
 VIRTUAL_PORT = 7768
 """The virtual robot's: private, so that nothing here ever meets a real one."""
 _ROUTES = Path("/proc/net/route")

@@ -184,7 +184,7 @@ WTW_STATE_ESTIMATOR = Message(
 VIRTUAL_ROBOT = Message(
     "pronk.virtual_robot_lcmt", 0x23FC8EF4C8F343CB, "int64_t request; int8_t clamped[12]"
 )
-"""From the bench: joints to hold. From the virtual robot: joints held, and their request."""
+"""To the virtual robot: joints to hold. From it: joints held, and the last request met."""
 
 MESSAGES = (
     SPI_DATA,
