@@ -118,14 +118,7 @@ class McapLogWriter:
     ) -> None:
         """Write one measured state.
 
-        Args:
-            time: Measured timestamp [s].
-            command: Position command in force [rad], one per joint.
-            position: Measured position [rad], one per joint.
-            velocity: Measured velocity [rad/s], one per joint.
-            torque: Measured torque [N m], one per joint.
-            frequency: Instantaneous frequency [Hz]; NaN between segments.
-            segment: Number of the segment; -1 between segments.
+        One number a joint [rad, rad/s, N m]; `frequency` is NaN and `segment` -1 between segments.
         """
         body: dict[str, Any] = {"t": time, "command": command, "position": position}
         if velocity is not None:

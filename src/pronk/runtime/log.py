@@ -142,11 +142,7 @@ three at most [s]."""
 def write_log(plan: Plan, header: dict[str, Any], name: str, talk: Connection) -> None:
     """Body of the logger's process; ends on request, or after the servo.
 
-    Args:
-        plan: Of the run.
-        header: Of a policy's log.
-        name: Of the shared memory.
-        talk: Sends `READY` or an error; receives the figures of the run, JSON, at its end.
+    `talk` sends `READY` or an error, and receives the figures of the run, JSON, at its end.
     """
     leave()
     parent = os.getppid()

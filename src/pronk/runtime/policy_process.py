@@ -53,12 +53,7 @@ def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
     Nothing is begun in less than half of the time that it took before, because each repeat is
     quicker than the one before. Returns at once if the deadline has passed.
 
-    Args:
-        deadline: Time of CLOCK_MONOTONIC [s].
-        act: Repeated; without lasting effect.
-
-    Returns:
-        Number of repeats.
+    `deadline` is a time of CLOCK_MONOTONIC [s]; returns the number of repeats.
     """
     sleep_until(deadline - LEAD_S)
     count, needed, now = 0, _FIRST_S, time.monotonic()
@@ -74,13 +69,7 @@ def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
 
 
 def serve_policy(plan: Plan, name: str, end: Connection) -> None:
-    """Body of the policy's process.
-
-    Args:
-        plan: The run.
-        name: Of the shared memory.
-        end: Sends the figures of the run when it is over, JSON.
-    """
+    """Body of the policy's process."""
     leave()
     assert plan.policy is not None
     shared = Shared(name)

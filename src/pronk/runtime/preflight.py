@@ -39,12 +39,7 @@ def refusals(
 ) -> tuple[str, ...]:
     """Why the robot must not move; empty if it may.
 
-    Args:
-        states: Those received while nothing was sent, oldest first.
-        robot: The expected robot.
-        limits: Of the safety filter.
-        now: On the same clock as the states [s].
-        seconds: Time in which they were received [s].
+    `states` were received in the last `seconds` before `now`, oldest first, while nothing was sent.
     """
     if len(states) < 2:
         return (
@@ -145,10 +140,7 @@ def delay_objection(latency_s: float, count: int, trained: tuple[float, float]) 
     The latency from a state to the command computed from it is this computer's part of the command
     delay; the drives add theirs, so the lower end of the training range is not compared.
 
-    Args:
-        latency_s: 95 % of the steps were faster [s].
-        count: Of how many steps.
-        trained: Command delays that the policy was trained for [s].
+    95 % of `count` steps were faster than `latency_s`; `trained` is the range of training [s].
     """
     if count < 10:
         return "the policy's process has sent no action yet; wait a moment or see the events."

@@ -123,13 +123,7 @@ class PolicyRunner:
     def decide(self, state: State, commanded: Commanded, now: float) -> tuple[Command, Tick]:
         """Run one policy step; call it at `policy.contract.policy_rate_hz`.
 
-        Args:
-            state: The newest.
-            commanded: Velocity command and jump input.
-            now: The machine's clock [s].
-
-        Returns:
-            The command to send, and the record of the step.
+        `now` is the machine's clock [s]; returns the command to send and the record of the step.
 
         Raises:
             ArtefactError: Something is not finite, or a policy without jump is commanded to jump.

@@ -211,10 +211,7 @@ class Deployment:
     ) -> RunSummary:
         """Send the operator's commands until the servo ends.
 
-        Args:
-            operator: Called 50 times a second.
-            notify: Called with every event of the servo.
-            progress: Called with the share of a sweep that is done, 0 to 1.
+        `progress` is called with the share of a sweep that is done, 0 to 1.
         """
         wake = time.monotonic()
         while (mode := self._noted(operator, notify)) is not Mode.ENDED:
@@ -373,11 +370,8 @@ def run_sweep(
 ) -> Recorded:
     """Carry out a sweep on a machine in real time.
 
-    Args:
-        plan: With a sweep.
-        clamp_operator: Clamps joints on a real bench; called in a thread of its own.
-        notify: Called with every event.
-        progress: Called with the share done, 0 to 1.
+    `clamp_operator` clamps joints on a real bench, in a thread of its own; `progress` is called
+    with the share done, 0 to 1.
 
     Raises:
         PronkError: The robot may not be moved, the filter stopped the sweep, or a process was

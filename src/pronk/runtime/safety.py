@@ -308,18 +308,9 @@ def fit(
     nearest to the given target in their intersection. If the bus power there is too large, all
     torques are scaled by one factor, the solution of a quadratic equation.
 
-    Args:
-        q: Measured positions [rad]. (..., n)
-        v: Measured speeds [rad/s]. (..., n)
-        target: Commanded [rad]. (..., n)
-        last: Sent a tick ago [rad]. (..., n)
-        kp: Stiffness, not negative [N m/rad]. (..., n)
-        kd: Damping, not negative [N m s/rad]. (..., n)
-        limits: The limits.
-
-    Returns:
-        Targets (..., n); the limit that moved them, as a `Reason`, or 0 (...,); and whether there
-        is a target within all limits (...,).
+    `q`, `v`, `target` and `last` (sent a tick ago) in rad and rad/s, `kp` and `kd` not negative,
+    all (..., n). Returns the targets (..., n); the limit that moved them, as a `Reason`, or 0
+    (...,); and whether there is a target within all limits (...,).
     """
     stiff = kp > _NO_STIFFNESS
     divisor = np.where(stiff, kp, 1.0)
@@ -424,17 +415,9 @@ def filtered(
 ) -> tuple[Command | None, FilterDecision, FilterState]:
     """Apply the rules to one command.
 
-    Args:
-        state: The newest.
-        command: To be sent.
-        memory: From the tick before.
-        limits: The limits.
-        t: Now, on the machine's clock [s].
-        held: Whether the dead-man button is held.
-        earlier: Other states since the tick before; a fault in any of them counts.
-
-    Returns:
-        The command to send, None for damping; the decision; and the memory for the next tick.
+    `memory` is from the tick before, `t` is now on the machine's clock [s], `held` the dead-man
+    button; a fault in any of the `earlier` states since the tick before counts. Returns the command
+    to send, None for damping; the decision; and the memory for the next tick.
     """
     n = len(limits.joints)
     states = (*earlier, state)
@@ -492,13 +475,7 @@ def fault(memory: FilterState, level: FilterAction, reason: Reason, t: float) ->
 
 
 def released(memory: FilterState, t: float, *, acknowledged: bool = False) -> FilterState:
-    """Clear a fault that has lasted long enough; a latched one only if `acknowledged`.
-
-    Args:
-        memory: With or without a fault.
-        t: Now [s].
-        acknowledged: The operator has reset the fault.
-    """
+    """Clear a fault that has lasted long enough; a latched one only if `acknowledged`."""
     if not memory.faulted or t - memory.since < LEAST_DAMPING_S:
         return memory
     return FilterState() if acknowledged or memory.level is FilterAction.DAMP else memory
@@ -533,8 +510,7 @@ def _detail(reason: Reason, state: State, command: Command, limits: Limits, t: f
 def tilt(orientation: Array) -> float:
     """Angle of the trunk's z axis from the vertical [rad].
 
-    Args:
-        orientation: Trunk to world, quaternion w, x, y, z. (4,)
+    `orientation` is trunk to world, quaternion w, x, y, z. (4,)
     """
     _, x, y, _ = np.asarray(orientation) / np.linalg.norm(orientation)
     return float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))

@@ -46,11 +46,7 @@ _DECIDING = (Mode.STAND, Mode.POLICY, Mode.HALT)
 def serve_robot(plan: Plan, name: str, trained: tuple[float, float], end: Connection) -> None:
     """Body of the servo's process.
 
-    Args:
-        plan: The run.
-        name: Of the shared memory.
-        trained: Command delays that the policy was trained for [s].
-        end: Sends the figures of the run when it is over, JSON.
+    `trained` are the command delays that the policy was trained for [s].
     """
     leave()  # the operator's process decides
     shared = Shared(name)

@@ -211,15 +211,8 @@ class StateMachine:
     ) -> tuple[DesiredCommand, FilterState]:
         """Compute the desired command of one tick.
 
-        Args:
-            t: Now [s].
-            state: The newest.
-            memory: Of the filter.
-            action: The policy's newest.
-            objection: Why the policy may not start; empty if it may.
-
-        Returns:
-            The command, and the filter's memory, with a fault released or added.
+        `objection` says why the policy may not start. Returns the command, and the filter's memory
+        with a fault released or added.
         """
         memory = self._grant(t, state, memory, objection)
         if self.mode in _SILENT:

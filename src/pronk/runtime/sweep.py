@@ -241,14 +241,9 @@ class SweepController:
     ) -> None:
         """Begin on a machine that is connected.
 
-        Args:
-            task: The sweep.
-            machine: Clamps joints.
-            sink: Takes the log's records (`sample_dtype`).
-            state: The newest.
-            real_time: Stiffen the joints first, and hold them while the operator clamps others.
-            progress: Called about twice a second of machine time.
-            limits: Other values for the scalar limits of the filter.
+        `sink` takes the log's records (`sample_dtype`); in `real_time` the joints are stiffened
+        first, and held while the operator clamps others; `limits` are other scalar limits of the
+        filter.
         """
         self.task, self.plan, self.machine = task, task.plan, machine
         self.progress = progress
@@ -294,9 +289,6 @@ class SweepController:
 
     def advance(self, t: float) -> SweepStep | None:
         """Log the tick that is over and give the next command; None at the end.
-
-        Args:
-            t: Now, on the machine's clock [s].
 
         Raises:
             HardwareError: A joint is far from its pose or could not be clamped.
@@ -466,13 +458,7 @@ def record(
 ) -> list[Path]:
     """Carry out a sweep on a machine whose clock waits; the link is opened here and closed again.
 
-    Args:
-        machine: Not connected.
-        task: The sweep; its plan is checked first.
-        progress: Called about twice a second of machine time.
-
-    Returns:
-        The logs, in the order written.
+    `progress` is called about twice a second of machine time. Returns the logs, in order.
 
     Raises:
         PlanError: The plan could exceed a limit.
