@@ -58,25 +58,21 @@ def _part(path: Path, root: Path, origin: Results | Bodies, **fields: Any) -> Pa
 
 def walk_tables(walks: Results) -> tuple[Sheet, ...]:
     """Return the figures of the walks by velocity, a table a policy."""
-    return tuple(_walk_table(walks, subject.name) for subject in walks.subjects)
-
-
-def _walk_table(walks: Results, policy: str) -> Sheet:
-    own = [cell for cell in walks.cells if cell.policy == policy]
-    counts = ("n", "fell", "non_foot_contact")
-    names = ("walks", "fell", "non-foot contact")
-    return Sheet(
-        title=f"{policy}: mean +- standard deviation",
-        columns=("figure", *(cell.case for cell in own)),
-        rows=(
-            *((n, *(str(getattr(c, f)) for c in own)) for n, f in zip(names, counts, strict=True)),
-            *(figure_row(name, WALK_FIGURES[name].unit, own, 2) for name in _WALK_TABLE),
-        ),
-        notes=(
-            "non-foot contact: walks in which something but a foot touched the ground. The first "
-            f"{SETTLE_S:g} s after the command are left out.",
-        ),
+    note = (
+        "non-foot contact: walks in which something but a foot touched the ground. The first "
+        f"{SETTLE_S:g} s after the command are left out."
     )
+    sheets = []
+    for subject in walks.subjects:
+        own = [cell for cell in walks.cells if cell.policy == subject.name]
+        rows = [("walks", *(str(cell.n) for cell in own))]
+        rows.append(("fell", *(str(cell.fell) for cell in own)))
+        rows.append(("non-foot contact", *(str(cell.non_foot_contact) for cell in own)))
+        rows += [figure_row(name, WALK_FIGURES[name].unit, own, 2) for name in _WALK_TABLE]
+        title = f"{subject.name}: mean +- standard deviation"
+        columns = ("figure", *(cell.case for cell in own))
+        sheets.append(Sheet(title=title, columns=columns, rows=tuple(rows), notes=(note,)))
+    return tuple(sheets)
 
 
 def walk_part(path: Path, root: Path, **names: str) -> Part:
@@ -104,7 +100,7 @@ def walk_part(path: Path, root: Path, **names: str) -> Part:
     return _part(path, root, walks, **fields, **names)
 
 
-def _definitions(figures: Any) -> Sheet | None:
+def _definitions(figures: Any) -> Sheet:
     return table("figure | unit | equation", ((f.name, f.unit, f.says) for f in figures))
 
 
@@ -120,30 +116,24 @@ def climb_line(climb: Climb) -> Array:
 
 def crossing_table(crossings: Results) -> Sheet:
     """Return the largest sizes, and why larger ones were not crossed."""
-    rows, reasons = [], []
+    rows, settings = [], crossings.settings
+    notes = [
+        f"crossed: in {settings['enough']} or more of {settings['runs']} runs, as were all smaller "
+        "ones. ever crossed: in any run. The paper's gaps were judged from video of jumps over "
+        "flat floor."
+    ]
     for climb in climbs(crossings):
         what = f"{climb.policy}: {_OBSTACLES.get(climb.kind, climb.kind)}, {climb.case}"
         last = climb.rungs[-1] if climb.rungs else None
         paper = PAPER_GAPS.get(climb.case, math.nan) if climb.kind == "gap" else math.nan
         failed = last.size if last and last.size > climb.largest else math.nan
-        sizes = (climb.largest, climb.ever, paper, failed)
-        rows.append((what, *(number(size, 2) for size in sizes)))
+        rows.append((what, climb.largest, climb.ever, paper, failed))
         if last and math.isfinite(failed):
             counted = sorted(last.reasons.items(), key=lambda item: -item[1])
             why = "; ".join(f"{reason} ({count})" for reason, count in counted)
-            reasons.append(f"{what}, {number(failed, 2)} m: {why}.")
-    settings = crossings.settings
-    return Sheet(
-        title="Largest obstacles [m]",
-        columns=("policy: obstacle", "crossed", "ever crossed", "paper, from video", "failed at"),
-        rows=tuple(rows),
-        notes=(
-            f"crossed: in {settings['enough']} or more of {settings['runs']} runs, as were all "
-            "smaller ones. ever crossed: in any run. The paper's gaps were judged from video of "
-            "jumps over flat floor.",
-            *reasons,
-        ),
-    )
+            notes.append(f"{what}, {failed:.2f} m: {why}.")
+    columns = "policy: obstacle | crossed;2 | ever crossed;2 | paper, from video;2 | failed at;2"
+    return table(columns, rows, *notes, title="Largest obstacles [m]")
 
 
 def crossing_part(path: Path, root: Path, **names: str) -> Part:
@@ -280,7 +270,7 @@ def by_body(bodies: Bodies, figure: str) -> Values:
     }
 
 
-def _bodies_gains(bodies: Bodies) -> Sheet | None:
+def _bodies_gains(bodies: Bodies) -> Sheet:
     names = dict.fromkeys(gains for body in bodies.bodies for gains in body.errors)
     found = [body.errors for body in bodies.bodies]
     return table(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -105,16 +104,6 @@ def verdict(result: MatchResult) -> dict[str, Any]:
     }
 
 
-def part(path: Path, root: Path, *, anchor: str = "match", title: str = "Match") -> Part:
-    """Make the part of the match in `path`, a `match.npz`.
-
-    Raises:
-        ArtefactError: An artefact is missing or damaged.
-    """
-    made = _part(load(path.parent), path.parent, find_gains(path.parent).name)
-    return replace(made, anchor=anchor, title=title, source=str(path.relative_to(root)))
-
-
 def write_page(out_dir: Path, *, gains: str | None = None) -> tuple[Path, Part]:
     """Write the page of the match in `out_dir`; return its path and its part.
 
@@ -125,29 +114,35 @@ def write_page(out_dir: Path, *, gains: str | None = None) -> tuple[Path, Part]:
     Raises:
         ArtefactError: The folder has no gains or no `match.npz`, or one of them is damaged.
     """
-    path = out_dir / gains if gains else find_gains(out_dir)
-    result = result_file.load(out_dir / "match.npz", gains_file.load(path))
-    written = out_dir / PAGE_NAME
-    made = _part(result, out_dir, path.name)
-    write_text(written, page(f"match of {result.gains.robot}", [made]))
-    return written, made
+    made = part(out_dir / "match.npz", out_dir, gains=gains)
+    write_text(out_dir / PAGE_NAME, page(made.title, [made]))
+    return out_dir / PAGE_NAME, made
 
 
 def _where(virtual: bool) -> str:
     return "the virtual robot" if virtual else "the robot"
 
 
-def _part(result: MatchResult, folder: Path, gains_name: str) -> Part:
-    gains, found = result.gains, verdict(result)
-    worst = found["worst"]
+def part(
+    path: Path, root: Path, *, anchor: str = "match", title: str = "Match", gains: str | None = None
+) -> Part:
+    """Make the part of the match in `path`, a `match.npz`; arguments as of `write_page`.
+
+    Raises:
+        ArtefactError: An artefact is missing or damaged.
+    """
+    folder = path.parent
+    gains_path = folder / gains if gains else find_gains(folder)
+    result = result_file.load(path, gains_file.load(gains_path))
+    own, found, worst = result.gains, verdict(result), verdict(result)["worst"]
     lines = [
-        f"Gain error in the compared band, RMS over the joints of {_where(gains.virtual)}: "
+        f"Gain error in the compared band, RMS over the joints of {_where(own.virtual)}: "
         f"{found['naive_error_db']:.2f} dB with the nominal gains of the real drive, "
         f"{found['error_db']:.2f} dB with the matched gains."
     ]
     if worst:
-        lines.append(f"Largest error: {joint_words(worst)}, {gains.joints[worst].error_db:.2f} dB.")
-    if gains.virtual:
+        lines.append(f"Largest error: {joint_words(worst)}, {own.joints[worst].error_db:.2f} dB.")
+    if own.virtual:
         lines.append(
             "Every measured number on this page is of pronk's virtual robot, a simulated machine "
             "that stands in for hardware, not for a real robot."
@@ -157,23 +152,23 @@ def _part(result: MatchResult, folder: Path, gains_name: str) -> Part:
     # Without a grid several joints moved at once and were fitted in time.
     in_time = not any(fit.grid_error.size for fit in result.joints.values())
     return Part(
-        anchor="match",
-        title=f"Match of {gains.robot}",
-        source=f"{gains_name} and match.npz",
-        virtual=gains.virtual,
+        anchor=anchor,
+        title=f"{title} of {own.robot}",
+        source=str(path.relative_to(root)),
+        virtual=own.virtual,
         summary=f"{found['matched']} of {found['joints']} joints matched.",
         lines=lines,
         warning=found["matched"] < found["joints"] or bool(found["flags"]),
         sections=[
-            _gains(gains, in_time),
+            _gains(own, in_time),
             _bode(fits, in_time) if fits else None,
             None if in_time else _maps(result),
-            _ranges(gains),
+            _ranges(own),
             _without_armature(fits),
             _predictions(folder),
-            _identifiability(gains, in_time),
-            _use(gains, gains_name),
-            _excitation(gains, fits),
+            _identifiability(own, in_time),
+            _use(own, gains_path.name),
+            _excitation(own, fits),
         ],
         note="; ".join(f"{joint_words(stage)} {s:.1f} s" for stage, s in result.seconds.items()),
         figures=found,

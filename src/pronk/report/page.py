@@ -35,12 +35,17 @@ class Code:
     text: str
 
 
-class Fold:
-    """Content that is closed at first; left out if empty."""
+class Section:
+    """A heading with what stands below it."""
 
-    def __init__(self, summary: str, *content: Content | None) -> None:
-        """Set the line that opens it, and its content without None."""
-        self.summary, self.content = summary, [one for one in content if one]
+    def __init__(self, title: str, *content: Content | None) -> None:
+        """Set the heading, and the content without None, empty text and empty tables."""
+        self.title, self.anchor = title, title.lower().replace(" ", "-")
+        self.content = [one for one in content if one and getattr(one, "rows", True)]
+
+
+class Fold(Section):
+    """Content that is closed at first; left out if empty."""
 
     def __len__(self) -> int:
         """Return the number of its items."""
@@ -49,15 +54,6 @@ class Fold:
 
 Content = str | Picture | Sheet | Fold | Code
 """A string is a paragraph; one of class `markupsafe.Markup` is HTML as it is."""
-
-
-class Section:
-    """A heading with what stands below it."""
-
-    def __init__(self, title: str, *content: Content | None) -> None:
-        """Set the heading, the anchor within the part, and the content without None."""
-        self.title, self.anchor = title, title.lower().replace(" ", "-")
-        self.content = [one for one in content if one]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,10 +86,8 @@ def picture(figure: Figure, alt: str, *, dense: bool = False) -> Picture:
     return Picture(src=style.data_uri(style.render(figure, kind), kind), alt=alt)
 
 
-def table(
-    columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = ""
-) -> Sheet | None:
-    """Return a table, or None without a row.
+def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:
+    """Return a table; without a row it is left out of the page.
 
     Args:
         columns: Headers with ` | ` between them; `;2` behind one sets the digits of its numbers,
@@ -108,7 +102,7 @@ def table(
         for row in rows
     )
     names = tuple(head[0] for head in heads)
-    return Sheet(title=title, columns=names, rows=cells, notes=notes) if cells else None
+    return Sheet(title=title, columns=names, rows=cells, notes=notes)
 
 
 def _cell(value: Any, digits: int) -> str:

@@ -183,51 +183,29 @@ def lines(panels: Sequence[Panel], *, columns: int, mark: str, bar: str) -> Figu
     return figure
 
 
-def heights(traces: Traces, *, standing: float) -> Figure:
-    """Draw the trunk height of every run over the time since the jump input, a panel a command.
+def traces(found: Mapping[str, Traces], *, x_label: str, level: float) -> Figure:
+    """Draw runs over time, a row for each quantity and policy, a column a command.
 
     Args:
-        traces: Height [m].
-        standing: Height of the trunk in the default pose [m].
+        found: By quantity with its unit.
+        x_label: Of the time.
+        level: Drawn dashed in each panel.
     """
-    commands, policies = commands_of(traces), looks(list(traces))
-    shape = (len(policies), len(commands))
-    size = 1.75 * len(policies) + 0.6
-    with drawing(*shape, height=size, sharex=True, sharey="row") as (figure, grid):
-        for row, (name, look) in zip(grid, policies.items(), strict=True):
+    first = next(iter(found.values()))
+    commands, policies = commands_of(first), looks(list(first))
+    rows = [(quantity, name) for quantity in found for name in policies]
+    options: dict[str, Any] = {"sharex": True, "sharey": "row", "height": 1.7 * len(rows) + 0.6}
+    with drawing(len(rows), len(commands), **options) as (figure, grid):
+        for row, (quantity, name) in zip(grid, rows, strict=True):
             for axes, command in zip(row, commands, strict=True):
-                for time, value in traces[name].get(command, ()):
-                    axes.plot(time, value, color=look["color"], linewidth=0.7, alpha=0.55)
-                axes.axhline(standing, **_DASH)
-            row[0].set_ylabel(f"{name}\ntrunk height [m]")
+                for time, value in found[quantity][name].get(command, ()):
+                    look = {"color": policies[name]["color"], "linewidth": 0.7, "alpha": 0.55}
+                    axes.plot(time, value, **look)
+                axes.axhline(level, **_DASH)
+            row[0].set_ylabel(f"{name}\n{quantity}")
         for top, bottom, command in zip(grid[0], grid[-1], commands, strict=True):
             top.set_title(command)
-            bottom.set_xlabel("time since input [s]")
-        keys = [key(f"{n}, virtual robot", color=look["color"]) for n, look in policies.items()]
-        legend(figure, [*keys, key("standing", **_DASH)])
-    return figure
-
-
-def rates(traces: Mapping[str, Traces]) -> Figure:
-    """Draw rates of the trunk while it accelerates, a row a rate, a column a policy (paper R7).
-
-    Args:
-        traces: By the label of the rate; time since the command to run.
-    """
-    policies = looks(list(next(iter(traces.values()))))
-    shape, size = (len(traces), len(policies)), 1.9 * len(traces) + 0.6
-    with drawing(*shape, height=size, sharex=True, sharey="row") as (figure, grid):
-        for row, (label, found) in zip(grid, traces.items(), strict=True):
-            for axes, (name, look) in zip(row, policies.items(), strict=True):
-                runs = [run for one in found[name].values() for run in one]
-                # The first run is drawn strongly, above the others.
-                for i, (time, value) in reversed(list(enumerate(runs))):
-                    weak: dict[str, Any] = {"linewidth": 0.5, "alpha": 0.25} if i else {}
-                    axes.plot(time, value, color=look["color"], **({"linewidth": 1.2} | weak))
-                axes.set_title(f"RMS {rms(runs):.2f} rad/s over {len(runs)} runs", fontsize=9)
-            row[0].set_ylabel(label)
-        for axes in grid[-1]:
-            axes.set_xlabel("time since the command to run [s]")
+            bottom.set_xlabel(x_label)
         legend(figure, [key(f"{n}, virtual robot", color=p["color"]) for n, p in policies.items()])
     return figure
 

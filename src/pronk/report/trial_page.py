@@ -275,21 +275,29 @@ def _traces(trial: Results, seen: tuple[Captured, int] | None) -> list[Section]:
     """Sections that need captures."""
     if seen is None:
         return []
-    traces, missing = seen
+    (height, roll, pitch), missing = seen[0].values(), seen[1]
     where, found = tables.place(trial), []
-    height, roll, pitch = traces.values()
-
     if any(roll.values()):
-        text = (
-            f"In the trunk's frame, until the jump input, at {RATES.name} (the paper's figure 6)."
+        rates = {"roll rate [rad/s]": roll, "pitch rate [rad/s]": pitch}
+        figure = draw.traces(rates, x_label="time since the command to run [s]", level=0.0)
+        rows = [
+            (name, *(draw.rms(one[name].get(RATES.name, [])) for one in (roll, pitch)))
+            for name in roll
+        ]
+        found.append(
+            Section(
+                "Roll and pitch rates",
+                f"In the trunk's frame, until the jump input, at {RATES.name} (paper, figure 6).",
+                picture(figure, f"Rates of the {where} while it accelerates", dense=True),
+                table("policy | roll rate, RMS [rad/s];2 | pitch rate, RMS [rad/s];2", rows),
+            )
         )
-        figure = draw.rates({"roll rate [rad/s]": roll, "pitch rate [rad/s]": pitch})
-        drawn = picture(figure, f"Rates of the {where} while it accelerates", dense=True)
-        found.append(Section("Roll and pitch rates", text, drawn))
     count = sum(len(runs) for cases in height.values() for runs in cases.values())
-    text = f"{count} of {len(trial.rows)} jumps, those with a capture."
+    text = f"{count} of {len(trial.rows)} jumps, those with a capture. Dashed: standing."
     text += f" {missing} captures are missing from the folder." * bool(missing)
-    figure = draw.heights(height, standing=float(trial.rules.get("standing_height", np.nan)))
+    standing = float(trial.rules.get("standing_height", np.nan))
+    heights, x_label = {"trunk height [m]": height}, "time since input [s]"
+    figure = draw.traces(heights, x_label=x_label, level=standing)
     drawn = picture(figure, f"Trunk height of the {where} since the jump input", dense=True)
     return [*found, Section("Trunk height over time", text, drawn)]
 
