@@ -192,14 +192,15 @@ def test_training_answers_the_chirp_that_was_matched(joint: str, delay: int) -> 
         pose=np.array([j.default_position for j in CHEETAH.joints]),
     )
     gains = {n: MATCHED.groups[CHEETAH.joint(n).group] for n in CHEETAH.joint(joint).chain}
-    expected = simulate(
-        CHEETAH,
-        question,
-        gains[joint].stiffness,
-        gains[joint].damping,
-        held_stiffness={name: g.stiffness for name, g in gains.items()},
-        held_damping={name: g.damping for name, g in gains.items()},
-    )[0, :: CHEETAH.decimation]
+    joints = tuple(
+        replace(j, stiffness=gains[j.name].stiffness, damping=gains[j.name].damping)
+        if j.name in gains
+        else j
+        for j in CHEETAH.joints
+    )
+    matched = replace(CHEETAH, joints=joints)
+    expected = simulate(matched, question, gains[joint].stiffness, gains[joint].damping)
+    expected = expected[0, :: CHEETAH.decimation]
 
     env = on_the_bench(joint, MATCHED, delay)
     env.reset()

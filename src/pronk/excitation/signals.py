@@ -190,8 +190,6 @@ class Multisine(Signal):
     tilt: float = 0.5
     """A line's amplitude falls with its frequency to this power; 0 is flat. Speed and torque at
     the high lines are what limits a flat one."""
-    harmonics: tuple[int, ...] = ()
-    """Take these odd harmonics instead of the logarithmic grid."""
     draws: int = 200
     seed: int = 0
 
@@ -200,10 +198,6 @@ class Multisine(Signal):
         self._positive("length_s", "lines", "periods", "draws")
         self._ordered(self.low_hz, self.high_hz)
         self._positive("tilt", zero=True)
-        if any(h < 1 or h % 2 == 0 for h in self.harmonics):
-            raise PlanError(
-                f"Multisine.harmonics are {self.harmonics}; expected odd positive numbers."
-            )
         if not self.harmonic_numbers:
             raise PlanError(
                 f"Multisine: no odd multiple of {1.0 / self.length_s:g} Hz lies between "
@@ -213,8 +207,6 @@ class Multisine(Signal):
     @property
     def harmonic_numbers(self) -> tuple[int, ...]:
         """Excited odd harmonics, increasing: those nearest to a logarithmic grid."""
-        if self.harmonics:
-            return tuple(sorted(set(self.harmonics)))
         low, high = self.low_hz * self.length_s, self.high_hz * self.length_s
         lowest = 2 * int(np.ceil((low * (1.0 - 1e-9) - 1.0) / 2.0)) + 1
         highest = 2 * int(np.floor((high * (1.0 + 1e-9) - 1.0) / 2.0)) + 1

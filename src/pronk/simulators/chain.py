@@ -22,6 +22,7 @@ from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import roll
+from pronk.simulators.simulator import Closing
 
 Array = NDArray[np.float64]
 
@@ -105,7 +106,7 @@ def moves_together(log: JointLog) -> bool:
     return int(moving.sum()) > 1
 
 
-class ChainSimulation:
+class ChainSimulation(Closing):
     """The chain with the commands of one or more logs, for many sets of drives."""
 
     def __init__(self, robot: RobotSpec, logs: Sequence[JointLog], *, threads: int = 2) -> None:
@@ -134,12 +135,6 @@ class ChainSimulation:
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(threads, 1))]
         self._tracks = [self._track(log) for log in self.logs]
-
-    def __enter__(self) -> ChainSimulation:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop the threads."""

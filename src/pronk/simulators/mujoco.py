@@ -14,7 +14,7 @@ import copy
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import mujoco.rollout
@@ -26,7 +26,7 @@ from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_drive_gains, set_passive
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, original_pose
-from pronk.simulators.simulator import CHUNK, PARAMETERS, Count, SimulatorInfo, play
+from pronk.simulators.simulator import CHUNK, PARAMETERS, Closing, Count, SimulatorInfo, play
 
 Array = NDArray[np.float64]
 
@@ -90,7 +90,7 @@ def roll(
     return np.concatenate([state[:, None], after], axis=1)[..., 1 : 1 + nq]
 
 
-class JointTestRig:
+class JointTestRig(Closing):
     """One joint on the test rig, the original of a mirrored family, with many gain pairs."""
 
     def __init__(
@@ -100,8 +100,6 @@ class JointTestRig:
         *,
         armature: float | None = None,
         frictionloss: float | None = None,
-        held_stiffness: Mapping[str, float] | None = None,
-        held_damping: Mapping[str, float] | None = None,
         threads: int = 2,
         chunk: int = CHUNK,
     ) -> None:
@@ -112,8 +110,6 @@ class JointTestRig:
             joint: The joint to excite; the original of a mirrored family.
             armature: Rotor inertia of the excited joint [kg m^2]; the drive's if not given.
             frictionloss: Dry friction of the excited joint [N m]; the drive's if not given.
-            held_stiffness: Gains of the joints that are held [N m/rad]; the robot's if not given.
-            held_damping: Gains of the joints that are held [N m s/rad]; the robot's if not given.
             threads: Threads of the simulator.
             chunk: Simulations in flight at once.
         """
@@ -122,8 +118,6 @@ class JointTestRig:
         spec = bench_spec(
             robot,
             joint,
-            stiffness=held_stiffness,
-            damping=held_damping,
             armature=None if armature is None else {joint: armature},
             frictionloss=None if frictionloss is None else {joint: frictionloss},
         )
@@ -141,9 +135,7 @@ class JointTestRig:
         self.threads = threads
         self.chunk = chunk
         self.count = Count()
-        self._stiffness = np.array(
-            [(held_stiffness or {}).get(name, robot.joint(name).stiffness) for name in self.chain]
-        )
+        self._stiffness = np.array([robot.joint(name).stiffness for name in self.chain])
         self._sensor = int(self.model.sensor_adr[self.model.sensor("excited").id])
         # One actuator a joint; map joint order to the columns of ctrl.
         self._ctrl = np.array([self.model.actuator(name).id for name in self.chain])
@@ -151,12 +143,6 @@ class JointTestRig:
         self._passive_set = False
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop the threads."""
@@ -293,7 +279,7 @@ def mujoco_info(robot: RobotSpec) -> SimulatorInfo:
     )
 
 
-class MujocoSimulator:
+class MujocoSimulator(Closing):
     """A robot's joints in MuJoCo, each branch on a fixed base; models are compiled once.
 
     `rig` is the fast path: one joint, many gain pairs, on CPU threads or (MuJoCo Warp) a GPU.
@@ -317,12 +303,6 @@ class MujocoSimulator:
         self._armature = armature
         self._threads = threads
         self._rigs: dict[str, JointTestRig] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop the threads of every rig."""

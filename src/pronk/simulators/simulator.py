@@ -143,7 +143,20 @@ class JointRigs(Protocol):
         """Close."""
 
 
-class RolloutRigs:
+class Closing:
+    """Something to be closed after use, also by a with statement."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release threads and memory; nothing by default."""
+
+
+class RolloutRigs(Closing):
     """Rigs of any simulator, made from its `rollout`."""
 
     def __init__(
@@ -157,15 +170,6 @@ class RolloutRigs:
         self.count = Count()
         self._simulator = simulator
         self._armature = armature
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """No-op: the simulator belongs to the caller."""
 
     def without_armature(self) -> RolloutRigs:
         """The same with no rotor inertia at the excited joint."""
