@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from pronk.links.machine import State
 from pronk.policy.layout import JOINTS, MEASURED_SIZE
+from pronk.runtime.safety import FilterAction, Reason
 
 Record = np.ndarray[Any, Any] | np.void
 
@@ -301,21 +302,28 @@ def get_state(record: np.void) -> State:
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """An event of the servo, as the operator's program receives it."""
+    """Something that happened, as the operator's program and the log's reader have it."""
 
     time: float
     """CLOCK_MONOTONIC [s]."""
     kind: str
-    """`mode`, `fault`, `refused`, `notice`, `lost`, `system`, `robot`, `clamp` or `log`."""
+    """`mode`, `fault`, `refused`, `notice`, `lost`, `system`, `robot`, `policy`, `clamp`, `log`."""
     text: str
-    level: int
-    """A `FilterAction`."""
+    reason: str = Reason.NONE.name
+    """Name of a `Reason`."""
+    level: str = FilterAction.PASS.name
+    """Name of a `FilterAction`."""
 
     @classmethod
     def of(cls, record: np.void) -> Self:
         """Read a record of `EVENT`."""
-        kind, text = (bytes(record[name]).decode("ascii") for name in ("kind", "text"))
-        return cls(time=float(record["time"]), kind=kind, text=text, level=int(record["level"]))
+        return cls(
+            time=float(record["time"]),
+            kind=bytes(record["kind"]).decode("ascii"),
+            text=bytes(record["text"]).decode("ascii"),
+            reason=Reason(int(record["reason"])).name,
+            level=FilterAction(int(record["level"])).name,
+        )
 
 
 def serve(process: Any, shared: Shared, end: Connection) -> None:

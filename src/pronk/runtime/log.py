@@ -39,9 +39,9 @@ from pronk.logs.mcap import (
     Record,
     records,
 )
-from pronk.runtime.ipc import STEP, TICK, VIRTUAL, Mode, Shared
+from pronk.runtime.ipc import STEP, TICK, VIRTUAL, Event, Mode, Shared
 from pronk.runtime.plan import Plan
-from pronk.runtime.safety import FilterAction, Reason
+from pronk.runtime.safety import Reason
 from pronk.runtime.sweep import SweepLogs
 
 SCHEMA = "pronk/deploy/3"
@@ -111,10 +111,8 @@ class DeployLogWriter:
 
     def event(self, record: np.void) -> None:
         """Write a record of `EVENT`."""
-        row = _values(record)
-        row |= {name: row[name].decode("ascii") for name in ("kind", "text")}
-        row |= {"reason": Reason(row["reason"]).name, "level": FilterAction(row["level"]).name}
-        self._put(_EVENT, row["time"], row)
+        event = Event.of(record)
+        self._put(_EVENT, event.time, vars(event))
 
     def end(self, *, complete: bool, figures: dict[str, Any]) -> None:
         """Write the end and close the file."""
@@ -218,28 +216,10 @@ def _drain(writer: DeployLogWriter | SweepLogs, shared: Shared) -> None:
         writer.step(record)
 
 
-@dataclass(frozen=True, kw_only=True)
-class DeployEvent:
-    """Something that happened."""
-
-    time: float
-    """CLOCK_MONOTONIC [s]."""
-    kind: str
-    """`mode`, `fault`, `refused`, `notice`, `lost`, `system`, `robot` or `policy`."""
-    text: str
-    reason: str
-    """Name of a `Reason`."""
-    level: str
-    """Name of a `FilterAction`."""
-
-
 _TICK_NAMES = {"time": "begun", "state_time": "time", "state_sequence": "sequence"} | {
     "action_number": "action"
 }
-_STEP_NAMES = {f"step_{name}": name for name in ("deadline", "done", "state_time")} | {
-    "step_time": "begun",
-    "step_live": "live",
-}
+_STEP_NAMES = {"step_time": "begun", "step_live": "live"}
 """Arrays of a log whose fields in the records have other names."""
 _FLAGS = ("damped", "step_live", "jump")
 
@@ -260,7 +240,7 @@ class DeployLog:
     """Records of `TICK`. (T,)"""
     steps: NDArray[Any]
     """Records of `STEP`. (P,)"""
-    events: tuple[DeployEvent, ...]
+    events: tuple[Event, ...]
     complete: bool
     """True if the end was written and no record was lost."""
     figures: dict[str, Any]
@@ -363,7 +343,7 @@ def read_deploy_log(path: Path) -> DeployLog:
             header=header,
             ticks=ticks,
             steps=steps,
-            events=tuple(DeployEvent(**row) for row in messages[_EVENT]),
+            events=tuple(Event(**row) for row in messages[_EVENT]),
             complete=bool(end.get("complete", False)) and not damage,
             figures=end.get("figures", {}),
             damage=damage,
