@@ -18,7 +18,6 @@ from pronk.match.fit import DRIVE_MODE
 from pronk.match.measured_joint import trusted_frequency, trusted_samples
 from pronk.match.predict import drives_of, predict
 from pronk.match.result import MatchResult
-from pronk.response.grid import held_mean
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together
 
@@ -102,15 +101,6 @@ def test_still_arm_is_refused() -> None:
     log = commands(30.0, (0.2, 3.0), 0.0)
     with pytest.raises(LogError, match="radians"):
         ChainSimulation(ARM, [log])
-
-
-def test_held_mean_is_the_command_on_the_grid_and_its_share_off_it() -> None:
-    time, command = np.arange(4) * 0.02, np.array([0.0, 1.0, 3.0, 3.0])
-    edges = np.arange(17) * 0.005
-    assert held_mean(time, command, edges) == pytest.approx(np.repeat(command, 4))
-    late = held_mean(time, command, edges - 0.0025)
-    assert late[3:6] == pytest.approx([0.0, 0.5, 1.0])
-    assert held_mean(time, command, np.array([-1.0, -0.5])) == pytest.approx([0.0])
 
 
 def test_moving_together_differs_from_taking_turns() -> None:

@@ -76,29 +76,25 @@ def test_known_gains_are_inside_their_intervals(matched: MatchResult) -> None:
         assert found.band_hz == ROBOT.joint(joint).band_hz
 
 
-def test_the_result_holds_what_the_page_draws(matched: MatchResult) -> None:
+def test_the_result_holds_responses_maps_and_repeats(matched: MatchResult) -> None:
     for joint in KNOWN:
         one = matched.joints[joint]
         assert [round(r.amplitude, 3) for r in one.responses] == [0.25, 0.125]
         assert one.grid_error.shape == (25, 25)
-        count = len(one.responses[0].omega)
-        for response in (one.matched, one.naive, one.zero_armature):
-            assert response is not None
-            assert response.shape == (count,)
-            assert np.isfinite(response).all()
         assert one.repeat_gains.shape == (3, 2)
         assert one.amplitude_gains.shape == (2, 3)
+        assert one.zero_armature is not None
+        assert np.isfinite(one.naive + one.zero_armature).all()
         inside = one.responses[0].band(*one.band_hz)
         error = 20 * np.log10(np.abs(one.matched / one.responses[0].response))[inside]
         assert np.sqrt(np.mean(error**2)) == pytest.approx(one.error_db, rel=0.02)
-    assert set(matched.seconds) >= {"estimate", "quick search", "zero armature"}
 
 
 def test_zero_armature_is_refuted_where_the_data_can(matched: MatchResult) -> None:
     knee, roll = matched.joints["FR_knee"], matched.joints["FR_hip_roll"]
     assert knee.zero_armature_error_db > 5 * knee.error_db
     assert any(flag.startswith("zero armature: no match") for flag in knee.flags)
-    # The rotor of a hip is light beside the leg: other gains make up for it, and pronk says so.
+    # The rotor of a hip is light beside the leg: other gains make up for it.
     assert any("not ruled out by this joint" in flag for flag in roll.flags)
     assert matched.gains.joints["FR_knee"].flags == ()
 
@@ -169,7 +165,7 @@ def test_a_multisine_is_matched_through_its_lines() -> None:
     assert (found.stiffness, found.damping) == pytest.approx((21.0, 0.5), rel=5e-3)
 
 
-def test_naive_gains_are_those_that_the_log_says() -> None:
+def test_naive_gains_are_those_of_the_log() -> None:
     log = replace(
         log_of("FR_knee", (21.0, 0.5)), stiffness=np.array([21.0]), damping=np.array([0.5])
     )
@@ -177,25 +173,21 @@ def test_naive_gains_are_those_that_the_log_says() -> None:
     assert found.naive_error_db < 0.1
 
 
-def test_bad_logs_are_refused_in_one_sentence() -> None:
+def test_bad_logs_are_refused() -> None:
     good = log_of("FR_knee", (21.0, 0.5))
-    with pytest.raises(LogError, match="FR_hip_roll"):
-        match_logs([], ROBOT, settings=QUICK)
     elbow = tuple(replace(s, joints=("elbow",)) for s in good.segments)
-    renamed = replace(good, joints=("elbow",), segments=elbow)
-    with pytest.raises(RobotError, match=r"elbow.*FR_hip_roll"):
-        match_logs([renamed], ROBOT, settings=QUICK)
-    with pytest.raises(LogError, match="FR_knee"):
-        match_logs([replace(good, position=0 * good.position)], ROBOT, settings=QUICK)
-    with pytest.raises(LogError, match="unit 'unknown'"):
-        match_logs([replace(good, units=("unknown",))], ROBOT, settings=QUICK)
-    rng = np.random.default_rng(0)
-    drowned = replace(good, position=good.position + 2.0 * rng.standard_normal(good.position.shape))
-    with pytest.raises(IdentifiabilityError, match="FR_knee is coherent"):
-        match_logs([drowned], ROBOT, settings=QUICK)
-    steps = replace(good, segments=tuple(replace(s, kind="sine_steps") for s in good.segments))
-    with pytest.raises(LogError, match="sine steps"):
-        match_logs([steps], ROBOT, settings=QUICK)
+    steps = tuple(replace(s, kind="sine_steps") for s in good.segments)
+    noise = 2.0 * np.random.default_rng(0).standard_normal(good.position.shape)
+    for logs, error, message in (
+        ([], LogError, "FR_hip_roll"),
+        ([replace(good, joints=("elbow",), segments=elbow)], RobotError, r"elbow.*FR_hip_roll"),
+        ([replace(good, position=0 * good.position)], LogError, "FR_knee"),
+        ([replace(good, units=("unknown",))], LogError, "unit 'unknown'"),
+        ([replace(good, position=good.position + noise)], IdentifiabilityError, "coherent"),
+        ([replace(good, segments=steps)], LogError, "sine steps"),
+    ):
+        with pytest.raises(error, match=message):
+            match_logs(logs, ROBOT, settings=QUICK)
 
 
 @pytest.mark.parametrize(
