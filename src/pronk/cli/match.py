@@ -184,24 +184,10 @@ def predict(
             rows += [row | {"log": log.source} for row in prediction_rows(found.joints)]
             done((i + 1) / len(logs))
     virtual = any(log.virtual for log in logs)
-    columns = "joint | signal | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4 | unit"
-    cells = [
-        (
-            row["joint"],
-            row["signal"].replace("_", " "),
-            row["rmse_naive"],
-            row["rmse_naive_delayed"],
-            row["rmse_matched"],
-            row["unit"],
-            row["rmse_matched"] / (row["rmse_naive"] or float("nan")),
-            row["r2_naive"],
-            row["r2_matched"],
-        )
-        for row in rows
-    ]
+    columns = "joint | signal | unit | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4"
+    cells = [list(row.values())[:-1] for row in rows]
     title = "Replayed logs of the virtual robot" if virtual else "Replayed logs"
-    columns += " | matched / nominal;2 | R2 nominal | R2 matched"
-    console.show_sheet(table(columns, cells, title=title))
+    console.show_sheet(table(f"{columns} | R2 nominal | R2 matched", cells, title=title))
     for source in fitted:
         console.warn(f"{source} was used by these gains: this is a check of the fit.")
     for reason in excluded.values():

@@ -108,25 +108,20 @@ class Reading:
         """
         from pronk.logs.readers import read_logs
 
-        scale = {}
-        for name, value in _pairs(self.scale, "--scale").items():
-            try:
-                scale[name] = float(value)
-            except ValueError:
-                raise PronkError(f"--scale: {value!r} is not a number.") from None
-        options: dict[str, Any] = {
-            "unit": self.unit,
-            "time_unit": self.time_unit,
+        options = vars(self) | {
             "columns": _pairs(self.columns, "--columns") or None,
             "joint_names": _pairs(self.joint_names, "--joint-names") or None,
-            "scale": scale or None,
-            "rate_hz": self.rate_hz,
+            "scale": None,
             "format": self.log_format,
-            "measured_topic": self.measured_topic,
-            "command_topic": self.command_topic,
-            "command_field": self.command_field,
+            "log_format": None,
+            "reader_options": None,
             **_pairs(self.reader_options, "--reader-option"),
         }
+        try:
+            scale = {name: float(text) for name, text in _pairs(self.scale, "--scale").items()}
+        except ValueError as error:
+            raise PronkError(f"--scale: {error}.") from None
+        options["scale"] = scale or None
         given = {name: value for name, value in options.items() if value is not None}
         return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **given)
 

@@ -93,7 +93,7 @@ def summary(found: FrequencyResponse) -> dict[str, Any]:
 
     hz = found.frequency_hz
     coherent = hz[found.coherence >= COHERENT]
-    band = [float(coherent.min()), float(coherent.max())] if len(coherent) else None
+    band = (float(coherent.min()), float(coherent.max())) if len(coherent) else None
     inside = found.band(*band) if band else hz > 0.0
     peak = int(np.argmax(np.where(inside, found.gain, -np.inf)))
     return {
@@ -132,23 +132,19 @@ def show(rows: list[dict[str, Any]]) -> None:
     """Print the table of responses."""
     from pronk.report.page import table
 
-    columns = f"joint | amplitude [rad];3 | repeats | coherence >= {COHERENT} [Hz];1 | least there"
-    columns += " | peak [dB];2 | at [Hz];2 | -3 dB at [Hz];2 | command delay [ms];1"
-    cells = [
-        (
-            row["joint"],
-            row["amplitude_rad"],
-            row["repeats"],
-            tuple(row["coherent_hz"] or ()) or "none",
-            row["coherence_min"],
-            row["peak_db"],
-            row["peak_hz"],
-            row["bandwidth_hz"],
-            1000.0 * row["delay_s"],
-            100.0 * row["third_harmonic"],
-        )
-        for row in rows
-    ]
+    columns = {
+        "joint": "joint",
+        "amplitude [rad]": "amplitude_rad",
+        "repeats": "repeats",
+        f"coherence >= {COHERENT} [Hz];1": "coherent_hz",
+        "least there": "coherence_min",
+        "peak [dB];2": "peak_db",
+        "at [Hz];2": "peak_hz",
+        "-3 dB at [Hz];2": "bandwidth_hz",
+        "command delay [s];4": "delay_s",
+        "third harmonic": "third_harmonic",
+    }
+    cells = [[row[key] for key in columns.values()] for row in rows]
     virtual = any(row["virtual"] for row in rows)
     title = "Responses of the virtual robot" if virtual else "Responses"
-    console.show_sheet(table(f"{columns} | third harmonic [%];1", cells, title=title))
+    console.show_sheet(table(" | ".join(columns), cells, title=title))

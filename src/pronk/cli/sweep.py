@@ -148,25 +148,23 @@ def show_plan(plan: SweepPlan) -> None:
     """Print what the sweep will do to each joint, against its limits."""
     from pronk.report.page import table
 
-    columns = "joint | amplitude [rad] | position [rad];2 | of range;2 | speed [rad/s];1"
-    columns += " | of no-load;1 | torque [N m];1 | of limit;1 | power [W];0 | bus [A];1"
-    rows = [
-        (
-            row["joint"],
-            row["amplitude_rad"],
-            (row["lowest_rad"], row["highest_rad"]),
-            (row["range_low_rad"], row["range_high_rad"]),
-            row["speed_rad_s"],
-            row["no_load_speed_rad_s"],
-            row["torque_nm"],
-            row["effort_limit_nm"],
-            row["electrical_power_w"],
-            row["bus_current_a"],
-        )
-        for row in plan.rows()
-    ]
+    columns = {
+        "joint": "joint",
+        "amplitude [rad]": "amplitude_rad",
+        "lowest [rad];2": "lowest_rad",
+        "of;2": "range_low_rad",
+        "highest [rad];2": "highest_rad",
+        "of ;2": "range_high_rad",
+        "speed [rad/s];1": "speed_rad_s",
+        "of no-load;1": "no_load_speed_rad_s",
+        "torque [N m];1": "torque_nm",
+        "of limit;1": "effort_limit_nm",
+        "power [W];0": "electrical_power_w",
+        "bus [A];1": "bus_current_a",
+    }
+    rows = [[row[key] for key in columns.values()] for row in plan.rows()]
     title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
-    console.show_sheet(table(columns, rows, title=title))
+    console.show_sheet(table(" | ".join(columns), rows, title=title))
 
 
 def record_virtual(
