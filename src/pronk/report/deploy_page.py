@@ -98,11 +98,12 @@ def overview(log: DeployLog) -> Figure:
                 low, high = axes.get_ylim()
                 axes.set_ylim(min(low, -0.5), max(high, 0.5))
             if label.endswith("[ms]"):
-                axes.set_yscale("log")
+                low, high = np.log10(np.array(axes.get_ylim()).clip(1e-3))
+                axes.set(yscale="log", ylim=(10.0 ** np.floor(low), 10.0 ** np.ceil(high)))
             axes.set_ylabel(label)
             _mark(axes, log)
-        grid[4, 0].set_ylim(bottom=0.0)
         grid[4, 0].axhline(limit, **_LIMIT)
+        grid[4, 0].set_ylim(bottom=0.0)
         xlim = (0.0, max(float(t[-1]), 1e-3))
         grid[-1, 0].set(xlim=xlim, xlabel="time since the first tick [s]")
         figure.align_ylabels()
@@ -173,8 +174,8 @@ def verdict(log: DeployLog) -> str:
         return f"{who} was not moved: {refusal.text}"
     if not active:
         return f"{who}: no fault; the policy was never active."
-    count = len(jumps(log))
-    return f"{who}: the policy was active for {active:.1f} s, {count} jump inputs, no fault."
+    inputs = f"jump inputs: {len(jumps(log))}"
+    return f"{who}: no fault; the policy was active for {active:.1f} s, {inputs}."
 
 
 def lines(log: DeployLog, found: Delay) -> Iterator[str]:

@@ -320,6 +320,6 @@ def bodies_part(path: Path, root: Path, **names: str) -> Part:
         drawn = picture(draw.cells(shown), words)
         sections.append(Section(f"{name.capitalize()} on each robot", drawn))
     folders = ", ".join(body.folder for body in bodies.bodies)
-    line = f"`pronk report FOLDER` makes a page of each folder: {folders}."
+    line = f"pronk report FOLDER makes a page of each folder: {folders}."
     text = f"{len(bodies.bodies)} other {where}s: {landed} of {n} jumps landed."
     return _part(path, root, bodies, summary=text, lines=[line], sections=sections, **names)

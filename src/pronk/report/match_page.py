@@ -145,7 +145,7 @@ def part(
     if own.virtual:
         lines.append(
             "Every measured number on this page is of pronk's virtual robot, a simulated machine "
-            "that stands in for hardware, not for a real robot."
+            "that stands in for hardware; none is of a real robot."
         )
     lines += [f"{joint_words(name)}: {'; '.join(flags)}." for name, flags in found["flags"].items()]
     fits = {name: fit for name, fit in result.joints.items() if fit.responses}
