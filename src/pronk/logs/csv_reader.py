@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.files import sha256, write_text
+from pronk.files import sha256
 from pronk.logs.columns import Columns
-from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
@@ -143,16 +142,3 @@ def _numbers(path: Path, name: str, cells: list[str]) -> Array:
             "number; repair or remove that row."
         )
     return values
-
-
-def write_csv(path: Path, log: JointLog) -> None:
-    """Write the columns of a log as `read_csv` reads them (unit='rad'), whole or not at all."""
-    names, values = ["time"], [log.time[:, None]]
-    for quantity in QUANTITIES:
-        matrix = getattr(log, quantity)
-        if matrix is not None:
-            names += [f"{quantity}.{joint}" for joint in log.joints]
-            values.append(matrix)
-    rows = np.hstack(values).tolist()
-    lines = [",".join(names), *(",".join(map(repr, row)) for row in rows)]
-    write_text(path, "\n".join(lines) + "\n")

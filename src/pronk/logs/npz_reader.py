@@ -7,43 +7,28 @@ import zipfile
 from pathlib import Path
 from typing import IO, Any
 
-import msgspec
 import numpy as np
-import orjson
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.files import sha256, written_whole
+from pronk.files import sha256
 from pronk.logs.columns import Columns
-from pronk.logs.joint_log import JointLog
 from pronk.robots.robot import RobotSpec
 
-SCHEMA = "pronk/sweep-npz/1"
-
 _COLUMNS = ("time", "command", "position", "velocity", "torque")
-_ARRAYS = (*_COLUMNS, "frequency", "stiffness", "damping", "pose")
-_FIELDS = ("robot", "joints", "segments", "units", "virtual", "complete", "notes", "metadata")
 _MOST_BYTES = 2**30
 """Largest size that the arrays may unpack to [bytes]."""
 
 
-def write_npz(path: Path, log: JointLog) -> None:
-    """Write a log, whole or not at all."""
-    header = {"schema": SCHEMA} | {name: getattr(log, name) for name in _FIELDS}
-    arrays = {name: getattr(log, name) for name in _ARRAYS if getattr(log, name) is not None}
-    with written_whole(path) as aside, aside.open("wb") as file:
-        np.savez_compressed(file, header=np.array(orjson.dumps(header).decode()), **arrays)
+def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
+    """Read the arrays `time` (n,), `command` and `position` (n, joints).
 
-
-def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns | JointLog:
-    """Read what `write_npz` wrote, or the arrays `time`, `command`, `position` of another tool.
+    `velocity`, `torque` and `joints` (the names) are read where they are there.
 
     Raises:
         LogError: Not such a file, or an array is missing.
     """
     arrays = _load(path)
-    if "header" in arrays:
-        return _own(path, arrays)
     if missing := [name for name in _COLUMNS[:3] if name not in arrays]:
         raise LogError(
             f"{path}: no array {', '.join(missing)}; it holds {', '.join(arrays) or 'none'}."
@@ -101,26 +86,3 @@ def _check_size(path: Path, name: str, file: IO[bytes], size: int) -> None:
         raise LogError(f"{path}: {name} holds pickled objects, which are not read.")
     if math.prod(shape) * dtype.itemsize > size:
         raise LogError(f"{path}: {name} promises shape {shape}, more than the file holds.")
-
-
-def _own(path: Path, arrays: dict[str, NDArray[Any]]) -> JointLog:
-    """A file of `write_npz`."""
-    try:
-        header = orjson.loads(str(arrays["header"]))
-        if header["schema"] != SCHEMA:
-            raise LogError(f"{path}: schema {header['schema']!r}; this pronk reads {SCHEMA!r}.")
-        for segment in header["segments"]:
-            if segment["amplitude"] is None:
-                segment["amplitude"] = math.nan
-        fields = {name: header[name] for name in _FIELDS}
-        fields |= {name: name for name in _ARRAYS if name in arrays}
-        fields |= {"source": str(path), "sha256": sha256(path)}
-        return msgspec.convert(
-            fields, JointLog, dec_hook=lambda _, name: np.asarray(arrays[name], dtype=np.float64)
-        )
-    except LogError:
-        raise
-    except Exception as error:
-        raise LogError(
-            f"{path}: damaged, or not of schema {SCHEMA} ({type(error).__name__})."
-        ) from error
