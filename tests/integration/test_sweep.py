@@ -111,36 +111,23 @@ def test_the_logged_command_is_the_plans_at_exactly_50_hz(recorded: Recorded) ->
             assert np.ptp(part.command[:, others]) == np.ptp(log.pose[others])
 
 
-def test_instantaneous_frequency_is_logged_inside_excitations_only(recorded: Recorded) -> None:
-    _, _, paths = recorded
-    log = read_mcap(paths[0])
-    assert log.frequency is not None
-    inside = np.zeros(len(log.time), dtype=bool)
-    for segment in log.segments:
-        excited = (log.time >= segment.start) & (log.time <= segment.start + SHORT.length_s - 0.05)
-        inside |= excited
-        values = log.frequency[excited]
-        assert values[0] == pytest.approx(0.5, abs=0.01)
-        assert values[-1] == pytest.approx(10.0, abs=0.3)
-        assert (np.diff(values) >= 0.0).all()
-    before = log.time < log.segments[0].start - 0.01
-    assert np.isnan(log.frequency[before]).all()
-
-
-def test_motion_of_other_joints_is_logged(recorded: Recorded) -> None:
+def test_frequency_and_motion_of_other_joints_are_logged(recorded: Recorded) -> None:
     _, _, paths = recorded
     hip, knee = (read_mcap(path) for path in paths)
+    assert hip.frequency is not None
+    for segment in hip.segments:
+        inside = (hip.time >= segment.start) & (hip.time <= segment.start + SHORT.length_s - 0.05)
+        values = hip.frequency[inside]
+        assert values[[0, -1]] == pytest.approx([0.5, 10.0], abs=0.3)
+        assert (np.diff(values) >= 0.0).all()
+    assert np.isnan(hip.frequency[hip.time < hip.segments[0].start - 0.01]).all()
     travel = np.ptp(hip.cut(hip.segments[0]).position, axis=0)
     assert travel[0] > 0.2
     assert 0.0 < travel[1] < 0.1
     clamped = np.ptp(knee.cut(knee.segments[0]).position, axis=0)
     assert clamped[:2].max() < 0.01
     assert clamped[2] > 0.2
-
-
-def test_no_sample_belongs_to_two_excitations(recorded: Recorded) -> None:
-    _, _, paths = recorded
-    first, second = read_mcap(paths[0]).segments
+    first, second = hip.segments
     assert first.stop < second.start
 
 
@@ -249,27 +236,23 @@ def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:
         sweep(Watched(), plan, tmp_path, joints=("FL_knee",))
 
 
-def test_a_log_in_the_way_is_not_lost(tmp_path: Path) -> None:
+def test_a_task_that_cannot_be_carried_out_moves_nothing(tmp_path: Path) -> None:
     kept = tmp_path / "FR_knee.mcap"
     kept.write_bytes(b"a day's work")
-    with pytest.raises(HardwareError, match="FR_knee"):
-        sweep(Watched(), plan_of("FR_knee"), tmp_path)
+    machine, other = Watched(), Watched()
+    other.robot = "so101"
+    too_much = plan_of("FR_knee", amplitudes=(1.5,))
+    for each, plan, error, word in (
+        (machine, plan_of("FR_knee"), HardwareError, "FR_knee"),
+        (machine, too_much, PlanError, "fits"),
+        (other, plan_of("FR_knee"), HardwareError, "so101"),
+    ):
+        folder = tmp_path if plan is not too_much else tmp_path / "none"
+        with pytest.raises(error, match=word):
+            sweep(each, plan, folder)
+    assert machine.calls == other.calls == []
     assert kept.read_bytes() == b"a day's work"
-
-
-def test_a_plan_that_could_exceed_a_limit_moves_nothing(tmp_path: Path) -> None:
-    machine = Watched()
-    with pytest.raises(PlanError, match="fits"):
-        sweep(machine, plan_of("FR_knee", amplitudes=(1.5,)), tmp_path)
-    assert machine.calls == []
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_machine_of_another_robot_is_refused(tmp_path: Path) -> None:
-    machine = Watched()
-    machine.robot = "so101"
-    with pytest.raises(HardwareError, match="so101"):
-        sweep(machine, plan_of("FR_knee"), tmp_path)
+    assert list(tmp_path.iterdir()) == [kept]
 
 
 def test_the_leg_is_what_is_logged() -> None:
