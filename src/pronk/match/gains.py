@@ -1,7 +1,6 @@
 """MatchedGains: the gains that make the simulated joint respond like the real one.
 
-`gains.yaml` is the artefact that people read most, so it is laid out for reading: the simulator
-the gains hold for, a line per joint, a line per joint group.
+`gains.yaml` has the simulator that the gains hold for, a line per joint, a line per joint group.
 """
 
 from __future__ import annotations
@@ -88,15 +87,13 @@ class _Flow(dict[str, Any]):
     """A mapping written on one line."""
 
 
-def _represent_flow(dumper: yaml.SafeDumper, data: _Flow) -> yaml.Node:
-    return dumper.represent_mapping("tag:yaml.org,2002:map", data, flow_style=True)
-
-
 class _Dumper(yaml.SafeDumper):
     """SafeDumper for `_Flow`."""
 
 
-_Dumper.add_representer(_Flow, _represent_flow)
+_Dumper.add_representer(
+    _Flow, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:map", data, True)
+)
 
 
 def _rounded(value: Any) -> Any:

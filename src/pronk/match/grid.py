@@ -192,9 +192,7 @@ def search_all(
 
 
 def _simulate_near(
-    rig: JointRig,
-    group: Sequence[MeasuredJoint],
-    shared: Sequence[GridSearch],
+    rig: JointRig, group: Sequence[MeasuredJoint], shared: Sequence[GridSearch]
 ) -> list[GridSearch]:
     """Simulate a group's own command wherever its shared maps could be the best."""
     maps = np.array([one.error for one in shared])
@@ -213,10 +211,7 @@ def _simulate_near(
 
 
 def coarse_search(
-    rig: JointRig,
-    group: Sequence[MeasuredJoint],
-    stiffness: Array,
-    damping: Array,
+    rig: JointRig, group: Sequence[MeasuredJoint], stiffness: Array, damping: Array
 ) -> list[GridSearch]:
     """Simulate every seventh node and the border, then ever closer around the best.
 
@@ -269,10 +264,7 @@ class QuickSearch:
 
 
 def quick_search(
-    simulator: JointRigs,
-    targets: Sequence[MeasuredJoint],
-    stiffness: Array,
-    damping: Array,
+    simulator: JointRigs, targets: Sequence[MeasuredJoint], stiffness: Array, damping: Array
 ) -> list[QuickSearch]:
     """Search the grid linearized everywhere and simulated where it matters; one result a target.
 

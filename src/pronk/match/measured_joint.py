@@ -17,7 +17,6 @@ from scipy import signal
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
-from pronk.response.averaged import H1Operator
 from pronk.response.estimate import estimate, excitations, log_rate
 from pronk.response.estimate import operator as build_operator
 from pronk.response.response import FrequencyResponse
@@ -163,10 +162,7 @@ def gains_on_drive(log: JointLog, joint: str, robot: RobotSpec) -> tuple[float, 
 
 
 def measured_joints(
-    log: JointLog,
-    joint: str,
-    robot: RobotSpec,
-    settings: MatchSettings,
+    log: JointLog, joint: str, robot: RobotSpec, settings: MatchSettings
 ) -> list[MeasuredJoint]:
     """Estimate a joint's responses and prepare each for comparison, largest amplitude first.
 
@@ -187,47 +183,33 @@ def measured_joints(
     measured = estimate(log, joint, settings.estimator)
     parts = excitations(log, joint)
     rate_hz = log_rate(parts)
+    known, where = robot.joint(joint), log.source or "log"
     found: list[MeasuredJoint] = []
     warnings: list[str] = []
-    for repeats, response in zip(parts, measured, strict=True):
-        operator = build_operator(repeats[0], joint, settings.estimator, rate_hz)
+    for (part, *_), response in zip(parts, measured, strict=True):
+        # Of several repeats any one, their commands being the same.
+        trace = command_trace(part, part.segments[0], joint, robot)
+        matrix = build_operator(part, joint, settings.estimator, rate_hz).matrix(trace.time)
         try:
-            found.append(_prepared(repeats[0], operator, response, robot, settings))
+            inside = _inside(response, known.band_hz, settings.coherence_min, where)
         except IdentifiabilityError as error:
             # The largest amplitude must be usable; a smaller one only checks it.
             if not found:
                 raise
             warnings.append(f"the response at {response.amplitude:.3g} rad is left out: {error}")
+            continue
+        found.append(
+            MeasuredJoint(
+                trace=trace,
+                sign=known.original[1],
+                measured=response,
+                matrix=matrix,
+                fit_mask=inside,
+                fit_matrix=_fit_matrix(matrix, inside, trace.mirrored(robot)[2]),
+            )
+        )
     found[0] = replace(found[0], warnings=tuple(warnings))
     return found
-
-
-def _prepared(
-    part: JointLog,
-    operator: H1Operator,
-    measured: FrequencyResponse,
-    robot: RobotSpec,
-    settings: MatchSettings,
-) -> MeasuredJoint:
-    """Prepare the comparison of one measured response to one segment (of repeats any one).
-
-    Raises:
-        LogError: The unit is unknown, or a clamped joint stood elsewhere.
-        IdentifiabilityError: Too little of the band is coherent, or the joint did not move.
-    """
-    joint = measured.joint
-    trace = command_trace(part, part.segments[0], joint, robot)
-    matrix = operator.matrix(trace.time)
-    low, high = robot.joint(joint).band_hz
-    inside = _inside(measured, low, high, settings, part.source or "log")
-    return MeasuredJoint(
-        trace=trace,
-        sign=robot.joint(joint).original[1],
-        measured=measured,
-        matrix=matrix,
-        fit_mask=inside,
-        fit_matrix=_fit_matrix(matrix, inside, trace.mirrored(robot)[2]),
-    )
 
 
 def merged(found: Sequence[Sequence[MeasuredJoint]]) -> list[MeasuredJoint]:
@@ -277,16 +259,17 @@ def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
 
 
 def _inside(
-    measured: FrequencyResponse, low: float, high: float, settings: MatchSettings, where: str
+    measured: FrequencyResponse, band_hz: tuple[float, float], coherence_min: float, where: str
 ) -> NDArray[np.bool_]:
     """Coherent frequencies of the band; refuses a band that is mostly incoherent."""
+    low, high = band_hz
     band = measured.band(low, high)
     if int(band.sum()) < 3:
         raise IdentifiabilityError(
             f"{where}: {measured.joint} has a response at {int(band.sum())} frequencies between "
             f"{low:g} and {high:g} Hz; a match needs 3 or more, so sweep longer or higher."
         )
-    coherent = measured.band(low, high, settings.coherence_min)
+    coherent = measured.band(low, high, coherence_min)
     moved = np.abs(measured.response[band]).max()
     if not moved > 1e-3:
         raise IdentifiabilityError(
@@ -295,7 +278,7 @@ def _inside(
         )
     if 2 * int(coherent.sum()) < int(band.sum()):
         raise IdentifiabilityError(
-            f"{where}: {measured.joint} is coherent (at least {settings.coherence_min:g}) at only "
+            f"{where}: {measured.joint} is coherent (at least {coherence_min:g}) at only "
             f"{int(coherent.sum())} of {int(band.sum())} frequencies between {low:g} and {high:g} "
             "Hz; repeat the sweep with a larger amplitude, a stiffer base or more repeats."
         )

@@ -132,13 +132,6 @@ def predict(
     Where several joints move at once the whole arm is simulated; otherwise each segment of each
     joint by itself, the rest held as on the rig.
 
-    Args:
-        log: What to replay; any signal.
-        robot: The robot.
-        gains: Matched gains of the joints to replay.
-        threads: Threads of the simulator.
-        simulator: What to replay in; see `pronk.simulators.simulator.load_simulator`.
-
     Raises:
         LogError: The log excites no joint that has matched gains, or the robots differ.
         PronkError: The simulator is unknown, or cannot replay joints that move together.

@@ -1,13 +1,12 @@
 """MatchResult: everything a match found.
 
-`gains.yaml` holds what training needs; `match.npz` beside it holds the error maps and the
-responses that the page draws. No pickle.
+`gains.yaml` holds what training needs, `match.npz` beside it the error maps and responses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -86,24 +85,17 @@ class JointFit:
             i, j = np.unravel_index(int(np.nanargmin(self.grid_error)), self.grid_error.shape)
             best = (float(self.grid_stiffness[i]), float(self.grid_damping[j]))
         (a, b), (c, d) = self.covariance.tolist()
-        return JointGains(
-            stiffness=self.stiffness,
-            damping=self.damping,
-            grid_stiffness=best[0],
-            grid_damping=best[1],
-            stiffness_ci95=self.ci95.get("stiffness", (self.stiffness, self.stiffness)),
-            damping_ci95=self.ci95.get("damping", (self.damping, self.damping)),
-            covariance=((a, b), (c, d)),
-            band_hz=self.band_hz,
-            error_db=self.error_db,
-            naive_error_db=self.naive_error_db,
-            coherence_min=self.coherence_min,
-            armature=self.armature,
-            amplitude_spread=amplitude_spread(self.amplitude_gains),
-            frictionloss=self.frictionloss,
-            delay_s=self.delay_s,
-            flags=tuple(f for f in self.flags if not f.startswith(ZERO_ARMATURE)),
-        )
+        shared = {f.name for f in fields(JointGains)} & {f.name for f in fields(JointFit)}
+        own = {
+            "grid_stiffness": best[0],
+            "grid_damping": best[1],
+            "stiffness_ci95": self.ci95.get("stiffness", (self.stiffness, self.stiffness)),
+            "damping_ci95": self.ci95.get("damping", (self.damping, self.damping)),
+            "covariance": ((a, b), (c, d)),
+            "amplitude_spread": amplitude_spread(self.amplitude_gains),
+            "flags": tuple(f for f in self.flags if not f.startswith(ZERO_ARMATURE)),
+        }
+        return JointGains(**{name: getattr(self, name) for name in shared} | own)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,8 +146,7 @@ def load(path: Path, gains: MatchedGains) -> MatchResult:
 def amplitude_spread(gains: Array) -> float:
     """Largest relative change of stiffness from the first amplitude; NaN with one amplitude.
 
-    Args:
-        gains: (amplitude, stiffness, damping), the matched amplitude first, shape (m, 3).
+    Rows of `gains` are (amplitude, stiffness, damping), the matched amplitude first.
     """
     if len(gains) < 2:
         return float("nan")
