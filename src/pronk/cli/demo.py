@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pronk
 from pronk.cli import console
 from pronk.cli.match import prediction_rows, summary
-from pronk.cli.sweep import AMPLITUDES, make, record_virtual
+from pronk.cli.sweep import AMPLITUDES, make
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
@@ -166,6 +166,7 @@ def sweep_and_match(
 
     The smaller amplitude only shows whether the gains hold there too; it has one repeat.
     """
+    from pronk.evaluation.virtual_sweep import sweep_virtual
     from pronk.logs.readers import read_logs
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
@@ -173,16 +174,27 @@ def sweep_and_match(
     from pronk.match.predict import Prediction, predict, save_prediction
     from pronk.match.settings import MatchSettings
     from pronk.response import save as save_responses
+    from pronk.virtual.sim_params import load_sim_params
+
+    params, cpus = load_sim_params(), os.cpu_count() or 1
 
     def record(folder: str, signal: Any, amplitudes: Any, counts: Any, seed: int) -> list[Path]:
         plan = make(robot, None, signal, amplitudes, counts)
         plan.check()
         bar = report.bar(f"sweep ({folder})")
-        return record_virtual(plan, out / folder, seed=seed, overwrite=True, progress=bar)
+        return sweep_virtual(
+            plan,
+            params,
+            out / folder,
+            seed=seed,
+            processes=cpus,
+            overwrite=True,
+            progress=bar,
+        )
 
     paths = record("logs", "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])), seed)
     fresh = record("fresh", "log-chirp", AMPLITUDES[:1], 1, seed + 1)
-    logs = read_logs(paths, processes=os.cpu_count() or 1, robot=robot)
+    logs = read_logs(paths, processes=cpus, robot=robot)
     settings = MatchSettings(method="quick" if quick else "grid")
     result = match_logs(logs, robot, settings=settings, progress=report)
     gains_file.save(out / "gains.yaml", result.gains)

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pronk.robots.robot import RobotSpec
     from pronk.runtime.ipc import Event
     from pronk.runtime.run import Recorded
-    from pronk.runtime.sweep import SweepTask
-    from pronk.virtual.sim_params import SimParams
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
 """Excitation signals."""
@@ -55,8 +53,10 @@ def sweep(
         overwrite: Replace logs that exist.
         json_file: Also write the figures to this file.
     """
+    from pronk.evaluation.virtual_sweep import sweep_virtual
     from pronk.links.address import SIM
     from pronk.robots import load_robot
+    from pronk.virtual.sim_params import load_sim_params
 
     known, address = load_robot(robot), machine.address()
     virtual = address.kind == SIM
@@ -89,12 +89,15 @@ def sweep(
     with console.progress() as report:
         bar = report.bar(f"excite over {address.kind}")
         if virtual:
-            params = address.options.get("params")
-            figures["logs"] = record_virtual(
+            file = address.options.get("params")
+            params = load_sim_params(None if file is None else str(file), known)
+            params.check_joints(known.joint_names, str(file or "sim_params"))
+            figures["logs"] = sweep_virtual(
                 plan,
+                params,
                 out,
-                sim_params=None if params is None else Path(str(params)),
                 seed=int(address.options.get("seed", 0)),
+                processes=os.cpu_count() or 1,
                 overwrite=overwrite,
                 progress=bar,
             )
@@ -165,55 +168,6 @@ def show_plan(plan: SweepPlan) -> None:
     rows = [[row[key] for key in columns.values()] for row in plan.rows()]
     title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
     console.show_sheet(table(" | ".join(columns), rows, title=title))
-
-
-def record_virtual(
-    plan: SweepPlan,
-    out: Path,
-    *,
-    sim_params: Path | None = None,
-    seed: int = 0,
-    overwrite: bool = False,
-    progress: Callable[[float], None] | None = None,
-) -> list[Path]:
-    """Excite the virtual robot faster than real time; return the logs in the order of its joints.
-
-    On a rigid bench limbs do not affect each other, so each is simulated in a process of its own.
-
-    Args:
-        plan: What to excite; checked by the caller.
-        out: Folder for the logs.
-        sim_params: sim_params file; the shipped one if None.
-        seed: Of all noise; each limb derives its own.
-        overwrite: Replace logs that exist.
-        progress: Called with the share done, 0 to 1.
-    """
-    from pronk.evaluation.trial import in_processes
-    from pronk.runtime.sweep import SweepTask
-    from pronk.virtual.plant import leg_of, legs_of
-    from pronk.virtual.sim_params import load_sim_params
-
-    robot, metadata = plan.robot, {"link": "virtual robot, in this program"}
-    params = load_sim_params(sim_params, robot)
-    params.check_joints(robot.joint_names, str(sim_params or "sim_params"))
-    jobs = []
-    for index, limb in enumerate(legs_of(robot)):
-        joints = tuple(name for name in plan.joints if leg_of(robot, name) == limb)
-        task = SweepTask(
-            plan=plan, out_dir=out, joints=joints, overwrite=overwrite, metadata=metadata
-        )
-        jobs += [(task, params, limb, 1000 * seed + index)] if joints else []
-    logs = in_processes(_record_limb, jobs, processes=os.cpu_count() or 1, progress=progress)
-    order = {name: i for i, name in enumerate(robot.joint_names)}
-    return sorted((path for paths in logs for path in paths), key=lambda path: order[path.stem])
-
-
-def _record_limb(job: tuple[SweepTask, SimParams, str, int]) -> list[Path]:
-    from pronk.runtime.sweep import record
-    from pronk.virtual.robot import VirtualRobot
-
-    task, params, limb, seed = job
-    return record(VirtualRobot(task.plan.robot, params, seed=seed, legs=(limb,)), task)
 
 
 def record_wire(

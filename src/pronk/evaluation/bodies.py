@@ -34,9 +34,10 @@ from pronk.errors import PronkError
 from pronk.evaluation.results import Results, Subject, load_json, save_json
 from pronk.evaluation.results import load as load_results
 from pronk.evaluation.tables import Sheet, number, sheet
-from pronk.evaluation.trial import Plan, in_processes, load_subjects, run_trial, versions
+from pronk.evaluation.trial import Plan, load_subjects, run_trial, versions
 from pronk.evaluation.variation import GROUP_TORQUE, TOLERANCES, draw_robot, save_sim_params
-from pronk.excitation.plan import SweepPlan, make_plan
+from pronk.evaluation.virtual_sweep import sweep_virtual
+from pronk.excitation.plan import make_plan
 from pronk.files import sha256
 from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import read_logs
@@ -47,10 +48,7 @@ from pronk.match.measured_joint import SimRequest, logs_by_joint, measured_joint
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.robots.robot import RobotSpec
-from pronk.runtime.sweep import SweepTask, record
 from pronk.simulators.mujoco import MujocoSimulator
-from pronk.virtual.plant import legs_of
-from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
 SCHEMA = "pronk/trial-bodies/4"
@@ -203,14 +201,6 @@ def add_bodies(
 # ---- sweep and match ----
 
 
-def _sweep_leg(leg: tuple[str, int, SweepPlan, SimParams, Path]) -> list[Path]:
-    """Sweep the joints of one leg; on a rigid test rig legs do not affect each other."""
-    name, seed, plan, sim_params, out = leg
-    machine = VirtualRobot(plan.robot, sim_params, seed=seed, legs=(name,))
-    joints = tuple(joint for joint in plan.joints if joint.split("_")[0] == name)
-    return record(machine, SweepTask(plan=plan, out_dir=out, joints=joints, overwrite=True))
-
-
 def match_body(
     robot: RobotSpec,
     sim_params: SimParams,
@@ -237,11 +227,15 @@ def match_body(
         save_sim_params(folder / SIM_PARAMS, sim_params, says=says)
         plan = make_plan(robot, amplitudes=(AMPLITUDE,), repeats=repeats)
         plan.check()
-        legs = [
-            (leg, 1000 * seed + i, plan, sim_params, folder / LOGS)
-            for i, leg in enumerate(legs_of(robot))
-        ]
-        in_processes(_sweep_leg, legs, processes=processes, progress=partial(progress, "sweep"))
+        sweep_virtual(
+            plan,
+            sim_params,
+            folder / LOGS,
+            seed=seed,
+            processes=processes,
+            overwrite=True,
+            progress=partial(progress, "sweep"),
+        )
         progress("match", 0.0)
         logs = read_logs(files, processes=processes, robot=robot)
         found = match_logs(logs, robot, settings=SETTINGS)
