@@ -215,7 +215,7 @@ def test_who_else_commands_later_ends_the_sweep(port: int, tmp_path: Path) -> No
     assert "another program" in log.notes[0]
 
 
-def test_nobody_there(tmp_path: Path) -> None:
+def test_without_a_robot_there_is_no_log(tmp_path: Path) -> None:
     with pytest.raises(HardwareError, match="sent no state on spi_data"):
         swept(ROBOT, plan_of("FR_hip_roll"), tmp_path / "x", 7799)
     assert not (tmp_path / "x").exists()

@@ -84,9 +84,9 @@ def decided(process: PolicyProcess, warm_ups: int, seen: list[State]) -> list[by
 
 def test_warm_ups_change_no_bit_of_what_is_decided() -> None:
     seen = states(len(WAY))
-    with running() as plain, running() as rehearsed:
+    with running() as plain, running() as warm:
         expected = decided(plain, 0, seen)
-        assert decided(rehearsed, 1, seen) == expected
+        assert decided(warm, 1, seen) == expected
     assert len(set(expected)) == len(expected)
     # That would have been seen: with the policy itself instead of its sibling it is another.
     with running() as wrong:
@@ -151,7 +151,7 @@ def test_warm_ups_lie_in_the_last_two_milliseconds(took: float) -> None:
     assert most == 1 if took > LEAD_S else most >= 2
 
 
-def test_nothing_is_rehearsed_for_a_deadline_that_has_passed() -> None:
+def test_there_is_no_warm_up_for_a_deadline_that_has_passed() -> None:
     assert warm_up_until(time.monotonic() - 1.0, pytest.fail) == 0  # type: ignore[arg-type]
     # Nor where there is less time than the first one needs.
     assert warm_up_until(time.monotonic() + 5e-4, pytest.fail) == 0  # type: ignore[arg-type]
