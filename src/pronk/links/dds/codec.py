@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 HEAD = (0xFE, 0xEF)
 LOW_LEVEL = 0xFF
 """`level_flag` of a command to the motors."""
-SERVO, OFF = 0x01, 0x00
-"""`mode` of a motor."""
+SERVO = 0x01
+"""`mode` of a motor that obeys; 0 is off."""
 POS_STOP = 2.146e9
 """`q` of a motor whose position is not controlled (Unitree's PosStopF)."""
 VEL_STOP = 16000.0
