@@ -221,6 +221,14 @@ _TICK_NAMES = {"time": "begun", "state_time": "time", "state_sequence": "sequenc
 }
 _STEP_NAMES = {"step_time": "begun", "step_live": "live"}
 """Arrays of a log whose fields in the records have other names."""
+_DIFFERENCES = {
+    "lateness": ("ticks", "begun", "deadline"),
+    "work": ("ticks", "done", "begun"),
+    "state_age": ("ticks", "begun", "time"),
+    "step_lateness": ("steps", "begun", "deadline"),
+    "decision": ("steps", "inferred", "observed"),
+}
+"""Lateness and work of a tick, age of its state, lateness of a step and the time of its network."""
 _FLAGS = ("damped", "step_live", "jump")
 
 
@@ -231,8 +239,9 @@ class DeployLog:
     The fields of the records (`pronk.runtime.ipc`) are attributes: of `ticks` first, then those of
     `steps` that have another name (`step_time`, `step_live`, `command`, `jump`, `observation`,
     `action`, `target`, `contact`, `linear_velocity`). `time` is the begin of a tick, `state_time`
-    and `state_sequence` are of the newest state, `action_number` is of the policy's action. Times
-    are on CLOCK_MONOTONIC [s], joints in file order; NaN where there was nothing.
+    and `state_sequence` are of the newest state, `action_number` is of the policy's action;
+    differences of times have the names of `_DIFFERENCES`. Times are on CLOCK_MONOTONIC [s], joints
+    in file order; NaN where there was nothing.
     """
 
     header: dict[str, Any]
@@ -252,42 +261,18 @@ class DeployLog:
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         """An array by its name."""
-        if name in _TICK_NAMES:
-            found = self.ticks[_TICK_NAMES[name]]
-        elif name in _STEP_NAMES:
+        if name in _DIFFERENCES:
+            which, end, begin = _DIFFERENCES[name]
+            return np.asarray(getattr(self, which)[end] - getattr(self, which)[begin])
+        if name in _STEP_NAMES:
             found = self.steps[_STEP_NAMES[name]]
-        elif name in (STEP.names or ()) and name not in ("deadline", "begun", "done"):
+        elif name in _TICK_NAMES or (name in (TICK.names or ()) and name != "action"):
+            found = self.ticks[_TICK_NAMES.get(name, name)]
+        elif name in (STEP.names or ()):
             found = self.steps[name]
-        elif name in (TICK.names or ()):
-            found = self.ticks[name]
         else:
             raise AttributeError(name)
         return found.astype(bool) if name in _FLAGS else found
-
-    @property
-    def lateness(self) -> NDArray[np.float64]:
-        """Of each tick. (T,)."""
-        return np.asarray(self.ticks["begun"] - self.ticks["deadline"])
-
-    @property
-    def work(self) -> NDArray[np.float64]:
-        """From the begin of the tick until the command was on the wire. (T,)."""
-        return np.asarray(self.ticks["done"] - self.ticks["begun"])
-
-    @property
-    def state_age(self) -> NDArray[np.float64]:
-        """Of the newest state at a tick. (T,)."""
-        return np.asarray(self.ticks["begun"] - self.ticks["time"])
-
-    @property
-    def step_lateness(self) -> NDArray[np.float64]:
-        """Of each step. (P,)."""
-        return np.asarray(self.steps["begun"] - self.steps["deadline"])
-
-    @property
-    def decision(self) -> NDArray[np.float64]:
-        """Time of observation and network. (P,)."""
-        return np.asarray(self.steps["inferred"] - self.steps["observed"])
 
     @property
     def virtual(self) -> bool:
