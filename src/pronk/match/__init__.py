@@ -1,10 +1,9 @@
 """Find the parameters with which a simulated joint responds as the measured one does.
 
 Start at `pipeline.match_logs`. In order: `measured_joint` (responses ready to be compared), `grid`
-(the paper's search) or `quick` (the linearized model), `refine` (off the grid), `drive` (mode
-drive), `arm` (joints that moved together), `uncertainty`, `diagnostics`, `ranges` (what training
-randomizes). Parameters are in `parameters`, the least-squares problem in `problem`, results in
-`result` and `gains`.
+(the paper's search, whole or linearized), `response_fit` (off the grid, and mode drive), `arm`
+(joints that moved together), `ranges` (what training randomizes). Parameters, least-squares
+problems, solvers and uncertainty are in `fit`, results in `result` and `gains`.
 """
 
 from __future__ import annotations
