@@ -290,8 +290,8 @@ class Results:
         )
         value, low, high = ratio_of_scatter(own, others, seed=self.seed)
         n = (sum(map(len, own)), sum(map(len, others)))
-        who = {"figure": figure, "case": case, "policy": first, "other": other}
-        return Ratio(**who, value=value, low=low, high=high, n=n)  # type: ignore[arg-type]
+        who: Any = {"figure": figure, "case": case, "policy": first, "other": other}
+        return Ratio(**who, value=value, low=low, high=high, n=n)
 
 
 def share_interval(count: int, n: int) -> tuple[float, float]:
@@ -474,10 +474,7 @@ def load(folder: Path, kind: Kind = JUMPS) -> Results:
     with load_json(folder / kind.summary, kind.schema, kind.writer) as body:
         stored = {name: body[name] for name in _HEAD}
         head = replace(msgspec.convert(stored, Results), kind=kind)
-        runs = sum(cell["n"] for cell in body["cells"])
-        counts = {
-            (c["policy"], c["case"], c["parameter"], c["value"], c["n"]) for c in body["cells"]
-        }
+        counts = [(cell["policy"], cell["case"], cell["n"]) for cell in body["cells"]]
     path = folder / kind.table
     try:
         table = path.read_text(encoding="utf-8")
@@ -486,12 +483,9 @@ def load(folder: Path, kind: Kind = JUMPS) -> Results:
             f"{path}: cannot be read ({error.strerror}); `{kind.writer}` writes it."
         ) from None
     results = replace(head, rows=tuple(_rows(table, head, path)))
-    if counts != {
-        (c.policy, c.case, c.parameter, c.value if c.parameter else None, c.n)
-        for c in results.cells
-    }:
+    if counts != [(cell.policy, cell.case, cell.n) for cell in results.cells]:
         raise ArtefactError(
-            f"{path}: {len(results.rows)} runs do not fit the {runs} that {kind.summary} counts; "
-            "run the trial again."
+            f"{path}: {len(results.rows)} runs do not fit the counts of {kind.summary}; run the "
+            "trial again."
         )
     return results
