@@ -94,13 +94,7 @@ def _keys(virtual: bool, matched: str = "", naive: str = "") -> list[Line2D | Pa
 
 
 def bode(fit: JointFit, *, title: str | None = None, coherence: bool = True) -> Figure:
-    """Draw the Bode plot of one joint: measured with its 95 % interval, matched, nominal.
-
-    Args:
-        fit: Of the joint.
-        title: Above the plot; the joint's name if None.
-        coherence: Draw the coherence below.
-    """
+    """Draw the Bode plot of one joint: measured with its 95 % interval, matched, nominal."""
     response = fit.responses[0]
     ratios = [3.0, 2.0, 0.8] if coherence else [3.0, 2.0]
     options: dict[str, Any] = {"sharex": True, "height_ratios": ratios}
@@ -226,9 +220,7 @@ _MARKS = {
 def error_maps(result: MatchResult, drive: Mapping[str, tuple[float, float]]) -> Figure:
     """Draw the gain error over the grid for every joint, with the optimum and known gains.
 
-    Args:
-        result: Of the match.
-        drive: Stiffness [N m/rad] and damping [N m s/rad] of the real drive by joint.
+    `drive` has stiffness [N m/rad] and damping [N m s/rad] of the real drive by joint.
     """
     fits = {name: joint for name, joint in result.joints.items() if joint.grid_error.size}
     paper = published(result.gains.robot)
@@ -264,12 +256,7 @@ def error_maps(result: MatchResult, drive: Mapping[str, tuple[float, float]]) ->
 
 
 def ranges(gains: MatchedGains, groups: Mapping[str, Sequence[str]]) -> Figure:
-    """Draw the gains of the joints of each group, the training range and the ellipse.
-
-    Args:
-        gains: Of the match.
-        groups: Names of the joints of each group.
-    """
+    """Draw the gains of the joints of each group, the training range and the ellipse."""
     paper, columns = published(gains.robot), min(3, len(groups))
     rows = -(-len(groups) // columns)
     box: dict[str, Any] = {"facecolor": "#dbeaf4", "edgecolor": style.MATCHED}
@@ -338,13 +325,7 @@ def busiest_window(prediction: JointPrediction, seconds: float) -> slice:
 
 
 def prediction(found: JointPrediction, *, virtual: bool, seconds: float = 1.5) -> Figure:
-    """Draw one joint over time: command, measured, simulated, and the errors below.
-
-    Args:
-        found: Of the joint.
-        virtual: The measured curve is the virtual robot's.
-        seconds: Length of the part that is drawn, by `busiest_window` [s].
-    """
+    """Draw the `busiest_window` of one joint: command, measured, simulated, and the errors."""
     window = busiest_window(found, seconds)
     time, measured = found.time[window], found.measured[window]
     looks = {"naive": style.NAIVE_LINE, "matched": style.MATCHED_LINE}

@@ -107,9 +107,7 @@ def verdict(result: MatchResult) -> dict[str, Any]:
 def write_page(out_dir: Path, *, gains: str | None = None) -> tuple[Path, Part]:
     """Write the page of the match in `out_dir`; return its path and its part.
 
-    Args:
-        out_dir: Folder with the gains and `match.npz`.
-        gains: Name of the gains file in it; found by `find_gains` if None.
+    `gains` is the name of the gains file in it, found by `find_gains` if None.
 
     Raises:
         ArtefactError: The folder has no gains or no `match.npz`, or one of them is damaged.

@@ -87,14 +87,7 @@ def leg_of(name: str) -> str:
 def drawing(
     rows: int = 1, columns: int = 1, *, height: float, **options: Any
 ) -> Iterator[tuple[Figure, NDArray[Any]]]:
-    """Make a figure of page width with a grid of axes, and draw in it with pronk's look.
-
-    Args:
-        rows: Of axes.
-        columns: Of axes.
-        height: Of the figure [in].
-        options: Of `Figure.subplots`.
-    """
+    """Make a figure of page width and a height in inches, with a grid of axes in pronk's look."""
     with mpl.rc_context(_RC):  # type: ignore[arg-type]
         figure = Figure(figsize=(PAGE_WIDTH_IN, height), layout="constrained")
         yield figure, figure.subplots(rows, columns, squeeze=False, **options)

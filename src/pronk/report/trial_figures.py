@@ -31,11 +31,7 @@ _PAPER |= {"markeredgecolor": style.PAPER, "markeredgewidth": 1.4}
 
 
 def looks(policies: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return colour and marker of each policy: fixed for `naive` and `matched`, else by place.
-
-    Args:
-        policies: Names; what follows a comma (`naive, body 1`) does not change the look.
-    """
+    """Return colour and marker of each policy; text after a comma (`naive, body 1`) is ignored."""
     found, spare = {}, iter(_OTHERS * (1 + len(policies) // len(_OTHERS)))
     for name in policies:
         base = name.split(",")[0]
@@ -69,8 +65,7 @@ def commands_of(values: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def cells(panels: Sequence[tuple[str, Values, Published]]) -> Figure:
     """Draw every jump with mean and standard deviation, beside the paper's.
 
-    Args:
-        panels: One below the other: label of the vertical axis with its unit, ours, the paper's.
+    Panels, one below the other, have the label of the axis with its unit, ours and the paper's.
     """
     height = 2.9 if len(panels) < 3 else 2.1
     size = height * len(panels) + 0.5
@@ -115,9 +110,7 @@ def _cells_panel(axes: Axes, values: Values, published: Published) -> None:
 def scatter_over_error(errors_db: Mapping[str, float], panels: Mapping[str, Values]) -> Figure:
     """Draw the scatter of each command's jumps over the error of the policy's training gains.
 
-    Args:
-        errors_db: By policy, RMS over the joints' bands [dB].
-        panels: By what scatters, with its unit as in `height [m]`.
+    Errors are by policy, RMS over the joints' bands; panels by quantity as in `height [m]`.
     """
     policies = looks(list(errors_db))
     with drawing(1, len(panels), height=3.4) as (figure, grid):
@@ -154,14 +147,7 @@ class Panel:
 
 
 def lines(panels: Sequence[Panel], *, columns: int, mark: str, bar: str) -> Figure:
-    """Draw panels of lines, row by row.
-
-    Args:
-        panels: In rows.
-        columns: Panels in a row.
-        mark: Meaning of the marked places.
-        bar: Meaning of the error bars.
-    """
+    """Draw panels of lines, row by row; `mark` and `bar` name the marks and the error bars."""
     policies = list(dict.fromkeys(name for panel in panels for name in panel.lines))
     rows = -(-len(panels) // columns)
     with drawing(rows, columns, height=2.35 * rows + 0.5) as (figure, grid):
@@ -186,10 +172,7 @@ def lines(panels: Sequence[Panel], *, columns: int, mark: str, bar: str) -> Figu
 def traces(found: Mapping[str, Traces], *, x_label: str, level: float) -> Figure:
     """Draw runs over time, a row for each quantity and policy, a column a command.
 
-    Args:
-        found: By quantity with its unit.
-        x_label: Of the time.
-        level: Drawn dashed in each panel.
+    `found` is by quantity with its unit; `level` is drawn dashed in each panel.
     """
     first = next(iter(found.values()))
     commands, policies = commands_of(first), looks(list(first))

@@ -99,14 +99,9 @@ def captured(trial: Results, folder: Path) -> tuple[Captured, int] | None:
 
 
 def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
-    """Return the RMS gain error over the band with these gains, from the joint's error map [dB].
+    """Return the RMS gain error [dB] with these gains [N m/rad, N m s/rad] over the joint's band.
 
-    NaN outside of the map, or without one.
-
-    Args:
-        joint: Its map holds mean squares [dB^2] over a grid.
-        stiffness: [N m/rad]
-        damping: [N m s/rad]
+    It is interpolated in the joint's error map; NaN outside of it, or without one.
     """
     from scipy.interpolate import RectBivariateSpline
 
