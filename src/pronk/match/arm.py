@@ -298,7 +298,7 @@ def _joint_fits(
             inside = measured.band(*band, COHERENCE_MIN)
             if best is None or inside.sum() > best[1].sum():
                 best = (k, inside, measured)
-        nan, rows = float("nan"), problem.block(name)
+        rows = problem.block(name)
         mask = np.concatenate(masks)[:, i]
         share = mask.sum() / sum(len(p) for p in problem.measured if np.isfinite(p[0, i]))
         flags = [
@@ -313,7 +313,6 @@ def _joint_fits(
             )
         fit = JointFit(
             joint=name,
-            responses=(),
             stiffness=found.values["stiffness"],
             damping=found.values["damping"],
             armature=found.values["armature"],
@@ -322,11 +321,6 @@ def _joint_fits(
             ci95=found.ci95,
             covariance=found.covariance,
             held=held[name],
-            band_hz=(nan, nan),
-            error_db=nan,
-            naive_error_db=nan,
-            matched=np.empty(0, dtype=np.complex128),
-            naive=np.empty(0, dtype=np.complex128),
             rmse=_rms(solution.residual[rows][mask]),
             published_rmse=_rms(naive_residual[rows][mask]),
             flags=(*flags, *found.flags),

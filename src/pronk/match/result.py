@@ -29,7 +29,7 @@ class JointFit:
     """How one joint was matched. Responses share the frequencies of `responses[0]`."""
 
     joint: str
-    responses: tuple[FrequencyResponse, ...]
+    responses: tuple[FrequencyResponse, ...] = ()
     """Measured, one per amplitude; the first (largest amplitude) is the one matched. Empty where
     several joints moved together and none could be estimated."""
     stiffness: float
@@ -48,15 +48,15 @@ class JointFit:
     """Of (stiffness, damping), shape (2, 2)."""
     held: tuple[str, ...] = ()
     """Parameters that were to be fitted but are held, because the logs do not identify them."""
-    band_hz: tuple[float, float]
-    error_db: float
+    band_hz: tuple[float, float] = (float("nan"), float("nan"))
+    error_db: float = float("nan")
     """Root mean square of the gain error in the band at the optimum [dB]."""
-    naive_error_db: float
+    naive_error_db: float = float("nan")
     """The same with the gains of the real drive put into the simulator."""
     coherence_min: float = float("nan")
-    matched: ComplexArray
+    matched: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
     """Simulated response with the matched gains, shape (f,)."""
-    naive: ComplexArray
+    naive: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
     """Simulated response with the real drive's gains put into the simulator, shape (f,)."""
     grid_stiffness: Array = field(default_factory=lambda: np.empty(0))
     """Axis of the grid [N m/rad], shape (a,); empty where no grid was searched."""
