@@ -126,11 +126,11 @@ def add_bodies(
     with those gains finds them unchanged.
 
     Args:
-        policies: `policy.onnx` of each; all of them are tried on every robot.
+        policies: All of them are tried on every robot.
         plan: Of the trials; 20 jumps with each of the paper's commands if None.
         robot: The robot of the policies.
         sim_params: To draw around.
-        out: Folder of the trial; the robots' folders are made in `bodies` in it.
+        out: The robots' folders are made in `bodies` in it.
         about: Source of the parameters, kept with the results.
         count: Robots.
         own: For each robot, in order, policies that were trained with its gains.

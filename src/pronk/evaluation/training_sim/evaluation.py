@@ -198,10 +198,10 @@ def evaluate_policy(
         env: Built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
             random generators of the process are seeded with the plan's seed.
         plan: Of the evaluation.
-        estimate: The policy's estimator, to be evaluated as well.
+        estimate: The policy's estimator, if it is evaluated too.
         progress: Called with the share done, 0 to 1.
-        about: Kept with the result: where policy and gains come from.
-        before: Speed errors of the policy before the jump phases, `Evaluation.speed_errors`.
+        about: As of `Evaluation`.
+        before: As of `Evaluation`.
 
     Raises:
         PronkError: The environment was not built for this plan.
