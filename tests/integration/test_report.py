@@ -193,7 +193,7 @@ def test_one_policy_without_captures_or_match(tmp_path: Path) -> None:
 def test_missing_captures_are_counted(tmp_path: Path) -> None:
     trial = write_trial(tmp_path, ("matched",), CASES[:1], keep=True)
     (tmp_path / trial.rows[1].capture).unlink()
-    found = trial_page.captured(trial, tmp_path)
+    found = trial_page.traces(trial, tmp_path)
     assert found is not None
     assert (found[1], len(found[0]["height"]["matched"]["forward 1"])) == (1, 2)
     assert "2 of 3 jumps" in report(tmp_path).text

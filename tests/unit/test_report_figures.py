@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from pronk.evaluation.crossing import climbs
 from pronk.report import extra_pages, figures, style, trial_figures, trial_page
-from pronk.report.paper import published
+from pronk.report.paper import published, published_jumps
 from report_cases import (
     CASES,
     FLIGHTS,
@@ -52,7 +52,7 @@ def trial(folder):
 
 @pytest.fixture(scope="module")
 def captured(trial, folder):
-    traces, missing = trial_page.captured(trial, folder)
+    traces, missing = trial_page.traces(trial, folder)
     assert missing == 0
     return traces
 
@@ -167,7 +167,7 @@ def test_prediction_shows_where_the_nominal_simulation_is_worst() -> None:
 
 
 def test_cells_draw_mean_spread_and_the_paper(trial) -> None:
-    distance, paper = trial_page.values(trial, "distance"), trial_page.published("distance")
+    distance, paper = trial_page.values(trial, "distance"), published_jumps("distance")
     assert list(distance) == ["naive", "matched"]  # as in the paper
     axes = trial_figures.cells([("distance [m]", distance, paper)]).axes[0]
     points = {
@@ -207,7 +207,9 @@ def test_rates_are_of_the_acceleration_at_the_papers_speed(captured) -> None:
     assert time[[0, -1]] == pytest.approx([0.0, SCRIPT.run_s])
     assert np.allclose(rate, 2.0 * RATE * np.sin(OMEGA * time), atol=1e-6)
     # A sine over nearly whole periods.
-    assert trial_figures.rms(runs) == pytest.approx(2.0 * RATE / math.sqrt(2.0), rel=0.02)
+    assert trial_page.rate_rms({CASES[2].name: runs}) == pytest.approx(
+        2.0 * RATE / math.sqrt(2.0), rel=0.02
+    )
 
 
 def test_lines_are_drawn_in_order_with_bars_and_marks() -> None:

@@ -52,7 +52,6 @@ def match(
         reading: How logs are read.
         json_file: Also write the figures to this file.
     """
-    from pronk.evaluation.tables import Sheet
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
     from pronk.match.pipeline import match_logs
@@ -82,14 +81,16 @@ def match(
         report("page", 0.0)
         page, part = write_page(out.parent, gains=out.name)
         report("page", 1.0)
-    console.say(f"{part.summary} {part.lines[0]}")
-    for name, flags in part.figures["flags"].items():
+    found = part.figures
+    console.say(
+        f"{part.summary} Gain error in the compared band, RMS over the joints: "
+        f"{found['naive_error_db']:.2f} dB with the nominal gains of the real drive, "
+        f"{found['error_db']:.2f} dB with the matched gains."
+    )
+    for name, flags in found["flags"].items():
         console.say(f"{name}: {'; '.join(flags)}")
-    for section in part.sections:
-        if section is not None and section.title in ("Matched gains", "Training ranges"):
-            for content in section.content:
-                if isinstance(content, Sheet):
-                    console.show_sheet(content, section.title)
+    for name, title in (("gains_table", "Matched gains"), ("ranges_table", "Training ranges")):
+        console.show_sheet(part.content[name], title)
     figures = summary(result)
     joints = result.joints.items()
     if any(np.isfinite(joint.rmse) for joint in result.joints.values()):

@@ -20,13 +20,14 @@ from pronk.report.page import Part, page
 from pronk.runtime.log import is_deploy_log
 
 NAME = "report.html"
+LOGS = "*.mcap"
 KINDS: tuple[tuple[str, str, str, Callable[..., Part]], ...] = (
     (SUMMARY, "trial", "Trial", trial_page.part),
     (WALK.summary, "walk", "Walking", extra_pages.walk_part),
     (CROSSING.summary, "crossing", "Crossing gaps and steps", extra_pages.crossing_part),
     (VARIATION.summary, "variation", "Variation", extra_pages.variation_part),
     (bodies.FILE, "bodies", "Randomized robots", extra_pages.bodies_part),
-    ("*.mcap", "deploy", "Deployment", deploy_page.part),
+    (LOGS, "deploy", "Deployment", deploy_page.part),
     ("match.npz", "match", "Match", match_page.part),
 )
 """Files, anchor, title and builder of each kind of part, in the order of the page."""
@@ -34,10 +35,11 @@ KINDS: tuple[tuple[str, str, str, Callable[..., Part]], ...] = (
 
 def artefacts(root: Path, pattern: str) -> list[Path]:
     """Return the files below `root`, upper ones first, without those under a `bodies.json`."""
+    if root.is_file():
+        return [root] if pattern == LOGS else []
     covered = {path.parent / bodies.FOLDER for path in root.rglob(bodies.FILE)}
     found = [p for p in root.rglob(pattern) if p.is_file() and covered.isdisjoint(p.parents)]
-    if pattern.endswith(".mcap"):
-        found = [path for path in found if is_deploy_log(path)]
+    found = [path for path in found if pattern != LOGS or is_deploy_log(path)]
     return sorted(found, key=lambda path: (len(path.parts), path))
 
 
@@ -61,16 +63,16 @@ def write_report(
             "wrote to, or the log of a deployment."
         )
     parts = []
+    base = root if root.is_dir() else root.parent
     for n, (pattern, anchor, title, make) in enumerate(KINDS):
         progress("report", n / len(KINDS))
-        paths = artefacts(root, pattern) if root.is_dir() else [root] * (pattern == "*.mcap")
+        paths = artefacts(root, pattern)
         for i, path in enumerate(paths):
-            base = root if root.is_dir() else root.parent
             where = path.relative_to(base)
-            named = where if pattern == "*.mcap" else where.parent
-            own = f"{title}: {named}" if len(paths) > 1 else title
+            own = f"{title}: {where if pattern == LOGS else where.parent}"
             try:
-                parts.append(make(path, base, anchor=f"{anchor}{i or ''}", title=own))
+                titled = {"anchor": f"{anchor}{i or ''}", "title": own if paths[1:] else title}
+                parts.append(make(path, base, **titled))
             except LogError:
                 # A link that never opened leaves a log without a tick beside others with ticks.
                 if len(paths) == 1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,12 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
+from pronk.evaluation.tables import Sheet
 from pronk.report import deploy_run as run
 from pronk.report import style
 from pronk.report.deploy_run import Delay, faults, jumps, seconds
-from pronk.report.page import Fold, Part, Section, picture, table
-from pronk.report.style import drawing, joint_words, key, legend
+from pronk.report.page import Part, table
+from pronk.report.style import drawing, joint_words, key, legend, picture
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import REAL, VIRTUAL, Mode
@@ -36,12 +36,7 @@ _LIMIT: dict[str, Any] = {"color": style.NAIVE, "linestyle": (0, (4, 2)), "linew
 _DESIRED: dict[str, Any] = {"color": style.NAIVE, "linestyle": (0, (2, 1)), "linewidth": 1.2}
 _ESTIMATE: dict[str, Any] = {"color": style.MEASURED_WIDE, "linewidth": 1.2}
 _COMMAND: dict[str, Any] = {"color": style.MATCHED, "linewidth": 1.4}
-_DOTS: dict[str, Any] = {
-    "color": style.MEASURED,
-    "linestyle": "none",
-    "marker": ".",
-    "markersize": 2.5,
-}
+_DOTS = {"color": style.MEASURED, "linestyle": "none", "marker": ".", "markersize": 2.5}
 _PROBLEMS = ("fault", "refused")
 _MOVED = 1e-6
 """Smaller differences of desired and sent targets are not drawn [rad]."""
@@ -71,7 +66,7 @@ def overview(log: DeployLog) -> Figure:
         commanded[log.step_live] = log.command[log.step_live]
     gyro = np.where(run.policy_active(log), log.gyro[:, 2], np.nan)
     volts = np.where(log.bus_voltage > 0.0, log.bus_voltage, np.nan)
-    thin = {"color": style.MEASURED, "linewidth": 0.9}
+    thin: dict[str, Any] = {"color": style.MEASURED, "linewidth": 0.9}
     tracks: list[tuple[str, Array, Array, dict[str, Any]]] = [
         ("forward [m/s]", step, estimate[:, 0], _ESTIMATE),
         ("left [m/s]", step, estimate[:, 1], _ESTIMATE),
@@ -87,11 +82,11 @@ def overview(log: DeployLog) -> Figure:
     tracks = tracks[:4] + [one for one in tracks[4:] if np.isfinite(one[2]).any()]
     limit = log.header.get("limits", {}).get("tilt") or np.nan
     rows, ratios = len(tracks) + 1, [0.42, *[1.0] * len(tracks)]
-    options: dict[str, Any] = {"sharex": True, "height_ratios": ratios}
-    with drawing(rows, height=1.3 * rows + 0.5, **options) as (figure, grid):
-        _draw_modes(grid[0, 0], log)
+    with drawing(rows, height=1.3 * rows + 0.5, sharex=True, height_ratios=ratios) as drawn:
+        figure, panels = drawn[0], drawn[1][:, 0]
+        _draw_modes(panels[0], log)
         for i, (label, time, values, look) in enumerate(tracks):
-            axes = grid[i + 1, 0]
+            axes = panels[i + 1]
             axes.plot(time, values, **look)
             if i < 3:
                 axes.step(step, commanded[:, i], where="post", **_COMMAND)
@@ -102,10 +97,10 @@ def overview(log: DeployLog) -> Figure:
                 axes.set(yscale="log", ylim=(10.0 ** np.floor(low), 10.0 ** np.ceil(high)))
             axes.set_ylabel(label)
             _mark(axes, log)
-        grid[4, 0].axhline(limit, **_LIMIT)
-        grid[4, 0].set_ylim(bottom=0.0)
+        panels[4].axhline(limit, **_LIMIT)
+        panels[4].set_ylim(bottom=0.0)
         xlim = (0.0, max(float(t[-1]), 1e-3))
-        grid[-1, 0].set(xlim=xlim, xlabel="time since the first tick [s]")
+        panels[-1].set(xlim=xlim, xlabel="time since the first tick [s]")
         figure.align_ylabels()
         keys = [key("command", **_COMMAND), key("policy's estimate; turning: gyro", **_ESTIMATE)]
         legend(figure, [*keys, key("tilt limit", **_LIMIT), *_mark_keys(log)])
@@ -127,7 +122,7 @@ def _draw_modes(axes: Axes, log: DeployLog) -> None:
 
 
 def window(log: DeployLog) -> tuple[float, float, str]:
-    """Return begin and end of the close-up since the first tick [s], and what it shows.
+    """Return begin and end of the close-up since the first tick [s], and what it is about.
 
     About the first fault, or else the first jump input, or else the begin of the policy's time.
     """
@@ -163,69 +158,22 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure:
 def verdict(log: DeployLog) -> str:
     """Return the outcome in one sentence."""
     kinds = {event.text for event in log.events if event.kind == "robot"}
-    who = log.header["robot"] + ("" if {REAL, VIRTUAL} & kinds else " (real or virtual unknown)")
-    who = f"Virtual {who}" if VIRTUAL in kinds else f"Real {who}" if REAL in kinds else who
+    robot = log.header["robot"]
+    robot = f"Virtual {robot}" if VIRTUAL in kinds else f"Real {robot}" if REAL in kinds else robot
+    if not {REAL, VIRTUAL} & kinds:
+        robot += " (real or virtual unknown)"
     active = sum(length for mode, _, length in run.stretches(log) if mode in run.POLICY_MODES)
-    events = {event.kind: event for event in reversed(log.events)}
-    if fault := events.get("fault"):
+    first = {event.kind: event for event in reversed(log.events)}
+    if fault := first.get("fault"):
         after = f"after {active:.1f} s of the policy" if active else "before the policy started"
-        return f"{who}: a fault at {float(seconds(log, fault.time)):.2f} s, {after}: {fault.text}."
-    if refusal := events.get("refused"):
-        return f"{who} was not moved: {refusal.text}"
+        at = float(seconds(log, fault.time))
+        return f"{robot}: a fault at {at:.2f} s, {after}: {fault.text}."
+    if refusal := first.get("refused"):
+        return f"{robot} was not moved: {refusal.text}"
     if not active:
-        return f"{who}: no fault; the policy was never active."
+        return f"{robot}: no fault; the policy was never active."
     inputs = f"jump inputs: {len(jumps(log))}"
-    return f"{who}: no fault; the policy was active for {active:.1f} s, {inputs}."
-
-
-def lines(log: DeployLog, found: Delay) -> Iterator[str]:
-    """Yield what stands below the outcome."""
-    for event in [event for event in log.events if event.kind in _PROBLEMS][1:]:
-        yield f"Then {event.kind} at {float(seconds(log, event.time)):.2f} s: {event.text}"
-    bad = log.level >= FilterAction.DAMP
-    if faults(log) and bad.any():
-        first = int(bad.argmax())
-        after, age = log.damped[first:], 1e3 * float(log.state_age[first])
-        yield (
-            f"From that tick on, {after.sum()} of {len(after)} commands on the wire were damping; "
-            f"the newest state was {age:.1f} ms old then."
-        )
-    modes = (f"{mode.name.lower()} {length:.1f} s" for mode, _, length in run.stretches(log))
-    yield f"Modes: {', '.join(modes)}."
-    yield filtering(log)
-    yield delay_words(found)
-    if left_out := run.missed(log):
-        yield f"{left_out} of {len(log.tick) + left_out} ticks were left out as too late."
-    if dropped := sum(log.figures.get("servo", {}).get("dropped", {}).values()):
-        yield f"{dropped} records were dropped on their way to the log; figures here lack them."
-    if not log.complete:
-        yield f"The log was cut{f' ({log.damage})' if log.damage else ''}."
-    if log.virtual:
-        yield "Every number here is of pronk's virtual robot, a simulated machine."
-
-
-def filtering(log: DeployLog) -> str:
-    """Return how many commands the safety filter changed."""
-    given = np.isfinite(log.desired).any(axis=1)
-    moved = int((given & np.isin(log.level, (FilterAction.LIMIT, FilterAction.HOLD))).sum())
-    return f"The safety filter moved targets in {moved} of {given.sum()} commands."
-
-
-def delay_words(found: Delay) -> str:
-    """Return the measured delay beside the training range."""
-    if not found.command["n"]:
-        return "No delay was measured: no action of the policy was sent."
-    words = "From a state to its torque {:.1f} to {:.1f} ms"
-    low, high = found.total
-    if not np.isfinite([low, high]).all():
-        words = "From a state to its command, without the drives, {:.1f} ms (median) to {:.1f} ms"
-        low, high = found.command["p50"], found.longest
-    words = words.format(1e3 * low, 1e3 * high).replace("nan ms", "an unknown time")
-    if found.trained is None:
-        return f"{words}; the log does not hold the delays of the policy's training."
-    where = {True: "within", False: "BEYOND", None: "beside"}[found.within]
-    low, high = found.trained
-    return f"{words}: {where} the training range of {1e3 * low:g} to {1e3 * high:g} ms."
+    return f"{robot}: no fault; the policy was active for {active:.1f} s, {inputs}."
 
 
 def part(path: Path, root: Path, *, anchor: str = "deploy", title: str = "Deployment") -> Part:
@@ -238,22 +186,45 @@ def part(path: Path, root: Path, *, anchor: str = "deploy", title: str = "Deploy
     with suppress(PronkError):  # drives and limits of an unknown robot are left out
         known = load_robot(str(log.header["robot"]))
         robot = known if known.joint_names == log.joints else None
-    found, policy = run.delay(log, robot), log.header.get("policy", {})
-    versions = ", ".join(f"{k} {v}" for k, v in log.header.get("versions", {}).items())
-    bad = any(event.kind in _PROBLEMS for event in log.events)
+    found, (begin, end, about) = run.delay(log, robot), window(log)
+    given = np.isfinite(log.desired).any(axis=1)
+    bad = np.flatnonzero(log.level >= FilterAction.DAMP)
+    damped = bad[:1].tolist() if faults(log) else []
+    content = {
+        "log": log,
+        "file": path.name,
+        "later": [
+            (event.kind, float(seconds(log, event.time)), event.text)
+            for event in [event for event in log.events if event.kind in _PROBLEMS][1:]
+        ],
+        "stretches": run.stretches(log),
+        "damped": log.damped[damped[0] :] if damped else None,
+        "damped_age_ms": 1e3 * float(log.state_age[damped[0]]) if damped else None,
+        "given": int(given.sum()),
+        "moved": int((given & np.isin(log.level, (FilterAction.LIMIT, FilterAction.HOLD))).sum()),
+        "missed": run.missed(log),
+        "dropped": sum(log.figures.get("servo", {}).get("dropped", {}).values()),
+        "policy": log.header.get("policy", {}),
+        "overview": picture(overview(log), dense=True),
+        "events": _event_table(log),
+        "close_up": f"{end - begin:.1f} s {about}",
+        "joints": picture(joints(log, begin, end)),
+        "joint_table": _joint_table(log, robot),
+        "delay": found,
+        "delay_table": _delay_table(found),
+        "timing": _timing_table(log),
+        "interventions": _intervention_table(log),
+    }
+    problem = any(event.kind in _PROBLEMS for event in log.events)
     return Part(
+        kind="deploy",
         anchor=anchor,
         title=title,
         source=str(path.relative_to(root)),
         virtual=log.virtual,
         summary=verdict(log),
-        lines=list(lines(log, found)),
-        warning=bad or not log.complete or found.within is False,
-        sections=[_overview(log), _joints(log, robot), _delay(found), _timing(log), _filter(log)],
-        note=f"{path.name}: {len(log.time)} ticks of the servo, {len(log.step_time)} steps of the "
-        f"policy, over {log.header.get('link', 'an unknown link')}; SHA-256 {log.sha256}. Policy "
-        f"{Path(policy.get('file', 'unknown')).name} {policy.get('sha256', '')}, trained with "
-        f"{policy.get('gains', 'unknown')} gains. Versions: {versions or 'unknown'}.",
+        warning=problem or not log.complete or found.within is False,
+        content=content,
         figures=_figures(log, found),
     )
 
@@ -273,46 +244,34 @@ def _figures(log: DeployLog, found: Delay) -> dict[str, Any]:
         "missed_ticks": run.missed(log),
         "times": {name: run.quantiles(values) for name, (values, _) in run.times(log).items()},
         "delay": vars(found) | {"within": found.within},
-        "interventions": [vars(one) for one in run.interventions(log)],
+        "interventions": run.interventions(log),
         "tracking_rms_rad": dict(zip(log.joints, run.tracking(log)["error"], strict=True)),
     }
 
 
-def _overview(log: DeployLog) -> Section:
+def _event_table(log: DeployLog) -> Sheet:
     events = sorted(log.events, key=lambda event: event.time)
     rows = [(float(seconds(log, one.time)), one.kind, one.text) for one in events]
-    words = "Modes, velocities commanded and estimated, tilt, battery and timing over the run"
-    return Section(
-        "Overview",
-        "Velocities are the policy's own estimate; turning is the gyro's.",
-        picture(overview(log), words, dense=True),
-        Fold("Events", table("time [s] | kind | text", rows)),
-    )
+    return table("time [s] | kind | text", rows)
 
 
-def _joints(log: DeployLog, robot: RobotSpec | None) -> Section:
-    begin, end, words = window(log)
+def _joint_table(log: DeployLog, robot: RobotSpec | None) -> Sheet:
     unknown = [np.nan] * len(log.joints)
-    effort = unknown if robot is None else [joint.drive.effort_limit for joint in robot.joints]
+    effort = [joint.drive.effort_limit for joint in robot.joints] if robot else unknown
     speed = log.header.get("limits", {}).get("speed", unknown)
-    found = run.tracking(log).values()
-    rows = [
-        (joint_words(name), *(values[i] for values in found), effort[i], speed[i])
-        for i, name in enumerate(log.joints)
-    ]
-    words = f"{end - begin:.1f} s {words}."
-    drawn = picture(joints(log, begin, end), f"Targets and positions of all joints, {words}")
+    measures = (*run.tracking(log).values(), effort, speed)
+    rows = zip(map(joint_words, log.joints), *measures, strict=True)
     columns = "joint | error standing, RMS [rad] | error, RMS [rad] | largest error [rad]"
     columns += " | torque, RMS [N m];1 | largest torque [N m];1 | largest speed [rad/s];1"
-    note = (
+    return table(
+        f"{columns} | effort limit [N m];0 | speed limit [rad/s];0",
+        rows,
         "error: target in force less measured position; the policy commands torque by it. All but "
-        "the first column: while the policy was active. Torques as the robot reports them."
+        "the first column: while the policy was active. Torques as the robot reports them.",
     )
-    columns += " | effort limit [N m];0 | speed limit [rad/s];0"
-    return Section("Joints", words, drawn, table(columns, rows, note))
 
 
-def _delay(found: Delay) -> Section:
+def _delay_table(found: Delay) -> Sheet:
     p50, p95 = found.command["p50"], found.command["p95"]
     rows = (
         ("state to command", p50, p95, "median to 95 %, measured"),
@@ -321,34 +280,23 @@ def _delay(found: Delay) -> Section:
         ("training range", *(found.trained or (np.nan, np.nan)), "contract in the policy's file"),
     )
     scaled = [(name, 1e3 * low, 1e3 * high, source) for name, low, high, source in rows]
-    how = (
-        "The delay of the drives is the one with which targets, positions, speeds and gains "
-        "explain the torques best, to about a tick; torques above half the effort limits are left "
-        "out."
-        if np.isfinite(found.drives).all()
-        else "The delay of the drives could not be estimated: the run is too short, the robot "
-        "reports no torques, or targets and gains do not explain them."
-    )
-    content = (table("delay | from [ms];1 | to [ms];1 | source", scaled), how)
-    return Section("Delay", delay_words(found), *(content if found.command["n"] else ()))
+    return table("delay | from [ms];1 | to [ms];1 | source", scaled if found.command["n"] else ())
 
 
-def _timing(log: DeployLog) -> Section:
-    found = run.times(log)
-    rows = []
+def _timing_table(log: DeployLog) -> Sheet:
+    found, rows = run.times(log), []
     for name, (values, _) in found.items():
         n, *rest = run.quantiles(values).values()
         rows.append((name, n, *(1e3 * value for value in rest)))
     notes = [f"{name}: {meaning}." for name, (_, meaning) in found.items()]
-    columns = "[ms] | n | 50 % | 95 % | 99 % | 99.9 % | max"
-    return Section("Timing", table(columns, rows, *notes))
+    return table("[ms] | n | 50 % | 95 % | 99 % | 99.9 % | max", rows, *notes)
 
 
-def _filter(log: DeployLog) -> Section:
-    rows = [
-        (one.level.lower(), one.ticks, one.first, one.largest, one.joint, one.why)
-        for one in run.interventions(log)
-    ]
-    columns = "action | ticks | first at [s];2 | largest change [rad] | joint | reason"
-    note = "joint: the one whose target was changed most often for this reason."
-    return Section("Safety filter", filtering(log), table(columns, rows, note))
+def _intervention_table(log: DeployLog) -> Sheet:
+    names = ("level", "ticks", "first", "largest", "joint", "why")
+    rows = [[one[name] for name in names] for one in run.interventions(log)]
+    return table(
+        "action | ticks | first at [s];2 | largest change [rad] | joint | reason",
+        [(row[0].lower(), *row[1:]) for row in rows],
+        "joint: the one whose target was changed most often for this reason.",
+    )

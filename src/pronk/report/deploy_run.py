@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.report.style import rms
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import Mode
 from pronk.runtime.log import DeployLog
@@ -93,39 +95,32 @@ def tilt(log: DeployLog) -> Array:
         return np.asarray(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y) / size**2, -1.0, 1.0)))
 
 
-@dataclass(frozen=True)
-class Intervention:
-    """Action of the safety filter for one reason."""
+def interventions(log: DeployLog) -> list[dict[str, Any]]:
+    """Return what the safety filter did, by level and reason; the mildest first.
 
-    level: str
-    """Name of a `FilterAction`."""
-    reason: str
-    """Name of a `Reason`."""
-    why: str
-    ticks: int
-    first: float
-    """Since the first tick [s]."""
-    largest: float
-    """Largest change of a target [rad]; NaN while damped."""
-    joint: str
-    """Joint whose target was changed most often; empty while damped."""
-
-
-def interventions(log: DeployLog) -> list[Intervention]:
-    """Return what the filter did, by level and reason; the mildest first."""
+    `level` and `reason` are names, `why` is the reason in words; `ticks` is their number, `first`
+    the time since the first tick [s], `largest` the largest change of a target [rad] and `joint`
+    the one that was changed most often: NaN and empty while damped.
+    """
     found = []
     with np.errstate(invalid="ignore"):
         change = np.nan_to_num(np.abs(log.sent - log.desired))
     for level, reason in product(list(FilterAction)[1:], Reason):
         there = (log.level == level) & (log.reason == reason)
         if there.any():
-            first = float(seconds(log, log.time[there][0]))
             often = (change[there] > _MOVED).sum(axis=0)
             moved = level < FilterAction.DAMP and bool(often.any())
-            largest = float(change[there].max()) if moved else float("nan")
-            joint = log.joints[int(often.argmax())] if moved else ""
-            what = (level.name, reason.name, reason.text, int(there.sum()))
-            found.append(Intervention(*what, first, largest, joint))
+            found.append(
+                {
+                    "level": level.name,
+                    "reason": reason.name,
+                    "why": reason.text,
+                    "ticks": int(there.sum()),
+                    "first": float(seconds(log, log.time[there][0])),
+                    "largest": float(change[there].max()) if moved else float("nan"),
+                    "joint": log.joints[int(often.argmax())] if moved else "",
+                }
+            )
     return found
 
 
@@ -135,13 +130,6 @@ def in_force(log: DeployLog) -> Array:
     The one of the tick before; NaN for the first tick and after a damped one.
     """
     return np.vstack([np.full((1, log.sent.shape[1]), np.nan), log.sent[:-1]])
-
-
-def _rms(values: Array) -> Array:
-    """Of the finite values of each column; NaN without any."""
-    there = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.sqrt((np.where(there, values, 0.0) ** 2).sum(0) / there.sum(0)))
 
 
 def _largest(values: Array) -> Array:
@@ -160,10 +148,10 @@ def tracking(log: DeployLog) -> dict[str, Array]:
     error, active = in_force(log) - log.position, policy_active(log)
     torque = log.torque if log.torque.any() else np.full_like(log.torque, np.nan)
     return {
-        "standing": _rms(error[log.mode == Mode.STAND]),
-        "error": _rms(error[active]),
+        "standing": rms(error[log.mode == Mode.STAND], axis=0),
+        "error": rms(error[active], axis=0),
         "largest": _largest(error[active]),
-        "torque": _rms(torque[active]),
+        "torque": rms(torque[active], axis=0),
         "torque_largest": _largest(torque[active]),
         "speed_largest": _largest(log.velocity[active]),
     }
@@ -179,6 +167,11 @@ class Delay:
     """Quantiles from a state to the first command that uses it, while the policy was active."""
     drives: tuple[float, float]
     """From a command on the wire to its torque, bounds; NaN where it could not be estimated."""
+
+    @property
+    def drives_known(self) -> bool:
+        """Whether the delay of the drives could be estimated."""
+        return bool(np.isfinite(self.drives).all())
 
     @property
     def total(self) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The page builder: parts of sections of paragraphs, tables and pictures, filled into one template.
+"""The page: parts, each a template of its kind filled with tables and figures.
 
 A page holds everything it shows and needs no network.
 """
@@ -11,55 +11,17 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from matplotlib.figure import Figure
 
 from pronk import __version__
 from pronk.evaluation.tables import Sheet
-from pronk.report import style
-
-
-@dataclass(frozen=True, kw_only=True)
-class Picture:
-    """An image that lies in the page itself."""
-
-    src: str
-    """A `data:` address."""
-    alt: str
-    caption: str = ""
-
-
-@dataclass(frozen=True)
-class Code:
-    """Commands to copy."""
-
-    text: str
-
-
-class Section:
-    """A heading with what stands below it."""
-
-    def __init__(self, title: str, *content: Content | None) -> None:
-        """Set the heading, and the content without None, empty text and empty tables."""
-        self.title, self.anchor = title, title.lower().replace(" ", "-")
-        self.content = [one for one in content if one and getattr(one, "rows", True)]
-
-
-class Fold(Section):
-    """Content that is closed at first; left out if empty."""
-
-    def __len__(self) -> int:
-        """Return the number of its items."""
-        return len(self.content)
-
-
-Content = str | Picture | Sheet | Fold | Code
-"""A string is a paragraph; one of class `markupsafe.Markup` is HTML as it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One artefact on the page: a summary, then sections."""
+    """One artefact on the page."""
 
+    kind: str
+    """Its template is `templates/KIND.html.j2`."""
     anchor: str
     """Begins the anchors of all its sections."""
     title: str
@@ -69,21 +31,12 @@ class Part:
     """Measured on the virtual robot."""
     summary: str
     """One sentence."""
-    lines: Sequence[str] = ()
-    """Paragraphs below it."""
     warning: bool = False
     """A result is not as expected."""
-    sections: Sequence[Section | None]
-    note: str = ""
-    """Seeds, hashes, versions."""
+    content: Mapping[str, Any]
+    """Variables of the template."""
     figures: Mapping[str, Any] = field(default_factory=dict)
     """What `--json` gives of it."""
-
-
-def picture(figure: Figure, alt: str, *, dense: bool = False) -> Picture:
-    """Return a figure as part of a page; as PNG if `dense`, since many marks make a large SVG."""
-    kind = "png" if dense else "svg"
-    return Picture(src=style.data_uri(style.render(figure, kind), kind), alt=alt)
 
 
 def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:
@@ -126,11 +79,19 @@ def page(title: str, parts: Sequence[Part]) -> str:
         loader=jinja2.PackageLoader("pronk.report", "templates"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        extensions=["jinja2.ext.do"],
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters["signs"] = _signs
+    environment.filters["words"] = lambda name: name.replace("_", " ")
     # Columns of text are set to the left.
     environment.filters["align"] = lambda rows, i: "left" * any(len(row[i]) > 24 for row in rows)
+    bodies = [
+        environment.get_template(f"{part.kind}.html.j2").render(
+            part.content, part=part, many=len(parts) > 1, sections=[]
+        )
+        for part in parts
+    ]
     template = environment.get_template("page.html.j2")
-    return template.render(version=__version__, title=title, parts=parts)
+    return template.render(version=__version__, title=title, parts=parts, bodies=bodies)

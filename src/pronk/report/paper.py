@@ -1,31 +1,41 @@
-"""Joint gains that the paper published (arXiv 2404.15096, Table I), to compare with."""
+"""What the paper published (arXiv 2404.15096), to compare with; Table III is in `evaluation`."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-_LEGS = ("FR", "FL", "HR", "HL")
-# Table I, columns FR, FL, HR, HL.
-_STIFFNESS = {
-    "hip_roll": (20.6, 18.1, 18.5, 21.0),
-    "hip_pitch": (16.5, 17.7, 16.9, 18.9),
-    "knee": (21.8, 22.0, 22.2, 21.8),
-}
-_DAMPING = {
-    "hip_roll": (0.492, 0.516, 0.431, 0.49),
-    "hip_pitch": (0.382, 0.406, 0.382, 0.431),
-    "knee": (0.541, 0.523, 0.553, 0.553),
+from pronk.evaluation.protocol import TABLE_III
+
+_TABLE_I = {
+    "FR_hip_roll": (20.6, 0.492),
+    "FL_hip_roll": (18.1, 0.516),
+    "HR_hip_roll": (18.5, 0.431),
+    "HL_hip_roll": (21.0, 0.490),
+    "FR_hip_pitch": (16.5, 0.382),
+    "FL_hip_pitch": (17.7, 0.406),
+    "HR_hip_pitch": (16.9, 0.382),
+    "HL_hip_pitch": (18.9, 0.431),
+    "FR_knee": (21.8, 0.541),
+    "FL_knee": (22.0, 0.523),
+    "HR_knee": (22.2, 0.553),
+    "HL_knee": (21.8, 0.553),
 }
 # Last column of Table I.
 _TRAINING = {"hip_roll": (20.0, 0.45), "hip_pitch": (17.5, 0.4), "knee": (21.5, 0.55)}
+GAPS = {"forward 2": 0.55, "back 2": 0.5, "side -1": 0.4, "side +1": 0.4}
+"""Widest gaps by command, read off video (R3) [m]; of which policy is not stated."""
+WALKS = ("forward 2", "back 2", "side -1", "side +1")
+"""Velocities of R4."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Published:
     """Gains that the paper gives for its robot: stiffness [N m/rad] and damping [N m s/rad]."""
 
-    joints: dict[str, tuple[float, float]]
-    training: dict[str, tuple[float, float]]
+    joints: Mapping[str, tuple[float, float]]
+    training: Mapping[str, tuple[float, float]]
     """Of each joint group, as used in training."""
     stiffness_range: float = 2.0
     """Half-width of the randomization [N m/rad] (D3)."""
@@ -35,11 +45,14 @@ class Published:
 
 def published(robot: str) -> Published | None:
     """Return the paper's gains of `robot`; None for another robot than the paper's."""
-    if robot != "mini_cheetah":
-        return None
-    joints = {
-        f"{leg}_{group}": (_STIFFNESS[group][i], _DAMPING[group][i])
-        for i, leg in enumerate(_LEGS)
-        for group in _STIFFNESS
+    return Published(joints=_TABLE_I, training=_TRAINING) if robot == "mini_cheetah" else None
+
+
+def published_jumps(figure: str) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return mean and deviation of `height`, `distance` or `gap` [m] by policy and command."""
+    if figure == "gap":
+        return {"matched": {case: (gap, math.nan) for case, gap in GAPS.items()}}
+    return {
+        gains: {case: getattr(cell, figure)[gains] for case, cell in TABLE_III.items()}
+        for gains in ("naive", "matched")
     }
-    return Published(joints=joints, training=dict(_TRAINING))

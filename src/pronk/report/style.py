@@ -72,6 +72,14 @@ def decibel(gain: Any) -> Any:
     return 20.0 * np.log10(np.maximum(np.abs(gain), 1e-10))
 
 
+def rms(values: Any, axis: int | None = None) -> Any:
+    """Return the root mean square of the finite values; NaN without any."""
+    known = np.asarray(values, dtype=float)
+    there = np.isfinite(known)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt((np.where(there, known, 0.0) ** 2).sum(axis) / there.sum(axis))
+
+
 def joint_words(name: str) -> str:
     """Return a joint's name for a title: `FR_hip_roll` becomes `FR hip roll`."""
     return name.replace("_", " ")
@@ -166,8 +174,14 @@ def render(figure: Figure, kind: str = "svg", *, dpi: float = 130.0) -> bytes:
 
 def data_uri(data: bytes, kind: str) -> str:
     """Return an image file as a `data:` address; `kind` is `svg`, `png` or `gif`."""
-    mime = {"svg": "svg+xml"}.get(kind, kind)
+    mime = "svg+xml" if kind == "svg" else kind
     return f"data:image/{mime};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def picture(figure: Figure, *, dense: bool = False) -> str:
+    """Return a figure as a `data:` address; as PNG if `dense`: many marks make a large SVG."""
+    kind = "png" if dense else "svg"
+    return data_uri(render(figure, kind), kind)
 
 
 def save(figure: Figure, path: Path) -> Path:

@@ -191,9 +191,3 @@ def traces(found: Mapping[str, Traces], *, x_label: str, level: float) -> Figure
             bottom.set_xlabel(x_label)
         legend(figure, [key(f"{n}, virtual robot", color=p["color"]) for n, p in policies.items()])
     return figure
-
-
-def rms(runs: Sequence[Array]) -> float:
-    """Return the root mean square over all samples of all runs; NaN without any."""
-    values = np.concatenate([run[1] for run in runs]) if runs else np.empty(0)
-    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
