@@ -318,7 +318,7 @@ def test_a_pickle_bomb_does_not_run(tmp_path: Path, protocol: int) -> None:
         with pytest.raises(LogError, match=r"a\.pt"):
             read_log(path, robot=ROBOT)
     np.savez(tmp_path / "a.npz", time=np.array([Bomb(boom)], dtype=object))
-    with pytest.raises(LogError, match="pickled"):
+    with pytest.raises(LogError, match="pickle"):
         read_log(tmp_path / "a.npz", **OPTIONS[".npz"])
     assert not boom.exists()
 
@@ -330,7 +330,7 @@ def test_a_pickle_bomb_does_not_run(tmp_path: Path, protocol: int) -> None:
         (b"cbuiltins\neval\n(S'1'\ntR.", "builtins.eval"),
         (b"cnumpy.core.multiarray\n_reconstruct\n.", "numpy.core.multiarray"),
         (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "os.system"),
-        (b"(S'x'\nios\nsystem\n.", "INST"),
+        (b"(ios\nsystem\n.", "INST"),
         (b"ccollections\nOrderedDict\n}b.", "BUILD"),
         (b"\x80\x02ccollections\nOrderedDict\n)\x81.", "NEWOBJ"),
         (b"N.", "NoneType"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,42 +105,10 @@ def examine(time: Array) -> Timing:
     )
 
 
-def check_increasing(time: Array, where: str, row: Callable[[int], str]) -> None:
-    """Refuse timestamps that are not finite, repeat or go back.
-
-    Args:
-        time: Timestamps in any unit, shape (n,).
-        where: File, for the message.
-        row: Name of a sample in the file, for instance `row 7`.
-
-    Raises:
-        LogError: Names the row.
-    """
-    if len(time) < 2:
-        raise LogError(f"{where}: {len(time)} samples; a log needs at least 2.")
-    if not np.isfinite(time).all():
-        lost = row(int(np.argmin(np.isfinite(time))))
-        raise LogError(f"{where}: the timestamp in {lost} is missing or not a number.")
-    steps = np.diff(time)
-    if (steps > 0.0).all():
-        return
-    i = int(np.argmin(steps > 0.0)) + 1
-    if steps[i - 1] == 0.0:
-        raise LogError(
-            f"{where}: {row(i)} repeats the timestamp {time[i]:.9g} of the one before; timestamps "
-            "must increase (drop_duplicates=True drops rows that repeat the one before in full)."
-        )
-    raise LogError(
-        f"{where}: time goes back in {row(i)}, from {time[i - 1]:.9g} to {time[i]:.9g}; sort or "
-        "split the file."
-    )
-
-
 def check_unit(time: Array, where: str, unit: str) -> None:
     """Refuse timestamps [s], converted from `unit`, whose rate fits another unit.
 
-    Raises:
-        LogError: Names the likely unit.
+    The LogError names the likely unit.
     """
     rate = 1.0 / float(np.median(np.diff(time)))
     low, high = PLAUSIBLE_HZ
@@ -164,11 +132,7 @@ def check_unit(time: Array, where: str, unit: str) -> None:
 
 
 def check_rate(timing: Timing, where: str, expected_hz: float) -> None:
-    """Refuse an expected rate that differs from the measured one.
-
-    Raises:
-        LogError: Gives both.
-    """
+    """Refuse an expected rate that differs from the measured one; the LogError gives both."""
     if not (np.isfinite(expected_hz) and expected_hz > 0.0):
         raise LogError(f"{where}: rate_hz is {expected_hz}; expected a positive number.")
     # Lost samples do not make the clock slow.
@@ -182,11 +146,7 @@ def check_rate(timing: Timing, where: str, expected_hz: float) -> None:
 
 
 def check_motion(log: JointLog, joint: str) -> None:
-    """Refuse a joint that was not excited or did not move.
-
-    Raises:
-        LogError: Names the check and its numbers.
-    """
+    """Refuse a joint that was not excited or did not move."""
     where, column = log.source or "log", log.column(joint)
     position = log.position[:, column]
     travel, commanded = float(np.ptp(position)), float(np.ptp(log.command[:, column]))
@@ -224,8 +184,7 @@ def time_at_ends(log: JointLog, joint: str) -> float:
 
 def saturation_note(log: JointLog, joint: str) -> str:
     """A warning for a joint that is saturated, or ""."""
-    share = time_at_ends(log, joint)
-    if share <= _SATURATED:
+    if (share := time_at_ends(log, joint)) <= _SATURATED:
         return ""
     return (
         f"{joint} is saturated: for {100.0 * share:.0f} % of the time it stays at an end of its "
@@ -235,11 +194,7 @@ def saturation_note(log: JointLog, joint: str) -> str:
 
 
 def check_radians(log: JointLog, joint: str) -> None:
-    """Refuse a joint in radians that moves as only degrees would.
-
-    Raises:
-        LogError: Gives the number.
-    """
+    """Refuse a joint in radians that moves as only degrees would."""
     column = log.column(joint)
     command, position = log.command[:, column], log.position[:, column]
     peak = 0.5 * float(np.ptp(command))
@@ -260,13 +215,8 @@ def correlation(commands: Array, rate_hz: float) -> Array:
     With correlated commands, the motion that one joint causes in another looks like a response to
     the other's own command: the coherence stays near one while the response is wrong.
 
-    Args:
-        commands: Uniformly sampled, shape (n, joints).
-        rate_hz: Rate of the samples [Hz].
-
-    Returns:
-        Symmetric matrix in 0..1 with ones on the diagonal, shape (joints, joints). A command that
-        never changes correlates with nothing.
+    Commands are uniformly sampled, shape (n, joints). Returns a symmetric matrix in 0..1 with ones
+    on the diagonal; a command that never changes correlates with nothing.
     """
     centred = commands - commands.mean(axis=0)
     energy = np.sqrt((centred**2).sum(axis=0))

@@ -9,15 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.logs.checks import (
-    TIME_UNITS,
-    check_increasing,
-    check_rate,
-    check_unit,
-    correlation_note,
-    examine,
-)
-from pronk.logs.joint_log import JointLog, Segment
+from pronk.logs.checks import TIME_UNITS, check_unit, correlation_note
+from pronk.logs.joint_log import JointLog, Segment, check_increasing
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
@@ -47,8 +40,8 @@ class Columns:
     """Unit of the angles, one of `UNITS`, where the format defines it."""
     time_unit: str = "s"
     """One of `TIME_UNITS`."""
-    units: tuple[str, ...] = ()
-    """Unit of each joint, where the format declares that one is not an angle."""
+    no_angles: tuple[str, ...] = ()
+    """Joints whose position is on another scale than `unit`, by their names in the file."""
     names: Names | None = None
     """Joint names that the format's own stand for."""
     row: Callable[[int], str] = "sample {}".format
@@ -66,7 +59,6 @@ def import_columns(
     unit: str | None = None,
     time_unit: str | None = None,
     joint_names: Names | None = None,
-    rate_hz: float | None = None,
     drop_duplicates: bool = False,
     scale: Mapping[str, float] | None = None,
 ) -> JointLog:
@@ -74,18 +66,16 @@ def import_columns(
 
     Args:
         columns: What was read.
-        robot: The robot, to check names against, or to name columns that have no names.
+        robot: The robot; it names columns that have no names.
         unit: Unit of angles in the file, `rad` or `deg`; required where the format has none.
         time_unit: Unit of the timestamps, one of `TIME_UNITS`; the format's if None.
         joint_names: Names of the joints.
-        rate_hz: Expected rate.
         drop_duplicates: Drop rows that repeat the one before in full.
         scale: Radians per unit of joints whose unit is unknown, by (new) joint name; for command
             and position, the velocity is left as it is.
 
     Raises:
         LogError: Something is implausible; the message names it and the way out.
-        RobotError: The robot has no such joint.
     """
     where = columns.where
     unit, time_unit = unit or columns.unit, time_unit or columns.time_unit
@@ -97,16 +87,12 @@ def import_columns(
     for name, value, known in (("unit", unit, UNITS), ("time_unit", time_unit, TIME_UNITS)):
         if value not in known:
             raise LogError(f"{where}: {name} {value!r}; expected one of {', '.join(known)}.")
-    joints = _named(columns, robot, columns.names if joint_names is None else joint_names)
-    for joint in joints if robot is not None else ():
-        robot.joint(joint)  # type: ignore[union-attr]
-    keep = np.arange(len(columns.time))
-    notes = list(columns.notes)
+    joints = _joint_names(columns, robot, columns.names if joint_names is None else joint_names)
+    keep, notes = np.arange(len(columns.time)), list(columns.notes)
     if drop_duplicates and len(keep) > 1:
-        same = np.diff(columns.time) == 0.0
-        for values in (columns.command, columns.position, columns.velocity, columns.torque):
-            if values is not None:
-                same &= (np.diff(values, axis=0) == 0.0).all(axis=1)
+        every = (columns.command, columns.position, columns.velocity, columns.torque)
+        table = np.column_stack([columns.time, *(v for v in every if v is not None)])
+        same = (np.diff(table, axis=0) == 0.0).all(axis=1)
         keep = np.flatnonzero(np.concatenate(([True], ~same)))
         if dropped := int(same.sum()):
             notes.append(f"{dropped} rows that repeat the one before were dropped")
@@ -120,17 +106,30 @@ def import_columns(
         # Before the unit is changed: nothing is rounded away.
         time = time - time[0]
     time = time * seconds
-    timing = examine(time)
-    notes.append(timing.words())
-    if rate_hz is not None:
-        check_rate(timing, where, rate_hz)
-    factors, rates, units = _factors(columns, joints, UNITS[unit], scale or {})
-
-    def scaled(values: Array | None, by: Array | float = 1.0) -> Array | None:
-        return None if values is None else np.asarray(values[keep] * by)
-
+    scale = scale or {}
+    for joint, factor in scale.items():
+        if joint not in joints:
+            raise LogError(
+                f"{where}: a scale is given for {joint}; the joints are {', '.join(joints)}."
+            )
+        if not (np.isfinite(factor) and factor != 0.0):
+            raise LogError(f"{where}: the scale of {joint} is {factor}; expected a number.")
+    # A scale defines the unit of position; the velocity beside it may be an angle already.
+    own = columns.joints if columns.no_angles else joints
+    other = [name in columns.no_angles for name in own]
+    factors = np.where(other, 1.0, UNITS[unit])
+    rates = np.where([joint in scale for joint in joints], 1.0, factors)
+    factors = np.array([scale.get(j, factor) for j, factor in zip(joints, factors, strict=True)])
     command = columns.command[keep] * factors
-    if note := _correlation(time, command, joints, timing.rate_hz):
+    # One excitation of unknown kind for every joint whose command moves.
+    travel = dict(zip(joints, np.ptp(command, axis=0), strict=True))
+    start, stop = float(time[0]), float(time[-1])
+    segments = tuple(
+        Segment(kind="unknown", joints=(joint,), start=start, stop=stop, amplitude=float(peak) / 2)
+        for joint, peak in travel.items()
+        if peak > 0.0
+    )
+    if note := _correlation(time, command, joints):
         notes.append(note)
     return JointLog(
         robot=robot.name if robot is not None else columns.robot,
@@ -138,22 +137,14 @@ def import_columns(
         time=time,
         command=command,
         position=columns.position[keep] * factors,
-        velocity=scaled(columns.velocity, rates),
-        torque=scaled(columns.torque),
-        # One excitation of unknown kind for every joint whose command moves.
-        segments=tuple(
-            Segment(
-                kind="unknown",
-                joints=(joint,),
-                start=float(time[0]),
-                stop=float(time[-1]),
-                amplitude=float(travel) / 2.0,
-            )
-            for joint, travel in zip(joints, np.ptp(command, axis=0), strict=True)
-            if travel > 0.0
-        ),
+        velocity=None if columns.velocity is None else columns.velocity[keep] * rates,
+        torque=None if columns.torque is None else columns.torque[keep],
+        segments=segments,
         pose=np.asarray(0.5 * (command.max(axis=0) + command.min(axis=0))),
-        units=units,
+        units=tuple(
+            "unknown" if off and joint not in scale else "rad"
+            for joint, off in zip(joints, other, strict=True)
+        ),
         source=where,
         sha256=columns.sha256,
         notes=tuple(notes),
@@ -161,7 +152,7 @@ def import_columns(
     )
 
 
-def _named(columns: Columns, robot: RobotSpec | None, names: Names | None) -> tuple[str, ...]:
+def _joint_names(columns: Columns, robot: RobotSpec | None, names: Names | None) -> tuple[str, ...]:
     """Names of the joints, as many as there are columns."""
     where, joints = columns.where, columns.joints
     shape = (len(columns.time), columns.position.shape[-1])
@@ -194,34 +185,13 @@ def _named(columns: Columns, robot: RobotSpec | None, names: Names | None) -> tu
     return joints
 
 
-def _factors(
-    columns: Columns, joints: tuple[str, ...], factor: float, scale: Mapping[str, float]
-) -> tuple[Array, Array, tuple[str, ...]]:
-    """Radians per unit of position and of velocity by joint, and the units that result."""
-    for joint, value in scale.items():
-        if joint not in joints:
-            raise LogError(
-                f"{columns.where}: a scale is given for {joint}; the joints are "
-                f"{', '.join(joints)}."
-            )
-        if not (np.isfinite(value) and value != 0.0):
-            raise LogError(f"{columns.where}: the scale of {joint} is {value}; expected a number.")
-    units = columns.units or ("rad",) * len(joints)
-    own = [factor if unit == "rad" else 1.0 for unit in units]
-    # A scale defines the unit of position; the velocity beside it may be an angle already.
-    return (
-        np.array([scale.get(joint, f) for joint, f in zip(joints, own, strict=True)]),
-        np.array([1.0 if joint in scale else f for joint, f in zip(joints, own, strict=True)]),
-        tuple("rad" if j in scale else unit for j, unit in zip(joints, units, strict=True)),
-    )
-
-
-def _correlation(time: Array, command: Array, joints: tuple[str, ...], rate_hz: float) -> str:
+def _correlation(time: Array, command: Array, joints: tuple[str, ...]) -> str:
     """Warning where the commands of several joints are alike."""
     moving = np.flatnonzero(np.ptp(command, axis=0) > 0.0)
     if len(moving) < 2 or not np.isfinite(command).all():
         return ""
     # The command is held, so reading it on a uniform grid moves no edge by more than a sample.
+    rate_hz = (len(time) - 1) / float(time[-1] - time[0])
     grid = time[0] + np.arange(len(time)) / rate_hz
     index = np.clip(np.searchsorted(time, grid + 0.5 / rate_hz) - 1, 0, len(time) - 1)
     return correlation_note(command[index][:, moving], [joints[i] for i in moving], rate_hz)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,17 +23,11 @@ MOST_BYTES = 2**30
 
 
 def read_text(path: Path) -> str:
-    """Read a text file, UTF-8 with or without byte order mark.
-
-    Raises:
-        LogError: Missing, too large, or not text.
-    """
+    """Read a text file, UTF-8 with or without byte order mark."""
     try:
         if path.stat().st_size > MOST_BYTES:
             raise LogError(f"{path}: larger than {MOST_BYTES >> 20} MiB; split the recording.")
         return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise LogError(f"{path}: no such file.") from None
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
     except UnicodeDecodeError as error:
@@ -42,8 +37,7 @@ def read_text(path: Path) -> str:
 def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     """Header and rows of a CSV file; comma, semicolon or tab, whichever the header has most of.
 
-    Raises:
-        LogError: No header and rows, or a row of another length; the message names the row.
+    A LogError names a row of another length.
     """
     text = read_text(path)
     delimiter = max(",;\t", key=text.split("\n", 1)[0].count)
@@ -69,7 +63,7 @@ def read_csv(
     """Read a CSV file.
 
     Columns are called `time`, `command.JOINT`, `position.JOINT`, and optionally `velocity.JOINT`
-    [angle/s] and `torque.JOINT` [N m]; `columns` maps these names to those in the file.
+    [angle/s] and `torque.JOINT` [N m].
 
     Args:
         path: The file.
@@ -81,36 +75,41 @@ def read_csv(
         LogError: Something is missing; the message names column and row.
     """
     header, rows = read_rows(path)
-    given = dict(columns or {})
-    ours = [name for name in header if name not in given.values()]
-    where = given | {name: name for name in ours if name not in given and _is_ours(name)}
+    given, listed = dict(columns or {}), ", ".join(header)
+    names = {name: name for name in header if _is_ours(name) and name not in given.values()}
+    names |= given
     if wrong := [name for name in given if not _is_ours(name)]:
         raise LogError(
             f"{path}: columns names {wrong[0]!r}; expected time, or a quantity and a joint, for "
             f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
         )
-    joints = tuple(name.partition(".")[2] for name in where if name.startswith("position."))
+    joints = tuple(name.partition(".")[2] for name in names if name.startswith("position."))
     needed = ["time", *(f"command.{joint}" for joint in joints)]
-    missing = [name for name in needed if name not in where] or ["position.JOINT"] * (not joints)
+    missing = [name for name in needed if name not in names] or ["position.JOINT"] * (not joints)
     if missing:
         raise LogError(
-            f"{path}: no column called {', '.join(missing)}; the header is {', '.join(header)}; "
+            f"{path}: no column called {', '.join(missing)}; the header is {listed}; "
             f"say which it is with columns={{{missing[0]!r}: ...}}."
         )
-    for name, theirs in where.items():
+    for name, theirs in names.items():
         if header.count(theirs) != 1:
             many = "several columns" if theirs in header else "no column"
-            raise LogError(
-                f"{path}: {many} called {theirs!r} (for {name}); the header is {', '.join(header)}."
-            )
+            raise LogError(f"{path}: {many} called {theirs!r} (for {name}); it has {listed}.")
 
     def numbers(name: str) -> Array:
-        return _numbers(path, where[name], [row[header.index(where[name])] for row in rows])
+        index = header.index(names[name])
+        for i, row in enumerate(rows):
+            if not _is_finite(row[index]):
+                raise LogError(
+                    f"{path}: row {i + 2} holds {row[index][:40]!r} in column {names[name]!r}; "
+                    "expected a finite number; repair or remove that row."
+                )
+        return np.array([float(row[index]) for row in rows])
 
     found = {
         quantity: np.stack([numbers(f"{quantity}.{joint}") for joint in joints], axis=1)
         for quantity in QUANTITIES
-        if all(f"{quantity}.{joint}" in where for joint in joints)
+        if all(f"{quantity}.{joint}" in names for joint in joints)
     }
     return Columns(
         where=str(path),
@@ -127,18 +126,8 @@ def _is_ours(name: str) -> bool:
     return name == "time" or (kind in QUANTITIES and bool(joint))
 
 
-def _numbers(path: Path, name: str, cells: list[str]) -> Array:
-    """One column as finite numbers, shape (n,)."""
-    values = np.full(len(cells), np.nan)
-    for i, cell in enumerate(cells):
-        try:
-            values[i] = float(cell)
-        except ValueError:
-            break
-    if not np.isfinite(values).all():
-        i = int(np.argmin(np.isfinite(values)))
-        raise LogError(
-            f"{path}: row {i + 2} holds {cells[i][:40]!r} in column {name!r}; expected a finite "
-            "number; repair or remove that row."
-        )
-    return values
+def _is_finite(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell))
+    except ValueError:
+        return False

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from pronk.errors import LogError
 Array = NDArray[np.float64]
 
 SIGNAL_KINDS = ("chirp", "log_chirp", "multisine", "sine_steps", "unknown")
+_PER_JOINT = ("stiffness", "damping", "pose", "units")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +80,7 @@ class JointLog:
     """Gains on the drives [N m s/rad], shape (joints,); None if unknown."""
     pose: Array | None = None
     """Position the signals are centred on [rad], shape (joints,)."""
-    units: tuple[str, ...] = ()
+    units: tuple[str, ...] | None = None
     """Unit of each column's position: `rad`, or `unknown` where the source gives another scale."""
     virtual: bool = False
     """True if the machine was pronk's virtual robot."""
@@ -95,63 +98,38 @@ class JointLog:
         """Refuse wrong shapes, numbers that are not finite, and time that does not increase."""
         where = self.source or "log"
         n, width = len(self.time), len(self.joints)
-        if n < 2:
-            raise LogError(f"{where}: {n} samples; a log needs at least 2.")
+        check_increasing(self.time, where, "sample {}".format)
         if width == 0:
             raise LogError(f"{where}: no joints.")
         if len(set(self.joints)) != width:
             raise LogError(f"{where}: a joint is named twice in {', '.join(self.joints)}.")
-        for name in ("command", "position", "velocity", "torque"):
+        shapes = dict.fromkeys(("command", "position", "velocity", "torque"), (n, width))
+        for name, shape in (shapes | dict.fromkeys(_PER_JOINT, (width,))).items():
             values = getattr(self, name)
             if values is None:
                 continue
-            if values.shape != (n, width):
+            if np.shape(values) != shape:
                 raise LogError(
-                    f"{where}: {name} has shape {values.shape}; expected {(n, width)} "
+                    f"{where}: {name} has shape {np.shape(values)}; expected {shape} "
                     f"({n} timestamps, {width} joints)."
                 )
-            if not np.isfinite(values).all():
+            if name in shapes and not np.isfinite(values).all():
                 row, column = np.argwhere(~np.isfinite(values))[0]
                 raise LogError(
                     f"{where}: {name} of {self.joints[column]} is not finite at sample {row} "
                     f"(t = {self.time[row]:.3f} s); drop or repair such rows before reading."
                 )
-        if not np.isfinite(self.time).all():
-            raise LogError(f"{where}: a timestamp is not finite.")
-        steps = np.diff(self.time)
-        if not (steps > 0.0).all():
-            row = int(np.argmin(steps > 0.0)) + 1
-            what = "repeats" if steps[row - 1] == 0.0 else "goes back"
-            raise LogError(
-                f"{where}: time {what} at sample {row} ({self.time[row - 1]:.6f} s, then "
-                f"{self.time[row]:.6f} s); timestamps must increase."
-            )
-        for name in ("stiffness", "damping", "pose"):
-            values = getattr(self, name)
-            if values is not None and values.shape != (width,):
-                raise LogError(f"{where}: {name} has shape {values.shape}; expected {(width,)}.")
-        if self.units and len(self.units) != width:
-            raise LogError(f"{where}: {len(self.units)} units for {width} joints.")
         for segment in self.segments:
             for joint in segment.joints:
-                if joint not in self.joints:
-                    raise LogError(
-                        f"{where}: a segment names joint {joint!r}; "
-                        f"the columns are {', '.join(self.joints)}."
-                    )
+                self.column(joint)
 
     def column(self, joint: str) -> int:
-        """Index of a joint's column.
-
-        Raises:
-            LogError: The log has no such joint; the message lists those it has.
-        """
-        try:
-            return self.joints.index(joint)
-        except ValueError:
+        """Index of a joint's column; a LogError lists the joints if it is not one of them."""
+        if joint not in self.joints:
             raise LogError(
                 f"{self.source or 'log'}: no joint {joint!r}; it has {', '.join(self.joints)}."
-            ) from None
+            )
+        return self.joints.index(joint)
 
     def unit(self, joint: str) -> str:
         """Unit of a joint's position, `rad` unless the log declares another."""
@@ -171,17 +149,32 @@ class JointLog:
                 f"holds {int(inside.sum())} samples; the log spans {self.time[0]:.3f} to "
                 f"{self.time[-1]:.3f} s."
             )
+        names = ("time", "command", "position", "velocity", "torque", "frequency")
+        rows = {name: getattr(self, name) for name in names}
+        part: dict[str, Any] = {n: None if v is None else v[inside] for n, v in rows.items()}
+        return replace(self, segments=(segment,), **part)
 
-        def rows(values: Array | None) -> Array | None:
-            return None if values is None else values[inside]
 
-        return replace(
-            self,
-            time=self.time[inside],
-            command=self.command[inside],
-            position=self.position[inside],
-            velocity=rows(self.velocity),
-            torque=rows(self.torque),
-            frequency=rows(self.frequency),
-            segments=(segment,),
+def check_increasing(time: Array, where: str, row: Callable[[int], str]) -> None:
+    """Refuse timestamps that are not finite, repeat or go back.
+
+    The LogError begins with `where`, the file, and names the sample by `row`, as in `row 7`.
+    """
+    if len(time) < 2:
+        raise LogError(f"{where}: {len(time)} samples; a log needs at least 2.")
+    if not np.isfinite(time).all():
+        lost = row(int(np.argmin(np.isfinite(time))))
+        raise LogError(f"{where}: the timestamp in {lost} is missing or not a number.")
+    steps = np.diff(time)
+    if (steps > 0.0).all():
+        return
+    i = int(np.argmin(steps > 0.0)) + 1
+    if steps[i - 1] == 0.0:
+        raise LogError(
+            f"{where}: {row(i)} repeats the timestamp {time[i]:.9g} of the one before; timestamps "
+            "must increase (drop_duplicates=True drops rows that repeat the one before in full)."
         )
+    raise LogError(
+        f"{where}: time goes back in {row(i)}, from {time[i - 1]:.9g} to {time[i]:.9g}; sort or "
+        "split the file."
+    )

@@ -8,9 +8,8 @@ may claim to unpack to more than there is memory.
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,6 +20,8 @@ from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
+
+from pronk.errors import LogError
 
 NUMBER: dict[str, Any] = {"type": "number"}
 INTEGER: dict[str, Any] = {"type": "integer"}
@@ -39,14 +40,9 @@ class McapWriter:
     """Writes JSON messages. What was flushed stays readable whatever comes after."""
 
     def __init__(self, path: Path, topics: Mapping[str, Mapping[str, Any]]) -> None:
-        """Open `path`, which is replaced.
+        """Open `path`, which is replaced; its folder is made.
 
-        Args:
-            path: The file; its folder is made.
-            topics: Topic to the properties of its messages, as JSON Schema has them.
-
-        Raises:
-            OSError: The file cannot be made.
+        `topics` maps each topic to the properties of its messages, as JSON Schema has them.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream: IO[bytes] = path.open("wb")
@@ -72,7 +68,7 @@ class McapWriter:
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
 
     def flush(self) -> None:
-        """Finish the chunk and hand everything to the operating system."""
+        """Finish the chunk and pass everything to the operating system."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.flush()
 
@@ -117,36 +113,25 @@ def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[li
     reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
     try:
         for record in reader.records:
+            inside = [record]
             if isinstance(record, Chunk):
                 unpacked += record.uncompressed_size
                 if unpacked > most:
                     raise DamagedError(f"its chunks unpack to more than {most >> 20} MiB")
-                inside = breakup_chunk(_unpacked(record))
-            elif isinstance(record, Schema | Channel | Message):
-                inside = [record]
-            else:
-                continue
+                inside = breakup_chunk(_unpacked(record), validate_crc=True)
             batch = []
             for item in inside:
-                if isinstance(item, Message):
-                    channel = channels.get(item.channel_id)
-                    if channel is None:
-                        raise DamagedError(
-                            f"a message on channel {item.channel_id}, which is not declared"
-                        )
-                    batch.append(
-                        Record(
-                            topic=channel.topic,
-                            encoding=channel.message_encoding,
-                            schema=schemas.get(channel.schema_id),
-                            log_time=item.log_time,
-                            data=item.data,
-                        )
-                    )
-                elif isinstance(item, Channel):
+                if isinstance(item, Channel):
                     channels[item.id] = item
                 elif isinstance(item, Schema):
                     schemas[item.id] = item
+                elif isinstance(item, Message):
+                    if item.channel_id not in channels:
+                        raise DamagedError(f"channel {item.channel_id} is not declared")
+                    channel = channels[item.channel_id]
+                    schema = schemas.get(channel.schema_id)
+                    encoding = channel.message_encoding
+                    batch.append(Record(channel.topic, encoding, schema, item.log_time, item.data))
             yield batch
     except DamagedError:
         raise
@@ -159,38 +144,39 @@ def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[li
 
 
 def _unpacked(chunk: Chunk) -> Chunk:
-    """The chunk with its data unpacked and checked.
+    """Unpack the data of a chunk; no more memory is taken than the chunk claims to need."""
+    size = chunk.uncompressed_size
+    if size > _MOST_CHUNK:
+        raise DamagedError(f"a chunk claims to unpack to {size >> 20} MiB")
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise DamagedError(f"a chunk is compressed with {chunk.compression!r}, which is unknown")
+    if len(data) != size:
+        raise DamagedError(f"a chunk unpacks to {len(data)} bytes instead of {size}")
+    return replace(chunk, compression="", data=data)
+
+
+def read_records(path: Path) -> tuple[list[Record], str]:
+    """Every readable message of a file, and what ended the reading early ("" if nothing did).
 
     Raises:
-        DamagedError: It does not unpack, is too large, or its checksum does not fit.
+        LogError: There is no such file, or no message in it.
     """
-    if chunk.uncompressed_size > _MOST_CHUNK:
-        raise DamagedError(f"a chunk claims to unpack to {chunk.uncompressed_size >> 20} MiB")
-    limit = chunk.uncompressed_size
+    found: list[Record] = []
+    damage = ""
     try:
-        if chunk.compression == "zstd":
-            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(limit + 1)
-        elif chunk.compression == "lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=limit + 1)
-        elif chunk.compression == "":
-            data = chunk.data
-        else:
-            raise DamagedError(
-                f"a chunk is compressed with {chunk.compression!r}, which is unknown"
-            )
-    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-        raise DamagedError(
-            f"a chunk does not unpack: {' '.join(str(error).split())[:120]}"
-        ) from None
-    if len(data) != limit:
-        raise DamagedError(f"a chunk unpacks to {len(data)} bytes instead of {limit}")
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise DamagedError("the checksum of a chunk does not fit")
-    return Chunk(
-        compression="",
-        data=data,
-        message_start_time=chunk.message_start_time,
-        message_end_time=chunk.message_end_time,
-        uncompressed_crc=0,
-        uncompressed_size=limit,
-    )
+        with path.open("rb") as stream:
+            for batch in records(stream, path.stat().st_size):
+                found += batch
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
+    except DamagedError as error:
+        damage = str(error)
+    if not found:
+        raise LogError(f"{path}: not a readable MCAP file ({damage or 'it has no messages'}).")
+    return found, damage

@@ -12,6 +12,7 @@ import functools
 import io
 import math
 import pickle
+import pickletools
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -38,13 +39,15 @@ _STORAGES = {
     "ByteStorage": "u1",
     "BoolStorage": "?",
 }
-_FORBIDDEN = (
-    *("BUILD", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"),
-    *("EMPTY_SET", "ADDITEMS", "FROZENSET"),
+_OPCODES = (
+    *("PROTO", "FRAME", "STOP", "MARK", "GLOBAL", "STACK_GLOBAL", "REDUCE", "BINPERSID"),
+    *("BINPUT", "LONG_BINPUT", "MEMOIZE", "BINGET", "LONG_BINGET"),
+    *("EMPTY_DICT", "SETITEM", "SETITEMS", "EMPTY_LIST", "APPEND", "APPENDS"),
+    *("EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"),
+    *("NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"),
+    *("BINUNICODE", "SHORT_BINUNICODE"),
 )
-"""Opcodes that a dictionary of tensors does not need: they make objects or hash their input."""
-_KEYED = ("SETITEM", "SETITEMS", "DICT")
-"""Opcodes that fill dictionaries."""
+"""Opcodes that torch.save uses for a dictionary of tensors."""
 _MOST_PICKLE = 2**20
 """Largest `data.pkl` [bytes]; that of a PACE file has 500."""
 _MOST_BYTES = 2**28
@@ -58,13 +61,31 @@ class _Dtype:
         self.code = code
 
 
+class _Dispatch(dict[int, Callable[..., None]]):
+    """Functions of the permitted opcodes."""
+
+    def __missing__(self, code: int) -> Callable[..., None]:
+        names = [opcode.name for opcode in pickletools.opcodes if opcode.code == chr(code)]
+        raise LogError(
+            f"its pickle uses the opcode {names[0] if names else code}, which a dictionary of "
+            "tensors does not need; nothing of it was run; do not trust the file"
+        )
+
+
 class _Unpickler(pickle._Unpickler):
     """Interprets a pickle of tensors, and nothing else.
 
     Pure Python: a number in the file cannot make its memo allocate memory.
     """
 
-    dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(pickle._Unpickler.dispatch)
+    stack: list[Any]
+    pop_mark: Callable[[], list[Any]]
+    dispatch: ClassVar[dict[int, Callable[..., None]]] = _Dispatch(
+        {
+            getattr(pickle, name)[0]: pickle._Unpickler.dispatch[getattr(pickle, name)[0]]
+            for name in _OPCODES
+        }
+    )
 
     def __init__(self, data: bytes, storage: Callable[[str, str, int], NDArray[Any]]) -> None:
         super().__init__(io.BytesIO(data))
@@ -90,34 +111,21 @@ class _Unpickler(pickle._Unpickler):
             raise ValueError
         return self._storage(dtype.code, key, int(count))
 
-
-def _refuse(name: str) -> Callable[..., None]:
-    def refuse(_: Any) -> None:
-        raise LogError(
-            f"its pickle uses the opcode {name}, which a dictionary of tensors does not need; "
-            "nothing of it was run; do not trust the file"
-        )
-
-    return refuse
-
-
-def _text_keys(load: Callable[[Any], None]) -> Callable[..., None]:
-    """Let an opcode fill dictionaries with text keys only: nested keys take too long to hash."""
-
-    def checked(unpickler: Any) -> None:
-        last = unpickler.stack[-2:-1] if load.__name__ == "load_setitem" else unpickler.stack[::2]
-        if not all(isinstance(key, str) for key in last):
+    def _put(self, key: Any, value: Any) -> None:
+        """Fill a dictionary with text keys only: nested tuples take too long to hash."""
+        if not isinstance(key, str):
             raise ValueError
-        load(unpickler)
+        self.stack[-1][key] = value
 
-    return checked
+    def _set_item(self) -> None:
+        self._put(self.stack.pop(-2), self.stack.pop())
 
+    def _set_items(self) -> None:
+        items = self.pop_mark()
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            self._put(key, value)
 
-for _name in _FORBIDDEN:
-    _Unpickler.dispatch[getattr(pickle, _name)[0]] = _refuse(_name)
-for _name in _KEYED:
-    _code = getattr(pickle, _name)[0]
-    _Unpickler.dispatch[_code] = _text_keys(_Unpickler.dispatch[_code])
+    dispatch[pickle.SETITEM[0]], dispatch[pickle.SETITEMS[0]] = _set_item, _set_items
 
 
 def _empty(*args: Any) -> dict[Any, Any]:
@@ -151,18 +159,21 @@ def load_tensors(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         LogError: Not such a file, or its pickle names something else.
     """
+    expected = f"expected a dictionary of {', '.join(KEYS)} saved with torch.save"
     try:
         with zipfile.ZipFile(path) as archive:
-            pickles = [n for n in archive.namelist() if n.split("/")[1:] == ["data.pkl"]]
+            sizes = {info.filename: info.file_size for info in archive.infolist()}
+            pickles = [name for name in sizes if name.split("/")[1:] == ["data.pkl"]]
             if len(pickles) != 1:
-                raise LogError("it holds no data.pkl; expected what torch.save writes since 1.6")
+                raise LogError(f"it holds no data.pkl; {expected}")
             root = pickles[0].split("/")[0]
-            if sum(info.file_size for info in archive.infolist()) > _MOST_BYTES:
-                raise LogError(f"it unpacks to more than {_MOST_BYTES >> 20} MiB")
-            if archive.getinfo(pickles[0]).file_size > _MOST_PICKLE:
-                raise LogError(f"its data.pkl is larger than {_MOST_PICKLE >> 10} KiB")
+            if sum(sizes.values()) > _MOST_BYTES or sizes[pickles[0]] > _MOST_PICKLE:
+                raise LogError(
+                    f"it unpacks to more than {_MOST_BYTES >> 20} MiB, or its data.pkl to more "
+                    f"than {_MOST_PICKLE >> 10} KiB"
+                )
             order = f"{root}/byteorder"
-            if order in archive.namelist() and archive.read(order).strip() != b"little":
+            if order in sizes and archive.read(order).strip() != b"little":
                 raise LogError("it was written on a big-endian machine")
 
             @functools.cache
@@ -171,30 +182,21 @@ def load_tensors(path: Path) -> dict[str, NDArray[Any]]:
                 return numbers[:count]
 
             found = _Unpickler(archive.read(pickles[0]), storage).load()
+        if not isinstance(found, dict):
+            raise LogError(f"it holds a {type(found).__name__}; {expected}")
     except LogError as error:
         raise LogError(f"{path}: {error}.") from None
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
     except Exception as error:
         # A damaged pickle fails in every way there is; none of its code was run.
-        raise LogError(
-            f"{path}: not a readable .pt file of tensors ({type(error).__name__}); expected a "
-            f"dictionary of {', '.join(KEYS)} saved with torch.save."
-        ) from error
-    if not isinstance(found, dict):
-        raise LogError(
-            f"{path}: it holds a {type(found).__name__}; expected a dictionary of "
-            f"{', '.join(KEYS)}."
-        )
+        reason = type(error).__name__
+        raise LogError(f"{path}: not readable as tensors ({reason}); {expected}.") from error
     return {k[:40]: v for k, v in found.items() if isinstance(v, np.ndarray)}
 
 
 def read_pace(path: Path, *, robot: RobotSpec | None = None) -> Columns:
-    """Read a PACE recording: `time` (n,), `dof_pos` and `des_dof_pos` (n, joints).
-
-    Raises:
-        LogError: Not such a file.
-    """
+    """Read a PACE recording: `time` (n,), `dof_pos` and `des_dof_pos` (n, joints)."""
     tensors = load_tensors(path)
     if missing := [key for key in KEYS if key not in tensors]:
         raise LogError(
@@ -202,15 +204,14 @@ def read_pace(path: Path, *, robot: RobotSpec | None = None) -> Columns:
             f"a PACE recording has {', '.join(KEYS)}."
         )
     time, position, command = (np.array(tensors[key], dtype=np.float64) for key in KEYS)
-    time = time.reshape(-1)
     if position.ndim != 2 or command.shape != position.shape or 0 in position.shape:
         raise LogError(
-            f"{path}: time has shape {time.shape}, dof_pos {position.shape} and des_dof_pos "
-            f"{command.shape}; expected (n,), (n, joints) and (n, joints)."
+            f"{path}: dof_pos has shape {position.shape} and des_dof_pos {command.shape}; expected "
+            "(n, joints)."
         )
     return Columns(
         where=str(path),
-        time=time,
+        time=time.reshape(-1),
         command=command,
         position=position,
         unit="rad",

@@ -29,17 +29,13 @@ from pronk.robots.robot import RobotSpec
 
 GROUP = "pronk.readers"
 """Entry points of readers from other packages; each is a function decorated with `reader`."""
-
-
-def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Parameters that are options of a format."""
-    found = inspect.signature(function).parameters.items()
-    return {name: p for name, p in found if name not in ("path", "robot")}
-
-
-_COMMON = {n: p for n, p in _parameters(import_columns).items() if p.kind is p.KEYWORD_ONLY}
-"""Options of every format whose reader returns `Columns`."""
 _TYPES = {"int": int, "float": float, "bool": bool}
+
+
+def _options(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Parameters that are options of a format: all but what is read and the robot."""
+    _, *found = inspect.signature(function).parameters.items()
+    return {name: parameter for name, parameter in found if name != "robot"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,34 +49,21 @@ class Reader:
     """`function(path, *, robot, **options)`; its keyword parameters are options of the format."""
 
     @property
-    def parameters(self) -> Mapping[str, inspect.Parameter]:
+    def options(self) -> Mapping[str, inspect.Parameter]:
         """Options by name; those of `import_columns` among them where the reader uses it."""
         returns = str(inspect.signature(self.function).return_annotation)
-        return _parameters(self.function) | (_COMMON if "Columns" in returns else {})
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Names of the options."""
-        return tuple(self.parameters)
+        shared = _options(import_columns) if "Columns" in returns else {}
+        return _options(self.function) | shared
 
     def read(self, path: Path, *, robot: RobotSpec | None = None, **options: Any) -> JointLog:
         """Read a file; a reader that returns `Columns` has them checked and converted."""
-        own = _parameters(self.function)
-        given = {name: value for name, value in options.items() if name in own}
-        found = self.function(path, robot=robot, **given)
-        if isinstance(found, Columns):
-            common = {name: value for name, value in options.items() if name not in own}
-            return import_columns(found, robot, **common)
-        return found
+        own = {name: options.pop(name) for name in _options(self.function) if name in options}
+        found = self.function(path, robot=robot, **own)
+        return import_columns(found, robot, **options) if isinstance(found, Columns) else found
 
 
 def reader(name: str, *suffixes: str) -> Callable[[Callable[..., JointLog | Columns]], Reader]:
-    """Declare a function as the reader of a format.
-
-    Args:
-        name: Of the format, as `--format` takes it.
-        suffixes: Endings of its files, such as `.csv`.
-    """
+    """Declare a function as the reader of a format, as `--format` takes it, and of its suffixes."""
     return lambda function: Reader(name=name, suffixes=suffixes, function=function)
 
 
@@ -157,11 +140,12 @@ def read_log(
     if kind not in known:
         raise LogError(f"{path}: format {kind!r}; expected one of {', '.join(known)}.")
     if kind == "mcap" and path.is_dir():
-        path = _only_mcap(path)
+        inside = sorted(path.glob("*.mcap"))
+        if len(inside) != 1:
+            raise LogError(f"{path}: {len(inside)} MCAP files in it; name the one to read.")
+        path = inside[0]
     chosen = known[kind]
     given = {name: value for name, value in options.items() if value is not None}
-    if rate_hz is not None and "rate_hz" in chosen.options:
-        given["rate_hz"] = rate_hz
     if wrong := [name for name in given if name not in chosen.options]:
         raise LogError(
             f"{path}: {', '.join(wrong)} means nothing for the format {kind}; it takes "
@@ -170,7 +154,9 @@ def read_log(
     try:
         given = {name: _typed(path, chosen, name, value) for name, value in given.items()}
         log = chosen.read(path, robot=robot, **given)
-        return _checked(path, chosen, log, robot, rate_hz)
+        if not isinstance(log, JointLog):
+            raise LogError(f"{path}: the reader {kind} returned {type(log).__name__}.")
+        return replace(log, notes=(*log.notes, *_examined(path, log, robot, rate_hz)))
     except PronkError as error:
         # Names from the file itself may hold line breaks; a message is one sentence.
         raise type(error)(" ".join(str(error).split())) from error.__cause__
@@ -178,7 +164,7 @@ def read_log(
 
 def _typed(path: Path, chosen: Reader, name: str, value: Any) -> Any:
     """Convert an option given as text to the type that a reader declares, where it does."""
-    declared = chosen.parameters[name].annotation
+    declared = chosen.options[name].annotation
     kind = _TYPES.get(getattr(declared, "__name__", declared))
     if kind is None or not isinstance(value, str):
         return value
@@ -191,19 +177,15 @@ def _typed(path: Path, chosen: Reader, name: str, value: Any) -> Any:
         ) from None
 
 
-def _checked(
-    path: Path, chosen: Reader, log: JointLog, robot: RobotSpec | None, rate_hz: float | None
-) -> JointLog:
-    """Check what all logs must pass."""
-    if not isinstance(log, JointLog):
-        raise LogError(f"{path}: the reader {chosen.name} returned {type(log).__name__}.")
-    notes = list(log.notes)
-    if "rate_hz" not in chosen.options:
-        timing = examine(log.time)
-        check_unit(log.time, str(path), "s")
-        if rate_hz is not None:
-            check_rate(timing, str(path), rate_hz)
-        notes.append(timing.words())
+def _examined(
+    path: Path, log: JointLog, robot: RobotSpec | None, rate_hz: float | None
+) -> list[str]:
+    """Check what all logs must pass; returns notes."""
+    timing = examine(log.time)
+    check_unit(log.time, str(path), "s")
+    if rate_hz is not None:
+        check_rate(timing, str(path), rate_hz)
+    notes = [timing.words()]
     if robot is not None and log.robot not in (robot.name, "unknown"):
         raise LogError(
             f"{path}: recorded on {log.robot}, but the robot is {robot.name}; name the right robot."
@@ -212,9 +194,8 @@ def _checked(
         if robot is not None:
             robot.joint(joint)
         check_radians(log, joint)
-        if note := saturation_note(log, joint):
-            notes.append(note)
-    return replace(log, notes=tuple(notes))
+        notes.append(saturation_note(log, joint))
+    return [note for note in notes if note]
 
 
 def find_logs(paths: Iterable[Path | str]) -> list[Path]:
@@ -245,13 +226,7 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
 
 
 def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any) -> list[JointLog]:
-    """Read several logs; a folder that is not itself a log stands for the logs in it.
-
-    Args:
-        paths: Files and folders.
-        processes: Read so many at a time; worth it from four long logs on.
-        options: As for `read_log`; so are the errors.
-    """
+    """Read the logs that `find_logs` finds, several at a time; `options` as for `read_log`."""
     files = find_logs(paths)
     read: Callable[[Path], JointLog] = partial(read_log, **options)
     if processes < 2 or len(files) < _WORTH_PROCESSES:
@@ -280,18 +255,9 @@ def _sniff(path: Path, known: Mapping[str, Reader]) -> str:
             "joint_list.txt) and no MCAP file in it."
         )
     suffixes = _suffixes(known)
-    kind = suffixes.get(path.suffix.lower())
-    if kind is None:
+    if (suffix := path.suffix.lower()) not in suffixes:
         raise LogError(
             f"{path}: the ending {path.suffix!r} names no known format; expected "
             f"{', '.join(suffixes)} or a SAGE folder, or a format, one of {', '.join(known)}."
         )
-    return kind
-
-
-def _only_mcap(folder: Path) -> Path:
-    """The one MCAP file of a rosbag2 folder."""
-    inside = sorted(folder.glob("*.mcap"))
-    if len(inside) != 1:
-        raise LogError(f"{folder}: {len(inside)} MCAP files in it; name the one to read.")
-    return inside[0]
+    return suffixes[suffix]

@@ -6,7 +6,7 @@ A bag does not say which topic is the command, so the command topic must be name
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ def read_joint_states(
     damage: str,
     *,
     robot: str,
-    measured_topic: str | None,
+    measured_topic: str,
     command_topic: str | None,
     command_field: str,
 ) -> JointLog:
@@ -47,7 +47,7 @@ def read_joint_states(
         found: Its messages.
         damage: Why reading ended early, or "".
         robot: Name of the robot.
-        measured_topic: Topic of the measured JointState; `/joint_states` if None.
+        measured_topic: Topic of the measured JointState.
         command_topic: Topic of the commands: JointState, or any message with the field below.
         command_field: Positions in a command message, dots between names, numbers for indices.
 
@@ -56,7 +56,6 @@ def read_joint_states(
     """
     topics = {r.topic: r.schema.name if r.schema else r.encoding for r in found}
     listed = ", ".join(f"{topic} ({name})" for topic, name in sorted(topics.items()))
-    measured_topic = measured_topic or MEASURED_TOPIC
     if topics.get(measured_topic) != JOINT_STATE:
         raise LogError(
             f"{path}: no {JOINT_STATE} on {measured_topic}; it holds {listed}; name the topic "
@@ -69,19 +68,12 @@ def read_joint_states(
         )
     if command_topic not in topics or command_topic == measured_topic:
         raise LogError(f"{path}: no commands on {command_topic}; it holds {listed}.")
-    decode = _decoder(path)
-    states = [(r, decode(r)) for r in found if r.topic == measured_topic]
-    commands = [(r, decode(r)) for r in found if r.topic == command_topic]
-    stamped = all(_stamp(message) > 0.0 for _, message in (*states, *commands))
-
-    def times(pairs: list[tuple[Record, Any]]) -> Array:
-        return np.array([_stamp(m) if stamped else r.log_time * 1e-9 for r, m in pairs])
-
-    joints = tuple(str(name) for name in states[0][1].name)
-    time, sent = times(states), times(commands)
-    wanted = np.array(
-        [_command(path, command_topic, command_field, m, joints) for _, m in commands]
-    )
+    states, received = _decoded(path, found, measured_topic)
+    commands, arrived = _decoded(path, found, command_topic)
+    stamps = [np.array([_stamp(message) for message in each]) for each in (states, commands)]
+    stamped = all((each > 0.0).all() for each in stamps)
+    time, sent = stamps if stamped else (received, arrived)
+    joints = tuple(str(name) for name in states[0].name)
     order = np.argsort(sent, kind="stable")
     index = in_force(sent[order], time)
     known = index >= 0
@@ -91,18 +83,17 @@ def read_joint_states(
             f"{command_topic}; at least 2 are needed."
         )
 
-    def measured(name: str) -> Array | None:
-        """One field of every state, shape (n, joints); None where a state lacks it."""
-        if any(len(getattr(message, name)) == 0 for _, message in states):
-            return None
-        rows = [_by_name(path, measured_topic, m.name, getattr(m, name), joints) for _, m in states]
-        matrix = np.array(rows)[known]
-        # Drivers fill what they do not measure with NaN.
-        return None if name != "position" and np.isnan(matrix).any() else matrix
+    def values(messages: Sequence[Any], topic: str, field: str) -> Array:
+        return np.array([_values(path, topic, message, field, joints) for message in messages])
 
-    position = measured("position")
-    if position is None:
-        raise LogError(f"{path}: the states on {measured_topic} hold no positions.")
+    def measured(field: str) -> Array | None:
+        """Velocity or effort; None where a state lacks it."""
+        if any(len(getattr(state, field)) == 0 for state in states):
+            return None
+        matrix = values(states, measured_topic, field)[known]
+        # Drivers fill what they do not measure with NaN.
+        return None if np.isnan(matrix).any() else matrix
+
     notes = {
         f"{(~known).sum()} states before the first command were dropped": not known.all(),
         "message headers hold no stamps on both topics; times of reception were used": not stamped,
@@ -112,8 +103,8 @@ def read_joint_states(
         robot=robot,
         joints=joints,
         time=time[known] - time[known][0],
-        command=wanted[order][index[known]],
-        position=position,
+        command=values(commands, command_topic, command_field)[order][index[known]],
+        position=values(states, measured_topic, "position")[known],
         velocity=measured("velocity"),
         torque=measured("effort"),
         source=str(path),
@@ -124,25 +115,26 @@ def read_joint_states(
     )
 
 
-def _decoder(path: Path) -> Callable[[Record], Any]:
-    factory = DecoderFactory()
-
-    def decode(record: Record) -> Any:
+def _decoded(path: Path, found: Sequence[Record], topic: str) -> tuple[list[Any], Array]:
+    """Messages of a topic, and when they were received [s]."""
+    factory, messages = DecoderFactory(), []
+    records = [record for record in found if record.topic == topic]
+    for record in records:
         try:
-            decoder = factory.decoder_for(record.encoding, record.schema)
-            if decoder is not None:
-                return decoder(record.data)
+            decode = factory.decoder_for(record.encoding, record.schema)
+            messages.append(None if decode is None else decode(record.data))
         except Exception as error:
             # The decoder is generated from the file's own schema and may fail in any way.
             raise LogError(
-                f"{path}: a message on {record.topic} cannot be decoded ({type(error).__name__})."
+                f"{path}: a message on {topic} cannot be decoded ({type(error).__name__})."
             ) from error
-        raise LogError(
-            f"{path}: messages on {record.topic} are encoded as {record.encoding!r} with schema "
-            f"{record.schema.encoding if record.schema else 'none'!r}; expected cdr with ros2msg."
-        )
-
-    return decode
+        if decode is None:
+            raise LogError(
+                f"{path}: messages on {topic} are encoded as {record.encoding!r} with schema "
+                f"{record.schema.encoding if record.schema else 'none'!r}; expected cdr with "
+                "ros2msg."
+            )
+    return messages, np.array([record.log_time * 1e-9 for record in records])
 
 
 def _stamp(message: Any) -> float:
@@ -151,30 +143,8 @@ def _stamp(message: Any) -> float:
     return 0.0 if stamp is None else float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
-def _by_name(
-    path: Path, topic: str, names: Sequence[str], values: Sequence[float], joints: Sequence[str]
-) -> list[float]:
-    """Values in the order of `joints`."""
-    if names and len(names) == len(values):
-        each = dict(zip(names, values, strict=True))
-        if missing := [joint for joint in joints if joint not in each]:
-            raise LogError(
-                f"{path}: a message on {topic} lacks {', '.join(missing)}; it names "
-                f"{', '.join(names)}."
-            )
-        return [float(each[joint]) for joint in joints]
-    if len(values) != len(joints):
-        raise LogError(
-            f"{path}: a message on {topic} holds {len(values)} values; expected {len(joints)} "
-            f"({', '.join(joints)})."
-        )
-    return [float(value) for value in values]
-
-
-def _command(
-    path: Path, topic: str, field: str, message: Any, joints: Sequence[str]
-) -> list[float]:
-    """Positions of one command message."""
+def _values(path: Path, topic: str, message: Any, field: str, joints: Sequence[str]) -> list[float]:
+    """Numbers of a field, one a joint in the order of `joints`."""
     value = message
     for part in field.split("."):
         try:
@@ -182,21 +152,28 @@ def _command(
         except (AttributeError, IndexError, TypeError):
             slots = [s for s in getattr(value, "__slots__", ()) if not s.startswith("_")]
             raise LogError(
-                f"{path}: commands on {topic} have no field {field!r} (at {part!r}"
+                f"{path}: messages on {topic} have no field {field!r} (at {part!r}"
                 + (f"; there are {', '.join(slots)}" if slots else "")
                 + "); name it with command_field."
             ) from None
-    names = getattr(message, "name", None) or getattr(message, "joint_names", None) or []
     try:
-        return _by_name(path, topic, list(names), [_number(v) for v in value], joints)
+        numbers = [math.nan if math.isinf(number) else float(number) for number in value]
     except TypeError:
         raise LogError(
-            f"{path}: field {field!r} of the commands on {topic} is not a list of numbers; name "
+            f"{path}: field {field!r} of the messages on {topic} is not a list of numbers; name "
             "another with command_field."
         ) from None
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError
-    return float(value) if math.isfinite(value) else math.nan
+    names = list(getattr(message, "name", None) or getattr(message, "joint_names", None) or ())
+    if names and len(names) == len(numbers):
+        if missing := [joint for joint in joints if joint not in names]:
+            raise LogError(
+                f"{path}: a message on {topic} lacks {', '.join(missing)}; it names "
+                f"{', '.join(names)}."
+            )
+        return [numbers[names.index(joint)] for joint in joints]
+    if len(numbers) != len(joints):
+        raise LogError(
+            f"{path}: a message on {topic} holds {len(numbers)} values; expected {len(joints)} "
+            f"({', '.join(joints)})."
+        )
+    return numbers

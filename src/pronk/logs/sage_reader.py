@@ -59,9 +59,6 @@ def read_sage(path: Path, *, robot: RobotSpec | None = None) -> Columns:
 
     The command in force at a state is the last one at or before its timestamp. Joints of the
     SO-101 get their robot's names; the unit of its Jaw stays `unknown` unless a scale is given.
-
-    Raises:
-        LogError: A file is missing or cannot be read; the message names file and row.
     """
     for name in FILES:
         if not (path / name).is_file():
@@ -103,7 +100,7 @@ def read_sage(path: Path, *, robot: RobotSpec | None = None) -> Columns:
         torque=torque[kept],
         unit="rad",
         time_unit="us",
-        units=tuple("unknown" if so101 and name == "Jaw" else "rad" for name in joints),
+        no_angles=("Jaw",) if so101 else (),
         row=lambda i: f"row {int(kept[i]) + 2} of state_motor.csv",
         notes=tuple(note for note, applies in notes.items() if applies),
         sha256=hashlib.sha256("".join(sha256(path / f) for f in FILES).encode()).hexdigest(),
@@ -111,24 +108,20 @@ def read_sage(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     )
 
 
-def _table(path: Path, names: tuple[str, ...]) -> list[list[str]]:
-    """Cells of some columns of a CSV file, one list a row."""
-    header, rows = read_rows(path)
-    for name in names:
-        if name not in header:
-            raise LogError(f"{path}: no column {name!r}; the header is {', '.join(header)}.")
-    return [[row[header.index(name)] for name in names] for row in rows]
-
-
 def _rows(path: Path, lists: tuple[str, ...], width: int) -> tuple[Array, Array]:
     """Timestamps and list columns of one file, shapes (n,) and (lists, n, width)."""
-    rows = _table(path, ("timestamp", *lists))
+    header, rows = read_rows(path)
+    names = ("timestamp", *lists)
+    if missing := [name for name in names if name not in header]:
+        raise LogError(f"{path}: no column {missing[0]!r}; the header is {', '.join(header)}.")
+    columns = [header.index(name) for name in names]
     time, values = np.empty(len(rows)), np.empty((len(lists), len(rows), width))
-    for i, (stamp, *cells) in enumerate(rows):
+    for i, row in enumerate(rows):
+        stamp, *cells = (row[column] for column in columns)
         try:
             time[i] = float(stamp)
+            # JSON, not eval: text of a file must not run.
             for k, cell in enumerate(cells):
-                # JSON, not eval: text of a file must not run.
                 numbers = orjson.loads(cell)
                 if not isinstance(numbers, list) or len(numbers) != width:
                     raise ValueError
@@ -144,10 +137,11 @@ def _rows(path: Path, lists: tuple[str, ...], width: int) -> tuple[Array, Array]
 def _events(path: Path) -> tuple[float, float]:
     """When the motion began and when the motors were disabled, in the file's own unit."""
     found = {"MOTION_START": -np.inf, "DISABLE": np.inf}
-    rows = _table(path, ("timestamp", "event")) if path.is_file() else []
-    for i, (stamp, event) in enumerate(rows):
+    header, rows = read_rows(path) if path.is_file() else ([], [])
+    for i, row in enumerate(rows):
+        cells = dict(zip(header, row, strict=True))
         try:
-            found[event.strip()] = float(stamp)
-        except ValueError:
-            raise LogError(f"{path}: row {i + 2} holds no timestamp.") from None
+            found[cells["event"].strip()] = float(cells["timestamp"])
+        except (KeyError, ValueError):
+            raise LogError(f"{path}: row {i + 2} holds no event and its timestamp.") from None
     return found["MOTION_START"], found["DISABLE"]
