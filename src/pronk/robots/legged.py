@@ -1,25 +1,28 @@
-"""Dimensions of a robot with legs of a hip, a thigh and a shank, read from its model."""
+"""Dimensions of a robot with legs, read from its model."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
+import mujoco
 import numpy as np
 
+from pronk.errors import RobotError
 from pronk.robots import load_robot
 
 
 @dataclass(frozen=True, kw_only=True)
 class Legged:
-    """Legs `LEG`, joints `LEG_JOINT`, bodies `LEG_hip`, `LEG_thigh`, `LEG_shank`."""
+    """Legs `LEG` with joints `LEG_JOINT`; the last two turn a thigh and a shank."""
 
     legs: tuple[str, ...]
     leg_joints: tuple[str, ...]
     default_position: dict[str, float]
     """By joint of a leg [rad]."""
     thigh_length: float
-    """hip_pitch axis to knee axis, in the plane of the leg [m]."""
+    """Axis of the thigh's joint to knee axis, in the plane of the leg [m]."""
     shank_length: float
     """Knee axis to the centre of the foot [m]."""
     foot_radius: float
@@ -33,23 +36,32 @@ class Legged:
 
 
 @lru_cache
-def legged(name: str) -> Legged:
-    """Read the dimensions of a robot."""
+def legged(name: str | Path) -> Legged:
+    """Read the dimensions of a robot from its first leg, whose foot is a sphere on the shank.
+
+    Raises:
+        RobotError: The robot has no legs, or its first leg has no such foot.
+    """
     robot = load_robot(name)
+    if not robot.legs:
+        raise RobotError(f"{robot.name} has no legs; name them as `legs` in its robot.yaml.")
+    leg = f"{robot.legs[0]}_"
+    joints = [joint for joint in robot.joints if joint.name.startswith(leg)]
     model = robot.build_spec().compile()
-    legs = tuple(dict.fromkeys(joint.split("_", 1)[0] for joint in robot.joint_names))
-    parts = tuple(dict.fromkeys(joint.split("_", 1)[1] for joint in robot.joint_names))
-    foot = model.geom(f"{legs[0]}_foot_collision")
+    shank = model.joint(joints[-1].name).bodyid[0]
+    spheres = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    feet = np.flatnonzero(spheres & (model.geom_bodyid == shank))
+    if not len(feet):
+        raise RobotError(f"{robot.name}: the leg {robot.legs[0]} has no sphere as its foot.")
+    base = model.body(robot.base_body)
     return Legged(
-        legs=legs,
-        leg_joints=parts,
-        default_position={
-            part: robot.joint(f"{legs[0]}_{part}").default_position for part in parts
-        },
-        thigh_length=float(-model.body(f"{legs[0]}_shank").pos[2]),
-        shank_length=float(-foot.pos[2]),
-        foot_radius=float(foot.size[0]),
-        standing_height=float(model.body(robot.base_body).pos[2]),
+        legs=robot.legs,
+        leg_joints=tuple(joint.name.removeprefix(leg) for joint in joints),
+        default_position={j.name.removeprefix(leg): j.default_position for j in joints},
+        thigh_length=float(-model.body_pos[shank, 2]),
+        shank_length=float(-model.geom_pos[feet[-1], 2]),
+        foot_radius=float(model.geom_size[feet[-1], 0]),
+        standing_height=float(base.pos[2]),
         total_mass=float(np.sum(model.body_mass)),
-        base_mass=float(model.body(robot.base_body).mass[0]),
+        base_mass=float(base.mass[0]),
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -36,7 +36,11 @@ _Least = Annotated[float, Meta(ge=0.0)]
 _Band = tuple[_Positive, _Positive]
 
 
-class DriveEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class _Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A part of a `robot.yaml`."""
+
+
+class DriveEntry(_Entry):
     """A drive: its torque-speed line or the motor's constants, from which the line follows."""
 
     effort_limit: _Positive
@@ -54,18 +58,13 @@ class DriveEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     viscous_damping: _Least = 0.0
 
     def drive(self, source: str) -> Drive:
-        """Make the drive.
-
-        Raises:
-            RobotError: The torque-speed line is not given, in one way or the other.
-        """
+        """Make the drive; a RobotError names what is missing of its torque-speed line."""
         gear, volts = self.gear_ratio, self.bus_voltage
         if self.phases not in _TORQUE_FACTOR:
             raise RobotError(f"{source}: phases is {self.phases}; expected 1 (brushed) or 3.")
         if self.armature is not None and self.rotor_inertia is not None:
             raise RobotError(f"{source}: give rotor_inertia or armature, not both.")
         torque_factor, emf_factor = _TORQUE_FACTOR[self.phases], _EMF_FACTOR[self.phases]
-        rotor = (self.armature or 0.0) / gear**2
         constant, resistance = self.torque_constant, self.resistance
         if self.joint_torque_constant is not None:
             constant = self.joint_torque_constant / gear
@@ -82,6 +81,7 @@ class DriveEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
                 f"{source}: the torque-speed line is missing; give stall_torque and no_load_speed, "
                 "or torque_constant and resistance."
             )
+        rotor = (self.armature or 0.0) / gear**2
         return Drive(
             gear_ratio=gear,
             rotor_inertia=rotor if self.rotor_inertia is None else self.rotor_inertia,
@@ -96,7 +96,7 @@ class DriveEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         )
 
 
-class GroupEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class GroupEntry(_Entry):
     """Joints that are built alike, their drive, gains and test rig."""
 
     joints: str | None = None
@@ -109,7 +109,7 @@ class GroupEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Patterns of joints of the same limb that are fixed while one of these is excited."""
 
 
-class SymmetryEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SymmetryEntry(_Entry):
     """Limbs that mirror another: prefix of joint names to the prefix of the original."""
 
     mirror: dict[str, str] = msgspec.field(default_factory=dict)
@@ -117,7 +117,7 @@ class SymmetryEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Joints whose coordinate has the opposite sign of the original's."""
 
 
-class AboutEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class AboutEntry(_Entry):
     """Metadata for tables; nothing depends on it."""
 
     model: str = ""
@@ -127,7 +127,7 @@ class AboutEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Name of the training task with mjlab."""
 
 
-class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class RobotFile(_Entry):
     """Content of a `robot.yaml`."""
 
     schema: str
@@ -139,6 +139,7 @@ class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     defaults: GroupEntry = GroupEntry()
     symmetry: SymmetryEntry = SymmetryEntry()
     base_body: str | None = None
+    legs: tuple[str, ...] = ()
     policy_rate_hz: _Positive = 50.0
     timestep_s: _Positive = 0.005
     decimation: Annotated[int, Meta(ge=1)] = 4
@@ -160,11 +161,7 @@ class Model:
 
 @lru_cache
 def read_model(path: Path) -> Model:
-    """Read an MJCF or URDF; angles become radians, inertias explicit; meshes, drives are left out.
-
-    Raises:
-        RobotError: The file is missing or does not compile.
-    """
+    """Read an MJCF or URDF; angles in radians, explicit inertias, no meshes and drives."""
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         text = path.read_text(encoding="utf-8")
@@ -195,11 +192,7 @@ def read_model(path: Path) -> Model:
 
 
 def read_robot(path: Path) -> RobotSpec:
-    """Read a `robot.yaml`.
-
-    Raises:
-        RobotError: The file is missing, has another schema, or disagrees with its model.
-    """
+    """Read a `robot.yaml`; a RobotError names what is wrong in it."""
     try:
         body = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -214,11 +207,7 @@ def read_robot(path: Path) -> RobotSpec:
 
 
 def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
-    """Join a robot file with its model.
-
-    Raises:
-        RobotError: Something is missing or inconsistent; names the entry.
-    """
+    """Join a robot file with its model; a RobotError names the entry that is inconsistent."""
     ticks = file.timestep_s * file.decimation * file.policy_rate_hz
     if abs(ticks - 1.0) > 1e-9:
         raise RobotError(
@@ -226,92 +215,99 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
             "command for `decimation` steps of the simulator."
         )
     model = build().compile()
-    hinges = [
-        model.joint(i).name
-        for i in range(model.njnt)
-        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
-    ]
     base = file.base_body or default_base(model)
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base) < 0:
         raise RobotError(f"{source}: base_body {base!r} is not a body of the model.")
-    limbs = {
-        name: _limb(model, model.joint(name).bodyid[0], model.body(base).id) for name in hinges
+    hinges = {
+        model.joint(i).name: _limb(model, int(model.jnt_bodyid[i]), model.body(base).id)
+        for i in range(model.njnt)
+        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
     }
-    if "default" not in file.poses:
-        raise RobotError(f"{source}: poses.default is missing.")
-    group_of: dict[str, str] = {}
+    groups = _groups(file, hinges, source)
+    copied = (
+        "legs",
+        "policy_rate_hz",
+        "timestep_s",
+        "decimation",
+        "grid_stiffness",
+        "grid_damping",
+    )
+    robot = RobotSpec(
+        name=file.name,
+        joints=tuple(_joint(file, model, name, hinges, groups[name], source) for name in hinges),
+        build_spec=build,
+        base_body=base,
+        **{name: getattr(file, name) for name in copied},
+    )
+    _verify_mirrors(robot, model, source)
+    return robot
+
+
+def _groups(file: RobotFile, hinges: Iterable[str], source: str) -> dict[str, str]:
+    """The group of each hinge."""
+    found: dict[str, str] = {}
     for name, group in file.groups.items():
-        found = fnmatch.filter(hinges, group.joints or name)
-        if not found:
+        members = fnmatch.filter(hinges, group.joints or name)
+        if not members:
             raise RobotError(
                 f"{source}: groups.{name} matches no hinge joint of the model; those are "
                 f"{', '.join(hinges)}."
             )
-        for joint in found:
-            if joint in group_of:
-                raise RobotError(
-                    f"{source}: {joint} is in the groups {group_of[joint]} and {name}."
-                )
-            group_of[joint] = name
-    if missing := [name for name in hinges if name not in group_of]:
+        for joint in members:
+            if joint in found:
+                raise RobotError(f"{source}: {joint} is in the groups {found[joint]} and {name}.")
+            found[joint] = name
+    if missing := [name for name in hinges if name not in found]:
         raise RobotError(f"{source}: {', '.join(missing)} is in no group; add one that matches it.")
-    joints = []
-    for name in hinges:
-        own, shared = file.groups[group_of[name]], file.defaults
-        where = f"{source}: groups.{group_of[name]}"
+    return found
 
-        def entry(field: str, own: Any = own, shared: Any = shared, where: str = where) -> Any:
-            value = getattr(own, field)
-            value = getattr(shared, field) if value is None else value
-            if value is None:
-                raise RobotError(f"{where}.{field} is missing.")
-            return value
 
-        if (drive := entry("drive")) not in file.drives:
-            raise RobotError(
-                f"{where}.drive is {drive!r}; the drives are {', '.join(file.drives)}."
-            )
-        limb = [other for other in hinges if limbs[other] == limbs[name]]
-        patterns = own.clamped or shared.clamped
-        clamped = tuple(other for other in limb if any(fnmatch.fnmatch(other, p) for p in patterns))
-        low, high = model.joint(name).range
-        limited = bool(model.jnt_limited[model.joint(name).id])
-        prefix = next((p for p in file.symmetry.mirror if name.startswith(f"{p}_")), None)
-        mirror = None
-        if prefix is not None:
-            original = file.symmetry.mirror[prefix] + name[len(prefix) :]
-            mirror = (original, -1.0 if name in file.symmetry.negated else 1.0)
-        joints.append(
-            Joint(
-                name=name,
-                group=group_of[name],
-                drive=file.drives[drive].drive(f"{source}: drives.{drive}"),
-                range=(float(low), float(high)) if limited else (-math.pi, math.pi),
-                default_position=_position(file.poses, "default", name, group_of[name], source),
-                folded_position=_position(file.poses, "folded", name, group_of[name], source)
-                if "folded" in file.poses
-                else None,
-                stiffness=entry("stiffness"),
-                damping=entry("damping"),
-                band_hz=entry("band_hz"),
-                clamped=clamped,
-                chain=tuple(other for other in limb if other not in clamped),
-                mirror=mirror,
-            )
-        )
-    robot = RobotSpec(
-        name=file.name,
-        joints=tuple(joints),
-        build_spec=build,
-        base_body=base,
-        policy_rate_hz=file.policy_rate_hz,
-        timestep_s=file.timestep_s,
-        decimation=file.decimation,
-        grid_stiffness=file.grid_stiffness,
-        grid_damping=file.grid_damping,
+def _joint(
+    file: RobotFile,
+    model: mujoco.MjModel,
+    name: str,
+    limbs: Mapping[str, int],
+    group: str,
+    source: str,
+) -> Joint:
+    """One joint, from its group, the defaults, the poses and the model."""
+    entry: dict[str, Any] = {}
+    for field in ("drive", "stiffness", "damping", "band_hz"):
+        own, shared = getattr(file.groups[group], field), getattr(file.defaults, field)
+        entry[field] = shared if own is None else own
+        if entry[field] is None:
+            raise RobotError(f"{source}: groups.{group}.{field} is missing.")
+    drive = entry.pop("drive")
+    if drive not in file.drives:
+        drives = ", ".join(file.drives)
+        raise RobotError(f"{source}: groups.{group}.drive is {drive!r}; the drives are {drives}.")
+    limb = [other for other in limbs if limbs[other] == limbs[name]]
+    patterns = file.groups[group].clamped or file.defaults.clamped
+    clamped = tuple(other for other in limb if any(fnmatch.fnmatch(other, p) for p in patterns))
+    (low, high), limited = model.joint(name).range, model.jnt_limited[model.joint(name).id]
+    mirror = None
+    for prefix, original in file.symmetry.mirror.items():
+        if name.startswith(f"{prefix}_"):
+            sign = -1.0 if name in file.symmetry.negated else 1.0
+            mirror = (original + name.removeprefix(prefix), sign)
+    position: dict[str, float | None] = {"folded": None}
+    for pose in ("default", "folded") if "folded" in file.poses else ("default",):
+        values = file.poses.get(pose, {})
+        if name not in values and group not in values:
+            raise RobotError(f"{source}: poses.{pose} has no entry for {name} or {group}.")
+        position[pose] = float(values[name] if name in values else values[group])
+    return Joint(
+        name=name,
+        group=group,
+        drive=file.drives[drive].drive(f"{source}: drives.{drive}"),
+        range=(float(low), float(high)) if limited else (-math.pi, math.pi),
+        default_position=position["default"] or 0.0,
+        folded_position=position["folded"],
+        clamped=clamped,
+        chain=tuple(other for other in limb if other not in clamped),
+        mirror=mirror,
+        **entry,
     )
-    _verify_mirrors(robot, model, source)
-    return robot
 
 
 def default_base(model: mujoco.MjModel) -> str:
@@ -327,15 +323,6 @@ def _limb(model: mujoco.MjModel, body: int, base: int) -> int:
     while model.body_parentid[body] not in (base, 0):
         body = int(model.body_parentid[body])
     return int(body)
-
-
-def _position(
-    poses: Mapping[str, Mapping[str, float]], pose: str, joint: str, group: str, source: str
-) -> float:
-    values = poses[pose]
-    if joint not in values and group not in values:
-        raise RobotError(f"{source}: poses.{pose} has no entry for {joint} or its group {group}.")
-    return float(values.get(joint, values.get(group, 0.0)))
 
 
 def _verify_mirrors(robot: RobotSpec, model: mujoco.MjModel, source: str) -> None:

@@ -45,9 +45,6 @@ def free_spec(
     simulator's, the integrator implicitfast; keyframe `default` is the default pose.
 
     Values by joint name replace the drive's.
-
-    Raises:
-        RobotError: A joint is unknown.
     """
     spec = robot.build_spec()
     spec.option.timestep = robot.timestep_s
@@ -73,10 +70,8 @@ def bench_spec(
     by their own drives. Contacts are off, gravity is on. Geoms are left out (the bench is
     computed, not drawn). Keyframe `default` is the default pose with the commands that hold it.
 
-    Values by joint name replace those of the robot's drives.
-
-    Raises:
-        RobotError: A joint is unknown, or something outside the chain could move with it.
+    Values by joint name replace those of the robot's drives. A RobotError names a joint outside
+    the chain that could move with it.
     """
     joint = robot.joint(joint_name)
     spec = robot.build_spec()
@@ -90,15 +85,8 @@ def bench_spec(
     _remove_other_branches(spec, base, {*joint.chain, *joint.clamped}, joint_name)
     for name in joint.clamped:
         _weld(spec, name, robot.joint(name).default_position)
-    add_drives(
-        spec,
-        robot,
-        joint.chain,
-        stiffness=stiffness,
-        damping=damping,
-        armature=armature,
-        frictionloss=frictionloss,
-    )
+    passive = {"armature": armature, "frictionloss": frictionloss}
+    add_drives(spec, robot, joint.chain, stiffness=stiffness, damping=damping, **passive)
     _add_default_key(spec, robot, with_command=True)
     return spec
 
@@ -114,11 +102,7 @@ def set_inertia(body: Any, model: mujoco.MjModel) -> None:
 
 
 def remove_geoms(spec: mujoco.MjSpec) -> None:
-    """Delete all geoms; bodies whose inertia comes from them keep it as an explicit one.
-
-    Raises:
-        RobotError: The model does not compile.
-    """
+    """Delete all geoms; bodies whose inertia comes from them keep it as an explicit one."""
     ignored = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     inferred = [body for body in spec.bodies[1:] if ignored or not body.explicitinertial]
     if inferred:
@@ -150,9 +134,6 @@ def add_drives(
     Actuators have the names of their joints and take position commands [rad].
 
     Values by joint name [N m/rad, N m s/rad, kg m^2, N m] replace those of the robot's drives.
-
-    Raises:
-        RobotError: A joint is unknown.
     """
     names = tuple(joint_names)
     _check_names(robot, stiffness, damping)
@@ -179,15 +160,8 @@ def add_drives(
 def set_drive_gains(
     model: mujoco.MjModel, joint_name: str, drive: Drive, stiffness: float, damping: float
 ) -> None:
-    """Change the gains of one drive in a compiled model, exactly as compiling anew would.
-
-    Raises:
-        RobotError: The model has no drive of that name.
-    """
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, joint_name)
-    if index < 0:
-        names = ", ".join(model.actuator(i).name for i in range(model.nu))
-        raise RobotError(f"the model has no drive {joint_name!r}; its drives are {names}.")
+    """Change the gains of one drive in a compiled model, exactly as compiling anew would."""
+    index = _index(model, "actuator", model.nu, joint_name)
     model.actuator_gainprm[index, [_KP, _KD]] = _voltage_gains(drive, stiffness, damping)
 
 
@@ -202,20 +176,22 @@ def set_passive(
 
     Constants that MuJoCo derives from them are computed anew, so the model is the one that
     compiling with these values would give. None leaves a value.
-
-    Raises:
-        RobotError: The model has no joint of that name.
     """
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint_name)
-    if index < 0:
-        names = ", ".join(model.joint(i).name for i in range(model.njnt))
-        raise RobotError(f"the model has no joint {joint_name!r}; its joints are {names}.")
-    dof = model.jnt_dofadr[index]
+    dof = model.jnt_dofadr[_index(model, "joint", model.njnt, joint_name)]
     if frictionloss is not None:
         model.dof_frictionloss[dof] = frictionloss
     if armature is not None:
         model.dof_armature[dof] = armature
         mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _index(model: mujoco.MjModel, kind: str, count: int, name: str) -> int:
+    """Index of a named joint or actuator of a compiled model."""
+    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    if index < 0:
+        names = ", ".join(getattr(model, kind)(i).name for i in range(count))
+        raise RobotError(f"the model has no {kind} {name!r}; it has {names}.")
+    return int(index)
 
 
 def _constants(drive: Drive) -> tuple[float, float]:
@@ -293,12 +269,11 @@ def _add_default_key(spec: mujoco.MjSpec, robot: RobotSpec, *, with_command: boo
     """Keyframe `default`: the default pose, the base where the model puts it."""
     model = spec.compile()
     qpos = model.qpos0.copy()
-    for index in range(model.njnt):
-        name = model.joint(index).name
-        if name in robot.joint_names:
-            qpos[model.jnt_qposadr[index]] = robot.joint(name).default_position
+    for joint in robot.joints:
+        index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint.name)
+        if index >= 0:
+            qpos[model.jnt_qposadr[index]] = joint.default_position
+    key = spec.add_key(name="default", qpos=qpos)
     if with_command:
-        command = [robot.joint(model.actuator(i).name).default_position for i in range(model.nu)]
-        spec.add_key(name="default", qpos=qpos, ctrl=command)
-    else:
-        spec.add_key(name="default", qpos=qpos)
+        names = [model.actuator(i).name for i in range(model.nu)]
+        key.ctrl = [robot.joint(name).default_position for name in names]

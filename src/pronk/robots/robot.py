@@ -38,11 +38,7 @@ class Drive:
     """Torque per ampere, motor side [N m/A]."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible drives.
-
-        Raises:
-            RobotError: A value that must be positive is not, or friction is negative.
-        """
+        """Refuse values that must be positive and are not, and negative friction."""
         positive = ("gear_ratio", "stall_torque", "no_load_speed", "effort_limit", "bus_voltage")
         for name in (*positive, "rotor_inertia", "frictionloss", "viscous_damping"):
             value = getattr(self, name)
@@ -105,6 +101,8 @@ class RobotSpec:
     """Builds a fresh, free-floating (or, for an arm, fixed) model without actuators."""
     base_body: str
     """Body that the bench holds still."""
+    legs: tuple[str, ...] = ()
+    """Prefixes of the joints of each leg, from the hip down; empty for a robot without legs."""
     source: str = ""
     """What `load_robot` reads it from: a shipped name or a path."""
     policy_rate_hz: float = 50.0
@@ -118,22 +116,16 @@ class RobotSpec:
     """Damping axis of the grid search [N m s/rad] (paper F7)."""
 
     def __post_init__(self) -> None:
-        """Check that names are unique and every reference resolves.
-
-        Raises:
-            RobotError: A joint is named twice, or refers to one that does not exist.
-        """
+        """Check that names are unique and every reference resolves."""
         names = self.joint_names
         if len(set(names)) != len(names):
             raise RobotError(f"{self.name}: a joint is named twice in {', '.join(names)}.")
         for joint in self.joints:
-            others = (*joint.clamped, *joint.chain, joint.original[0])
-            for other in others:
-                if other not in names:
-                    raise RobotError(
-                        f"{self.name}: {joint.name} refers to {other!r}; "
-                        f"the joints are {', '.join(names)}."
-                    )
+            for other in (*joint.clamped, *joint.chain, joint.original[0]):
+                self.joint(other)
+        for leg in self.legs:
+            if not any(name.startswith(f"{leg}_") for name in names):
+                raise RobotError(f"{self.name}: the leg {leg!r} has no joint {leg}_*.")
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -146,11 +138,7 @@ class RobotSpec:
         return tuple(dict.fromkeys(joint.group for joint in self.joints))
 
     def joint(self, name: str) -> Joint:
-        """The joint called `name`.
-
-        Raises:
-            RobotError: There is none; the message lists those there are.
-        """
+        """The joint called `name`; a RobotError lists those there are."""
         for joint in self.joints:
             if joint.name == name:
                 return joint
@@ -159,18 +147,10 @@ class RobotSpec:
         )
 
     def group(self, name: str) -> tuple[Joint, ...]:
-        """The joints of one group, in file order.
-
-        Raises:
-            RobotError: There is no such group.
-        """
+        """The joints of one group, in file order; a RobotError lists the groups."""
         members = tuple(joint for joint in self.joints if joint.group == name)
         if not members:
             raise RobotError(
                 f"{self.name} has no joint group {name!r}; its groups are {', '.join(self.groups)}."
             )
         return members
-
-
-Robot = RobotSpec
-"""The former name."""
