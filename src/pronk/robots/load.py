@@ -40,7 +40,7 @@ class _Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """A part of a `robot.yaml`."""
 
 
-class DriveEntry(_Entry):
+class DriveEntry(_Entry, frozen=True):
     """A drive: its torque-speed line or the motor's constants, from which the line follows."""
 
     effort_limit: _Positive
@@ -96,7 +96,7 @@ class DriveEntry(_Entry):
         )
 
 
-class GroupEntry(_Entry):
+class GroupEntry(_Entry, frozen=True):
     """Joints that are built alike, their drive, gains and test rig."""
 
     joints: str | None = None
@@ -109,7 +109,7 @@ class GroupEntry(_Entry):
     """Patterns of joints of the same limb that are fixed while one of these is excited."""
 
 
-class SymmetryEntry(_Entry):
+class SymmetryEntry(_Entry, frozen=True):
     """Limbs that mirror another: prefix of joint names to the prefix of the original."""
 
     mirror: dict[str, str] = msgspec.field(default_factory=dict)
@@ -117,7 +117,7 @@ class SymmetryEntry(_Entry):
     """Joints whose coordinate has the opposite sign of the original's."""
 
 
-class AboutEntry(_Entry):
+class AboutEntry(_Entry, frozen=True):
     """Metadata for tables; nothing depends on it."""
 
     model: str = ""
@@ -127,7 +127,7 @@ class AboutEntry(_Entry):
     """Name of the training task with mjlab."""
 
 
-class RobotFile(_Entry):
+class RobotFile(_Entry, frozen=True):
     """Content of a `robot.yaml`."""
 
     schema: str
