@@ -19,8 +19,8 @@ from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
-from pronk.match.fit import GAINS
 from pronk.match.measured_joint import measured_joints
+from pronk.match.parameters import GAINS
 from pronk.match.response_fit import interval, refine
 from pronk.match.settings import MatchSettings
 from pronk.report.paper import published

@@ -69,8 +69,7 @@ def engine_gap(
     log = synthetic_log(fine, joint, [excitation], *gains, threads=chosen.threads)
     goal = measured_joints(log, joint, robot, chosen)[0]
     with MujocoSimulator(robot, threads=chosen.threads) as simulator:
-        best = quick_search(simulator, [goal], *axes(robot, chosen.grid_points))[0].fit
-        matched = (best.stiffness, best.damping)
+        matched = quick_search(simulator, [goal], *axes(robot, chosen.grid_points))[1][0].gains
         requests = [SimRequest(goal, *gains), SimRequest(goal, *matched)]
         coarse, closed = responses(simulator, requests, whole=True)
     hz = goal.measured.omega / (2.0 * np.pi)

@@ -41,14 +41,14 @@ ROBOT = "mini_cheetah"
 
 def bare_rollout(rig: JointTestRig, goal: MeasuredJoint, pairs: int, threads: int) -> float:
     """Steps per second of `mujoco.rollout` alone over a rig's model and a target's command."""
-    command = goal.trace.mirrored(rig.robot)[2][: goal.steps]
-    control = np.tile(rig.control(rig.pose(goal.trace)), (pairs, goal.steps, 1))
+    pose, command = goal.trace.excitation(rig.robot, goal.steps)
+    control = np.tile(rig.control(pose), (pairs, goal.steps, 1))
     control[:, :, rig.actuator] += command
     models = [copy.copy(rig.model) for _ in range(pairs)]
     data = [mujoco.MjData(rig.model) for _ in range(threads)]
     width = mujoco.mj_stateSize(rig.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     initial = np.zeros((pairs, width))
-    initial[:, 1 : 1 + rig.model.nq] = rig.pose(goal.trace)
+    initial[:, 1 : 1 + rig.model.nq] = pose
     with mujoco.rollout.Rollout(nthread=threads) as pool:
         begin = time.perf_counter()
         pool.rollout(models, data, initial, control)
@@ -92,7 +92,7 @@ def run(
     with MujocoSimulator(robot, threads=threads) as simulator:
         for k, group in enumerate(groups):
             rig = simulator.rig(group[0].joint)
-            before = simulator.count.steps
+            before = simulator.steps
             pairs = min(BARE_PAIRS, points**2)
             speeds = [bare_rollout(rig, group[0], pairs, threads)]
             begin = time.perf_counter()
@@ -100,22 +100,22 @@ def run(
             def advance(share: float, k: int = k) -> None:
                 progress("grid", (k + share) / len(groups))
 
-            found = search(rig, group, stiffness, damping, progress=advance)
+            found = search(simulator, group, stiffness, damping, progress=advance)
             grid_s += time.perf_counter() - begin
             speeds.append(bare_rollout(rig, group[0], pairs, threads))
-            bare_s += (simulator.count.steps - before) / float(np.mean(speeds))
+            bare_s += (simulator.steps - before) / float(np.mean(speeds))
             grids |= {goal.joint: grid for goal, grid in zip(group, found, strict=True)}
-        steps = simulator.count.steps
+        steps = simulator.steps
         begin = time.perf_counter()
         fits = refine(simulator, goals, [grids[goal.joint].gains for goal in goals])
         refine_s = time.perf_counter() - begin
     begin = time.perf_counter()
     with MujocoSimulator(robot, threads=threads) as simulator:
-        quick = quick_search(simulator, goals, stiffness, damping)
+        quick = zip(*quick_search(simulator, goals, stiffness, damping), strict=True)
     quick_s = time.perf_counter() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in bytes on macOS, else in kB
     rows = []
-    for goal, fit, one in zip(goals, fits, quick, strict=True):
+    for goal, fit, (cells, off_grid) in zip(goals, fits, quick, strict=True):
         gains, best = known[goal.joint], grids[goal.joint]
         nearest = tuple(
             int(np.argmin(np.abs(axis - value)))
@@ -127,9 +127,9 @@ def run(
                 "known": gains,
                 "grid": best.gains,
                 "nearest_cell": best.cell == nearest,
-                "refined": (fit.stiffness, fit.damping),
-                "quick": (one.fit.stiffness, one.fit.damping),
-                "quick_same_cell": one.grid.cell == best.cell,
+                "refined": fit.gains,
+                "quick": off_grid.gains,
+                "quick_same_cell": cells.cell == best.cell,
             }
         )
     return {

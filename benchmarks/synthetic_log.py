@@ -15,7 +15,7 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import simulate
-from pronk.simulators.simulator import JointRigs, play
+from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ def synthetic_log(
             log (signal by signal, repeat by repeat), each at least as long as the segment.
         delay_s: From a command to its effect [s], not necessarily whole steps.
         simulator: Rigs of another simulator, which then also gives the timestep.
-        options: Those of `pronk.simulators.mujoco.JointTestRig`.
+        options: Those of `pronk.simulators.mujoco.simulate`.
 
     Returns:
         A log of this joint alone; its `stiffness` and `damping` are those of the robot's drive, not
@@ -108,7 +108,8 @@ def synthetic_log(
             amplitude=float(np.abs(one.offsets).max()),
         )
         if simulator is not None:
-            simulated = play(simulator.rig(joint), trace, *gains)
+            names = ("stiffness", "damping")
+            simulated = simulator.play(trace, dict(zip(names, gains, strict=True)))
         else:
             simulated = simulate(robot, trace, *gains, **options)
         count = len(ticks) * per_tick

@@ -13,13 +13,12 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.readers import read_log
 from pronk.match import gains as gains_file
 from pronk.match import match_logs
-from pronk.match.arm import fit_whole_arm
-from pronk.match.fit import DRIVE_MODE
-from pronk.match.measured_joint import trusted_frequency, trusted_samples
+from pronk.match.arm import fit_whole_arm, trusted_frequency, trusted_samples
+from pronk.match.parameters import DRIVE_MODE
 from pronk.match.predict import drives_of, predict
 from pronk.match.result import MatchResult
 from pronk.robots import load_robot
-from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together
+from pronk.simulators.chain import ChainSimulation, moves_together
 
 SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the SO-101 recordings are not here")
@@ -29,13 +28,13 @@ JOINTS = ARM.joint_names[:5]
 COUNT = 2.0 * np.pi / 4096
 """Encoder of the servo: 12 bits."""
 KNOWN = {
-    name: JointDrive(
-        stiffness=17.8,
-        damping=0.75 + 0.1 * i,
-        armature=0.02 + 0.004 * i,
-        frictionloss=0.1 + 0.05 * i,
-        delay=0.008 + 0.002 * i,
-    )
+    name: {
+        "stiffness": 17.8,
+        "damping": 0.75 + 0.1 * i,
+        "armature": 0.02 + 0.004 * i,
+        "frictionloss": 0.1 + 0.05 * i,
+        "delay": 0.008 + 0.002 * i,
+    }
     for i, name in enumerate(JOINTS)
 }
 
@@ -61,28 +60,28 @@ def commands(seconds: float, lines_hz: tuple[float, float], amplitude: float) ->
     )
 
 
-def recorded_with(log: JointLog, known: dict[str, JointDrive]) -> JointLog:
-    """What an arm with these drives and 12-bit encoders would have recorded."""
+def recorded_with_known_drives(log: JointLog) -> JointLog:
+    """What an arm with the known drives and 12-bit encoders would have recorded."""
     with ChainSimulation(ARM, [log]) as bench:
-        position = bench.run([known])[0][0]
+        position = bench.run([KNOWN])[0][0]
     return replace(log, position=np.round(position / COUNT) * COUNT)
 
 
 def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
-    log = recorded_with(commands(65.0, (0.15, 8.0), 0.35), KNOWN)
+    log = recorded_with_known_drives(commands(65.0, (0.15, 8.0), 0.35))
     joints, _ = fit_whole_arm([log], ARM, DRIVE_MODE, most_held=0)
     for name, known in KNOWN.items():
         joint = joints[name]
-        assert joint.stiffness == known.stiffness
-        assert joint.damping == pytest.approx(known.damping, rel=0.03)
-        assert joint.armature == pytest.approx(known.armature, rel=0.08)
-        assert joint.frictionloss == pytest.approx(known.frictionloss, rel=0.05)
-        assert joint.delay_s == pytest.approx(known.delay, abs=1e-3)
+        assert joint.stiffness == known["stiffness"]
+        assert joint.damping == pytest.approx(known["damping"], rel=0.03)
+        assert joint.armature == pytest.approx(known["armature"], rel=0.08)
+        assert joint.frictionloss == pytest.approx(known["frictionloss"], rel=0.05)
+        assert joint.delay_s == pytest.approx(known["delay"], abs=1e-3)
         assert joint.rmse < 1e-3 < joint.published_rmse
 
 
 def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
-    log = recorded_with(commands(65.0, (0.05, 0.4), 0.1), KNOWN)
+    log = recorded_with_known_drives(commands(65.0, (0.05, 0.4), 0.1))
     with pytest.raises(IdentifiabilityError, match=r"armature.*a sweep to higher frequencies"):
         fit_whole_arm([log], ARM, DRIVE_MODE, most_held=0)
 
@@ -148,7 +147,7 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
 ) -> None:
     gains_file.save(tmp_path / "gains.yaml", matched.gains)
     gains = gains_file.load(tmp_path / "gains.yaml")
-    assert drives_of(ARM, gains)["elbow_flex"].frictionloss == pytest.approx(
+    assert drives_of(ARM, gains)["elbow_flex"]["frictionloss"] == pytest.approx(
         matched.joints["elbow_flex"].frictionloss, rel=1e-5
     )
     found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains)

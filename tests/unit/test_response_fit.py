@@ -1,4 +1,4 @@
-"""Gains off the grid: known gains found again, intervals that cover, amplitudes, the engine."""
+"""Gains off the grid: known gains found again, intervals that cover, amplitudes, delay, engine."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 from benchmarks.engine import engine_gap
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.excitation.signals import Chirp
-from pronk.match.fit import GAINS
 from pronk.match.measured_joint import MeasuredJoint, measured_joints
-from pronk.match.pipeline import amplitude_flags, amplitude_gains
+from pronk.match.parameters import GAINS
+from pronk.match.pipeline import amplitude_flags, amplitude_gains, command_delay
 from pronk.match.response_fit import interval, refine
 from pronk.match.result import amplitude_spread
 from pronk.match.settings import MatchSettings
@@ -32,12 +32,17 @@ JOINT = "FR_hip_pitch"
 def known(
     joint: str = JOINT,
     gains: tuple[float, float] = KNOWN,
+    *,
+    amplitudes: tuple[float, ...] = (0.25,),
     repeats: int = 1,
     **options: Any,
-) -> MeasuredJoint:
-    excitation = Excitation(offsets=Chirp(length_s=8.0).samples(), repeats=repeats)
-    log = synthetic_log(ROBOT, joint, [excitation], *gains, **options)
-    return measured_joints(log, joint, ROBOT, SHORT)[0]
+) -> list[MeasuredJoint]:
+    excitations = [
+        Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples(), repeats=repeats)
+        for a in amplitudes
+    ]
+    log = synthetic_log(ROBOT, joint, excitations, *gains, **options)
+    return measured_joints(log, joint, ROBOT, SHORT)
 
 
 def repeated(goal: MeasuredJoint, responses: np.ndarray) -> MeasuredJoint:
@@ -45,36 +50,42 @@ def repeated(goal: MeasuredJoint, responses: np.ndarray) -> MeasuredJoint:
     return replace(goal, measured=measured)
 
 
+def delayed(goal: MeasuredJoint, delay_s: float) -> MeasuredJoint:
+    return repeated(goal, goal.measured.repeats * np.exp(-1j * goal.measured.omega * delay_s))
+
+
 def test_known_gains_are_found_from_anywhere_on_the_grid_whatever_the_delay() -> None:
-    knee, pair = known("FR_knee", (22.0, 0.523)), (22.0, 0.523)
-    # Phase is disregarded (F9).
-    late = knee.measured.response * np.exp(-1j * knee.measured.omega * 0.004)
-    goals = [known(), replace(knee, measured=replace(knee.measured, response=late))]
+    goals = [known()[0], delayed(known("FR_knee", (22.0, 0.523))[0], 0.004)]
     with MujocoSimulator(ROBOT) as simulator:
         for start in ((13.0, 0.1), (27.0, 0.7), (13.0, 0.7), (27.0, 0.1)):
-            for fit, gains in zip(
-                refine(simulator, goals, [start, start]), (KNOWN, pair), strict=True
-            ):
+            fits = refine(simulator, goals, [start, start])
+            for fit, gains in zip(fits, (KNOWN, (22.0, 0.523)), strict=True):
                 assert fit.solution.settled
-                assert (fit.stiffness, fit.damping) == pytest.approx(gains, rel=1e-3)
+                assert fit.gains == pytest.approx(gains, rel=1e-3)
                 assert fit.error_db < 0.01
+
+
+def test_delay_is_the_lag_of_the_phase_where_the_joint_is_coherent() -> None:
+    goal = known()[0]
+    band, late = ROBOT.joint(JOINT).band_hz, delayed(goal, 0.002).measured
+    assert command_delay(late, goal.measured.response, band) == pytest.approx(0.002, abs=1e-6)
+    incoherent = replace(late, coherence=np.zeros_like(late.coherence))
+    assert command_delay(incoherent, goal.measured.response, band) == 0.0
 
 
 def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
     """95 % intervals, 200 trials of three repeats each, noise coloured at 2 Hz: 90 to 99 %."""
     rng = np.random.default_rng(2)
     trials, repeats = 200, 3
-    clean = known()
-    excitation = Excitation(offsets=Chirp(length_s=8.0).samples(), repeats=repeats)
     noise = partial(coloured_noise, rng, deviation=0.003, corner_hz=2.0, rate_hz=500.0)
+    excitation = Excitation(offsets=Chirp(length_s=8.0).samples(), repeats=repeats)
     log = synthetic_log(ROBOT, JOINT, [excitation], *KNOWN, noise=list(noise((repeats, 6000))))
     measured = measured_joints(log, JOINT, ROBOT, SHORT)[0]
     operator = operators(log, JOINT, SHORT.estimator)[0][0]
     errors = noise((trials, repeats, len(operator.time))) @ operator.matrix(operator.time)
-    goals = [repeated(measured, response) for response in clean.measured.response + errors]
+    goals = [repeated(measured, one) for one in known()[0].measured.response + errors]
     with MujocoSimulator(ROBOT) as simulator:
-        fits = refine(simulator, goals, [KNOWN] * trials)
-    found = [interval(fit) for fit in fits]
+        found = [interval(fit) for fit in refine(simulator, goals, [KNOWN] * trials)]
     assert all(one.flags == () for one in found)
     for name, true in zip(GAINS, KNOWN, strict=True):
         covered = sum(low <= true <= high for low, high in (one.ci95[name] for one in found))
@@ -86,7 +97,7 @@ def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
 
 def test_each_repeat_is_fitted_by_itself() -> None:
     others = np.array([(16.4, 0.380), (16.5, 0.384), (16.6, 0.386)])
-    each = [known(gains=(kp, kd)) for kp, kd in others]
+    each = [known(gains=(kp, kd))[0] for kp, kd in others]
     both = repeated(each[0], np.array([goal.measured.response for goal in each]))
     with MujocoSimulator(ROBOT) as simulator:
         fit = refine(simulator, [both], [(17.0, 0.4)])[0]
@@ -101,7 +112,7 @@ def test_each_repeat_is_fitted_by_itself() -> None:
 
 def test_few_repeats_are_flagged() -> None:
     rng = np.random.default_rng(3)
-    two = known(repeats=2, noise=list(0.002 * rng.standard_normal((2, 6000))))
+    two = known(repeats=2, noise=list(0.002 * rng.standard_normal((2, 6000))))[0]
     one = replace(two, measured=replace(two.measured, repeats=two.measured.repeats[:1]))
     with MujocoSimulator(ROBOT) as simulator:
         pair, single = (interval(fit) for fit in refine(simulator, [two, one], [KNOWN, KNOWN]))
@@ -116,11 +127,7 @@ def test_few_repeats_are_flagged() -> None:
 def test_friction_that_the_simulator_lacks_shows_between_amplitudes(
     friction: float, flagged: bool
 ) -> None:
-    excitations = [
-        Excitation(offsets=Chirp(length_s=8.0, amplitude=a).samples()) for a in (0.25, 0.1)
-    ]
-    log = synthetic_log(ROBOT, "FR_knee", excitations, 20.0, 0.5, frictionloss=friction)
-    goals = measured_joints(log, "FR_knee", ROBOT, SHORT)
+    goals = known("FR_knee", (20.0, 0.5), amplitudes=(0.25, 0.1), frictionloss=friction)
     with MujocoSimulator(ROBOT) as simulator:
         gains = amplitude_gains(refine(simulator, goals, [(20.0, 0.5)] * 2))
     assert gains[:, 0] == pytest.approx([0.25, 0.1], rel=1e-3)

@@ -100,9 +100,9 @@ def test_chunks_and_threads_change_nothing() -> None:
     trace = trace_of("FR_hip_pitch", short_chirp())
     stiffness, damping = np.linspace(14, 26, 7), np.linspace(0.2, 0.6, 7)
     with JointTestRig(ROBOT, "FR_hip_pitch", chunk=3) as rig:
-        command = trace.mirrored(ROBOT)[2]
-        found = np.empty((7, len(command)))
-        for part, position in rig.run([command], [rig.pose(trace)], stiffness, damping):
+        found = np.empty((7, len(trace.command)))
+        values = {"stiffness": stiffness, "damping": damping}
+        for part, position in rig.run([trace], values, len(trace.command)):
             found[part] = position
     one = simulate(ROBOT, trace, stiffness[4], damping[4], threads=1)[0]
     centre = ROBOT.joint("FR_hip_pitch").default_position

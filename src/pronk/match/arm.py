@@ -14,31 +14,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.fit import (
-    PARAMETERS,
     Estimate,
+    Problem,
     Solution,
-    begin,
     block_moves,
-    bounds,
-    checked_names,
     estimate,
     jackknife,
     solve,
 )
-from pronk.match.identifiability import EXPERIMENTS
-from pronk.match.measured_joint import DB, trusted_samples
+from pronk.match.measured_joint import DB
+from pronk.match.parameters import PARAMETERS, checked_names
 from pronk.match.result import JointFit
 from pronk.response.estimate import estimate as estimate_response
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import ChainSimulation, Drives, JointDrive, excited_joints
+from pronk.simulators.chain import ChainSimulation, published
+from pronk.simulators.mujoco import Drives
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -53,57 +53,46 @@ _SETTLED = 1e-3
 """Relative change of cost or parameters that ends the search: far below the intervals."""
 _HOLD_FIRST = ("armature", "stiffness", "delay", "offset", "frictionloss", "damping")
 """Of several parameters that cannot be distinguished, the first of these is held."""
+_COHERENT = 0.95
+_SEGMENT_S = 5.0
+_EXCITED = 1e-3
+"""Power of the command, over its largest, from which on a frequency counts as excited."""
+_WIDE = 8.0
+"""A recording shows where coherence ends only if it was coherent over three octaves below: a sweep
+does; a few lines or a motion that mostly sticks do not."""
+_WINDOW_S = 2.0
+_AT_LIMIT = 0.25
+"""Share of its power that a sine at the limit keeps, filtered forwards and backwards."""
 
 
-class TimeProblem:
-    """Residuals of the drives of one arm in time, as a `Problem`."""
+class TimeProblem(Problem):
+    """Residuals of the drives of one arm in time."""
 
     def __init__(
         self,
         arm: ChainSimulation,
         masks: Sequence[Mask],
-        fitted: Mapping[str, tuple[str, ...]],
-        start: Drives,
+        fitted: Mapping[str, Sequence[str]],
+        found: Drives,
         progress: Callable[[int], None],
     ) -> None:
-        """Take in the recordings.
+        """Take the recordings and the samples of them to use, shape (n, joints) each.
 
-        Args:
-            arm: The arm and its recordings.
-            masks: Samples to use, shape (n, joints) a recording.
-            fitted: Names of the parameters to fit, by joint.
-            start: Drives to begin with; the robot's published ones if not given.
-            progress: Called with the number of simulations so far.
+        `found` holds drives from an earlier fit, the published ones where a joint is missing;
+        `progress` is called with the number of simulations so far.
         """
-        self.arm, self.fitted = arm, fitted
-        self.slots = [(joint, name) for joint in arm.joints for name in fitted[joint]]
-        """Joint and name of every searched number."""
-        published = {joint: JointDrive.published(arm.robot, joint) for joint in arm.joints}
-        self._start = published | dict(start)
-        names = [name for _, name in self.slots]
-        self.low, self.high = bounds(names)
-        self.begin = begin(
-            names,
-            [getattr(self._start[joint], name) for joint, name in self.slots],
-            [joint in start for joint, _ in self.slots],
-        )
+        start = {joint: published(arm.robot, joint) for joint in arm.joints}
+        super().__init__(start | dict(found), fitted, refitted=found)
+        self.arm, self.fitted, self.masks = arm, fitted, masks
         self.measured = arm.measured()
-        self._masks = masks
-        self._kinds = [name for name in PARAMETERS if name in names]
+        self._kinds = [name for name in PARAMETERS if name in {name for _, name in self.slots}]
         self._evaluations, self._progress = 0, progress
         self._last: tuple[Array, Array] | None = None
-
-    def drives(self, x: Array) -> dict[str, JointDrive]:
-        """Drives that some searched numbers stand for."""
-        out = dict(self._start)
-        for (joint, name), value in zip(self.slots, x, strict=True):
-            out[joint] = replace(out[joint], **{name: PARAMETERS[name].unscaled(float(value))})
-        return out
 
     def residual(self, x: Array) -> Array:
         """Simulated less measured [rad], 0 where not trusted, one joint after another."""
         if self._last is None or not np.array_equal(self._last[0], x):
-            self._last = (x.copy(), self._simulated([self.drives(x)])[0])
+            self._last = (x.copy(), self._simulated([self.values(x)])[0])
         return self._last[1]
 
     def jacobian(self, x: Array) -> Array:
@@ -115,7 +104,7 @@ class TimeProblem:
         sets = []
         for kind in self._kinds:
             mine = np.array([name == kind for _, name in self.slots])
-            sets.append(self.drives(np.where(mine, moved, x)))
+            sets.append(self.values(np.where(mine, moved, x)))
         before, after = self.residual(x), self._simulated(sets)
         out = np.zeros((len(before), len(x)))
         for i, (joint, name) in enumerate(self.slots):
@@ -132,7 +121,7 @@ class TimeProblem:
     def residuals(self, positions: Sequence[Array]) -> Array:
         """Residuals of simulated positions, one array a recording."""
         parts = []
-        for position, measured, mask in zip(positions, self.measured, self._masks, strict=True):
+        for position, measured, mask in zip(positions, self.measured, self.masks, strict=True):
             # What diverged is as wrong as a joint can be, not undefined.
             wrong = np.clip(np.nan_to_num(position - measured, nan=np.pi), -np.pi, np.pi)
             parts.append(np.where(mask, wrong, 0.0))
@@ -152,7 +141,7 @@ def fit_whole_arm(
     *,
     most_held: int = 2,
     threads: int = 2,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[dict[str, JointFit], dict[str, str]]:
     """Fit drive parameters of every joint that moves in some recordings.
 
@@ -178,11 +167,6 @@ def fit_whole_arm(
         raise LogError("no recordings; the fit of an arm needs at least one.")
     names = checked_names(names, tuple(PARAMETERS))
     most = _ROUNDS * (1 + len(names))
-
-    def report(evaluations: int) -> None:
-        if progress is not None:
-            progress(min(evaluations / most, 0.99))
-
     with ChainSimulation(robot, logs, threads=threads) as arm:
         masks, limit_hz = _trusted(arm)
         blocks = _blocks(logs)
@@ -192,25 +176,68 @@ def fit_whole_arm(
                 f"{MIN_BLOCKS}."
             )
         held: dict[str, tuple[str, ...]] = dict.fromkeys(arm.joints, ())
-        start: dict[str, JointDrive] = {}
+        found: dict[str, dict[str, float]] = {}
         while True:
             fitted = {j: tuple(n for n in names if n not in held[j]) for j in arm.joints}
-            problem = TimeProblem(arm, masks, fitted, start, report)
+            problem = TimeProblem(
+                arm, masks, fitted, found, lambda count: progress(min(count / most, 0.99))
+            )
             solution = solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
-            estimates = _estimates(problem, solution, np.concatenate(masks).T, blocks)
+            estimates = _estimates(problem, solution, blocks)
             unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
             if not unknown:
-                break
-            start = problem.drives(solution.x)
+                fits = _joint_fits(problem, solution, estimates, held, limit_hz)
+                return fits, arm.excluded
+            found = problem.values(solution.x)
             for joint, few in unknown.items():
                 if len(held[joint]) == most_held or len(fitted[joint]) == 1:
                     _refuse(unknown)
                 worst = min(few, key=_HOLD_FIRST.index)
                 held[joint] = (*held[joint], worst)
-                value = getattr(JointDrive.published(robot, joint), worst)
-                start[joint] = replace(start[joint], **{worst: value})
-        fits = _joint_fits(problem, solution, estimates, held, masks, limit_hz)
-        return fits, arm.excluded
+                found[joint][worst] = published(robot, joint)[worst]
+
+
+def trusted_frequency(time: Array, command: Array, position: Array) -> float:
+    """Frequency at which the coherence of a sweep falls below 0.95 [Hz], from arrays of shape (n,).
+
+    A servo has limits of its own (acceleration, speed, torque) that no gain describes. Beyond them
+    the response is no longer a linear joint's, and the coherence of a sweep that runs into them
+    falls. Infinity if it does not, or if the recording is too narrow to show it.
+    """
+    rate = (len(time) - 1) / (time[-1] - time[0])
+    width = min(round(_SEGMENT_S * rate), len(time))
+    hz, power = signal.welch(command, rate, nperseg=width)
+    if power.max() == 0.0 or np.ptp(position) == 0.0:
+        return float("inf")
+    _, coherence = signal.coherence(command, position, rate, nperseg=width)
+    excited = power > _EXCITED * power.max()
+    excited[0] = False  # each segment's mean is removed, so 0 Hz is not excited
+    good = excited & (coherence >= _COHERENT)
+    first = int(np.argmax(good))
+    fallen = np.flatnonzero(excited[first:] & ~good[first:])
+    if not good.any() or len(fallen) == 0:
+        return float("inf")
+    last = hz[first + fallen[0] - 1]
+    return float(hz[first + fallen[0]]) if last >= _WIDE * hz[first] else float("inf")
+
+
+def trusted_samples(log: JointLog, joint: str) -> tuple[Mask, float]:
+    """Samples that a fit may use, and the trusted frequency [Hz].
+
+    The mask, shape (n,), is false where, over two seconds, the command is mostly above the trusted
+    frequency.
+    """
+    column, rate = log.column(joint), log.rate_hz
+    command = log.command[:, column]
+    limit = trusted_frequency(log.time, command, log.position[:, column])
+    if not limit < 0.45 * rate:
+        return np.ones(len(log.time), dtype=bool), limit
+    about = command - command.mean()
+    high = signal.sosfiltfilt(signal.butter(4, limit, "highpass", fs=rate, output="sos"), about)
+    window = np.ones(max(round(_WINDOW_S * rate), 1))
+    share = signal.fftconvolve(high**2, window, "same")
+    whole = signal.fftconvolve(about**2, window, "same")
+    return np.asarray(share <= _AT_LIMIT * np.maximum(whole, 0.0)), limit
 
 
 def _trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
@@ -219,14 +246,13 @@ def _trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
     The frequency is infinite where no recording ran out of coherence.
     """
     masks, limit = [], dict.fromkeys(arm.joints, float("inf"))
-    for log in arm.logs:
-        excited, _ = excited_joints(log, arm.robot)
+    for log, excited in zip(arm.logs, arm.excited, strict=True):
         mask = np.zeros((len(log.time), len(arm.joints)), dtype=bool)
-        for i, joint in enumerate(arm.joints):
-            if joint in excited:
-                mask[:, i], highest = trusted_samples(log, joint)
-                if not mask[:, i].all():
-                    limit[joint] = min(limit[joint], highest)
+        for joint in excited:
+            own, highest = trusted_samples(log, joint)
+            mask[:, arm.joints.index(joint)] = own
+            if not own.all():
+                limit[joint] = min(limit[joint], highest)
         masks.append(mask)
     return masks, limit
 
@@ -244,17 +270,18 @@ def _blocks(logs: Sequence[JointLog]) -> NDArray[np.int64]:
 
 
 def _estimates(
-    problem: TimeProblem, solution: Solution, masks: Mask, blocks: NDArray[np.int64]
+    problem: TimeProblem, solution: Solution, blocks: NDArray[np.int64]
 ) -> dict[str, Estimate]:
     """Values and intervals of every joint; those at a bound are flagged."""
-    out = {}
-    for (joint, names), mask in zip(problem.fitted.items(), masks, strict=True):
+    out, values = {}, problem.values(solution.x)
+    for (joint, names), mask in zip(
+        problem.fitted.items(), np.concatenate(problem.masks).T, strict=True
+    ):
         rows = problem.block(joint)
         mine = [i for i, (name, _) in enumerate(problem.slots) if name == joint]
         jacobian = solution.jacobian[rows][:, mine][mask]
         moves = block_moves(jacobian, solution.residual[rows][mask], blocks[mask])
-        drive = vars(problem.drives(solution.x)[joint])
-        found = estimate(names, solution.x[mine], jackknife(moves), len(moves) - 1, drive)
+        found = estimate(names, solution.x[mine], jackknife(moves), len(moves) - 1, values[joint])
         flags = tuple(
             f"{name} at the bound of the search, {found.values[name]:.3g} {PARAMETERS[name].unit}"
             for name, i in zip(names, mine, strict=True)
@@ -268,9 +295,10 @@ def _refuse(unknown: Mapping[str, tuple[str, ...]]) -> None:
     """Raise for parameters that are not identified."""
     words = "; ".join(f"{joint}: {', '.join(names)}" for joint, names in unknown.items())
     wanted = {name for names in unknown.values() for name in names}
-    cures = "; ".join(EXPERIMENTS[name] for name in PARAMETERS if name in wanted)
+    remedies = "; ".join(PARAMETERS[name].remedy for name in PARAMETERS if name in wanted)
     raise IdentifiabilityError(
-        f"these recordings do not identify {words}; fit fewer parameters, or record more: {cures}."
+        f"these recordings do not identify {words}; fit fewer parameters, or record more: "
+        f"{remedies}."
     )
 
 
@@ -279,75 +307,75 @@ def _joint_fits(
     solution: Solution,
     estimates: Mapping[str, Estimate],
     held: Mapping[str, tuple[str, ...]],
-    masks: Sequence[Mask],
     limit_hz: Mapping[str, float],
 ) -> dict[str, JointFit]:
     """Every joint with the response of the recording that shows most of its band."""
     arm, out = problem.arm, {}
-    matched, naive = arm.run([problem.drives(solution.x), {}])
+    matched, naive = arm.run([problem.values(solution.x), {}])
     naive_residual = problem.residuals(naive)
     for i, (name, found) in enumerate(estimates.items()):
-        low, high = arm.robot.joint(name).band_hz
-        band = (low, min(high, limit_hz[name]))
-        best: tuple[int, Mask, FrequencyResponse] | None = None
-        for k, log in enumerate(arm.logs):
-            try:
-                measured = estimate_response(log, name)[0]
-            except LogError:
-                continue  # not excited, or stuck, in this recording
-            inside = measured.band(*band, COHERENCE_MIN)
-            if best is None or inside.sum() > best[1].sum():
-                best = (k, inside, measured)
         rows = problem.block(name)
-        mask = np.concatenate(masks)[:, i]
-        share = mask.sum() / sum(len(p) for p in problem.measured if np.isfinite(p[0, i]))
+        mask = np.concatenate(problem.masks)[:, i]
         flags = [
             f"{one} held at {found.values[one]:.4g}: these recordings do not identify it; "
-            f"{EXPERIMENTS[one]}"
+            f"{PARAMETERS[one].remedy}"
             for one in held[name]
         ]
         if np.isfinite(limit_hz[name]):
+            share = mask.sum() / sum(len(p) for p in problem.measured if np.isfinite(p[0, i]))
             flags.append(
                 f"used up to {limit_hz[name]:.2g} Hz, where the coherence falls "
                 f"({100 * share:.0f} % of the samples)"
             )
-        fit = JointFit(
-            joint=name,
-            stiffness=found.values["stiffness"],
-            damping=found.values["damping"],
-            armature=found.values["armature"],
-            frictionloss=found.values["frictionloss"],
-            delay_s=found.values["delay"],
-            ci95=found.ci95,
-            covariance=found.covariance,
+        simulated = [(one[:, i], other[:, i]) for one, other in zip(matched, naive, strict=True)]
+        out[name] = JointFit.of(
+            name,
+            found,
             held=held[name],
             rmse=_rms(solution.residual[rows][mask]),
             published_rmse=_rms(naive_residual[rows][mask]),
             flags=(*flags, *found.flags),
+            **_compared(arm, name, simulated, limit_hz[name]),
         )
-        if best is not None and best[1].any():
-            k, inside, measured = best
-            one, other = (_response(arm.logs[k], name, p[k][:, i]) for p in (matched, naive))
-            fit = replace(
-                fit,
-                responses=(measured,),
-                band_hz=band,
-                coherence_min=float(measured.coherence[inside].min()),
-                matched=one.response,
-                naive=other.response,
-                error_db=_rms(DB * np.log(one.gain[inside] / measured.gain[inside])),
-                naive_error_db=_rms(DB * np.log(other.gain[inside] / measured.gain[inside])),
-            )
-        out[name] = fit
     return out
+
+
+def _compared(
+    arm: ChainSimulation, joint: str, simulated: Sequence[tuple[Array, Array]], limit_hz: float
+) -> dict[str, Any]:
+    """Fields of `JointFit` that compare responses; none where no recording gives a response.
+
+    `simulated` holds the positions with matched and published parameters for each recording.
+    """
+    low, high = arm.robot.joint(joint).band_hz
+    band = (low, min(high, limit_hz))
+    found: list[tuple[int, Mask, FrequencyResponse]] = []
+    for k, log in enumerate(arm.logs):
+        try:
+            measured = estimate_response(log, joint)[0]
+        except LogError:
+            continue  # not excited, or stuck, in this recording
+        found.append((k, measured.band(*band, COHERENCE_MIN), measured))
+    if not any(inside.any() for _, inside, _ in found):
+        return {}
+    k, inside, measured = max(found, key=lambda each: int(each[1].sum()))
+    log, responses = arm.logs[k], []
+    for position in simulated[k]:
+        # Through the same estimator as the recording's.
+        positions = log.position.copy()
+        positions[:, log.column(joint)] = position
+        responses.append(estimate_response(replace(log, position=positions), joint)[0])
+    errors = [_rms(DB * np.log(one.gain[inside] / measured.gain[inside])) for one in responses]
+    return {
+        "responses": (measured,),
+        "band_hz": band,
+        "coherence_min": float(measured.coherence[inside].min()),
+        "matched": responses[0].response,
+        "naive": responses[1].response,
+        "error_db": errors[0],
+        "naive_error_db": errors[1],
+    }
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _response(log: JointLog, joint: str, position: Array) -> FrequencyResponse:
-    """Response of a simulated position, through the same estimator as the recording's."""
-    positions = log.position.copy()
-    positions[:, log.column(joint)] = position
-    return estimate_response(replace(log, position=positions), joint)[0]

@@ -1,26 +1,26 @@
-"""Least squares over parameters of joint drives: parameters, problems, solvers, uncertainty.
+"""Least squares over parameters of joint drives: problems, solvers, uncertainty.
 
-Every fit is a `Problem`: residuals and their Jacobian as functions of searched numbers. Responses
-of single joints (`response_fit`) and positions of a whole arm in time (`arm`) differ in nothing
-else. The unit of uncertainty is a block: a repeat of a sweep, or 20 s of a recording in time.
-Noise on a robot is coloured and neighbouring frequencies and samples share it, so intervals that
-take them for independent are several times too narrow; blocks are independent whatever the colour.
-Intervals are Student's t over the blocks, which holds with as few as three.
+Every fit is a `Problem`: residuals and their Jacobian as functions of searched numbers. Another
+kind of measurement is another subclass; solvers and uncertainty stay the same. The unit of
+uncertainty is a block: a repeat of a sweep, or 20 s of a recording in time. Noise on a robot is
+coloured and neighbouring frequencies and samples share it, so intervals that take them for
+independent are several times too narrow; blocks are independent whatever the colour. Intervals are
+Student's t over the blocks, which holds with as few as three.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import least_squares
 
-from pronk.errors import PronkError
-from pronk.match.identifiability import SD_MAX
+from pronk.match.parameters import GAINS, PARAMETERS
 
 Array = NDArray[np.float64]
 
@@ -33,104 +33,50 @@ _ROUNDS = 12
 """Three or four are usual."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Parameter:
-    """One parameter. Positive ones are searched in their logarithm."""
+class Problem(ABC):
+    """Weighted simulated less measured values of some joints, by the parameters of their drives."""
 
-    low: float
-    high: float
-    unit: str
-    start: float
-    """Where the search begins if the published value is smaller."""
-    step: float
-    """Finite difference, of the logarithm or of the parameter itself."""
-    sd_max: float = SD_MAX
-    """Standard deviation beyond which it counts as unknown: relative, or in `unit`."""
-    log: bool = True
+    def __init__(
+        self,
+        start: Mapping[str, Mapping[str, float]],
+        fitted: Mapping[str, Sequence[str]],
+        *,
+        refitted: Collection[str] = (),
+    ) -> None:
+        """Choose what is searched.
 
-    def scaled(self, value: float) -> float:
-        """Return the number that is searched."""
-        return float(np.log(value)) if self.log else float(value)
+        Args:
+            start: Parameters by joint; of the fitted ones, where to begin.
+            fitted: Names of the parameters to fit, by joint.
+            refitted: Joints whose values come from an earlier fit; published values may be a bad
+                place to begin (`Parameter.start`).
+        """
+        self.start = start
+        self.slots = [(joint, name) for joint, names in fitted.items() for name in names]
+        """Joint and name of each searched number."""
+        kinds = [PARAMETERS[name] for _, name in self.slots]
+        self.low = np.array([kind.scaled(kind.low) for kind in kinds])
+        self.high = np.array([kind.scaled(kind.high) for kind in kinds])
+        begin = []
+        for (joint, name), kind in zip(self.slots, kinds, strict=True):
+            value = start[joint][name]
+            least = kind.low if joint in refitted else max(kind.start, kind.low)
+            begin.append(kind.scaled(max(value, least)))
+        margin = 1e-3 * (self.high - self.low)
+        self.begin: Array = np.clip(begin, self.low + margin, self.high - margin)
 
-    def unscaled(self, scaled: float) -> float:
-        """Return the parameter that a searched number stands for."""
-        return float(np.exp(scaled)) if self.log else float(scaled)
+    def values(self, x: Array) -> dict[str, dict[str, float]]:
+        """Parameters by joint that some searched numbers stand for."""
+        out = {joint: dict(values) for joint, values in self.start.items()}
+        for (joint, name), number in zip(self.slots, x, strict=True):
+            out[joint][name] = PARAMETERS[name].unscaled(float(number))
+        return out
 
-
-PARAMETERS: Mapping[str, Parameter] = {
-    "stiffness": Parameter(low=0.5, high=200.0, unit="N m/rad", start=0.5, step=0.02),
-    "damping": Parameter(low=0.005, high=20.0, unit="N m s/rad", start=0.005, step=0.02),
-    "armature": Parameter(low=1e-4, high=1.0, unit="kg m^2", start=1e-3, step=0.03),
-    # From too little friction the search sees no sticking and does not find it.
-    "frictionloss": Parameter(low=1e-3, high=3.0, unit="N m", start=0.2, step=0.03),
-    # A delay is known if it is known to a physics step of the training simulator.
-    "delay": Parameter(low=0.0, high=0.1, unit="s", start=0.01, step=1e-3, sd_max=0.005, log=False),
-    "offset": Parameter(
-        low=-0.2, high=0.2, unit="rad", start=-0.2, step=2e-3, sd_max=0.01, log=False
-    ),
-}
-"""Bounds are far from what servos of small robots have; a fit that ends there is flagged. Steps are
-far above the chatter of dry friction and small against the curvature of the error."""
-
-GAINS = ("stiffness", "damping")
-DRIVE_MODE = ("damping", "armature", "frictionloss", "delay")
-"""Mode `drive`: the stiffness is known."""
-GAINS_MODE = ("stiffness", "damping", "frictionloss", "delay")
-"""Mode `gains` of whole arms: the armature is known; friction and delay are fitted too, so that
-they do not pass for damping."""
-
-
-def checked_names(names: Sequence[str], allowed: Sequence[str]) -> tuple[str, ...]:
-    """Parameter names in the order of `PARAMETERS`.
-
-    Raises:
-        PronkError: A name is unknown, or there is none.
-    """
-    if not names or (unknown := [name for name in names if name not in allowed]):
-        raise PronkError(
-            f"free parameters {', '.join(unknown) if names else 'none'}; expected some of "
-            f"{', '.join(allowed)}."
-        )
-    return tuple(name for name in PARAMETERS if name in names)
-
-
-def bounds(names: Sequence[str]) -> tuple[Array, Array]:
-    """Lower and upper bounds of the searched numbers, each of shape (p,)."""
-    kinds = [PARAMETERS[name] for name in names]
-    low = np.array([kind.scaled(kind.low) for kind in kinds])
-    return low, np.array([kind.scaled(kind.high) for kind in kinds])
-
-
-def begin(names: Sequence[str], values: Sequence[float], fitted: Sequence[bool]) -> Array:
-    """Searched numbers to begin with, inside the bounds, shape (p,).
-
-    Args:
-        names: The parameters.
-        values: Their values so far.
-        fitted: True for a value from an earlier fit; a published one may be a bad place to begin.
-    """
-    low, high = bounds(names)
-    scaled = []
-    for name, value, known in zip(names, values, fitted, strict=True):
-        kind = PARAMETERS[name]
-        scaled.append(kind.scaled(max(value if known else max(value, kind.start), kind.low)))
-    margin = 1e-3 * (high - low)
-    return np.asarray(np.clip(scaled, low + margin, high - margin))
-
-
-class Problem(Protocol):
-    """Residuals as a function of searched numbers."""
-
-    low: Array
-    """Lower bounds, shape (p,)."""
-    high: Array
-    """Upper bounds, shape (p,)."""
-    begin: Array
-    """Where to begin, shape (p,)."""
-
+    @abstractmethod
     def residual(self, x: Array) -> Array:
         """Weighted simulated less measured values, shape (m,)."""
 
+    @abstractmethod
     def jacobian(self, x: Array) -> Array:
         """Derivative of `residual`, shape (m, p)."""
 
@@ -166,12 +112,8 @@ class Solution:
 def solve(problem: Problem, *, tolerance: float, rounds: int) -> Solution:
     """Minimize the sum of squared residuals within the bounds.
 
-    Trust-region reflective method (Branch, Coleman and Li, SIAM J. Sci. Comput. 21, 1999).
-
-    Args:
-        problem: What to solve.
-        tolerance: Relative change of cost or numbers that ends the search.
-        rounds: Most evaluations of the residual.
+    Trust-region reflective method (Branch, Coleman and Li, SIAM J. Sci. Comput. 21, 1999), until
+    the relative change of cost or numbers is below `tolerance`.
     """
     found = least_squares(
         problem.residual,
@@ -194,11 +136,8 @@ def solve_together(
 ) -> list[Solution]:
     """Solve small problems by damped Gauss-Newton, in step, from points near their optima.
 
-    In step because the simulator is fastest with many simulations at once. Bounds are not used.
-
-    Args:
-        problems: What to solve.
-        evaluate: Prepares all residuals and Jacobians of one round, each problem at its point.
+    In step because the simulator is fastest with many simulations at once: `evaluate` prepares all
+    residuals and Jacobians of one round, each problem at its point. Bounds are not used.
     """
     points = [problem.begin for problem in problems]
     best, steps = list(points), [np.full(len(point), np.inf) for point in points]
@@ -209,10 +148,7 @@ def solve_together(
             break
         evaluate([(problems[i], points[i]) for i in active])
         for i in active.copy():
-            residual, jacobian = (
-                problems[i].residual(points[i]),
-                problems[i].jacobian(points[i]),
-            )
+            residual, jacobian = problems[i].residual(points[i]), problems[i].jacobian(points[i])
             cost = float(residual @ residual)
             if not np.isfinite(cost) or not cost <= costs[i] * (1.0 + 1e-9):
                 # Worse (or diverged): go back half the way. A step too short to matter that no
@@ -263,7 +199,7 @@ def block_moves(jacobian: Array, residual: Array, blocks: NDArray[np.int64]) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Fitted parameters of one joint with their uncertainty."""
+    """Parameters of one joint with their uncertainty."""
 
     values: Mapping[str, float]
     """Every parameter, fitted or held."""
@@ -284,32 +220,48 @@ class Estimate:
 
 
 def estimate(
-    fitted: Sequence[str], x: Array, covariance: Array, freedom: int, held: Mapping[str, float]
+    fitted: Sequence[str],
+    x: Array,
+    covariance: Array,
+    freedom: float,
+    held: Mapping[str, float],
+    *,
+    symmetric: bool = False,
 ) -> Estimate:
     """Turn searched numbers into parameters with intervals.
 
     Args:
         fitted: Names of the searched numbers.
         x: The optimum, shape (p,).
-        covariance: Of the searched numbers, shape (p, p).
+        covariance: Of the searched numbers, shape (p, p); of the parameters if `symmetric`.
         freedom: Degrees of freedom of the covariance; with 0 there are no intervals.
         held: Values of the parameters that were not fitted.
+        symmetric: Intervals are symmetric about the parameters, not about the searched numbers.
     """
-    values, ci95 = dict(held), {}
-    sd = np.sqrt(np.diag(covariance))
-    for i, name in enumerate(fitted):
-        kind, at = PARAMETERS[name], float(x[i])
-        values[name] = kind.unscaled(at)
-        if freedom:
+    best = {name: PARAMETERS[name].unscaled(float(at)) for name, at in zip(fitted, x, strict=True)}
+    sd, ci95 = np.sqrt(np.diag(covariance)), {}
+    quantile = stats.t.ppf(0.975, freedom) if freedom else np.nan
+    for name, at, half in zip(fitted, x, quantile * sd, strict=True):
+        if symmetric:
+            low, high = best[name] - half, best[name] + half
+        else:
             # e^20 is as good as infinite and does not overflow.
-            half = min(float(sd[i] * stats.t.ppf(0.975, freedom)), 20.0)
-            floor = -np.inf if name == "offset" else 0.0
-            ci95[name] = (max(kind.unscaled(at - half), floor), kind.unscaled(at + half))
+            low, high = (PARAMETERS[name].unscaled(at + s * min(half, 20.0)) for s in (-1, 1))
+        if freedom:
+            ci95[name] = (float(low if name == "offset" else max(low, 0.0)), float(high))
+    scale = np.array([best[name] if PARAMETERS[name].log else 1.0 for name in fitted])
+    if symmetric:
+        sd = sd / scale
+    else:
+        covariance = covariance * np.outer(scale, scale)
     own = np.zeros((2, 2))
     places = [(k, fitted.index(name)) for k, name in enumerate(GAINS) if name in fitted]
     for k, i in places:
         for n, j in places:
-            own[k, n] = covariance[i, j] * np.exp(x[i]) * np.exp(x[j])
+            own[k, n] = covariance[i, j]
     return Estimate(
-        values=values, covariance=own, sd=dict(zip(fitted, sd.tolist(), strict=True)), ci95=ci95
+        values={**held, **best},
+        covariance=own,
+        sd=dict(zip(fitted, sd.tolist(), strict=True)),
+        ci95=ci95,
     )

@@ -18,6 +18,7 @@ from pronk.files import converted, write_text
 from pronk.simulators.simulator import SimulatorInfo
 
 SCHEMA = "pronk/gains/1"
+NAN = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,25 +29,25 @@ class JointGains:
     """[N m/rad]"""
     damping: float
     """[N m s/rad]"""
-    grid_stiffness: float
-    """The paper's grid optimum [N m/rad]; NaN without a grid."""
-    grid_damping: float
-    """The paper's grid optimum [N m s/rad]; NaN without a grid."""
-    stiffness_ci95: tuple[float, float]
-    damping_ci95: tuple[float, float]
-    covariance: tuple[tuple[float, float], tuple[float, float]]
-    """Of (stiffness, damping), repeats as the unit."""
-    band_hz: tuple[float, float]
-    error_db: float
-    """Root mean square of the gain error in the band at the optimum [dB]."""
-    naive_error_db: float
-    """The same with the gains of the real drive put into the simulator."""
-    coherence_min: float
     armature: float
-    """Held fixed while matching [kg m^2]."""
-    amplitude_spread: float = float("nan")
+    """[kg m^2]"""
+    grid_stiffness: float = NAN
+    """The paper's grid optimum [N m/rad]; NaN without a grid."""
+    grid_damping: float = NAN
+    """The paper's grid optimum [N m s/rad]; NaN without a grid."""
+    stiffness_ci95: tuple[float, float] = (NAN, NAN)
+    damping_ci95: tuple[float, float] = (NAN, NAN)
+    covariance: tuple[tuple[float, float], tuple[float, float]] = ((NAN, NAN), (NAN, NAN))
+    """Of (stiffness, damping), repeats as the unit."""
+    band_hz: tuple[float, float] = (NAN, NAN)
+    error_db: float = NAN
+    """Root mean square of the gain error in the band at the optimum [dB]."""
+    naive_error_db: float = NAN
+    """The same with the gains of the real drive put into the simulator."""
+    coherence_min: float = NAN
+    amplitude_spread: float = NAN
     """Largest relative change of stiffness between amplitudes; NaN with one amplitude."""
-    frictionloss: float = float("nan")
+    frictionloss: float = NAN
     """Dry friction that goes with the gains [N m]; NaN: that of the robot's drive."""
     delay_s: float = 0.0
     """Command delay that goes with the gains [s]."""

@@ -21,10 +21,11 @@ from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
 from pronk.match.response_fit import Fit, refine
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant, plant
-from pronk.simulators.mujoco import JointTestRig
-from pronk.simulators.simulator import JointRig, JointRigs
+from pronk.simulators.mujoco import MujocoSimulator
+from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
+Progress = Callable[[float], None]
 
 DIVERGED_DB = 100.0
 """Error written for a simulation that diverged or did not move [dB]: beyond any response."""
@@ -100,31 +101,33 @@ def alike(targets: Sequence[MeasuredJoint], robot: RobotSpec) -> list[list[Measu
 
 
 def errors(
-    rig: JointRig,
+    rigs: JointRigs,
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
+    armature: float | None = None,
 ) -> Array:
     """Mean squared errors of targets that share one simulation [dB^2], shape (group, b).
 
     Args:
-        rig: The rig of the group's original joint.
+        rigs: The simulator.
         group: Targets whose commands are the same after mirroring.
         stiffness: [N m/rad], shape (b,).
         damping: [N m s/rad], shape (b,).
         progress: Called with the share done, 0 to 1.
+        armature: Rotor inertia [kg m^2]; the drive's if None.
     """
     # One may rest longer than the others at the end.
     longest = max(
-        (g.trace for g in group if g.trace.same_as(group[0].trace, rig.robot)),
+        (g.trace for g in group if g.trace.same_as(group[0].trace, rigs.robot)),
         key=lambda one: len(one.command),
     )
-    command = longest.mirrored(rig.robot)[2]
-    steps = max(goal.steps for goal in group)
-    command = np.pad(command, (0, max(0, steps - len(command))), mode="edge")
+    values = {"stiffness": stiffness, "damping": damping}
+    if armature is not None:
+        values["armature"] = np.full(len(stiffness), armature)
     out = np.empty((len(group), len(stiffness)))
-    for part, position in rig.run([command[:steps]], [rig.pose(longest)], stiffness, damping):
+    for part, position in rigs.run([longest], values, max(goal.steps for goal in group)):
         for k, goal in enumerate(group):
             out[k, part] = mean_square(goal, goal.fit_response(position))
         if progress is not None:
@@ -133,27 +136,27 @@ def errors(
 
 
 def search(
-    rig: JointRig,
+    rigs: JointRigs,
     group: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[GridSearch]:
     """Simulate the whole grid for targets that share one simulation; arguments as `errors`."""
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
     shape = (len(stiffness), len(damping))
-    found = errors(rig, group, kp, kd, progress)
+    found = errors(rigs, group, kp, kd, progress)
     return [
         GridSearch(stiffness=stiffness, damping=damping, error=row.reshape(shape)) for row in found
     ]
 
 
 def search_all(
-    simulator: JointRigs,
+    rigs: JointRigs,
     targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[GridSearch]:
     """The whole grid for any number of targets, each family of mirrored joints simulated once.
 
@@ -162,56 +165,52 @@ def search_all(
     the sides. Their maps are read off the shared simulation, then every node within `_NEAR_DB`
     of the best is simulated for itself. Should any of those have been wrong by half of that, all
     nodes are.
-
-    Returns one search a target, in their order.
     """
-    robot = simulator.robot
     families: list[list[list[MeasuredJoint]]] = []
-    for group in alike(targets, robot):
+    for group in alike(targets, rigs.robot):
         for family in families:
-            if family[0][0].trace.same_as(group[0].trace, robot, sign=-1.0):
+            if family[0][0].trace.same_as(group[0].trace, rigs.robot, sign=-1.0):
                 family.append(group)
                 break
         else:
             families.append([group])
     found: dict[int, GridSearch] = {}
     for k, family in enumerate(families):
-        rig = simulator.rig(family[0][0].joint)
 
         def report(share: float, k: int = k) -> None:
             if progress is not None:
                 progress((k + share) / len(families))
 
         members = [goal for group in family for goal in group]
-        maps = search(rig, members, stiffness, damping, report)
+        maps = search(rigs, members, stiffness, damping, report)
         found |= {id(goal): one for goal, one in zip(members, maps, strict=True)}
         for group in family[1:]:
-            done = _simulate_near(rig, group, [found[id(goal)] for goal in group])
+            done = _simulate_near(rigs, group, [found[id(goal)] for goal in group])
             found |= {id(goal): one for goal, one in zip(group, done, strict=True)}
     return [found[id(goal)] for goal in targets]
 
 
 def _simulate_near(
-    rig: JointRig, group: Sequence[MeasuredJoint], shared: Sequence[GridSearch]
+    rigs: JointRigs, group: Sequence[MeasuredJoint], shared: Sequence[GridSearch]
 ) -> list[GridSearch]:
     """Simulate a group's own command wherever its shared maps could be the best."""
     maps = np.array([one.error for one in shared])
     levels = np.sqrt(maps)
     near = (levels < levels.min(axis=(1, 2), keepdims=True) + _NEAR_DB).any(axis=0)
-    first = shared[0]
-
-    def simulate(nodes: NDArray[np.bool_]) -> None:
+    for nodes in (near, ~near):
         i, j = np.nonzero(nodes)
-        maps[:, i, j] = errors(rig, group, first.stiffness[i], first.damping[j])
-
-    simulate(near)
-    if np.abs(np.sqrt(maps) - levels).max() > 0.5 * _NEAR_DB:
-        simulate(~near)
+        maps[:, i, j] = errors(rigs, group, shared[0].stiffness[i], shared[0].damping[j])
+        if np.abs(np.sqrt(maps) - levels).max() <= 0.5 * _NEAR_DB:
+            break
     return [replace(one, error=row) for one, row in zip(shared, maps, strict=True)]
 
 
 def coarse_search(
-    rig: JointRig, group: Sequence[MeasuredJoint], stiffness: Array, damping: Array
+    rigs: JointRigs,
+    group: Sequence[MeasuredJoint],
+    stiffness: Array,
+    damping: Array,
+    armature: float | None = None,
 ) -> list[GridSearch]:
     """Simulate every seventh node and the border, then ever closer around the best.
 
@@ -226,7 +225,7 @@ def coarse_search(
     def simulate(nodes: NDArray[np.bool_]) -> bool:
         i, j = np.nonzero(nodes & ~done)
         if len(i):
-            maps[:, i, j] = errors(rig, group, stiffness[i], damping[j])
+            maps[:, i, j] = errors(rigs, group, stiffness[i], damping[j], armature=armature)
         done[i, j] = True
         return len(i) > 0
 
@@ -253,20 +252,10 @@ def _around(maps: Array, reach: int, stride: int) -> NDArray[np.bool_]:
     return close
 
 
-@dataclass(frozen=True, kw_only=True)
-class QuickSearch:
-    """What the quick way found for one joint."""
-
-    grid: GridSearch
-    """Corrected map; the nodes around its best are simulated."""
-    fit: Fit
-    """Optimum off the grid, found and verified by simulation."""
-
-
 def quick_search(
-    simulator: JointRigs, targets: Sequence[MeasuredJoint], stiffness: Array, damping: Array
-) -> list[QuickSearch]:
-    """Search the grid linearized everywhere and simulated where it matters; one result a target.
+    rigs: JointRigs, targets: Sequence[MeasuredJoint], stiffness: Array, damping: Array
+) -> tuple[list[GridSearch], list[Fit]]:
+    """Search the grid linearized everywhere and simulated where it matters.
 
     1. The closed form (`pronk.simulators.linear`) over the whole grid gives a first cell.
     2. Gauss-Newton with the simulator goes from there to the optimum off the grid.
@@ -275,57 +264,51 @@ def quick_search(
        corrected map is searched again. Its best few nodes are simulated, and the simulator decides
        between them.
 
+    Returns:
+        Corrected map, simulated around its best node, and optimum off the grid of each target.
+
     Raises:
         PronkError: The simulator is not MuJoCo.
     """
+    if not isinstance(rigs, MujocoSimulator):
+        raise PronkError(
+            f"the quick search linearizes MuJoCo; with simulator {rigs.info.engine} search "
+            "the grid."
+        )
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
-    shape = (len(stiffness), len(damping))
-    plants = [_plant(simulator, goal) for goal in targets]
-    logs = [
-        np.log(np.abs(p.response(kp, kd, amplitude=goal.trace.amplitude)))
-        for p, goal in zip(plants, targets, strict=True)
-    ]
-    first = [
-        int(np.argmin(mean_square(goal, np.exp(log).astype(np.complex128))))
-        for goal, log in zip(targets, logs, strict=True)
-    ]
-    start = [(float(kp[k]), float(kd[k])) for k in first]
-    fits = refine(simulator, targets, start)
+    plants, logs, start = [], [], []
+    for goal in targets:
+        pose = goal.trace.excitation(rigs.robot)[0]
+        plants.append(plant(rigs.rig(goal.joint), pose, goal.omega))
+        response = plants[-1].response(kp, kd, amplitude=goal.trace.amplitude)
+        logs.append(np.log(np.abs(response)))
+        first = int(np.argmin(mean_square(goal, np.exp(logs[-1]).astype(np.complex128))))
+        start.append((float(kp[first]), float(kd[first])))
+    fits = refine(rigs, targets, start)
     maps, requests = [], []
     for goal, p, log, fit in zip(targets, plants, logs, fits, strict=True):
         corrected = log + _correction(p, fit, kp, kd)
         maps.append(mean_square(goal, np.exp(corrected).astype(np.complex128)))
         requests += [SimRequest(goal, kp[k], kd[k]) for k in np.argsort(maps[-1])[:_VERIFIED]]
-    simulated = responses(simulator, requests)
-    found = []
-    for i, (goal, fit) in enumerate(zip(targets, fits, strict=True)):
-        best = np.argsort(maps[i])[:_VERIFIED]
+    simulated = responses(rigs, requests)
+    grids = []
+    for i, (goal, error) in enumerate(zip(targets, maps, strict=True)):
+        best = np.argsort(error)[:_VERIFIED]
         mine = simulated[_VERIFIED * i : _VERIFIED * (i + 1)]
         verified = [float(mean_square(goal, response)) for response in mine]
         # The simulator decides among them; no node without a simulation may win.
-        floor = min(verified)
-        maps[i] = np.maximum(maps[i], floor * (1.0 + 1e-9))
-        maps[i][best] = verified
-        grid = GridSearch(stiffness=stiffness, damping=damping, error=maps[i].reshape(shape))
-        found.append(QuickSearch(grid=grid, fit=fit))
-    return found
-
-
-def _plant(simulator: JointRigs, goal: MeasuredJoint) -> Plant:
-    rig = simulator.rig(goal.joint)
-    if not isinstance(rig, JointTestRig):
-        raise PronkError(
-            f"the quick search linearizes MuJoCo; with simulator {simulator.info.engine} search "
-            "the grid."
-        )
-    return plant(rig, rig.pose(goal.trace), goal.omega)
+        error = np.maximum(error, min(verified) * (1.0 + 1e-9))
+        error[best] = verified
+        error = error.reshape(len(stiffness), len(damping))
+        grids.append(GridSearch(stiffness=stiffness, damping=damping, error=error))
+    return grids, fits
 
 
 def _correction(linear: Plant, fit: Fit, stiffness: Array, damping: Array) -> Array:
     """Log gain of the simulator over that of the closed form, to first order, shape (b, f)."""
     goal = fit.target
     amplitude = goal.trace.amplitude
-    at = np.array([fit.stiffness, fit.damping])
+    at = np.array(fit.gains)
     near = at * np.exp(_STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     closed = np.log(np.abs(linear.response(near[:, 0], near[:, 1], amplitude=amplitude)))
     simulated = fit.solution.jacobian * goal.deviation_db()[:, None] / DB

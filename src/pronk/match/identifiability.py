@@ -22,14 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, PronkError
+from pronk.match.parameters import FREE, GAINS, checked_names
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-PARAMETERS = ("stiffness", "damping", "armature", "frictionloss", "viscous", "delay")
-"""What can be fitted; the rest is taken for known."""
 SD_MAX = 0.3
 """Relative standard deviation beyond which a parameter counts as unknown: at 95 % it would reach
 from a half to twice its value."""
@@ -39,18 +38,6 @@ _SHARE = 0.02
 """Component of a blind direction from which on a parameter takes part in it; below is rounding."""
 _STEP = 1e-4
 _ROUNDS = 40
-
-EXPERIMENTS: Mapping[str, str] = {
-    "stiffness": "a pose or a payload in which gravity loads the joint, or a torque channel, "
-    "gives the stiffness",
-    "damping": "a faster sweep, or another damping on the drive, gives the damping",
-    "armature": "a sweep to higher frequencies at an amplitude that the drive can follow, or a "
-    "second payload, gives the armature",
-    "frictionloss": "a second, smaller amplitude gives the dry friction",
-    "delay": "the phase at higher frequencies, or steps logged faster, gives the delay",
-    "offset": "the same pose approached from both sides gives the offset",
-}
-"""What to record when a drive parameter is not identified."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +50,8 @@ class Experiment:
     """m g l: how much gravity pulls the joint back [N m/rad]; negative where it pulls it over."""
     amplitude: float = 0.25
     """Peak of the command [rad] (paper F3)."""
+    viscous: float = 0.0
+    """Viscous friction of the joint [N m s/rad]."""
     gain_scale: float = 1.0
     """Stiffness on the drive over its nominal value, known."""
     damping_scale: float = 1.0
@@ -96,26 +85,17 @@ def identifiability(
     """Analyse what some experiments can determine of some parameters.
 
     Args:
-        parameters: What is to be fitted, out of `PARAMETERS`.
-        experiments: What is, or would be, recorded.
+        parameters: What is to be fitted, out of `FREE`.
+        experiments: What is, or would be, recorded, at least one.
         nominal: Value of every parameter about which the response is linearized; stiffness and
             damping are needed, the rest is 0 if not given. A fitted parameter must be positive.
 
     Raises:
         PronkError: A parameter is unknown, not positive though fitted, or there is none.
     """
-    values = {**dict.fromkeys(PARAMETERS, 0.0), **nominal}
-    for name in (*parameters, *nominal):
-        if name not in PARAMETERS:
-            raise PronkError(
-                f"there is no parameter {name!r}; expected some of {', '.join(PARAMETERS)}."
-            )
-    if not parameters or not experiments:
-        raise PronkError(
-            f"{len(parameters)} parameters and {len(experiments)} experiments; expected at least "
-            "one of each."
-        )
-    for name in {*parameters, "stiffness", "damping"}:
+    checked_names(parameters, FREE)
+    values = {**dict.fromkeys(FREE, 0.0), **nominal}
+    for name in {*parameters, *GAINS}:
         if not values[name] > 0.0:
             raise PronkError(
                 f"nominal {name} is {values[name]:g}; what is fitted (and stiffness and damping) "
@@ -155,14 +135,14 @@ def require_identifiable(
     result = identifiability(parameters, experiments, nominal)
     if not (confused := result.confused):
         return result
-    cures = [
+    remedies = [
         words
         for words, then in _candidates(experiments)
         if not identifiability(parameters, then, nominal).confused
     ]
     known = "no single further experiment would: fit fewer parameters"
-    if cures:
-        known = "any of these would: " + "; ".join(cures)
+    if remedies:
+        known = "any of these would: " + "; ".join(remedies)
     one = len(confused) == 1
     words = "do not identify" if one else "cannot separate"
     raise IdentifiabilityError(
@@ -207,6 +187,7 @@ def bench_experiment(robot: RobotSpec, joint_name: str) -> tuple[Experiment, dic
     experiment = Experiment(
         inertia=inertia - joint.drive.armature,
         gravity=gravity,
+        viscous=joint.drive.viscous_damping,
         frequency_hz=np.geomspace(*joint.band_hz, 60),
     )
     return experiment, {
@@ -214,7 +195,6 @@ def bench_experiment(robot: RobotSpec, joint_name: str) -> tuple[Experiment, dic
         "damping": joint.damping,
         "armature": joint.drive.armature,
         "frictionloss": joint.drive.frictionloss,
-        "viscous": joint.drive.viscous_damping,
         "delay": robot.timestep_s,
     }
 
@@ -230,7 +210,7 @@ def response(experiment: Experiment, values: Mapping[str, float]) -> ComplexArra
     size = np.ones(len(s))
     # Dry friction depends on the size of the motion it allows: a fixed point, halfway each time.
     for _ in range(_ROUNDS if values["frictionloss"] > 0.0 else 1):
-        passive = inertia * s**2 + (values["viscous"] + dry / size) * s + experiment.gravity
+        passive = inertia * s**2 + (experiment.viscous + dry / size) * s + experiment.gravity
         h = kp * wait / (passive + kd * s + kp)
         size = 0.5 * (size + np.maximum(np.abs(h), 1e-3))
     return np.asarray(h)

@@ -12,13 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
-from pronk.response.estimate import estimate, excitations, log_rate
-from pronk.response.estimate import operator as build_operator
+from pronk.response.estimate import estimate, excitations, log_rate, operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
@@ -35,16 +33,6 @@ frequencies outvote the band, though the model itself is not better than this.""
 _TAIL = 2e-4
 """Absolute error of gain that leaving out the end of the log would cause in a joint that follows
 its command: 0.002 dB at gain 1. Over the paper's grid it was 0.001 dB; nodes differ by 0.02 dB."""
-_COHERENT = 0.95
-_SEGMENT_S = 5.0
-_EXCITED = 1e-3
-"""Power of the command, over its largest, from which on a frequency counts as excited."""
-_WIDE = 8.0
-"""A recording shows where coherence ends only if it was coherent over three octaves below: a sweep
-does; a few lines or a motion that mostly sticks do not."""
-_WINDOW_S = 2.0
-_AT_LIMIT = 0.25
-"""Share of its power that a sine at the limit keeps, filtered forwards and backwards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +51,6 @@ class MeasuredJoint:
     """The part of `matrix` that the fit needs, real and imaginary columns side by side (one real
     product is faster than one of complex numbers), shape (steps, 2 inside). The estimator
     gets nothing of these frequencies from later steps, so they need not be simulated."""
-
     warnings: tuple[str, ...] = ()
     """What could not be used beside it."""
 
@@ -172,24 +159,22 @@ def measured_joints(
         LogError: The joint was not excited or did not move, or its unit is unknown.
         IdentifiabilityError: Too little of the band is coherent at the largest amplitude.
     """
-    chosen = tuple(segment for segment in log.segments if segment.kind != "sine_steps")
+    where = log.source or "log"
     if log.segments:
+        chosen = tuple(segment for segment in log.segments if segment.kind != "sine_steps")
         if not any(joint in segment.joints for segment in chosen):
             raise LogError(
-                f"{log.source or 'log'}: {joint} was excited by sine steps only; match a chirp or "
-                "a multisine, and keep the steps to check it."
+                f"{where}: {joint} was excited by sine steps only; match a chirp or a multisine, "
+                "and keep the steps to check it."
             )
         log = replace(log, segments=chosen)
-    measured = estimate(log, joint, settings.estimator)
-    parts = excitations(log, joint)
+    known, parts = robot.joint(joint), excitations(log, joint)
     rate_hz = log_rate(parts)
-    known, where = robot.joint(joint), log.source or "log"
     found: list[MeasuredJoint] = []
     warnings: list[str] = []
-    for (part, *_), response in zip(parts, measured, strict=True):
+    for (part, *_), response in zip(parts, estimate(log, joint, settings.estimator), strict=True):
         # Of several repeats any one, their commands being the same.
         trace = command_trace(part, part.segments[0], joint, robot)
-        matrix = build_operator(part, joint, settings.estimator, rate_hz).matrix(trace.time)
         try:
             inside = _inside(response, known.band_hz, settings.coherence_min, where)
         except IdentifiabilityError as error:
@@ -198,6 +183,7 @@ def measured_joints(
                 raise
             warnings.append(f"the response at {response.amplitude:.3g} rad is left out: {error}")
             continue
+        matrix = operator(part, joint, settings.estimator, rate_hz).matrix(trace.time)
         found.append(
             MeasuredJoint(
                 trace=trace,
@@ -205,7 +191,7 @@ def measured_joints(
                 measured=response,
                 matrix=matrix,
                 fit_mask=inside,
-                fit_matrix=_fit_matrix(matrix, inside, trace.mirrored(robot)[2]),
+                fit_matrix=_fit_matrix(matrix, inside, trace.excitation(robot)[1]),
             )
         )
     found[0] = replace(found[0], warnings=tuple(warnings))
@@ -315,14 +301,14 @@ class SimRequest:
 
 
 def responses(
-    simulator: JointRigs, requests: Sequence[SimRequest], *, whole: bool = False
+    rigs: JointRigs, requests: Sequence[SimRequest], *, whole: bool = False
 ) -> list[ComplexArray]:
     """Simulate requests; those whose joints mirror one original joint share a rollout.
 
     Armature and friction are given for all requests of one original joint, or for none.
 
     Args:
-        simulator: The training simulator.
+        rigs: The training simulator.
         requests: What to simulate.
         whole: All frequencies of the target instead of those inside its band.
 
@@ -330,29 +316,22 @@ def responses(
         One response a request, of shape (inside,), or (f,) if `whole`; NaN where a simulation
         diverged.
     """
-    robot = simulator.robot
     out: list[ComplexArray] = [np.empty(0, dtype=np.complex128)] * len(requests)
     by_original: dict[str, list[int]] = {}
     for i, request in enumerate(requests):
-        by_original.setdefault(robot.joint(request.target.joint).original[0], []).append(i)
-    for original, indices in by_original.items():
-        rig = simulator.rig(original)
-        goals = [requests[i].target for i in indices]
-        longest = max(len(goal.matrix) if whole else goal.steps for goal in goals)
-        commands = []
-        for goal in goals:
-            command = goal.trace.mirrored(robot)[2][:longest]
-            # Shorter commands rest at the pose until the longest has ended.
-            commands.append(np.pad(command, (0, longest - len(command))))
-        poses = [rig.pose(goal.trace) for goal in goals]
+        original = rigs.robot.joint(request.target.joint).original[0]
+        by_original.setdefault(original, []).append(i)
+    for indices in by_original.values():
+        group = [requests[i] for i in indices]
         values = {
-            name: np.array([getattr(requests[i], name) for i in indices])
+            name: np.array([getattr(request, name) for request in group])
             for name in ("stiffness", "damping", "armature", "frictionloss")
-            if getattr(requests[indices[0]], name) is not None
+            if getattr(group[0], name) is not None
         }
-        for part, position in rig.run(commands, poses, **values):
+        steps = max(len(r.target.matrix) if whole else r.target.steps for r in group)
+        for part, position in rigs.run([request.target.trace for request in group], values, steps):
             for row, k in enumerate(range(part.start, part.stop)):
-                goal, delay = goals[k], requests[indices[k]].delay
+                goal, delay = group[k].target, group[k].delay
                 read = goal.full_response if whole else goal.fit_response
                 response = read(position[row])
                 if delay:
@@ -360,49 +339,3 @@ def responses(
                     response = response * np.exp(-1j * omega * delay)
                 out[indices[k]] = response
     return out
-
-
-def trusted_frequency(time: Array, command: Array, position: Array) -> float:
-    """Frequency at which the coherence of a sweep falls below 0.95 [Hz], from arrays of shape (n,).
-
-    A servo has limits of its own (acceleration, speed, torque) that no gain describes. Beyond them
-    the response is no longer a linear joint's, and the coherence of a sweep that runs into them
-    falls. Infinity if it does not, or if the recording is too narrow to show it.
-    """
-    rate = (len(time) - 1) / (time[-1] - time[0])
-    width = min(round(_SEGMENT_S * rate), len(time))
-    hz, power = signal.welch(command, rate, nperseg=width)
-    excited = power > _EXCITED * power.max()
-    if power.max() == 0.0 or np.ptp(position) == 0.0:
-        return float("inf")
-    _, coherence = signal.coherence(command, position, rate, nperseg=width)
-    excited[0] = False  # each segment's mean is removed, so 0 Hz is not excited
-    good = excited & (coherence >= _COHERENT)
-    if not good.any():
-        return float("inf")
-    first = int(np.argmax(good))
-    fallen = np.flatnonzero(excited[first:] & ~good[first:])
-    if len(fallen) == 0:
-        return float("inf")
-    last = hz[first + fallen[0] - 1]
-    return float(hz[first + fallen[0]]) if last >= _WIDE * hz[first] else float("inf")
-
-
-def trusted_samples(log: JointLog, joint: str) -> tuple[NDArray[np.bool_], float]:
-    """Samples that a fit may use, and the trusted frequency [Hz].
-
-    The mask, shape (n,), is false where, over two seconds, the command is mostly above the trusted
-    frequency.
-    """
-    column = log.column(joint)
-    command = log.command[:, column]
-    limit = trusted_frequency(log.time, command, log.position[:, column])
-    rate = log.rate_hz
-    if not limit < 0.45 * rate:
-        return np.ones(len(log.time), dtype=bool), limit
-    about = command - command.mean()
-    high = signal.sosfiltfilt(signal.butter(4, limit, "highpass", fs=rate, output="sos"), about)
-    window = np.ones(max(round(_WINDOW_S * rate), 1))
-    share = signal.fftconvolve(high**2, window, "same")
-    whole = signal.fftconvolve(about**2, window, "same")
-    return np.asarray(share <= _AT_LIMIT * np.maximum(whole, 0.0)), limit

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from pronk.errors import PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.match.arm import fit_whole_arm
-from pronk.match.fit import DRIVE_MODE, GAINS_MODE, checked_names
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
     MeasuredJoint,
@@ -25,15 +23,24 @@ from pronk.match.measured_joint import (
     merged,
     responses,
 )
+from pronk.match.parameters import DRIVE_MODE, FREE, GAINS_MODE, checked_names
 from pronk.match.ranges import matched_gains
-from pronk.match.response_fit import FREE, Fit, fit_drive, interval, refine, require_sweeps
+from pronk.match.response_fit import (
+    Fit,
+    Pair,
+    fit_drive,
+    interval,
+    refine,
+    require_sweeps,
+    response_fit,
+)
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult, amplitude_spread
 from pronk.match.settings import MatchSettings
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together
 from pronk.simulators.mujoco import mujoco_info
-from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
+from pronk.simulators.simulator import JointRigs, joint_rigs
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -80,50 +87,43 @@ def match_logs(
             cannot be identified.
         PronkError: The device or simulator of the settings cannot be used here.
     """
-    chosen = settings or MatchSettings()
+    chosen, clock = settings or MatchSettings(), _Clock(progress)
     if mode not in ("gains", "drive"):
         raise PronkError(f"mode {mode!r}; expected gains or drive.")
     if free and mode != "drive":
         raise PronkError("parameters to fit can be named in mode drive only.")
-    clock = _Clock(progress)
+    excluded: Mapping[str, str] = {}
+    rate = float("nan")
     if any(moves_together(log) for log in logs):
         if chosen.simulator != "mujoco":
             raise PronkError(
                 f"simulator {chosen.simulator}: several joints of these logs move at once, which "
                 "only simulator mujoco matches; record one joint at a time."
             )
+        info, names = mujoco_info(robot), GAINS_MODE if mode == "gains" else DRIVE_MODE
         with clock.stage("fit"):
-            names = GAINS_MODE if mode == "gains" else DRIVE_MODE
             joints, excluded = fit_whole_arm(
                 logs, robot, names, threads=chosen.threads, progress=clock.report
             )
-        return _result(logs, robot, mujoco_info(robot), joints, clock, excluded=excluded)
-    # The simulator first: a device that is missing must not cost the user an estimate.
-    with joint_rigs(chosen.simulator, robot, threads=chosen.threads, device=chosen.device) as rigs:
-        if mode == "drive":
-            joints = _drives(rigs, logs, checked_names(free or DRIVE_MODE, FREE), chosen, clock)
-            return _result(logs, rigs.robot, rigs.info, joints, clock)
-        joints, rate = _gains(rigs, logs, chosen, clock)
-        return _result(logs, rigs.robot, rigs.info, joints, clock, rate=rate)
-
-
-def _result(
-    logs: Sequence[JointLog],
-    robot: RobotSpec,
-    info: SimulatorInfo,
-    joints: Mapping[str, JointFit],
-    clock: _Clock,
-    *,
-    rate: float = float("nan"),
-    excluded: Mapping[str, str] | None = None,
-) -> MatchResult:
+    else:
+        fitted = checked_names(free or DRIVE_MODE, FREE)
+        # The simulator first: a device that is missing must not cost the user an estimate.
+        with joint_rigs(
+            chosen.simulator, robot, threads=chosen.threads, device=chosen.device
+        ) as rigs:
+            robot, info = rigs.robot, rigs.info
+            found, on_drive = _measured(logs, robot, chosen, clock)
+            if mode == "drive":
+                joints = _match_drives(rigs, found, on_drive, fitted, clock)
+            else:
+                joints, rate = _match_gains(rigs, found, on_drive, chosen, clock)
     gains = {name: joint.gains() for name, joint in joints.items()}
     return MatchResult(
         gains=matched_gains(robot, gains, logs, info),
         joints={name: joint for name, joint in joints.items() if joint.responses},
         seconds=clock.seconds,
         grid_steps_per_second=rate,
-        excluded=excluded or {},
+        excluded=excluded,
     )
 
 
@@ -132,7 +132,7 @@ class _Clock:
 
     def __init__(self, progress: Progress | None) -> None:
         self.seconds: dict[str, float] = {}
-        self._progress = progress
+        self._progress = progress or (lambda stage, share: None)
         self._stage = ""
 
     @contextmanager
@@ -147,165 +147,146 @@ class _Clock:
 
     def report(self, share: float) -> None:
         """Report the share of the stage that is done."""
-        if self._progress is not None:
-            self._progress(self._stage, share)
+        self._progress(self._stage, share)
 
 
-@dataclass
-class _Joint:
-    """One joint: what was measured and what the search found."""
-
-    targets: list[MeasuredJoint]
-    """Largest amplitude, the one that is matched, first."""
-    on_drive: tuple[float, float]
-    """Gains on the real drive while the log was made."""
-    fits: list[Fit] = field(default_factory=list)
-    """One an amplitude."""
-    grid: GridSearch | None = None
-    zero: GridSearch | None = None
-    """The search without rotor inertia."""
-    matched: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
-    naive: ComplexArray = field(default_factory=lambda: np.empty(0, dtype=np.complex128))
-    zero_response: ComplexArray | None = None
+Found = Mapping[str, Sequence[MeasuredJoint]]
+"""Measured responses by joint; largest amplitude, the one that is matched, first."""
 
 
-def _collect(
+def _measured(
     logs: Sequence[JointLog], robot: RobotSpec, settings: MatchSettings, clock: _Clock
-) -> dict[str, _Joint]:
-    """Responses of every excited joint, in the robot's order."""
-    out = {}
+) -> tuple[Found, dict[str, Pair]]:
+    """Responses of every excited joint, in the robot's order, and the gains on its real drive."""
+    found, on_drive = {}, {}
     with clock.stage("estimate"):
         for name, sources in (where := logs_by_joint(logs, robot)).items():
-            out[name] = _Joint(
-                targets=merged([measured_joints(log, name, robot, settings) for log in sources]),
-                on_drive=gains_on_drive(sources[0], name, robot),
-            )
-            clock.report(len(out) / len(where))
-    return out
+            found[name] = merged([measured_joints(log, name, robot, settings) for log in sources])
+            on_drive[name] = gains_on_drive(sources[0], name, robot)
+            clock.report(len(found) / len(where))
+    return found, on_drive
 
 
-def _drives(
+def _match_drives(
     rigs: JointRigs,
-    logs: Sequence[JointLog],
-    names: tuple[str, ...],
-    settings: MatchSettings,
+    found: Found,
+    on_drive: Mapping[str, Pair],
+    fitted: tuple[str, ...],
     clock: _Clock,
 ) -> dict[str, JointFit]:
     """Mode drive: fit the drive of every joint, if the sweeps can separate its parameters."""
-    found = _collect(logs, rigs.robot, settings, clock)
-    for name, one in found.items():
-        require_sweeps(rigs.robot, name, one.targets, names)
+    for name, goals in found.items():
+        require_sweeps(rigs.robot, name, goals, fitted)
     joints = {}
     with clock.stage("fit"):
-        for name, one in found.items():
-            joints[name] = fit_drive(rigs, one.targets, one.on_drive, names)
+        for name, goals in found.items():
+            joints[name] = fit_drive(rigs, goals, on_drive[name], fitted)
             clock.report(len(joints) / len(found))
     return joints
 
 
-def _gains(
-    rigs: JointRigs, logs: Sequence[JointLog], settings: MatchSettings, clock: _Clock
+def _match_gains(
+    rigs: JointRigs,
+    found: Found,
+    on_drive: Mapping[str, Pair],
+    settings: MatchSettings,
+    clock: _Clock,
 ) -> tuple[dict[str, JointFit], float]:
     """The paper's search and its refinement; physics steps per second of the grid."""
-    found = _collect(logs, rigs.robot, settings, clock)
-    joints = list(found.values())
-    main = [one.targets[0] for one in joints]
-    stiffness, damping = axes(rigs.robot, settings.grid_points)
-    rate = float("nan")
+    main = [goals[0] for goals in found.values()]
+    grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
     if settings.method == "quick":
         with clock.stage("quick search"):
-            for one, quick in zip(
-                joints, quick_search(rigs, main, stiffness, damping), strict=True
-            ):
-                one.grid, one.fits = quick.grid, [quick.fit]
+            grids, fits = quick_search(rigs, main, *grid)
     else:
         with clock.stage("grid"):
             begin = time.perf_counter()
-            grids = search_all(rigs, main, stiffness, damping, clock.report)
+            grids = search_all(rigs, main, *grid, clock.report)
             # Everything the search does counts, not the simulator alone.
-            rate = rigs.count.steps / (time.perf_counter() - begin)
+            rate = rigs.steps / (time.perf_counter() - begin)
         with clock.stage("refine"):
-            fits = refine(rigs, main, [grid.gains for grid in grids])
-        for one, grid, fit in zip(joints, grids, fits, strict=True):
-            one.grid, one.fits = grid, [fit]
+            fits = refine(rigs, main, [one.gains for one in grids])
+    best = {fit.target.joint: fit for fit in fits}
+    by_amplitude = {name: [fit] for name, fit in best.items()}
     with clock.stage("amplitudes"):
-        others = [goal for one in joints for goal in one.targets[1:]]
-        best = [_pair(found[goal.joint].fits[0]) for goal in others]
-        for fit in refine(rigs, others, best):
-            found[fit.target.joint].fits.append(fit)
+        others = [goal for goals in found.values() for goal in goals[1:]]
+        for fit in refine(rigs, others, [best[goal.joint].gains for goal in others]):
+            by_amplitude[fit.target.joint].append(fit)
     with clock.stage("responses"):
-        requests = [SimRequest(one.targets[0], *_pair(one.fits[0])) for one in joints]
-        requests += [SimRequest(one.targets[0], *one.on_drive) for one in joints]
+        requests = [SimRequest(goal, *best[goal.joint].gains) for goal in main]
+        requests += [SimRequest(goal, *on_drive[goal.joint]) for goal in main]
         simulated = responses(rigs, requests, whole=True)
-        for k, one in enumerate(joints):
-            one.matched, one.naive = simulated[k], simulated[len(joints) + k]
+    zero: dict[str, tuple[float, ComplexArray]] = {}
     if settings.zero_armature and "armature" in rigs.parameters:
         with clock.stage("zero armature"):
-            _without_armature(rigs, found, stiffness, damping, clock)
-    return {name: _joint_fit(rigs.robot, one) for name, one in found.items()}, rate
-
-
-def _pair(fit: Fit) -> tuple[float, float]:
-    return fit.stiffness, fit.damping
+            zero = _without_armature(rigs, main, *grid, clock)
+    joints = {}
+    for k, (name, goals) in enumerate(found.items()):
+        matched, naive = simulated[k], simulated[len(main) + k]
+        joints[name] = _joint_fit(
+            rigs.robot, goals, by_amplitude[name], grids[k], matched, naive, zero.get(name)
+        )
+    return joints, rate
 
 
 def _without_armature(
-    simulator: JointRigs,
-    found: Mapping[str, _Joint],
+    rigs: JointRigs,
+    targets: Sequence[MeasuredJoint],
     stiffness: Array,
     damping: Array,
     clock: _Clock,
-) -> None:
-    """The search without rotor inertia (F13), and whole responses at its best nodes."""
-    groups = alike([one.targets[0] for one in found.values()], simulator.robot)
-    requests = []
-    with simulator.without_armature() as rigs:
-        for k, group in enumerate(groups):
-            grids = coarse_search(rigs.rig(group[0].joint), group, stiffness, damping)
-            for goal, grid in zip(group, grids, strict=True):
-                found[goal.joint].zero = grid
-                requests.append(SimRequest(goal, *grid.gains))
-            clock.report((k + 1) / len(groups))
-        for request, response in zip(requests, responses(rigs, requests, whole=True), strict=True):
-            found[request.target.joint].zero_response = response
+) -> dict[str, tuple[float, ComplexArray]]:
+    """The search without rotor inertia (F13): by joint, error [dB] and response at its best."""
+    errors, requests = [], []
+    groups = alike(targets, rigs.robot)
+    for k, group in enumerate(groups):
+        for goal, grid in zip(
+            group, coarse_search(rigs, group, stiffness, damping, armature=0.0), strict=True
+        ):
+            errors.append(grid.error_db)
+            requests.append(SimRequest(goal, *grid.gains, armature=0.0))
+        clock.report((k + 1) / len(groups))
+    simulated = responses(rigs, requests, whole=True)
+    names = [request.target.joint for request in requests]
+    return dict(zip(names, zip(errors, simulated, strict=True), strict=True))
 
 
-def _joint_fit(robot: RobotSpec, found: _Joint) -> JointFit:
-    """Put one joint's findings together."""
-    goal, fit, grid = found.targets[0], found.fits[0], found.grid
-    assert grid is not None
-    joint = robot.joint(goal.joint)
-    uncertainty = interval(fit)
-    per_amplitude = amplitude_gains(found.fits)
-    zero_db = float("nan") if found.zero is None else found.zero.error_db
-    band = goal.measured.band(*joint.band_hz)
-    return JointFit(
-        joint=goal.joint,
-        responses=tuple(one.measured for one in found.targets),
-        stiffness=fit.stiffness,
-        damping=fit.damping,
-        armature=joint.drive.armature,
-        delay_s=command_delay(goal.measured, found.matched, joint.band_hz),
-        ci95=uncertainty.ci95,
-        covariance=uncertainty.covariance,
-        band_hz=joint.band_hz,
+def _joint_fit(
+    robot: RobotSpec,
+    goals: Sequence[MeasuredJoint],
+    fits: Sequence[Fit],
+    grid: GridSearch,
+    matched: ComplexArray,
+    naive: ComplexArray,
+    zero: tuple[float, ComplexArray] | None,
+) -> JointFit:
+    """Put one joint's findings together; `fits` are of each amplitude."""
+    goal, fit, joint = goals[0], fits[0], robot.joint(goals[0].joint)
+    held = {
+        "armature": joint.drive.armature,
+        "frictionloss": float("nan"),
+        "delay": command_delay(goal.measured, matched, joint.band_hz),
+    }
+    found, by_amplitude = interval(fit, held), amplitude_gains(fits)
+    zero_db, zero_response = zero or (float("nan"), None)
+    return response_fit(
+        robot,
+        goals,
+        found,
+        matched,
+        naive,
         error_db=fit.error_db,
-        naive_error_db=goal.rms_db(found.naive[goal.fit_mask]),
-        coherence_min=float(goal.measured.coherence[band].min()),
-        matched=found.matched,
-        naive=found.naive,
         grid_stiffness=grid.stiffness,
         grid_damping=grid.damping,
         grid_error=grid.error,
         zero_armature_error_db=zero_db,
-        zero_armature=found.zero_response,
-        repeat_gains=uncertainty.repeat_gains,
-        amplitude_gains=per_amplitude,
+        zero_armature=zero_response,
+        amplitude_gains=by_amplitude,
         flags=(
             *_warnings(fit, grid),
-            *uncertainty.flags,
-            *amplitude_flags(per_amplitude),
-            *_left_out(goal, band),
+            *found.flags,
+            *amplitude_flags(by_amplitude),
+            *_left_out(goal, joint.band_hz),
             *goal.warnings,
             *_armature_flags(fit, zero_db),
         ),
@@ -335,10 +316,10 @@ def _warnings(fit: Fit, grid: GridSearch) -> Iterator[str]:
         yield "the command does not change at the policy's rate; each physics step holds its own"
 
 
-def _left_out(goal: MeasuredJoint, band: NDArray[np.bool_]) -> Iterator[str]:
+def _left_out(goal: MeasuredJoint, band_hz: tuple[float, float]) -> Iterator[str]:
     """Frequencies of the band that the fit did not use."""
-    left, whole = int(band.sum()) - int(goal.fit_mask.sum()), int(band.sum())
-    if left:
+    whole = int(goal.measured.band(*band_hz).sum())
+    if left := whole - int(goal.fit_mask.sum()):
         yield f"{left} of {whole} frequencies left out for low coherence"
 
 
@@ -357,7 +338,7 @@ def _armature_flags(fit: Fit, zero_db: float) -> Iterator[str]:
 
 def amplitude_gains(fits: Sequence[Fit]) -> Array:
     """(amplitude, stiffness, damping) of each amplitude fitted by itself, shape (m, 3)."""
-    rows = [(fit.target.measured.amplitude, *_pair(fit)) for fit in fits]
+    rows = [(fit.target.measured.amplitude, *fit.gains) for fit in fits]
     return np.array(rows).reshape(-1, 3)
 
 

@@ -20,13 +20,14 @@ from scipy.interpolate import CubicSpline
 from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.gains import MatchedGains
 from pronk.match.measured_joint import gains_on_drive
+from pronk.match.parameters import GAINS
 from pronk.response.grid import held_mean
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import ChainSimulation, JointDrive, moves_together
+from pronk.simulators.chain import ChainSimulation, moves_together, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
-from pronk.simulators.simulator import JointRigs, joint_rigs, play
+from pronk.simulators.simulator import JointRigs, joint_rigs
 
 Array = NDArray[np.float64]
 
@@ -144,95 +145,125 @@ def predict(
                 f"{log.source or 'log'}: several joints move at once, which only simulator mujoco "
                 f"replays, not {simulator}."
             )
-        return _arm(log, robot, gains, threads)
-    with joint_rigs(simulator, robot, threads=threads) as rigs:
-        return _joint_by_joint(log, rigs, gains)
-
-
-def drives_of(robot: RobotSpec, gains: MatchedGains) -> dict[str, JointDrive]:
-    """Drives of the matched joints."""
-    return {name: _drive(robot, name, joint) for name, joint in gains.joints.items()}
-
-
-def _drive(robot: RobotSpec, name: str, joint: JointGains) -> JointDrive:
-    known = robot.joint(name).drive.frictionloss
-    return JointDrive(
-        stiffness=joint.stiffness,
-        damping=joint.damping,
-        armature=joint.armature,
-        frictionloss=known if np.isnan(joint.frictionloss) else joint.frictionloss,
-        delay=joint.delay_s,
+        joints, excluded = _arm(log, robot, gains, threads)
+    else:
+        with joint_rigs(simulator, robot, threads=threads) as rigs:
+            joints, excluded = _joint_by_joint(log, rigs, gains)
+    if not joints:
+        reasons = " ".join(excluded.values()) or "no joint is excited in it."
+        raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
+    return Prediction(
+        joints=tuple(joints), source=log.source, virtual=log.virtual, excluded=excluded
     )
 
 
-def _arm(log: JointLog, robot: RobotSpec, gains: MatchedGains, threads: int) -> Prediction:
-    """The whole arm at once."""
+def drives_of(robot: RobotSpec, gains: MatchedGains) -> dict[str, dict[str, float]]:
+    """Parameters of the drives of the matched joints, as `published`."""
+    out = {}
+    for name, joint in gains.joints.items():
+        found = {
+            "stiffness": joint.stiffness,
+            "damping": joint.damping,
+            "armature": joint.armature,
+            "frictionloss": joint.frictionloss,
+            "delay": joint.delay_s,
+        }
+        known = {n: value for n, value in found.items() if not np.isnan(value)}
+        out[name] = published(robot, name) | known
+    return out
+
+
+def _on_drive(log: JointLog, robot: RobotSpec, name: str) -> dict[str, float]:
+    """The published drive, with the gains that were on it."""
+    pair = gains_on_drive(log, name, robot)
+    return published(robot, name) | dict(zip(GAINS, pair, strict=True))
+
+
+def _without_gains(name: str) -> str:
+    return (
+        f"{name} is left out: the gains have no entry for it; match a log in which it is excited."
+    )
+
+
+def _arm(
+    log: JointLog, robot: RobotSpec, gains: MatchedGains, threads: int
+) -> tuple[list[JointPrediction], dict[str, str]]:
+    """The whole arm at once; joints and the reasons why others are left out."""
     matched = drives_of(robot, gains)
-    with ChainSimulation(robot, [log], threads=threads) as rig:
-        naive = {name: _on_drive(log, robot, name) for name in rig.joints}
+    kinds = {name: s.kind for s in log.segments for name in s.joints}
+    with ChainSimulation(robot, [log], threads=threads) as arm:
+        naive = {name: _on_drive(log, robot, name) for name in arm.joints}
         late = {
-            name: replace(drive, delay=matched[name].delay) if name in matched else drive
+            name: drive | {"delay": matched[name]["delay"]} if name in matched else drive
             for name, drive in naive.items()
         }
-        simulated = [positions for (positions,) in rig.run([naive, late, matched])]
-        kinds = {name: s.kind for s in log.segments for name in s.joints}
-        found = {}
-        for i, name in enumerate(rig.joints):
-            column = log.column(name)
-            measured = log.time, log.command[:, column], log.position[:, column]
-            found[name] = kinds.get(name, "unknown"), (*measured, *(p[:, i] for p in simulated))
-        return _prediction(log, gains, found, rig.excluded)
+        simulated = [positions for (positions,) in arm.run([naive, late, matched])]
+    missing = {name: _without_gains(name) for name in arm.joints if name not in matched}
+    joints = [
+        JointPrediction(
+            joint=name,
+            time=log.time,
+            command=log.command[:, log.column(name)],
+            measured=log.position[:, log.column(name)],
+            naive=simulated[0][:, i],
+            naive_delayed=simulated[1][:, i],
+            matched=simulated[2][:, i],
+            signal=kinds.get(name, "unknown"),
+        )
+        for i, name in enumerate(arm.joints)
+        if name in matched
+    ]
+    return joints, arm.excluded | missing
 
 
-def _joint_by_joint(log: JointLog, rigs: JointRigs, gains: MatchedGains) -> Prediction:
+def _joint_by_joint(
+    log: JointLog, rigs: JointRigs, gains: MatchedGains
+) -> tuple[list[JointPrediction], dict[str, str]]:
     """One joint after the other, segment by segment."""
     segments = log.segments or _single(log)
-    excited = {name for segment in segments for name in segment.joints}
-    found: dict[str, tuple[str, Sequence[Array]]] = {}
-    for name in (name for name in rigs.robot.joint_names if name in excited):
-        mine = sorted((s for s in segments if name in s.joints), key=lambda one: one.start)
-        parts = []
-        if name in gains.joints:
-            parts = [_replay(log.cut(one), one, name, rigs, gains.joints[name]) for one in mine]
-        kind = next(s.kind for s in segments if name in s.joints)
-        found[name] = kind, [np.concatenate(columns) for columns in zip(*parts, strict=True)]
-    return _prediction(log, gains, found, {})
+    matched, joints, missing = drives_of(rigs.robot, gains), [], {}
+    for name in rigs.robot.joint_names:
+        mine = [segment for segment in segments if name in segment.joints]
+        if mine and name not in matched:
+            missing[name] = _without_gains(name)
+        elif mine:
+            parts = [
+                _replay(log.cut(one), one, name, rigs, matched[name])
+                for one in sorted(mine, key=lambda one: one.start)
+            ]
+            columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+            one = JointPrediction(joint=name, **columns)  # type: ignore[arg-type]
+            joints.append(replace(one, signal=mine[0].kind))
+    return joints, missing
 
 
 def _replay(
-    part: JointLog, segment: Segment, name: str, rigs: JointRigs, gains: JointGains
-) -> tuple[Array, ...]:
-    """Time, command, measured, naive, naive with the delay and matched position of a segment."""
-    robot, rig = rigs.robot, rigs.rig(name)
-    trace = command_trace(part, segment, name, robot)
-    late = _delayed(trace, gains.delay_s)
-    real, best = _on_drive(part, robot, name), _drive(robot, name, gains)
-    own = {n: np.array([getattr(best, n)]) for n in ("armature", "frictionloss")}
-    own = {n: value for n, value in own.items() if n in rigs.parameters}
-    on_drive = np.array([real.stiffness]), np.array([real.damping])
-    naive, naive_delayed = (play(rig, one, *on_drive)[0] for one in (trace, late))
-    matched = play(rig, late, np.array([best.stiffness]), np.array([best.damping]), **own)[0]
+    part: JointLog, segment: Segment, name: str, rigs: JointRigs, best: Mapping[str, float]
+) -> dict[str, Array]:
+    """The arrays of `JointPrediction` for a segment."""
+    trace, late = command_trace(part, segment, name, rigs.robot), best["delay"]
+    delayed = trace
+    if late:
+        edges = np.append(trace.time, trace.time[-1] + trace.timestep) - late
+        delayed = replace(trace, command=held_mean(trace.time, trace.command, edges))
+    real = _on_drive(part, rigs.robot, name)
+    own = [n for n in ("armature", "frictionloss") if n in rigs.parameters]
     # The last state is that at the start of the last step: no sample may lie beyond it.
     inside = (part.time >= trace.time[0]) & (part.time <= trace.time[-1])
     time, column = part.time[inside], part.column(name)
-    simulated = (
-        np.asarray(CubicSpline(trace.time, one)(time)) for one in (naive, naive_delayed, matched)
-    )
-    return time, part.command[inside, column], part.position[inside, column], *simulated
 
+    def played(command: CommandTrace, values: Mapping[str, float], names: Sequence[str]) -> Array:
+        position = rigs.play(command, {n: np.array([values[n]]) for n in names})[0]
+        return np.asarray(CubicSpline(trace.time, position)(time))
 
-def _delayed(trace: CommandTrace, delay: float) -> CommandTrace:
-    """The trace with its command delayed [s]."""
-    if delay == 0.0:
-        return trace
-    edges = np.append(trace.time, trace.time[-1] + trace.timestep) - delay
-    return replace(trace, command=held_mean(trace.time, trace.command, edges))
-
-
-def _on_drive(log: JointLog, robot: RobotSpec, name: str) -> JointDrive:
-    """The published drive, with the gains that were on it."""
-    stiffness, damping = gains_on_drive(log, name, robot)
-    return replace(JointDrive.published(robot, name), stiffness=stiffness, damping=damping)
+    return {
+        "time": time,
+        "command": part.command[inside, column],
+        "measured": part.position[inside, column],
+        "naive": played(trace, real, GAINS),
+        "naive_delayed": played(delayed, real, GAINS),
+        "matched": played(delayed, best, [*GAINS, *own]),
+    }
 
 
 def _single(log: JointLog) -> tuple[Segment, ...]:
@@ -249,41 +280,4 @@ def _single(log: JointLog) -> tuple[Segment, ...]:
             stop=float(log.time[-1]),
             amplitude=float("nan"),
         ),
-    )
-
-
-def _prediction(
-    log: JointLog,
-    gains: MatchedGains,
-    found: Mapping[str, tuple[str, Sequence[Array]]],
-    excluded: Mapping[str, str],
-) -> Prediction:
-    """Put joints together: by name the kind of signal and the columns of `JointPrediction`."""
-    excluded = dict(excluded)
-    joints = []
-    for name, (kind, columns) in found.items():
-        if name not in gains.joints:
-            excluded[name] = (
-                f"{name} is left out: the gains have no entry for it; match a log in which it is "
-                "excited."
-            )
-            continue
-        time, command, measured, naive, naive_delayed, matched = columns
-        joints.append(
-            JointPrediction(
-                joint=name,
-                time=time,
-                command=command,
-                measured=measured,
-                naive=naive,
-                naive_delayed=naive_delayed,
-                matched=matched,
-                signal=kind,
-            )
-        )
-    if not joints:
-        reasons = " ".join(excluded.values()) or "no joint is excited in it."
-        raise LogError(f"{log.source or 'log'}: nothing to replay; {reasons}")
-    return Prediction(
-        joints=tuple(joints), source=log.source, virtual=log.virtual, excluded=excluded
     )

@@ -10,35 +10,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from pronk.errors import IdentifiabilityError
 from pronk.match.fit import (
-    GAINS,
-    PARAMETERS,
     Estimate,
+    Problem,
     Solution,
-    begin,
-    bounds,
     estimate,
     jackknife,
     solve,
     solve_together,
 )
-from pronk.match.identifiability import EXPERIMENTS, bench_experiment, require_identifiable
+from pronk.match.identifiability import bench_experiment, require_identifiable
 from pronk.match.measured_joint import DB, FLOOR_DB, MeasuredJoint, SimRequest, responses
+from pronk.match.parameters import FREE, GAINS, PARAMETERS
 from pronk.match.result import JointFit
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+Pair = tuple[float, float]
+"""Stiffness [N m/rad] and damping [N m s/rad]."""
 
-FREE = ("stiffness", "damping", "armature", "frictionloss", "delay")
-"""What mode drive can fit."""
 _SHARED = 1.5
 """Equivalent noise bandwidth of the Hann window in bins (Harris 1978, table 1): how many
 neighbouring frequencies share their noise."""
@@ -59,52 +57,33 @@ def residual_db(simulated: ComplexArray, measured: ComplexArray, phase: bool) ->
     return np.concatenate([DB * ratio.real, DB * np.unwrap(ratio.imag, axis=-1)], axis=-1)
 
 
-class ResponseProblem:
-    """Residuals of one joint's drive in frequency, as a `Problem`."""
+class ResponseProblem(Problem):
+    """Residuals of one joint's drive in frequency, at one or more amplitudes."""
 
     def __init__(
         self,
         rigs: JointRigs,
         goals: Sequence[MeasuredJoint],
-        fitted: tuple[str, ...],
-        known: Mapping[str, float],
+        fitted: Sequence[str],
+        start: Mapping[str, float],
         *,
         phase: bool,
-        start: Array | None = None,
     ) -> None:
-        """Take in what was measured.
+        """Take the joint at each amplitude to fit, largest first; `phase`: fit the phase too.
 
-        Args:
-            rigs: The training simulator.
-            goals: The joint at each amplitude to fit, largest first.
-            fitted: Names of the parameters to fit, in the order of `PARAMETERS`.
-            known: Values of the parameters; of the fitted ones, where to begin. What is missing
-                keeps the simulator's value.
-            phase: Fit the phase too.
-            start: Searched numbers to begin with, instead of `known` moved inside the bounds.
+        What is missing in `start` keeps the simulator's value.
         """
-        self.goals, self.fitted, self.known, self.phase = goals, fitted, known, phase
-        self.low, self.high = bounds(fitted)
-        self.begin: Array = (
-            begin(fitted, [known[n] for n in fitted], [False] * len(fitted))
-            if start is None
-            else start
-        )
-        self._rigs = rigs
+        super().__init__({goals[0].joint: start}, {goals[0].joint: fitted})
+        self.goals, self.phase = goals, phase
+        self._rigs, self._late = rigs, "delay" in fitted
         # The effect of a delay is known without a simulation.
         self._steps = np.diag([PARAMETERS[n].step for n in fitted if n != "delay"])
-        if "delay" in fitted:
-            self._steps = np.pad(self._steps, ((0, 0), (0, 1)))
+        self._steps = np.pad(self._steps, ((0, 0), (0, int(self._late))))
         self._cache: dict[bytes, tuple[Array, Array]] = {}
-
-    def values(self, x: Array) -> dict[str, float]:
-        """Every parameter that some searched numbers stand for."""
-        fitted = zip(self.fitted, x, strict=True)
-        return {**self.known, **{n: PARAMETERS[n].unscaled(float(v)) for n, v in fitted}}
 
     def requests(self, x: Array) -> list[SimRequest]:
         """What to simulate for residual and Jacobian at a point."""
-        points = [self.values(point) for point in (x, *(x + self._steps))]
+        points = [self.values(point)[self.goals[0].joint] for point in (x, *(x + self._steps))]
         return [SimRequest(goal, **values) for goal in self.goals for values in points]
 
     def take(self, x: Array, simulated: Sequence[ComplexArray]) -> None:
@@ -113,11 +92,10 @@ class ResponseProblem:
         count = 1 + len(self._steps)
         for k, goal in enumerate(self.goals):
             measured = goal.measured.response[goal.fit_mask]
-            rows = residual_db(
-                np.array(simulated[k * count : (k + 1) * count]), measured, self.phase
-            )
+            mine = np.array(simulated[k * count : (k + 1) * count])
+            rows = residual_db(mine, measured, self.phase)
             slope = (rows[1:] - rows[0]) / self._steps.max(axis=1, initial=0.0)[:, None]
-            if "delay" in self.fitted:
+            if self._late:
                 # Its phase is -omega * delay.
                 late = np.concatenate([np.zeros(len(goal.omega)), -DB * goal.omega])
                 slope = np.vstack([slope, late])
@@ -195,6 +173,11 @@ class Fit:
         return float(np.exp(self.solution.x[1]))
 
     @property
+    def gains(self) -> Pair:
+        """Stiffness and damping."""
+        return self.stiffness, self.damping
+
+    @property
     def gain_db(self) -> Array:
         """Gain of the simulated over the measured response in the band [dB], shape (inside,)."""
         return np.asarray(self.solution.residual * self.target.deviation_db())
@@ -205,27 +188,23 @@ class Fit:
         return float(np.sqrt(np.mean(self.gain_db**2)))
 
 
-def refine(
-    rigs: JointRigs, targets: Sequence[MeasuredJoint], start: Sequence[tuple[float, float]]
-) -> list[Fit]:
-    """Find the gains that minimize the weighted squared gain error, one pair a target.
+def refine(rigs: JointRigs, targets: Sequence[MeasuredJoint], start: Sequence[Pair]) -> list[Fit]:
+    """Find the gains that minimize the weighted squared gain error, one fit a target.
 
-    Args:
-        rigs: The training simulator.
-        targets: What to match.
-        start: (stiffness, damping) to start from, one a target.
+    `start` holds the (stiffness, damping) to begin with, one a target.
     """
-    problems = [
-        ResponseProblem(rigs, [goal], GAINS, {}, phase=False, start=np.log(np.asarray(pair)))
-        for goal, pair in zip(targets, start, strict=True)
-    ]
+    problems = []
+    for goal, pair in zip(targets, start, strict=True):
+        values = dict(zip(GAINS, pair, strict=True))
+        problems.append(ResponseProblem(rigs, [goal], GAINS, values, phase=False))
+        problems[-1].begin = np.log(np.asarray(pair))
     solutions = solve_together(problems, lambda points: evaluate(rigs, points))
     return [
         Fit(problem=problem, solution=one) for problem, one in zip(problems, solutions, strict=True)
     ]
 
 
-def interval(fit: Fit) -> Estimate:
+def interval(fit: Fit, held: Mapping[str, float] | None = None) -> Estimate:
     """Uncertainty of refined gains, from the repeats of the measured response.
 
     With one repeat there is nothing to compare; the interval is then that of the coherence
@@ -233,8 +212,8 @@ def interval(fit: Fit) -> Estimate:
     frequencies and by the misfit), which takes noise for white, and a flag states it.
     """
     goal, solution = fit.target, fit.solution
-    optimum = np.array([fit.stiffness, fit.damping])
-    count = len(goal.measured.repeats)
+    optimum, count = np.array(fit.gains), len(goal.measured.repeats)
+    freedom: float = count - 1
     flags: tuple[str, ...] = ()
     if count < 2:
         deviation = goal.deviation_db()
@@ -244,24 +223,15 @@ def interval(fit: Fit) -> Estimate:
         misfit = max(1.0, float(solution.residual @ solution.residual) / free)
         covariance = _SHARED * misfit * (influence * white) @ influence.T
         covariance = covariance * np.outer(optimum, optimum)
-        gains, quantile = optimum[None, :], float(stats.norm.ppf(0.975))
+        gains, freedom = optimum[None, :], np.inf
         flags = ("one repeat: the interval assumes white noise",)
     else:
         gains = optimum * np.exp(fit.problem.repeat_moves(solution)[0])
         covariance = jackknife(gains / (count - 1))
-        quantile = float(stats.t.ppf(0.975, count - 1))
         if count == 2:
             flags = ("two repeats: the interval is wide, three or more narrow it",)
-    sd = np.sqrt(np.diag(covariance))
-    ends = zip(GAINS, optimum.tolist(), (quantile * sd).tolist(), strict=True)
-    return Estimate(
-        values=dict(zip(GAINS, optimum.tolist(), strict=True)),
-        covariance=covariance,
-        sd=dict(zip(GAINS, (sd / optimum).tolist(), strict=True)),
-        ci95={name: (max(gain - half, 0.0), gain + half) for name, gain, half in ends},
-        repeat_gains=gains,
-        flags=flags,
-    )
+    found = estimate(GAINS, solution.x, covariance, freedom, held or {}, symmetric=True)
+    return replace(found, repeat_gains=gains, flags=flags)
 
 
 def require_sweeps(
@@ -290,10 +260,7 @@ def require_sweeps(
 
 
 def fit_drive(
-    rigs: JointRigs,
-    goals: Sequence[MeasuredJoint],
-    on_drive: tuple[float, float],
-    fitted: tuple[str, ...],
+    rigs: JointRigs, goals: Sequence[MeasuredJoint], on_drive: Pair, fitted: tuple[str, ...]
 ) -> JointFit:
     """Fit one joint's drive to gain and phase of its responses at all amplitudes.
 
@@ -306,43 +273,54 @@ def fit_drive(
     Raises:
         IdentifiabilityError: The repeats leave a fitted parameter unknown.
     """
-    goal = goals[0]
-    joint = rigs.robot.joint(goal.joint)
-    drive = joint.drive
+    goal, name = goals[0], goals[0].joint
+    drive = rigs.robot.joint(name).drive
     known = dict(zip(FREE, (*on_drive, drive.armature, drive.frictionloss, 0.0), strict=True))
     problem = ResponseProblem(rigs, goals, fitted, known, phase=True)
     solution = solve(problem, tolerance=1e-7, rounds=100)
-    counts = [len(one.measured.repeats) for one in goals]
-    freedom = sum(count - 1 for count in counts)
-    covariance = np.zeros((len(fitted), len(fitted)))
-    for count, moves in zip(counts, problem.repeat_moves(solution), strict=True):
-        if count > 1:
-            covariance += jackknife(moves / (count - 1))
+    freedom, covariance = 0, np.zeros((len(fitted), len(fitted)))
+    for moves in problem.repeat_moves(solution):
+        if (more := len(moves) - 1) > 0:
+            freedom, covariance = freedom + more, covariance + jackknife(moves / more)
     found = estimate(fitted, solution.x, covariance, freedom, known)
     if freedom and found.unidentified:
-        name = found.unidentified[0]
+        unknown = found.unidentified[0]
         raise IdentifiabilityError(
-            f"{joint.name}: these sweeps do not identify the {name} (deviation "
-            f"{found.sd[name]:.2g}); {EXPERIMENTS[name]}; or hold it at a known value."
+            f"{name}: these sweeps do not identify the {unknown} (deviation "
+            f"{found.sd[unknown]:.2g}); {PARAMETERS[unknown].remedy}; or hold it at a known value."
         )
     requests = [SimRequest(goal, **values) for values in (found.values, known)]
     matched, naive = responses(rigs, requests, whole=True)
     flags = () if freedom else ("one repeat: no interval; record three or more",)
-    return JointFit(
-        joint=joint.name,
-        responses=tuple(one.measured for one in goals),
-        stiffness=found.values["stiffness"],
-        damping=found.values["damping"],
-        armature=found.values["armature"],
-        frictionloss=found.values["frictionloss"],
-        delay_s=found.values["delay"],
-        ci95=found.ci95,
-        covariance=found.covariance,
-        band_hz=joint.band_hz,
+    return response_fit(
+        rigs.robot,
+        goals,
+        found,
+        matched,
+        naive,
         error_db=goal.rms_db(matched[goal.fit_mask]),
+        flags=flags if solution.settled else (*flags, "the fit did not settle"),
+    )
+
+
+def response_fit(
+    robot: RobotSpec,
+    goals: Sequence[MeasuredJoint],
+    found: Estimate,
+    matched: ComplexArray,
+    naive: ComplexArray,
+    **more: Any,
+) -> JointFit:
+    """Result of a joint that was fitted to its responses at each amplitude, largest first."""
+    goal, band_hz = goals[0], robot.joint(goals[0].joint).band_hz
+    return JointFit.of(
+        goal.joint,
+        found,
+        responses=tuple(one.measured for one in goals),
+        band_hz=band_hz,
         naive_error_db=goal.rms_db(naive[goal.fit_mask]),
-        coherence_min=float(goal.measured.coherence[goal.measured.band(*joint.band_hz)].min()),
+        coherence_min=float(goal.measured.coherence[goal.measured.band(*band_hz)].min()),
         matched=matched,
         naive=naive,
-        flags=flags if solution.settled else (*flags, "the fit did not settle"),
+        **more,
     )

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.files import load_artefact, save_artefact
+from pronk.match.fit import Estimate
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.response.response import FrequencyResponse
 
@@ -78,6 +80,22 @@ class JointFit:
     """The same with the robot's published parameters [rad]."""
     flags: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, joint: str, found: Estimate, **more: Any) -> JointFit:
+        """A fit with the parameters and intervals of an estimate; `more` are the other fields."""
+        return cls(
+            joint=joint,
+            stiffness=found.values["stiffness"],
+            damping=found.values["damping"],
+            armature=found.values["armature"],
+            frictionloss=found.values["frictionloss"],
+            delay_s=found.values["delay"],
+            ci95=found.ci95,
+            covariance=found.covariance,
+            repeat_gains=found.repeat_gains,
+            **more,
+        )
+
     def gains(self) -> JointGains:
         """The part of the fit that training needs."""
         best = (float("nan"), float("nan"))
@@ -99,10 +117,9 @@ class JointFit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchResult:
-    """A whole match: the gains and what they rest on."""
+class MatchDetails:
+    """What matched gains rest on."""
 
-    gains: MatchedGains
     joints: Mapping[str, JointFit]
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time of each stage [s]."""
@@ -113,34 +130,22 @@ class MatchResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Stored:
-    """A match without its gains, which have a file of their own."""
+class MatchResult(MatchDetails):
+    """A whole match."""
 
-    joints: Mapping[str, JointFit]
-    seconds: Mapping[str, float]
-    grid_steps_per_second: float
-    excluded: Mapping[str, str] = field(default_factory=dict)
+    gains: MatchedGains
 
 
 def save(path: Path, result: MatchResult) -> None:
     """Write `match.npz`; the gains themselves are written by `pronk.match.gains.save`."""
-    stored = _Stored(
-        joints=result.joints,
-        seconds=result.seconds,
-        grid_steps_per_second=result.grid_steps_per_second,
-        excluded=result.excluded,
-    )
-    save_artefact(path, stored, SCHEMA)
+    details = {f.name: getattr(result, f.name) for f in fields(MatchDetails)}
+    save_artefact(path, MatchDetails(**details), SCHEMA)
 
 
 def load(path: Path, gains: MatchedGains) -> MatchResult:
-    """Read what `save` wrote, to go with the gains beside it.
-
-    Raises:
-        ArtefactError: Missing, damaged or of another schema.
-    """
-    stored = load_artefact(path, _Stored, SCHEMA, what="a match file", writer="pronk match")
-    return MatchResult(gains=gains, **vars(stored))
+    """Read what `save` wrote, to go with the gains beside it; ArtefactError for another file."""
+    found = load_artefact(path, MatchDetails, SCHEMA, what="a match file", writer="pronk match")
+    return MatchResult(gains=gains, **vars(found))
 
 
 def amplitude_spread(gains: Array) -> float:

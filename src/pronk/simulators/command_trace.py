@@ -51,11 +51,27 @@ class CommandTrace:
         """Start of each step, on the clock of the log [s], shape (steps,)."""
         return np.asarray(self.start + self.timestep * np.arange(len(self.command)))
 
-    def mirrored(self, robot: RobotSpec) -> tuple[str, float, Array]:
-        """Original joint to simulate, sign, and `sign * (command - pose)` [rad], (steps,)."""
-        name, sign = robot.joint(self.joint).original
-        centre = self.pose[robot.joint_names.index(self.joint)]
-        return name, sign, np.asarray(sign * (self.command - centre))
+    def excitation(self, robot: RobotSpec, steps: int | None = None) -> tuple[Array, Array]:
+        """What the original joint is simulated with, mirrored from this one.
+
+        Args:
+            robot: The robot.
+            steps: Steps of the command, all of them if None; a shorter one stays where it ends.
+
+        Returns:
+            Pose of the original joint's chain [rad], shape (chain,), and the command about it at
+            each step [rad], shape (steps,).
+        """
+        excited = robot.joint(self.joint)
+        first, sign = excited.original
+        # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
+        pairs = zip(excited.chain, robot.joint(first).chain, strict=True)
+        signs = [robot.joint(own).original[1] * robot.joint(one).original[1] for own, one in pairs]
+        names = robot.joint_names
+        pose = np.array(signs) * self.pose[[names.index(own) for own in excited.chain]]
+        command = sign * (self.command[:steps] - self.pose[names.index(self.joint)])
+        spare = 0 if steps is None else steps - len(command)
+        return pose, np.pad(command, (0, spare), mode="edge")
 
     def same_as(self, other: CommandTrace, robot: RobotSpec, *, sign: float = 1.0) -> bool:
         """True if both lead to the same simulation of the same original joint.
@@ -63,25 +79,15 @@ class CommandTrace:
         One may rest longer than the other at the end. With `sign` -1 the commands are compared
         with opposite signs.
         """
-        mine, theirs = self.mirrored(robot), other.mirrored(robot)
-        if mine[0] != theirs[0]:
+        if robot.joint(self.joint).original[0] != robot.joint(other.joint).original[0]:
             return False
-        short, long = sorted((mine[2], sign * theirs[2]), key=len)
+        (pose, mine), (other_pose, theirs) = self.excitation(robot), other.excitation(robot)
+        short, long = sorted((mine, sign * theirs), key=len)
         return (
             bool(np.abs(long[: len(short)] - short).max() < _SAME)
             and bool(np.abs(long[len(short) :] - short[-1]).max(initial=0.0) < _SAME)
-            and np.allclose(original_pose(self, robot), original_pose(other, robot), atol=1e-3)
+            and np.allclose(pose, other_pose, atol=1e-3)
         )
-
-
-def original_pose(trace: CommandTrace, robot: RobotSpec) -> Array:
-    """Pose of the original joint's chain that mirrors the trace's pose [rad], shape (chain,)."""
-    excited = robot.joint(trace.joint)
-    original = robot.joint(excited.original[0])
-    # Chains of mirrored mechanisms run through the same kinds of joint in the same order.
-    pairs = zip(excited.chain, original.chain, strict=True)
-    signs = [robot.joint(own).original[1] * robot.joint(first).original[1] for own, first in pairs]
-    return np.array(signs) * trace.pose[[robot.joint_names.index(own) for own in excited.chain]]
 
 
 def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float]:

@@ -1,16 +1,16 @@
 """The Simulator protocol: what an engine must offer so that its joints can be matched.
 
-An engine implements `Simulator`; MuJoCo is one of them (`pronk.simulators.mujoco`). The match works
-on `JointRigs`, which excite one joint at a time with many gain pairs: MuJoCo has a fast path of its
-own for that, every other simulator gets one by `RolloutRigs`.
+An engine implements `Simulator`; MuJoCo is one of them (`pronk.simulators.mujoco`). The match
+excites one joint at a time with many parameter sets, by `JointRigs`: those of MuJoCo are a fast
+path, those of every other simulator call its `rollout`.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
@@ -21,9 +21,11 @@ from numpy.typing import NDArray
 from pronk import plugins
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.command_trace import CommandTrace, original_pose
+from pronk.simulators.command_trace import CommandTrace
 
 Array = NDArray[np.float64]
+Values = Mapping[str, Array]
+"""Parameter name to values."""
 
 PARAMETERS = ("stiffness", "damping", "armature", "frictionloss", "delay")
 """Parameters of a joint [N m/rad, N m s/rad, kg m^2, N m, s]; the gains must be settable."""
@@ -73,76 +75,6 @@ class Simulator(Protocol):
         """
 
 
-@dataclass
-class Count:
-    """Physics steps done and the wall time they took."""
-
-    steps: int = 0
-    seconds: float = 0.0
-
-
-class JointRig(Protocol):
-    """One joint excited with many parameter sets, the other joints held."""
-
-    robot: RobotSpec
-
-    def pose(self, trace: CommandTrace) -> Array:
-        """Pose at which the joint's chain is held for a trace [rad], shape (chain,)."""
-
-    def run(
-        self,
-        commands: Sequence[Array],
-        poses: Sequence[Array],
-        stiffness: Array,
-        damping: Array,
-        *,
-        armature: Array | None = None,
-        frictionloss: Array | None = None,
-    ) -> Iterator[tuple[slice, Array]]:
-        """Yield the excited joint's positions a chunk at a time.
-
-        Args:
-            commands: Command about the pose during each step [rad], each of shape (steps,); one
-                for all simulations, or one each.
-            poses: Pose of the chain [rad], each of shape (chain,); one for all or one each.
-            stiffness: Of the excited joint [N m/rad], shape (b,).
-            damping: Of the excited joint [N m s/rad], shape (b,).
-            armature: Of the excited joint [kg m^2], shape (b,); the rig's own if not given.
-            frictionloss: Of the excited joint [N m], shape (b,); the rig's own if not given.
-
-        Yields:
-            Which simulations, and the position about the pose at the start of each step [rad],
-            shape (chunk, steps). The array is reused: take what is needed before going on.
-        """
-
-
-class JointRigs(Protocol):
-    """The rigs of all joints of a robot in one simulator."""
-
-    robot: RobotSpec
-    info: SimulatorInfo
-    parameters: frozenset[str]
-
-    @property
-    def count(self) -> Count:
-        """Steps and seconds of all rigs together."""
-
-    def rig(self, joint: str) -> JointRig:
-        """The rig that is simulated for a joint: that of its mirrored original."""
-
-    def without_armature(self) -> JointRigs:
-        """The same rigs with no rotor inertia at the excited joint."""
-
-    def close(self) -> None:
-        """Release threads and memory."""
-
-    def __enter__(self) -> Self:
-        """Use the rigs in a with statement."""
-
-    def __exit__(self, *error: object) -> None:
-        """Close."""
-
-
 class Closing:
     """Something to be closed after use, also by a with statement."""
 
@@ -156,133 +88,100 @@ class Closing:
         """Release threads and memory; nothing by default."""
 
 
-class RolloutRigs(Closing):
+class JointRigs(Closing, ABC):
+    """The joints of a robot in one simulator, excited one at a time with many parameter sets."""
+
+    robot: RobotSpec
+    info: SimulatorInfo
+    parameters: frozenset[str]
+    """Which of `PARAMETERS` can be set."""
+    steps: int = 0
+    """Physics steps done so far."""
+
+    @abstractmethod
+    def run(
+        self, traces: Sequence[CommandTrace], values: Values, steps: int
+    ) -> Iterator[tuple[slice, Array]]:
+        """Yield the excited joint's positions a chunk of simulations at a time.
+
+        A joint that mirrors another is simulated as that other (`Joint.original`).
+
+        Args:
+            traces: Commands to joints of one original; one for all simulations, or one each.
+            values: Parameter name to values of the excited joint, shape (b,): stiffness, damping,
+                and armature and frictionloss where they are not the robot's.
+            steps: Physics steps to simulate; a shorter command stays where it ends.
+
+        Yields:
+            Which simulations, and the original joint's position about the pose at the start of
+            each step [rad], shape (chunk, steps). The array is reused: take what is needed first.
+        """
+
+    def play(self, trace: CommandTrace, values: Values) -> Array:
+        """Position of a trace's joint at `trace.time` [rad], shape (b, steps); see `run`."""
+        sign = self.robot.joint(trace.joint).original[1]
+        centre = trace.pose[self.robot.joint_names.index(trace.joint)]
+        out = np.empty((len(values["stiffness"]), len(trace.command)))
+        for part, position in self.run([trace], values, len(trace.command)):
+            out[part] = centre + sign * position
+        return out
+
+
+class RolloutRigs(JointRigs):
     """Rigs of any simulator, made from its `rollout`."""
 
-    def __init__(
-        self, simulator: Simulator, robot: RobotSpec, *, armature: float | None = None
-    ) -> None:
-        """Take a simulator, and the armature of the excited joint [kg m^2] instead of its own."""
-        info = simulator.info
+    def __init__(self, simulator: Simulator, robot: RobotSpec) -> None:
+        self.info = info = simulator.info
         self.robot = replace(robot, timestep_s=info.timestep_s, decimation=info.decimation)
-        self.info = info
         self.parameters = simulator.parameters
-        self.count = Count()
         self._simulator = simulator
-        self._armature = armature
-
-    def without_armature(self) -> RolloutRigs:
-        """The same with no rotor inertia at the excited joint."""
-        return RolloutRigs(self._simulator, self.robot, armature=0.0)
-
-    def rig(self, joint: str) -> RolloutRig:
-        """The rig of a joint's mirrored original; PronkError if the simulator lacks it."""
-        original = self.robot.joint(joint).original[0]
-        if original not in self._simulator.joints:
-            raise PronkError(
-                f"simulator {self.info.engine} has no joint {original!r}; its joints are "
-                f"{', '.join(self._simulator.joints)}."
-            )
-        return RolloutRig(self._simulator, self.robot, original, self._armature, self.count)
-
-
-@dataclass
-class RolloutRig:
-    """One joint of any simulator, the others held at the pose."""
-
-    simulator: Simulator
-    robot: RobotSpec
-    joint: str
-    """An original, not a mirror image."""
-    armature: float | None = None
-    """Instead of the simulator's own [kg m^2]."""
-    count: Count = field(default_factory=Count)
-
-    def pose(self, trace: CommandTrace) -> Array:
-        """Pose of the joint's chain [rad], shape (chain,)."""
-        return original_pose(trace, self.robot)
 
     def run(
-        self,
-        commands: Sequence[Array],
-        poses: Sequence[Array],
-        stiffness: Array,
-        damping: Array,
-        *,
-        armature: Array | None = None,
-        frictionloss: Array | None = None,
+        self, traces: Sequence[CommandTrace], values: Values, steps: int
     ) -> Iterator[tuple[slice, Array]]:
-        """Yield the excited joint's positions a chunk at a time; see `JointRig.run`."""
-        names, can = self.simulator.joints, self.simulator.parameters
-        column = names.index(self.joint)
+        """See `JointRigs.run`; PronkError if the simulator lacks the joint or a parameter."""
+        names, engine = self._simulator.joints, self.info.engine
+        original = self.robot.joint(self.robot.joint(traces[0].joint).original[0])
+        if original.name not in names:
+            raise PronkError(
+                f"simulator {engine} has no joint {original.name!r}; its joints are "
+                f"{', '.join(names)}."
+            )
+        if lacking := set(values) - self.parameters:
+            raise PronkError(
+                f"simulator {engine} cannot set {', '.join(sorted(lacking))}; it sets "
+                f"{', '.join(sorted(self.parameters))}."
+            )
+        column = names.index(original.name)
         joints = [self.robot.joint(name) for name in names]
-        chain = self.robot.joint(self.joint).chain or (self.joint,)
-        if armature is None and self.armature is not None:
-            armature = np.full(len(stiffness), self.armature)
         own = {
             "stiffness": [joint.stiffness for joint in joints],
             "damping": [joint.damping for joint in joints],
             "armature": [joint.drive.armature for joint in joints],
             "frictionloss": [joint.drive.frictionloss for joint in joints],
         }
-        given = (stiffness, damping, armature, frictionloss)
-        excited = {n: value for n, value in zip(own, given, strict=True) if value is not None}
-        if lacking := set(excited) - can:
-            raise PronkError(
-                f"simulator {self.simulator.info.engine} cannot set "
-                f"{', '.join(sorted(lacking))}; it sets {', '.join(sorted(can))}."
-            )
-        locked = tuple(name for name in names if name != self.joint)
-        for begin in range(0, len(stiffness), CHUNK):
-            part = slice(begin, min(begin + CHUNK, len(stiffness)))
-            size = part.stop - part.start
-            command = np.empty((size, len(commands[0]), len(names)))
-            centre = np.empty((size, 1))
+        locked = tuple(name for name in names if name != original.name)
+        for begin in range(0, len(values["stiffness"]), CHUNK):
+            part = slice(begin, min(begin + CHUNK, len(values["stiffness"])))
+            command = np.empty((part.stop - part.start, steps, len(names)))
+            centre = np.empty((len(command), 1))
             for row, i in enumerate(range(part.start, part.stop)):
-                pose = dict(zip(chain, poses[0 if len(poses) == 1 else i], strict=True))
-                command[row] = [pose.get(j.name, j.default_position) for j in joints]
-                command[row, :, column] += commands[0 if len(commands) == 1 else i]
-                centre[row] = pose[self.joint]
-            values = {name: np.tile(own[name], (size, 1)) for name in own if name in can}
-            for name, array in excited.items():
-                values[name][:, column] = array[part]
-            before = time.perf_counter()
-            position = np.asarray(
-                self.simulator.rollout(command, values, locked=locked), dtype=np.float64
-            )
+                pose, offsets = traces[i if len(traces) > 1 else 0].excitation(self.robot, steps)
+                at = dict(zip(original.chain, pose, strict=True))
+                command[row] = [at.get(joint.name, joint.default_position) for joint in joints]
+                command[row, :, column] += offsets
+                centre[row] = at[original.name]
+            tiled = {n: np.tile(own[n], (len(command), 1)) for n in own if n in self.parameters}
+            for name, array in values.items():
+                tiled[name][:, column] = array[part]
+            position = np.asarray(self._simulator.rollout(command, tiled, locked=locked))
             if position.shape != command.shape:
                 raise PronkError(
                     f"the simulator's rollout returned shape {position.shape}; expected that of "
                     f"the command, {command.shape} (runs, steps, joints)."
                 )
-            self.count.seconds += time.perf_counter() - before
-            self.count.steps += size * command.shape[1]
+            self.steps += len(command) * steps
             yield part, position[:, :, column] - centre
-
-
-def play(
-    rig: JointRig,
-    trace: CommandTrace,
-    stiffness: Array,
-    damping: Array,
-    *,
-    armature: Array | None = None,
-    frictionloss: Array | None = None,
-) -> Array:
-    """Position of the joint of a trace, for many parameter sets.
-
-    Returns:
-        Position at the start of each step [rad], shape (b, steps), at `trace.time`.
-    """
-    sign, command = trace.mirrored(rig.robot)[1:]
-    centre = trace.pose[rig.robot.joint_names.index(trace.joint)]
-    out = np.empty((len(stiffness), len(command)))
-    pose = rig.pose(trace)
-    for part, position in rig.run(
-        [command], [pose], stiffness, damping, armature=armature, frictionloss=frictionloss
-    ):
-        out[part] = centre + sign * position
-    return out
 
 
 def load_simulator(

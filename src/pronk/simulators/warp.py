@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import copy
 import gc
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -32,7 +31,9 @@ from numpy.typing import NDArray
 from pronk.errors import PronkError
 from pronk.robots.model import set_drive_gains
 from pronk.robots.robot import RobotSpec
+from pronk.simulators.command_trace import CommandTrace
 from pronk.simulators.mujoco import JointTestRig
+from pronk.simulators.simulator import Values
 
 Array = NDArray[np.float64]
 
@@ -98,31 +99,20 @@ class WarpTestRig(JointTestRig):
         self._worlds = None
 
     def run(
-        self,
-        commands: Sequence[Array],
-        poses: Sequence[Array],
-        stiffness: Array,
-        damping: Array,
-        *,
-        armature: Array | None = None,
-        frictionloss: Array | None = None,
+        self, traces: Sequence[CommandTrace], values: Values, steps: int
     ) -> Iterator[tuple[slice, Array]]:
-        """Yield the excited joint's positions a chunk at a time; see `JointRig.run`."""
-        total = len(stiffness)
-        if total < self._least or armature is not None or frictionloss is not None:
-            yield from super().run(
-                commands, poses, stiffness, damping, armature=armature, frictionloss=frictionloss
-            )
+        """Yield the excited joint's positions a chunk at a time; see `JointRigs.run`."""
+        total = len(values["stiffness"])
+        if total < self._least or set(values) != {"stiffness", "damping"}:
+            yield from super().run(traces, values, steps)
             return
         for begin in range(0, total, MOST):
             batch = slice(begin, min(begin + MOST, total))
-            own = commands if len(commands) == 1 else commands[batch]
-            stands = poses if len(poses) == 1 else poses[batch]
-            before = time.perf_counter()
-            raw = self._step(own, stands, stiffness[batch], damping[batch])
-            self.count.seconds += time.perf_counter() - before
-            self.count.steps += raw.size
-            centre = np.array([pose[self.index] for pose in stands])
+            own = traces if len(traces) == 1 else traces[batch]
+            excited = [trace.excitation(self.robot, steps) for trace in own]
+            raw = self._step(excited, values["stiffness"][batch], values["damping"][batch])
+            self.steps += raw.size
+            centre = np.array([pose[self.index] for pose, _ in excited])
             for first in range(0, raw.shape[1], self.chunk):
                 part = slice(first, min(first + self.chunk, raw.shape[1]))
                 about = centre if len(centre) == 1 else centre[part]
@@ -130,18 +120,16 @@ class WarpTestRig(JointTestRig):
                 yield slice(begin + part.start, begin + part.stop), position
 
     def _step(
-        self, commands: Sequence[Array], poses: Sequence[Array], stiffness: Array, damping: Array
+        self, excited: Sequence[tuple[Array, Array]], stiffness: Array, damping: Array
     ) -> NDArray[np.float32]:
-        """Positions of the excited joint [rad], shape (steps, n), all simulated at once."""
-        count, steps = len(stiffness), len(commands[0])
-        shared = len(commands) == 1 and len(poses) == 1
-        ways = 1 if shared else count
-        target = np.empty((steps, ways))
-        control = np.empty((ways, self.model.nu))
-        for i in range(ways):
-            pose = poses[0 if len(poses) == 1 else i]
-            control[i] = self.control(pose)
-            target[:, i] = pose[self.index] + commands[0 if len(commands) == 1 else i]
+        """Positions of the excited joint [rad], shape (steps, n), all simulated at once.
+
+        `excited` holds pose and command (`CommandTrace.excitation`), one for all or one each.
+        """
+        count, steps, ways = len(stiffness), len(excited[0][1]), len(excited)
+        shared = ways == 1
+        control = np.array([self.control(pose) for pose, _ in excited])
+        target = np.stack([pose[self.index] + command for pose, command in excited], axis=1)
         gains = np.empty((count, *self.model.actuator_gainprm.shape))
         start = np.empty((count, self.model.nq))
         scratch = copy.copy(self.model)
@@ -152,7 +140,7 @@ class WarpTestRig(JointTestRig):
             if not shared or kp not in rest:
                 first = control[i % ways].copy()
                 first[self.actuator] = target[0, i % ways]
-                rest[kp] = self._equilibrium(first[self._ctrl], kp)
+                rest[kp] = self.equilibrium(first[self._columns], kp)
             start[i] = rest[kp]
         worlds = self._worlds
         if worlds is None or not worlds.fits(count, steps, shared):
