@@ -8,7 +8,7 @@ whole steps where a simulator has no other delay.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -17,12 +17,12 @@ from pronk.errors import PronkError
 from pronk.match.gains import MatchedGains
 from pronk.robots import load_robot
 from pronk.robots.model import add_drives, free_spec
-from pronk.robots.robot import RobotSpec
+from pronk.robots.robot import Drive, RobotSpec
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroupDrive:
-    """One joint group as every export needs it: gains, ranges and the drive's limits."""
+    """One joint group as every export needs it."""
 
     group: str
     joints: tuple[str, ...]
@@ -36,16 +36,8 @@ class GroupDrive:
     """Lowest and highest of the uniform randomization, not below 0 [N m s/rad]."""
     armature: float
     """[kg m^2]"""
-    frictionloss: float
-    """[N m]"""
-    viscous_damping: float
-    """[N m s/rad]"""
-    effort_limit: float
-    """[N m]"""
-    stall_torque: float
-    """[N m]"""
-    no_load_speed: float
-    """[rad/s]"""
+    drive: Drive
+    """Limits and friction; the dry friction is the matched one where it was fitted."""
     delay_steps: int
     """Command delay in physics steps."""
 
@@ -59,14 +51,13 @@ def group_drives(gains: MatchedGains, robot: RobotSpec) -> list[GroupDrive]:
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
     out = []
-    for name in robot.groups:
-        if name not in gains.groups:
-            continue
+    for name in (name for name in robot.groups if name in gains.groups):
         group, members = gains.groups[name], robot.group(name)
-        matched = [gains.joints[j.name] for j in members if j.name in gains.joints]
         drive = members[0].drive
+        matched = [gains.joints[j.name] for j in members if j.name in gains.joints]
+        armature = [j.armature for j in matched] or [drive.armature]
         dry = [j.frictionloss for j in matched if not np.isnan(j.frictionloss)]
-        delay = float(np.mean([j.delay_s for j in matched])) if matched else 0.0
+        delay = float(np.mean([j.delay_s for j in matched] or [0.0]))
         out.append(
             GroupDrive(
                 group=name,
@@ -75,14 +66,8 @@ def group_drives(gains: MatchedGains, robot: RobotSpec) -> list[GroupDrive]:
                 damping=group.damping,
                 stiffness_range=_about(group.stiffness, group.stiffness_range),
                 damping_range=_about(group.damping, group.damping_range),
-                armature=float(np.mean([j.armature for j in matched]))
-                if matched
-                else drive.armature,
-                frictionloss=float(np.mean(dry)) if dry else drive.frictionloss,
-                viscous_damping=drive.viscous_damping,
-                effort_limit=drive.effort_limit,
-                stall_torque=drive.stall_torque,
-                no_load_speed=drive.no_load_speed,
+                armature=float(np.mean(armature)),
+                drive=replace(drive, frictionloss=float(np.mean(dry or [drive.frictionloss]))),
                 delay_steps=round(delay / gains.simulator.timestep_s),
             )
         )
@@ -147,8 +132,6 @@ def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
     """
     drives = group_drives(gains, robot)
     by_joint = {joint: drive for drive in drives for joint in drive.joints}
-    friction = {name: drive.frictionloss for name, drive in by_joint.items()}
-    armature = {name: drive.armature for name, drive in by_joint.items()}
     spec = free_spec(robot)
     spec.option.timestep = gains.simulator.timestep_s
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -158,8 +141,8 @@ def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
         robot.joint_names,
         stiffness={name: drive.stiffness for name, drive in by_joint.items()},
         damping={name: drive.damping for name, drive in by_joint.items()},
-        armature=armature,
-        frictionloss=friction,
+        armature={name: drive.armature for name, drive in by_joint.items()},
+        frictionloss={name: drive.drive.frictionloss for name, drive in by_joint.items()},
     )
     spec.compile()
     late = [f"{d.group} {d.delay_steps} steps" for d in drives if d.delay_steps]
@@ -195,17 +178,16 @@ def isaaclab_text(gains: MatchedGains, robot: RobotSpec) -> str:
 
 def _fields(drive: GroupDrive, friction: str, **extra: str) -> str:
     """Arguments of an actuator, by the simulator's names, one a line."""
+    own = {name: getattr(drive, name) for name in ("stiffness", "damping", "armature")}
     names = {
-        "stiffness": "stiffness",
-        "damping": "damping",
-        "armature": "armature",
         friction: "frictionloss",
         **extra,
         "effort_limit": "effort_limit",
         "saturation_effort": "stall_torque",
         "velocity_limit": "no_load_speed",
     }
-    return "".join(f"        {n}={_number(getattr(drive, f))},\n" for n, f in names.items())
+    own |= {name: getattr(drive.drive, field) for name, field in names.items()}
+    return "".join(f"        {name}={_number(value)},\n" for name, value in own.items())
 
 
 EXPORTS: Mapping[str, Callable[[MatchedGains, RobotSpec], str]] = {

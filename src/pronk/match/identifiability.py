@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -230,20 +229,18 @@ def _observed(experiments: Sequence[Experiment], values: Mapping[str, float]) ->
 def _candidates(experiments: Sequence[Experiment]) -> list[tuple[str, list[Experiment]]]:
     """Further experiments, in words and with what would then be known."""
     first = experiments[0]
-    changes: list[tuple[str, dict[str, Any]]] = [
-        (
-            "sweep a second pose or a known payload (three times the inertia)",
-            {"inertia": 3.0 * first.inertia},
+    heavy, quiet = 3.0 * first.inertia, 0.25 * first.amplitude
+    pull = "sweep a pose in which gravity pulls the joint back (m g l of 2 N m/rad)"
+    further = {
+        "sweep a second pose or a known payload (three times the inertia)": replace(
+            first, inertia=heavy
         ),
-        (
-            "sweep a pose in which gravity pulls the joint back (m g l of 2 N m/rad)",
-            {"gravity": 2.0},
-        ),
-        ("sweep again with half the stiffness on the drive", {"gain_scale": 0.5}),
-        ("sweep again with half the damping on the drive", {"damping_scale": 0.5}),
-        ("sweep again at a quarter of the amplitude", {"amplitude": 0.25 * first.amplitude}),
-    ]
-    found = [(words, [*experiments, replace(first, **change)]) for words, change in changes]
+        pull: replace(first, gravity=2.0),
+        "sweep again with half the stiffness on the drive": replace(first, gain_scale=0.5),
+        "sweep again with half the damping on the drive": replace(first, damping_scale=0.5),
+        "sweep again at a quarter of the amplitude": replace(first, amplitude=quiet),
+    }
+    found = [(words, [*experiments, one]) for words, one in further.items()]
     if not all(e.phase for e in experiments):
         found.append(("use the phase as well", [replace(e, phase=True) for e in experiments]))
     return found

@@ -90,15 +90,8 @@ class MeasuredJoint:
         )
 
     def deviation_db(self) -> Array:
-        """Standard deviation of the measured gain from its coherence [dB], shape (inside,).
-
-        `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
-        eq. 9.90), in dB, not below `FLOOR_DB`.
-        """
-        coherence = np.clip(self.measured.coherence[self.fit_mask], 1e-9, 1.0)
-        averages = np.maximum(self.measured.averages[self.fit_mask], 1.0)
-        relative = np.sqrt((1.0 - coherence) / (2.0 * averages * coherence))
-        return np.asarray(np.hypot(DB * relative, FLOOR_DB))
+        """Standard deviation of the measured gain from its coherence [dB], shape (inside,)."""
+        return np.asarray(np.hypot(DB * self.measured.deviation()[self.fit_mask], FLOOR_DB))
 
     def error_db(self, simulated: ComplexArray) -> Array:
         """Gain over the measured one [dB] of a simulated response, both of shape (..., inside)."""

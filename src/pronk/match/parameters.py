@@ -10,17 +10,17 @@ import numpy as np
 from pronk.errors import PronkError
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Parameter:
     """One parameter. Positive ones are searched in their logarithm."""
 
     low: float
     high: float
     unit: str
-    start: float
-    """Where the search begins if the published value is smaller."""
     step: float
     """Finite difference, of the logarithm or of the parameter itself."""
+    start: float
+    """Where the search begins if the published value is smaller."""
     remedy: str
     """What to record where it is not identified."""
     sd_max: float = 0.3
@@ -37,60 +37,32 @@ class Parameter:
         return float(np.exp(scaled)) if self.log else float(scaled)
 
 
+_POSE = "a pose or a payload in which gravity loads the joint, or a torque channel, gives the "
+_SWEEP = "a sweep to higher frequencies at an amplitude that the drive can follow, or a second "
 PARAMETERS: Mapping[str, Parameter] = {
-    "stiffness": Parameter(
-        low=0.5,
-        high=200.0,
-        unit="N m/rad",
-        start=0.5,
-        step=0.02,
-        remedy="a pose or a payload in which gravity loads the joint, or a torque channel, "
-        "gives the stiffness",
-    ),
+    "stiffness": Parameter(0.5, 200.0, "N m/rad", 0.02, 0.5, f"{_POSE}stiffness"),
     "damping": Parameter(
-        low=0.005,
-        high=20.0,
-        unit="N m s/rad",
-        start=0.005,
-        step=0.02,
-        remedy="a faster sweep, or another damping on the drive, gives the damping",
+        *(0.005, 20.0, "N m s/rad", 0.02, 0.005),
+        "a faster sweep, or another damping on the drive, gives the damping",
     ),
-    "armature": Parameter(
-        low=1e-4,
-        high=1.0,
-        unit="kg m^2",
-        start=1e-3,
-        step=0.03,
-        remedy="a sweep to higher frequencies at an amplitude that the drive can follow, or a "
-        "second payload, gives the armature",
-    ),
+    "armature": Parameter(1e-4, 1.0, "kg m^2", 0.03, 1e-3, f"{_SWEEP}payload, gives the armature"),
     "frictionloss": Parameter(
-        low=1e-3,
-        high=3.0,
-        unit="N m",
-        start=0.2,  # from too little friction the search sees no sticking and does not find it
-        step=0.03,
-        remedy="a second, smaller amplitude gives the dry friction",
+        # From too little friction the search sees no sticking and does not find it.
+        *(1e-3, 3.0, "N m", 0.03, 0.2),
+        "a second, smaller amplitude gives the dry friction",
     ),
     "delay": Parameter(
-        low=0.0,
-        high=0.1,
-        unit="s",
-        start=0.01,
-        step=1e-3,
-        sd_max=0.005,  # a physics step of the training simulator
+        # Known if known to a physics step of the training simulator.
+        *(0.0, 0.1, "s", 1e-3, 0.01),
+        "the phase at higher frequencies, or steps logged faster, gives the delay",
+        sd_max=0.005,
         log=False,
-        remedy="the phase at higher frequencies, or steps logged faster, gives the delay",
     ),
     "offset": Parameter(
-        low=-0.2,
-        high=0.2,
-        unit="rad",
-        start=-0.2,
-        step=2e-3,
+        *(-0.2, 0.2, "rad", 2e-3, -0.2),
+        "the same pose approached from both sides gives the offset",
         sd_max=0.01,
         log=False,
-        remedy="the same pose approached from both sides gives the offset",
     ),
 }
 """Bounds are far from what servos of small robots have; a fit that ends there is flagged. Steps are

@@ -56,30 +56,11 @@ class JointPrediction:
     """Kind of the signal that was replayed."""
     unit: str = "rad"
 
-    @property
-    def rmse_naive(self) -> float:
-        """Root mean square of naive less measured [rad]."""
-        return rmse(self.naive, self.measured)
-
-    @property
-    def rmse_naive_delayed(self) -> float:
-        """Root mean square of naive with the delay less measured [rad]."""
-        return rmse(self.naive_delayed, self.measured)
-
-    @property
-    def rmse_matched(self) -> float:
-        """Root mean square of matched less measured [rad]."""
-        return rmse(self.matched, self.measured)
-
-    @property
-    def r2_naive(self) -> float:
-        """Share of the measured variance that the naive simulation explains."""
-        return r2(self.naive, self.measured)
-
-    @property
-    def r2_matched(self) -> float:
-        """Share of the measured variance that the matched simulation explains."""
-        return r2(self.matched, self.measured)
+    rmse_naive = property(lambda self: rmse(self.naive, self.measured))
+    rmse_naive_delayed = property(lambda self: rmse(self.naive_delayed, self.measured))
+    rmse_matched = property(lambda self: rmse(self.matched, self.measured))
+    r2_naive = property(lambda self: r2(self.naive, self.measured))
+    r2_matched = property(lambda self: r2(self.matched, self.measured))
 
 
 @dataclass(frozen=True, kw_only=True)

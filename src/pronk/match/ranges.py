@@ -46,11 +46,7 @@ _SLACK = 1e-6
 
 
 def group_gains(robot: RobotSpec, joints: Mapping[str, JointGains]) -> dict[str, GroupGains]:
-    """Training gains, ranges and joint ellipsoids of every group with a matched joint.
-
-    Raises:
-        RobotError: A joint is not one of the robot's.
-    """
+    """Training gains, ranges and joint ellipsoids of every group with a matched joint."""
     for name in joints:
         robot.joint(name)
     out = {}
@@ -92,27 +88,19 @@ def matched_gains(
 
 
 def characteristic_frequency(robot: RobotSpec, joint_name: str, damping: float) -> float:
-    """Half-width of a joint's resonance, `damping / (2 inertia)` [rad/s].
-
-    The inertia is the joint's own in the bench model at the default pose, armature included.
-
-    Raises:
-        RobotError: The robot has no such joint.
-    """
+    """Half-width of a joint's resonance, `damping / (2 inertia)` [rad/s], armature included."""
     inertia, _ = bench_inertia(robot, robot.joint(joint_name).original[0])
     return damping / (2.0 * inertia)
 
 
 def _bounds(gains: JointGains) -> tuple[tuple[float, float], tuple[float, float]]:
     """Interval of each gain, the gain included; the bare gain where there is no interval."""
-    out = []
-    for value, (low, high) in (
-        (gains.stiffness, gains.stiffness_ci95),
-        (gains.damping, gains.damping_ci95),
-    ):
-        finite = np.isfinite(low) and np.isfinite(high)
-        out.append((min(low, value), max(high, value)) if finite else (value, value))
-    return out[0], out[1]
+
+    def about(value: float, interval: tuple[float, float]) -> tuple[float, float]:
+        ends = [*interval, value] if np.isfinite(interval).all() else [value]
+        return min(ends), max(ends)
+
+    return about(gains.stiffness, gains.stiffness_ci95), about(gains.damping, gains.damping_ci95)
 
 
 def _centre(robot: RobotSpec, group: Mapping[str, JointGains]) -> tuple[float, float]:
@@ -158,15 +146,11 @@ def interval_points(gains: JointGains, level: float = 0.95) -> Array:
 
 
 def enclosing(points: Array, *, tolerance: float = 1e-4, rounds: int = 2000) -> tuple[Array, Array]:
-    """Minimum-volume ellipsoid that covers some points.
+    """Minimum-volume ellipsoid that covers points of shape (n, d).
 
     Khachiyan's algorithm (Todd and Yildirim, *On Khachiyan's algorithm for the computation of
-    minimum-volume enclosing ellipsoids*, 2007), then scaled so that every point is inside.
-
-    Args:
-        points: shape (n, d), spanning all d directions.
-        tolerance: Relative excess of volume that is good enough.
-        rounds: Most iterations.
+    minimum-volume enclosing ellipsoids*, 2007) up to a relative excess of volume, then scaled so
+    that every point is inside.
 
     Returns:
         Centre c, shape (d,), and shape matrix E, shape (d, d), of

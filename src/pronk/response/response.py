@@ -116,14 +116,22 @@ class FrequencyResponse:
         """Unwrapped phase [rad], shape (f,)."""
         return np.asarray(np.unwrap(np.angle(self.response)))
 
+    def deviation(self) -> Array:
+        """Relative standard deviation of the response by its coherence, shape (f,).
+
+        `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
+        eq. 9.90), which takes noise for white inside a bin.
+        """
+        coherent = np.clip(self.coherence, 1e-9, 1.0)
+        averages = np.maximum(self.averages, 1.0)
+        return np.asarray(np.sqrt((1.0 - coherent) / (2.0 * coherent * averages)))
+
     def relative_error(self, level: float = 0.95) -> Array:
         """Half-width of the interval on the complex response, relative to its gain, shape (f,).
 
-        With three repeats or more Student's t over repeats; with fewer
-        `sqrt((1 - coherence) / (2 averages coherence))` (Bendat and Piersol, *Random Data*,
-        eq. 9.90), which takes noise for white inside a bin. The bias of the window comes on top
-        (0.3 % of gain at most for the default settings and a chirp of 0.1 to 25 Hz in 20 s), alike
-        for a measured and a simulated joint that go through the same estimator.
+        With three repeats or more Student's t over repeats; with fewer by `deviation`. The bias of
+        the window comes on top (0.3 % of gain at most for the default settings and a chirp of 0.1
+        to 25 Hz in 20 s), alike for a measured and a simulated joint.
         """
         n = len(self.repeats)
         if n >= 3:
@@ -132,9 +140,7 @@ class FrequencyResponse:
             deviation = np.sqrt((spread**2).sum(axis=0) / (2.0 * (n - 1)))
             quantile = float(stats.t.ppf(0.5 + level / 2.0, 2 * (n - 1)))
             return np.asarray(quantile * deviation / np.sqrt(n) / self.gain)
-        coherent = np.clip(self.coherence, 1e-9, 1.0)
-        deviation = np.sqrt((1.0 - coherent) / (2.0 * coherent * np.maximum(self.averages, 1.0)))
-        return np.asarray(float(stats.norm.ppf(0.5 + level / 2.0)) * deviation)
+        return np.asarray(float(stats.norm.ppf(0.5 + level / 2.0)) * self.deviation())
 
     def gain_interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Lower and upper bound of the absolute gain."""
