@@ -87,11 +87,7 @@ class Layout:
 
 
 def layout(grid: Grid, estimator: Estimator, *, padded: bool) -> Layout:
-    """Lay the segments over a grid.
-
-    Raises:
-        LogError: The excitation is too short for two segments, or no frequency is left.
-    """
+    """Lay the segments over a grid; LogError if it is too short, or no frequency is left."""
     samples, rate_hz = round(estimator.segment_s * grid.rate_hz), grid.rate_hz
     span = grid.count / rate_hz
     if samples < 8 or grid.count < samples:
@@ -160,9 +156,8 @@ class Sums:
     def coherence(self) -> Array:
         """Magnitude-squared coherence; 0 where the frequency was not excited, shape (f,).
 
-        Every segment counts, also those in which a chirp is elsewhere: they bring the noise (and
-        the harmonics) at this frequency and nothing else. Coherence is then the share of the
-        position's power at this frequency, over the whole log, that the command explains. A
+        The share of the position's power over the whole log that the command explains: every
+        segment counts, also those in which a chirp is elsewhere, which bring the noise alone. A
         single passage of a chirp in a single segment would be 1 by construction.
         """
         raw = np.abs(self.uy) ** 2 / np.maximum(self.uu * self.yy, _TINY)
@@ -176,9 +171,8 @@ class Sums:
 
         `segments sum P / sum_s,t conj(U_s) U_t r_st`, P = |U|^2 and r_st the overlap of windows s
         and t inside the excitation: the number n for which `(1 - coherence) / (2 n coherence)` is
-        the variance of the estimate under white noise, and 1/n the coherence of a position that
-        is noise alone. For a stationary random command it is Welch's number; for a chirp it
-        counts the segments in which the chirp is elsewhere, as `coherence` does.
+        the variance of the estimate under white noise, and 1/n the coherence of noise alone. For
+        a chirp it counts the segments in which the chirp is elsewhere, as `coherence` does.
         """
         return np.asarray(self.segments * self.uu / np.maximum(self.spread, _TINY))
 
@@ -261,16 +255,10 @@ class H1Operator:
     def build(
         cls, time: Array, command: Array, estimator: Estimator, *, rate_hz: float | None = None
     ) -> H1Operator:
-        """Compute the map for one command.
+        """Compute the map for one command [rad] in force from timestamps [s], both of shape (n,).
 
-        Args:
-            time: Measured timestamps [s], shape (n,).
-            command: Command in force at each [rad], shape (n,).
-            estimator: Settings.
-            rate_hz: Rate of the analysis grid; that of the timestamps if not given.
-
-        Raises:
-            LogError: The excitation is shorter than two segments.
+        The analysis grid has the rate of the timestamps if none is given. LogError if the
+        excitation is shorter than two segments.
         """
         grid = grid_over(time, rate_hz)
         held = held_mean(time, command, grid.edges)
@@ -295,19 +283,10 @@ class H1Operator:
         return cls(omega=where.omega, time=times, grid=grid, weights=weights, excitation=uu)
 
     def matrix(self, sample_times: Array) -> ComplexArray:
-        """Map from positions sampled at other instants, so that `H = positions @ matrix`.
+        """Map from positions at other instants, `H = positions @ matrix`, shape (m, f).
 
-        The cubic interpolation onto the analysis grid is included. For a large batch multiply by
-        `matrix.real` and `matrix.imag` apart, made contiguous, with the batch in one dimension:
-        numpy turns real positions into complex ones otherwise.
-
-        Args:
-            sample_times: Increasing instants on the clock of the log [s], shape (m,).
-
-        Returns:
-            Shape (m, f).
-
-        Raises:
-            LogError: The instants do not span the excitation.
+        `sample_times` [s], shape (m,), are increasing instants on the clock of the log; the cubic
+        interpolation onto the analysis grid is included. LogError if they do not span the
+        excitation.
         """
         return pull_back(self.weights, np.asarray(sample_times, dtype=np.float64), self.grid)

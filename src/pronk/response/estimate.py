@@ -102,16 +102,9 @@ def estimate(
 
 
 def operator(part: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
-    """Return the estimate of one excitation as a matrix; equal repeats share it.
+    """The estimate of one excitation (a log of one segment) as a matrix; equal repeats share it.
 
-    Args:
-        part: A log of one segment.
-        joint: The joint.
-        estimator: Settings.
-        rate_hz: Rate of the analysis grid, from `log_rate`.
-
-    Raises:
-        PronkError: Sine steps, which have no common grid.
+    `rate_hz` is that of `log_rate`. PronkError for sine steps, which have no common grid.
     """
     segment, command = part.segments[0], part.command[:, part.column(joint)]
     if segment.kind == "sine_steps":

@@ -70,17 +70,10 @@ def grid_over(time: Array, rate_hz: float | None = None) -> Grid:
 
 
 def held_mean(time: Array, command: Array, edges: Array) -> Array:
-    """Mean over each interval of a command that is held from each timestamp to the next.
+    """Mean over each interval of a command that is held from each timestamp to the next [rad].
 
-    Before the first timestamp the first command holds, after the last one the last.
-
-    Args:
-        time: Timestamps [s], shape (n,).
-        command: Command in force from each of them [rad], shape (n,).
-        edges: Ends of the intervals [s], shape (m + 1,).
-
-    Returns:
-        Means [rad], shape (m,).
+    Timestamps [s] and commands have shape (n,), edges of the intervals [s] shape (m + 1,), means
+    (m,). Before the first timestamp the first command holds, after the last one the last.
     """
     before, after = min(edges[0], time[0]) - 1.0, max(edges[-1], time[-1]) + 1.0
     knots = np.concatenate(([before], time, [after]))
@@ -99,21 +92,11 @@ def interpolate(time: Array, values: Array, grid: Grid) -> Array:
 
 
 def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
-    """Carry weights on grid samples over to samples at other instants, through the spline.
+    """Carry weights, shape (grid.count, f), over to samples at instants [s], shape (n,): (n, f).
 
     `values @ pull_back(weights, time, grid) == interpolate(time, values, grid) @ weights`, at the
-    cost of one banded solve, whatever number of `values` follows.
-
-    Args:
-        weights: Shape (grid.count, f).
-        time: Increasing instants of the samples [s], shape (n,).
-        grid: The analysis grid.
-
-    Returns:
-        Shape (n, f).
-
-    Raises:
-        LogError: The samples do not span the grid.
+    cost of one banded solve, whatever number of `values` follows. LogError if the samples do not
+    span the grid.
     """
     last = grid.start + (grid.count - 1) / grid.rate_hz
     if time[0] > grid.start + _REACH_S or time[-1] < last - _REACH_S:

@@ -141,13 +141,9 @@ def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
 def read_periods(
     log: JointLog, joint: str, estimator: Estimator, rate_hz: float | None = None
 ) -> Spectra:
-    """Spectra of the steady periods of one multisine at its excited lines.
+    """Spectra of the steady periods of one multisine (`JointLog.cut`) at its excited lines.
 
-    Args:
-        log: One excitation (`JointLog.cut`), whose segment gives the period.
-        joint: The excited joint.
-        estimator: Gives the band.
-        rate_hz: About the rate of the analysis grid; that of the timestamps if not given.
+    `rate_hz` is about that of the analysis grid; that of the timestamps if not given.
 
     Raises:
         LogError: The segment gives no period, or fewer than three equal periods.
@@ -229,13 +225,9 @@ def _steady_step(
 
 
 def read_steps(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> Spectra:
-    """Read every step of one excitation inside the band.
+    """Read every step of one excitation (`JointLog.cut`) inside the band.
 
-    Args:
-        log: One excitation (`JointLog.cut`) with its instantaneous frequency.
-        joint: The excited joint.
-        estimator: Gives the band.
-        rate_hz: About the rate of the grid; each step takes a whole number of samples a period.
+    `rate_hz` is about that of the grid; each step takes a whole number of samples a period.
 
     Raises:
         LogError: No frequency channel, no step in the band, or steps of fewer than three periods.
