@@ -17,8 +17,9 @@ from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.excitation.signals import Chirp
 from pronk.match.grid import axes, quick_search
-from pronk.match.measured_joint import DB, SimRequest, measured_joints, responses
+from pronk.match.measured_joint import DB, measured_joints
 from pronk.match.settings import MatchSettings
+from pronk.match.simulated import SimRequest, responses
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import MujocoSimulator

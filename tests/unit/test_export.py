@@ -25,15 +25,9 @@ def matched(robot_name: str = "mini_cheetah", **extra: float) -> MatchedGains:
         joints[joint.name] = JointGains(
             stiffness=kp,
             damping=kd,
-            grid_stiffness=kp,
-            grid_damping=kd,
             stiffness_ci95=(kp - 0.3, kp + 0.3),
             damping_ci95=(kd - 0.02, kd + 0.02),
             covariance=((0.02, 0.0), (0.0, 1e-4)),
-            band_hz=joint.band_hz,
-            error_db=0.2,
-            naive_error_db=1.0,
-            coherence_min=0.97,
             armature=joint.drive.armature,
             **extra,
         )

@@ -22,17 +22,11 @@ from pronk.match.grid import (
     search,
     search_all,
 )
-from pronk.match.measured_joint import (
-    DB,
-    MeasuredJoint,
-    SimRequest,
-    measured_joints,
-    merged,
-    responses,
-)
+from pronk.match.measured_joint import DB, MeasuredJoint, measured_joints, merged
 from pronk.match.parameters import GAINS
 from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
+from pronk.match.simulated import SimRequest, responses
 from pronk.response.response import Estimator
 from pronk.robots import load_robot
 from pronk.simulators.linear import plant

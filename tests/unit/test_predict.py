@@ -22,7 +22,6 @@ MADE_WITH = {"FL_hip_roll": (20.0, 0.5), "HR_knee": (22.0, 0.55)}
 
 
 def gains(names: tuple[str, ...], **extra: float) -> MatchedGains:
-    nan = float("nan")
     return MatchedGains(
         robot=ROBOT.name,
         simulator=SimulatorInfo(),
@@ -30,15 +29,6 @@ def gains(names: tuple[str, ...], **extra: float) -> MatchedGains:
             name: JointGains(
                 stiffness=MADE_WITH[name][0],
                 damping=MADE_WITH[name][1],
-                grid_stiffness=nan,
-                grid_damping=nan,
-                stiffness_ci95=(nan, nan),
-                damping_ci95=(nan, nan),
-                covariance=((0.0, 0.0), (0.0, 0.0)),
-                band_hz=(1.0, 10.0),
-                error_db=0.1,
-                naive_error_db=1.0,
-                coherence_min=0.99,
                 armature=ROBOT.joint(name).drive.armature,
                 **extra,
             )

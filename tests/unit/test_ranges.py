@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,22 +24,14 @@ TABLE_I = {
 
 
 def joint(stiffness: float, damping: float, half: tuple[float, float] | None = None) -> JointGains:
-    nan = (math.nan, math.nan)
-    return JointGains(
-        stiffness=stiffness,
-        damping=damping,
-        grid_stiffness=stiffness,
-        grid_damping=damping,
-        stiffness_ci95=nan if half is None else (stiffness - half[0], stiffness + half[0]),
-        damping_ci95=nan if half is None else (damping - half[1], damping + half[1]),
-        covariance=((math.nan, math.nan), (math.nan, math.nan))
-        if half is None
-        else (((half[0] / 2) ** 2, 0.0), (0.0, (half[1] / 2) ** 2)),
-        band_hz=(1.0, 10.0),
-        error_db=0.2,
-        naive_error_db=1.0,
-        coherence_min=0.99,
-        armature=0.0026,
+    found = JointGains(stiffness=stiffness, damping=damping, armature=0.0026)
+    if half is None:
+        return found
+    return replace(
+        found,
+        stiffness_ci95=(stiffness - half[0], stiffness + half[0]),
+        damping_ci95=(damping - half[1], damping + half[1]),
+        covariance=(((half[0] / 2) ** 2, 0.0), (0.0, (half[1] / 2) ** 2)),
     )
 
 

@@ -44,9 +44,10 @@ from pronk.logs.readers import read_logs
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
-from pronk.match.measured_joint import SimRequest, logs_by_joint, measured_joints, responses
+from pronk.match.measured_joint import logs_by_joint, measured_joints
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
+from pronk.match.simulated import SimRequest, responses
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import MujocoSimulator
 from pronk.virtual.sim_params import SimParams, load_sim_params

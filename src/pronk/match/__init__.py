@@ -1,9 +1,10 @@
 """Find the parameters with which a simulated joint responds as the measured one does.
 
-Start at `pipeline.match_logs`. In order: `measured_joint` (responses ready to be compared), `grid`
-(the paper's search, whole or linearized), `response_fit` (off the grid, and mode drive), `arm`
-(joints that moved together), `ranges` (what training randomizes). Parameters, least-squares
-problems, solvers and uncertainty are in `fit`, results in `result` and `gains`.
+Start at `pipeline.match_logs`. In order: `measured_joint` (responses ready to be compared),
+`simulated` (the same of the simulator), `grid` (the paper's search, whole or linearized),
+`response_fit` (off the grid, and mode drive) or `arm` (joints that moved together), `result`,
+`ranges` (what training randomizes), `gains`. The one list of parameters is `parameters`; problems,
+solvers and uncertainty are in `fit`.
 """
 
 from __future__ import annotations

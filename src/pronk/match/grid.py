@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.match.measured_joint import DB, MeasuredJoint, SimRequest, responses
+from pronk.match.measured_joint import DB, MeasuredJoint
 from pronk.match.response_fit import Fit, refine
+from pronk.match.simulated import SimRequest, responses
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant, plant
 from pronk.simulators.mujoco import MujocoSimulator

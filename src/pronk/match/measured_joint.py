@@ -20,7 +20,6 @@ from pronk.response.estimate import estimate, excitations, log_rate, operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
-from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -276,59 +275,3 @@ def _fit_matrix(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array)
     loud = np.nonzero(tail > _TAIL)[0]
     steps = min(int(loud[-1]) + 2, len(matrix)) if len(loud) else len(matrix)
     return np.hstack([chosen[:steps].real, chosen[:steps].imag])
-
-
-@dataclass(frozen=True)
-class SimRequest:
-    """One simulation: the command of a measured response, with some parameters of the joint."""
-
-    target: MeasuredJoint
-    stiffness: float
-    damping: float
-    armature: float | None = None
-    """[kg m^2]; None: the simulator's."""
-    frictionloss: float | None = None
-    """[N m]; None: the simulator's."""
-    delay: float = 0.0
-    """Delay of the command [s]."""
-
-
-def responses(
-    rigs: JointRigs, requests: Sequence[SimRequest], *, whole: bool = False
-) -> list[ComplexArray]:
-    """Simulate requests; those whose joints mirror one original joint share a rollout.
-
-    Armature and friction are given for all requests of one original joint, or for none.
-
-    Args:
-        rigs: The training simulator.
-        requests: What to simulate.
-        whole: All frequencies of the target instead of those inside its band.
-
-    Returns:
-        One response a request, of shape (inside,), or (f,) if `whole`; NaN where a simulation
-        diverged.
-    """
-    out: list[ComplexArray] = [np.empty(0, dtype=np.complex128)] * len(requests)
-    by_original: dict[str, list[int]] = {}
-    for i, request in enumerate(requests):
-        original = rigs.robot.joint(request.target.joint).original[0]
-        by_original.setdefault(original, []).append(i)
-    for indices in by_original.values():
-        group = [requests[i] for i in indices]
-        values = {
-            name: np.array([getattr(request, name) for request in group])
-            for name in ("stiffness", "damping", "armature", "frictionloss")
-            if getattr(group[0], name) is not None
-        }
-        steps = max(len(r.target.matrix) if whole else r.target.steps for r in group)
-        for part, position in rigs.run([request.target.trace for request in group], values, steps):
-            for row, k in enumerate(range(part.start, part.stop)):
-                goal, delay = group[k].target, group[k].delay
-                read = goal.full_response if whole else goal.fit_response
-                response = read(position[row])
-                if delay:
-                    omega = goal.measured.omega if whole else goal.omega
-                    response = response * np.exp(-1j * omega * delay)
-                out[indices[k]] = response
-    return out

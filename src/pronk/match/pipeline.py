@@ -16,12 +16,10 @@ from pronk.match.arm import fit_whole_arm
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
     MeasuredJoint,
-    SimRequest,
     gains_on_drive,
     logs_by_joint,
     measured_joints,
     merged,
-    responses,
 )
 from pronk.match.parameters import DRIVE_MODE, FREE, GAINS_MODE, checked_names
 from pronk.match.ranges import matched_gains
@@ -36,6 +34,7 @@ from pronk.match.response_fit import (
 )
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult, amplitude_spread
 from pronk.match.settings import MatchSettings
+from pronk.match.simulated import SimRequest, responses
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together

@@ -26,9 +26,10 @@ from pronk.match.fit import (
     solve_together,
 )
 from pronk.match.identifiability import bench_experiment, require_identifiable
-from pronk.match.measured_joint import DB, FLOOR_DB, MeasuredJoint, SimRequest, responses
+from pronk.match.measured_joint import DB, FLOOR_DB, MeasuredJoint
 from pronk.match.parameters import FREE, GAINS, PARAMETERS
 from pronk.match.result import JointFit
+from pronk.match.simulated import SimRequest, responses
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import JointRigs
 

@@ -53,17 +53,12 @@ _SHAPE = {1: 4, 2: 2, 3: 2}
 
 @dataclass(frozen=True, kw_only=True)
 class DelayFit:
-    """A second-order joint and the delay beyond it; NaN if too few frequencies are coherent."""
+    """Delay beyond a second-order joint; NaN if too few frequencies are coherent."""
 
     delay_s: float = float("nan")
     """[s]"""
     standard_error_s: float = float("nan")
     """Over repeats where there are three or more, else from the residual of the fit [s]."""
-    ratio: float = float("nan")
-    """Gain at standstill."""
-    natural_hz: float = float("nan")
-    """Undamped natural frequency [Hz]."""
-    damping_ratio: float = float("nan")
 
 
 def _fit(
@@ -105,14 +100,7 @@ def fit_delay(response: FrequencyResponse, *, max_hz: float = 25.0) -> DelayFit:
     else:
         variance = float(residual @ residual) / (len(residual) - len(best))
         error = float(np.sqrt(variance * np.linalg.pinv(jacobian.T @ jacobian)[3, 3]))
-    ratio, natural, zeta = np.exp(best[:3]).tolist()
-    return DelayFit(
-        delay_s=float(best[3]),
-        standard_error_s=error,
-        ratio=ratio,
-        natural_hz=natural / (2.0 * np.pi),
-        damping_ratio=zeta,
-    )
+    return DelayFit(delay_s=float(best[3]), standard_error_s=error)
 
 
 def third_harmonic(log: JointLog, joint: str, band_hz: tuple[float, float] = LOW_BAND_HZ) -> float:
