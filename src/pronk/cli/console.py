@@ -10,7 +10,7 @@ import json
 import math
 import select
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -93,30 +93,38 @@ def show_sheet(sheet: Sheet | None, title: str = "") -> None:
             say(f"  {note}")
 
 
+def show_rows(title: str, columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print some fields of rows: heading (and digits, as in `peak [dB];2`) to name of a field."""
+    from pronk.report.page import table
+
+    cells = [[row[name] for name in columns.values()] for row in rows]
+    show_sheet(table(" | ".join(columns), cells, title=title))
+
+
 def number(value: float, digits: int = 2) -> str:
     """Format a number; a dash where it is unknown."""
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def _plain(value: Any) -> Any:
-    """Convert to what strict JSON can hold; unknown numbers are null."""
+    """Convert to what strict JSON can hold; numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(entry) for entry in value]
-    if isinstance(value, Path):
-        return str(value)
     if hasattr(value, "tolist"):
         return _plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
 
 
-def write_json(path: Path | None, figures: dict[str, Any]) -> None:
+def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
     """Write a command's figures, if a file was requested."""
     if path is not None:
         from pronk.files import write_text
 
-        write_text(path, json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n")
+        write_text(path, json.dumps(_plain(dict(figures)), indent=2, allow_nan=False) + "\n")
         wrote(path)
 
 

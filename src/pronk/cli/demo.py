@@ -104,11 +104,7 @@ def demo(
 
 
 def find_policies(folder: Path | None, robot: RobotSpec) -> list[Path]:
-    """Return the policies of a folder, or of pronk's source if None; the matched one first.
-
-    Raises:
-        PronkError: A given folder has none, or one of them is not for the robot.
-    """
+    """Return the policies of a folder, or of pronk's source if None; the matched one first."""
     from pronk.evaluation.trial import load_subjects
 
     place = folder or Path(pronk.__file__).parents[2] / "policies"

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 def deploy(
     policy: tyro.conf.Positional[Path],
+    robot: str | None = None,
     machine: LinkOptions = LinkOptions(),  # noqa: B008
     base: Base | None = None,
     script: str | None = None,
@@ -39,6 +40,7 @@ def deploy(
 
     Args:
         policy: policy.onnx, as `pronk train` writes it.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
         machine: The machine.
         base: Of the virtual robot; the ground if left out.
         script: Run this unattended: paper, or a command such as 1,0,0.
@@ -63,7 +65,7 @@ def deploy(
     if capture is not None and (address.kind != SIM or address.interface == "bench"):
         raise HardwareError("--capture needs --link sim --base ground: no camera sees elsewhere.")
     plan = Plan(
-        link=Link(robot=contract.robot, address=address, release=machine.release),
+        link=Link(robot=robot or contract.robot, address=address, release=machine.release),
         policy=policy,
         log=log,
         capture=capture,

@@ -39,7 +39,7 @@ def match(
 
     Args:
         paths: Logs, or folders of logs.
-        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF.
         out: The gains file.
         mode: gains: stiffness and damping (the paper's). drive: damping, armature, friction and
             delay at known stiffness.
@@ -62,9 +62,7 @@ def match(
 
     known = load_robot(robot)
     if out.suffix not in (".yaml", ".yml"):
-        raise PronkError(
-            f"--out {out}: expected a name that ends in .yaml, for instance gains.yaml."
-        )
+        raise PronkError(f"--out {out}: expected a name that ends in .yaml, as in gains.yaml.")
     if free and mode != "drive":
         raise PronkError("--fit names what --mode drive fits; give --mode drive as well.")
     logs = reading.read(paths, known)
@@ -116,17 +114,12 @@ def summary(result: MatchResult) -> dict[str, Any]:
     """Figures of a match, for JSON."""
     from pronk.report.match_page import verdict
 
-    def zero(name: str) -> float | None:
-        fit = result.joints.get(name)
-        return fit.zero_armature_error_db if fit else None
-
+    zero = {name: joint.zero_armature_error_db for name, joint in result.joints.items()}
     return verdict(result) | {
         "gains": {
             name: vars(gains)
-            | {
-                "grid": [gains.grid_stiffness, gains.grid_damping],
-                "zero_armature_error_db": zero(name),
-            }
+            | {"grid": [gains.grid_stiffness, gains.grid_damping]}
+            | {"zero_armature_error_db": zero.get(name)}
             for name, gains in result.gains.joints.items()
         },
         "groups": {name: vars(group) for name, group in result.gains.groups.items()},
@@ -148,7 +141,7 @@ def predict(
 
     Args:
         paths: Logs, or folders of logs.
-        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF.
         gains: gains.yaml of `pronk match`.
         out: Folder for replays and figures; beside the gains.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
@@ -218,7 +211,7 @@ def export(
         gains: gains.yaml of `pronk match`.
         to: What reads the file.
         out: The file to write.
-        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF; the gains' if left out.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
         json_file: Also write the figures to this file.
     """
     from pronk.files import write_text

@@ -14,6 +14,7 @@ from pronk.errors import PronkError
 
 def play(
     policy: tyro.conf.Positional[Path],
+    robot: str | None = None,
     sim_params: Path | None = None,
     port: int = 8080,
     host: str = "127.0.0.1",
@@ -25,6 +26,7 @@ def play(
 
     Args:
         policy: policy.onnx.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
         sim_params: Body of the virtual robot; the one that ships with pronk if left
             out.
         port: Of the page; the next one that is free.
@@ -46,12 +48,13 @@ def play(
     from pronk.virtual.sim_params import load_sim_params
 
     modules()
-    robot = load_robot("mini_cheetah")
-    loaded, params = load_policy(policy), load_sim_params(sim_params)
-    check(loaded.contract, robot)
+    loaded = load_policy(policy)
+    machine = load_robot(robot or loaded.contract.robot)
+    params = load_sim_params(sim_params, machine)
+    check(loaded.contract, machine)
     ranges = loaded.contract.command_ranges
     title = (
-        f"## The virtual robot\nNot a real one. {robot.name}, policy `{policy.name}` "
+        f"## The virtual robot\nNot a real one. {machine.name}, policy `{policy.name}` "
         f"({loaded.contract.gains} gains), in real time."
     )
     devices = sorted(Path("/dev/input").glob("js*"))
@@ -65,7 +68,7 @@ def play(
         pad = stack.enter_context(closing(Gamepad(devices[0], ranges))) if devices else None
         joystick = Joystick(ranges=ranges, jumps=loaded.contract.jump, gamepad=pad)
         page = stack.enter_context(
-            WebPage(robot, params.ground, joystick, title=title, host=host, port=port)
+            WebPage(machine, params.ground, joystick, title=title, host=host, port=port)
         )
         console.say(f"the virtual robot stands at {page.address}; Ctrl-C ends it")
         if host != "127.0.0.1":
@@ -75,7 +78,7 @@ def play(
                 f"gamepad: {devices[0]} (left stick walks, right stick turns, RB jumps, START "
                 "sets down anew)"
             )
-        played = run(robot, loaded, params, joystick, page, seed=seed)
+        played = run(machine, loaded, params, joystick, page, seed=seed)
     factor = played.simulated_s / max(played.wall_s, 1e-9)
     console.say(
         f"{played.simulated_s:.0f} s of the virtual robot in {played.wall_s:.0f} s "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,7 @@ def response(
 
     Args:
         paths: Logs, or folders of logs.
-        robot: RobotSpec: a name, or a path to its robot.yaml, MJCF or URDF; the log's if left out.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF; the log's if left out.
         out: Folder for what is written; beside the log if left out.
         plots: Draw Bode plots.
         reading: How logs are read.
@@ -61,7 +62,8 @@ def response(
             written.append(folder / f"{stem}.response.npz")
             rows += [summary(one) | {"log": log.source} for one in found]
             done((i + 1) / len(logs))
-    show(rows)
+    virtual = any(row["virtual"] for row in rows)
+    console.show_rows("Responses of the virtual robot" if virtual else "Responses", COLUMNS, rows)
     for log in logs:
         for note in log.notes:
             console.say(f"note: {Path(log.source).name}: {note}")
@@ -73,11 +75,7 @@ def response(
 
 
 def excited_joints(log: JointLog) -> tuple[str, ...]:
-    """Joints of the log's segments; without segments, those whose command moves.
-
-    Raises:
-        LogError: There is none.
-    """
+    """Joints of the log's segments; without segments, those whose command moves."""
     named = {name for segment in log.segments for name in segment.joints}
     moving = log.command.max(axis=0) > log.command.min(axis=0)
     pairs = zip(log.joints, moving, strict=True)
@@ -88,14 +86,23 @@ def excited_joints(log: JointLog) -> tuple[str, ...]:
 
 
 def summary(found: FrequencyResponse) -> dict[str, Any]:
-    """Figures of one response, for the table and for JSON."""
+    """Figures of one response, for the table and for JSON.
+
+    The bandwidth is where the gain falls 3 dB below that at the lowest frequency [Hz]: after the
+    last coherent frequency above that level, so that a noisy dip is not taken for it.
+    """
     import numpy as np
 
-    hz = found.frequency_hz
+    hz, level = found.frequency_hz, found.gain[0] / np.sqrt(2.0)
     coherent = hz[found.coherence >= COHERENT]
     band = (float(coherent.min()), float(coherent.max())) if len(coherent) else None
     inside = found.band(*band) if band else hz > 0.0
     peak = int(np.argmax(np.where(inside, found.gain, -np.inf)))
+    above = np.flatnonzero((found.gain >= level) & (found.coherence >= 0.5))
+    bandwidth = math.nan
+    if len(above) and above[-1] + 1 < len(hz):
+        ends = slice(above[-1], above[-1] + 2)
+        bandwidth = float(np.interp(-level, -found.gain[ends], hz[ends]))
     return {
         "joint": found.joint,
         "virtual": found.virtual,
@@ -106,45 +113,22 @@ def summary(found: FrequencyResponse) -> dict[str, Any]:
         "coherence_min": float(found.coherence[inside].min()),
         "peak_db": float(20.0 * np.log10(found.gain[peak])),
         "peak_hz": float(hz[peak]),
-        "bandwidth_hz": bandwidth_hz(found),
+        "bandwidth_hz": bandwidth,
         "delay_s": found.delay_s,
         "third_harmonic": found.third_harmonic,
     }
 
 
-def bandwidth_hz(found: FrequencyResponse) -> float:
-    """Frequency at which the gain falls 3 dB below that at the lowest frequency, interpolated [Hz].
-
-    It lies after the last coherent frequency above that level, so that a noisy dip is not taken for
-    the end of the band; NaN if the gain never falls.
-    """
-    import numpy as np
-
-    level = found.gain[0] / np.sqrt(2.0)
-    above = np.flatnonzero((found.gain >= level) & (found.coherence >= 0.5))
-    if len(above) == 0 or above[-1] + 1 >= len(found.gain):
-        return float("nan")
-    ends = slice(above[-1], above[-1] + 2)
-    return float(np.interp(-level, -found.gain[ends], found.frequency_hz[ends]))
-
-
-def show(rows: list[dict[str, Any]]) -> None:
-    """Print the table of responses."""
-    from pronk.report.page import table
-
-    columns = {
-        "joint": "joint",
-        "amplitude [rad]": "amplitude_rad",
-        "repeats": "repeats",
-        f"coherence >= {COHERENT} [Hz];1": "coherent_hz",
-        "least there": "coherence_min",
-        "peak [dB];2": "peak_db",
-        "at [Hz];2": "peak_hz",
-        "-3 dB at [Hz];2": "bandwidth_hz",
-        "command delay [s];4": "delay_s",
-        "third harmonic": "third_harmonic",
-    }
-    cells = [[row[key] for key in columns.values()] for row in rows]
-    virtual = any(row["virtual"] for row in rows)
-    title = "Responses of the virtual robot" if virtual else "Responses"
-    console.show_sheet(table(" | ".join(columns), cells, title=title))
+COLUMNS = {
+    "joint": "joint",
+    "amplitude [rad]": "amplitude_rad",
+    "repeats": "repeats",
+    f"coherence >= {COHERENT} [Hz];1": "coherent_hz",
+    "least there": "coherence_min",
+    "peak [dB];2": "peak_db",
+    "at [Hz];2": "peak_hz",
+    "-3 dB at [Hz];2": "bandwidth_hz",
+    "command delay [s];4": "delay_s",
+    "third harmonic": "third_harmonic",
+}
+"""Heading to field of a summary."""

@@ -52,16 +52,15 @@ def _check(path: Path) -> None:
     rows, problems = [], []
     for joint in found.joints:
         bench_spec(found, joint.name).compile()
-        low, high = joint.range
+        (low, high), at, drive = joint.range, joint.default_position, joint.drive
         chain, clamped = " ".join(joint.chain), " ".join(joint.clamped)
-        effort, default = joint.drive.effort_limit, joint.default_position
-        rows.append((joint.name, joint.group, joint.range, default, effort, chain, clamped))
-        if not low < joint.default_position < high:
-            problems.append(f"poses.default of {joint.name} is outside of its range")
-        if not joint.drive.armature:
-            problems.append(f"the rotor inertia (armature) of {joint.name} is 0")
-        if not joint.drive.frictionloss:
-            problems.append(f"the dry friction (frictionloss) of {joint.name} is 0")
+        rows.append((joint.name, joint.group, joint.range, at, drive.effort_limit, chain, clamped))
+        checks = {
+            f"poses.default of {joint.name} is outside of its range": low < at < high,
+            f"the rotor inertia (armature) of {joint.name} is 0": drive.armature > 0.0,
+            f"the dry friction (frictionloss) of {joint.name} is 0": drive.frictionloss > 0.0,
+        }
+        problems += [problem for problem, met in checks.items() if not met]
     columns = "joint | group | range [rad];2 | default [rad];2 | effort limit [N m]"
     title = f"{found.name}: {len(found.joints)} joints"
     console.show_sheet(table(f"{columns} | chain | clamped", rows, title=title))

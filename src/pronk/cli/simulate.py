@@ -49,7 +49,7 @@ def simulate(
     Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
 
     Args:
-        robot: RobotSpec, for instance mini_cheetah.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF.
         link: The wire.
         layout: Messages on LCM: Cheetah-Software's, or walk-these-ways'.
         base: bench: the trunk is fixed; ground: it stands and moves freely.

@@ -42,7 +42,7 @@ def sweep(
     """Excite every joint: plan, check against the limits, excite, record.
 
     Args:
-        robot: RobotSpec, for instance mini_cheetah.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF.
         out: Folder for the logs, one MCAP per joint.
         machine: The machine.
         joints: Joints to excite; repeat it. All if left out.
@@ -149,8 +149,6 @@ def make(
 
 def show_plan(plan: SweepPlan) -> None:
     """Print what the sweep will do to each joint, against its limits."""
-    from pronk.report.page import table
-
     columns = {
         "joint": "joint",
         "amplitude [rad]": "amplitude_rad",
@@ -165,9 +163,8 @@ def show_plan(plan: SweepPlan) -> None:
         "power [W];0": "electrical_power_w",
         "bus [A];1": "bus_current_a",
     }
-    rows = [[row[key] for key in columns.values()] for row in plan.rows()]
     title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
-    console.show_sheet(table(" | ".join(columns), rows, title=title))
+    console.show_rows(title, columns, plan.rows())
 
 
 def record_wire(

@@ -15,7 +15,6 @@ from pronk.errors import PronkError
 if TYPE_CHECKING:
     from pronk.evaluation.tables import Sheet
 
-ROBOT = "mini_cheetah"
 RATES_JUMPS = 3
 """At 2.25 m/s, beside the paper's commands: enough to draw its figure of roll and pitch rates."""
 
@@ -23,6 +22,7 @@ RATES_JUMPS = 3
 def trial(
     policy: tyro.conf.Positional[Path],
     out: Path,
+    robot: str | None = None,
     also: tuple[Path, ...] = (),
     commands: tuple[str, ...] = (),
     jumps: int = 20,
@@ -44,6 +44,7 @@ def trial(
 
     Args:
         policy: policy.onnx.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
         out: Folder for tables, captures, videos and the page.
         also: Another policy to compare with, as the naive one. Give it repeatedly.
         commands: Forward and left velocity in m/s, as "2.25,0"; a yaw rate in rad/s may
@@ -73,6 +74,7 @@ def trial(
     from pronk.evaluation.results import SUMMARY, TABLE
     from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, cores, run_trial
     from pronk.files import sha256
+    from pronk.policy.runtime import load_policy
     from pronk.report.build import write_report
     from pronk.robots import load_robot
     from pronk.virtual.sim_params import SHIPPED, load_sim_params
@@ -86,9 +88,10 @@ def trial(
         seed=seed,
     )
     file, policies = sim_params or SHIPPED, [policy, *also]
+    known = load_robot(robot or load_policy(policy).contract.robot)
     setup: dict[str, Any] = {
-        "robot": load_robot(ROBOT),
-        "sim_params": load_sim_params(file),
+        "robot": known,
+        "sim_params": load_sim_params(sim_params, known),
         "out": out,
         "about": {
             "file": str(sim_params) if sim_params else "shipped with pronk",
