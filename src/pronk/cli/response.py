@@ -13,7 +13,6 @@ from pronk.cli.options import Reading
 from pronk.errors import LogError
 
 if TYPE_CHECKING:
-    from pronk.logs.joint_log import JointLog
     from pronk.response.response import FrequencyResponse
 
 COHERENT = 0.95
@@ -40,6 +39,7 @@ def response(
     """
     from pronk.report import figures, style
     from pronk.response import Estimator, estimate, save
+    from pronk.response.estimate import excited_joints
     from pronk.robots import load_robot
 
     logs = reading.read(paths, load_robot(robot) if robot else None)
@@ -51,7 +51,9 @@ def response(
             source = Path(log.source or "log")
             folder, stem = out or source.parent, source.stem
             found: list[FrequencyResponse] = []
-            for joint in (joints := excited_joints(log)):
+            if not (joints := excited_joints(log)):
+                raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
+            for joint in joints:
                 mine = estimate(log, joint, Estimator())
                 found += mine
                 if plots:
@@ -72,17 +74,6 @@ def response(
     name = robot or logs[0].robot or "ROBOT"
     where = " ".join(str(path) for path in paths)
     console.following(f"pronk match {where} --robot {name} --out gains.yaml")
-
-
-def excited_joints(log: JointLog) -> tuple[str, ...]:
-    """Joints of the log's segments; without segments, those whose command moves."""
-    named = {name for segment in log.segments for name in segment.joints}
-    moving = log.command.max(axis=0) > log.command.min(axis=0)
-    pairs = zip(log.joints, moving, strict=True)
-    excited = tuple(name for name, moves in pairs if (name in named if log.segments else moves))
-    if not excited:
-        raise LogError(f"{log.source or 'log'}: no command moves, so no joint was excited.")
-    return excited
 
 
 def summary(found: FrequencyResponse) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,25 +85,24 @@ class SweepPlan:
         excited = sum(self.seconds(each) for each in self.excitations)
         return excited + len(self.joints) * (POSE_RAMP_S + 2.0 * self.settle_s)
 
-    def rows(self) -> list[dict[str, float | str]]:
+    def rows(self) -> list[dict[str, Any]]:
         """The forecasts as a table: a row per joint, worst case over the uncertainty."""
+        units = {
+            "amplitude": "rad",
+            "lowest": "rad",
+            "highest": "rad",
+            "speed": "rad_s",
+            "no_load_speed": "rad_s",
+            "torque": "nm",
+            "effort_limit": "nm",
+            "mechanical_power": "w",
+            "electrical_power": "w",
+            "bus_current": "a",
+        }
         return [
-            {
-                "joint": f.joint,
-                "amplitude_rad": f.amplitude,
-                "lowest_rad": f.lowest,
-                "highest_rad": f.highest,
-                "range_low_rad": f.range[0],
-                "range_high_rad": f.range[1],
-                "speed_rad_s": f.speed,
-                "no_load_speed_rad_s": f.no_load_speed,
-                "torque_nm": f.torque,
-                "effort_limit_nm": f.effort_limit,
-                "torque_share": f.torque_share,
-                "mechanical_power_w": f.mechanical_power,
-                "electrical_power_w": f.electrical_power,
-                "bus_current_a": f.bus_current,
-            }
+            {"joint": f.joint, "torque_share": f.torque_share}
+            | {"range_low_rad": f.range[0], "range_high_rad": f.range[1]}
+            | {f"{name}_{unit}": getattr(f, name) for name, unit in units.items()}
             for f in self.forecasts
             if f.amplitude > 0.0
         ]
@@ -179,7 +179,7 @@ def make_plan(
     damping: Mapping[str, float] | None = None,
     uncertainty: Uncertainty | None = None,
 ) -> SweepPlan:
-    """Plan a sweep, and forecast its effect on the robot.
+    """Plan a sweep, and forecast its effect on the robot; call its `check` before anything moves.
 
     One joint at a time (paper F1), in the order of the robot's files; each amplitude `repeats`
     times. Joints that the robot's file clamps for an excitation are clamped (paper F6), the others
@@ -196,9 +196,6 @@ def make_plan(
         stiffness: Gains on the drives by joint, instead of the robot's [N m/rad].
         damping: Gains on the drives by joint, instead of the robot's [N m s/rad].
         uncertainty: How far the robot may be from its model.
-
-    Returns:
-        The plan. Call its `check` before anything moves.
 
     Raises:
         RobotError: A joint is unknown.

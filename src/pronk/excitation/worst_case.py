@@ -140,15 +140,8 @@ def forecast(
 ) -> list[Forecast]:
     """Simulate the bench model in every corner of the uncertainty.
 
-    Args:
-        robot: The robot.
-        joint: The excited joint.
-        offsets: Command offsets about the default pose [rad], shape (ticks,).
-        rate_hz: Rate of the ticks.
-        stiffness: Gains of the real drives by joint [N m/rad].
-        damping: Gains of the real drives by joint [N m s/rad].
-        uncertainty: How far the robot may be from the model.
-        timestep_s: Physics step.
+    `offsets` of the command to a joint about the default pose [rad] have shape (ticks,);
+    `stiffness` and `damping` are those of the real drives by joint.
 
     Returns:
         A forecast for every joint of the chain, those that are only held included.

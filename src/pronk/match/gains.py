@@ -29,8 +29,6 @@ class JointGains:
     """[N m/rad]"""
     damping: float
     """[N m s/rad]"""
-    armature: float
-    """[kg m^2]"""
     grid_stiffness: float = NAN
     """The paper's grid optimum [N m/rad]; NaN without a grid."""
     grid_damping: float = NAN
@@ -45,6 +43,8 @@ class JointGains:
     naive_error_db: float = NAN
     """The same with the gains of the real drive put into the simulator."""
     coherence_min: float = NAN
+    armature: float
+    """[kg m^2]"""
     amplitude_spread: float = NAN
     """Largest relative change of stiffness between amplitudes; NaN with one amplitude."""
     frictionloss: float = NAN

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
-from pronk.response.estimate import estimate, excitations, log_rate, operator
+from pronk.response.estimate import (
+    estimate,
+    excitations,
+    excited_joints,
+    log_rate,
+    operator,
+)
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
@@ -117,11 +123,8 @@ def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[
     """
     where: dict[str, list[JointLog]] = {}
     for log in logs:
-        names = {name for segment in log.segments for name in segment.joints}
-        # Without segments, the excited joints are those whose command moves.
-        for i, name in enumerate(log.joints):
-            if name in names or (not log.segments and np.ptp(log.command[:, i]) > 0.0):
-                where.setdefault(name, []).append(log)
+        for name in excited_joints(log):
+            where.setdefault(name, []).append(log)
     for name in where:
         robot.joint(name)
     if not where:

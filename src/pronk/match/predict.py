@@ -23,6 +23,7 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import MatchedGains
 from pronk.match.measured_joint import gains_on_drive
 from pronk.match.parameters import GAINS
+from pronk.response.estimate import excited_joints
 from pronk.response.grid import held_mean
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, moves_together, published
@@ -249,9 +250,7 @@ def _replay(
 
 def _single(log: JointLog) -> tuple[Segment, ...]:
     """The whole log as one segment of those whose command moves."""
-    moving = np.ptp(log.command, axis=0) > 0.0
-    names = tuple(name for name, moves in zip(log.joints, moving, strict=True) if moves)
-    if not names:
+    if not (names := excited_joints(log)):
         return ()
     return (
         Segment(

@@ -19,6 +19,14 @@ from pronk.response.response import Estimator, FrequencyResponse
 _ESTIMATORS = {"multisine": estimate_multisine, "sine_steps": estimate_steps}
 
 
+def excited_joints(log: JointLog) -> tuple[str, ...]:
+    """Joints of the log's segments; without segments, those whose command moves."""
+    named = {name for segment in log.segments for name in segment.joints}
+    moving = np.ptp(log.command, axis=0) > 0.0
+    pairs = zip(log.joints, moving, strict=True)
+    return tuple(name for name, moves in pairs if (name in named if log.segments else moves))
+
+
 def excitations(log: JointLog, joint: str) -> list[list[JointLog]]:
     """Split a log into the excitations of one joint, grouped into repeats.
 
