@@ -26,18 +26,18 @@ def test_help_names_every_command_and_loads_no_heavy_library():
         "print([name for name in heavy if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    *shown, loaded = done.stdout.strip().splitlines()
+    *printed, loaded = done.stdout.strip().splitlines()
     assert loaded == "[]"
-    words = " ".join(shown).split()
+    words = " ".join(printed).split()
     assert set(cli.COMMANDS) <= set(words)
     assert accepted("--version").strip() == f"pronk {__version__}"
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_every_command_has_help(command):
-    shown = accepted(command, "--help")
-    assert len(shown) > 200
-    assert "--json" in shown or command == "robot"
+    printed = accepted(command, "--help")
+    assert len(printed) > 200
+    assert "--json" in printed or command == "robot"
 
 
 @pytest.mark.parametrize(
@@ -104,16 +104,16 @@ def test_sweep_writes_a_log_of_the_virtual_robot(swept):
 
 
 def test_plan_only_writes_nothing(tmp_path):
-    shown = accepted("sweep", "mini_cheetah", "--out", tmp_path / "x", *KNEE, "--plan-only")
-    assert "torque [N m]" in shown
+    printed = accepted("sweep", "mini_cheetah", "--out", tmp_path / "x", *KNEE, "--plan-only")
+    assert "torque [N m]" in printed
     assert not (tmp_path / "x").exists()
 
 
 def test_response_table_and_files(swept, tmp_path):
     figures = tmp_path / "response.json"
     log = swept / "FR_knee.mcap"
-    shown = accepted("response", log, "--out", tmp_path, "--json", figures)
-    assert "virtual robot" in shown
+    printed = accepted("response", log, "--out", tmp_path, "--json", figures)
+    assert "virtual robot" in printed
     row = json.loads(figures.read_text())["responses"][0]
     assert row["joint"] == "FR_knee"
     assert 5.0 < row["bandwidth_hz"] < 15.0
@@ -173,5 +173,5 @@ def test_drive_mode_fits_what_it_can_and_refuses_the_rest(matched, tmp_path):
     fits = [word for name in names for word in ("--fit", name)]
     assert "FR_knee" in refused(*common, "--mode", "drive", *fits)
     assert not out.exists()
-    shown = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay")
-    assert "held" in shown
+    printed = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay")
+    assert "held" in printed

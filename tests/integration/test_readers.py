@@ -237,10 +237,9 @@ def test_pace_recording_without_pytorch_gives_pytorchs_numbers(tmp_path: Path) -
 
 
 def test_an_upper_case_ending_and_an_explicit_format(tmp_path: Path) -> None:
-    write_csv(tmp_path / "A.CSV", example())
-    assert len(read_log(tmp_path / "A.CSV", unit="rad").time) == 500
-    (tmp_path / "A.CSV").rename(tmp_path / "a.txt")
-    assert len(read_log(tmp_path / "a.txt", unit="rad", format="csv").time) == 500
+    for name, options in (("A.CSV", {}), ("a.txt", {"format": "csv"})):
+        write_csv(tmp_path / name, example())
+        assert len(read_log(tmp_path / name, unit="rad", **options).time) == 500
 
 
 # --- timing -------------------------------------------------------------------------------------

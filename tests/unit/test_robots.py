@@ -32,8 +32,19 @@ def posed(model: mujoco.MjModel) -> mujoco.MjData:
 
 
 def test_unknown_robot_names_the_known_ones() -> None:
-    with pytest.raises(RobotError, match=r"'go1'.*mini_cheetah, go2, so101"):
+    with pytest.raises(RobotError, match="mini_cheetah"):
         load_robot("go1")
+    with pytest.raises(RobotError, match="legs"):
+        legged("so101")
+
+
+def test_dimensions_of_legs_come_from_the_model() -> None:
+    go2 = legged("go2")
+    assert go2.legs == ("FR", "FL", "RR", "RL")
+    assert go2.leg_joints == CHEETAH.leg_joints == ("hip_roll", "hip_pitch", "knee")
+    assert (go2.thigh_length, go2.shank_length, go2.foot_radius) == (0.213, 0.213, 0.022)
+    lengths = (CHEETAH.thigh_length, CHEETAH.shank_length, CHEETAH.foot_radius)
+    assert lengths == (0.209, 0.195, 0.0175)
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
@@ -53,13 +64,26 @@ def test_every_joint_of_the_robot_is_a_hinge_of_the_model(name: str) -> None:
     assert robot.timestep_s * robot.decimation * robot.policy_rate_hz == pytest.approx(1.0)
 
 
-def test_drive_figures_of_the_paper_and_the_open_software() -> None:
-    robot = load_robot("mini_cheetah")
-    hip, knee = robot.joint("FR_hip_pitch").drive, robot.joint("FR_knee").drive
-    assert (hip.armature, knee.armature) == pytest.approx((0.0026, 0.0063), abs=5e-5)  # S6
-    assert (hip.effort_limit, knee.effort_limit) == pytest.approx((17.0, 26.4), abs=0.05)  # A12
-    assert (hip.stall_torque, knee.stall_torque) == pytest.approx((62.4, 97.1), abs=0.05)
-    assert (hip.no_load_speed, knee.no_load_speed) == pytest.approx((40.0, 25.7), abs=0.05)
+@pytest.mark.parametrize(
+    ("name", "armature", "effort", "stall", "free"),
+    [
+        # S6 and A12 of the paper; stall torque and no-load speed of the open software.
+        ("mini_cheetah", (0.0026, 0.0063), (17.0, 26.4), (62.4, 97.1), (40.0, 25.7)),
+        ("go2", (0.01, 0.0225), (23.7, 35.55), (23.7, 35.55), (30.1, 20.07)),
+    ],
+)
+def test_drives_have_the_published_figures(
+    name: str,
+    armature: tuple[float, ...],
+    effort: tuple[float, ...],
+    stall: tuple[float, ...],
+    free: tuple[float, ...],
+) -> None:
+    drives = [load_robot(name).joint(joint).drive for joint in ("FR_hip_pitch", "FR_knee")]
+    assert [drive.armature for drive in drives] == pytest.approx(armature, abs=5e-5)
+    assert [drive.effort_limit for drive in drives] == pytest.approx(effort, abs=0.05)
+    assert [drive.stall_torque for drive in drives] == pytest.approx(stall, abs=0.05)
+    assert [drive.no_load_speed for drive in drives] == pytest.approx(free, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -86,13 +110,6 @@ def test_a_robot_rises_from_a_folded_pose_within_its_ranges(name: str) -> None:
         assert joint.range[0] < joint.folded_position < joint.range[1]
     knee = load_robot(name).joint("FR_knee")
     assert abs(knee.folded_position or 0.0) > abs(knee.default_position)
-
-
-def test_drives_of_go2_have_the_published_limits() -> None:
-    go2 = load_robot("go2")
-    hip, knee = go2.joint("FR_hip_pitch").drive, go2.joint("FR_knee").drive
-    assert (hip.armature, knee.armature) == pytest.approx((0.01, 0.0225))
-    assert (hip.effort_limit, knee.effort_limit) == (23.7, 35.55)
 
 
 def test_feet_of_go2_are_under_the_hips_and_on_the_floor() -> None:

@@ -198,7 +198,7 @@ class Person:
         words = [f"fix {', '.join(joints)} mechanically where they are"] if joints else []
         words += [f"free {', '.join(free)}"] if free else []
         say(
-            f"By hand, please: {', and '.join(words)}. The drives hold the pose meanwhile; keep "
+            f"Please {', and '.join(words)}. The drives hold the pose meanwhile; keep "
             "clear of the legs afterwards. Press Enter when it is done."
         )
         # Polling lets a fault end the program meanwhile.
@@ -206,7 +206,7 @@ class Person:
             pass
         if not sys.stdin.readline():
             raise HardwareError(
-                "no person is there to fix joints by hand; sweep joints that need no clamp "
-                "(--joints), or run this from a terminal."
+                "standard input has ended, so no joint can be clamped; sweep joints that need no "
+                "clamp (--joints), or run this from a terminal."
             )
         self._fixed = joints

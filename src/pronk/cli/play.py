@@ -72,7 +72,7 @@ def play(
         )
         console.say(f"the virtual robot stands at {page.address}; Ctrl-C ends it")
         if host != "127.0.0.1":
-            console.warn(f"bound to {host}: everyone who reaches this machine can play")
+            console.warn(f"bound to {host}: every computer that reaches this one can play")
         if pad is not None:
             console.say(
                 f"gamepad: {devices[0]} (left stick walks, right stick turns, RB jumps, START "

@@ -22,8 +22,8 @@ def report(
     """
     from pronk.report import build
 
-    with console.progress() as shown:
-        page, found = build.write_report(folder, shown)
+    with console.progress() as progress:
+        page, found = build.write_report(folder, progress)
     console.wrote(page)
     console.write_json(
         json_file,

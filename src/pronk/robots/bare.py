@@ -17,6 +17,11 @@ NATURAL_HZ, DAMPING_RATIO = 3.0, 0.7
 _NO_LOAD_SPEED = 30.0
 """[rad/s], where the model does not say; typical of geared robot joints."""
 _BAND_HZ = (0.2, 10.0)
+_FIELDS = (
+    *("effort_limit", "stall_torque", "no_load_speed", "bus_voltage", "gear_ratio", "armature"),
+    *("frictionloss", "viscous_damping"),
+)
+"""Fields of a drive that are written."""
 
 
 def file_of_model(path: Path) -> RobotFile:
@@ -102,51 +107,41 @@ def robot_of_model(path: Path) -> RobotSpec:
 def yaml_of_model(path: Path) -> str:
     """Write the `robot.yaml` of a bare model, with comments on what to check."""
     file = file_of_model(path)
-    lines = [
-        f"# Robot of {path.name}. Units: rad, N m, s, kg m^2, V. Check every line marked CHECK,",
-        "# then run `pronk robot check` on this file.",
-        f"schema: {file.schema}",
-        f"name: {file.name}",
-        f"model: {file.model}",
-        "policy_rate_hz: 50.0  # rate of the commands; timestep_s * decimation * rate must be 1",
-        "timestep_s: 0.005     # of the simulator that is matched",
-        "decimation: 4",
-        f"grid_stiffness: {list(file.grid_stiffness)}  # range of `pronk match`'s search",
-        f"grid_damping: {list(file.grid_damping)}",
-        "",
-        "drives:  # CHECK against the data sheet: limits, torque-speed line, rotor inertia",
-    ]
-    fields = (
-        "effort_limit",
-        "stall_torque",
-        "no_load_speed",
-        "bus_voltage",
-        "gear_ratio",
-        "armature",
-        "frictionloss",
-        "viscous_damping",
+    drives = "\n".join(
+        f"  {name}:\n" + "\n".join(f"    {field}: {getattr(drive, field)}" for field in _FIELDS)
+        for name, drive in file.drives.items()
     )
-    for name, drive in file.drives.items():
-        lines.append(f"  {name}:")
-        lines += [f"    {field}: {getattr(drive, field)}" for field in fields]
-    lines += [
-        "",
-        "groups:  # CHECK: gains on the real drives; joints built alike may share a group, with",
-        '  # a pattern such as {joints: "*_knee"}; `clamped: ["*_hip"]` names joints fixed in the',
-        "  # bench test.",
-    ]
-    for name, group in file.groups.items():
-        lines.append(
-            f"  {name}: {{drive: {group.drive}, stiffness: {group.stiffness}, "
-            f"damping: {group.damping}, band_hz: {list(group.band_hz or _BAND_HZ)}}}"
-        )
-    lines += [
-        "",
-        "poses:  # CHECK: the pose of the sweep; a robot that stands up needs `folded` too",
-        "  default:",
-    ]
-    lines += [f"    {name}: {value}" for name, value in file.poses["default"].items()]
-    return "\n".join(lines) + "\n"
+    groups = "\n".join(
+        f"  {name}: {{drive: {group.drive}, stiffness: {group.stiffness}, "
+        f"damping: {group.damping}, band_hz: {list(group.band_hz or _BAND_HZ)}}}"
+        for name, group in file.groups.items()
+    )
+    pose = "\n".join(f"    {name}: {value}" for name, value in file.poses["default"].items())
+    return f"""\
+# Robot of {path.name}. Units: rad, N m, s, kg m^2, V. Check every line marked CHECK,
+# then run `pronk robot check` on this file.
+schema: {file.schema}
+name: {file.name}
+model: {file.model}
+policy_rate_hz: 50.0  # rate of the commands; timestep_s * decimation * rate must be 1
+timestep_s: 0.005     # of the simulator that is matched
+decimation: 4
+grid_stiffness: {list(file.grid_stiffness)}  # range of `pronk match`'s search
+grid_damping: {list(file.grid_damping)}
+# legs: [FR, FL, HR, HL]  # for a robot with legs: prefixes of their joints
+
+drives:  # CHECK against the data sheet: limits, torque-speed line, rotor inertia
+{drives}
+
+groups:  # CHECK: gains on the real drives; joints built alike may share a group, with
+  # a pattern such as {{joints: "*_knee"}}; `clamped: ["*_hip"]` names joints fixed in the
+  # bench test.
+{groups}
+
+poses:  # CHECK: the pose of the sweep; a robot that stands up needs `folded` too
+  default:
+{pose}
+"""
 
 
 def _short(value: float) -> float:
