@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
-from benchmarks.runner import Progress, table
+from benchmarks.runner import Progress, finish, table
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -30,44 +30,34 @@ from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = "mini_cheetah"
 JOINTS = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
-NOISE_RAD = 0.003
-NOISE_CORNER_HZ = 2.0
-RATE_HZ = 500.0
+NOISE_RAD, NOISE_CORNER_HZ = 0.003, 2.0
+REPEATS, LENGTH_S, REST_S, RATE_HZ = 3, 20.0, 0.5, 500.0
 BATCH = 50
-REST_S = 0.5
 
 
-def run(
-    trials: int,
-    seed: int,
-    progress: Progress,
-    *,
-    repeats: int = 3,
-    length_s: float = 20.0,
-    threads: int = 2,
-) -> dict[str, dict[str, Any]]:
-    """Trials for one joint of each group.
+def run(trials: int, seed: int, progress: Progress, *, threads: int = 2) -> dict[str, Any]:
+    """Fit `trials` logs for one joint of each group.
 
     Returns:
         By joint, pairs for stiffness and damping: `covered` (trials whose interval holds the known
         value), bias, standard deviation and mean half-width of the interval.
 
     Raises:
-        PronkError: Fewer than one trial or than two repeats.
+        PronkError: No trials.
     """
-    if trials < 1 or repeats < 2:
-        raise PronkError(f"{trials} trials of {repeats} repeats; expected at least 1 of 2.")
+    if trials < 1:
+        raise PronkError(f"{trials} trials; expected 1 or more.")
     robot, settings = load_robot(ROBOT), MatchSettings(threads=threads)
     paper = published(ROBOT)
     assert paper is not None
-    chirp = Excitation(offsets=Chirp(length_s=length_s).samples(), repeats=repeats, settle_s=REST_S)
-    samples = round((length_s + 2.0 * REST_S + 1.0) * RATE_HZ)
+    chirp = Excitation(offsets=Chirp(length_s=LENGTH_S).samples(), repeats=REPEATS, settle_s=REST_S)
+    samples = round((LENGTH_S + 2.0 * REST_S + 1.0) * RATE_HZ)
     noise = partial(coloured_noise, deviation=NOISE_RAD, corner_hz=NOISE_CORNER_HZ, rate_hz=RATE_HZ)
     found = {}
     for index, name in enumerate(JOINTS):
         rng, known = np.random.default_rng([seed, index]), paper.joints[name]
         log = synthetic_log(
-            robot, name, [chirp], *known, noise=list(noise(rng, (repeats, samples)))
+            robot, name, [chirp], *known, noise=list(noise(rng, (REPEATS, samples)))
         )
         noisy = measured_joints(log, name, robot, settings)[0]
         quiet = synthetic_log(robot, name, [replace(chirp, repeats=1)], *known)
@@ -78,25 +68,25 @@ def run(
         with MujocoSimulator(robot, threads=threads) as simulator:
             for begin in range(0, trials, BATCH):
                 count = min(BATCH, trials - begin)
-                errors = noise(rng, (count, repeats, len(operator.time))) @ to_response
+                errors = noise(rng, (count, REPEATS, len(operator.time))) @ to_response
                 goals = []
                 for response in clean + errors:
                     each = replace(noisy.measured, response=response.mean(axis=0), repeats=response)
                     goals.append(replace(noisy, measured=each))
                 for k, fit in enumerate(refine(simulator, goals, [known] * count), start=begin):
-                    bounds = interval(fit)
+                    ci95 = interval(fit).ci95
                     gains[k] = fit.stiffness, fit.damping
-                    for i in range(2):
-                        low[k, i], high[k, i] = bounds.ci95[GAINS[i]]
+                    low[k], high[k] = zip(*(ci95[one] for one in GAINS), strict=True)
                 progress("trials", (index + (begin + count) / trials) / len(JOINTS))
         expected = np.array(known)
-        pairs = {
+        found[name] = {
+            "known": known,
+            "trials": trials,
             "covered": ((low <= expected) & (expected <= high)).sum(axis=0),
             "bias_percent": 100.0 * (gains.mean(axis=0) / expected - 1.0),
             "deviation_percent": 100.0 * gains.std(axis=0, ddof=1) / expected,
             "half_width_percent": 50.0 * (high - low).mean(axis=0) / expected,
         }
-        found[name] = {"known": known, "trials": trials, **pairs}
     return found
 
 
@@ -108,9 +98,8 @@ def coverage(trials: int = 200, seed: int = 0, json_file: console.JsonFile = Non
         seed: Of the noise.
         json_file: Also write the figures to this file.
     """
-    repeats = 3
     with console.progress() as report:
-        found = run(trials, seed, report, repeats=repeats)
+        found = run(trials, seed, report)
     rows = [
         (
             joint,
@@ -123,11 +112,10 @@ def coverage(trials: int = 200, seed: int = 0, json_file: console.JsonFile = Non
     ]
     low, high = binom(trials, 0.95).interval(0.95)
     caption = (
-        f"{trials} logs a joint of {repeats} chirps each, noise {1e3 * NOISE_RAD:g} mrad coloured "
+        f"{trials} logs a joint of {REPEATS} chirps each, noise {1e3 * NOISE_RAD:g} mrad coloured "
         f"at {NOISE_CORNER_HZ:g} Hz; an exact interval would hold {low:.0f} to {high:.0f} "
         "(95 % of such benchmarks)"
     )
     title = "95 % intervals under coloured noise (stiffness / damping)"
     columns = ("joint", "hold the known value", "bias [%]", "scatter [%]", "half-width [%]")
-    console.show(table(title, columns, rows, caption))
-    console.write_json(json_file, found)
+    finish(json_file, found, table(title, columns, rows, caption))

@@ -18,7 +18,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from benchmarks.runner import Progress, table
+from benchmarks.runner import Progress, finish, table
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.excitation.signals import Chirp
@@ -28,7 +28,6 @@ from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
 from pronk.report.paper import published
 from pronk.robots import load_robot
-from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
 
 Gains = tuple[float, float]
@@ -65,12 +64,7 @@ def run(
 ) -> dict[str, Any]:
     """Search the grid for every joint, beside the bare loop; then the linearized search.
 
-    Args:
-        progress: Called with the stage and the share done.
-        points: Points of each axis of the grid.
-        length_s: Length of the chirp [s].
-        threads: Threads of both.
-        joints: All of them if not given.
+    `points` are of each axis of the grid, `length_s` of the chirp.
 
     Returns:
         `joints`, a row each (gains in N m/rad, N m s/rad; `nearest_cell`: the grid's best node is
@@ -83,47 +77,45 @@ def run(
     settings = MatchSettings(grid_points=points, threads=threads)
     goals = []
     for k, (name, gains) in enumerate(known.items(), start=1):
-        goals.append(_measured(robot, name, gains, length_s, settings))
+        # Mirrored joints get a mirrored command.
+        offsets = robot.joint(name).original[1] * Chirp(length_s=length_s).samples(
+            robot.policy_rate_hz
+        )
+        log = synthetic_log(robot, name, [Excitation(offsets=offsets)], *gains, threads=threads)
+        goals.append(measured_joints(log, name, robot, settings)[0])
         progress("logs with known gains", k / len(known))
-    stiffness, damping = axes(robot, points)
+    grid_axes = axes(robot, points)
     groups = alike(goals, robot)
     grids: dict[str, GridSearch] = {}
     grid_s = bare_s = 0.0
     with MujocoSimulator(robot, threads=threads) as simulator:
         for k, group in enumerate(groups):
-            rig = simulator.rig(group[0].joint)
+            rig, pairs = simulator.rig(group[0].joint), min(BARE_PAIRS, points**2)
             before = simulator.steps
-            pairs = min(BARE_PAIRS, points**2)
             speeds = [bare_rollout(rig, group[0], pairs, threads)]
             begin = time.perf_counter()
-
-            def advance(share: float, k: int = k) -> None:
-                progress("grid", (k + share) / len(groups))
-
-            found = search(simulator, group, stiffness, damping, progress=advance)
+            found = search(simulator, group, *grid_axes)
             grid_s += time.perf_counter() - begin
             speeds.append(bare_rollout(rig, group[0], pairs, threads))
             bare_s += (simulator.steps - before) / float(np.mean(speeds))
             grids |= {goal.joint: grid for goal, grid in zip(group, found, strict=True)}
+            progress("grid", (k + 1) / len(groups))
         steps = simulator.steps
         begin = time.perf_counter()
         fits = refine(simulator, goals, [grids[goal.joint].gains for goal in goals])
         refine_s = time.perf_counter() - begin
     begin = time.perf_counter()
     with MujocoSimulator(robot, threads=threads) as simulator:
-        quick = zip(*quick_search(simulator, goals, stiffness, damping), strict=True)
+        quick = zip(*quick_search(simulator, goals, *grid_axes), strict=True)
     quick_s = time.perf_counter() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in bytes on macOS, else in kB
     rows = []
-    for goal, fit, (cells, off_grid) in zip(goals, fits, quick, strict=True):
-        gains, best = known[goal.joint], grids[goal.joint]
-        nearest = tuple(
-            int(np.argmin(np.abs(axis - value)))
-            for axis, value in zip((stiffness, damping), gains, strict=True)
-        )
+    for (name, gains), fit, (cells, off_grid) in zip(known.items(), fits, quick, strict=True):
+        best, pairs_of = grids[name], zip(grid_axes, gains, strict=True)
+        nearest = tuple(int(np.argmin(np.abs(axis - value))) for axis, value in pairs_of)
         rows.append(
             {
-                "joint": goal.joint,
+                "joint": name,
                 "known": gains,
                 "grid": best.gains,
                 "nearest_cell": best.cell == nearest,
@@ -145,16 +137,6 @@ def run(
         "steps_per_second": steps / grid_s,
         "ratio": bare_s / grid_s,
     }
-
-
-def _measured(
-    robot: RobotSpec, name: str, gains: Gains, length_s: float, settings: MatchSettings
-) -> MeasuredJoint:
-    """A joint's chirp in the training simulator; mirrored joints get a mirrored command."""
-    sign = robot.joint(name).original[1]
-    chirp = Excitation(offsets=sign * Chirp(length_s=length_s).samples(robot.policy_rate_hz))
-    log = synthetic_log(robot, name, [chirp], *gains, threads=settings.threads)
-    return measured_joints(log, name, robot, settings)[0]
 
 
 def _percent(found: Gains, expected: Gains) -> str:
@@ -195,5 +177,4 @@ def grid(points: int = 50, json_file: console.JsonFile = None) -> None:
     )
     columns = ("joint", "known", "grid", "nearest cell", "refined off by [%]", "quick off [%]")
     title = "Known gains (Table I, training simulator, no noise)"
-    console.show(table(title, columns, rows, caption))
-    console.write_json(json_file, found)
+    finish(json_file, found, table(title, columns, rows, caption))

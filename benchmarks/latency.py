@@ -15,19 +15,17 @@ Ticks of both kinds alternate in one loop. Quantiles are the upper edges of the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from concurrent.futures import ProcessPoolExecutor, TimeoutError, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
-from benchmarks.runner import Progress, table
+from benchmarks.runner import Progress, finish, table
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.criteria import Check
@@ -40,14 +38,22 @@ from pronk.runtime.rollout import PolicyRunner
 from pronk.runtime.script import STILL
 
 RATE_HZ = 50.0
-HOGS = 2
 PRIORITY = 50
 BACK_TO_BACK = 1000
-LATE_MS, NETWORK_MS = 1.0, 0.2
-"""Limits at 99 %, on an idle computer."""
+LIMITS_MS = {"lateness": 1.0, "network": 0.2}
+"""At 99 %, after warm-up on an idle computer."""
 WAYS = ("back to back", "at the tick", "after warm-up")
 START_S = 60.0
 """Longest time that a process may take to start."""
+QUANTILES = {"lateness": ("p50", "p99", "p99_9", "max"), "network": ("p50", "p99")}
+QUANTILES["decision"] = QUANTILES["network"]
+"""Columns of the table; `network` is ONNX Runtime alone, `decision` is observation, network and
+targets."""
+
+Row = dict[str, Any]
+"""Figures of a case: `granted` (replies of the operating system to the requested priority, core and
+memory lock), `ways` (by way and quantity as `Histogram.figures` gives them [ms]; no lateness back
+to back), `missed` (ticks left out because the one before was not done)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,32 +68,13 @@ class Case:
 
 CASES = tuple(
     Case(name=f"{'two CPU hogs' if hogs else 'idle'}, {how}", hogs=hogs, real_time=real_time)
-    for hogs in (0, HOGS)
+    for hogs in (0, 2)
     for real_time, how in ((False, "ordinary"), (True, "real time"))
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """Figures of a case."""
-
-    case: str
-    granted: tuple[str, ...]
-    """Replies of the operating system to the requested priority, core and memory lock."""
-    ways: dict[str, dict[str, dict[str, float | int]]]
-    """By name (`WAYS`): `lateness` (empty back to back), `network` (ONNX Runtime alone) and
-    `decision` (observation, network, targets), each as `Histogram.figures` gives them [ms]."""
-    missed: int
-    """Ticks left out because the one before was not done."""
-
-
-def run(policy: Path, seconds: float, progress: Progress) -> list[Row]:
-    """All cases, one after the other.
-
-    Args:
-        policy: Runs at each tick.
-        seconds: Of each case; half of its ticks follow a warm-up.
-        progress: Called with the case and its share.
+def run(policy: Path, seconds: float, progress: Progress) -> dict[str, Row]:
+    """Run all cases one after the other, `seconds` each; half of the ticks follow a warm-up.
 
     Raises:
         PronkError: Too short a time, the policy cannot be read, or a process died.
@@ -95,36 +82,31 @@ def run(policy: Path, seconds: float, progress: Progress) -> list[Row]:
     if not seconds * RATE_HZ >= 20:
         raise PronkError(f"{seconds:g} s of ticks; expected 0.4 s or more, 40 s for 99.9 %.")
     load_policy(policy)
-    return [_measure(case, policy, seconds, partial(progress, case.name)) for case in CASES]
+    return {case.name: _measure(case, policy, seconds, progress) for case in CASES}
 
 
-def _measure(case: Case, policy: Path, seconds: float, progress: Callable[[float], None]) -> Row:
+def _measure(case: Case, policy: Path, seconds: float, progress: Progress) -> Row:
     context = get_context("spawn")
-    result, end = context.Pipe(duplex=False)
-    processes: list[BaseProcess] = [
-        context.Process(target=_hog, daemon=True) for _ in range(case.hogs)
-    ]
-    processes.append(context.Process(target=_loop, args=(case, policy, seconds, end), daemon=True))
+    hogs = [context.Process(target=_hog, daemon=True) for _ in range(case.hogs)]
+    for hog in hogs:
+        hog.start()
+    pool = ProcessPoolExecutor(1, mp_context=context)
     try:
-        for process in processes:
-            process.start()
-        end.close()
-        begun = time.monotonic()
-        while not result.poll(0.2):
+        found, begun = pool.submit(_loop, case, policy, seconds), time.monotonic()
+        while not wait([found], timeout=0.2).done:
             passed = time.monotonic() - begun
-            progress(min(passed / (seconds + 3.0), 1.0))
+            progress(case.name, passed / (seconds + 3.0))
             if passed > seconds + START_S:
-                raise PronkError(f"the loop of {case.name!r} did not finish; try again.")
-        try:
-            found: dict[str, Any] = result.recv()
-        except EOFError:
-            raise PronkError(f"the loop of {case.name!r} died; try again.") from None
+                raise TimeoutError
+        progress(case.name, 1.0)
+        return found.result()
+    except (BrokenProcessPool, TimeoutError):
+        raise PronkError(f"the loop of {case.name!r} did not finish; try again.") from None
     finally:
-        for process in processes:
-            process.kill()
-            process.join()
-    progress(1.0)
-    return Row(case=case.name, **found)
+        pool.shutdown(wait=False, cancel_futures=True)
+        for hog in hogs:
+            hog.kill()
+            hog.join()
 
 
 def _hog() -> None:
@@ -132,14 +114,12 @@ def _hog() -> None:
         pass
 
 
-def _loop(case: Case, path: Path, seconds: float, end: Connection) -> None:
+def _loop(case: Case, path: Path, seconds: float) -> Row:
     policy = load_policy(path)
     robot = load_robot(policy.contract.robot)
     runner, stand_in = PolicyRunner(policy, robot), PolicyRunner(policy.sibling(), robot)
     states = _states(standing(policy.contract))
-    counts = {
-        way: {name: Histogram() for name in ("lateness", "network", "decision")} for way in WAYS
-    }
+    counts = {way: {name: Histogram() for name in QUANTILES} for way in WAYS}
 
     def warm_up() -> None:
         stand_in.reset()
@@ -152,17 +132,15 @@ def _loop(case: Case, path: Path, seconds: float, end: Connection) -> None:
         counts[way]["decision"].add(time.monotonic() - begun)
         counts[way]["network"].add(policy.network_s)
 
-    granted = enter(
-        Wanted(priority=PRIORITY, core=0, lock=True) if case.real_time else Wanted(lock=False)
-    )
+    real_time = Wanted(priority=PRIORITY, core=0, lock=True)
+    granted = enter(real_time if case.real_time else Wanted(lock=False))
     once, ticked, warmed = WAYS
     for _ in range(WARM_UP):
         warm_up()
     for number in range(BACK_TO_BACK):
         decide(number, once)
     pace = Pace(RATE_HZ, time.monotonic() + 0.1)
-    last = round(seconds * RATE_HZ)
-    while pace.tick < last:
+    while pace.tick < round(seconds * RATE_HZ):
         way = warmed if pace.tick % 2 else ticked
         if way is warmed:
             warm_up_until(pace.deadline, warm_up)
@@ -175,7 +153,7 @@ def _loop(case: Case, path: Path, seconds: float, end: Connection) -> None:
         way: {name: histogram.figures() for name, histogram in counted.items()}
         for way, counted in counts.items()
     }
-    end.send({"granted": granted, "ways": ways, "missed": pace.missed})
+    return {"case": case.name, "granted": granted, "ways": ways, "missed": pace.missed}
 
 
 def _states(still: State) -> list[State]:
@@ -193,20 +171,19 @@ def _states(still: State) -> list[State]:
     ]
 
 
-def checks(rows: list[Row]) -> list[Check]:
+def checks(rows: dict[str, Row]) -> list[Check]:
     """The limits for the loop as `pronk deploy` runs it, on an idle computer."""
-    idle = {case.name for case in CASES if not case.hogs}
     return [
         Check(
-            what=f"{row.case}: {name}, 99 %",
-            value=row.ways[WAYS[-1]][name]["p99_ms"],
+            what=f"{case.name}: {name}, 99 %",
+            value=rows[case.name]["ways"][WAYS[-1]][name]["p99_ms"],
             sense="<=",
             limit=limit,
             unit="ms",
         )
-        for row in rows
-        if row.case in idle
-        for name, limit in (("lateness", LATE_MS), ("network", NETWORK_MS))
+        for case in CASES
+        if not case.hogs
+        for name, limit in LIMITS_MS.items()
     ]
 
 
@@ -224,34 +201,26 @@ def latency(
     """
     with console.progress() as report:
         rows = run(policy, seconds, report)
-    found = checks(rows)
     cells = []
-    for row in rows:
-        cells.append((row.case, *[""] * 9, str(row.missed)))
-        for way, figures in row.ways.items():
-            keys = {"lateness": ("p50", "p99", "p99_9", "max"), "network": ("p50", "p99")}
-            keys["decision"] = keys["network"]
+    for name, row in rows.items():
+        cells.append((name, *[""] * 9, str(row["missed"])))
+        for way, figures in row["ways"].items():
             numbers = [
-                f"{figures[name][f'{key}_ms']:.3f}" if figures[name]["n"] else ""
-                for name, chosen in keys.items()
-                for key in chosen
+                f"{figures[what][f'{key}_ms']:.3f}" if figures[what]["n"] else ""
+                for what, keys in QUANTILES.items()
+                for key in keys
             ]
             cells.append((f"  {way}", str(figures["network"]["n"]), *numbers, ""))
     columns = ["case", "n", "late: median", "99 %", "99.9 %", "largest", "network: median", "99 %"]
     columns += ["decision: median", "99 %", "missed"]
-    console.show(table(f"A {RATE_HZ:g} Hz loop on this computer [ms]", columns, cells))
+    measured = table(f"A {RATE_HZ:g} Hz loop on this computer [ms]", columns, cells)
+    found = checks(rows)
     limits = [
-        (
-            check.what,
-            f"{check.value:.3f}",
-            f"{check.sense} {check.limit:g}",
-            "yes" if check.passed else "NO",
-        )
-        for check in found
+        (c.what, f"{c.value:.3f}", f"{c.sense} {c.limit:g}", "yes" if c.passed else "NO")
+        for c in found
     ]
     columns = ["what", "measured [ms]", "limit [ms]", "passed"]
-    console.show(table("Limits, after warm-up", columns, limits))
-    for line in dict.fromkeys(line for row in rows for line in row.granted):
+    figures = {"cases": rows, "limits": [check.row() for check in found]}
+    finish(json_file, figures, measured, table("Limits, after warm-up", columns, limits))
+    for line in dict.fromkeys(line for row in rows.values() for line in row["granted"]):
         console.say(line)
-    body = {row.case: asdict(row) for row in rows}
-    console.write_json(json_file, {"cases": body, "limits": [check.row() for check in found]})

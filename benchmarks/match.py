@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.peers import POPULATION, Bounds, Estimate, fit_cma, fit_sysid, import_peers
-from benchmarks.runner import Progress, machine, table
+from benchmarks.peers import POPULATION, Estimate, fit_cma, fit_sysid, import_peers
+from benchmarks.runner import Progress, finish, machine, table
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -41,8 +41,6 @@ KNOWN = (21.8, 0.541)
 """Stiffness [N m/rad] and damping [N m s/rad] to find: FR knee in Table I of the paper."""
 MAX_DELAY_S = 0.04
 """Largest delay a tool with such a parameter may find [s]."""
-FULL_GRID = "pronk, the paper's grid"
-FREE = "stiffness, damping"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +51,7 @@ class Scenario:
     words: str
     """One line for the table."""
     noise_rad: float = 3e-3
-    """Standard deviation of the measurement noise [rad]."""
-    noise_corner_hz: float = 2.0
+    """Standard deviation of the measurement noise, with a corner at 2 Hz [rad]."""
     delay_s: float = 0.0
     """From a command to its effect [s]; in no tool's model."""
     friction_factor: float = 1.0
@@ -83,26 +80,19 @@ def known_log(
     length_s: float = 20.0,
     threads: int = 2,
 ) -> JointLog:
-    """A log of `JOINT` with the gains `KNOWN`: the same chirp `repeats` times."""
-    signal = Chirp(length_s=length_s)
+    """Return a log of `JOINT` with the gains `KNOWN`: the same chirp `repeats` times."""
+    signal, rate = Chirp(length_s=length_s), 1.0 / robot.timestep_s
     chirp = Excitation(
         offsets=signal.samples(robot.policy_rate_hz), band_hz=signal.band_hz, repeats=repeats
     )
     factors = 1.0 + scenario.gain_spread * rng.standard_normal((repeats, 2))
-    rate = 1.0 / robot.timestep_s
-    noise = coloured_noise(
-        rng,
-        (repeats, round((length_s + 2.0) * rate)),
-        deviation=scenario.noise_rad,
-        corner_hz=scenario.noise_corner_hz,
-        rate_hz=rate,
-    )
+    shape = (repeats, round((length_s + 2.0) * rate))
+    noise = coloured_noise(rng, shape, deviation=scenario.noise_rad, corner_hz=2.0, rate_hz=rate)
     return synthetic_log(
         robot,
         JOINT,
         [chirp],
-        KNOWN[0] * factors[:, 0],
-        KNOWN[1] * factors[:, 1],
+        *(np.array(KNOWN) * factors).T,
         rate_hz=rate,
         noise=list(noise),
         delay_s=scenario.delay_s,
@@ -111,10 +101,10 @@ def known_log(
     )
 
 
-def fit_pronk(log: JointLog, *, robot: RobotSpec, method: Any, threads: int) -> Estimate:
-    """Match a log the way `pronk match` does, by the method `grid` or `quick`."""
+def fit_pronk(log: JointLog, *, robot: RobotSpec, threads: int = 2) -> Estimate:
+    """Match a log the way `pronk match --quick` does."""
     before = time.perf_counter()
-    settings = MatchSettings(method=method, zero_armature=False, threads=threads)
+    settings = MatchSettings(method="quick", zero_armature=False, threads=threads)
     found = match_logs([log], robot, settings=settings).gains.joints[JOINT]
     return Estimate(
         stiffness=found.stiffness,
@@ -126,29 +116,22 @@ def fit_pronk(log: JointLog, *, robot: RobotSpec, method: Any, threads: int) -> 
 
 def tools(
     robot: RobotSpec, scenario: Scenario, *, seed: int, threads: int
-) -> dict[str, tuple[str, Callable[[JointLog], Estimate]]]:
-    """The tools of a scenario: name to free parameters and fit."""
+) -> dict[str, Callable[[JointLog], Estimate]]:
+    """Return the tools of a scenario by name."""
     joint = robot.joint(JOINT)
-    bounds: Bounds = (robot.grid_stiffness, robot.grid_damping)
-    shared: dict[str, Any] = {
-        "joint": JOINT,
-        "robot": robot,
-        "bounds": bounds,
-        "start": (joint.stiffness, joint.damping),
-        "threads": threads,
-    }
-    sysid = partial(fit_sysid, **shared)
-    cma = partial(fit_cma, seed=seed + 1, **shared)
-    chosen: dict[str, tuple[str, Callable[[JointLog], Estimate]]] = {
-        "pronk": (FREE, partial(fit_pronk, robot=robot, method="quick", threads=threads)),
-        "mujoco.sysid": (FREE, sysid),
-        "CMA-ES as PACE": (FREE, cma),
+    shared: dict[str, Any] = {"joint": JOINT, "robot": robot, "threads": threads}
+    shared["bounds"] = robot.grid_stiffness, robot.grid_damping
+    shared["start"] = joint.stiffness, joint.damping
+    sysid, cma = partial(fit_sysid, **shared), partial(fit_cma, seed=seed + 1, **shared)
+    chosen: dict[str, Callable[[JointLog], Estimate]] = {
+        "pronk": partial(fit_pronk, robot=robot, threads=threads),
+        "mujoco.sysid": sysid,
+        "CMA-ES as PACE": cma,
     }
     if scenario.delay_s:
         steps = round(MAX_DELAY_S / robot.timestep_s)
-        free = f"{FREE}, delay"
-        chosen["mujoco.sysid + delay"] = free, partial(sysid, delay_bounds_s=(0.0, MAX_DELAY_S))
-        chosen["CMA-ES as PACE + delay"] = f"{free} in steps", partial(cma, delay_steps=steps)
+        chosen["mujoco.sysid + delay"] = partial(sysid, delay_bounds_s=(0.0, MAX_DELAY_S))
+        chosen["CMA-ES as PACE + delay"] = partial(cma, delay_steps=steps)
     return chosen
 
 
@@ -160,20 +143,9 @@ def run(
     scenarios: Sequence[Scenario] = SCENARIOS,
     repeats: int = 5,
     length_s: float = 20.0,
-    full_grid: bool = True,
     threads: int = 2,
 ) -> list[dict[str, Any]]:
-    """Run every tool on every log.
-
-    Args:
-        trials: Logs of each scenario.
-        seed: Of the noise.
-        progress: Called with the stage and the share done.
-        scenarios: Disturbances.
-        repeats: Chirps in each log, of `length_s` [s].
-        length_s: Length of each chirp.
-        full_grid: Also time the paper's whole grid, on the first log.
-        threads: Threads of the simulator, the same for every tool.
+    """Run every tool on `trials` logs of each scenario, of `repeats` chirps of `length_s` [s].
 
     Raises:
         PronkError: A peer is not installed, or a number is impossible.
@@ -182,31 +154,25 @@ def run(
         raise PronkError(f"{trials} trials of {repeats} repeats; expected 1 or more of each.")
     import_peers()
     robot = load_robot(ROBOT)
-    found: dict[tuple[str, str, str], list[Estimate]] = {}
+    found: dict[tuple[str, str], list[Estimate]] = {}
     for index, scenario in enumerate(scenarios):
         for trial in range(trials):
             rng = np.random.default_rng([seed, index, trial])
             log = known_log(
                 robot, scenario, rng, repeats=repeats, length_s=length_s, threads=threads
             )
-            chosen = tools(robot, scenario, seed=seed, threads=threads)
-            if full_grid and index == trial == 0:
-                # It ends in the same refinement as the linearized search; one log shows its time.
-                grid = partial(fit_pronk, robot=robot, method="grid", threads=threads)
-                chosen[FULL_GRID] = FREE, grid
-            for name, (free, fit) in chosen.items():
-                found.setdefault((scenario.name, name, free), []).append(fit(log))
+            for name, fit in tools(robot, scenario, seed=seed, threads=threads).items():
+                found.setdefault((scenario.name, name), []).append(fit(log))
             progress("match", (index * trials + trial + 1) / (trials * len(scenarios)))
     return [summary(*key, estimates) for key, estimates in found.items()]
 
 
-def summary(scenario: str, tool: str, free: str, estimates: Sequence[Estimate]) -> dict[str, Any]:
-    """Errors and coverage of one tool in one scenario; NaN where there is nothing to average.
+def summary(scenario: str, tool: str, estimates: Sequence[Estimate]) -> dict[str, Any]:
+    """Return errors and coverage of one tool in one scenario; NaN where there is no average.
 
-    Returns:
-        Pairs for stiffness and damping, relative to the known gains [%]: `bias`, `sd` over the
-        trials, `half_width` of the 95 % intervals. `intervals` were given, `covered` of them hold
-        the known gain. Means of `seconds` and `delay_ms`; `estimates` in N m/rad, N m s/rad.
+    Pairs are for stiffness and damping, relative to the known gains [%]: `bias`, `sd` over the
+    trials, `half_width` of the 95 % intervals. `intervals` were given, `covered` of them hold the
+    known gain. Means of `seconds` and `delay_ms`; `estimates` in N m/rad, N m s/rad.
     """
     gains, known = np.array([(one.stiffness, one.damping) for one in estimates]), np.array(KNOWN)
     error = 100.0 * (gains / known - 1.0)
@@ -217,7 +183,6 @@ def summary(scenario: str, tool: str, free: str, estimates: Sequence[Estimate]) 
     return {
         "scenario": scenario,
         "tool": tool,
-        "free": free,
         "trials": len(estimates),
         "bias": error.mean(axis=0),
         "sd": error.std(axis=0, ddof=1) if len(estimates) > 1 else nan,
@@ -231,7 +196,7 @@ def summary(scenario: str, tool: str, free: str, estimates: Sequence[Estimate]) 
 
 
 def show(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
-    """A section for each scenario."""
+    """Make a table with a section for each scenario."""
     columns = ["tool", "logs", "stiffness [%]", "damping [%]", "coverage", "half-widths [%]"]
     made = table(title, [*columns, "fit [s]", "delay [ms]"], caption=caption)
     scenario = None
@@ -282,8 +247,7 @@ def match(trials: int = 5, seed: int = 0, json_file: console.JsonFile = None) ->
         f"4,096 on a GPU. {computer['cores']} cores ({computer['processor']}), MuJoCo "
         f"{computer['mujoco']}, Python {computer['python']}; {seconds:.0f} s in all."
     )
-    console.show(show(rows, title, caption))
-    body = {"schema": "pronk/bench-match/2", "rows": rows}
     known = {"joint": JOINT, "known": KNOWN, "scenarios": [asdict(one) for one in SCENARIOS]}
     about = {"trials": trials, "seed": seed, "machine": computer, "seconds": seconds}
-    console.write_json(json_file, body | known | about)
+    figures = {"schema": "pronk/bench-match/3", "rows": rows} | known | about
+    finish(json_file, figures, show(rows, title, caption))

@@ -55,7 +55,7 @@ class Estimate:
     """[N m/rad]"""
     damping: float
     """[N m s/rad]"""
-    interval: Bounds | None
+    interval: Bounds | None = None
     """95 % intervals of stiffness and of damping; None if the tool has none."""
     seconds: float
     """Wall time of the fit [s]."""
@@ -64,7 +64,7 @@ class Estimate:
 
 
 def import_peers() -> tuple[Any, Any]:
-    """The packages mujoco.sysid and cma.
+    """Return the packages mujoco.sysid and cma.
 
     Raises:
         PronkError: One of them, or a dependency of it, is not installed.
@@ -84,15 +84,11 @@ class Replay:
     """A log as time-domain tools need it: commands and positions at the physics steps."""
 
     def __init__(self, log: JointLog, joint: str, robot: RobotSpec) -> None:
-        """Read a log; joints that are held stand at their default position.
-
-        Args:
-            log: Sampled at the physics steps; its segments have one and the same command.
-            joint: The excited joint.
-            robot: Gives the bench model.
+        """Read a log whose segments have one and the same command; held joints do not move.
 
         Raises:
-            LogError: The log is not sampled so, or its repeats differ in their commands.
+            LogError: It is not sampled at the physics steps, or its repeats differ in their
+                commands.
         """
         self.robot, self.joint = robot, joint
         self.spec = bench_spec(robot, joint)
@@ -138,21 +134,16 @@ class Replay:
         """Of each step since the first [s], shape (steps,)."""
 
     def with_gains(self, stiffness: float, damping: float) -> Any:
-        """A copy of the compiled model with other gains on the joint's drive."""
+        """Return a copy of the compiled model with other gains on the joint's drive."""
         model = copy.copy(self.model)
         set_drive_gains(model, self.joint, self.robot.joint(self.joint).drive, stiffness, damping)
         return model
 
     def positions(self, gains: Array, pool: Any, datas: list[Any]) -> Array:
-        """Simulated positions of many gain pairs, from the mean initial state of the repeats.
+        """Return simulated positions of gain pairs (b, 2 or more) from the mean initial state.
 
-        Args:
-            gains: Stiffness and damping, shape (b, 2 or more).
-            pool: A `mujoco.rollout.Rollout`.
-            datas: One `MjData` a thread of the pool.
-
-        Returns:
-            At the start of each step [rad], shape (b, steps).
+        `pool` is a `mujoco.rollout.Rollout`, with one `MjData` a thread. The result is at the start
+        of each step [rad], (b, steps).
         """
         models = [self.with_gains(float(pair[0]), float(pair[1])) for pair in gains]
         begin = np.tile(self.initial.mean(axis=0), (len(models), 1))
@@ -173,14 +164,7 @@ def fit_sysid(
 ) -> Estimate:
     """Fit stiffness and damping with `mujoco.sysid.optimize`, its default optimizer.
 
-    Args:
-        log: The log, sampled at the physics steps; each repeat is one sequence.
-        joint: The excited joint.
-        robot: Gives the bench model.
-        bounds: Of the gains.
-        start: Stiffness and damping to begin with.
-        delay_bounds_s: Fit a measurement delay between these as well [s].
-        threads: Threads of the simulator.
+    Each repeat is one sequence; a measurement delay between `delay_bounds_s` is fitted if given.
     """
     sysid, _ = import_peers()
     before = time.perf_counter()
@@ -252,17 +236,8 @@ def fit_cma(
 ) -> Estimate:
     """Fit stiffness and damping by CMA-ES on the mean squared position error.
 
-    Args:
-        log: The log, sampled at the physics steps.
-        joint: The excited joint.
-        robot: Gives the bench model.
-        bounds: Of the gains.
-        start: Stiffness and damping of the first mean.
-        delay_steps: Fit a delay of 0 to this many whole physics steps as well, truncated as PACE
-            truncates it.
-        population: Simulations a generation.
-        seed: Of the search; not 0, which `cma` takes for the clock.
-        threads: Threads of the simulator.
+    A delay of 0 to `delay_steps` whole physics steps is fitted if given, truncated as PACE
+    truncates it. `seed` is not 0, which `cma` takes for the clock.
     """
     _, cma = import_peers()
     before = time.perf_counter()
@@ -283,13 +258,8 @@ def fit_cma(
             return np.zeros(len(candidates), dtype=np.int64)
         return np.minimum(candidates[:, 2].astype(np.int64), delay_steps)
 
-    options = {
-        "bounds": [-1.0, 1.0],
-        "popsize": population,
-        "seed": seed,
-        "verbose": -9,
-        "maxiter": GENERATIONS,
-    }
+    options = {"bounds": [-1.0, 1.0], "popsize": population, "maxiter": GENERATIONS}
+    options |= {"seed": seed, "verbose": -9}
     unit_start = list(2.0 * (first - lows) / (highs - lows) - 1.0)
     search = cma.CMAEvolutionStrategy(unit_start, SIGMA, options)
     datas = [mujoco.MjData(replay.model) for _ in range(threads)]
@@ -307,10 +277,5 @@ def fit_cma(
                 break
     best = lows + 0.5 * (np.clip(search.result.xfavorite, -1.0, 1.0) + 1.0) * (highs - lows)
     late = None if delay_steps is None else float(steps_late(best[None])[0]) * robot.timestep_s
-    return Estimate(
-        stiffness=float(best[0]),
-        damping=float(best[1]),
-        interval=None,
-        seconds=time.perf_counter() - before,
-        delay_s=late,
-    )
+    seconds = time.perf_counter() - before
+    return Estimate(stiffness=float(best[0]), damping=float(best[1]), seconds=seconds, delay_s=late)

@@ -1,4 +1,4 @@
-"""What the benchmarks share: blocks of work in turn, paired ratios, tables."""
+"""Blocks of work in turn, paired ratios, and the output that the benchmarks share."""
 
 from __future__ import annotations
 
@@ -6,35 +6,33 @@ import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from pronk.cli import console
+
 Progress = Callable[[str, float], None]
-"""Is given the stage and the share done, 0 to 1."""
+"""Called with the stage and the share done, 0 to 1."""
 
 
 def in_turn(blocks: Sequence[Callable[[], float]], repeats: int) -> list[list[float]]:
-    """Run blocks in turn; the order is reversed in every second turn.
+    """Run blocks, each of which returns its time [s], in turn; every second turn backwards.
 
-    Args:
-        blocks: Each returns its time [s].
-        repeats: Turns.
-
-    Returns:
-        Times of each block, turn by turn [s].
+    Returns the times of each block, turn by turn [s].
     """
     times: list[list[float]] = [[] for _ in blocks]
     for turn in range(repeats):
-        order = range(len(blocks))
-        for k in order if turn % 2 == 0 else reversed(order):
+        for k in range(len(blocks))[:: -1 if turn % 2 else 1]:
             times[k].append(blocks[k]())
     return times
 
 
 def paired_ratio(ours: Sequence[float], peer: Sequence[float]) -> tuple[float, float, float]:
-    """Ratio of two series of rates that were measured in turn: median, least, greatest.
+    """Return the ratio of two series of rates measured in turn: median, least, greatest.
 
     Neighbouring blocks are compared, so that a slow drift of the machine cancels.
     """
@@ -43,13 +41,13 @@ def paired_ratio(ours: Sequence[float], peer: Sequence[float]) -> tuple[float, f
 
 
 def spread(found: tuple[float, float, float], digits: int = 2) -> str:
-    """Median, least and greatest as text."""
+    """Format median, least and greatest."""
     middle, low, high = (f"{value:.{digits}f}" for value in found)
     return f"{middle} ({low} to {high})"
 
 
 def machine(*packages: str) -> dict[str, str]:
-    """The computer and the versions of packages."""
+    """Return the computer and the versions of packages."""
     return {
         "processor": platform.processor() or platform.machine(),
         "cores": str(os.cpu_count()),
@@ -61,7 +59,7 @@ def machine(*packages: str) -> dict[str, str]:
 def table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str]] = (), caption: str = ""
 ) -> Table:
-    """A table whose first column is left-aligned."""
+    """Make a table whose first column is left-aligned."""
     made = Table(title=Text(title), caption=Text(caption) if caption else None)
     made.title_justify = made.caption_justify = "left"
     for k, column in enumerate(columns):
@@ -69,3 +67,10 @@ def table(
     for cells in rows:
         made.add_row(*map(Text, cells))
     return made
+
+
+def finish(json_file: Path | None, figures: dict[str, Any], *tables: Table) -> None:
+    """Print the tables of a benchmark, and write its figures if a file was requested."""
+    for each in tables:
+        console.show(each)
+    console.write_json(json_file, figures)

@@ -84,13 +84,10 @@ def synthetic_log(
         A log of this joint alone; its `stiffness` and `damping` are those of the robot's drive, not
         those simulated.
     """
-    if simulator is not None:
-        robot = simulator.robot
+    robot = simulator.robot if simulator else robot
     known = robot.joint(joint)
     gains = np.atleast_1d(stiffness), np.atleast_1d(damping)
-    pose = np.array([j.default_position for j in robot.joints])
-    centre = known.default_position
-    tick = robot.timestep_s * robot.decimation
+    centre, tick = known.default_position, robot.timestep_s * robot.decimation
     per_tick = round(tick * rate_hz)
     rate = per_tick / tick
     commands, positions = [], []
@@ -104,12 +101,12 @@ def synthetic_log(
             start=0.0,
             timestep=robot.timestep_s,
             command=np.repeat(ticks, robot.decimation),
-            pose=pose,
+            pose=np.array([each.default_position for each in robot.joints]),
             amplitude=float(np.abs(one.offsets).max()),
         )
-        if simulator is not None:
-            names = ("stiffness", "damping")
-            simulated = simulator.play(trace, dict(zip(names, gains, strict=True)))
+        if simulator:
+            values = dict(zip(("stiffness", "damping"), gains, strict=True))
+            simulated = simulator.play(trace, values)
         else:
             simulated = simulate(robot, trace, *gains, **options)
         count = len(ticks) * per_tick
@@ -119,18 +116,17 @@ def synthetic_log(
             extra = 0.0 if noise is None else noise[len(segments)][:count]
             commands.append(np.repeat(ticks, per_tick))
             positions.append(position[repeat % len(position)] + extra)
-            segments.append(
-                Segment(
-                    kind=one.kind,
-                    joints=(joint,),
-                    start=begin / rate,
-                    stop=(begin + count - 1) / rate,
-                    amplitude=trace.amplitude,
-                    repeat=repeat,
-                    band_hz=one.band_hz,
-                    clamped=known.clamped,
-                )
+            segment = Segment(
+                kind=one.kind,
+                joints=(joint,),
+                start=begin / rate,
+                stop=(begin + count - 1) / rate,
+                amplitude=trace.amplitude,
+                repeat=repeat,
+                band_hz=one.band_hz,
+                clamped=known.clamped,
             )
+            segments.append(segment)
             begin += count
     return JointLog(
         robot=robot.name,

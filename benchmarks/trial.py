@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from benchmarks.runner import Progress, in_turn, machine, paired_ratio, spread, table
+from benchmarks.runner import Progress, finish, in_turn, machine, paired_ratio, spread, table
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.protocol import PAPER_COMMANDS
@@ -83,28 +83,6 @@ class Recording:
         return seconds
 
 
-def figures(simulated_s: float, trial_s: list[float], bare_s: list[float]) -> dict[str, Any]:
-    """Simulated seconds per second of both loops (medians), and their paired ratio.
-
-    Args:
-        simulated_s: Length of the run, settling included [s].
-        trial_s: Processor times of the whole trial loop [s].
-        bare_s: Processor times of the bare loop [s].
-    """
-    middle, low, high = paired_ratio(bare_s, trial_s)
-    return {
-        "trial_s": trial_s,
-        "bare_s": bare_s,
-        "simulated_s": simulated_s,
-        "speed": simulated_s / float(np.median(trial_s)),
-        "bare_speed": simulated_s / float(np.median(bare_s)),
-        "ratio": middle,
-        "ratio_range": (low, high),
-        "limit": LIMIT,
-        "passed": middle >= LIMIT,
-    }
-
-
 def run(
     policy: Path,
     progress: Progress,
@@ -115,6 +93,10 @@ def run(
 ) -> dict[str, Any]:
     """Time the trial loop of one jump beside the bare loop.
 
+    Returns:
+        Processor times of both loops [s], simulated seconds per second (medians), and the paired
+        ratio with its range.
+
     Raises:
         PronkError: The policy does not fit the robot, or there is nothing to repeat.
     """
@@ -123,30 +105,33 @@ def run(
     robot = load_robot(ROBOT)
     (subject,) = load_subjects([policy], robot)
     plan = Plan(cases=(CASE,), jumps=1, seed=seed)
-    chosen = sim_params or load_sim_params()
-    [job] = plan_jobs([subject], plan, robot=robot, sim_params=chosen)
+    [job] = plan_jobs([subject], plan, robot=robot, sim_params=sim_params or load_sim_params())
     recording = Recording(job)  # the warm-up as well
-    done = iter(range(1, 2 * repeats + 1))
 
     def trial_block() -> float:
         begun = time.process_time()
         run_job(job)
-        seconds = time.process_time() - begun
-        progress("trial", next(done) / (2 * repeats))
-        return seconds
+        return time.process_time() - begun
 
-    def bare_block() -> float:
-        progress("trial", next(done) / (2 * repeats))
-        return recording.replay()
-
-    trial_s, bare_s = in_turn([trial_block, bare_block], repeats)
+    progress("trial", 0.0)
+    trial_s, bare_s = in_turn([trial_block, recording.replay], repeats)
+    middle, *extremes = paired_ratio(bare_s, trial_s)
+    simulated_s = recording.steps * recording.timestep_s
     return {
         "policy": subject.name,
         "sha256": subject.sha256,
         "steps": recording.steps,
         "timestep_s": recording.timestep_s,
         "machine": machine("mujoco", "onnxruntime"),
-        **figures(recording.steps * recording.timestep_s, trial_s, bare_s),
+        "trial_s": trial_s,
+        "bare_s": bare_s,
+        "simulated_s": simulated_s,
+        "speed": simulated_s / float(np.median(trial_s)),
+        "bare_speed": simulated_s / float(np.median(bare_s)),
+        "ratio": middle,
+        "ratio_range": extremes,
+        "limit": LIMIT,
+        "passed": middle >= LIMIT,
     }
 
 
@@ -176,15 +161,13 @@ def trial(
         f"Policy {found['policy']} ({found['sha256'][:12]}), MuJoCo {found['machine']['mujoco']}, "
         f"ONNX Runtime {found['machine']['onnxruntime']}."
     )
+    ratio = spread((found["ratio"], *found["ratio_range"]))
+    limit = f"{LIMIT:.2f} {'reached' if found['passed'] else 'MISSED'}"
+    whole = "trial: build, settle, policy, sensors, capture, measure"
     rows = [
-        (
-            "trial: build, settle, policy, sensors, capture, measure",
-            f"{found['speed']:.2f}",
-            spread((found["ratio"], *found["ratio_range"])),
-            f"{LIMIT:.2f} {'reached' if found['passed'] else 'MISSED'}",
-        ),
+        (whole, f"{found['speed']:.2f}", ratio, limit),
         ("bare mujoco.mj_step", f"{found['bare_speed']:.2f}", "1", ""),
     ]
+    columns = ("loop", "simulated s per s", "ratio", "least ratio")
     title = "Simulated seconds per second and core, virtual robot"
-    console.show(table(title, ("loop", "simulated s per s", "ratio", "least ratio"), rows, caption))
-    console.write_json(json_file, found)
+    finish(json_file, found, table(title, columns, rows, caption))

@@ -19,7 +19,6 @@ import pronk
 from benchmarks import grid, latency, match, runner, train, trial
 from benchmarks.peers import Estimate, Replay, fit_cma, fit_sysid
 from benchmarks.synthetic_log import coloured_noise
-from benchmarks.train_task import REST, Stages, counted
 from hopper import ROBOT as HOPPER
 from hopper import write_hopper
 from pronk.errors import LogError, PronkError
@@ -101,7 +100,7 @@ def test_logs_are_reproducible_and_have_the_disturbance_of_their_scenario(quiet:
     [
         (lambda log: fit_sysid(log, match.JOINT, ROBOT, **PEER), 1e-3),
         (lambda log: fit_cma(log, match.JOINT, ROBOT, population=12, **PEER), 1e-3),
-        (lambda log: match.fit_pronk(log, robot=ROBOT, method="quick", threads=2), 1e-2),
+        (lambda log: match.fit_pronk(log, robot=ROBOT), 1e-2),
     ],
 )
 def test_every_tool_finds_the_known_gains_without_noise(
@@ -138,7 +137,7 @@ def test_a_row_is_the_mean_and_the_coverage_of_its_estimates() -> None:
         Estimate(stiffness=1.05 * kp, damping=kd, interval=around, seconds=1.0),
         Estimate(stiffness=kp, damping=0.9 * kd, interval=beside, seconds=3.0),
     ]
-    row = match.summary("s", "t", "f", estimates)
+    row = match.summary("s", "t", estimates)
     assert row["bias"] == pytest.approx((2.5, -5.0))
     assert row["sd"][0] == pytest.approx(5.0 / math.sqrt(2.0))
     assert (row["covered"], row["intervals"], row["seconds"]) == (3, 4, 2.0)
@@ -159,7 +158,7 @@ def test_a_missing_peer_is_named(package: str, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_delay_softens_only_fits_in_the_time_domain() -> None:
     scenarios = (replace(match.SCENARIOS[1], noise_rad=1e-3),)
-    rows = match.run(1, 4, ignore, scenarios=scenarios, full_grid=False, **SHORT)
+    rows = match.run(1, 4, ignore, scenarios=scenarios, **SHORT)
     bias = {one["tool"]: one["bias"][0] for one in rows}
     assert abs(bias["pronk"]) < 2.0
     assert bias["mujoco.sysid"] < -10.0
@@ -182,21 +181,16 @@ def test_the_grid_search_is_refined_to_the_known_gains() -> None:
 
 
 def test_limits_hold_for_the_warm_loop_on_an_idle_computer() -> None:
-    def figures(late: float, network: float) -> dict[str, dict[str, float | int]]:
+    def figures(late: float, network: float) -> dict[str, dict[str, float]]:
         return {"lateness": {"p99_ms": late}, "network": {"p99_ms": network}}
 
-    rows = [
-        latency.Row(
-            case=case.name,
-            granted=(),
-            ways={way: figures(7.0, 7.0) for way in latency.WAYS[:2]}
-            | {latency.WAYS[2]: figures(0.9 + case.hogs, 0.25 - 0.1 * case.real_time)},
-            missed=0,
-        )
-        for case in latency.CASES
-    ]
+    rows = {}
+    for case in latency.CASES:
+        ways = dict.fromkeys(latency.WAYS, figures(7.0, 7.0))
+        ways[latency.WAYS[-1]] = figures(0.9 + case.hogs, 0.25 - 0.1 * case.real_time)
+        rows[case.name] = {"ways": ways}
     assert [check.passed for check in latency.checks(rows)] == [True, False, True, True]
-    with pytest.raises(PronkError, match=r"0\.4 s or more"):
+    with pytest.raises(PronkError):
         latency.run(POLICY, 0.1, ignore)
 
 
@@ -224,75 +218,12 @@ def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: Job) -> None:
 # --- train --------------------------------------------------------------------------------------
 
 
-class Work:
-    """Methods that take a known time on a clock of their own."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def outer(self) -> str:
-        self.now += 1.0
-        self.inner()
-        self.now += 2.0
-        return "done"
-
-    def inner(self) -> None:
-        self.now += 10.0
-
-    def fails(self) -> None:
-        self.now += 5.0
-        raise ValueError("on purpose")
-
-
-def test_time_belongs_to_the_innermost_stage() -> None:
-    work = Work()
-    borders: list[float] = []
-    stages = Stages(wait=lambda: borders.append(work.now), clock=lambda: work.now)
-    parts = [(work, "outer", "o"), (work, "inner", "i"), (work, "fails", "f"), (work, "none", "n")]
-    with stages.measured(parts):
-        work.now += 100.0
-        assert work.outer() == "done"
-        work.inner()
-        with pytest.raises(ValueError, match="on purpose"):
-            work.fails()
-    assert dict(stages.seconds) == {REST: 100.0, "o": 3.0, "i": 20.0, "f": 5.0}
-    # The device is waited for at every border.
-    assert borders == [0.0, 100.0, 101.0, 111.0, 113.0, 113.0, 123.0, 123.0, 128.0, 128.0]
-    assert set(vars(work)) == {"now"}  # unwrapped again
-
-
 @pytest.mark.parametrize("wrong", [{"envs": ()}, {"envs": (0,)}, {"steps": 0}, {"repeats": 0}])
 def test_impossible_numbers_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(PronkError, match="expected 1 or more"):
+    with pytest.raises(PronkError):
         train.run(**wrong)
-    with pytest.raises(PronkError, match="16,many"):
+    with pytest.raises(PronkError):
         train.train(envs="16,many")
-
-
-@pytest.mark.train
-def test_operations_and_waits_are_counted_by_stage() -> None:
-    torch = pytest.importorskip("torch")
-
-    class Sums:
-        def add(self, x: Any) -> Any:
-            return (x + x) * 2.0
-
-        def look(self, x: Any) -> float:
-            return float((x > 0.0).sum().item())
-
-        def pick(self, x: Any) -> Any:
-            return x[x > 0.0]
-
-    sums, x, stages = Sums(), torch.ones(3, 2), Stages()
-    parts = [(sums, name, name) for name in ("add", "look", "pick")]
-    with torch.no_grad(), stages.measured(parts), counted(stages) as (operations, waits):
-        sums.add(x)
-        sums.look(x)
-        sums.pick(x)
-        x.view(6)[:3].t()  # views are not counted
-        x.mul_(2.0)
-    assert dict(operations) == {"add": 2, "look": 3, "pick": 2, REST: 1}
-    assert +waits == {"look": 1, "pick": 1}
 
 
 @pytest.mark.train
@@ -315,16 +246,11 @@ def test_a_small_training_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
         train.run(envs=(2,), device="cpu", tasks=("Cartwheel", "Cartwheel"))
     lines: list[str] = []
     found = train.run(lines.append, envs=(4,), steps=4, repeats=1, device="cpu", tasks=(name, name))
-    for one in found.pairs[0]:
-        assert (one.task, one.envs, one.horizon) == (name, 4, 8)
-        step = {cost.stage: cost for cost in one.step_stages}
-        assert step["physics"].operations == 0.0  # what Warp launches is not counted
-        assert step["rewards"].operations > 0.0
-        iteration = {cost.stage for cost in one.iteration_stages}
-        assert {"inference", "advantages", "PPO update", "estimator update"} <= iteration
-        assert 2.0 <= one.physics_per_step <= 6.0
-    assert sum("steps/s" in line for line in lines) == 2
+    for one in found["pairs"][0]:
+        assert (one["task"], one["envs"], one["horizon"]) == (name, 4, 8)
+        assert min(*one["stepping"], *one["training"]) > 0.0
+        assert 2.0 <= one["physics_per_step"] <= 6.0
+    assert len(lines) == 3
     assert "WITHOUT CUDA graphs" in text(train.rate_table(found))
-    assert "estimator update" in text(train.stage_table(found))
-    json.dumps(found.figures())
+    json.dumps(found)
     assert capsys.readouterr().out == ""
