@@ -23,6 +23,7 @@ from pronk.files import write_text
 from pronk.logs.mcap_log import read_mcap
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
+from pronk.report.paper import published
 from pronk.robots import load_robot
 from pronk.runtime.sweep import SweepTask, record
 from pronk.virtual.robot import VirtualRobot
@@ -36,12 +37,6 @@ from pronk.virtual.sim_params import (
 )
 
 LEGS = ("FR", "FL", "HR", "HL")
-# Paper, Table I: stiffness and damping by leg.
-TABLE_I = {
-    "hip_roll": ((20.6, 18.1, 18.5, 21.0), (0.492, 0.516, 0.431, 0.490)),
-    "hip_pitch": ((16.5, 17.7, 16.9, 18.9), (0.382, 0.406, 0.382, 0.431)),
-    "knee": ((21.8, 22.0, 22.2, 21.8), (0.541, 0.523, 0.553, 0.553)),
-}
 # Spacing of the paper's grid: 13 to 27 and 0.1 to 0.7 in 50 points (F7).
 CELL = np.array([14.0 / 49.0, 0.6 / 49.0])
 GOOD_CELLS = 0.1
@@ -155,9 +150,9 @@ def designed() -> SimParams:
 
 
 def target(name: str) -> np.ndarray:
-    leg, group = name.split("_", 1)
-    stiffness, damping = TABLE_I[group]
-    return np.array([stiffness[LEGS.index(leg)], damping[LEGS.index(leg)]])
+    paper = published("mini_cheetah")
+    assert paper is not None
+    return np.array(paper.joints[name])
 
 
 def matched(

@@ -84,7 +84,7 @@ def test_the_page_of_everything(tree: Path, html: str) -> None:
     assert {"trial", "walk", "crossing", "variation", "bodies", "match"} < set(page.ids)
     assert "trial1" not in page.ids  # trials of the randomized robots belong to their part
     for section in (
-        "table-iii",
+        "jumps-beside-table-iii-of-the-paper",
         "acceptance-criteria",
         "scatter",
         "films",
@@ -186,7 +186,7 @@ def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
 def test_one_policy_without_captures_or_match(tmp_path: Path) -> None:
     write_trial(tmp_path, ("matched",), CASES[:2])
     page = report(tmp_path)
-    assert "trial-table-iii" in page.ids
+    assert "trial-jumps-beside-table-iii-of-the-paper" in page.ids
     assert not {"trial-scatter", "trial-films", "trial-trunk-height-over-time"} & set(page.ids)
 
 

@@ -87,11 +87,11 @@ def page(title: str, parts: Sequence[Part]) -> str:
     environment.filters["words"] = lambda name: name.replace("_", " ")
     # Columns of text are set to the left.
     environment.filters["align"] = lambda rows, i: "left" * any(len(row[i]) > 24 for row in rows)
-    bodies = [
+    rendered = [
         environment.get_template(f"{part.kind}.html.j2").render(
             part.content, part=part, many=len(parts) > 1, sections=[]
         )
         for part in parts
     ]
     template = environment.get_template("page.html.j2")
-    return template.render(version=__version__, title=title, parts=parts, bodies=bodies)
+    return template.render(version=__version__, title=title, parts=parts, rendered=rendered)
