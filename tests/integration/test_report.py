@@ -214,13 +214,6 @@ def test_two_trials_are_two_parts(tmp_path: Path) -> None:
     assert "Trial: tuesday" in page.text
 
 
-def test_the_nearest_match_is_not_looked_for_above_the_root(tree: Path) -> None:
-    found = trial_page.match_near(tree / "trial", tree)
-    assert found is not None
-    assert set(found.joints) == {"FR_knee"}
-    assert trial_page.match_near(tree / "trial", tree / "trial") is None
-
-
 @pytest.mark.parametrize(
     ("name", "bytes_kept"),
     [

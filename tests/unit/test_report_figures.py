@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
@@ -27,7 +26,6 @@ from report_cases import (
     joint_prediction,
     lift_off,
     match,
-    subject,
     varied,
     write_bodies,
     write_trial,
@@ -258,26 +256,3 @@ def test_scatter_over_gain_error_of_randomized_robots(tmp_path) -> None:
     means = {line.get_xdata()[0]: line.get_ydata()[0] for line in axes.lines
              if line.get_marker() == "_"}  # fmt: skip
     assert means[1.2] == pytest.approx(trial_figures.std(np.array([0.38, 0.40, 0.42])), rel=0.6)
-
-
-def test_error_of_gains_is_interpolated_in_the_error_map() -> None:
-    fit = joint_fit("knee")
-    k, d = fit.grid_stiffness, fit.grid_damping
-    # A map that cubic splines reproduce exactly.
-    smooth = 0.5 * (k[:, None] - 20.0) ** 2 + 30.0 * (d[None, :] - 0.5) ** 2 + 0.01
-    mapped = replace(fit, grid_error=smooth)
-    expected = math.sqrt(0.5 * 1.3**2 + 30.0 * 0.07**2 + 0.01)
-    assert trial_page.joint_error_db(mapped, 21.3, 0.43) == pytest.approx(expected)
-    assert math.isnan(trial_page.joint_error_db(mapped, 40.0, 0.43))
-    empty = replace(fit, grid_error=np.empty((0, 0)))
-    assert math.isnan(trial_page.joint_error_db(empty, 20.0, 0.5))
-
-
-def test_error_of_training_gains_is_known_for_all_policies_or_for_none(trial, result) -> None:
-    errors = trial_page.gains_errors(trial, result)
-    nominal = [fit.naive_error_db for fit in result.joints.values()]
-    assert errors["naive"] == pytest.approx(math.sqrt(np.mean(np.square(nominal))), rel=0.02)
-    assert errors["matched"] < errors["naive"]
-    for contract in ({"stiffness": (99.0,) * 12}, {"joint_names": ()}):
-        subjects = (subject("matched", **contract), *trial.subjects[1:])
-        assert trial_page.gains_errors(replace(trial, subjects=subjects), result) == {}

@@ -15,8 +15,7 @@ from pronk.evaluation import tables
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.protocol import RATES, in_paper_order
 from pronk.evaluation.results import SUMMARY, Results, Subject, load, share_interval
-from pronk.match.result import JointFit, MatchResult
-from pronk.report import match_page, style
+from pronk.report import style
 from pronk.report import trial_figures as draw
 from pronk.report.page import Part, table
 from pronk.report.paper import published_jumps
@@ -84,55 +83,10 @@ def traces(trial: Results, folder: Path) -> tuple[Traces, int] | None:
     return found, len(kept) - len(present)
 
 
-def joint_error_db(joint: JointFit, stiffness: float, damping: float) -> float:
-    """Return the RMS gain error [dB] with these gains [N m/rad, N m s/rad] over the joint's band.
-
-    It is interpolated in the joint's error map; NaN outside of it, or without one.
-    """
-    from scipy.interpolate import RectBivariateSpline
-
-    k, d = joint.grid_stiffness, joint.grid_damping
-    inside = k[0] <= stiffness <= k[-1] and d[0] <= damping <= d[-1] if len(k) else False
-    if not inside or min(joint.grid_error.shape) < 4:
-        return float("nan")
-    # The square of the error is smooth between nodes; its root has a cusp at a match.
-    square = float(RectBivariateSpline(k, d, joint.grid_error).ev([stiffness], [damping])[0])
-    return float(np.sqrt(max(square, 0.0)))
-
-
-def gains_errors(trial: Results, result: MatchResult) -> dict[str, float]:
-    """Return the error of each policy's training gains on a sweep, RMS over the joints [dB].
-
-    Empty unless it is known for all joints of every policy.
-    """
-    found = {}
-    for subject in trial.subjects if result.joints else ():
-        gains = _training_gains(subject)
-        errors = [
-            joint_error_db(joint, *gains.get(name, (np.nan, np.nan)))
-            for name, joint in result.joints.items()
-        ]
-        found[subject.name] = float(np.sqrt(np.mean(np.square(errors))))
-    return found if np.isfinite(list(found.values())).all() else {}
-
-
 def _training_gains(subject: Subject) -> dict[str, tuple[float, float]]:
     """Stiffness [N m/rad] and damping [N m s/rad] by joint, as of the contract."""
     fields = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
     return {name: (stiffness, damping) for name, stiffness, damping in zip(*fields, strict=False)}
-
-
-def match_near(folder: Path, root: Path) -> MatchResult | None:
-    """Return the match nearest to a trial: in its folder or one above it, up to `root`."""
-    for near in (folder, *folder.parents):
-        if (near / "match.npz").exists():
-            try:
-                return match_page.load(near)
-            except ArtefactError:
-                return None  # the match's own part reports it
-        if near == root:
-            return None
-    return None
 
 
 def films(folder: Path) -> tuple[dict[str, str], list[str]]:
@@ -177,11 +131,10 @@ def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial")
     checks, first = trial_checks(trial), trial.subjects[0].name
     passed = sum(check.passed for check in checks)
     pictures, names = films(folder)
-    match = match_near(folder, root)
-    errors = gains_errors(trial, match) if match else {}
-    by_figure = {f"{name} [m]": values(trial, name) for name in ("height", "distance", "gap")}
-    panels = [(label, one, published_jumps(label[:-4])) for label, one in by_figure.items()]
-    scatter = {label: by_figure[label] for label in ("height [m]", "distance [m]")}
+    panels = [
+        (f"{name} [m]", values(trial, name), published_jumps(name))
+        for name in ("height", "distance", "gap")
+    ]
     content = {
         "trial": trial,
         "where": where,
@@ -191,7 +144,6 @@ def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial")
         "table_iii": [tables.table_iii(trial, figure) for figure in ("height", "distance")],
         "criteria": tables.criteria(trial),
         "scatter_table": tables.scatter(trial) if trial.ratios else None,
-        "scatter": picture(draw.scatter_over_error(errors, scatter)) if len(errors) > 1 else None,
         "pictures": pictures,
         "films": names,
         "landings": tables.landings(trial),
