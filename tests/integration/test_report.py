@@ -177,12 +177,6 @@ def test_text_of_files_is_escaped(tmp_path: Path) -> None:
     assert text.count("&lt;img src=x onerror=alert(1)&gt;") == 3
 
 
-def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
-    write_trial(tmp_path, ("matched",), CASES[:1])
-    first = build.write_report(tmp_path)[0].read_bytes()
-    assert build.write_report(tmp_path)[0].read_bytes() == first
-
-
 def test_one_policy_without_captures_or_match(tmp_path: Path) -> None:
     write_trial(tmp_path, ("matched",), CASES[:2])
     page = report(tmp_path)
@@ -204,14 +198,6 @@ def test_a_policy_that_never_jumps(tmp_path: Path) -> None:
     rows = tuple(replace(row, figures=JumpFigures(standing=True, fell=True)) for row in trial.rows)
     results.save(tmp_path, replace(trial, rows=rows))
     assert "6 jumps commanded, 0 jumped" in report(tmp_path).text
-
-
-def test_two_trials_are_two_parts(tmp_path: Path) -> None:
-    for name in ("monday", "tuesday"):
-        write_trial(tmp_path / name, ("matched",), CASES[:1])
-    page = report(tmp_path)
-    assert "Trial: monday" in page.text
-    assert "Trial: tuesday" in page.text
 
 
 @pytest.mark.parametrize(
