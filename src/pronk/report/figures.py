@@ -158,7 +158,9 @@ def zero_armature(fit: JointFit) -> Figure:
     with drawing(height=3.9) as (figure, grid):
         axes = grid[0, 0]
         _panel(axes, fit, curves)
-        axes.set_xlabel("frequency [Hz]")
+        # An antiresonance would leave the rest of the curves no room.
+        shallow = style.decibel(fit.matched).min() - 20.0
+        axes.set(xlabel="frequency [Hz]", ylim=(max(shallow, axes.get_ylim()[0]), None))
         axes.set_title(f"{style.joint_words(fit.joint)}: with and without rotor inertia")
         best = f"best without rotor inertia: error {fit.zero_armature_error_db:.2f} dB"
         keys = _keys(fit.responses[0].virtual, f": error {fit.error_db:.2f} dB")
