@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
 Progress = Callable[[float], None]
+T = TypeVar("T")
 
 DIVERGED_DB = 100.0
 """Error written for a simulation that diverged or did not move [dB]: beyond any response."""
@@ -88,17 +90,21 @@ def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128]) -> Array
     return np.asarray(error**2 @ np.full(count, 1.0 / count))
 
 
+def _grouped(items: Sequence[T], same: Callable[[T, T], bool]) -> list[list[T]]:
+    """Gather items that are the same as the first of a group."""
+    groups: list[list[T]] = []
+    for item in items:
+        group = next((group for group in groups if same(group[0], item)), None)
+        if group is None:
+            groups.append([item])
+        else:
+            group.append(item)
+    return groups
+
+
 def alike(targets: Sequence[MeasuredJoint], robot: RobotSpec) -> list[list[MeasuredJoint]]:
     """Targets gathered by simulation: mirror-image joints excited alike share one."""
-    groups: list[list[MeasuredJoint]] = []
-    for goal in targets:
-        for group in groups:
-            if group[0].trace.same_as(goal.trace, robot):
-                group.append(goal)
-                break
-        else:
-            groups.append([goal])
-    return groups
+    return _grouped(targets, lambda one, other: one.trace.same_as(other.trace, robot))
 
 
 def errors(
@@ -167,14 +173,10 @@ def search_all(
     of the best is simulated for itself. Should any of those have been wrong by half of that, all
     nodes are.
     """
-    families: list[list[list[MeasuredJoint]]] = []
-    for group in alike(targets, rigs.robot):
-        for family in families:
-            if family[0][0].trace.same_as(group[0].trace, rigs.robot, sign=-1.0):
-                family.append(group)
-                break
-        else:
-            families.append([group])
+    families = _grouped(
+        alike(targets, rigs.robot),
+        lambda one, other: one[0].trace.same_as(other[0].trace, rigs.robot, sign=-1.0),
+    )
     found: dict[int, GridSearch] = {}
     for k, family in enumerate(families):
 

@@ -124,13 +124,7 @@ def identifiability(
 def require_identifiable(
     parameters: Sequence[str], experiments: Sequence[Experiment], nominal: Mapping[str, float]
 ) -> Identifiability:
-    """The same, refusing what cannot be distinguished.
-
-    Raises:
-        IdentifiabilityError: Some parameters cannot be distinguished; the message names them and
-            the experiments that would help.
-        PronkError: As `identifiability`.
-    """
+    """The same; IdentifiabilityError names what cannot be distinguished and what would help."""
     result = identifiability(parameters, experiments, nominal)
     if not (confused := result.confused):
         return result
@@ -151,14 +145,9 @@ def require_identifiable(
 
 
 def bench_inertia(robot: RobotSpec, joint: str) -> tuple[float, float]:
-    """Inertia and gravity of a joint in the bench model at the default pose.
+    """Inertia of a joint in the bench model, armature included [kg m^2], and pull of gravity.
 
-    Returns:
-        Inertia about the joint, armature included [kg m^2], and how much gravity pulls the joint
-        back [N m/rad].
-
-    Raises:
-        RobotError: The robot has no such joint.
+    At the default pose; the pull is how much gravity moves the joint back [N m/rad].
     """
     model = bench_spec(robot, joint).compile()
     data = mujoco.MjData(model)
@@ -176,11 +165,7 @@ def bench_inertia(robot: RobotSpec, joint: str) -> tuple[float, float]:
 
 
 def bench_experiment(robot: RobotSpec, joint_name: str) -> tuple[Experiment, dict[str, float]]:
-    """The paper's sweep of one joint, and nominal values of every parameter.
-
-    Raises:
-        RobotError: The robot has no such joint.
-    """
+    """The paper's sweep of one joint, and nominal values of every parameter."""
     joint = robot.joint(joint_name)
     inertia, gravity = bench_inertia(robot, joint_name)
     experiment = Experiment(

@@ -115,12 +115,7 @@ class MeasuredJoint:
 
 
 def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[JointLog]]:
-    """Logs that excite each joint, joints in the robot's order.
-
-    Raises:
-        LogError: No log excites any joint.
-        RobotError: A log excites a joint that the robot has not.
-    """
+    """Logs that excite each joint, joints in the robot's order; LogError if none does."""
     where: dict[str, list[JointLog]] = {}
     for log in logs:
         for name in excited_joints(log):

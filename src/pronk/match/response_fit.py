@@ -238,11 +238,7 @@ def interval(fit: Fit, held: Mapping[str, float] | None = None) -> Estimate:
 def require_sweeps(
     robot: RobotSpec, joint: str, goals: Sequence[MeasuredJoint], free: tuple[str, ...]
 ) -> None:
-    """Refuse what sweeps cannot separate, before anything is fitted.
-
-    Raises:
-        IdentifiabilityError: Names the parameters and the experiments that would help.
-    """
+    """Refuse what sweeps cannot separate before anything is fitted (`require_identifiable`)."""
     first, nominal = bench_experiment(robot, joint)
     experiments = [
         replace(
@@ -265,11 +261,7 @@ def fit_drive(
 ) -> JointFit:
     """Fit one joint's drive to gain and phase of its responses at all amplitudes.
 
-    Args:
-        rigs: The training simulator.
-        goals: The joint at every amplitude, largest first.
-        on_drive: Stiffness and damping on the real drive.
-        fitted: What to fit, out of `FREE`.
+    `goals` are the joint at every amplitude, largest first; `on_drive` the gains on the real drive.
 
     Raises:
         IdentifiabilityError: The repeats leave a fitted parameter unknown.

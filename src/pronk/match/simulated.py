@@ -36,14 +36,9 @@ def responses(
 
     Armature and friction are given for all requests of one original joint, or for none.
 
-    Args:
-        rigs: The training simulator.
-        requests: What to simulate.
-        whole: All frequencies of the target instead of those inside its band.
-
     Returns:
-        One response a request, of shape (inside,), or (f,) if `whole`; NaN where a simulation
-        diverged.
+        One response a request, of shape (inside,), or at all frequencies of the target, (f,), if
+        `whole`; NaN where a simulation diverged.
     """
     out: list[ComplexArray] = [np.empty(0, dtype=np.complex128)] * len(requests)
     by_original: dict[str, list[int]] = {}
