@@ -181,20 +181,9 @@ def record_wire(
 ) -> Recorded:
     """Sweep a robot in real time, all joints over one connection of the servo's process.
 
-    Args:
-        plan: What to excite; checked by the caller.
-        out: Folder for the logs.
-        address: Where the robot is.
-        release: Switch off the robot's own controller first.
-        overwrite: Replace logs that exist.
-        real_time: Request real-time scheduling, and print what was granted.
-        limits: Other values for scalar limits of the safety filter.
-        fresh: How fresh states must be at first; the usual if None.
-        progress: Called with the share done, 0 to 1.
-
-    Raises:
-        PronkError: The robot may not be moved or the filter stopped it, or a process was killed;
-            what was recorded until then stays.
+    The caller has checked the plan. `limits` are other values for scalar limits of the safety
+    filter; `fresh` is how fresh states must be at first. If the robot may not be moved, the filter
+    stops it or a process is killed, a PronkError is raised and what was recorded stays.
     """
     from pronk.runtime.plan import Link, Plan
     from pronk.runtime.run import run_sweep

@@ -113,11 +113,7 @@ class Contract(
     """Package to version at training."""
 
     def __post_init__(self) -> None:
-        """Refuse contradictions.
-
-        Raises:
-            ArtefactError: One sentence that names the field.
-        """
+        """Refuse contradictions; the ArtefactError names the field."""
         n = len(self.joint_names)
         for name in ("default_position", "action_scale", "stiffness", "damping"):
             values = getattr(self, name)
@@ -162,16 +158,7 @@ def to_json(contract: Contract) -> str:
 
 
 def from_json(text: str, *, source: object) -> Contract:
-    """Read what `to_json` wrote.
-
-    Args:
-        text: The JSON.
-        source: Where it is from, for errors.
-
-    Raises:
-        ArtefactError: Not JSON, of another schema, with fields missing, unknown or of another
-            type, or contradicting itself.
-    """
+    """Read what `to_json` wrote; errors begin with `source`."""
     try:
         body = msgspec.json.decode(text)
         # A field of older files: the jump input had to wait for a moment of the stride.
@@ -190,15 +177,9 @@ def from_json(text: str, *, source: object) -> Contract:
 
 
 def check(contract: Contract, robot: RobotSpec, *, gains_sha256: str | None = None) -> None:
-    """Refuse a policy that is not for this robot.
+    """Refuse a policy that is not for this robot; the ArtefactError names the field.
 
-    Args:
-        contract: What the policy was trained for.
-        robot: What it shall run on.
-        gains_sha256: Of the `gains.yaml` that the policy must be trained with, if any.
-
-    Raises:
-        ArtefactError: One sentence that names the field.
+    `gains_sha256` is that of the `gains.yaml` that the policy must be trained with, if any.
     """
     for field, want in {
         "robot": robot.name,

@@ -53,17 +53,10 @@ class History:
         self._actions = np.zeros((ACTIONS, JOINTS), np.float32)
 
     def observe(self, measurement: Measurement, command: ArrayLike) -> Floats:
-        """Add a sample; returns the measured vector, laid out as `layout.MEASURED`.
+        """Add a sample; returns the measured vector, laid out as `layout.MEASURED`. (105,).
 
-        Args:
-            measurement: The sample.
-            command: Forward and left [m/s], yaw rate [rad/s], in the trunk's frame. (3,)
-
-        Returns:
-            (105,)
-
-        Raises:
-            ArtefactError: The command has another size or is not finite; nothing was added.
+        The command is forward and left [m/s], yaw rate [rad/s], in the trunk's frame (3,). One that
+        is not finite is refused by an ArtefactError, and nothing is added.
         """
         commanded = finite("the command", command, (3,))
         position = np.asarray(measurement.position, np.float32) - self._default
@@ -91,11 +84,7 @@ def _pushed(history: Floats | None, sample: Floats) -> Floats:
 
 
 def finite(what: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """`value` as float32.
-
-    Raises:
-        ArtefactError: Of another shape, or with a number that is not finite; names it `what`.
-    """
+    """`value` as float32; an ArtefactError names it `what` if it is not finite or of that shape."""
     given = np.asarray(value)
     if given.shape != shape:
         raise ArtefactError(f"{what} has the shape {given.shape}; expected {shape}.")
