@@ -233,14 +233,14 @@ def test_a_small_training_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
     import mjlab.tasks  # noqa: F401 - registers mjlab's own
     from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, register_mjlab_task
 
-    from pronk.train.runner.runner import PronkRunner
-    from pronk.train.tasks import JUMP_TASK
+    from pronk.train.rl.runner import PronkRunner
 
-    name = "Pronk-Bench-Small"
-    learning, env_cfg = load_rl_cfg(JUMP_TASK), load_env_cfg(JUMP_TASK)
+    name, task = "Pronk-Bench-Small", "Pronk-Jump-MiniCheetah"
+    learning, env_cfg = load_rl_cfg(task), load_env_cfg(task)
     learning.actor.hidden_dims = learning.critic.hidden_dims = (8,)
     learning.algorithm.num_learning_epochs = 1
     learning.num_steps_per_env = 8
+    env_cfg.curriculum["phases"].params["steps_per_iteration"] = 8
     register_mjlab_task(name, env_cfg, env_cfg, learning, PronkRunner)
     with pytest.raises(PronkError, match="no task 'Cartwheel'"):
         train.run(envs=(2,), device="cpu", tasks=("Cartwheel", "Cartwheel"))

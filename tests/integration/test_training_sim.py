@@ -26,11 +26,11 @@ from pronk.evaluation.training_sim.evaluation import NEVER, Evaluation, Plan, ev
 from pronk.evaluation.training_sim.run import TERM, blank_actor, evaluation_cfg, load_subject
 from pronk.robots import load_robot
 from pronk.train.gains import training_gains
-from pronk.train.mdp.randomization import Randomization
+from pronk.train.phases import TASKS
+from pronk.train.provenance import SCHEMA, RunFolder
+from pronk.train.rl import checkpoint
 from pronk.train.rl.export import contract_for, export_policy
-from pronk.train.runner import checkpoint
-from pronk.train.runner.run_folder import RunFolder
-from pronk.train.tasks import env_cfg
+from pronk.train.tasks import load_task
 
 DT = 0.005
 DROP = 0.3
@@ -73,12 +73,15 @@ class Observed:
 @pytest.fixture(scope="module")
 def observed() -> Observed:
     """Six robots fall 0.3 m onto their feet; steps of 2 to 6 samples; one lies down."""
-
-    cfg = env_cfg(randomization=replace(Randomization.none(), decimation=(-2, 2)))
-    cfg.events["start"].params = dict.fromkeys(("place", "speed", "heading", "joints"), 0.0)
+    task = load_task("mini_cheetah")
+    cfg = task.env_cfg(task.robot, training_gains("naive", task.robot), iterations=TASKS["all"])
+    decimation = cfg.events["decimation"]
+    cfg.events["reset"].params = dict.fromkeys(("place", "speed", "heading", "joints"), 0.0)
     state = cfg.scene.entities["robot"].init_state
     state.pos = (0.0, 0.0, state.pos[2] + DROP)
-    env = ManagerBasedRlEnv(evaluation_cfg(cfg, SHORT), device="cpu")
+    cfg = evaluation_cfg(cfg, SHORT, "none")
+    cfg.events["decimation"] = decimation
+    env = ManagerBasedRlEnv(cfg, device="cpu")
     listener = env.metrics_manager.cfg[TERM].func
     runs: list[Any] = []
     reads: list[Any] = []
@@ -94,7 +97,7 @@ def observed() -> Observed:
         return actions
 
     def estimate(obs: Any) -> Any:
-        target = obs["target"].clone()
+        target = obs["estimator_target"].clone()
         target[:, 4] += BIAS
         return target[:, :4], target[:, 4:]
 
@@ -194,12 +197,20 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     """The folder of a run with one checkpoint of random weights, and its actor."""
 
     torch.manual_seed(5)
-    actor = blank_actor(jump=True)
+    actor = blank_actor()
+    torch.nn.init.normal_(actor.mlp[0].jump_weight)
     folder = RunFolder(tmp_path_factory.mktemp("run"))
-    about = {"phase": "jump_b", "gains": "matched", "gains_sha256": "ab" * 32}
-    tree = {"algorithm": {"actor_state_dict": actor.state_dict()}}
-    path = checkpoint.numbered(folder.checkpoints, 7)
-    checkpoint.save(path, checkpoint.Checkpoint(about=about, tree=tree))
+    folder.write(
+        {
+            "schema": SCHEMA,
+            "settings": {"robot": "mini_cheetah"},
+            "gains": {"name": "matched", "sha256": "ab" * 32},
+        }
+    )
+    keys = (*checkpoint.NETWORKS, *checkpoint.OPTIMIZERS, "infos")
+    state: dict[str, Any] = {key: {} for key in keys}
+    state |= {"actor_state_dict": actor.state_dict(), "iter": 7}
+    checkpoint.write(folder.path / "model_7.pt", state)
     return folder.path, actor
 
 
@@ -213,7 +224,7 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
         assert subject.estimate is not None
         assert torch.equal(subject.estimate(obs)[1], actor.estimate(obs)[1])
     assert subject.jump
-    assert subject.about["phase"] == "jump_b"
+    assert subject.about["iteration"] == 7
     naive = training_gains("naive", load_robot("mini_cheetah"))
     assert not subject.knows(naive)
     matched = replace(naive, name="matched", sha256="ab" * 32)
@@ -229,12 +240,14 @@ def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> N
         load_subject(tmp_path / "policy.onnx", "cpu")
     with pytest.raises(ArtefactError, match="no such file"):
         load_subject(tmp_path / "model_3.pt", "cpu")
-    found = checkpoint.load(trained[0] / "checkpoints" / "model_7.pt")
-    walking = tmp_path / "model_1.pt"
-    about = {**found.about, "phase": "walk"}
-    checkpoint.save(walking, checkpoint.Checkpoint(about=about, tree=found.tree))
-    with pytest.raises(ArtefactError, match="its actor is not that of this pronk"):
-        load_subject(walking, "cpu")
+    (tmp_path / "model_3.pt").write_bytes(b"PK not a checkpoint")
+    with pytest.raises(ArtefactError, match="not a checkpoint"):
+        load_subject(tmp_path / "model_3.pt", "cpu")
+    state = checkpoint.read(trained[0] / "model_7.pt")
+    del state["actor_state_dict"]["mlp.0.bias"]
+    checkpoint.write(tmp_path / "model_4.pt", state)
+    with pytest.raises(ArtefactError, match="its actor is not that"):
+        load_subject(tmp_path / "model_4.pt", "cpu")
 
 
 def test_an_exported_policy_does_what_its_checkpoint_does(
@@ -286,7 +299,7 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
     assert found.jumps == ()
     assert found.before == before
     assert found.about["randomization"] == "full"
-    assert found.about["policy"]["phase"] == "jump_b"
+    assert found.about["policy"]["iteration"] == 7
     assert found.about["gains"] == {"name": "naive", "sha256": "", "virtual": False}
     assert found.about["device"]["device"] == "cpu"
     assert found.about["versions"]["mjlab"]

@@ -52,10 +52,7 @@ def evaluate(
         device: auto: a GPU if there is one. On the CPU take a few robots.
     """
     from pronk.evaluation.training_sim.evaluation import JUMPS, WALKS, Plan
-    from pronk.robots import load_robot
-    from pronk.train.gains import training_gains
-    from pronk.train.runner.devices import find_devices, require_extra
-    from pronk.train.runner.request import ROBOT
+    from pronk.train.devices import find_devices, require_extra
 
     require_extra()
     if out.suffix != ".json":
@@ -66,12 +63,13 @@ def evaluate(
         walks=() if what == "jump" else WALKS,
         jumps=() if what == "walk" else JUMPS,
     )
-    drives = training_gains(gains, load_robot(ROBOT), like=like)
     where = "cuda:0" if find_devices(device).device == "cuda" else "cpu"
 
     from pronk.evaluation.tables import evaluation_sheets
     from pronk.evaluation.training_sim.evaluation import load_speed_errors, save
     from pronk.evaluation.training_sim.run import load_subject
+    from pronk.train.gains import training_gains
+    from pronk.train.tasks import load_task
 
     errors = {} if before is None else load_speed_errors(before)
     subject = load_subject(policy, where)
@@ -79,6 +77,7 @@ def evaluate(
         raise PronkError(
             f"{policy}: a policy without the jump input; evaluate it with --what walk."
         )
+    drives = training_gains(gains, load_task(subject.robot).robot, like=like)
     if not subject.knows(drives):
         console.warn(
             f"{policy} was not trained with these gains; it is evaluated with {drives.name} ones"
@@ -100,20 +99,23 @@ def run(
 ) -> Evaluation:
     """Build the simulator on a device, `cpu` or `cuda:0`, and evaluate in it.
 
-    `before` has speed errors to compare with; `randomization` is a key of `RANDOMIZATIONS`.
+    `before` has speed errors to compare with; `randomization` is one of `RANDOMIZATIONS`.
     """
     from mjlab.envs import ManagerBasedRlEnv
 
     from pronk.evaluation.training_sim.evaluation import evaluate_policy
-    from pronk.evaluation.training_sim.run import RANDOMIZATIONS, evaluation_cfg
-    from pronk.train.runner.provenance import device_facts, versions
-    from pronk.train.tasks import env_cfg
+    from pronk.evaluation.training_sim.run import evaluation_cfg
+    from pronk.train.devices import device_facts
+    from pronk.train.phases import TASKS
+    from pronk.train.rl.export import versions
+    from pronk.train.tasks import load_task
 
-    drawn = RANDOMIZATIONS[randomization]
+    task = load_task(subject.robot)
     # mjlab and Warp print to standard output.
     with console.progress() as report, redirect_stdout(io.StringIO()):
         report("building", 0.0)
-        cfg = evaluation_cfg(env_cfg(gains=gains, randomization=drawn, seed=plan.seed), plan)
+        cfg = task.env_cfg(task.robot, gains, iterations=TASKS["all"], seed=plan.seed)
+        cfg = evaluation_cfg(cfg, plan, randomization)
         env = ManagerBasedRlEnv(cfg=cfg, device=device)
         report("building", 1.0)
         about = {

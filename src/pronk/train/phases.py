@@ -1,240 +1,196 @@
-"""The phases of training: walk, then jump with a strong hint, then with a weak one (P1, P2).
+"""The phases of training as a curriculum term on the step counter (paper P1, P2).
 
-Phase 1 walks. The networks are then widened by the jump input, and in phase 2 half of the robots
-are commanded to jump now and then. In 2a equal feet are rewarded strongly, which is what makes a
-trot
-leave the ground with all feet at once; in 2b a tenth of that is left (Table II).
+Phase 1 walks, with the jump input held at zero. In phase 2 half of the robots are commanded to jump
+now and then. In 2a equal foot forces are rewarded strongly, which turns a trot into a jump with all
+feet at once; in 2b a tenth of that is left (Table II). The networks have the jump input from the
+beginning; its weights are zero until phase 2, since an input of zeros has no gradient: the blank
+neuron of the paper's widening (N3).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
-
-import numpy as np
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 from pronk.errors import PronkError
-from pronk.train.mdp.commands import NAME, MotionCommandCfg, motion_command
-from pronk.train.mdp.reward_sum import NAME as TABLE
-from pronk.train.mdp.reward_sum import reward_sum
-from pronk.train.mdp.reward_table import ROWS, JumpWeights, with_jump_weights
+from pronk.train.mdp.commands import motion_command
 
 if TYPE_CHECKING:
-    from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers import CurriculumTermCfg
 
-_NO_JUMP = JumpWeights(
-    dense=0.0,
-    sparse=0.0,
-    width=1.0,
-    rise=0.0,
-    reach=0.0,
-    gap=0.0,
-    countermovement=0.0,
-    hop=0.0,
-    collision=-ROWS["collision"].jump,
-    knees=-ROWS["knees"].jump,
-    landing=0.0,
-)
+NAME = "phases"
+"""The curriculum term's name in every environment."""
+STEPS_PER_ITERATION = 24
+"""Policy steps of every robot between two updates of PPO."""
+
+Span = tuple[float, float]
+"""Values at the beginning and at the end of a phase."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """One stretch of training with its own commands and rewards."""
+    """What changes from phase to phase; each value moves linearly unless said otherwise."""
 
-    name: str
     iterations: int
-    """PPO iterations."""
+    """PPO iterations, unless the task has other numbers."""
     jump: bool
-    """Whether the networks read the jump input, and half of the robots get it."""
-    weights: JumpWeights = _NO_JUMP
-    final: JumpWeights | None = None
-    """What they come to, evenly over the iterations; None: they stay."""
+    """Whether half of the robots get the jump input."""
+    weights: Mapping[str, Span] = field(default_factory=dict)
+    """Weights of rewards by name; the others keep those of `mdp.rewards`."""
+    jump_scales: Mapping[str, Span] = field(default_factory=dict)
+    """Their factors in jump mode."""
+    liftoff_std: Span = (1.0, 1.0)
+    """Standard deviation of the lift-off kernel [m/s]; the paper's expression has 1."""
+    guidance: Span = (0.0, 0.0)
+    """Fraction of the countermovement's guidance; falls fast at first and slowly at last, when
+    there is little noise left to learn with."""
+    noise: Span = (math.inf, math.inf)
+    """Largest standard deviation of the actions; falls slowly at first and fast at last: with
+    little noise a policy changes little in an iteration (PPO bounds a step in units of it)."""
     entropy: float = 0.005
-    """Coefficient of PPO's entropy bonus: how much exploring is worth."""
-    noise: tuple[float, float] | None = None
-    """Largest standard deviation of the network's actions, at first and at last; None: any."""
-    led: tuple[float, float] = (0.0, 0.0)
-    """Part of a countermovement's guidance that robots are given, at first and at last."""
+    """Coefficient of PPO's entropy bonus."""
     estimator_rate: float = 1e-3
     """Learning rate of the estimator."""
 
-    @property
-    def changes(self) -> bool:
-        """Whether what `enter_phase` sets goes on changing while it lasts."""
-        return self.final is not None or self.led[0] != self.led[1]
-
-    @property
-    def jump_fraction(self) -> float:
-        """Part of the robots that get the jump input."""
-        return 0.5 if self.jump else 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse a phase of no iterations, noise of none, and more guidance than all of it."""
-        if self.iterations < 1:
-            raise PronkError(f"phase {self.name} has {self.iterations} iterations; 1 or more.")
-        if not all(0.0 <= part <= 1.0 for part in self.led):
-            raise PronkError(f"phase {self.name} leads by {self.led}; both must be 0 to 1.")
-        if self.noise is not None and not all(limit > 0.0 for limit in self.noise):
-            raise PronkError(f"phase {self.name} has noise {self.noise}; both must be positive.")
-
-    def weights_at(self, done: float) -> JumpWeights:
-        """The weights when a part of the phase is over.
-
-        Args:
-            done: That part, 0 to 1.
-        """
-        if self.final is None:
-            return self.weights
-        now = {}
-        for name in (entry.name for entry in fields(JumpWeights)):
-            first, last = getattr(self.weights, name), getattr(self.final, name)
-            now[name] = float(np.interp(done, (0.0, 1.0), (first, last)))
-        return JumpWeights(**now)
-
-    def led_at(self, done: float) -> float:
-        """Part of the guidance that is given when a part of the phase is over.
-
-        It falls fast at first and slowly at last, when there is little noise left to learn with.
-
-        Args:
-            done: That part, 0 to 1.
-        """
-        first, last = self.led
-        return last + (first - last) * (1.0 - done) ** 2
-
     def largest_noise(self, done: float) -> float:
-        """Largest standard deviation of the network's actions; slow at first, fast in the end.
-
-        The less noise, the less a policy may change in an iteration (PPO's step is bound in units
-        of it): with the noise falling by as much every time, jumps grew no further from the middle
-        of the phase on.
-
-        Args:
-            done: Part of the phase that is over, 0 to 1.
-        """
-        if self.noise is None:
-            return math.inf
+        """Largest standard deviation of the actions when a fraction of the phase is over."""
         first, last = self.noise
-        return first * (last / first) ** done**2
+        return math.inf if math.isinf(first) else first * (last / first) ** done**2
 
 
-_WEAK = JumpWeights(
-    dense=0.002,
-    sparse=16.0,
-    width=0.8,
-    rise=16.0,
-    reach=28.0,
-    gap=12.0,
-    countermovement=60.0,
-    hop=1.0,
-    collision=5.0,
-    knees=3.0,
-    landing=0.0,
-)
-"""Of 2b, as it begins."""
-PHASES: tuple[Phase, ...] = (
-    Phase(name="walk", iterations=300, jump=False),
-    # Jumping has to be found, and a countermovement at once: policies that had learned to push
-    # without one never came to it. Hinted at by the trunk's velocity nothing was learned here:
-    # seven of eight trainings found a jump 40 to 400 iterations into 2b, whose kernel said nothing
-    # (width .3) of jumps as slow as theirs, and one none; what was found late was not done well by
-    # the end. So robots are led at first, the hint is for each leg and goes on into 2b, and the
-    # kernel narrows there.
-    # The entropy bonus alone would drive the noise from .5 to 1.0 in 170 iterations.
-    Phase(
-        name="jump_a",
-        iterations=220,
-        jump=True,
-        weights=replace(_WEAK, dense=0.02, width=1.0),
-        noise=(0.65, 0.65),
-        led=(1.0, 0.7),
+_JUMP_A = {
+    "dense_jump": (-0.02, -0.02),
+    "sparse_jump": (16.0, 16.0),
+    "jump_height": (16.0, 16.0),
+    "flight_distance": (28.0, 28.0),
+    "clearance_gap": (12.0, 12.0),
+    "countermovement": (60.0, 60.0),
+    "hop": (-1.0, -1.0),
+}
+
+PHASES: Mapping[str, Phase] = {
+    "walk": Phase(iterations=300, jump=False),
+    # Jumping has to be found, and a countermovement with it: policies that had learned to push
+    # without one never came to it. Rewarded by the trunk's velocity alone, seven of eight trainings
+    # found a jump 40 to 400 iterations into 2b, and one none. The entropy bonus alone would raise
+    # the noise from .5 to 1.0 in 170 iterations.
+    "jump_a": Phase(
+        iterations=220, jump=True, weights=_JUMP_A, noise=(0.65, 0.65), guidance=(1.0, 0.7)
     ),
-    # And then done alike every time: an actor that explores on (its standard deviation .59 after
-    # 560 iterations, .42 before the first jump) walks worse and scatters. Landing as it goes
-    # backwards, a robot stands until its thighs are on the ground, a centimetre of way at 5 a
-    # second: 6 of 20 such landings were well. Commanded for before there is a jump, it might teach
-    # that
-    # there be none, so it comes to cost more; 60, 40 and 100 made 280 of 300 landings well, of
-    # three seeds, but the first fell to .11 m and lost .8 of 2.4 m/s. What jumps are worth falls:
-    # with as much as at first walking came to be .18 m/s too fast, turning .2 rad/s too slow; led,
-    # and with worth down to 10, 8, 22 and 9, it was within .1 m/s and .1 rad/s.
-    Phase(
-        name="jump_b",
+    # Then alike every time: with a standard deviation of .59 after 560 iterations (.42 before the
+    # first jump) a policy walks worse and its jumps scatter. The penalties of low landings and of
+    # thighs and knees on the ground grow: in force before there is a jump, they might prevent it.
+    # Jumps earn less: with as much as at first walking came to be .18 m/s too fast and turning .2
+    # rad/s too slow.
+    "jump_b": Phase(
         iterations=560,
         jump=True,
-        weights=_WEAK,
-        final=replace(
-            _WEAK,
-            sparse=12.0,
-            width=0.25,
-            rise=10.0,
-            reach=28.0,
-            gap=11.0,
-            countermovement=0.0,
-            collision=45.0,
-            knees=30.0,
-            landing=40.0,
-        ),
+        weights={
+            **_JUMP_A,
+            "dense_jump": (-0.002, -0.002),
+            "sparse_jump": (16.0, 12.0),
+            "jump_height": (16.0, 10.0),
+            "clearance_gap": (12.0, 11.0),
+            "countermovement": (60.0, 0.0),
+            "landing": (0.0, -40.0),
+        },
+        jump_scales={"collision": (1.0, 9.0), "knees": (1.0, 10.0)},
+        liftoff_std=(0.8, 0.25),
         entropy=0.0,
         noise=(0.65, 0.2),
-        # A small network and 2,048 robots: lift-offs earned .47 a second, and rising, after 62
-        # iterations with all of the guidance, .09 where it was let go of by then.
-        led=(0.7, 0.0),
+        guidance=(0.7, 0.0),
         estimator_rate=3e-4,
     ),
-)
-"""The paper's phases. Its weights are 2.5 and 0.25 for dense and 250 for sparse, in `PAPER_UNIT`s
-.125, .0125 and 12.5."""
+}
+"""The phases by name, in order. The paper's weights are 2.5 and 0.25 for dense and 250 for sparse;
+in `PAPER_UNIT`s .125, .0125 and 12.5."""
+
+TASKS: Mapping[str, Mapping[str, int]] = {
+    "walk": {"walk": 300, "jump_a": 0, "jump_b": 0},
+    "jump": {"walk": 300, "jump_a": 220, "jump_b": 560},
+    "all": {"walk": 300, "jump_a": 220, "jump_b": 560},
+    # The paper's ablation: to walk and to jump at once, with as many iterations in all.
+    "together": {"walk": 0, "jump_a": 520, "jump_b": 560},
+}
+"""Iterations of each phase, by task; a task whose walk is 0 begins with jump_a."""
 
 
-def phase(name: str) -> Phase:
-    """The phase called `name`.
-
-    Raises:
-        PronkError: There is none; the message lists those there are.
-    """
-    for candidate in PHASES:
-        if candidate.name == name:
-            return candidate
-    raise PronkError(f"no phase {name!r}; the phases are {', '.join(p.name for p in PHASES)}.")
-
-
-def with_iterations(iterations: Mapping[str, int]) -> tuple[Phase, ...]:
-    """`PHASES` with other numbers of iterations.
+def phase_at(iterations: Mapping[str, int], iteration: int) -> tuple[str, float]:
+    """The phase of an iteration, and the fraction of it that is over before.
 
     Args:
-        iterations: By name of the phase; those left out keep theirs.
+        iterations: Of each phase by name.
+        iteration: Counted from 0; beyond the last, the last phase is over.
 
     Raises:
-        PronkError: A name is unknown or a number is below 1.
+        PronkError: There is no phase.
     """
-    for name in iterations:
-        phase(name)
-    return tuple(replace(p, iterations=iterations.get(p.name, p.iterations)) for p in PHASES)
+    left = iteration
+    present = [(name, count) for name, count in iterations.items() if count > 0]
+    if not present:
+        raise PronkError("all phases have 0 iterations; expected 1 or more for one of them.")
+    for name, count in present:
+        if left < count:
+            return name, left / count
+        left -= count
+    return present[-1][0], 1.0
 
 
-def configure_phase(cfg: ManagerBasedRlEnvCfg, phase: Phase) -> None:
-    """Set a phase in the configuration of an environment that is yet to be built."""
-    command = cfg.commands[NAME]
-    assert isinstance(command, MotionCommandCfg)
-    command.width = phase.weights.width
-    command.jump_fraction = phase.jump_fraction
-    cfg.rewards[TABLE].params["rows"] = with_jump_weights(ROWS, phase.weights)
+class Curriculum:
+    """Curriculum term: sets the rewards and the command term to the phase of the iteration.
 
-
-def enter_phase(env: ManagerBasedRlEnv, phase: Phase, done: float = 0.0) -> None:
-    """Set a phase in a living environment.
-
-    Args:
-        env: Built from `pronk.train.tasks.env_cfg`.
-        phase: Which.
-        done: Part of it that is over, 0 to 1.
+    The iteration follows from mjlab's step counter. mjlab calls the term whenever a robot resets,
+    the runner at the beginning of every iteration.
     """
-    command, table = motion_command(env), reward_sum(env)
-    weights = phase.weights_at(done)
-    command.tracker.width = weights.width
-    command.cfg.jump_fraction = phase.jump_fraction
-    command.led = phase.led_at(done)
-    table.set_rows(with_jump_weights(table.rows, weights))
+
+    def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
+        iterations = {name: cfg.params[name] for name in PHASES}
+        self.iterations = iterations
+        """Of each phase."""
+        self.steps_per_iteration: int = cfg.params["steps_per_iteration"]
+        self._set = -1
+        self._initial = {
+            name: (term.weight, dict(term.params)) for name, term in env.cfg.rewards.items()
+        }
+
+    @property
+    def total(self) -> int:
+        """Iterations of all phases."""
+        return sum(self.iterations.values())
+
+    def __call__(self, env: ManagerBasedRlEnv, env_ids: Any, **_: int) -> dict[str, float]:
+        """Apply the phase, and return what is logged."""
+        iteration = env.common_step_counter // self.steps_per_iteration
+        name, done = phase_at(self.iterations, iteration)
+        if iteration != self._set:
+            self._set = iteration
+            self.apply(env, PHASES[name], done)
+        return {"phase": float(list(PHASES).index(name)), "done": done}
+
+    def apply(self, env: ManagerBasedRlEnv, phase: Phase, done: float) -> None:
+        """Set a phase of which a fraction is over, whatever the step counter."""
+        for name, (weight, params) in self._initial.items():
+            term = env.reward_manager.get_term_cfg(name)
+            term.weight = _between(phase.weights.get(name, (weight, weight)), done)
+            if name in phase.jump_scales:
+                params = {**params, "jump_scale": _between(phase.jump_scales[name], done)}
+            term.params.update(params)
+        command = motion_command(env)
+        command.state.liftoff_std = _between(phase.liftoff_std, done)
+        command.cfg.jump_fraction = 0.5 if phase.jump else 0.0
+        first, last = phase.guidance
+        command.guidance_scale = last + (first - last) * (1.0 - done) ** 2
+
+
+def curriculum(env: ManagerBasedRlEnv) -> Curriculum:
+    """The curriculum term of an environment."""
+    term = env.curriculum_manager.get_term_cfg(NAME).func
+    assert isinstance(term, Curriculum)
+    return term
+
+
+def _between(span: Span, done: float) -> float:
+    return span[0] + (span[1] - span[0]) * done

@@ -9,10 +9,10 @@ runs in ONNX Runtime, the robots spread over the processor's cores.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -34,13 +34,11 @@ from pronk.policy.runtime import Policy as ExportedPolicy
 from pronk.robots import load_robot
 from pronk.train.gains import TrainingGains
 from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.randomization import Randomization
-from pronk.train.phases import phase
-from pronk.train.rl.actor import EstimatorActor
-from pronk.train.runner import checkpoint
-from pronk.train.runner.request import ROBOT
-from pronk.train.runner.run_folder import RunFolder
-from pronk.train.tasks import rl_cfg
+from pronk.train.provenance import RunFolder
+from pronk.train.rl import checkpoint
+from pronk.train.rl.networks import EstimatorActor
+from pronk.train.tasks.jump_env_cfg import without_randomization
+from pronk.train.tasks.jump_rl_cfg import jump_rl_cfg
 
 Policy = Callable[[TensorDict], Tensor]
 """Observation groups to actions (N, 12)."""
@@ -50,21 +48,7 @@ Estimate = Callable[[TensorDict], tuple[Tensor, Tensor]]
 TERM = "evaluation"
 """The metrics term's name."""
 
-_PAPER = Randomization.paper()
-RANDOMIZATIONS: Mapping[str, Randomization] = {
-    "full": _PAPER,
-    "noise": replace(
-        _PAPER,
-        friction=None,
-        gains="off",
-        shank_length=None,
-        base_mass=(0.0, 0.0),
-        bus_voltage=None,
-        push_velocity=0.0,
-        push_yaw_rate=0.0,
-    ),
-    "none": Randomization.none(),
-}
+RANDOMIZATIONS = ("full", "noise", "none")
 """What differs between robots. `full`: as in training. `noise`: the nominal body and gains,
 undisturbed, with noise, timing (D1) and command delay drawn as in training; the closest to the
 paper's figures, of one robot measured several times. `none`: only starts and times are drawn."""
@@ -84,11 +68,15 @@ class StepListener:
         return self._nothing
 
 
-def evaluation_cfg(cfg: ManagerBasedRlEnvCfg, plan: Plan) -> ManagerBasedRlEnvCfg:
+def evaluation_cfg(
+    cfg: ManagerBasedRlEnvCfg, plan: Plan, randomization: str = "full"
+) -> ManagerBasedRlEnvCfg:
     """Make an environment of training one to evaluate in; changes `cfg` and returns it.
 
     As many robots as the plan has, no time-out, no rewards, and the step listener.
     """
+    if randomization != "full":
+        without_randomization(cfg, noise=randomization == "noise")
     cfg.scene.num_envs = plan.size
     cfg.rewards = {}
     cfg.curriculum = {}
@@ -192,7 +180,7 @@ class Run:
             self.on = torch.where(rises, now, self.on)
             groups = TensorDict(obs, batch_size=[env.num_envs])
             if estimate is not None and self._walking[0] <= now < self._walking[1]:
-                self._compare(estimate(groups), groups["target"])
+                self._compare(estimate(groups), groups["estimator_target"])
             actions = policy(groups)
             # Read at the end of the step, by the next observation. Its length varies (D1).
             self._set_commands(now + env.cfg.decimation)
@@ -247,6 +235,8 @@ class Subject:
     estimate: Estimate | None
     jump: bool
     """Whether it has the jump input."""
+    robot: str
+    """The robot that it is trained for, by name or path."""
     about: dict[str, Any]
     """File, hash, and provenance."""
 
@@ -264,35 +254,45 @@ def load_subject(path: Path, device: str) -> Subject:
     """
     if path.suffix == ".onnx":
         return _exported(path, device)
-    found = checkpoint.latest(RunFolder(path).checkpoints) if path.is_dir() else path
-    if found is None:
-        raise ArtefactError(
-            f"{path}: no checkpoints in it; expected the folder of a run, a checkpoint, or "
-            "an exported policy.onnx."
-        )
-    stored = checkpoint.load(found)
-    jump = phase(str(stored.about.get("phase"))).jump
-    actor = blank_actor(jump=jump)
+    found = RunFolder(path).checkpoint() if path.is_dir() else path
+    state = checkpoint.widen_checkpoint(checkpoint.read(found))
+    actor = blank_actor()
     try:
-        actor.load_state_dict(stored.tree["algorithm"]["actor_state_dict"])
-    except (KeyError, RuntimeError) as error:
+        actor.load_state_dict(state["actor_state_dict"])
+    except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1].strip()
         raise ArtefactError(
             f"{found}: its actor is not that of this pronk ({reason}); train again."
         ) from error
     actor = actor.to(device).eval()
-    about = {"file": str(found), "sha256": sha256(found), **stored.about}
-    return Subject(act=actor, estimate=actor.estimate, jump=jump, about=about)
+    run = RunFolder(found.parent)
+    provenance = run.read() if run.provenance.is_file() else {}
+    settings, gains = provenance.get("settings", {}), provenance.get("gains", {})
+    about = {
+        "file": str(found),
+        "sha256": sha256(found),
+        "iteration": state["iter"],
+        "gains": gains.get("name"),
+        "gains_sha256": gains.get("sha256"),
+        "settings": settings,
+    }
+    return Subject(
+        act=actor,
+        estimate=actor.estimate,
+        jump=checkpoint.jumps(state),
+        robot=settings.get("robot", "mini_cheetah"),
+        about=about,
+    )
 
 
-def blank_actor(*, jump: bool) -> EstimatorActor:
-    """The actor as it is trained, with random weights; `jump` with the jump input."""
-    cfg = rl_cfg(jump=jump).actor
+def blank_actor() -> EstimatorActor:
+    """The actor as it is trained, with random weights."""
+    cfg = jump_rl_cfg(iterations=1).actor
     sizes = {"measured": MEASURED_SIZE, "jump": 1}
     blank = TensorDict({k: torch.zeros(1, n) for k, n in sizes.items()}, batch_size=[1])
     return EstimatorActor(
         blank,
-        {"actor": [*sizes] if jump else ["measured"]},
+        {"actor": [*sizes]},
         "actor",
         JOINTS,
         hidden_dims=cfg.hidden_dims,
@@ -306,7 +306,7 @@ def _exported(path: Path, device: str) -> Subject:
     policy = load_policy(path)
     contract = policy.contract
     try:
-        check(contract, load_robot(ROBOT))
+        check(contract, load_robot(contract.robot))
     except ArtefactError as error:
         raise ArtefactError(f"{path}: {error}") from None
     about = {
@@ -316,7 +316,13 @@ def _exported(path: Path, device: str) -> Subject:
         **{name: dict(getattr(contract, name)) for name in ("provenance", "versions")},
     }
     runner = _Exported(policy, device)
-    return Subject(act=runner.act, estimate=runner.estimate, jump=contract.jump, about=about)
+    return Subject(
+        act=runner.act,
+        estimate=runner.estimate,
+        jump=contract.jump,
+        robot=contract.robot,
+        about=about,
+    )
 
 
 class _Exported:

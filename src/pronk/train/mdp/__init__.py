@@ -1,1 +1,1 @@
-"""Simulation, commands, observations, randomization and rewards of the training environment."""
+"""Terms of the training environment: commands, observations, events, rewards, terminations."""

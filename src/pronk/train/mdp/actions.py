@@ -1,13 +1,13 @@
-"""The policy's action: joint position targets, which reach the drives late.
+"""The policy's action: joint position targets, which reach the drives after a delay.
 
-A command travels for a while before a real drive knows it. Here a target takes effect a number of
-physics steps after the policy issued it, one number per robot and episode, the same for all its
-joints, as on one bus. The delay is a transport delay, exact also where it is longer than a policy
-step: ages of targets are counted in physics steps, however many of them each policy step has.
+A target takes effect a number of physics steps after the policy issued it, one number for each
+robot and episode, the same for all its joints, as on one bus. It is a transport delay, exact also
+where it is longer than a policy step: ages of targets are counted in physics steps, however many
+of them a policy step has.
 
 mjlab's actuators can delay too, with a buffer that is read and written in every physics step. A
-target changes once in a policy step, so it is enough to choose, in the first few physics steps,
-between the last targets; after those nothing changes and nothing is done.
+target changes once in a policy step, so it is enough to choose between the last targets in the
+first few physics steps.
 """
 
 from __future__ import annotations
@@ -20,73 +20,67 @@ from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
 from torch import Tensor
 
 from pronk.errors import PronkError
-from pronk.train.mdp.supply import Supply
+from pronk.train.mdp.actuators import Battery
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
+NAME = "joint_position"
+"""The action term's name in every environment."""
+
 
 @dataclass(kw_only=True)
-class HeldJointPositionCfg(JointPositionActionCfg):
+class DelayedJointPositionActionCfg(JointPositionActionCfg):
     """Joint position targets with a command delay."""
 
     delay_steps: tuple[int, int] = (0, 0)
     """Smallest and largest delay, drawn uniformly at the start of an episode [physics steps]."""
 
     def __post_init__(self) -> None:
-        """Refuse a delay that is none.
-
-        Raises:
-            PronkError: The range falls or begins below zero.
-        """
+        """Refuse a delay that is negative or falls."""
         super().__post_init__()
         low, high = self.delay_steps
         if not 0 <= low <= high:
             raise PronkError(
-                f"command delay {low} to {high} physics steps; it must not fall nor be negative."
+                f"delay_steps is {low} to {high} physics steps; expected 0 or more, rising."
             )
 
-    def build(self, env: ManagerBasedRlEnv) -> HeldJointPosition:
-        """The term of an environment."""
-        return HeldJointPosition(self, env)
+    def build(self, env: ManagerBasedRlEnv) -> DelayedJointPositionAction:
+        """Build the term of an environment."""
+        return DelayedJointPositionAction(self, env)
 
 
-class HeldJointPosition(JointPositionAction):
+class DelayedJointPositionAction(JointPositionAction):
     """Targets of N robots: default pose + scale * action, in force `lag` physics steps later."""
 
-    cfg: HeldJointPositionCfg
+    cfg: DelayedJointPositionActionCfg
 
-    def __init__(self, cfg: HeldJointPositionCfg, env: ManagerBasedRlEnv) -> None:
+    def __init__(self, cfg: DelayedJointPositionActionCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         low, high = cfg.delay_steps
         self.lag = torch.full((self.num_envs, 1), low, device=self.device)
-        """Delay in this episode [physics steps]. Shape (N, 1)."""
-        self.supply = Supply(self._entity)
-        """What the drives are fed from."""
-        self.led: Tensor | None = None
-        """What a hand adds to the coming targets [rad], (N, joints); None: nothing."""
+        """Delay in this episode [physics steps]. (N, 1)"""
+        self.battery = Battery(self._entity)
+        self.guidance: Tensor | None = None
+        """Added to the coming targets [rad], (N, joints); None: nothing."""
         everything = self._target_ids.tolist() == list(range(self._entity.num_joints))
         # A slice costs a view where a list of indices costs a kernel.
         self._joints: slice | Tensor = slice(None) if everything else self._target_ids
-        self._rest: Tensor = self._entity.data.default_joint_pos[:, self._joints]
+        self._default: Tensor = self._entity.data.default_joint_pos[:, self._joints]
         # With a policy step of at least one physics step no older target can be in force.
         count = high + 1
-        self._targets = self._rest.repeat(count, 1, 1)
-        """The last targets, as a ring [rad]. Shape (count, N, joints)."""
+        self._targets = self._default.repeat(count, 1, 1)
+        """The last targets, as a ring [rad]. (count, N, joints)"""
         self._newest = 0
         """Where in the ring the newest target is."""
         self._ages = [high] * count
         """Physics steps since each target was issued, newest first."""
 
     def process_actions(self, actions: Tensor) -> None:
-        """Issue the targets of a policy step.
-
-        Args:
-            actions: The network's. Shape (N, joints).
-        """
+        """Issue the targets of a policy step; actions (N, joints) are the network's."""
         super().process_actions(actions)
-        if self.led is not None:
-            self._processed_actions += self.led
+        if self.guidance is not None:
+            self._processed_actions += self.guidance
         count = len(self._ages)
         self._newest = (self._newest + 1) % count
         self._ages = [0, *self._ages[:-1]]
@@ -100,7 +94,7 @@ class HeldJointPosition(JointPositionAction):
         if self._ages[0] == 0 or any(low <= age <= high for age in self._ages):
             self._entity.set_joint_position_target(self._in_force(), joint_ids=self._joints)
         self._ages = [age + 1 for age in self._ages]
-        self.supply.advance()
+        self.battery.advance()
 
     def _in_force(self) -> Tensor:
         """Of each robot the newest target that is at least as old as its delay."""
@@ -114,22 +108,23 @@ class HeldJointPosition(JointPositionAction):
         return target
 
     def reset(self, env_ids: Tensor | slice | None = None) -> None:
-        """Draw delays of new episodes, which batteries begin at rest.
-
-        Until a target arrives the default pose is in force.
-
-        Args:
-            env_ids: Which robots; all if None.
-        """
+        """Draw the delays of new episodes; the default pose is in force until a target arrives."""
         super().reset(env_ids)
         which = slice(None) if env_ids is None else env_ids
-        self.supply.rest(which)
-        if self.led is not None:
-            self.led[which] = 0.0
+        self.battery.reset(which)
+        if self.guidance is not None:
+            self.guidance[which] = 0.0
         low, high = self.cfg.delay_steps
         if high == 0:
             return
-        self._targets[:, which] = self._rest[which]
+        self._targets[:, which] = self._default[which]
         if low < high:
             drawn = torch.randint(low, high + 1, self.lag.shape, device=self.device)
             self.lag[which] = drawn[which]
+
+
+def joint_position_action(env: ManagerBasedRlEnv) -> DelayedJointPositionAction:
+    """The action term of an environment."""
+    term = env.action_manager.get_term(NAME)
+    assert isinstance(term, DelayedJointPositionAction)
+    return term

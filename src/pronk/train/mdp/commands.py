@@ -1,99 +1,76 @@
-"""Commands: velocities, redrawn at intervals, and the jump input.
+"""Commands: velocities, redrawn at intervals, and the jump input (paper C1 to C4).
 
-Checklist C1 to C4. Speed ranges grow from a part of the full range to the whole: with +-3 m/s
-from the first step a policy learns to stand, since the tracking reward has no slope so far away
-(seen in a probe), and they wait for a policy that does not keep up. Everything is computed for all
-robots with masks: no step waits for the device.
+The command term also holds what depends on the commands: the state of the jumps, the motion of the
+last step, and the ranges of the velocities. Everything is computed for all robots with masks, so
+that no step waits for the device.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import torch
+import tyro
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from torch import Tensor
 
+from pronk.robots import load_robot
 from pronk.robots.legged import legged
-from pronk.robots.robot import RobotSpec
 from pronk.train.gains import TrainingGains
-from pronk.train.mdp.actions import HeldJointPosition
+from pronk.train.mdp.actions import joint_position_action
 from pronk.train.mdp.guidance import guidance
-from pronk.train.mdp.jump import JumpSettings, JumpTracker
-from pronk.train.mdp.motion import STANDING_LEG, Motion, measure_motion
-from pronk.train.mdp.scene import FEET, FOOT_GEOMS
+from pronk.train.mdp.jump import JumpSettings, JumpState
+from pronk.train.mdp.motion import Motion, measure_motion, standing_leg
 from pronk.train.mdp.speed_ranges import Growth, SpeedRanges
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-
-BODY = legged("mini_cheetah")
 
 NAME = "motion"
 """The command term's name in every environment."""
 
 
 @dataclass(kw_only=True)
-class NominalDrive:
-    """Nominal gains and limit of every joint, in joint order."""
-
-    stiffness: tuple[float, ...]
-    """[N m/rad]"""
-    damping: tuple[float, ...]
-    """[N m s/rad]"""
-    effort_limit: tuple[float, ...]
-    """[N m]"""
-
-    @classmethod
-    def of(cls, robot: RobotSpec, gains: TrainingGains) -> Self:
-        """Of a robot with the gains it is trained with."""
-        groups = [gains.groups[joint.group] for joint in robot.joints]
-        return cls(
-            stiffness=tuple(group.stiffness for group in groups),
-            damping=tuple(group.damping for group in groups),
-            effort_limit=tuple(joint.drive.effort_limit for joint in robot.joints),
-        )
-
-
-@dataclass(kw_only=True)
 class MotionCommandCfg(CommandTermCfg):
     """Velocity ranges and jump intervals."""
 
-    drive: NominalDrive
-    """Of the robot that is commanded."""
+    robot: str
+    """The robot, as `load_robot` reads it."""
+    gains: tyro.conf.Suppress[TrainingGains]
+    """Nominal gains of the drives."""
     resampling_time_range: tuple[float, float] = (2.0, 6.0)
     """Time between draws of the velocity command [s]."""
     limits: tuple[float, float, float] = (3.0, 1.0, 2.0)
     """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3)."""
     growth: Growth = field(default_factory=Growth)
-    """How the ranges become as wide."""
+    """Growth of the ranges up to `limits`."""
     standing: float = 0.1
-    """Part of the draws that are zero."""
+    """Fraction of the draws that are zero."""
     one_axis: float = 0.4
-    """Part of the draws along one axis alone, as the trials ask."""
+    """Fraction of the draws along one axis alone, as in the trials."""
     jump_fraction: float = 0.0
-    """Part of the robots whose jump input is used (0 in phase 1, 0.5 in phase 2)."""
+    """Fraction of the robots whose jump input is used; a phase sets it."""
     jump_on_s: tuple[float, float] = (0.4, 0.7)
     """Time that the jump input is held [s]: less than preparation and flight together, so that
     one command means one jump."""
     jump_off_s: tuple[float, float] = (1.0, 2.5)
     """Time between jump inputs [s]."""
-    leap: float = 0.6
-    """In jump mode the horizontal speed commanded is this much higher [m/s], for commands below
+    jump_speed_added: float = 0.6
+    """In jump mode the rewarded horizontal speed is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
-    (.60 m at 1 m/s). Ground covered faster is not paid."""
-    width: float = 1.0
-    """Standard deviation of the lift-off kernel [m/s], see `JumpTracker`."""
+    (.60 m at 1 m/s). Ground covered faster is not rewarded."""
+    liftoff_std: float = 1.0
+    """Standard deviation of the lift-off kernel [m/s], see `JumpState`; a phase sets it."""
     settings: JumpSettings = field(default_factory=JumpSettings)
 
     def build(self, env: ManagerBasedRlEnv) -> MotionCommand:
-        """The term of an environment."""
+        """Build the term of an environment."""
         return MotionCommand(self, env)
 
 
 class MotionCommand(CommandTerm):
-    """Commands of N robots, and what they do about it."""
+    """Commands of N robots, and their motion in response."""
 
     cfg: MotionCommandCfg
     time_left: Tensor
@@ -101,29 +78,35 @@ class MotionCommand(CommandTerm):
     def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         count, device = self.num_envs, self.device
+        self.robot = load_robot(cfg.robot)
+        self.body = legged(cfg.robot)
         self.velocity = torch.zeros(count, 3, device=device)
-        """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. Shape (N, 3)."""
+        """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. (N, 3)"""
         self.jump = torch.zeros(count, dtype=torch.bool, device=device)
-        """Jump input. Shape (N,)."""
+        """Jump input. (N,)"""
         data = env.scene["robot"].data
         self.default_position: Tensor = data.default_joint_pos
         """[rad]. (N, 12)"""
         self.position_limits: Tensor = data.joint_pos_limits
         """[rad]. (N, 12, 2)"""
-        self.stiffness = torch.tensor(cfg.drive.stiffness, device=device)
+        nominal = [cfg.gains.groups[joint.group] for joint in self.robot.joints]
+        self.stiffness = torch.tensor([gains.stiffness for gains in nominal], device=device)
         """Nominal [N m/rad]. (12,)"""
-        self.damping = torch.tensor(cfg.drive.damping, device=device)
+        self.damping = torch.tensor([gains.damping for gains in nominal], device=device)
         """Nominal [N m s/rad]. (12,)"""
-        self.effort_limit = torch.tensor(cfg.drive.effort_limit, device=device)
+        self.effort_limit = torch.tensor(
+            [joint.drive.effort_limit for joint in self.robot.joints], device=device
+        )
         """[N m]. (12,)"""
         self.scripted = False
-        """True: nobody but the caller changes `velocity` and `jump`."""
-        self.led = 0.0
-        """Part of a countermovement's guidance that is given, 0 to 1; a phase sets it."""
+        """True: `velocity` and `jump` are set by the caller alone."""
+        self.guidance_scale = 0.0
+        """Fraction of the guidance that is added to the actions, 0 to 1; a phase sets it."""
         self._guidance = guidance(
-            cfg.settings, self.stiffness, self.damping, BODY.total_mass, env.step_dt
+            self.body, cfg.settings, self.stiffness, self.damping, env.step_dt
         )
-        self.tracker = JumpTracker(count, device, cfg.settings, cfg.width)
+        self._standing_leg = standing_leg(self.body)
+        self.state = JumpState(count, device, cfg.settings, cfg.liftoff_std)
         self.ranges = SpeedRanges(cfg.growth, device)
         self._jump_left = torch.zeros(count, device=device)
         self._limits = torch.tensor(cfg.limits, device=device)
@@ -137,34 +120,37 @@ class MotionCommand(CommandTerm):
         self._least, self._most = spans.to(device).T[:, :, None]
         # The golden ratio spreads any fraction evenly over the robots.
         self._rank = (torch.arange(count, device=device) * 0.6180339887) % 1.0
-        feet, _ = env.scene["robot"].find_sites(FEET, preserve_order=True)
-        self.feet: Tensor = env.scene["robot"].indexing.site_ids[feet].long()
+        entity = env.scene["robot"]
+        sites = [f"{leg}_foot" for leg in self.body.legs]
+        feet, _ = entity.find_sites(sites, preserve_order=True)
+        self.feet: Tensor = entity.indexing.site_ids[feet].long()
         """The foot sites' ids in the model. (4,)"""
-        geoms, _ = env.scene["robot"].find_geoms(FOOT_GEOMS, preserve_order=True)
-        self.foot_geoms: Tensor = env.scene["robot"].indexing.geom_ids[geoms].long()
-        """Ids of the feet themselves. (4,)"""
+        geoms, _ = entity.find_geoms([f"{s}_collision" for s in sites], preserve_order=True)
+        self.foot_geoms: Tensor = entity.indexing.geom_ids[geoms].long()
+        """Ids of the feet's geoms. (4,)"""
         self._motion: Motion | None = None
         self._motion_step = -1
+        self._scales: dict[float, Tensor] = {}
 
     @property
     def command(self) -> Tensor:
-        """Velocity command, shape (N, 3)."""
+        """Velocity command, (N, 3)."""
         return self.velocity
 
     @property
     def target(self) -> Tensor:
-        """Horizontal velocity that is rewarded: the command, in jump mode with `leap`. (N, 2).
+        """Horizontal velocity that is rewarded: the command, in jump mode faster. (N, 2).
 
-        What a robot ran too fast when the jump command came is requested on top.
+        The overspeed at the jump command is added, so that braking is not rewarded.
         """
         horizontal = self.velocity[:, :2]
         speed = torch.linalg.vector_norm(horizontal, dim=-1)
-        faster = (self.cfg.leap * speed.clamp_max(1.0) + self.tracker.lead) * self.tracker.mode
-        return horizontal * (1.0 + faster / speed.clamp_min(1e-6))[:, None]
+        added = self.cfg.jump_speed_added * speed.clamp_max(1.0) + self.state.overspeed
+        return horizontal * (1.0 + added * self.state.mode / speed.clamp_min(1e-6))[:, None]
 
     @property
     def jumper(self) -> Tensor:
-        """Gets jump inputs. Bool, (N,)."""
+        """Robots that get jump inputs. Bool, (N,)."""
         return self._rank < self.cfg.jump_fraction
 
     @property
@@ -175,84 +161,61 @@ class MotionCommand(CommandTerm):
     @property
     def standing(self) -> Tensor:
         """Commanded to stand still: no velocity and no jump. Bool, (N,)."""
-        return (self.velocity.square().sum(dim=-1) < 1e-4) & ~self.tracker.mode
-
-    @property
-    def fell(self) -> Tensor:
-        """Episodes that end in this step, and not for time. Bool, (N,)."""
-        terminated: Tensor = self._env.termination_manager.terminated
-        return terminated
+        return (self.velocity.square().sum(dim=-1) < 1e-4) & ~self.state.mode
 
     @property
     def position_target(self) -> Tensor:
-        """What the joints were sent in this step [rad]. (N, 12)."""
-        target: Tensor = self._env.action_manager.get_term("joint_position")._processed_actions
-        return target
-
-    def per_event(self, value: Tensor) -> Tensor:
-        """A reward for an event, as the rate that mjlab will multiply by the step's duration.
-
-        Args:
-            value: What the event is worth. (N,)
-        """
-        return value / self._env.step_dt
-
-    @property
-    def action_change(self) -> Tensor:
-        """Change of the network's actions in the last step. (N, 12)."""
-        actions = self._env.action_manager
-        return actions.action - actions.prev_action
+        """Joint position targets of this step [rad]. (N, 12)."""
+        return joint_position_action(self._env)._processed_actions
 
     @property
     def motion(self) -> Motion:
-        """What the robots did in the step just simulated; measured once a step, on first use."""
+        """Motion in the step just simulated; measured once a step, on first use."""
         step = self._env.common_step_counter
         if self._motion is None or self._motion_step != step:
-            self._motion = measure_motion(self._env, self.feet, self._motion)
+            self._motion = measure_motion(self._env, self.body, self.feet, self._motion)
             self._motion_step = step
-            self._follow(self._motion)
+            self._scales.clear()
+            self._advance_state(self._motion)
         return self._motion
 
-    def _follow(self, motion: Motion) -> None:
-        """Tell the tracker what the robots did in the step just simulated."""
+    def in_jump_mode(self, scale: float) -> Tensor:
+        """`scale` in jump mode, 1 outside. (N,)."""
+        if scale not in self._scales:
+            self._scales[scale] = torch.where(self.state.mode, scale, 1.0)
+        return self._scales[scale]
+
+    def _advance_state(self, motion: Motion) -> None:
         horizontal, target = motion.velocity_heading, self.target
         commanded = self.velocity[:, :2]
         speed = torch.linalg.vector_norm(commanded, dim=-1)
-        # The part towards the command, which `target` lies along; zero without one.
+        # The part along the command, which `target` is parallel to; zero without one.
         along = (horizontal * commanded).sum(dim=-1) / speed.clamp_min(1e-6)
-        self.tracker.advance(
+        left = torch.stack((-motion.heading[:, 1], motion.heading[:, 0]), dim=-1)
+        way = commanded[:, :1] * motion.heading + commanded[:, 1:] * left
+        self.state.advance(
             jump=self.jump,
             contact=motion.contact,
             height=motion.height,
             vertical=motion.velocity_world[:, 2],
-            miss=torch.linalg.vector_norm(horizontal - target, dim=-1),
+            velocity_error=torch.linalg.vector_norm(horizontal - target, dim=-1),
             turn=torch.linalg.vector_norm(motion.angular_velocity[:, :2], dim=-1),
             along=torch.minimum(along, torch.linalg.vector_norm(target, dim=-1)),
             excess=along - speed,
             feet=motion.foot_position,
-            direction=self._direction(motion.heading),
-            stretch=motion.leg_length - STANDING_LEG,
+            direction=way / torch.linalg.vector_norm(way, dim=-1, keepdim=True).clamp_min(1e-6),
+            extension=motion.leg_length - self._standing_leg,
             dt=self._env.step_dt,
         )
         if not self.scripted:
-            self.ranges.advance(horizontal - commanded, ~self.tracker.mode)
-
-    def _direction(self, heading: Tensor) -> Tensor:
-        """Unit vector of the velocity commanded, world frame, or zero. (N, 2).
-
-        Args:
-            heading: Unit vector of where the trunk heads, world frame. (N, 2)
-        """
-        left = torch.stack((-heading[:, 1], heading[:, 0]), dim=-1)
-        way = self.velocity[:, :1] * heading + self.velocity[:, 1:2] * left
-        return way / torch.linalg.vector_norm(way, dim=-1, keepdim=True).clamp_min(1e-6)
+            self.ranges.advance(horizontal - commanded, ~self.state.mode)
 
     def reset(self, env_ids: Tensor | slice | None) -> dict[str, float]:
-        """Fresh commands for robots that start anew; jumps under way are forgotten."""
+        """Draw commands for robots that start a new episode, and clear their jumps."""
         assert isinstance(env_ids, Tensor)
-        self.tracker.reset(env_ids)
+        self.state.reset(env_ids)
         if self._motion is not None:
-            self._motion.forget(env_ids)
+            self._motion.reset(env_ids)
         if self.scripted:
             return {}
         velocity, time, _, off = self._draw(len(env_ids))
@@ -263,18 +226,17 @@ class MotionCommand(CommandTerm):
         return {}
 
     def compute(self, dt: float | Tensor, env_ids: Tensor | None = None) -> None:
-        """Let time pass; draw anew where it has run out."""
+        """Advance the time by `dt`; draw anew where an interval is over."""
         # Rewards have read the feet before `forward`, and mjlab keeps what was read until a robot
-        # resets; what is observed after this shall be of now.
+        # resets; observations need the present contacts.
         self._env.scene["feet"].update(0.0)
         if env_ids is not None:
             return
         if not self.scripted:
-            self._pass(dt)
-        self._lead()
+            self._redraw(dt)
+        self._set_guidance()
 
-    def _pass(self, dt: float | Tensor) -> None:
-        """Draw anew what has run out after a time."""
+    def _redraw(self, dt: float | Tensor) -> None:
         self.time_left -= dt
         due = self.time_left <= 0.0
         velocity, time, on, off = self._draw(self.num_envs)
@@ -288,37 +250,36 @@ class MotionCommand(CommandTerm):
         self.jump = self.jump ^ turn
         self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
 
-    def _lead(self) -> None:
-        """Tell the action what a hand adds in the coming step."""
-        action = self._env.action_manager.get_term("joint_position")
-        assert isinstance(action, HeldJointPosition)
-        if self.led == 0.0:
-            action.led = None
+    def _set_guidance(self) -> None:
+        """Set what the action term adds to the targets of the coming step."""
+        action = joint_position_action(self._env)
+        if self.guidance_scale == 0.0:
+            action.guidance = None
             return
-        tracker, last = self.tracker, len(self._guidance) - 1
-        # The tracker hears of a new command when the step that it began is over.
-        begins = self.jump & ~tracker.commanded
-        steps = (tracker.since / self._env.step_dt).round().long().clamp_max(last)
-        on_the_ground = tracker.mode & (tracker.liftoffs == 0.0)
+        state, last = self.state, len(self._guidance) - 1
+        # The jump state learns of a new command at the end of the step that begins with it.
+        begins = self.jump & ~state.commanded
+        steps = (state.since / self._env.step_dt).round().long().clamp_max(last)
+        on_the_ground = state.mode & (state.liftoffs == 0.0)
         steps = torch.where(begins, 0, torch.where(on_the_ground, steps, last))
-        action.led = self.led * self._guidance[steps]
+        action.guidance = self.guidance_scale * self._guidance[steps]
 
     def _draw(self, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Velocity (count, 3), and times until the next, with jump and without it (count,) [s]."""
         drawn = torch.rand(7, count, device=self.device)
         axes = self._axes[torch.bucketize(drawn[3], self._kinds)]
-        velocity = (drawn[:3].T - 0.5) * (2.0 * self.ranges.part * self._limits) * axes
+        velocity = (drawn[:3].T - 0.5) * (2.0 * self.ranges.fraction * self._limits) * axes
         time, on, off = torch.lerp(self._least, self._most, drawn[4:])
         return velocity, time, on, off
 
     def _update_metrics(self) -> None:
-        """Nothing: rewards tell the story."""
+        """No-op: the rewards are logged."""
 
     def _resample_command(self, env_ids: Tensor) -> None:
-        """Nothing: `compute` and `reset` draw with masks."""
+        """No-op: `compute` and `reset` draw with masks."""
 
     def _update_command(self, env_ids: Tensor | None) -> None:
-        """Nothing: `compute` does it all."""
+        """No-op: see `compute`."""
 
 
 def motion_command(env: ManagerBasedRlEnv) -> MotionCommand:

@@ -1,9 +1,9 @@
-"""A hand that leads a jump: what is added to a policy's joint targets until it jumps by itself.
+"""Guidance of a jump: joint target offsets of a countermovement, added to the policy's targets.
 
-A countermovement asks something else of twelve drives at every moment of a quarter of a second, and
-an actor knows how late it is by the state of its legs alone: a policy that has not begun to fall
-cannot learn to push. So at first each leg is led through one (`JumpSettings.countermovement`), its
-foot below its hip, with the torque that it takes on top, and a phase lets go little by little.
+A countermovement needs a different action of twelve drives at every moment of a quarter of a
+second, and a policy that has not begun to fall cannot learn to push. So at first each leg is guided
+through `JumpSettings.countermovement`, its foot below its hip, with the torque that it takes; the
+phases of training then reduce the offsets to zero.
 """
 
 from __future__ import annotations
@@ -11,64 +11,70 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pronk.robots.legged import legged
+from pronk.robots.legged import Legged
 from pronk.train.mdp.jump import JumpSettings
-from pronk.train.mdp.motion import STANDING_LEG
-
-BODY = legged("mini_cheetah")
+from pronk.train.mdp.motion import standing_leg
 
 GRAVITY = 9.81
 """[m/s^2]"""
-_STEP = 1e-4
-"""Of the difference that gives the joints' speed [s]."""
+_DIFFERENCE = 1e-4
+"""Time step of the finite difference that gives joint velocities [s]."""
 
 
-def leg_angles(length: Tensor) -> tuple[Tensor, Tensor]:
-    """Hip pitch and knee [rad] of a leg whose foot is below its hip, the knee behind it.
+def leg_angles(body: Legged, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Hip pitch and knee [rad] of a leg whose foot is below its hip.
+
+    The knee bends as in the default pose.
 
     Args:
-        length: From the axis of the hip pitch to the foot [m]; beyond a straight leg's as that.
+        body: Dimensions of the robot.
+        length: From the axis of the hip pitch to the foot [m]; at most that of a straight leg.
     """
-    thigh, shank = BODY.thigh_length, BODY.shank_length
+    thigh, shank = body.thigh_length, body.shank_length
     cosine = (length.square() - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = torch.arccos(cosine.clamp(-1.0, 1.0))
-    return -torch.atan2(shank * knee.sin(), thigh + shank * knee.cos()), knee
+    pitch = -torch.atan2(shank * knee.sin(), thigh + shank * knee.cos())
+    sign = 1.0 if body.default_position["knee"] >= 0.0 else -1.0
+    return sign * pitch, sign * knee
 
 
 def guidance(
-    settings: JumpSettings, stiffness: Tensor, damping: Tensor, mass: float, dt: float
+    body: Legged, settings: JumpSettings, stiffness: Tensor, damping: Tensor, dt: float
 ) -> Tensor:
-    """What to add to the joint targets in each policy step after a jump command [rad].
+    """Offsets of the joint targets in each policy step after a jump command [rad].
 
-    A drive gives stiffness (target - q) - damping qdot, so a target lies beyond where its joint
-    shall be by what torque and speed there ask for. Led like that, a policy that only walks left
-    the ground at all of the paper's five commands, with .9 to 1.7 m/s upwards.
+    A drive gives stiffness (target - q) - damping qdot, so a target lies beyond the joint's
+    intended position by what torque and velocity need. Guided like that, a policy that only walks
+    left the ground at all of the paper's five commands, with .9 to 1.7 m/s upwards.
 
     Args:
+        body: Dimensions of the robot; each leg bears a quarter of its mass.
         settings: Of the jump.
-        stiffness: Of the drives [N m/rad], shape (12,), leg by leg.
-        damping: [N m s/rad], shape (12,).
-        mass: Of the robot [kg]; each leg bears a quarter.
+        stiffness: Of the drives [N m/rad], (12,), leg by leg.
+        damping: [N m s/rad], (12,).
         dt: Duration of a policy step [s].
 
     Returns:
-        Shape (steps + 1, 12): the last but one is for the step that ends with the lift-off, the
-        last is zero.
+        (steps + 1, 12): the last but one is for the step that ends with the lift-off, the last is
+        zero.
     """
     # Each target is for the end of its step.
     time = dt * torch.arange(1, round(settings.prompt_s / dt) + 1, dtype=torch.float64)
-    default = torch.tensor([BODY.default_position[name] for name in BODY.leg_joints]).double()
+    default = torch.tensor([body.default_position[name] for name in body.leg_joints]).double()
 
     def angles(at: Tensor) -> Tensor:
-        pitch, knee = leg_angles(STANDING_LEG + settings.countermovement(at))
+        pitch, knee = leg_angles(body, standing_leg(body) + settings.countermovement(at))
         return torch.stack((torch.zeros_like(pitch), pitch, knee), dim=-1)
 
-    pose, rate = angles(time), (angles(time + _STEP) - angles(time - _STEP)) / (2.0 * _STEP)
+    pose, rate = angles(time), angles(time + _DIFFERENCE) - angles(time - _DIFFERENCE)
     upwards = torch.where(time < settings.fall_s, -settings.fall, settings.push)
-    force = (0.25 * mass * (upwards + GRAVITY)).clamp_min(0.0)
+    force = (0.25 * body.total_mass * (upwards + GRAVITY)).clamp_min(0.0)
     torque = torch.zeros_like(pose)
-    # The force passes through the hip; the knee is behind it and would bend.
-    torque[:, 2] = force * BODY.thigh_length * pose[:, 1].sin()
-    offset, torque, rate = (value.repeat(1, 4) for value in (pose - default, torque, rate))
-    added = offset + (torque + damping.double().cpu() * rate) / stiffness.double().cpu()
+    # The force passes through the hip; the knee is beside it by the thigh's horizontal part.
+    torque[:, 2] = force * body.thigh_length * pose[:, 1].sin()
+    offset, torque, rate = (
+        value.repeat(1, len(body.legs)) for value in (pose - default, torque, rate)
+    )
+    moving = damping.double().cpu() * rate / (2.0 * _DIFFERENCE)
+    added = offset + (torque + moving) / stiffness.double().cpu()
     return torch.cat((added, torch.zeros_like(added[:1]))).float().to(stiffness.device)

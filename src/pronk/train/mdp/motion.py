@@ -1,7 +1,7 @@
-"""What the robots did in the last policy step: measured once, used by every reward.
+"""Motion of the robots in the last policy step: measured once, used by every reward.
 
-mjlab's derived quantities (feet, forces) lag positions by one physics step here, as everywhere in
-its rewards.
+mjlab's derived quantities (feet, forces) lag positions by one physics step here, as in all its
+rewards.
 """
 
 from __future__ import annotations
@@ -14,32 +14,27 @@ from mjlab.entity.data import compute_velocity_from_cvel
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from torch import Tensor
 
-from pronk.robots.legged import legged
+from pronk.robots.legged import Legged
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-BODY = legged("mini_cheetah")
-
-KNEES = slice(7 + BODY.leg_joints.index("knee"), None, len(BODY.leg_joints))
-"""Where a state's positions have the knees, after seven of the trunk."""
-
 
 @dataclass
 class Motion:
-    """One step of N robots."""
+    """One step of N robots with L legs and J joints."""
 
     position: Tensor
-    """Joint positions [rad]. (N, 12)"""
+    """Joint positions [rad]. (N, J)"""
     velocity: Tensor
-    """Joint velocities [rad/s]. (N, 12)"""
+    """Joint velocities [rad/s]. (N, J)"""
     height: Tensor
     """Trunk over ground [m]. (N,)"""
     velocity_world: Tensor
     """Velocity of the trunk, world frame [m/s]. (N, 3)"""
     velocity_heading: Tensor
-    """Its horizontal part, forward and left of where the trunk heads [m/s]: with the trunk's own
-    axes a robot that rears up as it leaps would move forward for going up. (N, 2)"""
+    """Its horizontal part, forward and left of the heading [m/s]. (N, 2). With the trunk's own
+    axes, upward motion of a pitched trunk would count as forward motion."""
     angular_velocity: Tensor
     """In the trunk's frame [rad/s]. (N, 3)"""
     gravity: Tensor
@@ -47,63 +42,64 @@ class Motion:
     heading: Tensor
     """Unit vector of the horizontal part of the trunk's x axis, world frame. (N, 2)"""
     contact: Tensor
-    """Feet on the ground, bool. (N, 4)"""
+    """Feet on the ground, bool. (N, L)"""
     force: Tensor
-    """Magnitude of the ground's force on each foot [N]. (N, 4)"""
+    """Magnitude of the ground's force on each foot [N]. (N, L)"""
     foot_position: Tensor
-    """Horizontal, world frame [m]. (N, 4, 2)"""
+    """Horizontal, world frame [m]. (N, L, 2)"""
     foot_height: Tensor
-    """Lowest point of each foot over ground [m]. (N, 4)"""
+    """Lowest point of each foot over ground [m]. (N, L)"""
     knee_height: Tensor
-    """Axes of the knees over ground [m]. (N, 4)"""
+    """Axes of the knees over ground [m]. (N, L)"""
     leg_length: Tensor
-    """From the axis of each hip pitch to the foot, shanks of nominal length [m]. (N, 4)"""
+    """From the axis of each hip pitch to the foot, shanks of nominal length [m]. (N, L)"""
     foot_velocity: Tensor
-    """World frame [m/s]. (N, 4, 3)"""
+    """World frame [m/s]. (N, L, 3)"""
     foot_velocity_change: Tensor
-    """Since the step before [m/s]. (N, 4, 3)"""
-    touching: Tensor
-    """How many of trunk, thighs and shanks touch the ground. (N,)"""
+    """Since the step before [m/s]. (N, L, 3)"""
+    non_foot_contacts: Tensor
+    """Number of parts other than feet on the ground. (N,)"""
     torque: Tensor
-    """On the joints, as the drives gave it [N m]. (N, 12)"""
+    """On the joints, as the drives gave it [N m]. (N, J)"""
     torque_change: Tensor
-    """Since the step before [N m]. (N, 12)"""
+    """Since the step before [N m]. (N, J)"""
 
-    def forget(self, env_ids: Tensor) -> None:
-        """Robots that start anew have no step before.
-
-        Args:
-            env_ids: Which, shape (n,).
-        """
+    def reset(self, env_ids: Tensor) -> None:
+        """Robots that start a new episode have no step before; env_ids (n,)."""
         self.foot_velocity[env_ids] = 0.0
         self.torque[env_ids] = 0.0
 
 
-def leg_length(knee: Tensor) -> Tensor:
+def leg_length(body: Legged, knee: Tensor) -> Tensor:
     """From the axis of the hip pitch to the foot's centre, in the leg's plane [m].
 
     Args:
+        body: Dimensions of the robot.
         knee: Angle of the knee [rad], 0 for a straight leg; any shape.
     """
-    thigh, shank = BODY.thigh_length, BODY.shank_length
+    thigh, shank = body.thigh_length, body.shank_length
     return (thigh**2 + shank**2 + 2.0 * thigh * shank * torch.cos(knee)).sqrt()
 
 
-STANDING_LEG = float(leg_length(torch.tensor(BODY.default_position["knee"]).double()))
-"""Length of a leg in the default pose [m]."""
+def standing_leg(body: Legged) -> float:
+    """Length of a leg in the default pose [m]."""
+    return float(leg_length(body, torch.tensor(body.default_position["knee"]).double()))
 
 
-def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) -> Motion:
+def measure_motion(
+    env: ManagerBasedRlEnv, body: Legged, feet: Tensor, before: Motion | None
+) -> Motion:
     """Measure the step just simulated.
 
     Args:
         env: The environment; the robot is the only thing in it that moves.
-        feet: The foot sites' ids in the model. (4,)
+        body: Dimensions of the robot.
+        feet: The foot sites' ids in the model. (L,)
         before: The step before; None at the very first.
     """
     robot, physics = env.scene["robot"].data, env.sim.data
     ground = env.scene["feet"].data
-    # Copies: a reset writes to the state before the step's motion is forgotten.
+    # Copies: a reset writes to the state before `Motion.reset` is called.
     qpos, qvel = physics.qpos.clone(), physics.qvel.clone()
     velocity = qvel[:, :3]  # of a free joint: of the body's origin, in the world's frame
     ahead = quat_apply(qpos[:, 3:7], robot.forward_vec_b)[:, :2]
@@ -113,9 +109,10 @@ def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) 
     foot = physics.site_xpos[:, feet]
     com = physics.subtree_com[:, robot.indexing.root_body_id].unsqueeze(1)
     shanks = env.sim.model.site_bodyid[feet]
-    shank_velocity = physics.cvel[:, shanks]
-    foot_velocity = compute_velocity_from_cvel(foot, com, shank_velocity)[..., :3]
+    foot_velocity = compute_velocity_from_cvel(foot, com, physics.cvel[:, shanks])[..., :3]
     torque = robot.actuator_force
+    # A free joint has seven positions; the knee has its place among the joints of each leg.
+    knees = qpos[:, 7 + body.leg_joints.index("knee") :: len(body.leg_joints)]
     return Motion(
         position=qpos[:, 7:],
         velocity=qvel[:, 6:],
@@ -128,12 +125,12 @@ def measure_motion(env: ManagerBasedRlEnv, feet: Tensor, before: Motion | None) 
         contact=ground.found > 0,
         force=torch.linalg.vector_norm(ground.force, dim=-1),
         foot_position=foot[..., :2],
-        foot_height=foot[..., 2] - BODY.foot_radius,
+        foot_height=foot[..., 2] - body.foot_radius,
         knee_height=physics.xpos[:, shanks, 2],
-        leg_length=leg_length(qpos[:, KNEES]),
+        leg_length=leg_length(body, knees),
         foot_velocity=foot_velocity,
         foot_velocity_change=foot_velocity - (before.foot_velocity if before else 0.0),
-        touching=(env.scene["limbs"].data.found > 0).sum(dim=-1, dtype=torch.float32),
+        non_foot_contacts=(env.scene["limbs"].data.found > 0).sum(dim=-1, dtype=torch.float32),
         torque=torque,
         torque_change=torque - (before.torque if before else 0.0),
     )

@@ -1,7 +1,7 @@
-"""What the networks read: the measured vector, the jump input, and what only training knows.
+"""Observations: the measured vector, the jump input, and the state that only training has.
 
-The measured vector is laid out in `pronk.policy.layout`, noise D7 to D10 included. The critic's
-vector is free of noise and knows the truth; it never leaves the simulator.
+The measured vector is laid out in `pronk.policy.layout`, with noise D7 to D10. The critic reads the
+simulator's state without noise and the randomized parameters of each robot.
 """
 
 from __future__ import annotations
@@ -9,18 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
-from mjlab.utils.noise import UniformNoiseCfg
 from torch import Tensor
 
-from pronk.policy.layout import ACTIONS, HISTORY
-from pronk.train.mdp.actions import HeldJointPosition
+from pronk.train.mdp.actions import joint_position_action
 from pronk.train.mdp.commands import motion_command
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-
-Noise = dict[str, UniformNoiseCfg | None]
 
 CRITIC = {
     "angular_velocity": 3,
@@ -45,30 +40,26 @@ CRITIC = {
     "stiffness": 12,
     "damping": 12,
 }
-"""Parts of the critic's vector, in order, and their sizes. What was drawn for a robot is among
-them, and how long its velocity command lasts: to a critic that does not know, what a robot earns
-would be luck."""
+"""Parts of the critic's vector, in order, and their sizes. With the randomized parameters of the
+robot and the time that its velocity command lasts, they explain differences between returns."""
 
 CRITIC_JUMP = {
     "jump": 1,
     "mode": 1,
     "since": 1,
     "airborne": 1,
-    "best": 1,
-    "stroke": 1,
-    "worth": 1,
-    "lead": 1,
-    "flown": 1,
-    "farthest": 1,
+    "best_score": 1,
+    "travel": 1,
+    "reward_scale": 1,
+    "overspeed": 1,
+    "flight": 1,
+    "best_flight": 1,
     "jumper": 1,
     "jump_left": 1,
 }
-"""Parts of what the critic reads of a jump, from phase 2 on. Commands come at random and are worth
-more than seconds of walking: whether one will come, and when, would else be the most of what
-separates one return from another, and hide what an action did."""
-
-_BODY_WEIGHT = 12.0 * 9.81
-"""Unit of the foot forces that the critic reads [N]."""
+"""Parts of the critic's jump vector; zeros as long as no robot gets a jump input. Jump commands
+come at random and earn more than seconds of walking: without knowing whether and when one comes,
+most of the difference between two returns would hide the effect of an action."""
 
 
 def angular_velocity(env: ManagerBasedRlEnv) -> Tensor:
@@ -106,17 +97,17 @@ def jump(env: ManagerBasedRlEnv) -> Tensor:
     return motion_command(env).jump.float()[:, None]
 
 
-def target(env: ManagerBasedRlEnv) -> Tensor:
-    """Truth for the estimator: contacts (0 or 1), velocity in the trunk's frame [m/s]. (N, 7)."""
+def estimator_target(env: ManagerBasedRlEnv) -> Tensor:
+    """Contacts (0 or 1), velocity in the trunk's frame [m/s]. (N, 7)."""
     contact = env.scene["feet"].data.found > 0
     return torch.cat([contact.float(), _linear_velocity(env)], dim=-1)
 
 
 def critic(env: ManagerBasedRlEnv) -> Tensor:
     """The parts of `CRITIC`. (N, 96)."""
-    robot = env.scene["robot"].data
     ground = env.scene["feet"].data
     terms = motion_command(env)
+    weight = 9.81 * terms.body.total_mass
     return torch.cat(
         [
             angular_velocity(env),
@@ -129,32 +120,30 @@ def critic(env: ManagerBasedRlEnv) -> Tensor:
             _linear_velocity(env),
             env.sim.data.qpos[:, 2:3],
             (ground.found > 0).float(),
-            torch.linalg.vector_norm(ground.force, dim=-1) / _BODY_WEIGHT,
-            robot.data.site_xpos[:, terms.feet, 2],
-            *body(env),
+            torch.linalg.vector_norm(ground.force, dim=-1) / weight,
+            env.sim.data.site_xpos[:, terms.feet, 2],
+            *randomized_parameters(env),
         ],
         dim=-1,
     )
 
 
-def body(env: ManagerBasedRlEnv) -> list[Tensor]:
-    """The parts of `CRITIC` that were drawn for each robot, in order. (N, size) each.
+def randomized_parameters(env: ManagerBasedRlEnv) -> list[Tensor]:
+    """The parts of `CRITIC` that are drawn for each robot, in order. (N, size) each.
 
-    As `pronk.train.mdp.draws.draws` has them, but stiffness and damping by kind of joint,
-    and of each kind by leg, and `drop` in 1/kW: what is normalised must not be much smaller than 1.
-    `voltage` is what is left of the battery's, over the rated one.
+    Stiffness and damping by joint group and leg; `voltage` is the battery's present one over the
+    rated one, `drop` in 1/kW; foot to knee axis in m, mass in kg, delay in physics steps.
     """
-    model, held = env.sim.model, env.action_manager.get_term("joint_position")
-    assert isinstance(held, HeldJointPosition)
-    feet, supply = motion_command(env).foot_geoms, held.supply
+    model, action = env.sim.model, joint_position_action(env)
+    feet, battery = motion_command(env).foot_geoms, action.battery
     drives = env.scene["robot"].actuators
     parts = [
-        supply.voltage,
-        supply.no_load,
-        1e3 * supply.drop,
+        battery.voltage,
+        battery.no_load,
+        1e3 * battery.drop,
         model.geom_friction[:, feet[:1], 0],
         model.body_mass[:, env.scene["robot"].indexing.body_ids[:1]],
-        held.lag,
+        action.lag,
         -model.geom_pos[:, feet, 2],
         *(drive.stiffness for drive in drives),
         *(drive.damping for drive in drives),
@@ -166,24 +155,24 @@ def body(env: ManagerBasedRlEnv) -> list[Tensor]:
 def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
     """The parts of `CRITIC_JUMP`. (N, 12)."""
     command = motion_command(env)
-    tracker = command.tracker
-    return torch.cat(
-        [
-            jump(env),
-            tracker.mode.float()[:, None],
-            tracker.since[:, None],
-            tracker.airborne.float()[:, None],
-            tracker.best[:, None],
-            tracker.stroke[:, None],
-            tracker.worth[:, None],
-            tracker.lead[:, None],
-            tracker.flown[:, None],
-            tracker.farthest[:, None],
-            command.jumper.float()[:, None],
-            command.jump_left[:, None],
-        ],
-        dim=-1,
-    )
+    state = command.state
+    parts = [
+        command.jump,
+        state.mode,
+        state.since,
+        state.airborne,
+        state.best_score,
+        state.travel,
+        state.reward_scale,
+        state.overspeed,
+        state.flight,
+        state.best_flight,
+        command.jumper,
+        command.jump_left,
+    ]
+    used = command.cfg.jump_fraction > 0.0 or command.scripted
+    parts = [part.float() for part in parts]
+    return torch.stack(parts, dim=-1) if used else env.sim.data.qpos.new_zeros(env.num_envs, 12)
 
 
 def _linear_velocity(env: ManagerBasedRlEnv) -> Tensor:
@@ -193,43 +182,6 @@ def _linear_velocity(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def _trunk_axes(env: ManagerBasedRlEnv) -> Tensor:
-    """The trunk's x, y, z axes in the world's frame, as columns. (N, 3, 3).
-
-    Positions are those of the state: mjlab computes them anew before it observes.
-    """
+    """The trunk's x, y, z axes in the world's frame, as columns. (N, 3, 3)."""
     axes: Tensor = env.sim.data.xmat[:, env.scene["robot"].indexing.root_body_id]
     return axes
-
-
-def groups(noise: Noise) -> dict[str, ObservationGroupCfg]:
-    """The observation groups `measured`, `jump`, `critic`, `critic_jump` and `target`.
-
-    Args:
-        noise: Noise by measured part (`position`, `velocity`, `angular_velocity`, `gravity`); None
-            for none.
-    """
-
-    def plain(func: object) -> ObservationGroupCfg:
-        return ObservationGroupCfg(terms={"all": ObservationTermCfg(func=func)})
-
-    measured = {
-        "angular_velocity": ObservationTermCfg(
-            func=angular_velocity, noise=noise["angular_velocity"]
-        ),
-        "projected_gravity": ObservationTermCfg(func=projected_gravity, noise=noise["gravity"]),
-        "joint_position": ObservationTermCfg(
-            func=joint_position, noise=noise["position"], history_length=HISTORY
-        ),
-        "joint_velocity": ObservationTermCfg(
-            func=joint_velocity, noise=noise["velocity"], history_length=HISTORY
-        ),
-        "action": ObservationTermCfg(func=action, history_length=ACTIONS),
-        "command": ObservationTermCfg(func=command),
-    }
-    return {
-        "measured": ObservationGroupCfg(terms=measured, enable_corruption=True),
-        "jump": plain(jump),
-        "critic": plain(critic),
-        "critic_jump": plain(critic_jump),
-        "target": plain(target),
-    }

@@ -1,92 +1,77 @@
-"""How wide the velocity ranges are: they grow as well as the robots keep their velocities."""
+"""Ranges of the velocity commands, which grow with the tracking performance of the robots.
+
+With +-3 m/s from the first step a policy learns to stand, since the tracking reward has no slope so
+far away (seen in a probe).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from pronk.errors import ArtefactError, PronkError
+from pronk.errors import PronkError
 
-_FORGETS = 0.01
-"""Share of a policy step in the mean of how well velocities are kept: two seconds or so."""
+_SMOOTHING = 0.01
+"""Weight of a policy step in the mean tracking performance: a time constant of two seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """From a part of the ranges to the whole.
+    """Growth of the ranges from a fraction to the whole.
 
-    Ranges that grew with the clock left one run in ten behind: it kept its velocities by .54 when
-    they began to grow, by .36 at the end, and walked 1 m/s when commanded 2.
+    Ranges that grew with the clock left one run in ten behind: it tracked by .54 when they began to
+    grow, by .36 at the end, and walked 1 m/s when 2 was commanded.
     """
 
     start: float = 0.35
-    """Part of the ranges at first."""
-    keep: float = 0.52
-    """Mean of exp(-|e|^2 / 0.25), e the error of the horizontal velocity [m/s], from which on they
-    grow at full rate."""
-    lose: float = 0.36
-    """The same mean up to which they do not grow; between the two the rate grows linearly. With
-    nothing in between, a run that keeps its velocities by .51 would stay where it is."""
+    """Fraction of the ranges at first."""
+    full_rate_tracking: float = 0.52
+    """Mean of exp(-|e|^2 / 0.25), e the error of the horizontal velocity [m/s], from which on the
+    ranges grow at the full rate."""
+    no_growth_tracking: float = 0.36
+    """The same mean up to which they do not grow; between the two the rate is linear. Without a
+    transition, a run that tracks by .51 would not grow."""
     steps: int = 5000
-    """Policy steps in which they grow to the whole at full rate."""
+    """Policy steps to the whole ranges at the full rate."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot grow."""
-        if not 0.0 < self.start <= 1.0:
-            raise PronkError(f"ranges begin with a part of {self.start}; above 0, and 1 at most.")
-        if not 0.0 <= self.lose < self.keep < 1.0:
+        """Refuse values outside their range."""
+        low, high = self.no_growth_tracking, self.full_rate_tracking
+        if not (0.0 < self.start <= 1.0 and 0.0 <= low < high < 1.0 and self.steps >= 1):
             raise PronkError(
-                f"ranges stay up to {self.lose} and grow at full rate from {self.keep}; expected "
-                "0 or more, and more, but less than 1."
+                f"growth of the speed ranges has start {self.start}, no_growth_tracking {low}, "
+                f"full_rate_tracking {high}, steps {self.steps}; expected start above 0 to 1, "
+                "0 <= no_growth_tracking < full_rate_tracking < 1, steps 1 or more."
             )
-        if self.steps < 1:
-            raise PronkError(f"ranges grow in {self.steps} policy steps; 1 or more.")
 
 
 class SpeedRanges:
-    """What part of the ranges is in use; nothing here waits for the device."""
+    """Fraction of the velocity ranges in use, computed without waiting for the device."""
 
     def __init__(self, growth: Growth, device: torch.device | str) -> None:
         self._growth = growth
-        self.kept = torch.zeros((), device=device)
-        """How well velocities were kept of late, over all robots. ()"""
+        self.tracking = torch.zeros((), device=device)
+        """Recent mean of the tracking kernel over all robots. ()"""
         self.grown = torch.zeros((), device=device)
-        """Policy steps at full rate in which they would have grown as far. ()"""
+        """Policy steps at the full rate that give the present ranges. ()"""
 
     @property
-    def part(self) -> Tensor:
-        """Part of the ranges in use. ()."""
+    def fraction(self) -> Tensor:
+        """Fraction of the ranges in use. ()."""
         start = self._growth.start
         return start + (1.0 - start) * (self.grown / self._growth.steps).clamp_max(1.0)
 
-    def advance(self, error: Tensor, walks: Tensor) -> None:
-        """One policy step further.
+    def advance(self, error: Tensor, counted: Tensor) -> None:
+        """Advance by one policy step.
 
         Args:
             error: Of the horizontal velocity [m/s]. (N, 2)
-            walks: Robots that count: who jumps is requested something else. Bool, (N,)
+            counted: Robots that count: those outside jump mode. Bool, (N,)
         """
-        # A robot whose physics went wrong keeps nothing.
-        kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * walks
-        self.kept.lerp_(kernel.sum() / walks.sum().clamp_min(1), _FORGETS)
-        law = self._growth
-        self.grown += ((self.kept - law.lose) / (law.keep - law.lose)).clamp(0.0, 1.0)
-
-    def resume(self, tree: Mapping[str, Any]) -> None:
-        """Continue with the ranges of a checkpoint.
-
-        Args:
-            tree: Of the checkpoint; "speed_ranges" is `grown`.
-
-        Raises:
-            ArtefactError: It is of another version of pronk.
-        """
-        if "speed_ranges" not in tree:
-            raise ArtefactError(
-                "the checkpoint has no speed_ranges; it is of another version of pronk."
-            )
-        self.grown.copy_(tree["speed_ranges"])
+        # A robot with a state that is not finite counts as not tracking.
+        kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * counted
+        self.tracking.lerp_(kernel.sum() / counted.sum().clamp_min(1), _SMOOTHING)
+        low, high = self._growth.no_growth_tracking, self._growth.full_rate_tracking
+        self.grown += ((self.tracking - low) / (high - low)).clamp(0.0, 1.0)

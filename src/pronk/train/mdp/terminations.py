@@ -26,13 +26,13 @@ def fell(env: ManagerBasedRlEnv, tilt_cosine: float, height: float) -> Tensor:
 
 
 def non_finite(env: ManagerBasedRlEnv, speed: float) -> Tensor:
-    """State that is not finite, or faster than anything this robot can do. Bool, (N,).
+    """State that is not finite, or faster than the robot can be. Bool, (N,).
 
-    Ends this robot's episode and nobody else's; the runner counts them.
+    Ends the episode of this robot alone.
 
     Args:
         env: The environment.
-        speed: Largest believable velocity, joint or trunk [rad/s, m/s].
+        speed: Largest plausible velocity, joint or trunk [rad/s, m/s].
     """
     # A largest magnitude is NaN if one of them is, and NaN is no less than anything.
     fastest = torch.linalg.vector_norm(env.sim.data.qvel, ord=torch.inf, dim=-1)

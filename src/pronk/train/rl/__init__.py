@@ -1,1 +1,1 @@
-"""Networks, and how they learn."""
+"""Networks, PPO with the estimator, symmetry, the runner, and export."""

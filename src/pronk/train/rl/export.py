@@ -1,17 +1,19 @@
-"""The policy leaves training: estimator and actor in one ONNX graph, the contract in its metadata.
+"""Export of a policy: estimator and actor in one ONNX graph, the contract in its metadata.
 
     measured (batch, 105), jump (batch, 1; policies that jump only)
         -> action (batch, 12), contact (batch, 4; probability), linear_velocity (batch, 3)
 
-All float32. The normalisation is part of the graph: what goes in is as measured.
+All float32. The normalization is part of the graph: the input is as measured.
 """
 
 from __future__ import annotations
 
 import copy
 import importlib.util
+import platform
 import warnings
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +28,32 @@ from pronk.policy.layout import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
 from pronk.policy.runtime import load_policy
 from pronk.robots.robot import RobotSpec
 from pronk.train.gains import TrainingGains
-from pronk.train.rl.actor import EstimatorActor
-from pronk.train.runner.provenance import versions
+from pronk.train.rl.networks import EstimatorActor
 
 OPSET = 18
 TOLERANCE = 1e-5
 """Largest difference between ONNX Runtime and PyTorch that `verify` should give."""
+
+_DISTRIBUTIONS = {
+    "mjlab": "mjlab",
+    "mujoco": "mujoco",
+    "mujoco_warp": "mujoco-warp",
+    "warp": "warp-lang",
+    "torch": "torch",
+    "rsl_rl": "rsl-rl-lib",
+    "numpy": "numpy",
+}
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that a run is computed with."""
+    found = {"python": platform.python_version(), "pronk": pronk.__version__}
+    for name, distribution in _DISTRIBUTIONS.items():
+        try:
+            found[name] = metadata.version(distribution)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
 
 
 def contract_for(
@@ -44,15 +66,15 @@ def contract_for(
     lift_off_velocity: float | None,
     provenance: Mapping[str, Any],
 ) -> Contract:
-    """The contract of a policy that was trained on `robot` as the robot's constants have it.
+    """The contract of a policy that was trained on `robot`.
 
     Args:
-        robot: Which robot; its order of joints is that of the actions.
+        robot: Its order of joints is that of the actions.
         gains: Nominal gains.
         action_scale: Position target per unit of action [rad].
         delay_steps: Smallest and largest command delay [physics steps].
         command_limits: Half-widths of the commands: forward, left [m/s], yaw rate [rad/s].
-        lift_off_velocity: Wanted at lift-off [m/s]; None for a policy without jump input.
+        lift_off_velocity: Desired at lift-off [m/s]; None for a policy without jump input.
         provenance: Phases, iterations, seed, run; what JSON can hold.
 
     Raises:
@@ -69,41 +91,34 @@ def contract_for(
         stiffness=tuple(group.stiffness for group in groups),
         damping=tuple(group.damping for group in groups),
         gains=gains.name,
-        gains_sha256=gains.sha256,
+        # A contract has the hash of gains alone, not of the ranges about naive ones.
+        gains_sha256=gains.sha256 if gains.name == "matched" else "",
         virtual=gains.virtual,
         observation=measured_layout(robot.policy_rate_hz),
         policy_rate_hz=robot.policy_rate_hz,
         timestep_s=robot.timestep_s,
         decimation=robot.decimation,
         delay_range_s=(low * robot.timestep_s, high * robot.timestep_s),
-        command_ranges={name: (-half, half) for name, half in limits},
+        command_ranges={name: (-limit, limit) for name, limit in limits},
         jump=lift_off_velocity is not None,
         lift_off_velocity=lift_off_velocity,
         provenance=dict(provenance),
-        versions={name: version for name, version in versions().items() if version is not None},
+        versions=versions(),
     )
 
 
 def export_policy(actor: EstimatorActor, contract: Contract, path: Path) -> None:
-    """Write `policy.onnx`, whole or not at all. The actor stays as it is, where it is.
+    """Write `policy.onnx`, whole or not at all; the actor stays unchanged.
 
-    Args:
-        actor: With or without jump input, as the contract says.
-        contract: From `contract_for`.
-        path: Where to.
-
-    Raises:
-        ValueError: Actor and contract disagree about the jump input.
+    With a contract without jump input the graph has none: the actor's is zero.
     """
     import onnx
 
-    if bool(actor.jump_size) != contract.jump:
-        raise ValueError(f"actor with {actor.jump_size} jump inputs, contract with {contract.jump}")
     inputs = {"measured": MEASURED_SIZE} | ({"jump": 1} if contract.jump else {})
     outputs = ["action", *ESTIMATE]
     with written_whole(path) as aside:
         with warnings.catch_warnings():
-            # The exporter that mjlab uses too; newer versions of torch say that another is newer.
+            # mjlab uses the same exporter; newer versions of torch announce another.
             warnings.simplefilter("ignore", DeprecationWarning)
             torch.onnx.export(
                 _Exported(actor),
@@ -127,54 +142,52 @@ def export_policy(actor: EstimatorActor, contract: Contract, path: Path) -> None
 
 
 def verify(path: Path, actor: EstimatorActor, observations: Mapping[str, Tensor]) -> float | None:
-    """How far an exported policy is from its actor.
+    """Largest absolute difference of all outputs between an exported policy and its actor.
 
-    Both compute on the processor: a GPU may round matrix products to TF32.
+    Both compute on the CPU: a GPU may round matrix products to TF32.
 
     Args:
         path: From `export_policy`.
-        actor: What was exported.
+        actor: The actor that was exported.
         observations: "measured" (N, 105) and, for a policy that jumps, "jump" (N, 1).
 
     Returns:
-        Largest absolute difference over all outputs; None if ONNX Runtime is not installed.
+        The difference; None if ONNX Runtime is not installed.
 
     Raises:
-        ArtefactError: The file cannot be run, or what goes in or comes out is not finite.
+        ArtefactError: The file cannot be run, or an input or output is not finite.
     """
     if importlib.util.find_spec("onnxruntime") is None:
         return None
-    groups = {
-        name: observations[name].detach().to("cpu", torch.float32)
-        for name in ("measured", *(["jump"] if actor.jump_size else []))
-    }
-    found = load_policy(path).infer(*(group.numpy() for group in groups.values()))
-    exported = _Exported(actor)
+    policy = load_policy(path)
+    names = ("measured", "jump") if policy.contract.jump else ("measured",)
+    inputs = [observations[name].detach().to("cpu", torch.float32) for name in names]
+    found = policy.infer(*(value.numpy() for value in inputs))
     with torch.no_grad():
-        action = exported.head(exported.actor(groups))
-        expected = torch.cat([action, *exported.actor.estimate(groups)], dim=-1)
+        expected = torch.cat(_Exported(actor)(*inputs), dim=-1)
     got = np.concatenate([found.action, found.contact, found.linear_velocity], axis=-1)
     return float((torch.from_numpy(got) - expected).abs().max())
 
 
 class _Exported(nn.Module):
-    """Estimate and action of one pass: the estimate is what the actor itself reads."""
+    """Action and estimate in one pass: the estimate is the one that the actor reads."""
 
     def __init__(self, actor: EstimatorActor) -> None:
         super().__init__()
-        # The distribution holds tensors of the last update, which cannot be copied; needed is only
-        # what it makes of the network's output without noise.
+        # The distribution holds tensors of the last update, which cannot be copied; only its
+        # deterministic output is needed.
         distribution = actor.distribution
-        assert distribution is not None, "PPO has trained it"
+        assert distribution is not None, "an actor of PPO has a distribution"
         self.head = distribution.as_deterministic_output_module()
         self.actor = copy.deepcopy(actor, {id(distribution): nn.Identity()})
         self.actor.distribution = None
         self.to("cpu", torch.float32).eval()
 
-    def forward(self, measured: Tensor, *jump: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, measured: Tensor, jump: Tensor | None = None) -> tuple[Tensor, ...]:
         """(N, 105) and, for policies that jump, (N, 1) to (N, 12), (N, 4), (N, 3)."""
-        groups = dict(zip(("measured", "jump"), (measured, *jump), strict=False))
-        latent = self.actor.get_latent(groups)
+        if jump is None:
+            jump = torch.zeros_like(measured[:, :1])
+        latent = self.actor.get_latent({"measured": measured, "jump": jump})
         contact = latent[:, : ESTIMATE["contact"]]
         velocity = latent[:, ESTIMATE["contact"] : ESTIMATE_SIZE]
         return self.head(self.actor.mlp(latent)), contact, velocity

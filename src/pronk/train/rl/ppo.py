@@ -1,8 +1,8 @@
 """PPO with the estimator beside it.
 
-An iteration is PPO's update, then some supervised steps of the estimator on the same rollout, then
-the statistics of the normalisation. In this order nothing that the actor's log-probabilities rest
-on changes before PPO has used them.
+An iteration is PPO's update, then supervised steps of the estimator on the same rollout, then the
+statistics of the normalization. In this order nothing that the actor's log-probabilities depend on
+changes before PPO has used them.
 """
 
 from __future__ import annotations
@@ -19,13 +19,10 @@ from rsl_rl.storage import RolloutStorage
 from torch import Tensor, nn
 
 from pronk.errors import PronkError
-from pronk.train.rl import adam
-from pronk.train.rl.actor import EstimatorActor, JumpCritic
-from pronk.train.rl.estimator import estimator_losses
-from pronk.train.rl.normalization import average
+from pronk.train.rl.networks import EstimatorActor, JumpCritic, average, jump_parameters
 
-TARGET_GROUP = "target"
-"""The group of observations that holds the estimator's truth."""
+TARGET_GROUP = "estimator_target"
+"""The group of observations that the estimator is trained on."""
 
 
 @dataclass
@@ -33,9 +30,9 @@ class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
     """Configuration of PPO and of the estimator's training."""
 
     estimator_learning_rate: float = 1e-3
-    """Of the estimator's own Adam."""
+    """Of the estimator's own Adam; a phase sets it."""
     estimator_epochs: int = 2
-    """How often the estimator sees each sample of a rollout."""
+    """Passes of the estimator over the samples of a rollout."""
     estimator_mini_batches: int = 12
     """Steps of the estimator in an epoch."""
     estimator_contact_coef: float = 1.0
@@ -43,25 +40,15 @@ class EstimatorPpoCfg(RslRlPpoAlgorithmCfg):
     estimator_velocity_coef: float = 1.0
     """Weight of the velocity's mean squared error [m^2/s^2]."""
     symmetry_cfg: dict[str, Any] | None = None
-    """Arguments of `rsl_rl.extensions.Symmetry`, but its environment; None for none."""
+    """Arguments of `rsl_rl.extensions.Symmetry`, except its environment; None for none."""
     class_name: str = "pronk.train.rl.ppo:EstimatorPPO"
-
-    def __post_init__(self) -> None:
-        """Refuse numbers outside their range."""
-        for name in ("estimator_epochs", "estimator_mini_batches"):
-            if getattr(self, name) < 1:
-                raise PronkError(f"{name} is {getattr(self, name)}; expected 1 or more.")
-        if not self.estimator_learning_rate > 0.0:
-            raise PronkError(
-                f"estimator_learning_rate is {self.estimator_learning_rate:g};"
-                " expected more than 0."
-            )
 
 
 class _Augmentation(Symmetry):
     """rsl_rl's symmetry without the mirror loss.
 
-    It computes it even where it is only logged: one more pass of the actor over every mini-batch.
+    rsl_rl computes that loss even where it is only logged: one more pass of the actor over every
+    mini-batch.
     """
 
     def compute_loss(self, actor: Any, batch: RolloutStorage.Batch, rows: int) -> Tensor:
@@ -88,26 +75,21 @@ class EstimatorPPO(PPO):
         estimator_velocity_coef: float = 1.0,
         **cfg: Any,
     ) -> None:
-        """Called by rsl_rl.
-
-        Args:
-            actor: With the estimator in it.
-            critic: Beside it.
-            storage: Of the rollouts; must hold the group `target`.
-            estimator_learning_rate: As in `EstimatorPpoCfg`, as all that follow.
-            estimator_epochs: See there.
-            estimator_mini_batches: See there.
-            estimator_contact_coef: See there.
-            estimator_velocity_coef: See there.
-            cfg: As `rsl_rl.algorithms.PPO` takes it.
+        """Called by rsl_rl with the fields of `EstimatorPpoCfg`.
 
         Raises:
-            PronkError: The storage lacks the truth for the estimator.
+            PronkError: The environment has no group for the estimator, or a number is out of range.
         """
         if TARGET_GROUP not in storage.observations.keys():  # noqa: SIM118 (a TensorDict)
             raise PronkError(
                 f"the environment gives the groups {', '.join(storage.observations.keys())};"
-                f" the estimator needs {TARGET_GROUP!r} to learn from."
+                f" the estimator is trained on {TARGET_GROUP!r}."
+            )
+        if not (min(estimator_epochs, estimator_mini_batches) > 0 < estimator_learning_rate):
+            raise PronkError(
+                f"estimator_epochs is {estimator_epochs}, estimator_mini_batches "
+                f"{estimator_mini_batches} and estimator_learning_rate "
+                f"{estimator_learning_rate:g}; expected more than 0."
             )
         super().__init__(actor, critic, storage, **cfg)
         symmetry: Mapping[str, Any] = cfg.get("symmetry_cfg") or {}
@@ -120,15 +102,17 @@ class EstimatorPPO(PPO):
         self.estimator_velocity_coef = estimator_velocity_coef
         # PPO has put the whole actor under its optimizer; the estimator is part of the actor.
         estimator = list(actor.estimator.parameters())
-        mine = {id(parameter) for parameter in estimator}
-        others = [p for p in (*actor.parameters(), *critic.parameters()) if id(p) not in mine]
-        self.optimizer = adam.on_device(type(self.optimizer), others, lr=self.learning_rate)
-        self.estimator_optimizer = adam.on_device(
-            torch.optim.Adam, estimator, lr=estimator_learning_rate
-        )
+        own = {id(parameter) for parameter in estimator}
+        others = [p for p in (*actor.parameters(), *critic.parameters()) if id(p) not in own]
+        # On a GPU the fused kernel steps all parameters at once; PyTorch's default launches a dozen
+        # kernels a step.
+        fused: dict[str, Any] = {"fused": True} if estimator[0].is_cuda else {}
+        kind: Any = type(self.optimizer)
+        self.optimizer = kind(others, lr=self.learning_rate, **fused)
+        self.estimator_optimizer = torch.optim.Adam(estimator, lr=estimator_learning_rate, **fused)
 
     def update(self) -> dict[str, float]:
-        """One iteration of learning on the stored rollout.
+        """Learn from the stored rollout.
 
         Returns:
             Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2].
@@ -153,7 +137,7 @@ class EstimatorPPO(PPO):
         weights = inputs.new_tensor(
             [self.estimator_contact_coef, self.estimator_velocity_coef]
         ).unbind()
-        seen: list[Tensor] = []
+        history: list[Tensor] = []
         for _ in range(self.estimator_epochs):
             order = torch.randperm(len(inputs), device=inputs.device)
             batches = (
@@ -161,17 +145,17 @@ class EstimatorPPO(PPO):
                 for whole in (inputs, targets)
             )
             for batch, target in zip(*batches, strict=True):
-                losses = estimator_losses(actor.estimator(batch), target)
+                losses = actor.estimator.losses(batch, target)
                 optimizer.zero_grad()
                 torch.autograd.backward(losses, weights)
                 if self.gpu_world_size > 1:
                     self._average_gradients(parameters)
                 nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
                 optimizer.step()
-                seen += [loss.detach() for loss in losses]
-        # PPO clips and reduces what gradients it finds in the actor: leave it none.
+                history += [loss.detach() for loss in losses]
+        # PPO clips and reduces the gradients that it finds in the actor: leave none.
         optimizer.zero_grad()
-        contact, velocity = torch.stack(seen).view(-1, 2).mean(dim=0).tolist()
+        contact, velocity = torch.stack(history).view(-1, 2).mean(dim=0).tolist()
         return {"estimator_contact": contact, "estimator_velocity": velocity}
 
     def _average_gradients(self, parameters: list[nn.Parameter]) -> None:
@@ -181,17 +165,19 @@ class EstimatorPPO(PPO):
         nn.utils.vector_to_parameters(together, gradients)
 
     def set_estimator_rate(self, rate: float) -> None:
-        """Let the estimator learn at another rate from now on.
-
-        Args:
-            rate: Learning rate of its Adam.
-        """
+        """Set the learning rate of the estimator."""
         for group in self.estimator_optimizer.param_groups:
             group["lr"] = rate
 
-    def get_critic(self) -> JumpCritic:
-        """The critic, uncompiled, as `get_policy` gives the actor."""
-        return self._raw_critic
+    def reset_jump_moments(self) -> None:
+        """Begin the moments and step counts of the jump inputs' weights anew.
+
+        With the step count of the other weights, zero moments would count as a long average, and
+        the first step would be (1 - 0.9) / sqrt(1 - 0.999) = 3.2 learning rates long.
+        """
+        for optimizer in (self.optimizer, self.estimator_optimizer):
+            for parameter in jump_parameters(self._raw_actor, self._raw_critic):
+                optimizer.state.pop(parameter, None)
 
     def save(self) -> dict[str, Any]:
         """State of the networks and both optimizers."""
@@ -205,17 +191,7 @@ class EstimatorPPO(PPO):
         load_cfg: Mapping[str, bool] | None = None,
         strict: bool = True,
     ) -> bool:
-        """Take over what `save` gave.
-
-        Args:
-            loaded_dict: The state.
-            load_cfg: What to take over (`actor`, `critic`, `optimizer`, `iteration`); None for
-                all. `optimizer` means both.
-            strict: Refuse missing and unknown weights.
-
-        Returns:
-            Whether the runner should take over the iteration.
-        """
+        """Load what `save` gave; `load_cfg` as rsl_rl has it, its `optimizer` means both."""
         if load_cfg is None or load_cfg.get("optimizer"):
             self.estimator_optimizer.load_state_dict(loaded_dict["estimator_optimizer_state_dict"])
         return bool(super().load(loaded_dict, load_cfg, strict))

@@ -1,23 +1,19 @@
-"""Left and right: what the robot would see and do in the mirror.
+"""Left-right symmetry: mirror images of observations and actions, for data augmentation.
 
-The robot is its own mirror image in the plane of its trunk's x and z. Mirrored, vectors lose the
-sign of y, turning rates those of x and z; right and left legs change places; hip_roll (about +x)
-changes sign, hip_pitch and knee (about -y) do not. rsl_rl's symmetry extension learns from both
-sides (Mittal et al. 2024):
+The robot is its own mirror image in the plane of its trunk's x and z axes. In the mirror image
+vectors change the sign of y, angular velocities those of x and z; right and left legs change
+places; hip_roll (about x) changes sign, hip_pitch and knee (about y) do not. rsl_rl's symmetry
+extension trains on both sides (Mittal et al. 2024):
 
     EstimatorPpoCfg(symmetry_cfg={
         "data_augmentation_func": "pronk.train.rl.symmetry:with_mirror_image",
         "use_data_augmentation": True,
     })
-
-Held by a test: the mirrored roll-out of the robot in MuJoCo is the roll-out of the mirror image.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import torch
@@ -26,136 +22,96 @@ from torch import Tensor
 
 from pronk.errors import PronkError
 from pronk.policy.layout import ESTIMATE, MEASURED
-from pronk.robots.legged import legged
+from pronk.robots.legged import Legged
+from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
-
-BODY = legged("mini_cheetah")
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
     "measured": {name: part.size for name, part in MEASURED.items()},
     "jump": {"jump": 1},
     "critic": CRITIC,
     "critic_jump": CRITIC_JUMP,
-    "target": ESTIMATE,
+    "estimator_target": ESTIMATE,
+    "action": {"action": 12},
 }
-"""Parts of every group of observations, in order, and their sizes."""
+"""Parts of every group of observations, and of the action, in order, and their sizes."""
 
-ACTION = {"action": len(BODY.legs) * len(BODY.leg_joints)}
-"""Parts of the action."""
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """How a quantity is mirrored: mirrored[i] = sign[i] * original[source[i]]."""
-
-    source: tuple[int, ...]
-    sign: tuple[float, ...]
-
-
-def _across(leg: str) -> int:
-    """Where the leg on the other side stands."""
-    return BODY.legs.index(leg[0] + {"R": "L", "L": "R"}[leg[1]])
-
-
-_SCALAR = _Kind((0,), (1.0,))
-_VECTOR = _Kind((0, 1, 2), (1.0, -1.0, 1.0))
-_TURNING = _Kind((0, 1, 2), (-1.0, 1.0, -1.0))
-_COMMAND = _Kind((0, 1, 2), (1.0, -1.0, -1.0))
-_FEET = _Kind(tuple(_across(leg) for leg in BODY.legs), (1.0,) * len(BODY.legs))
-_JOINTS = _Kind(
-    tuple(
-        _across(leg) * len(BODY.leg_joints) + i
-        for leg in BODY.legs
-        for i in range(len(BODY.leg_joints))
-    ),
-    tuple(-1.0 if joint == "hip_roll" else 1.0 for _ in BODY.legs for joint in BODY.leg_joints),
+_SIGNS = {
+    "angular_velocity": (-1.0, 1.0, -1.0),
+    "projected_gravity": (1.0, -1.0, 1.0),
+    "linear_velocity": (1.0, -1.0, 1.0),
+    "command": (1.0, -1.0, -1.0),
+}
+"""Factors of vectors, in the trunk's frame."""
+_JOINTS = ("joint_position", "joint_velocity", "action")
+_FEET = (
+    "contact",
+    "foot_contact",
+    "foot_force",
+    "foot_height",
+    "shank_length",
+    "stiffness",
+    "damping",
 )
-
-_KINDS: Mapping[str, _Kind] = {
-    "angular_velocity": _TURNING,
-    "projected_gravity": _VECTOR,
-    "linear_velocity": _VECTOR,
-    "command": _COMMAND,
-    "joint_position": _JOINTS,
-    "joint_velocity": _JOINTS,
-    "action": _JOINTS,
-    "contact": _FEET,
-    "foot_contact": _FEET,
-    "foot_force": _FEET,
-    "foot_height": _FEET,
-    "height": _SCALAR,
-    "jump": _SCALAR,
-    "mode": _SCALAR,
-    "since": _SCALAR,
-    "airborne": _SCALAR,
-    "best": _SCALAR,
-    "stroke": _SCALAR,
-    "worth": _SCALAR,
-    "lead": _SCALAR,
-    "flown": _SCALAR,
-    "farthest": _SCALAR,
-    "jumper": _SCALAR,
-    "jump_left": _SCALAR,
-    "time_left": _SCALAR,
-    "voltage": _SCALAR,
-    "no_load": _SCALAR,
-    "drop": _SCALAR,
-    "friction": _SCALAR,
-    "base_mass": _SCALAR,
-    "delay": _SCALAR,
-    "shank_length": _FEET,
-    "stiffness": _FEET,
-    "damping": _FEET,
-}
-"""Kind of every part. A part longer than its kind is a history of it."""
+"""Quantities by leg; stiffness and damping are those of one joint group after the other."""
 
 
 class Mirror:
-    """Mirrors a vector made of named parts. Twice mirrored is the original."""
+    """Mirror image of a vector of named parts: mirrored[i] = sign[i] * original[source[i]].
 
-    def __init__(self, parts: Mapping[str, int], device: torch.device | str = "cpu") -> None:
-        """Make ready.
+    Applied twice it is the identity. A part longer than its quantity is a history of it.
+    """
 
-        Args:
-            parts: Size of each part, in order.
-            device: Where the vectors will be.
+    def __init__(
+        self, parts: Mapping[str, int], body: Legged, device: torch.device | str = "cpu"
+    ) -> None:
+        """Prepare for parts given by name and size, in order.
 
         Raises:
-            PronkError: It is not known how to mirror a part, or it has no whole number of samples.
+            PronkError: A part has no whole number of samples.
         """
         source: list[int] = []
-        sign: list[float] = []
+        signs: list[float] = []
         for name, size in parts.items():
-            kind = _KINDS.get(name)
-            if kind is None:
+            indices, factors = _mirrored(name, body)
+            if size % len(indices):
                 raise PronkError(
-                    f"it is not known how {name!r} looks in the mirror; known are"
-                    f" {', '.join(_KINDS)}. Add it to pronk.train.rl.symmetry."
+                    f"{name} has {size} numbers; expected a multiple of {len(indices)}."
                 )
-            samples, rest = divmod(size, len(kind.source))
-            if rest:
-                raise PronkError(
-                    f"{name} has {size} numbers; expected a multiple of {len(kind.source)}."
-                )
-            for _ in range(samples):
+            for _ in range(size // len(indices)):
                 start = len(source)
-                source += [start + i for i in kind.source]
-                sign += kind.sign
+                source += [start + i for i in indices]
+                signs += factors
         self._source = torch.tensor(source, device=device)
-        self._sign = torch.tensor(sign, device=device)
+        self._sign = torch.tensor(signs, device=device)
 
     def __call__(self, x: Tensor) -> Tensor:
         """The mirror image of (..., size)."""
         return x[..., self._source] * self._sign
 
 
+def _mirrored(name: str, body: Legged) -> tuple[list[int], list[float]]:
+    """Source and sign of one sample of a quantity; unchanged unless it is listed above."""
+    other_leg = [body.legs.index(leg[0] + {"R": "L", "L": "R"}[leg[1]]) for leg in body.legs]
+    if name in _SIGNS:
+        return [0, 1, 2], list(_SIGNS[name])
+    if name in _FEET:
+        return other_leg, [1.0] * len(other_leg)
+    if name in _JOINTS:
+        joints = body.leg_joints
+        indices = [leg * len(joints) + i for leg in other_leg for i in range(len(joints))]
+        signs = [-1.0 if joint == "hip_roll" else 1.0 for _ in body.legs for joint in joints]
+        return indices, signs
+    return [0], [1.0]
+
+
 def with_mirror_image(
     env: Any, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
-    """Data augmentation for rsl_rl's symmetry extension: a batch, then its mirror image.
+    """A batch, then its mirror image, for rsl_rl's symmetry extension.
 
     Args:
-        env: Not used; the layout is pronk's.
+        env: The environment, whose command term has the robot's dimensions.
         obs: Groups of observations, each (N, size), or None.
         actions: (N, 12), or None.
 
@@ -163,25 +119,32 @@ def with_mirror_image(
         The same with 2 N rows; None stays None.
 
     Raises:
-        PronkError: There is a group that pronk does not know.
+        PronkError: There is a group without a layout in `GROUPS`.
     """
+    body = motion_command(env.unwrapped).body
     both = None
     if obs is not None:
         groups = {
-            name: torch.cat([group, _mirror(name, group.device)(group)])
+            name: torch.cat([group, _mirror(name, body, group.device)(group)])
             for name, group in obs.to_dict().items()
         }
         both = TensorDict(groups, batch_size=[2 * obs.batch_size[0]], device=obs.device)
     if actions is not None:
-        actions = torch.cat([actions, _mirror("action", actions.device)(actions)])
+        mirror = _mirror("action", body, actions.device)
+        actions = torch.cat([actions, mirror(actions)])
     return both, actions
 
 
-@cache
-def _mirror(group: str, device: torch.device) -> Mirror:
-    parts = ACTION if group == "action" else GROUPS.get(group)
-    if parts is None:
+_MIRRORS: dict[tuple[str, tuple[str, ...], torch.device], Mirror] = {}
+
+
+def _mirror(group: str, body: Legged, device: torch.device) -> Mirror:
+    if group not in GROUPS:
         raise PronkError(
-            f"it is not known what the group {group!r} holds; known are {', '.join(GROUPS)}."
+            f"the observation group {group!r} has no known layout; expected one of "
+            f"{', '.join(GROUPS)}."
         )
-    return Mirror(parts, device)
+    key = (group, body.legs, device)
+    if key not in _MIRRORS:
+        _MIRRORS[key] = Mirror(GROUPS[group], body, device)
+    return _MIRRORS[key]

@@ -1,1 +1,0 @@
-"""A training run: settings, loop, files, resume."""

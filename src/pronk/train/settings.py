@@ -1,0 +1,169 @@
+"""Settings of `pronk train`; its command line has the same fields."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import tyro
+
+from pronk.errors import PronkError
+from pronk.train.gains import NAIVE
+from pronk.train.phases import PHASES, TASKS
+
+Task = Literal["walk", "jump", "all", "together"]
+Device = Literal["auto", "cpu", "cuda"]
+Logger = Literal["tensorboard", "wandb"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings:
+    """Settings of a run. None: left out, so the default or, with `resume`, that of the run."""
+
+    task: tyro.conf.Positional[Task]
+    """walk: phase 1. jump: a walking policy, then phases 2a and 2b. all: both. together: walk and
+    jump at once from random weights, the paper's ablation."""
+    out: Path
+    """Folder of the run, new or empty."""
+    robot: str | None = None
+    """Name or robot.yaml of a robot with a task; mini_cheetah."""
+    gains: str | None = None
+    """gains.yaml of `pronk match`, or naive: the gains of the real drives as they are."""
+    ranges_from: Path | None = None
+    """With naive gains: the gains.yaml whose ranges and delay are used."""
+    init_checkpoint: Path | None = None
+    """jump: folder of a walking run, or one of its checkpoints."""
+    envs: int | None = None
+    """Robots on each device; 4096."""
+    seed: int | None = None
+    """Of all draws; 1. Process r of several draws from seed + r."""
+    phase: tuple[str, ...] = ()
+    """PHASE=ITERATIONS, as in walk=300, for walk, jump_a or jump_b; repeat it."""
+    ellipsoid: bool | None = None
+    """Draw gains from each group's ellipsoid, or its box; box."""
+    device: Device = "auto"
+    """auto: a GPU if there is one; the CPU is for tests."""
+    gpu_ids: str | None = None
+    """GPUs of this host, as in 0,1, or all; 0."""
+    resume: bool = False
+    """Continue the run in --out; options left out are those of the run."""
+    save_interval: int = 50
+    """Iterations between checkpoints."""
+    minutes: float | None = None
+    """Stop at a checkpoint after so long; --resume goes on from there."""
+    logger: Logger = "tensorboard"
+    """Where the curves go."""
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range and options that do not go together.
+
+        Raises:
+            PronkError: One sentence that names them.
+        """
+        for name, least in (("envs", 2), ("seed", 0), ("save_interval", 1)):
+            value = getattr(self, name)
+            if value is not None and not least <= value < 2**31:
+                option = name.replace("_", "-")
+                raise PronkError(f"--{option} is {value}; expected {least} or more, below 2^31.")
+        if self.minutes is not None and not self.minutes > 0.0:
+            raise PronkError(f"--minutes is {self.minutes:g}; expected more than 0.")
+        if self.ranges_from is not None and self.gains not in (None, NAIVE):
+            raise PronkError(
+                f"--ranges-from {self.ranges_from} goes with --gains naive; {self.gains} has its "
+                "own ranges."
+            )
+        if self.init_checkpoint is not None and self.task != "jump":
+            raise PronkError(
+                f"--init-checkpoint {self.init_checkpoint} goes with jump; {self.task} begins with "
+                "random weights."
+            )
+        self.iterations  # noqa: B018 (checks them)
+
+    @property
+    def iterations(self) -> Mapping[str, int]:
+        """PPO iterations of each phase; `walk` of the task jump is those of the walking policy.
+
+        Raises:
+            PronkError: A phase is not of the task, or has no iterations.
+        """
+        found = dict(TASKS[self.task])
+        known = [n for n in PHASES if found[n] > 0 and (n, self.task) != ("walk", "jump")]
+        given = set()
+        for entry in self.phase:
+            name, _, count = entry.partition("=")
+            if not (name and count.isdigit()):
+                raise PronkError(f"--phase {entry!r}: expected PHASE=ITERATIONS, as in walk=300.")
+            if name not in known:
+                raise PronkError(
+                    f"{self.task} has no phase {name!r}; its phases are {', '.join(known)}."
+                )
+            if name in given:
+                raise PronkError(f"--phase {name} is given twice; once is enough.")
+            if int(count) < 1:
+                raise PronkError(f"phase {name} has {count} iterations; expected 1 or more.")
+            given.add(name)
+            found[name] = int(count)
+        return found
+
+    @property
+    def gains_file(self) -> Path | None:
+        """The gains.yaml that is read, if any."""
+        return self.ranges_from if self.gains in (None, NAIVE) else Path(self.gains)
+
+    def completed(self) -> Self:
+        """With the defaults of a new run in place of None.
+
+        Raises:
+            PronkError: A new run needs an option that was left out.
+        """
+        if self.gains is None:
+            raise PronkError(
+                "a new run needs --gains: the gains.yaml of `pronk match`, or naive for the gains "
+                "of the real drives as they are."
+            )
+        if self.task == "jump" and self.init_checkpoint is None:
+            raise PronkError(
+                "jump needs --init-checkpoint: the folder of a walking run, or one of its "
+                "checkpoints; `pronk train all` does both."
+            )
+        defaults: dict[str, Any] = {
+            "robot": "mini_cheetah",
+            "envs": 4096,
+            "seed": 1,
+            "ellipsoid": False,
+        }
+        return replace(self, **{n: v for n, v in defaults.items() if getattr(self, n) is None})
+
+    def resumed(self, stored: Mapping[str, Any]) -> Self:
+        """With the values of the run that is resumed.
+
+        Args:
+            stored: From `stored_values`.
+
+        Raises:
+            PronkError: An option is given with another value than the run has.
+        """
+        given = self.stored_values()
+        for name, value in given.items():
+            if value and value != stored[name]:
+                raise PronkError(
+                    f"--resume: --{name.replace('_', '-')} is {value}, but the run in {self.out} "
+                    f"has {'none' if stored[name] is None else stored[name]}; leave it out to "
+                    "continue that run, or give a new --out."
+                )
+        values: dict[str, Any] = {
+            n: Path(v) if n in ("ranges_from", "init_checkpoint") and v else v
+            for n, v in stored.items()
+        }
+        return replace(self, **{**values, "phase": tuple(values["phase"])})
+
+    def stored_values(self) -> dict[str, Any]:
+        """What decides the result of a run, as JSON holds it."""
+        names = ("task", "robot", "gains", "ranges_from", "init_checkpoint", "envs", "seed")
+        values = {name: getattr(self, name) for name in (*names, "ellipsoid")}
+        return {
+            **{n: str(v) if isinstance(v, Path) else v for n, v in values.items()},
+            "phase": list(self.phase),
+        }

@@ -1,0 +1,105 @@
+"""The tasks: configurations of the environment and of PPO for each robot, registered with mjlab.
+
+mjlab finds this package by its entry point, so its `train`, `play` and `list-envs` have the tasks
+`Pronk-Jump-ROBOT` (the whole recipe) and `Pronk-Walk-ROBOT` (phase 1 alone), with nominal gains.
+`pronk train` builds the same configurations with the given gains.
+
+A robot outside this package has a task if `env_cfgs.py` (with `env_cfg`) and, optionally,
+`rl_cfg.py` (with `rl_cfg`) lie beside its `robot.yaml`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl import RslRlOnPolicyRunnerCfg
+from mjlab.tasks.registry import register_mjlab_task
+
+from pronk.errors import PronkError
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+from pronk.train.gains import NAIVE, training_gains
+from pronk.train.phases import TASKS
+from pronk.train.rl.runner import PronkRunner
+from pronk.train.tasks.jump_env_cfg import play_cfg
+from pronk.train.tasks.jump_rl_cfg import jump_rl_cfg
+
+ROBOTS = ("mini_cheetah",)
+"""Robots of this package with a task."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """The configurations of one robot; arguments are those of `jump_env_cfg`, `jump_rl_cfg`."""
+
+    robot: RobotSpec
+    env_cfg: Callable[..., ManagerBasedRlEnvCfg]
+    rl_cfg: Callable[..., RslRlOnPolicyRunnerCfg]
+
+
+def load_task(robot: str) -> Task:
+    """The task of a robot, by name or path.
+
+    Raises:
+        RobotError: There is no such robot.
+        PronkError: It has no task; the message says which robots have one.
+    """
+    spec = load_robot(robot)
+    if spec.source in ROBOTS:
+        package = f"{__name__}.config.{spec.source}"
+        modules = [importlib.import_module(f"{package}.{n}") for n in ("env_cfgs", "rl_cfg")]
+        return Task(robot=spec, env_cfg=modules[0].env_cfg, rl_cfg=modules[1].rl_cfg)
+    folder = Path(spec.source).parent
+    path = folder / "env_cfgs.py"
+    if not path.is_file():
+        raise PronkError(
+            f"{robot} has no training task: expected {path} with a function env_cfg, or one of the "
+            f"robots {', '.join(ROBOTS)}."
+        )
+    env = _function(path, "env_cfg")
+    own = folder / "rl_cfg.py"
+    return Task(
+        robot=spec, env_cfg=env, rl_cfg=_function(own, "rl_cfg") if own.is_file() else jump_rl_cfg
+    )
+
+
+def _function(path: Path, name: str) -> Callable[..., Any]:
+    found = importlib.util.spec_from_file_location(path.stem, path)
+    assert found is not None
+    assert found.loader is not None
+    module: ModuleType = importlib.util.module_from_spec(found)
+    try:
+        found.loader.exec_module(module)
+    except Exception as error:
+        raise PronkError(
+            f"{path}: cannot be imported ({type(error).__name__}: {error})."
+        ) from error
+    if not callable(function := getattr(module, name, None)):
+        raise PronkError(f"{path}: has no function {name}.")
+    return function
+
+
+def _register() -> None:
+    for robot in ROBOTS:
+        task = load_task(robot)
+        gains = training_gains(NAIVE, task.robot)
+        name = "".join(word.capitalize() for word in robot.split("_"))
+        for kind in ("Jump", "Walk"):
+            iterations = TASKS[kind.lower()]
+            register_mjlab_task(
+                task_id=f"Pronk-{kind}-{name}",
+                env_cfg=task.env_cfg(task.robot, gains, iterations=iterations),
+                play_env_cfg=play_cfg(task.env_cfg(task.robot, gains, iterations=iterations)),
+                rl_cfg=task.rl_cfg(iterations=sum(iterations.values())),
+                runner_cls=PronkRunner,
+            )
+
+
+_register()

@@ -1,0 +1,1 @@
+"""One folder a robot: `env_cfgs.py` and `rl_cfg.py`."""
