@@ -127,14 +127,15 @@ def initial_state(path: Path, iterations: int) -> dict[str, Any]:
             "expected the folder of a run whose phase walk is over, or one of its checkpoints."
         )
     state = checkpoint.widen_checkpoint(checkpoint.read(source))
-    if checkpoint.jumps(state):
+    infos = state["infos"] or {}
+    if checkpoint.jumps(state) or {"jump_a", "jump_b"} & set(infos.get("phases", ())):
         raise ArtefactError(
             f"--init-checkpoint {source}: a policy that jumps; expected one of phase walk."
         )
     state["iter"] = iterations - 1
     state["infos"] = {
         "env_state": {"common_step_counter": iterations * STEPS_PER_ITERATION},
-        "speed_ranges": (state["infos"] or {}).get("speed_ranges", 0.0),
+        "speed_ranges": infos.get("speed_ranges", 0.0),
         "start_sha256": sha256(source),
     }
     return state

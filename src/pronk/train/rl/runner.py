@@ -227,7 +227,6 @@ class PronkRunner(MjlabOnPolicyRunner):
         """Write the checkpoint of a phase and, after walk and the last one, the policy."""
         if self.folder is None or self.gpu_global_rank != 0 or name in self.phases:
             return
-        self.save(str(self.folder / f"{name}.pt"))
         iterations = self.curriculum.iterations[name]
         seconds = self._seconds - sum(entry["seconds"] for entry in self.phases.values())
         envs = self.env.num_envs * self.gpu_world_size
@@ -238,6 +237,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             "seconds": seconds,
             "steps_per_second": steps / seconds,
         }
+        self.save(str(self.folder / f"{name}.pt"))
         last = self.iteration >= self.curriculum.total
         if last or name == "walk":
             path = self.folder / ("policy.onnx" if last else "walk.onnx")

@@ -1,0 +1,188 @@
+"""Bad input to `pronk train`: one sentence, exit status 2, nothing written; devices and folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+from pronk.cli import main as cli
+from pronk.errors import PronkError
+from pronk.match.gains import MatchedGains, save
+from pronk.simulators.simulator import SimulatorInfo
+from pronk.train import devices
+from pronk.train.phases import TASKS
+from pronk.train.provenance import RunFolder
+from pronk.train.run import train
+from pronk.train.settings import TrainSettings
+from pronk.train.tasks import load_task
+
+pytestmark = pytest.mark.train
+NAIVE = ("--gains", "naive")
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert cli.run(["train", *map(str, arguments)]) == 2
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    return text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("fly", *NAIVE), "walk|jump|all"),
+        (("walk",), "--gains|gains.yaml|naive"),
+        (("walk", "--gains", "nowhere.yaml"), "nowhere.yaml|no such file"),
+        (("walk", *NAIVE, "--phase", "run=3"), "'run'|walk"),
+        (("walk", *NAIVE, "--phase", "jump_a=3"), "'jump_a'"),
+        (("jump", *NAIVE, "--phase", "walk=3"), "'walk'|jump_a, jump_b"),
+        (("walk", *NAIVE, "--phase", "walk=0"), "0 iterations|1 or more"),
+        (("walk", *NAIVE, "--phase", "walk"), "--phase 'walk'|walk=300"),
+        (("walk", *NAIVE, "--phase", "walk=many"), "walk=many|walk=300"),
+        (("walk", *NAIVE, "--phase", "walk=3", "--phase", "walk=4"), "--phase walk|twice"),
+        (("walk", "--gains", "a.yaml", "--ranges-from", "b.yaml"), "b.yaml|--gains naive"),
+        (("walk", *NAIVE, "--ranges-from", "b.yaml"), "b.yaml|no such file"),
+        (("jump", *NAIVE), "--init-checkpoint|pronk train all"),
+        (("walk", *NAIVE, "--init-checkpoint", "x"), "--init-checkpoint x|jump"),
+        (("jump", *NAIVE, "--init-checkpoint", "nowhere"), "nowhere|phase walk is over"),
+        (("walk", *NAIVE, "--gpu-ids", "one"), "--gpu-ids 'one'|0,1|all"),
+        (("walk", *NAIVE, "--gpu-ids", "0,0"), "--gpu-ids '0,0'|different"),
+        (("walk", *NAIVE, "--gpu-ids", "0", "--device", "cpu"), "--gpu-ids 0|cpu"),
+        (("walk", *NAIVE, "--device", "tpu"), "auto|cpu|cuda"),
+        (("walk", *NAIVE, "--minutes", "0"), "minutes is 0|more than 0"),
+        (("walk", *NAIVE, "--save-interval", "0"), "save-interval is 0|1 or more"),
+        (("walk", *NAIVE, "--envs", "1"), "envs is 1|2 or more"),
+        (("walk", *NAIVE, "--seed", "-1"), "seed is -1|0 or more"),
+        (("walk", *NAIVE, "--logger", "csv"), "tensorboard|wandb"),
+        (("walk", *NAIVE, "--robot", "so101"), "so101|no training task|mini_cheetah"),
+        (("walk", *NAIVE, "--robot", "dragon"), "dragon|mini_cheetah"),
+        (("walk", "--resume"), "holds no run|--resume"),
+    ],
+)
+def test_bad_input(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    out = tmp_path / "run"
+    text = refused(capsys, *arguments, "--out", out)
+    for word in words.split("|"):
+        assert word in text, (word, text)
+    assert not out.exists()
+
+
+def test_a_folder_that_is_not_empty_stays_as_it_is(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "notes.txt").write_text("kept")
+    text = refused(capsys, "walk", *NAIVE, "--out", tmp_path)
+    assert "notes.txt" in text
+    assert "--resume" in text
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+    assert "is a file" in refused(capsys, "walk", *NAIVE, "--out", tmp_path / "notes.txt")
+
+
+def test_gains_of_another_robot_are_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    simulator = SimulatorInfo(version=mujoco.__version__)
+    gains = MatchedGains(robot="so101", simulator=simulator, joints={}, groups={})
+    save(tmp_path / "arm.yaml", gains)
+    out = tmp_path / "run"
+    text = refused(capsys, "walk", "--gains", tmp_path / "arm.yaml", "--out", out)
+    assert "so101" in text
+    assert "mini_cheetah" in text
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"schema": "pronk/run/1"}', "{"])
+def test_damaged_provenance_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "provenance.json").write_text(content)
+    with pytest.raises(PronkError):
+        train(TrainSettings(task="walk", out=tmp_path, resume=True))
+
+
+def test_a_folder_is_trained_in_by_one_process(tmp_path: Path) -> None:
+    with (
+        RunFolder(tmp_path).locked(),
+        pytest.raises(PronkError, match="another process"),
+        RunFolder(tmp_path).locked(),
+    ):
+        pass
+
+
+def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:
+    first = TrainSettings(task="all", out=tmp_path, gains="naive", phase=("walk=7",), seed=0)
+    stored = first.completed().stored_values()
+    again = TrainSettings(task="all", out=tmp_path, resume=True).resumed(stored)
+    assert again.iterations == {**TASKS["all"], "walk": 7}
+    assert (again.seed, again.envs, again.gains, again.robot) == (0, 4096, "naive", "mini_cheetah")
+    for other in ({"envs": 8}, {"gains": "x.yaml"}, {"ellipsoid": True}, {"phase": ("walk=8",)}):
+        changed: dict[str, Any] = {"task": "all", "out": tmp_path, "resume": True, **other}
+        with pytest.raises(PronkError, match="leave it out"):
+            TrainSettings(**changed).resumed(stored)
+
+
+# --- Devices -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gpu_ids", "visible"),
+    [(None, ("4",)), ("0,2", ("4", "7")), ("all", ("4", "5", "7")), ("2", ("7",))],
+)
+def test_gpus_are_those_of_the_visible_ones(
+    monkeypatch: pytest.MonkeyPatch, gpu_ids: str | None, visible: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(devices, "visible_gpus", lambda: ("4", "5", "7"))
+    found = devices.find_devices("auto", gpu_ids)
+    assert (found.device, found.visible, found.count) == ("cuda", visible, len(visible))
+
+
+def test_missing_gpus_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "visible_gpus", lambda: ("0",))
+    with pytest.raises(PronkError, match="1 visible"):
+        devices.find_devices("cuda", "1")
+    monkeypatch.setattr(devices, "visible_gpus", lambda: ())
+    for requested, ids in (("cuda", None), ("auto", "0")):
+        with pytest.raises(PronkError, match="no GPU"):
+            devices.find_devices(requested, ids)
+    assert devices.find_devices("auto").device == "cpu"
+
+
+# --- Tasks of other robots -----------------------------------------------------------------------
+
+ENV_CFGS = """
+from pronk.train.tasks.jump_env_cfg import jump_env_cfg
+
+def env_cfg(robot, gains, **options):
+    cfg = jump_env_cfg(robot, gains, **options)
+    cfg.rewards["posture"].weight = -1.0
+    return cfg
+"""
+
+
+def test_a_robot_with_its_own_task(tmp_path: Path) -> None:
+    """`env_cfgs.py` beside the robot's file; the configuration of PPO is the shared one."""
+    import pronk.robots
+
+    shipped = Path(pronk.robots.__file__).parent / "mini_cheetah"
+    for path in shipped.iterdir():
+        if path.is_file():
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    robot = str(tmp_path / "robot.yaml")
+    with pytest.raises(PronkError, match="no training task"):
+        load_task(robot)
+    (tmp_path / "env_cfgs.py").write_text(ENV_CFGS)
+    task = load_task(robot)
+    from pronk.train.gains import training_gains
+
+    cfg = task.env_cfg(task.robot, training_gains("naive", task.robot), iterations=TASKS["all"])
+    assert cfg.rewards["posture"].weight == -1.0
+    assert task.rl_cfg(iterations=3).max_iterations == 3
+    for text, words in (("def env_cfg(:", "cannot be imported"), ("x = 1", "no function")):
+        (tmp_path / "env_cfgs.py").write_text(text)
+        with pytest.raises(PronkError, match=words):
+            load_task(robot)

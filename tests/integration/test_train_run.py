@@ -1,0 +1,215 @@
+"""`pronk train` and `mjlab train` on Warp's CPU device: 8 robots, an iteration or two a phase."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+import yaml
+
+from pronk.cli import main as cli
+from pronk.policy.runtime import load_policy
+from pronk.train.phases import PHASES, TASKS, phase_at
+from pronk.train.provenance import RunFolder
+from pronk.train.rl import checkpoint
+
+pytestmark = [pytest.mark.train, pytest.mark.slow]
+
+GAINS = Path(__file__).parents[2] / "policies" / "gains.yaml"
+SMALL = ("--envs", "8", "--device", "cpu", "--save-interval", "1")
+ALL = ("all", "--gains", str(GAINS), *SMALL)
+SHORT = ("--phase", "walk=2", "--phase", "jump_a=1", "--phase", "jump_b=2")
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Any:
+    """Batches this small lose more by waiting for each other's threads than they gain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def train(*arguments: str | Path) -> int:
+    return cli.run(["train", *map(str, arguments)])
+
+
+def command(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Popen[str]:
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-c", *map(str, arguments)],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run through all phases."""
+    torch.set_num_threads(1)
+    folder = RunFolder(tmp_path_factory.mktemp("train") / "all")
+    assert train(*ALL, *SHORT, "--out", folder.path) == 0
+    return folder
+
+
+def test_a_run_writes_policies_checkpoints_and_provenance(whole: RunFolder) -> None:
+    walk, jump = load_policy(whole.walk).contract, load_policy(whole.policy).contract
+    assert (walk.jump, jump.jump) == (False, True)
+    assert walk.provenance["phases"] == {"walk": 2}
+    assert jump.provenance["phases"] == {"walk": 2, "jump_a": 1, "jump_b": 2}
+    assert jump.gains_sha256 == walk.gains_sha256 != ""
+    found = whole.read()
+    assert found["finished"]
+    assert found["gains"]["virtual"]
+    for name, iterations in {"walk": 2, "jump_a": 1, "jump_b": 2}.items():
+        phase = found["phases"][name]
+        assert phase["iterations"] == iterations
+        assert phase["env_steps"] == iterations * 24 * 8
+        assert phase.get("onnx_difference", 0.0) < 1e-5
+        assert name in checkpoint.read(whole.path / f"{name}.pt")["infos"]["phases"]
+    assert not checkpoint.jumps(checkpoint.read(whole.path / "walk.pt"))
+    assert checkpoint.latest(whole.path) == whole.path / "model_4.pt"
+    assert len(checkpoint.numbered(whole.path)) == 3
+    assert (whole.gains).read_bytes() == GAINS.read_bytes()
+    assert found["sessions"][0]["versions"]["torch"] == torch.__version__
+    assert any(whole.path.glob("events.out.*"))
+
+
+def test_a_finished_run_is_not_trained_again(whole: RunFolder, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(whole.path, copy)
+    assert train("all", "--resume", "--out", copy) == 0
+    assert len(RunFolder(copy).read()["sessions"]) == 1
+    assert train("all", "--resume", "--out", copy, "--seed", "7") == 2
+    assert train(*ALL, *SHORT, "--out", copy) == 2
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path, kind: signal.Signals) -> None:
+    folder = RunFolder(tmp_path / "run")
+    code = "import sys; from pronk.cli.main import run; sys.exit(run(sys.argv[1:]))"
+    words = ("train", "walk", "--gains", "naive", *SMALL, "--phase", "walk=6", "--out", folder.path)
+    process = command(code, *words)
+    while not checkpoint.numbered(folder.path) and process.poll() is None:
+        time.sleep(0.1)
+    process.send_signal(kind)
+    output, _ = process.communicate()
+    assert process.returncode == 130, output
+    stopped = folder.read()
+    assert not stopped["finished"]
+    assert stopped["sessions"][0]["stopped"] == kind.name
+    last = checkpoint.latest(folder.path)
+    assert last is not None
+    done = checkpoint.read(last)["iter"] + 1
+    assert 1 <= done < 6
+    assert train("walk", "--resume", "--out", folder.path) == 0
+    found = folder.read()
+    assert found["finished"]
+    assert found["phases"]["walk"]["iterations"] == 6
+    state = checkpoint.read(folder.path / "walk.pt")
+    assert state["iter"] == 5
+    assert state["infos"]["env_state"]["common_step_counter"] == 6 * 24
+    assert not load_policy(folder.policy).contract.jump
+
+
+def test_a_jump_begins_with_a_walking_policy(whole: RunFolder, tmp_path: Path) -> None:
+    out = tmp_path / "jump"
+    words = ("jump", "--gains", "naive", "--ranges-from", GAINS, *SMALL, "--out", out)
+    phases = ("--phase", "jump_a=1", "--phase", "jump_b=1")
+    assert train(*words, *phases, "--init-checkpoint", whole.path / "policy.onnx") == 2
+    assert train(*words, *phases, "--init-checkpoint", whole.path / "jump_b.pt") == 2
+    assert not out.exists()
+    assert train(*words, *phases, "--init-checkpoint", whole.path) == 0
+    found = RunFolder(out).read()
+    assert set(found["phases"]) == {"jump_a", "jump_b"}
+    first = checkpoint.read(out / "jump_a.pt")
+    assert first["iter"] == TASKS["jump"]["walk"]
+    contract = load_policy(out / "policy.onnx").contract
+    assert (contract.gains, contract.gains_sha256) == ("naive", "")
+    assert contract.provenance["start_sha256"] == found["start_sha256"] != ""
+
+
+def test_mjlab_trains_every_phase_of_the_registered_task(whole: RunFolder, tmp_path: Path) -> None:
+    """With the phase settings of `pronk train`, and rewards that its command line has changed."""
+    phases = {"walk": 2, "jump-a": 1, "jump-b": 2}
+    options = [f"--env.curriculum.phases.params.{n}={c}" for n, c in phases.items()]
+    rewards = "--env.rewards.posture"
+    process = command(
+        "from mjlab.scripts.train import main; main()",
+        "Pronk-Jump-MiniCheetah",
+        "--env.scene.num-envs=8",
+        "--agent.max-iterations=5",
+        *options,
+        f"{rewards}.weight=-0.5",
+        f"{rewards}.params.jump-scale=0.25",
+        cwd=tmp_path,
+    )
+    output, _ = process.communicate()
+    assert process.returncode == 0, output[-3000:]
+    (folder,) = (tmp_path / "logs" / "rsl_rl" / "pronk_jump").iterdir()
+    assert load_policy(folder / "policy.onnx").contract.provenance["phases"] == {
+        "walk": 2,
+        "jump_a": 1,
+        "jump_b": 2,
+    }
+    theirs, ours = (
+        yaml.load((path / "params" / "env.yaml").read_text(), yaml.BaseLoader)
+        for path in (folder, whole.path)
+    )
+    assert theirs["curriculum"] == ours["curriculum"]
+    changed = theirs["rewards"].pop("posture")
+    assert (changed["weight"], changed["params"]["jump_scale"]) == ("-0.5", "0.25")
+    del ours["rewards"]["posture"]
+    assert theirs["rewards"] == ours["rewards"]
+    for name in PHASES:
+        a, b = (checkpoint.read(path / f"{name}.pt") for path in (folder, whole.path))
+        assert a["infos"]["env_state"] == b["infos"]["env_state"]
+        rates = [s["estimator_optimizer_state_dict"]["param_groups"][0]["lr"] for s in (a, b)]
+        assert rates == [PHASES[name].estimator_rate] * 2
+
+
+def test_the_reward_rises() -> None:
+    """64 robots and a small network walk better after 40 iterations, for each of two seeds."""
+    from dataclasses import asdict
+
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.rl import RslRlVecEnvWrapper
+    from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+
+    from pronk.train.rl.runner import PronkRunner
+
+    cfg, learning = load_env_cfg("Pronk-Walk-MiniCheetah"), load_rl_cfg("Pronk-Walk-MiniCheetah")
+    cfg.scene.num_envs, cfg.seed, learning.seed = 64, 1, 1
+    learning.actor.hidden_dims = learning.critic.hidden_dims = (64, 64)
+    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
+    runner = PronkRunner(env, asdict(learning), None, "cpu")
+    runner.learn(5, init_at_random_ep_len=True)
+    first = runner.logger.rewbuffer[0]
+    runner.learn(35)
+    assert runner.logger.rewbuffer[0] > first + 1.0
+    env.close()
+
+
+def test_the_curriculum_follows_the_step_counter() -> None:
+    iterations = {"walk": 2, "jump_a": 0, "jump_b": 4}
+    assert [phase_at(iterations, i) for i in (0, 1, 2, 5, 6, 9)] == [
+        ("walk", 0.0),
+        ("walk", 0.5),
+        ("jump_b", 0.0),
+        ("jump_b", 0.75),
+        ("jump_b", 1.0),
+        ("jump_b", 1.0),
+    ]

@@ -1,0 +1,411 @@
+"""Networks and PPO: the estimator, the normalization, the blank jump input, checkpoints."""
+
+from __future__ import annotations
+
+import copy
+import math
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+from rsl_rl.algorithms import PPO
+
+from ppo_case import (
+    ROBOTS,
+    STEPS,
+    build,
+    observe,
+    one_thread,  # noqa: F401
+    roll_out,
+    same,
+    trained,
+    weights,
+)
+from pronk.errors import ArtefactError, PronkError
+from pronk.policy.layout import ACTOR_INDICES, ESTIMATOR_INDICES
+from pronk.train.rl import checkpoint
+from pronk.train.rl.networks import JUMP_WEIGHT, Estimator, RolloutNormalization
+from pronk.train.rl.ppo import EstimatorPPO
+
+pytestmark = pytest.mark.train
+PAPER = (1024, 512, 256)
+
+
+# --- Estimator and normalization -----------------------------------------------------------------
+
+
+def test_losses_by_hand() -> None:
+    estimator = Estimator()
+    with torch.no_grad():
+        for parameter in estimator.parameters():
+            parameter.zero_()
+        estimator.mlp[-1].bias[:] = torch.tensor([0.0, 0.0, 0.0, math.log(3.0), 1.0, 2.0, 3.0])
+    x, target = torch.randn(1, 103), torch.tensor([[1.0, 0.0, 1.0, 0.0, 0.0, 2.0, 1.0]])
+    with torch.no_grad():
+        cross_entropy, squared = estimator.losses(x, target)
+    # Probabilities 1/2, 1/2, 1/2 and 3/4 where there is no contact.
+    assert float(cross_entropy) == pytest.approx((3 * math.log(2) + math.log(4)) / 4)
+    assert float(squared) == pytest.approx((1 + 0 + 4) / 3)
+    contact, _ = estimator.estimate(x)
+    torch.testing.assert_close(contact, torch.tensor([[0.5, 0.5, 0.5, 0.75]]))
+
+
+def test_what_the_networks_read() -> None:
+    algorithm = trained(1)
+    actor, critic, obs = algorithm.get_policy(), algorithm.critic, observe()
+    statistics = actor.obs_normalizer
+    measured = (obs["measured"] - statistics.mean) / (statistics.std + 0.01)
+    read = torch.cat([measured[:, list(ESTIMATOR_INDICES)], obs["jump"]], dim=1)
+    torch.testing.assert_close(actor.estimator_input(obs), read)
+    estimate = torch.cat(actor.estimate(obs), dim=1)
+    acting = torch.cat([estimate, measured[:, list(ACTOR_INDICES)], obs["jump"]], dim=1)
+    assert acting.shape == (ROBOTS, 53)
+    torch.testing.assert_close(actor.get_latent(obs), acting)
+    state = (obs["critic"] - critic.obs_normalizer.mean) / (critic.obs_normalizer.std + 0.01)
+    torch.testing.assert_close(critic.get_latent(obs), torch.cat([state, obs["critic_jump"]], 1))
+
+
+def test_noise_is_limited_where_it_is_larger_and_still_learned() -> None:
+    algorithm = build()
+    actor = algorithm.get_policy()
+    parameter = actor.distribution.std_param
+    with torch.no_grad():
+        parameter.copy_(torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6] * 2))
+    actor.limit_noise(math.inf)
+    assert float(parameter.detach()[5]) == pytest.approx(0.6)
+    actor.limit_noise(0.3)
+    assert parameter.detach().tolist() == pytest.approx([0.1, 0.2, 0.3, 0.3, 0.3, 0.3] * 2)
+    before = parameter.detach().clone()
+    roll_out(algorithm)
+    algorithm.update()
+    assert actor.distribution.std_param is parameter
+    assert 0.0 < float((parameter.detach() - before).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("groups", "sizes", "settings", "words"),
+    [
+        (["jump", "measured"], {}, {}, "expected measured and jump"),
+        (["measured", "jump"], {"measured": 104}, {}, "104 numbers"),
+        (None, {"estimator_target": None}, {}, "estimator_target"),
+        (None, {}, {"estimator_epochs": 0}, "more than 0"),
+        (None, {}, {"estimator_learning_rate": math.nan}, "more than 0"),
+    ],
+)
+def test_impossible_inputs_are_refused(
+    groups: Any, sizes: dict[str, Any], settings: dict[str, Any], words: str
+) -> None:
+    obs = observe()
+    for name, size in sizes.items():
+        if size is None:
+            del obs[name]
+        else:
+            obs[name] = torch.zeros(ROBOTS, size)
+    actor = type(build().get_policy())
+
+    def make() -> None:
+        if groups is None:
+            build(observation=obs, **settings)
+        else:
+            actor(obs, {"actor": groups}, "actor", 12)
+
+    with pytest.raises(PronkError, match=words):
+        make()
+
+
+def test_ppo_and_supervision_change_different_weights() -> None:
+    algorithm = build()
+    actor = algorithm.get_policy()
+    for _ in range(2):  # the second time the estimator has had gradients of its own
+        roll_out(algorithm)
+        estimator, network = weights(actor.estimator), weights(actor.mlp)
+        PPO.update(algorithm)
+        assert same(weights(actor.estimator), estimator)
+        assert not same(weights(actor.mlp), network)
+        assert all(p.grad is None for p in actor.estimator.parameters())
+    still = build(learning_rate=0.0, schedule="fixed")
+    roll_out(still)
+    actor, critic = still.get_policy(), still.critic
+    before = [weights(m) for m in (actor.mlp, critic.mlp, actor.estimator)]
+    still.update()
+    after = [weights(m) for m in (actor.mlp, critic.mlp, actor.estimator)]
+    assert [same(x, y) for x, y in zip(before, after, strict=True)] == [True, True, False]
+
+
+def test_every_weight_has_one_optimizer() -> None:
+    algorithm = build()
+    actor, critic = algorithm.get_policy(), algorithm.critic
+    mine = [p for g in algorithm.estimator_optimizer.param_groups for p in g["params"]]
+    others = [p for g in algorithm.optimizer.param_groups for p in g["params"]]
+    assert {id(p) for p in mine} == {id(p) for p in actor.estimator.parameters()}
+    everything = [*actor.parameters(), *critic.parameters()]
+    assert sorted(map(id, mine + others)) == sorted(map(id, everything))
+
+
+def test_losses_are_means_over_the_rollout() -> None:
+    # With a learning rate of nearly nothing the mean over mini-batches is that of the rollout.
+    algorithm = build(estimator_learning_rate=1e-30, estimator_epochs=2, estimator_mini_batches=4)
+    roll_out(algorithm)
+    actor, rollout = algorithm.get_policy(), algorithm.storage.observations.flatten(0, 1).clone()
+    with torch.no_grad():
+        contact, velocity = actor.estimator.losses(
+            actor.estimator_input(rollout), rollout["estimator_target"]
+        )
+    losses = algorithm.update()
+    assert losses["estimator_contact"] == pytest.approx(float(contact), rel=1e-5)
+    assert losses["estimator_velocity"] == pytest.approx(float(velocity), rel=1e-5)
+    assert {"value", "surrogate", "entropy"} <= losses.keys()
+
+
+def test_the_estimator_learns_a_known_function() -> None:
+    torch.manual_seed(0)
+    mixing = torch.randn(102, 7) / math.sqrt(102) / 3.0
+
+    def known() -> Any:
+        obs = observe()
+        target = (obs["measured"][:, list(ESTIMATOR_INDICES)] - 1.0) @ mixing
+        target[:, :4] = (target[:, :4] > 0.0).float()
+        obs["estimator_target"] = target
+        return obs
+
+    algorithm = build(hidden=(8,), estimator_epochs=4, num_learning_epochs=1)
+    for _ in range(100):
+        roll_out(algorithm, known)
+        algorithm.update()
+    fresh = known()
+    with torch.no_grad():
+        contact, velocity = algorithm.get_policy().estimate(fresh)
+    target = fresh["estimator_target"]
+    # A random estimate has half of the contacts right and a velocity error of one.
+    assert float(((contact > 0.5) == (target[:, :4] > 0.5)).float().mean()) > 0.85
+    assert float((velocity - target[:, 4:]).square().mean().sqrt()) < 0.3
+
+
+def test_statistics_are_those_of_all_rollouts_and_the_first_ratio_is_one() -> None:
+    algorithm, history = build(), []
+    for _ in range(3):
+        roll_out(algorithm)
+        stored, actor = algorithm.storage, algorithm.get_policy()
+        history.append(stored.observations.clone())
+        actor(stored.observations.flatten(0, 1), stochastic_output=True)
+        again = actor.get_output_log_prob(stored.actions.flatten(0, 1))
+        torch.testing.assert_close(again, stored.actions_log_prob.flatten())
+        algorithm.update()
+    for model, group in ((algorithm.get_policy(), "measured"), (algorithm.critic, "critic")):
+        samples = torch.cat([obs[group].flatten(0, 1) for obs in history])
+        normalizer = model.obs_normalizer
+        assert int(normalizer.count) == len(samples) == 3 * ROBOTS * STEPS
+        torch.testing.assert_close(normalizer.mean, samples.mean(dim=0), rtol=1e-4, atol=1e-5)
+        std = samples.std(dim=0, correction=0)
+        torch.testing.assert_close(normalizer.std, std, rtol=1e-4, atol=1e-5)
+
+
+def test_a_normalized_rollout_has_mean_zero_and_spread_one() -> None:
+    normalizer = RolloutNormalization(3)
+    x = torch.randn(4, 50, 3) * torch.tensor([1.0, 10.0, 0.1]) + 5.0
+    normalizer.learn(x)
+    y = normalizer(x).flatten(0, 1)
+    torch.testing.assert_close(y.mean(dim=0), torch.zeros(3), rtol=0, atol=1e-5)
+    flat = x.flatten(0, 1).std(dim=0, correction=0)
+    torch.testing.assert_close(y.std(dim=0, correction=0), flat / (flat + 0.01))
+
+
+# --- The jump input ------------------------------------------------------------------------------
+
+
+def narrow_state(state: dict[str, Any]) -> dict[str, Any]:
+    """The checkpoint of the same policy without jump inputs, optimizers without their moments."""
+    narrow = {"iter": 9, "infos": {}}
+    for key in checkpoint.NETWORKS:
+        narrow[key] = {n: v for n, v in state[key].items() if not n.endswith(JUMP_WEIGHT)}
+    # Places of the jump weights: behind weight and bias of the first layer of each network.
+    for key, jump in zip(checkpoint.OPTIMIZERS, ((3, 10), (2,)), strict=True):
+        (group,) = state[key]["param_groups"]
+        wide = [index for i, index in enumerate(group["params"]) if i not in jump]
+        moments = {i: state[key]["state"][index] for i, index in enumerate(wide)}
+        narrow[key] = {
+            "state": moments,
+            "param_groups": [{**group, "params": list(range(len(wide)))}],
+        }
+    return narrow
+
+
+def outputs(algorithm: EstimatorPPO, obs: Any) -> list[bytes]:
+    actor = algorithm.get_policy()
+    with torch.inference_mode():
+        found = [actor(obs), algorithm.critic(obs), *actor.estimate(obs)]
+    return [value.numpy().tobytes() for value in found]
+
+
+def jump_weights(algorithm: EstimatorPPO) -> list[Any]:
+    models = (algorithm.get_policy(), algorithm.critic)
+    return [v for m in models for n, v in m.state_dict().items() if n.endswith(JUMP_WEIGHT)]
+
+
+def test_fed_zeros_the_jump_input_stays_blank() -> None:
+    """After updates on zeros its weights are zero, and the function is that without it."""
+    algorithm = trained(3, jump=False, hidden=PAPER)
+    assert len(jump_weights(algorithm)) == 3
+    assert not any(value.any() for value in jump_weights(algorithm))
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        for rows in (1, 2, 7, 64, 500):
+            obs = observe(rows)
+            with_jump = outputs(algorithm, obs)
+            obs["jump"], obs["critic_jump"] = obs["jump"] * 0.0, obs["critic_jump"] * 0.0
+            assert outputs(algorithm, obs) == with_jump, (rows, threads)
+    roll_out(algorithm)
+    algorithm.update()
+    assert all(value.any() for value in jump_weights(algorithm))
+
+
+def test_a_layer_with_blank_inputs_is_the_layer_without_them() -> None:
+    """Bit for bit, by PyTorch's own linear layer."""
+    actor = trained(2, jump=False, hidden=PAPER).get_policy()
+    first = actor.mlp[0]
+    x = torch.randn(7, 53)
+    plain = torch.nn.functional.linear(x[:, :52].contiguous(), first.weight, first.bias)
+    assert torch.equal(first(x), plain)
+
+
+def test_the_moments_of_the_jump_inputs_begin_anew() -> None:
+    """Their first step is one learning rate long, though all others have a history."""
+    algorithm = trained(3, jump=False)
+    algorithm.reset_jump_moments()
+    rate = 1e-3
+    for optimizer in (algorithm.optimizer, algorithm.estimator_optimizer):
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+            for parameter in group["params"]:
+                parameter.grad = torch.ones_like(parameter)
+        optimizer.step()
+    for value in jump_weights(algorithm):
+        torch.testing.assert_close(value, torch.full_like(value, -rate), rtol=1e-4, atol=0.0)
+
+
+def test_a_checkpoint_without_jump_inputs_is_widened() -> None:
+    before = trained(2, jump=False)
+    state = {**copy.deepcopy(before.save()), "iter": 9, "infos": {}}
+    narrow = narrow_state(state)
+    wide = checkpoint.widen_checkpoint(narrow)
+    assert not checkpoint.jumps(wide)
+    after = build()
+    assert after.load(copy.deepcopy(wide))
+    for rows in (1, 64):
+        obs = observe(rows)
+        assert outputs(after, obs) == outputs(before, obs)
+    # The next update is that of the algorithm which had the inputs all along.
+    for algorithm in (before, after):
+        algorithm.reset_jump_moments()
+        torch.manual_seed(4)
+        roll_out(algorithm)
+        algorithm.update()
+    assert same(weights(before.get_policy()), weights(after.get_policy()))
+    assert same(weights(before.critic), weights(after.critic))
+    assert checkpoint.widen_checkpoint(state).keys() == state.keys()
+    assert checkpoint.jumps({**state, **after.save()})
+    narrow["optimizer_state_dict"]["param_groups"][0]["params"].pop()
+    with pytest.raises(ArtefactError, match="parameters"):
+        checkpoint.widen_checkpoint(narrow)
+
+
+# --- Checkpoints ---------------------------------------------------------------------------------
+
+
+def test_saved_and_loaded_it_continues_alike(tmp_path: Path) -> None:
+    first, second = trained(1), build()
+    path = tmp_path / "model_3.pt"
+    checkpoint.write(path, {**first.save(), "iter": 3, "infos": {"note": "x"}})
+    assert [p.name for p in tmp_path.iterdir()] == ["model_3.pt"]
+    state = checkpoint.read(path)
+    assert second.load(state)
+    for algorithm in (first, second):
+        torch.manual_seed(1)
+        roll_out(algorithm)
+        algorithm.update()
+    assert same(weights(first.get_policy()), weights(second.get_policy()))
+    assert same(weights(first.critic), weights(second.critic))
+    assert first.learning_rate == second.learning_rate
+    third = build()
+    assert not third.load(state, {"actor": True})
+    assert not third.estimator_optimizer.state
+
+
+class Harmful:
+    """Would write a file if it were unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.write_text, (self.path, "run")
+
+
+def test_other_files_are_refused_and_run_no_code(tmp_path: Path) -> None:
+    path = tmp_path / "model_1.pt"
+    mark = tmp_path / "mark"
+    torch.save({"actor_state_dict": Harmful(mark)}, path)
+    with pytest.raises(ArtefactError):
+        checkpoint.read(path)
+    assert not mark.exists()
+    torch.save({"actor_state_dict": {}}, path)
+    with pytest.raises(ArtefactError, match="critic_state_dict"):
+        checkpoint.read(path)
+    for content in (b"", b"text", path.read_bytes()[:300]):
+        path.write_bytes(content)
+        with pytest.raises(ArtefactError):
+            checkpoint.read(path)
+    with pytest.raises(ArtefactError):
+        checkpoint.read(tmp_path / "none.pt")
+
+
+def test_the_last_checkpoint_is_that_of_the_highest_iteration(tmp_path: Path) -> None:
+    assert checkpoint.latest(tmp_path) is None
+    for name in ("model_9.pt", "model_10.pt", "model_best.pt", "walk.pt"):
+        (tmp_path / name).touch()
+    assert checkpoint.latest(tmp_path) == tmp_path / "model_10.pt"
+
+
+def test_a_number_that_is_not_finite_is_found_by_its_path() -> None:
+    tree = {"a": [torch.ones(2), {"b": torch.tensor([1.0, math.nan])}], "c": 3}
+    assert checkpoint.not_finite(tree) == "a/1/b"
+    assert checkpoint.not_finite({"a": [torch.ones(2)], "c": None}) is None
+
+
+# --- Several processes ---------------------------------------------------------------------------
+
+
+def one_of_two(rank: int, port: int, folder: str) -> None:
+    """A process of two: learns from data of its own and writes its weights."""
+    torch.set_num_threads(1)
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2
+    )
+    torch.manual_seed(10 + rank)
+    algorithm = build(multi_gpu={"global_rank": rank, "local_rank": rank, "world_size": 2})
+    algorithm.broadcast_parameters()
+    for _ in range(2):
+        roll_out(algorithm)
+        algorithm.update()
+    models = {"actor": algorithm.get_policy(), "critic": algorithm.critic}
+    found = {name: weights(model) for name, model in models.items()}
+    found["data"] = {"measured": algorithm.storage.observations["measured"].clone()}
+    torch.save(found, Path(folder) / f"{rank}.pt")
+    torch.distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+def test_processes_stay_together(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    torch.multiprocessing.spawn(one_of_two, (port, str(tmp_path)), nprocs=2)
+    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in (0, 1))
+    assert not same(first["data"], second["data"])
+    assert same(first["actor"], second["actor"])
+    assert same(first["critic"], second["critic"])
+    assert int(first["actor"]["obs_normalizer.count"]) == 2 * 2 * ROBOTS * STEPS

@@ -1,0 +1,127 @@
+"""Export of a policy to ONNX, and its contract."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+pytest.importorskip("onnxruntime")
+from ppo_case import observe, one_thread, same, trained, weights  # noqa: F401
+from pronk.errors import ArtefactError
+from pronk.match.gains import GroupGains
+from pronk.policy.contract import Contract, check
+from pronk.policy.runtime import load_policy
+from pronk.robots import load_robot
+from pronk.train.gains import TrainingGains, training_gains
+from pronk.train.rl.export import TOLERANCE, contract_for, export_policy, verify
+
+pytestmark = pytest.mark.train
+ROBOT = load_robot("mini_cheetah")
+
+
+def contract(*, jump: bool, gains: TrainingGains | None = None) -> Contract:
+    return contract_for(
+        ROBOT,
+        gains or training_gains("naive", ROBOT),
+        action_scale=0.35,
+        delay_steps=(0, 2),
+        command_limits=(3.0, 1.0, 2.0),
+        lift_off_velocity=2.5 if jump else None,
+        provenance={"phases": {"walk": 2}, "seed": 1},
+    )
+
+
+@pytest.mark.parametrize("jump", [False, True])
+def test_onnx_equals_pytorch(tmp_path: Path, jump: bool) -> None:
+    torch.manual_seed(5)
+    actor = trained(jump=jump, hidden=(1024, 512, 256)).get_policy()
+    before, path = weights(actor), tmp_path / "policy.onnx"
+    export_policy(actor, contract(jump=jump), path)
+    assert path.stat().st_size < 4e6
+    assert [file.name for file in tmp_path.iterdir()] == ["policy.onnx"]
+    running = observe(256)  # as large as the observations of a robot that runs
+    spread = torch.tensor([3.0] * 3 + [0.3] * 3 + [0.5] * 36 + [10.0] * 36 + [2.0] * 24 + [1.5] * 3)
+    running["measured"] = torch.randn(256, 105) * spread
+    for observations in (observe(1), observe(256), running):
+        difference = verify(path, actor, observations)
+        assert difference is not None
+        assert difference <= TOLERANCE
+    assert actor.training
+    assert same(weights(actor), before)
+    policy = load_policy(path)
+    check(policy.contract, ROBOT)
+    assert policy.contract == contract(jump=jump)
+
+
+def test_verify_finds_another_policy_and_refuses_other_files(tmp_path: Path) -> None:
+    actor, path, observations = trained(1).get_policy(), tmp_path / "policy.onnx", observe(8)
+    with pytest.raises(ArtefactError, match="no such file"):
+        verify(path, actor, observations)
+    export_policy(actor, contract(jump=True), path)
+    with torch.no_grad():
+        actor.estimator.mlp[-1].bias[6] += 0.01
+    changed = verify(path, actor, observations)
+    assert changed is not None
+    assert changed >= 0.0099
+    observations["measured"][1, 3] = math.nan
+    with pytest.raises(ArtefactError, match="nan"):
+        verify(path, actor, observations)
+
+
+def test_the_jump_input_reaches_estimator_and_actor(tmp_path: Path) -> None:
+    path = tmp_path / "policy.onnx"
+    export_policy(trained(1).get_policy(), contract(jump=True), path)
+    measured = observe(1)["measured"].numpy()
+    policy = load_policy(path)
+    walk, jump = policy.infer(measured, [[0.0]]), policy.infer(measured, [[1.0]])
+    for name in ("action", "contact", "linear_velocity"):
+        assert not np.array_equal(getattr(walk, name), getattr(jump, name))
+    assert ((walk.contact > 0.0) & (walk.contact < 1.0)).all()
+
+
+def test_a_walking_policy_is_the_one_with_the_jump_input_at_zero(tmp_path: Path) -> None:
+    actor = trained(1).get_policy()
+    found = []
+    for jump in (False, True):
+        path = tmp_path / f"{jump}.onnx"
+        export_policy(actor, contract(jump=jump), path)
+        inputs: list[Any] = [observe(1)["measured"].numpy() * 0.0 + 1.0]
+        found.append(load_policy(path).infer(*inputs, *([[[0.0]]] if jump else [])))
+    np.testing.assert_allclose(found[0].action, found[1].action, atol=1e-6)
+
+
+def test_contract_by_hand(tmp_path: Path) -> None:
+    groups = {
+        name: GroupGains(stiffness=kp, damping=kd, stiffness_range=1.0, damping_range=0.05)
+        for name, kp, kd in (
+            ("hip_roll", 20.0, 0.45),
+            ("hip_pitch", 17.5, 0.4),
+            ("knee", 21.5, 0.55),
+        )
+    }
+    gains = TrainingGains(
+        name="matched", robot=ROBOT.name, groups=groups, sha256="ab" * 32, virtual=True
+    )
+    made = contract(jump=True, gains=gains)
+    assert made.stiffness == (20.0, 17.5, 21.5) * 4
+    assert made.damping == (0.45, 0.4, 0.55) * 4
+    assert made.default_position == (0.0, -0.8, 1.6) * 4
+    assert made.action_scale == (0.35,) * 12
+    assert made.delay_range_s == (0.0, 0.01)
+    assert made.command_ranges == {"vx": (-3.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
+    assert (made.gains, made.gains_sha256, made.virtual) == ("matched", "ab" * 32, True)
+    assert made.jump
+    assert made.versions["torch"] == torch.__version__
+    check(made, ROBOT, gains_sha256="ab" * 32)
+    onnx = pytest.importorskip("onnx")
+    export_policy(trained(1).get_policy(), made, tmp_path / "policy.onnx")
+    model = onnx.load(tmp_path / "policy.onnx")
+    body = json.loads({prop.key: prop.value for prop in model.metadata_props}["pronk.contract"])
+    assert (model.producer_name, body["lift_off_velocity"]) == ("pronk", 2.5)
