@@ -136,23 +136,23 @@ def over_lcm(port: int) -> Wire:
         met.clear()
         return found
 
-    listener.subscribe(CHEETAH.command_channel, receive).set_queue_capacity(500)
+    listener.subscribe(CHEETAH.command.channel, receive).set_queue_capacity(500)
     data = encode_command(CHEETAH, OTHER)
     return Wire(
-        lambda: sender.publish(CHEETAH.command_channel, data),
+        lambda: sender.publish(CHEETAH.command.channel, data),
         listen,
         lambda data: decode_command(CHEETAH, data),
     )
 
 
 def over_dds(domain: int) -> Wire:
-    from pronk.links.dds import messages as idl
+    from pronk.links.dds import codec as idl
     from pronk.links.dds.codec import decode_command, encode_command, joint_map
     from pronk.links.dds.link import COMMANDS, DdsNetwork, Participant, take, write
 
     joints, own = joint_map(ROBOT), Participant(DdsNetwork(domain=domain))
-    sender = own.writer(COMMANDS, idl.LowCmd, raw=True)
-    listener = own.reader(COMMANDS, idl.LowCmd, raw=True, own=False)
+    sender = own.writer(COMMANDS, idl.LowCmd)
+    listener = own.reader(COMMANDS, idl.LowCmd, own=False)
     counts: Counter[str] = Counter()
     # Every sample says when it was written, by the wall clock.
     wall = time.time() - time.monotonic()

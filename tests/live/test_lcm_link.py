@@ -20,7 +20,7 @@ import pytest
 from pronk.errors import HardwareError
 from pronk.links.lcm.codec import (
     CHEETAH,
-    REQUEST_CHANNEL,
+    CONTROL_PARAMETER,
     decode_command,
     encode_command,
     mode_request,
@@ -145,7 +145,7 @@ def test_a_command_that_expires_is_followed_by_damping(servers: dict[str, Proces
     listener = lcm.LCM(url_of(port=process.port))
     received: list[Command] = []
     listener.subscribe(
-        CHEETAH.command_channel, lambda _, data: received.append(decode_command(CHEETAH, data))
+        CHEETAH.command.channel, lambda _, data: received.append(decode_command(CHEETAH, data))
     )
     machine.connect()
     machine.send(replace(HOLD, made=machine.now(), valid_for=0.5))
@@ -176,7 +176,7 @@ def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
 
     def command() -> None:
         while not done.wait(0.02):
-            other.publish(CHEETAH.command_channel, encode_command(CHEETAH, HOLD))
+            other.publish(CHEETAH.command.channel, encode_command(CHEETAH, HOLD))
 
     rival = threading.Thread(target=command)
     rival.start()
@@ -190,7 +190,7 @@ def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
     machine.connect()
     machine.send(HOLD)
     foreign = replace(HOLD, position=HOLD.position + 0.01)
-    other.publish(CHEETAH.command_channel, encode_command(CHEETAH, foreign))
+    other.publish(CHEETAH.command.channel, encode_command(CHEETAH, foreign))
     until = time.monotonic() + LIMIT_S
     while not machine.counts["foreign"] and time.monotonic() < until:
         machine.wait(machine.now() + 0.01)
@@ -201,7 +201,7 @@ def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
 
 def test_the_robots_own_controller_is_released(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
-    lcm.LCM(url_of(port=process.port)).publish(REQUEST_CHANNEL, mode_request(4, 1))
+    lcm.LCM(url_of(port=process.port)).publish(CONTROL_PARAMETER.channel, mode_request(4, 1))
     with pytest.raises(HardwareError, match="another program"):
         process.machine().connect()
     machine = process.machine(release=True)

@@ -97,7 +97,7 @@ class Listener:
         self.received: list[tuple[float, Command]] = []
         """Each with the time at which it came [s]."""
         self._lcm = lcm.LCM(url_of(port=port))
-        self._lcm.subscribe(CHEETAH.command_channel, self._hear)
+        self._lcm.subscribe(CHEETAH.command.channel, self._hear)
         self._open = True
         self._thread = threading.Thread(target=self._listen)
 
@@ -206,7 +206,7 @@ def test_who_else_commands_later_ends_the_sweep(port: int, tmp_path: Path) -> No
     other = lcm.LCM(url_of(port=port))
     path = tmp_path / "FR_hip_roll.mcap"
     foreign = encode_command(CHEETAH, replace(HOLD, position=HOLD.position + 0.01))
-    late = once_written(path, lambda: other.publish(CHEETAH.command_channel, foreign))
+    late = once_written(path, lambda: other.publish(CHEETAH.command.channel, foreign))
     with pytest.raises(HardwareError, match="another program commands the joints"):
         swept(ROBOT, plan_of("FR_hip_roll"), tmp_path, port)
     late.join()

@@ -1,4 +1,4 @@
-"""Signals of a terminal: noted by the program in front, unheard by those that move a robot."""
+"""Signals of a terminal: the foreground program records them, those that move a robot do not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from pronk.links.realtime import ENDING, TERMINAL, Interrupts, unheard
+from pronk.links.realtime import ENDING, TERMINAL, Interrupts, terminal_blocked
 
 
 @pytest.mark.parametrize("number", ENDING)
@@ -59,17 +59,17 @@ BORN = "import sys; print('up', flush=True); sys.stdin.readline(); print('alive'
 LEFT = "from pronk.links.realtime import leave; leave();" + BORN
 
 
-@pytest.mark.parametrize(("code", "started_unheard"), [(BORN, True), (LEFT, False)])
+@pytest.mark.parametrize(("code", "blocked_at_start"), [(BORN, True), (LEFT, False)])
 def test_a_process_that_moves_a_robot_outlives_its_terminal(
-    code: str, started_unheard: bool
+    code: str, blocked_at_start: bool
 ) -> None:
     def start() -> subprocess.Popen[str]:
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         return subprocess.Popen([sys.executable, "-c", code], text=True, **pipes)
 
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    if started_unheard:
-        with unheard():
+    if blocked_at_start:
+        with terminal_blocked():
             process = start()
     else:
         process = start()
@@ -78,7 +78,7 @@ def test_a_process_that_moves_a_robot_outlives_its_terminal(
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         own = os.getsid(process.pid) == process.pid
-        assert own is not started_unheard
+        assert own is not blocked_at_start
         for number in TERMINAL:
             process.send_signal(number)
         out, _ = process.communicate("\n")

@@ -23,9 +23,9 @@ from pronk.links.link import (
     CommandWriter,
     Freshness,
     NetworkLink,
+    StateNumbering,
     StreamLink,
     await_rest,
-    check_rate,
     wait_for,
 )
 from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
@@ -63,18 +63,18 @@ def state(when: float = 0.0, speed: float = 0.0) -> State:
 
 
 class Windows(NetworkLink):
-    """A link that gives so many states a window."""
+    """A link that gives states at the given times in each window."""
 
     wire = "test"
     torque_kind: TorqueKind = "absent"
 
-    def __init__(self, *windows: int, **options: object) -> None:
+    def __init__(self, *windows: np.ndarray, **options: object) -> None:
         super().__init__(ROBOT, **options)  # type: ignore[arg-type]
-        self.left, self.waits = list(windows), list[float]()
+        self.left = list(windows)
 
     def wait(self, until: float) -> list[State]:
-        self.waits.append(until)
-        return [state(0.002 * k) for k in range(self.left.pop(0))] if until else [state()]
+        # Before each window, what had come until then is dropped.
+        return [state(when) for when in self.left.pop(0).tolist()] if until else [state()]
 
     def _open(self) -> CommandWriter:
         raise NotImplementedError
@@ -90,43 +90,89 @@ def test_a_condition_is_waited_for_and_given_up(clock: Clock) -> None:
     assert clock.now == pytest.approx(2.0, abs=0.01)
 
 
-def test_windows_of_a_busy_computer_may_fail_and_those_of_a_slow_robot_may_not() -> None:
-    link = Windows(20, 0, 100)
-    assert len(link.fresh_states(500.0, until=math.inf)) == 100
-    # Before each window, what had come until then is dropped.
-    assert [until == 0.0 for until in link.waits] == [True, False] * 3
-    with pytest.raises(HardwareError, match="20"):
-        Windows(20, 100).fresh_states(500.0, until=0.0)
+REGULAR = np.arange(100) * 2e-3
 
 
 @pytest.mark.parametrize(
-    ("times", "fresh", "wrong"),
+    ("windows", "until", "fresh", "found"),
     [
-        (np.arange(100) * 2e-3, None, ""),
-        (np.arange(80) * 2e-3, None, "80"),
-        (np.append(np.arange(95) * 1.7e-3, 0.1898), None, "30 ms"),
-        (np.arange(5) * 40e-3, Freshness(share=0.05, longest_gap_s=1.0), ""),
-        (np.array([]), None, "sent 0"),
+        ([REGULAR], 0.0, None, 100),
+        ([REGULAR[:80]], 0.0, None, "80"),
+        ([np.append(np.arange(95) * 1.7e-3, 0.1898)], 0.0, None, "30 ms"),
+        ([np.arange(5) * 40e-3], 0.0, Freshness(share=0.05, longest_gap_s=1.0), 5),
+        ([np.array([])], 0.0, None, "sent 0"),
+        # A busy computer may miss windows for a while.
+        ([REGULAR[:20], REGULAR[:0], REGULAR], math.inf, None, 100),
+        ([REGULAR[:20], REGULAR], 0.0, None, "20"),
     ],
 )
 def test_states_must_come_often_and_without_gaps(
-    times: np.ndarray, fresh: Freshness | None, wrong: str
+    windows: list[np.ndarray], until: float, fresh: Freshness | None, found: int | str
 ) -> None:
-    states = [state(when) for when in times.tolist()]
-    if not wrong:
-        check_rate("it", states, 500.0, fresh)
+    link = Windows(*windows, fresh=fresh)
+    if isinstance(found, int):
+        assert len(link.fresh_states(500.0, until=until)) == found
         return
-    with pytest.raises(HardwareError, match=wrong):
-        check_rate("it", states, 500.0, fresh)
+    with pytest.raises(HardwareError, match=found):
+        link.fresh_states(500.0, until=until)
 
 
-def test_commands_of_other_programs_are_refused(clock: Clock) -> None:
+def numbered(counts: tuple[int, ...], **options: int) -> tuple[list[int], dict[str, int]]:
+    """Sequence of the states that are made of a robot's counts, and what was counted."""
+    numbering = StateNumbering(Counter(), 500.0, **options)
+    made = []
+    for k, count in enumerate(counts):
+        values = {name: getattr(some_state(), name) for name in VALUES}
+        values["gyro"] = np.full(3, count % 1000)
+        made.append(numbering.number(values, count, 10.0 + 0.002 * k))
+    return [found.sequence for found in made if found is not None], dict(numbering.counts)
+
+
+VALUES = ("position", "velocity", "torque", "gyro", "accelerometer", "bus_voltage")
+TICKS = {"per_state": 2, "bits": 32}  # a clock in ms
+
+
+@pytest.mark.parametrize(
+    ("options", "counts", "sequence", "counted"),
+    [
+        ({}, (10, 11, 15), [0, 1, 5], {}),
+        ({}, (10, 12, 11, 12, 13), [0, 2, 3], {"out of order": 2}),
+        ({}, (10, 10**9, 11), [0, 1, 2], {"clock jumps": 2}),
+        (TICKS, (5000, 5002, 5004, 5006), [0, 1, 2, 3], {}),
+        # A jitter of the robot's clock of a millisecond loses nothing.
+        (TICKS, (5000, 5001, 5004, 5005, 5008), [0, 1, 3, 4, 6], {}),
+        (TICKS, (5000, 5002, 5008, 5010), [0, 1, 4, 5], {}),
+        (TICKS, (5000, 5002, 5002, 5006, 5004, 5008), [0, 1, 3, 4], {"out of order": 2}),
+        (TICKS, (90_000, 90_002, 4, 6, 8000, 8002), [0, 1, 2, 3, 4, 5], {"clock jumps": 2}),
+        (TICKS, (2**32 - 4, 2**32 - 2, 0, 2), [0, 1, 2, 3], {}),
+    ],
+)
+def test_states_are_numbered_by_the_robots_count(
+    options: dict[str, int],
+    counts: tuple[int, ...],
+    sequence: list[int],
+    counted: dict[str, int],
+) -> None:
+    assert numbered(counts, **options) == (sequence, counted)
+
+
+def test_values_that_repeat_make_no_states_and_times_increase() -> None:
+    numbering = StateNumbering(Counter(), 500.0)
+    values = {name: getattr(some_state(), name) for name in VALUES}
+    made = [numbering.number(values, 10 + k, 7.0) for k in range(50)]
+    assert [found is None for found in made] == [False] + [True] * 49
+    assert numbering.counts == {"repeated": 49}
+    later = numbering.number(values | {"gyro": np.zeros(3)}, 60, 7.0)
+    assert later is not None
+    assert later.time == pytest.approx(7.0 + 50e-6, abs=1e-8)
+
+
+def test_commands_of_other_programs_are_refused() -> None:
     link = Windows()
-    link.check_exclusive(0.0)
-    assert clock.now == pytest.approx(1.0)
+    link.check_exclusive()
     link.counts["foreign"] = 3
     with pytest.raises(HardwareError, match="3 commands"):
-        link.check_exclusive(0.0)
+        link.check_exclusive()
 
 
 def test_joints_are_clamped_by_a_person_or_not_at_all() -> None:

@@ -1,9 +1,9 @@
 """Address of a robot: `lcm://eth0?layout=wtw`, `dds://eth0`, `sim://ground`, or a short name.
 
-The scheme names a link: one of `BUILT_IN`, or an entry point of the group `pronk.links`. What
-stands after `//` is the network interface to a real robot; without one nothing leaves this
-computer. A link is a callable `(robot, *, interface, clamp_operator, release, exclusive_s, fresh,
-**options) -> Machine`; its further keyword arguments are the options of its addresses.
+The scheme names a link: one of `BUILT_IN`, or an entry point of the group `pronk.links`. After `//`
+follows the network interface to a real robot; without one nothing leaves this computer. A link is a
+callable `(robot, *, interface=None, **common) -> Machine`, `common` as of `NetworkLink`; its other
+keyword arguments are the options of its addresses.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from types import NoneType
 from typing import Any, get_type_hints
 from urllib.parse import parse_qsl, quote, urlsplit
@@ -21,7 +20,6 @@ import msgspec
 
 from pronk import plugins
 from pronk.errors import HardwareError
-from pronk.links.link import ClampOperator, Freshness
 from pronk.links.machine import Machine
 from pronk.robots.robot import RobotSpec
 
@@ -41,20 +39,18 @@ def link_names() -> tuple[str, ...]:
 
 
 def find_link(name: str) -> Callable[..., Machine]:
-    """Import a link; HardwareError where there is none, or its library is not installed."""
-    target = BUILT_IN.get(name)
-    if target is None:
-        known = entry_points(group=GROUP)
-        if name not in known.names:
-            raise HardwareError(f"no link {name!r}; the links are {', '.join(link_names())}.")
-        return plugins.load(known[name])  # type: ignore[no-any-return]
-    module, _, attribute = target.partition(":")
-    return getattr(import_module(module), attribute)  # type: ignore[no-any-return]
+    """Import a link; HardwareError for an unknown name or a library that is not installed."""
+    if target := BUILT_IN.get(name):
+        return EntryPoint(name, target, GROUP).load()  # type: ignore[no-any-return]
+    known = entry_points(group=GROUP)
+    if name not in known.names:
+        raise HardwareError(f"no link {name!r}; the links are {', '.join(link_names())}.")
+    return plugins.load(known[name])  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Address:
-    """How a robot is reached."""
+    """Link to a robot and its options."""
 
     kind: str = SIM
     """Name of the link."""
@@ -62,14 +58,13 @@ class Address:
     """Network interface to a real robot (`lo` for LCM on the robot itself), None for loopback; of
     `sim`, `bench` or `ground`."""
     options: Mapping[str, str | int] = field(default_factory=dict)
-    """Of the link: `layout` and `port` (lcm), `domain` (dds), `params` and `seed` (sim)."""
+    """`layout` and `port` (lcm), `domain` (dds), `params` and `seed` (sim)."""
 
     @classmethod
     def parse(cls, text: str, interface: str | None = None, **options: str | int | None) -> Address:
-        """Read a URI or a short name; refuse an unknown link or option.
+        """Parse a URI or a short name; HardwareError for an unknown link or option.
 
-        `interface` serves where the text names none; `options` are added to those of the text, and
-        None is no option.
+        `interface` applies where the text names none; `options` other than None are added.
         """
         kind, found, query = text, "", ""
         if "://" in text:
@@ -79,7 +74,13 @@ class Address:
             raise HardwareError(f"{text} names the interface {found}; leave out {interface}.")
         if kind == "twin":
             raise HardwareError("link 'twin' is now called 'sim'.")
-        known = _options_of(find_link(kind))
+        link = find_link(kind)
+        hints = get_type_hints(link.__init__ if inspect.isclass(link) else link)
+        known = {
+            name: hints.get(name, str | NoneType)
+            for name, parameter in inspect.signature(link).parameters.items()
+            if parameter.kind is parameter.KEYWORD_ONLY and name not in _COMMON
+        }
         merged = dict(parse_qsl(query)) | {k: v for k, v in options.items() if v is not None}
         for name, value in merged.items():
             if name not in known:
@@ -103,33 +104,6 @@ class Address:
         query = "&".join(f"{name}={quote(str(value))}" for name, value in self.options.items())
         return f"{self.kind}://{self.interface or ''}" + (f"?{query}" if query else "")
 
-    def machine(
-        self,
-        robot: RobotSpec,
-        *,
-        clamp_operator: ClampOperator | None = None,
-        release: bool = False,
-        exclusive_s: float = 1.0,
-        fresh: Freshness | None = None,
-    ) -> Machine:
-        """Make the machine, not yet connected; arguments as of `NetworkLink`."""
-        return find_link(self.kind)(
-            robot,
-            interface=self.interface,
-            clamp_operator=clamp_operator,
-            release=release,
-            exclusive_s=exclusive_s,
-            fresh=fresh,
-            **self.options,
-        )
-
-
-def _options_of(link: Callable[..., Machine]) -> dict[str, Any]:
-    """A link's own keyword arguments and their types."""
-    function = link.__init__ if inspect.isclass(link) else link
-    hints = get_type_hints(function)
-    return {
-        name: hints.get(name, str | NoneType)
-        for name, parameter in inspect.signature(link).parameters.items()
-        if parameter.kind is parameter.KEYWORD_ONLY and name not in _COMMON
-    }
+    def machine(self, robot: RobotSpec, **common: Any) -> Machine:
+        """Make the machine, not yet connected; `common` are keyword arguments of `NetworkLink`."""
+        return find_link(self.kind)(robot, interface=self.interface, **common, **self.options)

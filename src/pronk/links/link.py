@@ -1,9 +1,8 @@
-"""What every link does: opening, states, the writer of commands, clamps and the end.
+"""Connecting, states, commands, clamps and closing, common to all links.
 
-Before anything is written, states are fresh and no other program commands. A command that is not
-followed by another before it expires is followed by damping, from a thread of its own: the program
-that commanded may be stuck, and a single message may be lost. A second writer stops the first.
-At the end the robot is damped until it is at rest.
+Before anything is written, states are fresh and no other program commands. A thread of its own
+writes damping when a command expires without another, for the commanding program may be stuck. A
+second writer stops the first. At the end the robot is damped until it is at rest.
 
 A robot whose state is one message and whose command is one message needs only a `Codec` and a
 `Transport`:
@@ -11,7 +10,7 @@ A robot whose state is one message and whose command is one message needs only a
     def my_link(robot, *, interface=None, speed: int = 115200, **common):
         return StreamLink(robot, MyCodec(robot), lambda: MyTransport(interface, speed), **common)
 
-named as an entry point of the group `pronk.links`, is reached at `my_link://ttyUSB0?speed=9600`.
+As an entry point of the group `pronk.links` it is reached at `my_link://ttyUSB0?speed=9600`.
 `pronk.testing.check_link` checks a codec and its transport.
 """
 
@@ -22,7 +21,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -33,19 +32,25 @@ from pronk.links.machine import Command, RefusedError, State, TorqueKind, dampin
 from pronk.robots.robot import RobotSpec
 
 ClampOperator = Callable[[tuple[str, ...]], None]
-"""A person at the bench: receives the joints to fix and returns when they are."""
+"""A person at the bench: receives the joints to fix and returns when they are fixed."""
 
-WINDOW_S = 0.2
+RESPONSE_S = 2.0
+"""Time for a robot's first state, or for its response to a request [s]."""
+_WINDOW_S = 0.2
 """How long states are watched before a robot is commanded [s]."""
-ANSWER_S = 2.0
-"""Time for a robot's first state, or for its reply to a request [s]."""
 _POLL_S = 0.002
 _DAMP_PERIOD_S = 0.01
 """Between two messages of damping [s]."""
-_DAMP_AT_LEAST_S, _DAMP_AT_MOST_S = 1.0, 3.0
+_LEAST_DAMP_S, _MOST_DAMP_S = 1.0, 3.0
 _AT_REST = 0.5
-"""Joint speed below which a robot that is being left counts as at rest [rad/s]."""
+"""Joint speed below which a damped robot counts as at rest [rad/s]."""
 _KEPT_STATES = 10_000
+_MEASURED = ("position", "velocity", "gyro", "accelerometer")
+"""Of a live sensor these never repeat to the last bit."""
+# A robot's count that went back by more than this belongs to a robot that was started again; one
+# that runs ahead of this computer's clock by more than this has jumped [s].
+_COUNT_BACK_S, _COUNT_AHEAD_S = 1.0, 0.5
+_LEAST_STEP_S = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,23 +62,7 @@ class Freshness:
     longest_gap_s: float = 0.02
 
 
-def check_rate(
-    robot: str, states: Sequence[State], rate_hz: float, fresh: Freshness | None = None
-) -> None:
-    """Raise HardwareError unless the states of `WINDOW_S` came often enough and without gaps."""
-    wanted = fresh or Freshness()
-    expected = rate_hz * WINDOW_S
-    gap = float(np.diff([state.time for state in states]).max()) if len(states) > 1 else np.inf
-    if len(states) < wanted.share * expected or gap > wanted.longest_gap_s:
-        raise HardwareError(
-            f"{robot} sent {len(states)} fresh states in {WINDOW_S * 1e3:.0f} ms with a longest "
-            f"gap of {gap * 1e3:.0f} ms, expected about {expected:.0f} with none above "
-            f"{wanted.longest_gap_s * 1e3:.0f} ms; check the network and that this computer is "
-            "not busy."
-        )
-
-
-def wait_for(done: Callable[[], bool], seconds: float = ANSWER_S) -> bool:
+def wait_for(done: Callable[[], bool], seconds: float = RESPONSE_S) -> bool:
     """Wait at most `seconds` until a condition holds; return whether it does."""
     end = time.monotonic() + seconds
     while not done():
@@ -86,12 +75,54 @@ def wait_for(done: Callable[[], bool], seconds: float = ANSWER_S) -> bool:
 def await_rest(latest: Callable[[], State | None]) -> None:
     """Wait 1 to 3 s until the newest state is at rest; no state counts as at rest."""
     begun = time.monotonic()
-    while (spent := time.monotonic() - begun) < _DAMP_AT_MOST_S:
+    while (spent := time.monotonic() - begun) < _MOST_DAMP_S:
         state = latest()
         speed = np.abs(state.velocity).max() if state is not None else 0.0
-        if spent >= _DAMP_AT_LEAST_S and speed < _AT_REST:
+        if spent >= _LEAST_DAMP_S and speed < _AT_REST:
             break
         time.sleep(_POLL_S)
+
+
+class StateNumbering:
+    """Numbers the states of a live robot by the robot's own count, where it has one.
+
+    These make no state and are counted: a robot's count that stood still or went back (`out of
+    order`), and measurements that repeat to the last bit (`repeated`). `clock jumps` are counted.
+    """
+
+    def __init__(
+        self, counts: Counter[str], rate_hz: float, *, per_state: int = 1, bits: int = 64
+    ) -> None:
+        """Start at 0. The robot's count of `bits` grows by `per_state` with each state."""
+        self.counts = counts
+        self._rate, self._per_state, self._wrap = rate_hz, per_state, 1 << bits
+        self._count: int | None = None
+        self._time = -math.inf
+        self._sequence = -1
+        self._measured = b""
+
+    def number(self, values: dict[str, Any], count: int | None, arrived: float) -> State | None:
+        """Make a state of the other fields; `arrived` [s]. Simultaneous states are 1 us apart."""
+        steps = 1
+        if count is not None and self._count is not None:
+            half = self._wrap // 2
+            ahead = ((count - self._count + half) % self._wrap - half) / self._per_state
+            if -_COUNT_BACK_S * self._rate < ahead <= 0.0:
+                self.counts["out of order"] += 1
+                return None
+            if ahead < 0.0 or ahead > self._rate * (arrived - self._time + _COUNT_AHEAD_S):
+                self.counts["clock jumps"] += 1
+            else:
+                steps = max(1, round(ahead))
+        self._count = count
+        self._time = arrived = max(arrived, self._time + _LEAST_STEP_S)
+        measured = b"".join(values[name].tobytes() for name in _MEASURED)
+        if measured == self._measured:
+            self.counts["repeated"] += 1
+            return None
+        self._measured = measured
+        self._sequence += steps
+        return State(time=arrived, sequence=self._sequence, **values)
 
 
 class CommandWriter:
@@ -109,13 +140,9 @@ class CommandWriter:
     ) -> None:
         """Start the thread that watches the expiry; nothing is written yet.
 
-        Args:
-            encode: Refuses what no drive could follow.
-            publish: Puts bytes on the wire; only called by one thread at a time.
-            joints: Of a command.
-            damping: Of the joints while they are damped [N m s/rad].
-            repeat_s: Time after which the command in force is written again; None for once.
-            counts: Gets `commands`, `repeats`, `expired` and `not written`.
+        `encode` refuses impossible commands, and `publish` is called by one thread at a time. The
+        command in force is written again after `repeat_s` [s]; `damping` [N m s/rad] follows the
+        expiry. `counts` gets `commands`, `repeats`, `expired` and `not written`.
         """
         self.counts: Counter[str] = Counter() if counts is None else counts
         self.wrote = False
@@ -130,11 +157,11 @@ class CommandWriter:
         self._thread.start()
 
     def send(self, command: Command) -> None:
-        """Put a command into force; one that has expired already becomes damping.
+        """Put a command into force; damping if it has already expired.
 
         Raises:
-            HardwareError: No drive could follow it, and it was not sent; or the wire does not take
-                it, and it is followed by damping when it expires.
+            HardwareError: It is impossible, and was not sent; or writing failed, and damping
+                follows when it expires.
         """
         data = self._encode(command)
         expires = command.made + command.valid_for
@@ -151,7 +178,7 @@ class CommandWriter:
             self.counts["commands"] += 1
 
     def damp(self) -> None:
-        """Write damping now, and go on until the next command. Never raises."""
+        """Write damping now and repeat it until the next command. Never raises."""
         with self._changed:
             self._force(self._damping, math.inf)
 
@@ -168,7 +195,7 @@ class CommandWriter:
             return ""
         self._data, self._expires = data, expires
         problem = self._write()
-        # The thread sleeps to the time that was next when it fell asleep.
+        # The thread sleeps until the time that was next when it began to sleep.
         if min(self._due, self._expires) < self._wake:
             self._changed.notify()
         return problem
@@ -180,7 +207,7 @@ class CommandWriter:
         try:
             self._publish(self._data)
         except Exception as error:
-            # Whatever it is: the thread that damps must outlive it, and try again.
+            # Of any kind: the thread that damps must survive it and try again.
             self.counts["not written"] += 1
             return str(error) or type(error).__name__
         return ""
@@ -203,10 +230,9 @@ class CommandWriter:
 
 
 class NetworkLink(ABC):
-    """A robot behind a network. Implements `Machine` but for the wire.
+    """A robot behind a network. Implements `Machine`; subclasses add the wire.
 
-    A thread receives, stamps and keeps states, so that a state's age is right however late the
-    caller is. `virtual` is known once connected: the virtual robot identifies itself on the wire.
+    A thread receives, timestamps and keeps states, so that their times do not depend on the caller.
     """
 
     wire: str
@@ -215,10 +241,8 @@ class NetworkLink(ABC):
     state_rate_hz: float
     _writer: CommandWriter | None = None
     """None while the link is closed."""
-    _command_topic: str = ""
-    """Where commands are written."""
-    _address: str = ""
-    """Where states are expected, in words."""
+    _command_topic = _address = ""
+    """Where commands are written and states are expected, in error messages."""
 
     def __init__(
         self,
@@ -231,20 +255,16 @@ class NetworkLink(ABC):
     ) -> None:
         """Describe the link; nothing is opened yet.
 
-        Args:
-            robot: Names, order and limits of the joints.
-            clamp_operator: Fixes joints on a real bench; None without one.
-            release: Switch off the robot's own controller first; a standing robot
-                falls then.
-            exclusive_s: How long the topic of commands must be silent before pronk writes [s].
-            fresh: How fresh states must be; None for what moving a robot takes.
+        `release` switches the robot's own controller off first (a standing robot falls then);
+        before pronk writes, no command of others may come for `exclusive_s` [s].
         """
         self.robot, self._robot = robot.name, robot
         self.virtual = False
+        """Known once connected, when the virtual robot identifies itself."""
         self.counts: Counter[str] = Counter()
-        """`states`, `commands`, `repeats`, `expired`, `foreign`, and why states were not made."""
+        """`states`, `commands`, `repeats`, `expired`, `foreign`, and why messages were dropped."""
         self._clamp_operator, self._release = clamp_operator, release
-        self._exclusive_s, self._fresh = exclusive_s, fresh
+        self._exclusive_s, self._fresh = exclusive_s, fresh or Freshness()
         self._latest: State | None = None
         self._states: deque[State] = deque(maxlen=_KEPT_STATES)
 
@@ -273,8 +293,8 @@ class NetworkLink(ABC):
 
     def latest(self) -> State:
         """The newest state, without waiting."""
-        if self._writer is None or self._latest is None:
-            raise self._not_open()
+        self._opened()
+        assert self._latest is not None
         return self._latest
 
     def wait(self, until: float) -> list[State]:
@@ -285,15 +305,10 @@ class NetworkLink(ABC):
         return [self._states.popleft() for _ in range(len(self._states))]
 
     def send(self, command: Command) -> None:
-        """Put a command into force, until the next or until it expires; refuse a second writer."""
-        if self._writer is None:
-            raise self._not_open()
-        if foreign := self.foreign_commands:
-            raise HardwareError(
-                f"another program commands the joints on {self._command_topic} "
-                f"({foreign} commands met); stop it, and connect again."
-            )
-        self._writer.send(command)
+        """Put a command into force until the next or its expiry; refuse where others command."""
+        writer = self._opened()
+        self.check_exclusive()
+        writer.send(command)
 
     def clamp(self, joints: tuple[str, ...]) -> None:
         """Have joints fixed: by the virtual robot itself, or by a person; () frees all."""
@@ -302,7 +317,7 @@ class NetworkLink(ABC):
         if self.virtual and self._writer is not None:
             if not self._hold(joints):
                 raise HardwareError(
-                    f"the virtual robot did not confirm its clamps within {ANSWER_S:g} s; check "
+                    f"the virtual robot did not confirm its clamps within {RESPONSE_S:g} s; check "
                     "that `pronk simulate` still runs."
                 )
         elif self._clamp_operator is not None:
@@ -314,7 +329,7 @@ class NetworkLink(ABC):
             )
 
     def damp(self) -> None:
-        """Write damping now and go on until a command or the end. Never raises."""
+        """Write damping now and repeat it until the next command. Never raises."""
         if self._writer is not None:
             self._writer.damp()
 
@@ -333,49 +348,62 @@ class NetworkLink(ABC):
         self._writer = None
 
     def fresh_states(self, rate_hz: float, *, until: float) -> list[State]:
-        """Watch one window of states after another; return the first that passes `check_rate`.
+        """Watch windows of states until one is as fresh as required, and return that.
 
-        Windows that end before `until` [s] may fail; a later one that fails raises HardwareError.
+        Raises:
+            HardwareError: A window that ended after `until` [s] was not.
         """
+        expected, fresh = rate_hz * _WINDOW_S, self._fresh
         while True:
-            self.wait(0.0)  # those of before
-            states = self.wait(time.monotonic() + WINDOW_S)
-            try:
-                check_rate(self.robot, states, rate_hz, self._fresh)
-            except HardwareError:
-                # A busy computer may miss a window; a robot that is too slow misses them all.
-                if time.monotonic() > until:
-                    raise
-            else:
+            self.wait(0.0)  # drops earlier states
+            states = self.wait(time.monotonic() + _WINDOW_S)
+            gap = float(np.diff([s.time for s in states]).max()) if len(states) > 1 else np.inf
+            if len(states) >= fresh.share * expected and gap <= fresh.longest_gap_s:
                 return states
+            # A busy computer may miss a window; a robot that is too slow misses all.
+            if time.monotonic() > until:
+                raise HardwareError(
+                    f"{self.robot} sent {len(states)} fresh states in {_WINDOW_S * 1e3:.0f} ms "
+                    f"with a longest gap of {gap * 1e3:.0f} ms, expected about {expected:.0f} with "
+                    f"none above {fresh.longest_gap_s * 1e3:.0f} ms; check the network and that "
+                    "this computer is not busy."
+                )
 
-    def check_exclusive(self, since: float) -> None:
-        """Raise HardwareError if another program commanded within `exclusive_s` of `since` [s]."""
-        time.sleep(max(0.0, since + self._exclusive_s - time.monotonic()))
+    def check_exclusive(self) -> None:
+        """Raise HardwareError if another program has commanded since the link was opened."""
         if foreign := self.foreign_commands:
             raise HardwareError(
                 f"another program commands the joints: {foreign} commands on "
-                f"{self._command_topic} within {self._exclusive_s:g} s; stop that program, or "
-                "release the robot's own controller."
+                f"{self._command_topic}; stop that program, or release the robot's own controller, "
+                "and connect again."
             )
 
     @property
     def foreign_commands(self) -> int:
-        """Commands of others met since the link was opened."""
+        """Commands of others since the link was opened."""
         return self.counts["foreign"]
+
+    def _opened(self) -> CommandWriter:
+        if self._writer is None:
+            raise HardwareError(
+                f"the {self.wire} link to {self.robot} is not open; call connect() first."
+            )
+        return self._writer
 
     def _preflight(self) -> None:
         begun = time.monotonic()
         if not wait_for(lambda: self._latest is not None):
             why = f"; what came was refused: {self._last_error}" if self._last_error else ""
             raise HardwareError(
-                f"{self.robot} sent no state on {self._address} within {ANSWER_S:g} s{why}; check "
-                "that its program or the virtual robot runs, the link's options and the network."
+                f"{self.robot} sent no state on {self._address} within {RESPONSE_S:g} s{why}; "
+                "check that its program or the virtual robot runs, the link's options and the "
+                "network."
             )
         self._prepare()
         self.counts["foreign"], silent_from = 0, time.monotonic()
-        self.fresh_states(self.state_rate_hz, until=begun + 2.0 * ANSWER_S)
-        self.check_exclusive(silent_from)
+        self.fresh_states(self.state_rate_hz, until=begun + 2.0 * RESPONSE_S)
+        time.sleep(max(0.0, silent_from + self._exclusive_s - time.monotonic()))
+        self.check_exclusive()
         self._confirm()
         self.wait(0.0)
 
@@ -384,7 +412,7 @@ class NetworkLink(ABC):
             self._receive()
 
     def _take(self, decode: Callable[..., State | None], *given: Any) -> None:
-        """Keep what `decode(*given)` makes of a message; count what it refuses."""
+        """Keep the state that `decode(*given)` returns, if any; count a refused message."""
         try:
             state = decode(*given)
         except RefusedError as error:
@@ -396,11 +424,6 @@ class NetworkLink(ABC):
             self._states.append(state)
             self.counts["states"] += 1
 
-    def _not_open(self) -> HardwareError:
-        return HardwareError(
-            f"the {self.wire} link to {self.robot} is not open; call connect() first."
-        )
-
     # --- the wire -------------------------------------------------------------------------------
 
     @abstractmethod
@@ -409,7 +432,7 @@ class NetworkLink(ABC):
 
     @abstractmethod
     def _receive(self) -> None:
-        """Wait a moment for messages and `_take` them; called by the reading thread."""
+        """Wait at most 50 ms for messages and `_take` them; called by the reading thread."""
 
     @abstractmethod
     def _shut(self) -> None:
@@ -419,7 +442,7 @@ class NetworkLink(ABC):
         """Release the robot's own controller, after the first state and before all checks."""
 
     def _confirm(self) -> None:  # noqa: B027
-        """Check what remains when states are fresh, and identify the virtual robot."""
+        """Identify the virtual robot, after all other checks."""
 
     def _hold(self, joints: tuple[str, ...]) -> bool:
         """Make the virtual robot fix joints; return whether it confirmed."""
@@ -427,7 +450,7 @@ class NetworkLink(ABC):
 
 
 class Codec(Protocol):
-    """Bytes to states and commands to bytes, without a socket."""
+    """Decodes states and encodes commands, without a socket."""
 
     name: str
     """Of the wire, in error messages."""
@@ -435,14 +458,14 @@ class Codec(Protocol):
     torque_kind: TorqueKind
 
     def encode(self, command: Command) -> bytes:
-        """Encode a command; HardwareError where no drive could follow it (`check_command`)."""
+        """Encode a command; HardwareError for an impossible one (`check_command`)."""
 
     def decode(self, data: bytes) -> State:
-        """Decode a state, whose time and sequence the link replaces; RefusedError for no state."""
+        """Decode a state, whose time and sequence the link replaces; RefusedError if it is none."""
 
 
 class Transport(Protocol):
-    """Moves bytes. Opened by whatever makes it."""
+    """Moves bytes; open from the beginning."""
 
     local: bool
     """True where nothing can leave this computer; required without an interface."""
@@ -454,7 +477,7 @@ class Transport(Protocol):
         """Send a command."""
 
     def foreign_commands(self) -> int:
-        """Commands of other programs met since it was opened; 0 where the wire has one writer."""
+        """Commands of other programs since it was opened; 0 where the wire has one writer."""
 
     def close(self) -> None:
         """Close."""
@@ -472,9 +495,9 @@ class StreamLink(NetworkLink):
         repeat_s: float | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link; `transport` opens the wire, `repeat_s` is as of `CommandWriter`.
+        """Describe the link; `transport` opens the wire.
 
-        What else links take (`common`) is as of `NetworkLink`.
+        `repeat_s` is as of `CommandWriter`, `common` as of `NetworkLink`.
         """
         super().__init__(robot, **common)
         self.torque_kind, self.state_rate_hz = codec.torque_kind, codec.state_rate_hz
@@ -483,7 +506,7 @@ class StreamLink(NetworkLink):
 
     @property
     def foreign_commands(self) -> int:
-        """Commands of others met since the link was opened."""
+        """Commands of others since the link was opened."""
         return self._transport.foreign_commands()
 
     def _open(self) -> CommandWriter:

@@ -1,6 +1,5 @@
 """The interface to a machine, real or virtual.
 
-The servo side runs at the machine's own rate; pronk sends position commands and reads states.
 Times are the machine's own monotonic clock in seconds. Joints are in file order.
 """
 
@@ -20,7 +19,7 @@ TorqueKind = Literal["measured", "computed", "absent"]
 
 
 class RefusedError(HardwareError):
-    """A message that is not what it must be; `reason` is a label to count it under."""
+    """A message that cannot be used; `reason` is the label under which it is counted."""
 
     def __init__(self, reason: str, sentence: str) -> None:
         super().__init__(sentence)
@@ -29,18 +28,18 @@ class RefusedError(HardwareError):
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What the machine measured at one instant."""
+    """Measurement of all sensors at one instant. Arrays of joints have shape (joints,)."""
 
     time: float
     """Measured timestamp [s]."""
     sequence: int
     """Counts states from 0; a jump means states were lost."""
     position: Array
-    """Joint positions [rad], shape (joints,)."""
+    """[rad]"""
     velocity: Array
-    """Joint velocities [rad/s], shape (joints,)."""
+    """[rad/s]"""
     torque: Array
-    """Joint torques as the drive reports them [N m], shape (joints,)."""
+    """As the drives report it [N m]."""
     gyro: Array
     """Angular velocity of the trunk in its own frame [rad/s], shape (3,)."""
     accelerometer: Array
@@ -48,45 +47,42 @@ class State:
     bus_voltage: float
     """[V]"""
     orientation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-    """Trunk to world by the machine's own attitude filter, unit quaternion w, x, y, z, shape (4,).
-    Its yaw starts anywhere."""
+    """Trunk to world by the machine's own attitude filter, unit quaternion w, x, y, z. Its yaw has
+    an arbitrary zero."""
     robot_time: float | None = None
-    """The robot's own stamp [s], where the wire carries one."""
+    """The robot's own timestamp [s]; None where the wire carries none."""
     temperature: Array | None = None
-    """Of the motors [deg C], shape (joints,), where the wire carries it."""
+    """Of the motors [deg C]; None where the wire carries none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """Targets of the drives until the next command or until it expires."""
+    """Targets of the drives until the next command or until it expires; arrays (joints,)."""
 
     position: Array
-    """Target positions [rad], shape (joints,)."""
+    """[rad]"""
     stiffness: Array
-    """[N m/rad], shape (joints,)."""
+    """[N m/rad]"""
     damping: Array
-    """[N m s/rad], shape (joints,); the target velocity is zero (reading A9)."""
+    """[N m s/rad]; the target velocity is zero (reading A9)."""
     sequence: int = 0
-    """Counts commands; a link that puts a number on the wire uses this one."""
+    """Counts commands; the number on the wire, where there is one."""
     state_sequence: int = -1
-    """`State.sequence` that it was computed from; -1 for none."""
+    """`State.sequence` of the state it was computed from; -1 for none."""
     made: float = 0.0
-    """When it was decided, on the machine's clock [s]."""
+    """When it was computed, on the machine's clock [s]."""
     valid_for: float = math.inf
-    """Time after `made` at which the writer damps instead of repeating it [s]."""
+    """Time after `made` at which it expires and damping follows [s]."""
 
 
 def damping_command(joints: int, damping: float = 1.0) -> Command:
-    """Make a command without stiffness; with 1 N m s/rad a Mini Cheetah sinks in about a second."""
+    """Make a command without stiffness. At 1 N m s/rad a Mini Cheetah sinks in about 1 s."""
     zeros = np.zeros(joints)
     return Command(position=zeros, stiffness=zeros, damping=zeros + damping)
 
 
 def check_command(command: Command, joints: int) -> None:
-    """Raise HardwareError for a wrong shape, NaN, infinity, a negative gain or an impossible time.
-
-    A link's `encode` calls it first.
-    """
+    """Raise HardwareError for a wrong shape, NaN, infinity, negative gain or impossible time."""
     for name in ("position", "stiffness", "damping"):
         values = np.asarray(getattr(command, name))
         if values.shape != (joints,) or not np.isfinite(values).all():
@@ -107,22 +103,21 @@ class Machine(Protocol):
     """A robot that takes commands and reports states. Every link implements this."""
 
     robot: str
-    """Name of the robot."""
     virtual: bool
     torque_kind: TorqueKind
-    """Whether `State.torque` was measured, computed from the command, or is absent (zeros)."""
+    """`State.torque` is measured, computed from the command, or absent (zeros)."""
 
     def now(self) -> float:
         """The machine's clock [s]."""
 
     def connect(self) -> None:
-        """Open the link; raise HardwareError unless the machine is fit to move."""
+        """Open the link; raise HardwareError unless the machine is ready to move."""
 
     def latest(self) -> State:
         """The newest state, without waiting."""
 
     def wait(self, until: float) -> list[State]:
-        """Let time pass to `until` on the machine's clock; return the states met."""
+        """Let time pass to `until` [s] on its clock; return the states since the last call."""
 
     def send(self, command: Command) -> None:
         """Put a command into force."""
@@ -131,7 +126,7 @@ class Machine(Protocol):
         """Fix joints mechanically where they are; () frees all. HardwareError if impossible."""
 
     def damp(self) -> None:
-        """Let the joints sink softly: no stiffness, some damping."""
+        """Damp the joints without stiffness."""
 
     def close(self) -> None:
         """Damp and close the link."""

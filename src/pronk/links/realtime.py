@@ -2,10 +2,10 @@ r"""Real-time settings, pacing by absolute deadlines, and signals of a terminal.
 
 A real-time setting that is not granted is reported, and the loop runs without it.
 
-Ctrl-C, Ctrl-\, Ctrl-Z and the end of the terminal, a lost ssh connection, go to every process of
-the program in front of it. A process that moves a robot must damp the joints before it ends, so it
-receives none of them: `unheard` while it starts, `leave` when it runs. The program that started it
-receives them, and ends it in order: `Interrupts`.
+Ctrl-C, Ctrl-\, Ctrl-Z and the end of the terminal, as of an ssh connection, go to every process of
+the foreground program. A process that moves a robot must damp the joints before it ends, so it
+receives none of them: `terminal_blocked` while it starts, `leave` when it runs. The program that
+started it receives them, and ends it in order: `Interrupts`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import numpy as np
 _LOCK_NOW_AND_LATER = 3
 """MCL_CURRENT | MCL_FUTURE of mlockall(2)."""
 _LEAST_CORES = 4
-"""Fewest cores of which one can be given away."""
+"""Fewest cores of which one can be reserved."""
 
 TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP)
 r"""Signals of a terminal: Ctrl-C, Ctrl-\, Ctrl-Z, and its end."""
@@ -39,18 +39,18 @@ ENDING = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """Settings requested by a process."""
+    """Settings that a process requests."""
 
     priority: int | None = None
     """Of SCHED_FIFO, 1 to 99; None for ordinary scheduling."""
     core: int | None = None
-    """To run on and nowhere else, counted from the last one; None for any."""
+    """The only one to run on, counted from the last; None for any."""
     lock: bool = True
     """Keep its memory from being paged out."""
 
 
 def enter(wanted: Wanted) -> tuple[str, ...]:
-    """Request settings for this process; return one line for each reply.
+    """Request settings for this process; return one line for each.
 
     Garbage collection stops for good: a collection in a loop takes milliseconds.
     """
@@ -68,7 +68,7 @@ def enter(wanted: Wanted) -> tuple[str, ...]:
 
 
 def _granted(request: Callable[..., str], *values: int) -> str:
-    """The request, or why it was refused."""
+    """What a request set, or why it was refused."""
     try:
         return request(*values)
     except (AttributeError, TypeError):
@@ -88,7 +88,7 @@ def _schedule(priority: int) -> str:
 def _pin(core: int) -> str:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < _LEAST_CORES:
-        return f"{len(cores)} cores are too few to give one away"
+        return f"{len(cores)} cores are too few to reserve one"
     mine = cores[-1 - core % len(cores)]
     os.sched_setaffinity(0, {mine})
     return f"number {mine}"
@@ -102,23 +102,21 @@ def _lock() -> str:
 
 
 def sleep_until(deadline: float) -> None:
-    """Sleep to a time of CLOCK_MONOTONIC [s]; at once if it has passed."""
-    left = deadline - time.monotonic()
-    if left > 0.0:
-        time.sleep(left)
+    """Sleep to a time of CLOCK_MONOTONIC [s]; return at once if it has passed."""
+    time.sleep(max(0.0, deadline - time.monotonic()))
 
 
 class Pace:
-    """Ticks at absolute deadlines; lateness never adds up, missed ticks are only counted."""
+    """Ticks at absolute deadlines: lateness does not accumulate, missed ticks are counted."""
 
     def __init__(self, rate_hz: float, start: float | None = None) -> None:
-        """Begin with tick 0 due at `start` on CLOCK_MONOTONIC [s], now if left out."""
+        """Begin with tick 0 due at `start` on CLOCK_MONOTONIC [s], by default now."""
         self.rate_hz = rate_hz
         self.start = time.monotonic() if start is None else start
         self.tick = 0
         """Number of the next tick."""
         self.missed = 0
-        """Ticks left out because they had passed."""
+        """Ticks that had passed before they could be run."""
 
     @property
     def deadline(self) -> float:
@@ -126,7 +124,7 @@ class Pace:
         return self.start + self.tick / self.rate_hz
 
     def advance(self, now: float) -> None:
-        """The tick is done; go to the next one that has not passed."""
+        """Go to the next tick that has not passed."""
         following = max(self.tick + 1, math.ceil((now - self.start) * self.rate_hz))
         self.missed += following - self.tick - 1
         self.tick = following
@@ -137,7 +135,7 @@ _LOWEST = 1e-7
 
 
 class Histogram:
-    """How long something took, in bins of 4.7 % width from 0.1 us to 10 s."""
+    """Durations in bins of 4.7 % width from 0.1 us to 10 s."""
 
     def __init__(self) -> None:
         self.counts = np.zeros(8 * _PER_DECADE + 1, dtype=np.int64)
@@ -146,14 +144,14 @@ class Histogram:
         """[s]"""
 
     def add(self, seconds: float) -> None:
-        """Count one."""
+        """Count a duration."""
         place = math.log10(max(seconds, _LOWEST) / _LOWEST) * _PER_DECADE
         self.counts[min(int(place), len(self.counts) - 1)] += 1
         self.count += 1
         self.largest = max(self.largest, seconds)
 
     def quantile(self, share: float) -> float:
-        """Upper edge of the bin in which the given share of all lies [s]; NaN without any."""
+        """Upper edge of the bin that holds a quantile [s]; NaN without any duration."""
         if not self.count:
             return math.nan
         rank = max(1, math.ceil(share * self.count - 1e-9))
@@ -161,15 +159,15 @@ class Histogram:
         return min(_LOWEST * math.pow(10.0, (i + 1) / _PER_DECADE), self.largest)
 
     def figures(self) -> dict[str, float | int]:
-        """The usual quantiles [ms], the largest and the count."""
+        """Count, quantiles and maximum [ms]."""
         shares = {"p50_ms": 0.5, "p95_ms": 0.95, "p99_ms": 0.99, "p99_9_ms": 0.999}
         quantiles = {name: 1e3 * self.quantile(share) for name, share in shares.items()}
         return {"n": self.count, **quantiles, "max_ms": 1e3 * self.largest}
 
 
 @contextmanager
-def unheard() -> Iterator[None]:
-    """Start processes that ignore the terminal; signals that come meanwhile wait."""
+def terminal_blocked() -> Iterator[None]:
+    """Block the signals of the terminal, also in processes started meanwhile; pending ones wait."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL)
     try:
         yield
@@ -178,24 +176,19 @@ def unheard() -> Iterator[None]:
 
 
 def leave() -> None:
-    """Take this process out of the terminal's session and ignore its signals.
-
-    Raises:
-        PermissionError: It leads a group of processes, as a program started by a shell does.
-    """
+    """Leave the terminal's session and ignore its signals; PermissionError for a group leader."""
     os.setsid()
     for number in TERMINAL:
         signal.signal(number, signal.SIG_IGN)
 
 
 class Interrupts:
-    """Records signals that end the program, without breaking into it; `check` raises them.
+    """Context that records signals that end the program; `check` raises them.
 
-    A context manager. Outside the main thread, where Python receives no signals, it records none.
+    Outside the main thread, where Python receives no signals, it records none.
     """
 
     def __init__(self) -> None:
-        """Record nothing yet."""
         self._received = False
         self._before: dict[signal.Signals, Any] = {}
 
@@ -211,7 +204,7 @@ class Interrupts:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restore the handlers of before; twice does no harm."""
+        """Restore the earlier handlers, the first time."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before.clear()

@@ -18,7 +18,7 @@ import orjson
 from pronk import __version__
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.links.link import ClampOperator
-from pronk.links.realtime import Interrupts, unheard
+from pronk.links.realtime import Interrupts, terminal_blocked
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared, fill
@@ -128,7 +128,7 @@ class Deployment:
             HardwareError: The link could not be opened.
         """
         plan, context = self.plan, get_context("spawn")
-        with unheard():
+        with terminal_blocked():
             self.shared = Shared()
         name = self.shared.name
         self.write(OperatorCommand())
@@ -148,14 +148,14 @@ class Deployment:
         self._interrupts.__enter__()
         self._open = True
         try:
-            with unheard():
+            with terminal_blocked():
                 for started in (self.policy, self.logger):
                     if started is not None:
                         started.start()
             if self.logger is not None:
                 self._await_logger(self.logger)
             # Last, so that its first tick is logged.
-            with unheard():
+            with terminal_blocked():
                 self.servo.start()
             for end in (servo_end, policy_end):
                 end.close()

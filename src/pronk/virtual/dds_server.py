@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pronk.errors import HardwareError
-from pronk.links.dds import messages
+from pronk.links.dds import codec
 from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
 from pronk.links.dds.link import (
     BAD_PARAMETER,
@@ -48,8 +48,8 @@ class Server:
         self, participant: Participant, service: str, handler: Handler, counts: Counter[str]
     ) -> None:
         """Begin to listen; refused requests are counted in `counts`."""
-        self._requests = participant.reader(f"rt/api/{service}/request", messages.Request)
-        self._responses = participant.writer(f"rt/api/{service}/response", messages.Response)
+        self._requests = participant.reader(f"rt/api/{service}/request", codec.Request)
+        self._responses = participant.writer(f"rt/api/{service}/response", codec.Response)
         self._handler = handler
         self._counts = counts
 
@@ -65,10 +65,10 @@ class Server:
                 code, data = self._handler(identity.api_id, parameter)
             if code != DONE:
                 self._counts["refused: request"] += 1
-            status = messages.ResponseStatus(code=code)
-            header = messages.ResponseHeader(identity=identity, status=status)
+            status = codec.ResponseStatus(code=code)
+            header = codec.ResponseHeader(identity=identity, status=status)
             text = "" if data is None else json.dumps(data)
-            self._responses.write(messages.Response(header=header, data=text, binary=[]))
+            self._responses.write(codec.Response(header=header, data=text, binary=[]))
 
 
 class DdsServerTransport(ServerTransport):
@@ -76,7 +76,7 @@ class DdsServerTransport(ServerTransport):
 
     def __init__(self, robot: RobotSpec, network: DdsNetwork, *, mode: str = "") -> None:
         """Join a domain on loopback, with the controller that holds the joints at first."""
-        if not network.loopback:
+        if network.interface is not None:
             raise HardwareError(
                 f"a virtual robot does not go to {network}, where real ones listen; leave the "
                 "interface out."
@@ -84,14 +84,14 @@ class DdsServerTransport(ServerTransport):
         super().__init__(robot, mode, MODES)
         self._joints = joint_map(robot)
         own = Participant(network)
-        self._commands = own.reader(COMMANDS, messages.LowCmd, raw=True)
-        self._states = own.writer(STATES, messages.LowState, raw=True)
+        self._commands = own.reader(COMMANDS, codec.LowCmd)
+        self._states = own.writer(STATES, codec.LowState)
         self._servers = [
             Server(own, SWITCHER, self._switch, self.counts),
             Server(own, BENCH, self._bench, self.counts),
         ]
         # Another writer is another participant.
-        self._other = Participant(network).writer(COMMANDS, messages.LowCmd, raw=True)
+        self._other = Participant(network).writer(COMMANDS, codec.LowCmd)
         self._polls = 0
 
     def poll(self) -> list[Command]:

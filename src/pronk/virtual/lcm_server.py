@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from pronk.links.lcm.codec import (
     BEACON_CHANNEL,
-    BENCH_CHANNEL,
+    CONTROL_PARAMETER,
     MODES,
-    REQUEST_CHANNEL,
     RESPONSE_CHANNEL,
+    VIRTUAL_ROBOT,
     Layout,
     clamp_message,
     decode_command,
@@ -43,7 +43,7 @@ class LcmServerTransport(ServerTransport):
         self._other = open_lcm(url)
         self._arrived: list[Command] = []
         self._bench_request, self._requested = 0, False
-        for channel in (layout.command_channel, REQUEST_CHANNEL, BENCH_CHANNEL):
+        for channel in (layout.command.channel, CONTROL_PARAMETER.channel, VIRTUAL_ROBOT.channel):
             self._lcm.subscribe(channel, self.receive).set_queue_capacity(_QUEUE)
 
     def poll(self) -> list[Command]:
@@ -57,14 +57,14 @@ class LcmServerTransport(ServerTransport):
     def receive(self, channel: str, data: bytes) -> None:
         """Take one message, whatever it is. Never raises."""
         try:
-            if channel == self._layout.command_channel:
+            if channel == self._layout.command.channel:
                 self._arrived.append(decode_command(self._layout, self.corrupt_in(data)))
                 self.counts["commands"] += 1
-            elif channel == REQUEST_CHANNEL:
+            elif channel == CONTROL_PARAMETER.channel:
                 self.mode = read_mode_request(data)
                 self.counts["mode switches"] += 1
                 self._lcm.publish(RESPONSE_CHANNEL, data)
-            elif channel == BENCH_CHANNEL:
+            elif channel == VIRTUAL_ROBOT.channel:
                 self._bench_request, self.clamps = read_clamp_message(self._names, data)
                 self._requested = True
         except RefusedError as error:
@@ -72,8 +72,9 @@ class LcmServerTransport(ServerTransport):
 
     def publish(self, state: State) -> None:
         """Put a state on the wire, and at 10 Hz the beacon of the virtual robot."""
-        for channel, data in encode_state(self._layout, state):
-            self._lcm.publish(channel, self.corrupt_out(data))
+        messages = (self._layout.attitude, self._layout.joints)
+        for message, data in zip(messages, encode_state(self._layout, state), strict=True):
+            self._lcm.publish(message.channel, self.corrupt_out(data))
         if self._requested or self.counts["states"] % _BEACON_STATES == 0:
             self._requested = False
             beacon = clamp_message(self._names, self.clamps, self._bench_request)
@@ -82,7 +83,7 @@ class LcmServerTransport(ServerTransport):
 
     def contend(self, command: Command) -> None:
         """Command the joints as another program would."""
-        self._other.publish(self._layout.command_channel, encode_command(self._layout, command))
+        self._other.publish(self._layout.command.channel, encode_command(self._layout, command))
 
     def close(self) -> None:
         """Leave the wire."""

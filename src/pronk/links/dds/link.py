@@ -1,44 +1,36 @@
 """A robot behind Unitree's DDS messages: a Go2, or the virtual robot.
 
-A Go2 listens on domain 0. Nothing reaches a real network, or domain 0, without an interface that
-the user named. The command in force is repeated, because Unitree's drives are written to all the
-time and it is not published what they do when that stops.
+A Go2 reads domain 0. Nothing reaches a real network, or domain 0, without an interface that the
+user named. The command in force is repeated, because Unitree's drives are written to all the time
+and it is not published what they do when that stops.
 
 Unitree's services are a request and its response on two topics, in JSON. A request carries an id of
 its own and the number of a function (`api_id`); the response carries both again, and a code, 0 for
-done. `motion_switcher` (1001 CheckMode, 1003 ReleaseMode) reports which of the robot's own
-controllers holds the joints, and releases it. Older firmware has `robot_state` (1001 ServiceSwitch)
-instead.
+done. `motion_switcher` reports which of the robot's own controllers holds the joints, and releases
+it. Older firmware has `robot_state` instead.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from cyclonedds.core import (
-    DDSException,
-    InstanceState,
-    Policy,
-    Qos,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
+from cyclonedds import core
+from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from pronk.errors import HardwareError
-from pronk.links.dds import messages
+from pronk.links.dds import codec
 from pronk.links.dds.codec import STATE_RATE_HZ, StateDecoder, encode_command, joint_map
-from pronk.links.link import ANSWER_S, CommandWriter, NetworkLink
+from pronk.links.link import RESPONSE_S, CommandWriter, NetworkLink
 from pronk.robots.robot import RobotSpec
 
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
@@ -47,8 +39,8 @@ LOOPBACK_DOMAIN = 77
 """pronk's own; Unitree's robots use 0, unitree_mujoco 1."""
 ROBOT_DOMAIN = 0
 _MOST_DOMAIN = 232  # the ports of higher ones would exceed 65535
-_QUEUE = 64  # messages kept between two looks; at 500 Hz an eighth of a second
-_WRITE_NS = 1_000_000  # longest time that a reader who does not keep up may hold a writer up
+_QUEUE = 64  # messages kept between two reads; at 500 Hz an eighth of a second
+_WRITE_NS = 1_000_000  # longest time that a slow reader may hold a writer up
 
 _NAMED = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface name={}/></Interfaces></General></Domain></CycloneDDS>"""
@@ -61,16 +53,14 @@ _LOCAL = """<CycloneDDS><Domain Id="any"><General>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 
 _domains: dict[int, tuple[DdsNetwork, Any]] = {}
-"""Domains that this process has opened; the library holds one set-up for each."""
+"""Domains that this process has opened; the library holds one configuration for each."""
 
 SWITCHER, CHECK_MODE, SELECT_MODE, RELEASE_MODE = "motion_switcher", 1001, 1002, 1003
 OLDER, SERVICE_SWITCH = "robot_state", 1001
 BENCH, CLAMP = "pronk_bench", 1
 """Of the virtual robot alone: requests for clamps."""
-
 DONE, UNKNOWN_API, BAD_PARAMETER = 0, 3203, 3204
-"""Codes of a response; the errors are unitree_sdk2's for an unknown function and for an impossible
-parameter."""
+"""Codes of a response, the errors as in unitree_sdk2."""
 
 _POLL_S = 0.002
 _RELEASE_TRIES, _RELEASE_PAUSE_S = 10, 0.2
@@ -84,7 +74,7 @@ _REPEAT_S = 0.004
 
 @dataclass(frozen=True, kw_only=True)
 class DdsNetwork:
-    """Which domain on which interface."""
+    """A domain on an interface."""
 
     interface: str | None = None
     """Network interface by name, for instance `eth0`; None for loopback only."""
@@ -99,49 +89,39 @@ class DdsNetwork:
             raise HardwareError(f"DDS domain {self.domain}; expected 0 to {_MOST_DOMAIN}.")
         elif self.interface is None and self.domain == ROBOT_DOMAIN:
             raise HardwareError(
-                "DDS domain 0 is where real robots listen; name the network interface to the robot "
-                f"as well (for instance eth0), or take another domain, such as {LOOPBACK_DOMAIN}."
+                "DDS domain 0 is the real robots'; name the network interface to the robot as well "
+                f"(for instance eth0), or take another domain, such as {LOOPBACK_DOMAIN}."
             )
-
-    @property
-    def loopback(self) -> bool:
-        """True where nothing can leave this computer."""
-        return self.interface is None
 
     def __str__(self) -> str:
         return f"DDS domain {self.domain} on {self.interface or 'loopback'}"
 
-    @property
-    def configuration(self) -> str:
-        """The set-up as Cyclone DDS reads it."""
-        if self.interface is not None:
-            return _NAMED.format(quoteattr(self.interface))
-        return _LOCAL
 
-
-@dataclass
 class Message:
-    """A sample that stays bytes: header and payload."""
+    """A sample that stays bytes, header and payload."""
 
-    data: bytes
-    sample_info: Any = field(default=None, repr=False)
+    def __init__(self, data: bytes) -> None:
+        self.data = data
 
     def serialize(self, **_: Any) -> bytes:
-        """What goes on the wire."""
+        """The bytes for the wire."""
         return self.data
 
     @classmethod
     def deserialize(cls, data: bytes) -> Message:
-        """What came from the wire."""
+        """A sample of the bytes from the wire."""
         return cls(data)
 
 
 class Participant:
-    """One member of a domain, with readers and writers of its own."""
+    """One member of a domain, with readers and writers of its own.
+
+    Samples of `LowCmd` and `LowState` stay bytes (`Message`).
+    """
 
     def __init__(self, network: DdsNetwork) -> None:
-        """Join; refuse a missing interface, and a domain that this process uses elsewhere."""
-        domain = network.domain
+        """Join; HardwareError for a missing interface, or a domain in use with another."""
+        domain, interface = network.domain, network.interface
         assert domain is not None
         known = _domains.get(domain)
         if known is not None and known[0] != network:
@@ -150,7 +130,8 @@ class Participant:
             )
         try:
             if known is None:
-                _domains[domain] = (network, Domain(domain, network.configuration))
+                configuration = _NAMED.format(quoteattr(interface)) if interface else _LOCAL
+                _domains[domain] = (network, Domain(domain, configuration))
             self.entity = DomainParticipant(domain)
         except DDSException as error:
             _domains.pop(domain, None)
@@ -159,45 +140,37 @@ class Participant:
                 "has it an address? (`ip addr` lists them)"
             ) from None
 
-    def reader(self, topic: str, message: Any, *, raw: bool = False, own: bool = True) -> Any:
-        """Make a reader of an IDL type; `raw` samples stay bytes, `own` are of this participant."""
+    def reader(self, topic: str, message: Any, *, own: bool = True) -> Any:
+        """Make a reader of an IDL type; `own` samples are of this participant."""
         policies = [Policy.History.KeepLast(_QUEUE)]
         if not own:
             policies.append(Policy.IgnoreLocal.Participant)
-        return DataReader(self.entity, self._topic(topic, message, raw), Qos(*policies))
+        return DataReader(self.entity, self._topic(topic, message), Qos(*policies))
 
-    def writer(self, topic: str, message: Any, *, raw: bool = False) -> Any:
-        """Make a writer, arguments as for `reader`. Fits every reader, and waits for none."""
+    def writer(self, topic: str, message: Any) -> Any:
+        """Make a writer, which fits every reader and waits for none."""
         waits = Policy.Reliability.Reliable(_WRITE_NS)
-        return DataWriter(self.entity, self._topic(topic, message, raw), Qos(waits))
+        return DataWriter(self.entity, self._topic(topic, message), Qos(waits))
 
-    def _topic(self, name: str, message: Any, raw: bool) -> Any:
+    def _topic(self, name: str, message: Any) -> Any:
         topic = Topic(self.entity, name, message)
-        if raw:  # the type's name and description stay, only Python sees bytes
-            topic.data_type = Message
+        if message in (codec.LowCmd, codec.LowState):
+            topic.data_type = Message  # only for Python; the type's name and description stay
         return topic
-
-    def wake_on(self, *readers: Any) -> Any:
-        """Something whose `wait(nanoseconds)` ends when one of the readers has something."""
-        waiting = WaitSet(self.entity)
-        for reader in readers:
-            anything = SampleState.Any | ViewState.Any | InstanceState.Any
-            waiting.attach(ReadCondition(reader, anything))
-        return waiting
 
 
 def take(reader: Any, counts: Counter[str]) -> list[Any]:
-    """The samples that have come, oldest first; what cannot be read is counted and dropped."""
+    """The samples that have come, oldest first; bytes that cannot be read are counted."""
     try:
-        met = reader.take(_QUEUE)
-    except Exception:  # the library's decoder, of bytes that are no such message
+        samples = reader.take(_QUEUE)
+    except Exception:  # by the library's decoder
         counts["refused: unreadable"] += 1
         return []
-    return [sample for sample in met if sample.sample_info.valid_data]
+    return [sample for sample in samples if sample.sample_info.valid_data]
 
 
 def write(writer: Any, data: bytes, counts: Counter[str]) -> None:
-    """Write bytes; what the library would not take in time is counted and dropped."""
+    """Write bytes; those that the library does not take in time are counted and dropped."""
     try:
         writer.write(Message(data))
     except DDSException:
@@ -208,98 +181,88 @@ class Client:
     """Calls a service."""
 
     def __init__(self, participant: Participant, service: str) -> None:
-        """Prepare; nothing is sent."""
         self._service = service
-        self._requests = participant.writer(f"rt/api/{service}/request", messages.Request)
-        self._responses = participant.reader(f"rt/api/{service}/response", messages.Response)
+        self._requests = participant.writer(f"rt/api/{service}/request", codec.Request)
+        self._responses = participant.reader(f"rt/api/{service}/response", codec.Response)
 
-    def call(self, api_id: int, parameter: Any, *, timeout_s: float = 2.0) -> Any | None:
-        """Call a function by its number, again while there is no response.
+    def call(self, api_id: int, parameter: Any) -> dict[str, Any] | None:
+        """Call a function by its number, repeatedly while there is no response.
 
         Returns:
-            The response's data; None without a response within `timeout_s` [s].
+            The response's data; None without a response within `RESPONSE_S`.
 
         Raises:
-            HardwareError: The service responded with another code than 0.
+            HardwareError: The response has another code than 0, or is no JSON object.
         """
-        identity = messages.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
-        header = messages.RequestHeader(
+        identity = codec.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
+        header = codec.RequestHeader(
             identity=identity,
-            lease=messages.RequestLease(id=0),
-            policy=messages.RequestPolicy(priority=0, noreply=False),
+            lease=codec.RequestLease(id=0),
+            policy=codec.RequestPolicy(priority=0, noreply=False),
         )
-        request = messages.Request(header=header, parameter=json.dumps(parameter), binary=[])
-        end = time.monotonic() + timeout_s
+        request = codec.Request(header=header, parameter=json.dumps(parameter), binary=[])
+        end = time.monotonic() + RESPONSE_S
         again = -1.0
         while time.monotonic() < end:
             if time.monotonic() >= again and self._requests.get_matched_subscriptions():
                 self._requests.write(request)
-                again = time.monotonic() + timeout_s / 4
+                again = time.monotonic() + RESPONSE_S / 4
             for response in take(self._responses, Counter()):
                 if response.header.identity == identity:
                     return self._data(api_id, response)
             time.sleep(_POLL_S)
         return None
 
-    def _data(self, api_id: int, response: Any) -> Any:
-        code = response.header.status.code
-        if code != DONE:
-            raise HardwareError(
-                f"the robot's service {self._service} returned {code} for function {api_id}, "
-                "expected 0; switch by the robot's own remote or app instead."
-            )
-        try:
-            return json.loads(response.data or "null") or {}
-        except ValueError:
-            raise HardwareError(
-                f"the robot's service {self._service} returned {response.data[:60]!r} for function "
-                f"{api_id}, expected JSON; is its firmware supported?"
-            ) from None
+    def _data(self, api_id: int, response: Any) -> dict[str, Any]:
+        code, data = response.header.status.code, None
+        if code == DONE:
+            with contextlib.suppress(ValueError):
+                data = json.loads(response.data or "{}") or {}
+            if isinstance(data, dict):
+                return data
+        got = f"code {code}" if code != DONE else f"{response.data[:60]!r}"
+        raise HardwareError(
+            f"the robot's service {self._service} returned {got} for function {api_id}, expected "
+            "code 0 and a JSON object; switch by the robot's own remote or app instead."
+        )
 
 
-def check_own_controller(participant: Participant, *, release: bool, timeout_s: float) -> None:
+def check_own_controller(participant: Participant, *, release: bool) -> None:
     """Check that none of the robot's own controllers holds the joints; `release` one that does.
 
     Raises:
         HardwareError: One holds them and may not be, or could not be, released; or the robot does
-            not respond in time.
+            not respond.
     """
     switcher = Client(participant, SWITCHER)
-    response = switcher.call(CHECK_MODE, {}, timeout_s=timeout_s)
+    response = switcher.call(CHECK_MODE, {})
     if response is None:
         # Older firmware ends its sport mode by another service.
         sport = {"name": "sport_mode", "switch": 0}
-        older = Client(participant, OLDER)
-        if release and older.call(SERVICE_SWITCH, sport, timeout_s=timeout_s) is not None:
+        if release and Client(participant, OLDER).call(SERVICE_SWITCH, sport) is not None:
             return
         raise HardwareError(
-            f"the robot did not respond on its service {SWITCHER} within {timeout_s:g} s, so it is "
-            "not known whether its own controller is off; check the network, and its firmware."
+            f"the robot did not respond on its service {SWITCHER} within {RESPONSE_S:g} s, so it "
+            "is not known whether its own controller is off; check the network, and its firmware."
         )
-    name, tries = _name(response), _RELEASE_TRIES if release else 0
-    while name and tries:
+    tries = _RELEASE_TRIES if release else 0
+    while (name := (response or {}).get("name", "")) and tries:
         tries -= 1
-        switcher.call(RELEASE_MODE, {}, timeout_s=timeout_s)
+        switcher.call(RELEASE_MODE, {})
         time.sleep(_RELEASE_PAUSE_S)
-        name = _name(switcher.call(CHECK_MODE, {}, timeout_s=timeout_s))
-    if name and release:
-        raise HardwareError(
-            f"the robot's own controller {name!r} was not switched off after "
-            f"{_RELEASE_TRIES} requests; switch it off by the robot's app."
-        )
+        response = switcher.call(CHECK_MODE, {})
     if name:
         raise HardwareError(
-            f"the robot's own controller {name!r} holds the joints; lay the robot down or hang it "
-            "up, and have the controller released (--disable-onboard-controller)."
+            f"the robot's own controller {name!r} was not switched off after {_RELEASE_TRIES} "
+            "requests; switch it off by the robot's app."
+            if release
+            else f"the robot's own controller {name!r} holds the joints; lay the robot down or "
+            "hang it up, and have the controller released (--disable-onboard-controller)."
         )
-
-
-def _name(response: Any) -> str:
-    return str(response.get("name", "")) if isinstance(response, dict) else ""
 
 
 class DdsMachine(NetworkLink):
-    """A robot with twelve joints behind Unitree's messages. Implements `Machine`."""
+    """A robot with twelve joints behind Unitree's codec. Implements `Machine`."""
 
     wire = "DDS"
     torque_kind = "measured"  # tau_est, by the drives from their currents
@@ -313,10 +276,7 @@ class DdsMachine(NetworkLink):
         domain: int | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link on an interface and domain (`DdsNetwork`); nothing is opened yet.
-
-        What else links take (`common`) is as of `NetworkLink`.
-        """
+        """Describe the link on a `DdsNetwork`; `common` is as of `NetworkLink`."""
         super().__init__(robot, **common)
         self._joints = joint_map(robot)
         self._network = DdsNetwork(interface=interface, domain=domain)
@@ -326,11 +286,14 @@ class DdsMachine(NetworkLink):
         self._decoder = StateDecoder(self._joints, self.counts)
         self._senders: set[int] = set()
         self._participant = own = Participant(self._network)
-        self._states_in = own.reader(STATES, messages.LowState, raw=True)
-        self._others = own.reader(COMMANDS, messages.LowCmd, raw=True, own=False)
-        out = own.writer(COMMANDS, messages.LowCmd, raw=True)
+        self._states_in = own.reader(STATES, codec.LowState)
+        self._others = own.reader(COMMANDS, codec.LowCmd, own=False)
+        out = own.writer(COMMANDS, codec.LowCmd)
         self._bench = Client(own, BENCH)
-        self._wake = own.wake_on(self._states_in, self._others)
+        anything = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
+        self._wake = core.WaitSet(own.entity)
+        for reader in (self._states_in, self._others):
+            self._wake.attach(core.ReadCondition(reader, anything))
         return CommandWriter(
             lambda command: encode_command(self._joints, command),
             lambda data: write(out, data, self.counts),
@@ -349,7 +312,7 @@ class DdsMachine(NetworkLink):
                 f"the robot in {self._network} is not pronk's virtual robot, and no real "
                 f"{self.robot} sends Unitree's messages; give the robot's name."
             )
-        check_own_controller(self._participant, release=self._release, timeout_s=ANSWER_S)
+        check_own_controller(self._participant, release=self._release)
 
     def _confirm(self) -> None:
         if len(self._senders) > 1:
@@ -360,19 +323,18 @@ class DdsMachine(NetworkLink):
 
     def _hold(self, joints: tuple[str, ...]) -> bool:
         request = {"joints": list(joints)}
-        return self._bench.call(CLAMP, request, timeout_s=ANSWER_S) is not None
+        return self._bench.call(CLAMP, request) is not None
 
     def _receive(self) -> None:
         self._wake.wait(int(_LONGEST_PAUSE_S * 1e9))
         arrived = time.monotonic()
         if take(self._others, self.counts):
             self.counts["foreign"] += 1
-            # Damp, for it is unknown which command the drives follow.
             if self._writer is not None and self._writer.wrote:
                 self._writer.damp()
         samples = take(self._states_in, self.counts)
         for sample in samples:
-            # Those that waited together are distinguished by when they were sent.
+            # Samples that arrived together are distinguished by when they were sent.
             last, this = (each.sample_info.source_timestamp for each in (samples[-1], sample))
             stamp = arrived - min(max((last - this) * 1e-9, 0.0), _LONGEST_BURST_S)
             self._senders.add(sample.sample_info.publication_handle)

@@ -1,10 +1,8 @@
-"""LCM messages to states and commands, and back, without a socket.
+"""LCM messages of the Mini Cheetah and of the walk-these-ways bridge, to states and commands.
 
-Layouts. `cheetah` is Cheetah-Software on the robot with MiniCheetahSpi_Controller: states are
-spi_data_t and microstrain_lcmt, commands are leg_control_command_lcmt on spi_debug_cmd, of which
-the robot reads q_des, kp_joint and kd_joint. `wtw` is the bridge of walk-these-ways (Go1, and the
-Go2 forks that kept its messages): states are leg_control_data_lcmt and state_estimator_lcmt,
-commands are pd_tau_targets_lcmt.
+Layouts. `cheetah` is Cheetah-Software on the robot with MiniCheetahSpi_Controller, which reads
+q_des, kp_joint and kd_joint of its commands. `wtw` is the bridge of walk-these-ways (Go1, and the
+Go2 forks that kept its messages).
 
 Joints. All three orders agree: legs FR FL HR HL (RR and RL in the stacks), then abad, hip, knee.
 Signs: Cheetah-Software's are pronk's own. Unitree's hip pitch and knee axes point the other way
@@ -18,66 +16,175 @@ The wire has no checksum: a number that no motor or sensor of such a machine can
 
 Cheetah-Software's parameter `control_mode` chooses which of the robot's own controllers holds the
 joints. The virtual robot holds joints mechanically on request, and its beacon lists them.
+
+Sources: the `lcm-types` of Cheetah-Software (MIT Biomimetics) and of walk-these-ways
+(Improbable AI), both MIT licence; `lcmgen.c` for the fingerprint.
 """
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import HardwareError
-from pronk.links.lcm import messages
-from pronk.links.lcm.messages import Message
+from pronk.links.link import StateNumbering
 from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
 
 Array = NDArray[np.float64]
 
+# --- Messages -----------------------------------------------------------------------------------
+
+_KINDS = {
+    "int8_t": ">i1",
+    "int32_t": ">i4",
+    "int64_t": ">i8",
+    "float": ">f4",
+    "double": ">f8",
+}
+_WORD = (1 << 64) - 1
+
+
+class Message:
+    """A type of message: its fingerprint (8 bytes), then its fields, big-endian without padding.
+
+    The fingerprint is a hash of the fields' names, types and lengths. Two stacks use the same names
+    and channels for different layouts, so the fingerprint alone identifies a message.
+    """
+
+    def __init__(self, name: str, channel: str, layout: str) -> None:
+        """Read a layout in LCM's own language, `float q[12]; int64_t id`; `name` is STACK.NAME."""
+        self.name, self.channel, self.layout = name, channel, layout
+        columns: list[Any] = [("_fingerprint", ">u8")]
+        value = 0x12345678
+        for kind, field, count in re.findall(r"(\w+) (\w+)(?:\[(\d+)\])?", layout):
+            columns.append((field, _KINDS[kind], (int(count),) if count else ()))
+            # Texts with their lengths, the number of dimensions, and 0 for a constant one.
+            dimensions = b"\1\0" + _text(count) if count else b"\0"
+            for byte in _text(field) + _text(kind) + dimensions:
+                signed = value - (1 << 64) if value >> 63 else value
+                value = ((value << 8) ^ (signed >> 55)) + byte & _WORD
+        self.fingerprint = (value << 1 | value >> 63) & _WORD
+        self.dtype = np.dtype(columns)
+        """The whole message as a NumPy record."""
+
+    def encode(self, **values: ArrayLike) -> bytes:
+        """Encode a message; fields that are not named are 0, scalars fill arrays."""
+        record = np.zeros((), self.dtype)
+        record["_fingerprint"] = self.fingerprint
+        for name, value in values.items():
+            record[name] = value
+        return record.tobytes()
+
+    def decode(self, data: bytes) -> NDArray[np.void]:
+        """Decode the fields of a message; RefusedError `fingerprint` or `length`."""
+        found, size = int.from_bytes(data[:8], "big"), self.dtype.itemsize
+        if len(data) < 8 or found != self.fingerprint:
+            known = [f" ({other.name})" for other in MESSAGES if other.fingerprint == found]
+            raise RefusedError(
+                "fingerprint",
+                f"a message has fingerprint {found:#018x}{''.join(known)}, expected "
+                f"{self.fingerprint:#018x} ({self.name}); its sender uses another layout.",
+            )
+        if len(data) != size:
+            raise RefusedError(
+                "length",
+                f"{self.name} is {len(data)} bytes long, expected {size}; it was cut or padded on "
+                "the way.",
+            )
+        return np.frombuffer(data, self.dtype)[0]  # type: ignore[no-any-return]
+
+
+def _text(text: str) -> bytes:
+    return bytes([len(text)]) + text.encode()
+
+
+# Name, channel and fields. Arrays of 12 are leg by leg (FR FL HR HL, or FR FL RR RL), abad, hip,
+# knee (hip, thigh, calf in Unitree's signs); of 4, by leg. pronk's own: joints to hold, to the
+# virtual robot; from it, joints held and the last request received.
+_TABLE = """
+cheetah.spi_data_t spi_data
+    float q_abad[4]; float q_hip[4]; float q_knee[4];
+    float qd_abad[4]; float qd_hip[4]; float qd_knee[4];
+    int32_t flags[4]; int32_t spi_driver_status;
+cheetah.leg_control_command_lcmt spi_debug_cmd
+    float tau_ff[12]; float f_ff[12]; float q_des[12]; float qd_des[12]; float p_des[12];
+    float v_des[12]; float kp_cartesian[12]; float kd_cartesian[12]; float kp_joint[12];
+    float kd_joint[12];
+cheetah.microstrain_lcmt microstrain
+    float quat[4]; float rpy[3]; float omega[3]; float acc[3];
+    int64_t good_packets; int64_t bad_packets;
+cheetah.control_parameter_request_lcmt interface_request
+    int8_t name[64]; int64_t requestNumber; int8_t value[64]; int8_t parameterKind;
+    int8_t requestKind;
+wtw.leg_control_data_lcmt leg_control_data
+    float q[12]; float qd[12]; float p[12]; float v[12]; float tau_est[12];
+    int64_t timestamp_us; int64_t id; int64_t robot_id;
+wtw.pd_tau_targets_lcmt pd_plustau_targets
+    double q_des[12]; double qd_des[12]; double tau_ff[12]; double kp[12]; double kd[12];
+    int64_t timestamp_us; int64_t id; int64_t robot_id; double se_contactState[4];
+wtw.state_estimator_lcmt state_estimator_data
+    float p[3]; float vWorld[3]; float vBody[3]; float rpy[3]; float omegaBody[3];
+    float omegaWorld[3]; float quat[4]; float contact_estimate[4]; float aBody[3];
+    float aWorld[3]; int64_t timestamp_us; int64_t id; int64_t robot_id;
+pronk.virtual_robot_lcmt pronk_bench
+    int64_t request; int8_t clamped[12];
+"""
+MESSAGES = tuple(
+    Message(*found) for found in re.findall(r"^(\S+) (\w+)\n((?: .*\n)+)", _TABLE, re.MULTILINE)
+)
+(
+    SPI_DATA,
+    LEG_CONTROL_COMMAND,
+    MICROSTRAIN,
+    CONTROL_PARAMETER,
+    WTW_LEG_CONTROL_DATA,
+    WTW_PD_TAU_TARGETS,
+    WTW_STATE_ESTIMATOR,
+    VIRTUAL_ROBOT,
+) = MESSAGES
+# Responses (control_parameter_respones_lcmt) and beacons have the fields of the requests.
+RESPONSE_CHANNEL, BEACON_CHANNEL = "interface_response", "pronk_virtual"
+
+# --- Layouts ------------------------------------------------------------------------------------
+
 KNEE_RATIO = 0.6429
 """Motor to joint beyond the hips' 6:1, as `rt_spi.cpp` has it (6 / 9.33 = .6431)."""
-# What the motors' CAN messages can carry, motor firmware of bgkatz [rad, N m/rad, N m s/rad].
-_MOST_POSITION, _MOST_STIFFNESS, _MOST_DAMPING = 12.5, 500.0, 5.0
-# Beyond what any such machine can do or measure: 65 rad/s is the fastest that a motor's CAN
-# message can carry, ten times 17 N m is more than any motor of this size gives, 2000 deg/s and
-# 16 g are the ranges of inertial units [rad/s, N m, rad/s, m/s^2].
-_MOST_SPEED, _MOST_TORQUE, _MOST_TURN, _MOST_FORCE = 65.0, 170.0, 35.0, 160.0
 _JOINTS = 12
 _SPI_JOINTS = ("abad", "hip", "knee")
-
-# Where parameters are set and confirmed (`HardwareBridge.cpp`).
-REQUEST_CHANNEL, RESPONSE_CHANNEL = "interface_request", "interface_response"
-# Requests for clamps to the virtual robot, and its beacon.
-BENCH_CHANNEL, BEACON_CHANNEL = "pronk_bench", "pronk_virtual"
-MODES = {0: "", 1: "stand_up", 3: "balance_stand", 4: "locomotion", 6: "recovery_stand"}
-"""`control_mode` (`FSM_State.h`); 0 is passive, the joints are free for others."""
-_MODE = b"control_mode"
-# ControlParameters.h: the value is a double. ControlParameterInterface.h: set a robot's parameter.
-_DOUBLE, _SET = 1, 1
-
+_RANGES = {
+    # What the motors' CAN messages can carry, motor firmware of bgkatz [rad, N m/rad, N m s/rad].
+    "position": (-12.5, 12.5),
+    "stiffness": (0.0, 500.0),
+    "damping": (0.0, 5.0),
+    # 65 rad/s is the fastest that they can carry, ten times 17 N m is more than any motor of this
+    # size gives, 2000 deg/s and 16 g are the ranges of inertial units [rad/s, N m, rad/s, m/s^2].
+    "velocity": (-65.0, 65.0),
+    "torque": (-170.0, 170.0),
+    "gyro": (-35.0, 35.0),
+    "accelerometer": (-160.0, 160.0),
+    "orientation": (-2.0, 2.0),
+}
 _OLDEST_ATTITUDE_S = 0.02
-_NUMBER_JUMP = 1000
-"""A count this far from the last is that of a robot that was started again, or a broken one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
-    """Messages, their channels and fields, and how their numbers become pronk's."""
+    """Messages of a stack, and how their numbers become pronk's."""
 
     name: str
     command: Message
-    command_channel: str
-    gain_fields: tuple[str, str]
-    """Of stiffness and damping in a command."""
     joints: Message
-    joints_channel: str
     attitude: Message
-    attitude_channel: str
-    imu_fields: tuple[str, str]
-    """Of angular velocity and specific force."""
+    fields: Mapping[str, str]
+    """Names on the wire."""
     numbered: bool
     """Commands and states carry `timestamp_us` and `id`."""
     signs: Array
@@ -88,16 +195,14 @@ class Layout:
     state_rate_hz: float = 500.0
 
 
+_FIELDS = {"position": "q", "velocity": "qd", "torque": "tau_est", "orientation": "quat"}
 CHEETAH = Layout(
     name="cheetah",
-    command=messages.LEG_CONTROL_COMMAND,
-    command_channel="spi_debug_cmd",
-    gain_fields=("kp_joint", "kd_joint"),
-    joints=messages.SPI_DATA,
-    joints_channel="spi_data",
-    attitude=messages.MICROSTRAIN,
-    attitude_channel="microstrain",
-    imu_fields=("omega", "acc"),
+    command=LEG_CONTROL_COMMAND,
+    joints=SPI_DATA,
+    attitude=MICROSTRAIN,
+    fields=_FIELDS
+    | {"stiffness": "kp_joint", "damping": "kd_joint", "gyro": "omega", "accelerometer": "acc"},
     numbered=False,
     signs=np.ones(_JOINTS),
     gains=np.tile([1.0, 1.0, KNEE_RATIO**2], 4),
@@ -107,14 +212,11 @@ CHEETAH = Layout(
 )
 WTW = Layout(
     name="wtw",
-    command=messages.WTW_PD_TAU_TARGETS,
-    command_channel="pd_plustau_targets",
-    gain_fields=("kp", "kd"),
-    joints=messages.WTW_LEG_CONTROL_DATA,
-    joints_channel="leg_control_data",
-    attitude=messages.WTW_STATE_ESTIMATOR,
-    attitude_channel="state_estimator_data",
-    imu_fields=("omegaBody", "aBody"),
+    command=WTW_PD_TAU_TARGETS,
+    joints=WTW_LEG_CONTROL_DATA,
+    attitude=WTW_STATE_ESTIMATOR,
+    fields=_FIELDS
+    | {"stiffness": "kp", "damping": "kd", "gyro": "omegaBody", "accelerometer": "aBody"},
     numbered=True,
     signs=np.tile([1.0, -1.0, -1.0], 4),
     gains=np.ones(_JOINTS),
@@ -126,20 +228,19 @@ LAYOUTS = {"cheetah": CHEETAH, "spi": CHEETAH, "wtw": WTW}
 
 
 def layout_of(name: str) -> Layout:
-    """Look a layout up; refuse a name that there is not."""
+    """Look a layout up; HardwareError for an unknown name."""
     if name not in LAYOUTS:
         raise HardwareError(f"no LCM layout {name!r}; there are {', '.join(LAYOUTS)}.")
     return LAYOUTS[name]
 
 
 def encode_command(layout: Layout, command: Command) -> bytes:
-    """Encode a command; refuse one that is not for twelve joints or that no drive could follow."""
+    """Encode a command; HardwareError for an impossible one."""
     check_command(command, _JOINTS)
-    stiffness, damping = layout.gain_fields
     fields: dict[str, Any] = {
         "q_des": command.position * layout.signs,
-        stiffness: command.stiffness * layout.gains,
-        damping: command.damping * layout.gains,
+        layout.fields["stiffness"]: command.stiffness * layout.gains,
+        layout.fields["damping"]: command.damping * layout.gains,
     }
     if layout.numbered:
         fields |= {"timestamp_us": round(command.made * 1e6), "id": command.sequence}
@@ -155,10 +256,10 @@ def decode_command(layout: Layout, data: bytes) -> Command:
     """
     message = layout.command
     fields = message.decode(data)
-    kp, kd = layout.gain_fields
-    position = _within(message, fields, "q_des", _MOST_POSITION)
-    stiffness = _within(message, fields, kp, _MOST_STIFFNESS, low=0.0)
-    damping = _within(message, fields, kd, _MOST_DAMPING, low=0.0)
+    position = _in_range("position", fields["q_des"], message)
+    stiffness, damping = (
+        _in_range(name, fields[layout.fields[name]], message) for name in ("stiffness", "damping")
+    )
     # Of Cheetah-Software's message the robot reads nothing else.
     if layout is WTW and (np.any(fields["qd_des"]) or np.any(fields["tau_ff"])):
         raise RefusedError(
@@ -175,146 +276,131 @@ def decode_command(layout: Layout, data: bytes) -> Command:
     )
 
 
-def encode_state(layout: Layout, state: State) -> tuple[tuple[str, bytes], tuple[str, bytes]]:
-    """Encode a state as two (channel, bytes): attitude, then joints, which complete a state."""
-    position, velocity = state.position * layout.signs, state.velocity * layout.signs
-    turn, force = layout.imu_fields
-    attitude: dict[str, Any] = {"quat": state.orientation, "rpy": roll_pitch_yaw(state.orientation)}
-    attitude |= {turn: state.gyro, force: state.accelerometer}
-    joints: dict[str, Any]
+def encode_state(layout: Layout, state: State) -> tuple[bytes, bytes]:
+    """Encode a state as two messages: attitude, then joints, which complete a state."""
+    w, x, y, z = state.orientation
+    rpy = (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0)),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+    attitude: dict[str, Any] = {"quat": state.orientation, "rpy": rpy}
+    attitude |= {layout.fields[name]: getattr(state, name) for name in ("gyro", "accelerometer")}
+    joints: dict[str, Any] = {
+        "q": state.position * layout.signs,
+        "qd": state.velocity * layout.signs,
+    }
     if layout.numbered:
         stamp = {"timestamp_us": round(1e6 * (state.robot_time or 0.0)), "id": state.sequence}
         attitude |= stamp
-        joints = {"q": position, "qd": velocity, "tau_est": state.torque * layout.signs, **stamp}
+        joints |= {"tau_est": state.torque * layout.signs, **stamp}
     else:
         attitude |= {"good_packets": state.sequence}
-        joints = {f"q_{name}": position[k::3] for k, name in enumerate(_SPI_JOINTS)}
-        joints |= {f"qd_{name}": velocity[k::3] for k, name in enumerate(_SPI_JOINTS)}
-    return (
-        (layout.attitude_channel, layout.attitude.encode(**attitude)),
-        (layout.joints_channel, layout.joints.encode(**joints)),
-    )
-
-
-def decode_joints(layout: Layout, data: bytes) -> tuple[dict[str, Any], int | None]:
-    """Decode fields of a `State`, and the robot's own count or None where it is not filled.
-
-    Raises:
-        RefusedError: `fingerprint`, `length`, `not finite` or `out of range`.
-    """
-    message = layout.joints
-    fields: Any = message.decode(data)
-    torque, stamp, number = np.zeros(_JOINTS), 0, 0
-    if layout.numbered:
-        torque = _within(message, fields, "tau_est", _MOST_TORQUE)
-        stamp, number = int(fields["timestamp_us"]), int(fields["id"])
-    else:
-        # By joint, then leg, on the wire; by leg, then joint, here.
-        fields = {
-            kind: np.array([fields[f"{kind}_{name}"] for name in _SPI_JOINTS]).T.ravel()
-            for kind in ("q", "qd")
+        joints = {
+            f"{kind}_{name}": values[k::3]
+            for kind, values in joints.items()
+            for k, name in enumerate(_SPI_JOINTS)
         }
-    state = {
-        "position": _within(message, fields, "q", _MOST_POSITION) * layout.signs,
-        "velocity": _within(message, fields, "qd", _MOST_SPEED) * layout.signs,
-        "torque": torque * layout.signs,
-        # The bridge of walk-these-ways itself leaves both at 0.
-        "robot_time": 1e-6 * stamp if stamp else None,
-    }
-    return state, number or None
+    return layout.attitude.encode(**attitude), layout.joints.encode(**joints)
 
 
-def decode_attitude(layout: Layout, data: bytes) -> dict[str, Array]:
-    """Decode the trunk's part of a state: its fields `orientation`, `gyro` and `accelerometer`.
+class StateDecoder(StateNumbering):
+    """Makes states of the two messages, numbered by the robot's count where it is filled.
 
-    Raises:
-        RefusedError: `fingerprint`, `length`, `not finite`, `out of range`, or `quaternion` (not of
-            length 1).
-    """
-    message = layout.attitude
-    fields = message.decode(data)
-    orientation = _within(message, fields, "quat", 2.0)
-    length = float(np.sqrt(orientation @ orientation))
-    if not abs(length - 1.0) <= 0.02:
-        raise RefusedError(
-            "quaternion",
-            f"{message.name}.quat has length {length:.3f}, expected 1 within .02; the inertial "
-            "unit is not running, or the order of the numbers is another.",
-        )
-    turn, force = layout.imu_fields
-    return {
-        "orientation": orientation / length,
-        "gyro": _within(message, fields, turn, _MOST_TURN),
-        "accelerometer": _within(message, fields, force, _MOST_FORCE),
-    }
-
-
-class StateDecoder:
-    """Numbers the states that messages make.
-
-    No state is made, and the reason counted, of joints without a young attitude (`no attitude`); of
-    values that repeat to the last bit, as no live sensor's do (`repeated`); of a count that went
-    backwards (`out of order`). A refused message raises RefusedError. Neither layout carries the
-    bus voltage: NaN.
+    `no attitude` counts joints without an attitude of the last 20 ms, which make no state. Neither
+    layout carries the bus voltage: NaN.
     """
 
     def __init__(self, layout: Layout, counts: Counter[str]) -> None:
-        self.counts = counts
+        super().__init__(counts, layout.state_rate_hz)
         self._layout = layout
-        self._attitude: dict[str, Any] = {}
-        self._attitude_came = -float("inf")
-        self._values = b""
-        self._number: int | None = None
-        self._sequence = -1
+        self._attitude: dict[str, Array] = {}
+        self._attitude_came = -math.inf
 
     def attitude(self, data: bytes, now: float) -> None:
-        """Take a message of the inertial unit that arrived at `now` [s]."""
-        self._attitude = decode_attitude(self._layout, data)
+        """Take a message of the inertial unit that arrived at `now` [s].
+
+        Raises:
+            RefusedError: `fingerprint`, `length`, `not finite`, `out of range`, or `quaternion`
+                (not of length 1).
+        """
+        names = ("orientation", "gyro", "accelerometer")
+        found = self._decoded(self._layout.attitude, self._layout.attitude.decode(data), names)
+        orientation = found["orientation"]
+        length = math.sqrt(orientation @ orientation)
+        if not abs(length - 1.0) <= 0.02:
+            raise RefusedError(
+                "quaternion",
+                f"{self._layout.attitude.name}.quat has length {length:.3f}, expected 1 within "
+                ".02; the inertial unit is not running, or the order of the numbers is another.",
+            )
+        self._attitude = found | {"orientation": orientation / length}
         self._attitude_came = now
 
     def joints(self, data: bytes, now: float) -> State | None:
-        """Take a message of the joints that arrived at `now` [s]: it completes a state."""
-        joints, number = decode_joints(self._layout, data)
+        """Take a message of the joints that arrived at `now` [s]: it completes a state.
+
+        Raises:
+            RefusedError: `fingerprint`, `length`, `not finite` or `out of range`.
+        """
+        layout, names = self._layout, ("position", "velocity", "torque")
+        fields: Any = layout.joints.decode(data)
+        stamp = number = 0
+        if layout.numbered:
+            stamp, number = int(fields["timestamp_us"]), int(fields["id"])
+        else:
+            # By joint, then leg, on the wire; by leg, then joint, here.
+            fields = {"tau_est": np.zeros(_JOINTS)} | {
+                kind: np.array([fields[f"{kind}_{name}"] for name in _SPI_JOINTS]).T.ravel()
+                for kind in ("q", "qd")
+            }
+        found: dict[str, Any] = self._decoded(layout.joints, fields, names)
         if now - self._attitude_came > _OLDEST_ATTITUDE_S:
             self.counts["no attitude"] += 1
             return None
-        passed = 1
-        if number is not None and self._number is not None:
-            passed = number - self._number
-            if -_NUMBER_JUMP < passed <= 0:
-                self.counts["out of order"] += 1
-                return None
-        self._number = number
-        attitude = self._attitude
-        parts = (joints["position"], joints["velocity"], *list(attitude.values())[1:])
-        values = b"".join(part.tobytes() for part in parts)
-        if values == self._values:
-            self.counts["repeated"] += 1
-            return None
-        self._values = values
-        # Where the robot counts, what it counted and did not arrive is missing here too.
-        self._sequence += passed if 0 < passed < _NUMBER_JUMP else 1
-        voltage = float("nan")
-        return State(time=now, sequence=self._sequence, bus_voltage=voltage, **joints, **attitude)
+        values = {name: value * layout.signs for name, value in found.items()}
+        values |= self._attitude | {"bus_voltage": math.nan}
+        # The bridge of walk-these-ways itself leaves both at 0.
+        values["robot_time"] = 1e-6 * stamp if stamp else None
+        return self.number(values, number or None, now)
+
+    def _decoded(self, message: Message, fields: Any, names: tuple[str, ...]) -> dict[str, Array]:
+        wire = self._layout.fields
+        return {name: _in_range(name, fields[wire[name]], message) for name in names}
 
 
-def roll_pitch_yaw(orientation: Array) -> Array:
-    """Angles about x, then y, then z of the world, of a unit quaternion w, x, y, z [rad]."""
-    w, x, y, z = orientation
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return np.array([roll, pitch, yaw])
+def _in_range(name: str, values: NDArray[Any], message: Message) -> Array:
+    """Convert to float64; refuse what is not finite or not in its range."""
+    low, high = _RANGES[name]
+    # Before the conversion, which warns of a signalling NaN; NaN is in no range.
+    if ((values >= low) & (values <= high)).all():
+        return np.asarray(values, dtype=np.float64)
+    if not np.isfinite(values).all():
+        raise RefusedError("not finite", f"a {name} of {message.name} is not a finite number.")
+    raise RefusedError(
+        "out of range",
+        f"{name} of {message.name} lies between {values.min():g} and {values.max():g}, expected "
+        f"{low:g} to {high:g}, which is all that the motors and sensors can do.",
+    )
+
+
+# --- Requests -----------------------------------------------------------------------------------
+
+MODES = {0: "", 1: "stand_up", 3: "balance_stand", 4: "locomotion", 6: "recovery_stand"}
+"""`control_mode` (`FSM_State.h`); 0 is passive, the joints are free for others."""
+_MODE = b"control_mode"
+# ControlParameters.h: the value is a double. ControlParameterInterface.h: set a robot's parameter.
+_DOUBLE, _SET = 1, 1
 
 
 def mode_request(mode: int, number: int) -> bytes:
     """Encode the request of this number that sets `control_mode`; the same bytes confirm it."""
     # The robot copies memory here: little-endian, unlike everything else on this wire.
     value = struct.pack("<d", mode).ljust(64, b"\0")
-    return messages.CONTROL_PARAMETER.encode(
-        name=list(_MODE.ljust(64, b"\0")),
+    return CONTROL_PARAMETER.encode(
+        name=np.frombuffer(_MODE.ljust(64, b"\0"), np.int8),
         requestNumber=number,
-        value=list(memoryview(value).cast("b")),
+        value=np.frombuffer(value, np.int8),
         parameterKind=_DOUBLE,
         requestKind=_SET,
     )
@@ -326,7 +412,7 @@ def read_mode_request(data: bytes) -> str:
     Raises:
         RefusedError: `fingerprint`, `length`, or `parameter` (not `control_mode`, or no mode).
     """
-    fields = messages.CONTROL_PARAMETER.decode(data)
+    fields = CONTROL_PARAMETER.decode(data)
     name = fields["name"].tobytes().split(b"\0")[0]
     kinds = (int(fields["parameterKind"]), int(fields["requestKind"]))
     (value,) = struct.unpack_from("<d", fields["value"].tobytes())
@@ -341,31 +427,11 @@ def read_mode_request(data: bytes) -> str:
 
 def clamp_message(names: tuple[str, ...], held: tuple[str, ...], number: int) -> bytes:
     """Encode a request for clamps, or the beacon: joints to hold, or held, of all `names`."""
-    return messages.VIRTUAL_ROBOT.encode(request=number, clamped=[int(n in held) for n in names])
+    return VIRTUAL_ROBOT.encode(request=number, clamped=[int(n in held) for n in names])
 
 
 def read_clamp_message(names: tuple[str, ...], data: bytes) -> tuple[int, tuple[str, ...]]:
     """Number of the request, and the joints that are or shall be held."""
-    fields = messages.VIRTUAL_ROBOT.decode(data)
+    fields = VIRTUAL_ROBOT.decode(data)
     flags = zip(names, fields["clamped"].tolist(), strict=True)
     return int(fields["request"]), tuple(name for name, held in flags if held)
-
-
-def _within(
-    message: Message, fields: Any, name: str, most: float, low: float | None = None
-) -> Array:
-    """Convert a field to float64; refuse what is not finite or not in `low` (or -most) to most."""
-    values: NDArray[Any] = fields[name]
-    low = -most if low is None else low
-    # Before the conversion, which warns of a signalling NaN; NaN is within nothing.
-    if ((values >= low) & (values <= most)).all():
-        return np.asarray(values, dtype=np.float64)
-    if not np.isfinite(values).all():
-        raise RefusedError(
-            "not finite", f"{message.name}.{name} holds a number that is not finite."
-        )
-    raise RefusedError(
-        "out of range",
-        f"{message.name}.{name} lies between {values.min():g} and {values.max():g}, expected "
-        f"{low:g} to {most:g}, which is all that the motors and sensors can do.",
-    )

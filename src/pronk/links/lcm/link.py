@@ -6,8 +6,7 @@ it from other users of LCM here. LCM itself cannot choose an interface: the syst
 the route is looked up and must lead out of the interface that was named.
 
 One handle receives, in a thread of its own, because polling one message per tick from LCM's queue
-yields data hundreds of milliseconds old; the other publishes. Times are the local monotonic
-clock's: a state's is when its last message arrived.
+yields data hundreds of milliseconds old; the other publishes.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from typing import Any
 from pronk.errors import HardwareError
 from pronk.links.lcm.codec import (
     BEACON_CHANNEL,
-    BENCH_CHANNEL,
-    REQUEST_CHANNEL,
+    CONTROL_PARAMETER,
     RESPONSE_CHANNEL,
+    VIRTUAL_ROBOT,
     StateDecoder,
     clamp_message,
     encode_command,
@@ -32,13 +31,13 @@ from pronk.links.lcm.codec import (
     mode_request,
     read_clamp_message,
 )
-from pronk.links.link import ANSWER_S, CommandWriter, NetworkLink, wait_for
+from pronk.links.link import RESPONSE_S, CommandWriter, NetworkLink, wait_for
 from pronk.robots.robot import RobotSpec
 
 # LCM's multicast group and port, those of every robot too.
 GROUP, ROBOT_PORT = "239.255.76.67", 7667
 VIRTUAL_PORT = 7768
-"""The virtual robot's: private, so that nothing here ever meets a real one."""
+"""The virtual robot's, so that nothing here ever reaches a real one."""
 _ROUTES = Path("/proc/net/route")
 _QUEUE = 100
 _REMEMBERED = 512
@@ -80,17 +79,15 @@ def url_of(*, port: int | None = None, interface: str | None = None) -> str:
 def multicast_interface(table: str) -> str | None:
     """The interface by which LCM's packets leave, or None, by a table as in /proc/net/route."""
     group = int(ipaddress.IPv4Address(GROUP))
-    best: tuple[int, int, str] | None = None
-    for line in table.splitlines()[1:]:
-        words = line.split()
+    found: list[tuple[int, int, str]] = []
+    for words in map(str.split, table.splitlines()[1:]):
         if len(words) < 8 or not int(words[3], 16) & 1:
             continue
         target, mask = (int.from_bytes(bytes.fromhex(words[k])[::-1], "big") for k in (1, 7))
         if group & mask == target:
-            # The longest mask wins, then the smallest metric.
-            found = (mask, -int(words[6]), words[0])
-            best = max(best, found) if best else found
-    return best[2] if best else None
+            found.append((mask, -int(words[6]), words[0]))
+    # The longest mask wins, then the smallest metric.
+    return max(found)[2] if found else None
 
 
 def open_lcm(url: str) -> Any:
@@ -124,9 +121,9 @@ class LcmMachine(NetworkLink):
         interface: str | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link in a layout (`LAYOUTS`) at an address (`url_of`); nothing is opened.
+        """Describe the link in a layout (`LAYOUTS`) at an address (`url_of`).
 
-        What else links take (`common`) is as of `NetworkLink`.
+        `common` is as of `NetworkLink`.
         """
         super().__init__(robot, **common)
         self._layout = known = layout_of(layout)
@@ -136,15 +133,15 @@ class LcmMachine(NetworkLink):
                 "for twelve."
             )
         self.torque_kind, self.state_rate_hz = known.torque_kind, known.state_rate_hz
-        self._command_topic = known.command_channel
+        self._command_topic = known.command.channel
         self._interface = interface
         self._url = url_of(port=port, interface=interface)
-        self._address = f"{known.joints_channel} and {known.attitude_channel} at {self._url}"
+        self._address = f"{known.joints.channel} and {known.attitude.channel} at {self._url}"
 
     def _open(self) -> CommandWriter:
         layout = self._layout
         decoder = StateDecoder(layout, self.counts)
-        # Request for clamps that the virtual robot met last, and the joints it holds.
+        # Last request for clamps that the virtual robot received, and the joints it holds.
         self._held: tuple[int, tuple[str, ...]] | None = None
         self._responses: list[bytes] = []
         # Newest first: a message that comes back is nearly always the last one.
@@ -152,9 +149,9 @@ class LcmMachine(NetworkLink):
         self._publishing, self._remembering = threading.Lock(), threading.Lock()
         self._in, self._out = open_lcm(self._url), open_lcm(self._url)
         for channel, handler in (
-            (layout.attitude_channel, lambda data: decoder.attitude(data, time.monotonic())),
-            (layout.joints_channel, lambda data: decoder.joints(data, time.monotonic())),
-            (layout.command_channel, self._met_command),
+            (layout.attitude.channel, lambda data: decoder.attitude(data, time.monotonic())),
+            (layout.joints.channel, lambda data: decoder.joints(data, time.monotonic())),
+            (layout.command.channel, self._met_command),
             (BEACON_CHANNEL, self._met_beacon),
             (RESPONSE_CHANNEL, self._responses.append),
         ):
@@ -197,11 +194,11 @@ class LcmMachine(NetworkLink):
         if not self._release:
             return
         data = mode_request(0, time.monotonic_ns())
-        self._publish(REQUEST_CHANNEL, data)
+        self._publish(CONTROL_PARAMETER.channel, data)
         if not wait_for(lambda: data in self._responses):
             raise HardwareError(
                 f"{self.robot} did not confirm control_mode 0 on {RESPONSE_CHANNEL} within "
-                f"{ANSWER_S:g} s; release it by its own remote."
+                f"{RESPONSE_S:g} s; release it by its own remote."
             )
 
     def _confirm(self) -> None:
@@ -214,9 +211,9 @@ class LcmMachine(NetworkLink):
         names, request = self._robot.joint_names, time.monotonic_ns()
         data = clamp_message(names, joints, request)
         held = (request, tuple(name for name in names if name in joints))
-        # Requested again, for the way there may lose messages.
+        # Requested again, for messages may be lost.
         for _ in range(4):
-            self._publish(BENCH_CHANNEL, data)
-            if wait_for(lambda: self._held == held, ANSWER_S / 4):
+            self._publish(VIRTUAL_ROBOT.channel, data)
+            if wait_for(lambda: self._held == held, RESPONSE_S / 4):
                 return True
         return False
