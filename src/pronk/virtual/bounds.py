@@ -1,21 +1,39 @@
-"""Parameter dataclasses whose annotations hold bounds, and their reader.
-
-A field is `Annotated[float, Meta(ge=LOW, le=HIGH)]`, or a tuple of those.
-"""
+"""Frozen parameter dataclasses whose annotations hold bounds, `Annotated[float, Meta(ge=0.0)]`."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from functools import cache
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import msgspec
+import numpy as np
 
 from pronk.errors import RobotError
 
 T = TypeVar("T", bound="Bounded")
+_WORDS = {
+    "float": "a number",
+    "int": "a whole number",
+    "array": "a list",
+    "str": "a text",
+    "object": "a mapping",
+}
+
+
+class Bounded:
+    """Base of a parameter dataclass."""
+
+    def __post_init__(self) -> None:
+        """Convert fields to their types; RobotError names a wrong type or a value out of bounds."""
+        for name, hint in _hints(type(self)).items():
+            value = getattr(self, name)
+            try:
+                converted = msgspec.convert(_builtin(value), hint)
+            except msgspec.ValidationError as error:
+                raise RobotError(f"{name} is {value!r}; {plain(error)}.") from None
+            object.__setattr__(self, name, converted)
 
 
 @cache
@@ -23,36 +41,17 @@ def _hints(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
 
 
-@cache
-def _bounds(kind: Any) -> dict[str, tuple[float, float]]:
-    """Lowest and highest value by field; of a tuple, of each part."""
-    found = {}
-    for name, hint in _hints(kind).items():
-        first, *rest = get_args(hint) or (hint,)
-        for meta in (*get_args(first), *rest):
-            if isinstance(meta, msgspec.Meta) and meta.ge is not None:
-                found[name] = (meta.ge, math.inf if meta.le is None else meta.le)
-    return found
-
-
-class Bounded:
-    """Base of a parameter dataclass."""
-
-    def __post_init__(self) -> None:
-        """Refuse values out of their bounds, and NaN; name the field."""
-        kind: Any = type(self)
-        for name, (low, high) in _bounds(kind).items():
-            value = getattr(self, name)
-            for part in value if isinstance(value, tuple) else (value,):
-                if not low <= part <= high:
-                    raise RobotError(f"{name} is {part:g}; expected {low:g} to {high:g}.")
+def _builtin(value: Any) -> Any:
+    """Numbers of NumPy, also in tuples, as Python's own."""
+    if isinstance(value, tuple):
+        return tuple(map(_builtin, value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def plain(error: msgspec.ValidationError) -> str:
     """Put msgspec's message into plain words."""
     text = str(error)[0].lower() + str(error)[1:]
-    names = {"float": "a number", "int": "a whole number", "array": "a list", "str": "a text"}
-    for kind, words in {**names, "object": "a mapping"}.items():
+    for kind, words in _WORDS.items():
         text = text.replace(f"`{kind}`", words)
     return text
 
@@ -60,7 +59,7 @@ def plain(error: msgspec.ValidationError) -> str:
 def read(kind: type[T], where: str, entry: Any, without: tuple[str, ...] = ()) -> T:
     """Build a parameter class from a mapping of its fields, except those in `without`.
 
-    RobotErrors name `where` and the field that is missing, unknown, of another type or out of its
+    RobotErrors name `where` and the field that is missing, unknown, of a wrong type or out of its
     bounds.
     """
     if not isinstance(entry, Mapping):
@@ -69,17 +68,10 @@ def read(kind: type[T], where: str, entry: Any, without: tuple[str, ...] = ()) -
     for name in entry:
         if name not in known:
             raise RobotError(f"{where}.{name} is unknown; the fields are {', '.join(known)}.")
-    values: dict[str, Any] = {}
-    hints = get_type_hints(kind, include_extras=True)
     for name, part in known.items():
-        if name in entry:
-            try:
-                values[name] = msgspec.convert(entry[name], hints[name])
-            except msgspec.ValidationError as error:
-                raise RobotError(f"{where}.{name} is {entry[name]!r}; {plain(error)}.") from None
-        elif part.default is MISSING:
+        if name not in entry and part.default is MISSING:
             raise RobotError(f"{where}.{name} is missing.")
     try:
-        return kind(**values)
+        return kind(**entry)
     except RobotError as error:
         raise RobotError(f"{where}.{error}") from None

@@ -1,16 +1,16 @@
-"""What a motion-capture rig and force plates would record of the virtual robot, without noise.
+"""Motion capture and contacts of the virtual robot, without noise.
 
 Positions, orientations and contacts of a sample are of one instant: a foot is in contact if its
-sphere overlaps the ground there, as in training. Everything is in SI units; the world is z up;
-feet and legs are in the order FR, FL, HR, HL.
+sphere overlaps the ground, as in training. SI units; the world is z up; feet are FR, FL, HR, HL.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, get_type_hints
 
 import mujoco
 import numpy as np
@@ -24,62 +24,45 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SCHEMA = "pronk/capture/1"
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "time": (),
-    "position": (3,),
-    "orientation": (4,),
-    "velocity": (3,),
-    "angular_velocity": (3,),
-    "foot_position": (4, 3),
-    "contact": (4,),
-    "other_contact": (),
-    "joint_position": (12,),
-    "joint_velocity": (12,),
-    "torque": (12,),
-    "electrical_power": (),
-    "bus_voltage": (),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Capture:
-    """T samples at a constant rate."""
+    """T samples at a constant rate. Annotations hold the shapes after T."""
 
-    time: Array
-    """On the machine's clock [s]. (T,)"""
-    position: Array
-    """Origin of the trunk's frame, in the world [m]. (T, 3)"""
-    orientation: Array
-    """Trunk to world, unit quaternions w, x, y, z. (T, 4)"""
-    velocity: Array
-    """Of the trunk's origin, in the world [m/s]. (T, 3)"""
-    angular_velocity: Array
-    """Of the trunk, in its own frame [rad/s]. (T, 3)"""
-    foot_position: Array
-    """Centres of the foot spheres, in the world [m]. (T, 4, 3)"""
-    contact: Mask
-    """Feet on the ground. (T, 4)"""
-    other_contact: Mask
-    """Anything but a foot touches the ground. (T,)"""
-    joint_position: Array
-    """Of the links, in file order [rad]. (T, 12)"""
-    joint_velocity: Array
-    """Of the links [rad/s]. (T, 12)"""
-    torque: Array
-    """Of the motors through their gears, without friction [N m]. (T, 12)"""
-    electrical_power: Array
-    """From the battery into the motors; negative where they give it back [W]. (T,)"""
-    bus_voltage: Array
-    """[V]. (T,)"""
+    time: Annotated[Array, ()]
+    """On the machine's clock [s]."""
+    position: Annotated[Array, (3,)]
+    """Origin of the trunk's frame, in the world [m]."""
+    orientation: Annotated[Array, (4,)]
+    """Trunk to world, unit quaternions w, x, y, z."""
+    velocity: Annotated[Array, (3,)]
+    """Of the trunk's origin, in the world [m/s]."""
+    angular_velocity: Annotated[Array, (3,)]
+    """Of the trunk, in its own frame [rad/s]."""
+    foot_position: Annotated[Array, (4, 3)]
+    """Centres of the foot spheres, in the world [m]."""
+    contact: Annotated[Mask, (4,)]
+    """Feet on the ground."""
+    other_contact: Annotated[Mask, ()]
+    """Anything but a foot touches the ground."""
+    joint_position: Annotated[Array, (12,)]
+    """Of the links, in file order [rad]."""
+    joint_velocity: Annotated[Array, (12,)]
+    """Of the links [rad/s]."""
+    torque: Annotated[Array, (12,)]
+    """Of the motors through their gears, without friction [N m]."""
+    electrical_power: Annotated[Array, ()]
+    """From the battery into the motors; negative where they return it [W]."""
+    bus_voltage: Annotated[Array, ()]
+    """[V]"""
 
     def __post_init__(self) -> None:
         """Refuse arrays of wrong shapes."""
         for name, rest in _SHAPES.items():
-            shape = np.shape(getattr(self, name))
-            if shape != (len(self.time), *rest):
-                raise ArtefactError(
-                    f"Capture.{name} has shape {shape}; expected {(len(self.time), *rest)}."
-                )
+            found, expected = np.shape(getattr(self, name)), (len(self.time), *rest)
+            if found != expected:
+                raise ArtefactError(f"Capture.{name} has shape {found}; expected {expected}.")
 
     @property
     def dt(self) -> float:
@@ -87,6 +70,12 @@ class Capture:
         if len(self.time) < 2:
             return float("nan")
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
+
+
+_SHAPES = {
+    name: hint.__metadata__[0]
+    for name, hint in get_type_hints(Capture, include_extras=True).items()
+}
 
 
 def save(path: Path, capture: Capture) -> None:
@@ -97,18 +86,17 @@ def save(path: Path, capture: Capture) -> None:
 def load(path: Path) -> Capture:
     """Read a capture; refuse a missing or damaged file and another schema."""
     with stored_arrays(path, SCHEMA, what="a capture", writer="pronk trial") as (_, stored):
-        return Capture(**{part.name: stored[part.name] for part in fields(Capture)})
+        return Capture(**{name: stored[name] for name in _SHAPES})
 
 
 class Recorder:
-    """Keeps raw states of a plant while it runs, block after block as they come."""
+    """Keeps raw states of a running plant, block after block."""
 
     def __init__(self, plant: Plant, period_s: float) -> None:
         """Begin empty, for a plant on the ground; the first sample is due at the clock's zero."""
         self._plant, self._period = plant, period_s
         self._step_s = float(plant.model.opt.timestep)
-        self._rows: list[Array] = []
-        self._voltage: list[Array] = []
+        self._blocks: list[Array] = []
         self._begins = [0]
         """Number of the first sample of each block, and of the next one."""
 
@@ -119,40 +107,36 @@ class Recorder:
         most = math.floor((last + 0.5) * self._step_s / self._period) + 2
         return [step for step in self._steps(first, max(first, most)).tolist() if step <= last]
 
-    def keep(self, rows: Array, voltage: Array) -> None:
-        """Keep the raw states (n, state_size) and bus voltages (n,) [V] of the due steps."""
+    def keep(self, rows: Array) -> None:
+        """Keep the raw states (n, state_size) of the due steps."""
         if len(rows):
-            self._rows.append(rows)
-            self._voltage.append(voltage)
+            self._blocks.append(rows)
             self._begins.append(self._begins[-1] + len(rows))
+
+    def capture(self, since: float = -math.inf) -> Capture:
+        """Samples at and after a time [s]."""
+        times = self._step_s * self._steps(0, self._begins[-1]).astype(np.float64)
+        first = int(np.searchsorted(times, since - 0.5 * self._step_s))
+        block = max(bisect_right(self._begins, first) - 1, 0)
+        rows = np.concatenate([np.empty((0, self._plant.state_size)), *self._blocks[block:]])
+        return capture_of(self._plant, times[first:], rows[first - self._begins[block] :])
 
     def _steps(self, first: int, end: int) -> NDArray[np.intp]:
         """Physics steps of samples `first` to `end` - 1."""
         steps = np.arange(first, end) * self._period / self._step_s
         return np.asarray(np.rint(steps), dtype=np.intp)
 
-    def capture(self, since: float = -math.inf) -> Capture:
-        """Samples at and after a time [s]."""
-        times = self._step_s * self._steps(0, self._begins[-1]).astype(np.float64)
-        first = int(np.searchsorted(times, since - 0.5 * self._step_s))
-        # From the block that holds the first sample.
-        block = max(bisect_right(self._begins, first) - 1, 0)
-        skipped = first - self._begins[block]
-        none = np.empty((0, self._plant.state_size))
-        rows: Array = np.concatenate([none, *self._rows[block:]])
-        voltage: Array = np.concatenate([none[:, 0], *self._voltage[block:]])
-        return seen(self._plant, times[first:], rows[skipped:], voltage[skipped:])
 
-
-def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:
-    """Turn times [s] (T,), raw states (T, state_size) and bus voltages [V] (T,) into a capture."""
-    place, speed, act = plant.parts(rows)
-    torque, turn = plant.motor_torque(act), place[:, 3:7]
-    feet, contact, other = _touch(plant, place)
+def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
+    """Turn times [s] (T,) and raw states (T, state_size) into a capture."""
+    raw = plant.unpack(rows)
+    place, speed = raw.position, raw.velocity
+    orientation = place[:, 3:7]
+    feet, contact, other = _contacts(plant, place)
     return Capture(
         time=time,
         position=place[:, :3].copy(),
-        orientation=turn / np.sqrt((turn * turn).sum(axis=1, keepdims=True)),
+        orientation=orientation / np.sqrt((orientation * orientation).sum(axis=1, keepdims=True)),
         velocity=speed[:, :3].copy(),
         angular_velocity=speed[:, 3:6].copy(),
         foot_position=feet,
@@ -160,13 +144,13 @@ def seen(plant: Plant, time: Array, rows: Array, voltage: Array) -> Capture:
         other_contact=other,
         joint_position=place[:, plant.link_qpos],
         joint_velocity=speed[:, plant.link],
-        torque=torque,
-        electrical_power=plant.electrical_power(torque, speed[:, plant.rotor]),
-        bus_voltage=voltage.copy(),
+        torque=raw.torque,
+        electrical_power=plant.electrical_power(raw.torque, speed[:, plant.rotor]),
+        bus_voltage=raw.voltage.copy(),
     )
 
 
-def _touch(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
+def _contacts(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
     """Feet (T, 4, 3), whether they touch (T, 4), and whether anything else does (T,).
 
     Of a plant on the ground at positions (T, nq).
@@ -183,7 +167,7 @@ def _touch(plant: Plant, place: Array) -> tuple[Array, Mask, Mask]:
         if data.ncon:
             pairs.append(data.contact.geom.copy())
             samples += [k] * data.ncon
-    # The ground is one of two; what touches it is the other, a foot or none.
+    # The ground is one geom of a pair; the other is a foot or not.
     foot = np.full(model.ngeom, none)
     foot[plant.feet] = np.arange(none)
     touched = np.zeros((len(place), none + 1), dtype=bool)

@@ -1,21 +1,21 @@
 """The ground under a virtual robot, and how the robot is set down on it.
 
-Contact of a foot. A foot of rubber on a floor is a spring and a damper, one-sided, with Coulomb
-friction: pressed in by r at a speed v it pushes back with
+Contact of a foot. A foot of rubber on a floor is a one-sided spring and damper with Coulomb
+friction: pressed in by r at a speed v it exerts
 
     f = stiffness r + damping v - added_mass a,    f >= 0,    |friction force| <= friction f.
 
-The last term is what MuJoCo's soft constraints bring along. A constraint there has an inverse
-inertia A, an impedance d between 0 and 1, and a reference acceleration -(b/d) v - (k/d) r, which
-it approaches with the regularization R = A (1 - d) / d. Hence, in newtons,
+The last term is due to MuJoCo's soft constraints. A constraint there has an inverse inertia A, an
+impedance d between 0 and 1, and a reference acceleration -(b/d) v - (k/d) r, which it approaches
+with the regularization R = A (1 - d) / d. Hence, in newtons,
 
     stiffness = k / (A (1 - d)),  damping = b / (A (1 - d)),  added_mass = d / (A (1 - d)),
 
 solved here for k and b at d = 1/2: the added mass is then that of the foot itself (0.17 kg), and
-the static spring is exactly `stiffness`. Training's contact is another one: a
-reference of 20 ms and an impedance of .9 and more, seen through a step of 5 ms.
+the static spring is exactly `stiffness`. Training's contact differs: a reference of 20 ms and an
+impedance of .9 and more, at a step of 5 ms.
 
-Two traits of MuJoCo's friction remain. A sticking foot creeps, by 1 / (impratio damping) = 0.02
+Two properties of MuJoCo's friction remain. A sticking foot creeps, by 1 / (impratio damping) = 0.02
 mm/s per newton; and a sliding one is pressed more, by some 20 N per m/s of slip, as long as it
 stays pressed in. The friction force is `friction` times the normal force at every instant.
 """
@@ -35,7 +35,9 @@ from pronk.errors import RobotError
 from pronk.virtual.bounds import Bounded
 
 Array = NDArray[np.float64]
-Point = tuple[float, float, float]
+_Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
+_Size = Annotated[float, Meta(gt=0.0, le=1e6)]
+_Span = Annotated[float, Meta(ge=0.0, le=1e6)]
 
 _IMPEDANCE = 0.5
 _IMPRATIO = 1000.0
@@ -45,22 +47,13 @@ _COLOUR = (0.55, 0.58, 0.62, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box:
-    """A block that stands fast, its faces along the axes of the world."""
+class Box(Bounded):
+    """A fixed block, its faces along the axes of the world."""
 
-    center: Point
+    center: tuple[_Place, _Place, _Place]
     """[m]"""
-    half_size: Point
+    half_size: tuple[_Size, _Size, _Size]
     """[m]"""
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that are not finite and sizes that are not positive."""
-        for name in ("center", "half_size"):
-            value = getattr(self, name)
-            if np.shape(value) != (3,) or not np.isfinite(value).all():
-                raise RobotError(f"Box.{name} is {value}; expected three finite numbers [m].")
-        if not min(self.half_size) > 0.0:
-            raise RobotError(f"Box.half_size is {self.half_size}; each must be positive.")
 
     @property
     def top(self) -> float:
@@ -70,7 +63,7 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Ground(Bounded):
-    """A floor, blocks on it, and how feet feel them."""
+    """A floor, blocks on it, and their contact with feet."""
 
     friction: Annotated[float, Meta(ge=1e-3, le=10.0)] = 0.8
     """Coulomb coefficient between foot and ground [1]."""
@@ -150,20 +143,19 @@ class Ground(Bounded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Start:
+class Start(Bounded):
     """How a robot is set down, its drives holding `default pose + joint_offset`."""
 
-    position: tuple[float, float] = (0.0, 0.0)
+    position: tuple[_Place, _Place] = (0.0, 0.0)
     """Of the trunk over the ground [m]."""
-    yaw: float = 0.0
+    yaw: _Place = 0.0
     """Heading, positive to the left [rad]."""
-    joint_offset: tuple[float, ...] | None = None
-    """What the drives hold beside the default pose, until the first command, in file order [rad];
-    None is zeros."""
-    drop: float = 0.0
+    joint_offset: tuple[_Place, ...] | None = None
+    """From the default pose, until the first command, in file order [rad]; None is zeros."""
+    drop: _Span = 0.0
     """Height of the lowest foot over the ground when the robot is released [m]."""
-    settle_s: float = 1.5
-    """Time that it is given to come to rest, before the clock starts [s]."""
+    settle_s: _Span = 1.5
+    """Time before the clock starts [s]."""
 
     def offset(self, joints: int) -> Array:
         """The joint offset as an array [rad], (joints,); refuse another number of joints."""
@@ -173,13 +165,3 @@ class Start:
                 f"Start.joint_offset has {len(offset)} numbers; expected {joints}, one per joint."
             )
         return offset
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that are not finite, or negative where they cannot be."""
-        numbers = (*self.position, self.yaw, *(self.joint_offset or ()), self.drop, self.settle_s)
-        fits = len(self.position) == 2 and all(map(math.isfinite, numbers))
-        if not fits or self.drop < 0.0 or self.settle_s < 0.0:
-            raise RobotError(
-                f"{self}: expected two numbers in position, all numbers finite, drop and settle_s "
-                "not negative."
-            )

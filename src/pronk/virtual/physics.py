@@ -1,4 +1,4 @@
-"""A plant that runs: commands arrive, the battery sags, samples of the capture are kept.
+"""Simulation of a plant: commands arrive, the battery sags, samples of the capture are kept.
 
 Time is counted in physics steps from the clock's zero. Steps are taken natively in blocks, which
 end where a state or a sample is due, or a command takes effect.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -16,40 +15,24 @@ from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, damping_command
-from pronk.virtual.capture import Capture, Recorder, seen
+from pronk.virtual.capture import Capture, Recorder, capture_of
 from pronk.virtual.plant import Plant
 from pronk.virtual.sim_params import MachineParams
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 _LEAST_SHARE = -0.5
-"""No battery here is charged at more than twice its voltage, whatever runs away."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Block:
-    """Raw states of a plant at n instants."""
-
-    qpos: Array
-    """(n, nq)"""
-    qvel: Array
-    """(n, nv)"""
-    torque: Array
-    """Of the motors [N m]. (n, joints of the plant)"""
-    voltage: Array
-    """Of the bus [V]. (n,)"""
+"""Bounds the bus voltage at twice the battery's, also where numbers run away."""
 
 
 class Transport:
-    """Commands under way, in order of arrival. Time is counted in physics steps.
+    """Commands under way, in order of arrival. Time is counted in physics steps of `step_s`.
 
     A command that expires, at `made + valid_for` and later by the delay, is followed by damping. A
     newer command replaces an older one together with its expiry.
     """
 
     def __init__(self, joints: int, delay_s: float, step_s: float) -> None:
-        """Begin empty, for `joints` joints, with a delay [s] in steps of `step_s` [s]."""
         self._sinking = damping_command(joints)
         self._delay, self._step = delay_s, step_s
         self._under_way: deque[tuple[int, Command]] = deque()
@@ -82,68 +65,53 @@ class Transport:
 class Physics:
     """One run of a plant."""
 
-    def __init__(
-        self,
-        plant: Plant,
-        machine: MachineParams,
-        *,
-        pose: Array,
-        columns: Indices,
-        offset: Array,
-        first_step: int,
-    ) -> None:
-        """Begin with links and rotors in a pose and the drives off.
+    recorder: Recorder | None = None
+    """Keeps the samples of a capture."""
 
-        Args:
-            plant: Built with the physics step in its model.
-            machine: Battery.
-            pose: Of all joints of the robot [rad].
-            columns: Of the plant's joints in a pose or command.
-            offset: Reading of their encoders less the true angle [rad].
-            first_step: To begin with, negative before the clock's zero.
+    def __init__(
+        self, plant: Plant, machine: MachineParams, *, pose: Array, first_step: int
+    ) -> None:
+        """Begin with links and rotors in a pose of all joints [rad] and the drives off.
+
+        `first_step` is negative before the clock's zero.
         """
         self.plant, self._machine = plant, machine
         self.data = mujoco.MjData(plant.model)
         self.step = self._first = first_step
-        self.recorder: Recorder | None = None
-        """Keeps the samples of a capture, if there is to be one."""
-        self._columns, self._offset = columns, offset
         self._dt = float(plant.model.opt.timestep)
         self._voltage = machine.bus_voltage
         self._gains = b""
         self._qvel, self._act = self.data.qvel, self.data.act  # views
         plant.set_bus_voltage(self._voltage)
-        self.data.qpos[plant.rotor_qpos] = self.data.qpos[plant.link_qpos] = pose[columns]
+        self.data.qpos[plant.rotor_qpos] = self.data.qpos[plant.link_qpos] = pose[plant.columns]
         plant.set_clamps((), self.data.qpos, 0.0, 0.0)
 
     def apply(self, command: Command) -> None:
-        """Let the drives act on a command, through encoders that may be off."""
-        columns = self._columns
-        target = np.asarray(command.position, dtype=float)[columns] - self._offset
-        self.data.ctrl[self.plant.actuator] = target
+        """Set the drives' targets, through encoders that may be off, and gains."""
+        plant = self.plant
+        position = np.asarray(command.position, dtype=float)[plant.columns]
+        self.data.ctrl[plant.actuator] = position - plant.encoder_offset
         gains = np.asarray([command.stiffness, command.damping], dtype=float)
         # A policy repeats the same gains with every command.
         if (packed := gains.tobytes()) != self._gains:
             self._gains = packed
-            self.plant.set_gains(*gains[:, columns])
+            plant.set_gains(*gains[:, plant.columns])
 
-    def run(self, steps: list[int], transport: Transport) -> Block:
-        """Go on to each of some rising physics steps, and read the plant there."""
+    def run(self, steps: list[int], transport: Transport) -> Array:
+        """Advance over rising physics steps; return the raw states there, (n, state_size)."""
         plant, data, wanted = self.plant, self.data, set(steps)
         due = [] if self.recorder is None else self.recorder.due(steps[-1])
-        # Where a sample and a state are of the same step, one look does for both.
+        # A sample and a state of the same step are read once.
         stops = sorted(steps + [step for step in due if step not in wanted])
-        rows, voltages = np.empty((len(stops), plant.state_size)), []
+        rows = np.empty((len(stops), plant.state_size))
         next_due = transport.soonest
         for stop, row in zip(stops, rows, strict=True):
             if next_due < stop:
                 next_due = self._obey(stop, transport)
             self._step_to(stop)
-            plant.read(data, row)
-            voltages.append(self._voltage)
+            plant.read(data, self._voltage, row)
             if stop in wanted:
                 self._sag()
-        voltage = np.array(voltages)
         # MuJoCo starts over, its time at 0, where numbers run away.
         if data.time < (self.step - self._first - 0.5) * self._dt:
             raise HardwareError(
@@ -152,19 +120,14 @@ class Physics:
                 "gains."
             )
         if self.recorder is not None:
-            sampled = np.searchsorted(stops, due)
-            self.recorder.keep(rows[sampled], voltage[sampled])
-        if len(stops) > len(steps):
-            chosen = [stop in wanted for stop in stops]
-            rows, voltage = rows[chosen], voltage[chosen]
-        qpos, qvel, act = plant.parts(rows)
-        return Block(qpos=qpos, qvel=qvel, torque=plant.motor_torque(act), voltage=voltage)
+            self.recorder.keep(rows[np.searchsorted(stops, due)])
+        return rows if len(stops) == len(steps) else rows[[stop in wanted for stop in stops]]
 
-    def look(self) -> Capture:
+    def snapshot(self) -> Capture:
         """One sample of a capture, of now."""
         row = np.empty((1, self.plant.state_size))
-        self.plant.read(self.data, row[0])
-        return seen(self.plant, np.array([self.step * self._dt]), row, np.array([self._voltage]))
+        self.plant.read(self.data, self._voltage, row[0])
+        return capture_of(self.plant, np.array([self.step * self._dt]), row)
 
     def _obey(self, before: int, transport: Transport) -> float:
         """Apply the commands due before a physics step; return when the next one is due."""
@@ -179,11 +142,11 @@ class Physics:
             self.step = step
 
     def _sag(self) -> None:
-        """Let the bus voltage follow the power P that the motors draw (or give back).
+        """Update the bus voltage from the power P that the motors draw (or return).
 
-        V = U - R P / V, with P taken as growing with V^2 from what it was at the last V: that of
-        drives at their voltage limit does, and with P held fixed the two would chase each other.
-        Either way it settles on the same V.
+        V = U - R P / V, with P taken as proportional to V^2 about the last V, as it is for drives
+        at their voltage limit; with P constant the iteration would oscillate. Both have the same
+        fixed point.
         """
         plant, machine = self.plant, self._machine
         torque, speed = plant.motor_torque(self._act), self._qvel.take(plant.rotor)
@@ -191,6 +154,6 @@ class Physics:
         power = float(torque.dot(speed) + (current * current).dot(plant.resistance))
         share = machine.bus_resistance * power / self._voltage**2
         sagged = machine.bus_voltage / (1.0 + max(share, _LEAST_SHARE))
-        # A battery gives most at half its voltage; above that it gives no more.
+        # A battery's power is largest at half its voltage.
         self._voltage = max(sagged, 0.5 * machine.bus_voltage)
         plant.set_bus_voltage(self._voltage)

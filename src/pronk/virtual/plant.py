@@ -1,10 +1,9 @@
-"""The different machine: rotors behind compliant belts, driven by DC motors.
+"""The plant of the virtual robot: rotors behind compliant belts, driven by DC motors.
 
-From the robot's own structure (`RobotSpec.build_spec`) comes a plant in which every joint has two
-degrees of freedom: the link, and the rotor with the inertia reflected through the gear. A belt
-(spring and damper) couples them. Motor, encoder and friction sit on the rotor, as on the robot.
-All of it is in joint coordinates. On the bench the base is fixed to its stand and nothing touches
-anything; on the ground the trunk is free.
+Every joint of the robot's model has two degrees of freedom here: the link, and the rotor with the
+inertia reflected through the gear. A belt (spring and damper) couples them. Motor, encoder and
+friction are on the rotor. All of it is in joint coordinates. On the bench the base is fixed to its
+stand and there are no contacts; on the ground the trunk is free.
 
 Drive. MuJoCo's `dcmotor`, whose controller outputs volts. A drive that regulates current demands
 tau = stiffness (target - q) - damping qdot and assumes a motor constant K0; the motor has
@@ -18,7 +17,7 @@ gives the torque-speed line of the true motor. Friction is LuGre with a Stribeck
 dz/dt = v - sigma0 |v| z / g(v), g = F_C + (F_S - F_C) exp(-(v/v_S)^2), torque sigma0 z +
 sigma1 dz/dt, outside the limits of the motor.
 
-Time stepping. MuJoCo's Euler step is symplectic: positions see the new speed, torques the old one.
+Time stepping. MuJoCo's Euler step is symplectic: positions use the new speed, torques the old one.
 With the drive's derivative torque explicit, q_{n+1} - 2 q_n + q_{n-1} = -(h/I) kd (q_n - q_{n-1})
 + ..., in which the backward difference stands for qdot - (h/2) qddot: the joint responds as if its
 inertia were smaller by kd h / 2, an error of first order in the step h (0.13 dB at 0.25 ms). The
@@ -32,7 +31,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -61,65 +60,61 @@ _KP, _KD, _VMAX = 4, 6, 7
 _STATE = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT
 
 
-@dataclass(frozen=True)
-class Plant:
-    """A compiled plant and where to find its parts. Arrays are in the order of `joints`."""
+class RawStates(NamedTuple):
+    """Views of raw states of a plant at n instants."""
 
-    model: Any
-    """mujoco.MjModel"""
-    joints: tuple[str, ...]
-    """Joints that are in the plant, in file order."""
-    rotor: Indices
-    """Of each rotor in qvel."""
+    position: Array  # qpos, (n, nq)
+    velocity: Array  # qvel, (n, nv)
+    torque: Array  # of the motors [N m], (n, joints of the plant)
+    voltage: Array  # of the bus [V], (n,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plant:
+    """A compiled plant and indices of its parts. Arrays are in the order of `joints`."""
+
+    model: Any  # mujoco.MjModel
+    joints: tuple[str, ...]  # joints in the plant, in file order
+    columns: Indices  # of these joints among all joints of the robot
+    rotor: Indices  # in qvel
     rotor_qpos: Indices
-    link: Indices
-    """Of each link in qvel."""
+    link: Indices  # in qvel
     link_qpos: Indices
-    actuator: Indices
-    """Of each motor in ctrl."""
-    current: Indices
-    """Of each motor's current in act."""
-    stand: Indices
-    """Of the stand's roll, pitch and yaw in qpos and qvel; empty if it is rigid, and on the
-    ground."""
-    feet: Indices
-    """Geom of each leg's foot, on the ground; empty on the bench."""
-    base: int
-    """Id of the trunk's body."""
-    constant: Array
-    """True motor constants K [V s/rad]."""
-    believed: Array
-    """Motor constants K0 that the drives assume [V s/rad]."""
-    resistance: Array
-    """[ohm]"""
-    effort_limit: Array
-    """Largest torque that the motors give when the drives compute their own limit [N m]."""
-    rotor_inertia: Array
-    """True, reflected through the gear [kg m^2]."""
-    viscous: Array
-    """[N m s/rad]"""
+    actuator: Indices  # in ctrl
+    current: Indices  # of each motor's current in act
+    stand: Indices  # roll, pitch, yaw in qpos and qvel; empty if it is rigid, and on the ground
+    feet: Indices  # geoms; empty on the bench
+    constant: Array  # motor constants K [V s/rad]
+    believed: Array  # motor constants K0 that the drives assume [V s/rad]
+    resistance: Array  # [ohm]
+    effort_limit: Array  # largest torque of the motors [N m]
+    rotor_inertia: Array  # reflected through the gear [kg m^2]
+    viscous: Array  # [N m s/rad]
+    encoder_offset: Array  # reading minus true angle [rad]
 
     @cached_property
     def state_size(self) -> int:
-        """Numbers in a raw state: positions, velocities, activations."""
-        return int(self.model.nq + self.model.nv + self.model.na)
+        """Numbers in a raw state: positions, velocities, activations, bus voltage."""
+        return int(self.model.nq + self.model.nv + self.model.na + 1)
 
     @cached_property
     def aside(self) -> Any:
         """A mujoco.MjData to compute in, beside the run's."""
         return mujoco.MjData(self.model)
 
-    def read(self, data: Any, row: Array) -> None:
+    def read(self, data: Any, voltage: float, row: Array) -> None:
         """Copy the raw state of a mujoco.MjData into a row, shape (state_size,)."""
-        mujoco.mj_getState(self.model, data, row, _STATE)
+        mujoco.mj_getState(self.model, data, row[:-1], _STATE)
+        row[-1] = voltage
 
-    def parts(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Views of positions, velocities and activations in raw states, shape (..., state_size)."""
+    def unpack(self, rows: Array) -> RawStates:
+        """Split raw states (n, state_size)."""
         nq, nv = self.model.nq, self.model.nv
-        return rows[..., :nq], rows[..., nq : nq + nv], rows[..., nq + nv :]
+        torque = self.motor_torque(rows[:, nq + nv : -1])
+        return RawStates(rows[:, :nq], rows[:, nq : nq + nv], torque, rows[:, -1])
 
     def set_gains(self, stiffness: Array, damping: Array) -> None:
-        """Put gains [N m/rad, N m s/rad] on the drives, in force from the next physics step."""
+        """Set the drives' gains [N m/rad, N m s/rad] from the next physics step."""
         volts = self.resistance / self.believed
         self.model.actuator_gainprm[self.actuator, _KP] = volts * stiffness
         self.model.actuator_gainprm[self.actuator, _KD] = volts * damping - self.constant
@@ -128,7 +123,7 @@ class Plant:
         half_step = 0.5 * self.model.opt.timestep
         inertia = self.rotor_inertia + half_step * explicit
         self.model.dof_armature[self.rotor] = inertia
-        # What MuJoCo reads in its place for a rotor whose parent cannot move.
+        # MuJoCo reads this in its place for a rotor whose parent cannot move.
         self.model.dof_M0[self.rotor] = inertia + _ROTOR_MASS
 
     def set_bus_voltage(self, voltage: float) -> None:
@@ -137,7 +132,7 @@ class Plant:
 
     @cached_property
     def _inverters(self) -> Array:
-        """View of the voltages at which they clip; every actuator of the plant is a motor."""
+        """View of the clip voltages; every actuator of the plant is a motor."""
         view: Array = self.model.actuator_gainprm[:, _VMAX]
         return view
 
@@ -297,7 +292,7 @@ def _free_base(spec: Any, robot: RobotSpec, ground: Ground) -> None:
         raise RobotError(
             f"{robot.name} has no legs to stand on; it can be simulated on the bench only."
         )
-    # What is only drawn costs time in every step.
+    # Visual geoms cost time in every step.
     for geom in [geom for geom in spec.geoms if not geom.contype and not geom.conaffinity]:
         spec.delete(geom)
     ground.add_to(spec)
@@ -322,7 +317,7 @@ def _fix_base(spec: Any, robot: RobotSpec, sim_params: SimParams) -> None:
 
 
 def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
-    """Apply the trunk's parameters; refuse a body that could not be like that."""
+    """Apply the trunk's parameters; refuse an impossible body."""
     trunk = sim_params.trunk
     mass = float(model.body_mass[body])
     if not mass + trunk.mass_offset > 0.0:
@@ -353,14 +348,9 @@ def build_plant(
     timestep_s: float,
     ground: Ground | None = None,
 ) -> Plant:
-    """Build the plant: on the bench, base on the stand and feet in the air, or on the ground.
+    """Build the plant: on the bench, base on the stand and feet in the air, or on `ground`.
 
-    Args:
-        robot: Structure, masses and drives to start from.
-        sim_params: In what the machine differs.
-        legs: To keep in the plant, of `legs_of(robot)`.
-        timestep_s: Physics step [s].
-        ground: What it stands on; None is the bench.
+    `legs` of `legs_of(robot)` remain in the plant.
     """
     if sim_params.robot != robot.name:
         raise RobotError(
@@ -392,9 +382,9 @@ def build_plant(
         body = int(model.jnt_bodyid[link.id])
         model.body_mass[body] *= params.link_inertia_scale
         model.body_inertia[body] *= params.link_inertia_scale
-    base, feet = model.body(robot.base_body).id, np.array([], dtype=np.intp)
+    feet = _ids([])
     if ground is not None:
-        _change_trunk(model, base, sim_params)
+        _change_trunk(model, model.body(robot.base_body).id, sim_params)
         feet = _ids([model.geom(f"{leg}_foot_collision").id for leg in legs])
     mujoco.mj_setConst(model, mujoco.MjData(model))
     if ground is not None:
@@ -407,6 +397,7 @@ def build_plant(
     plant = Plant(
         model=model,
         joints=names,
+        columns=_ids([robot.joint_names.index(name) for name in names]),
         rotor=_ids([joint.dofadr[0] for joint in rotors]),
         rotor_qpos=_ids([joint.qposadr[0] for joint in rotors]),
         link=_ids([joint.dofadr[0] for joint in links]),
@@ -416,13 +407,13 @@ def build_plant(
         current=_ids(model.actuator_actadr[motors] + model.actuator_actnum[motors] - 1),
         stand=_ids([] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES]),
         feet=feet,
-        base=base,
         constant=scale * believed,
         believed=believed,
         resistance=resistance,
         effort_limit=scale * np.array([joint.drive.effort_limit for joint in joints]),
         rotor_inertia=np.array([params.rotor_inertia for params in true]) * gears**2,
         viscous=np.array([params.viscous for params in true]),
+        encoder_offset=np.array([params.encoder_offset for params in true]),
     )
     _check_springs(plant, sim_params)
     return plant

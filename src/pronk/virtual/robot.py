@@ -1,7 +1,6 @@
-"""The virtual robot: a stand-in for hardware, marked as such (`virtual` is True).
+"""The virtual robot, on the bench or on the ground: a `Machine` with `virtual` True.
 
-It stands on the bench or on the ground. Physics runs in blocks (`physics.py`), and each block of
-raw states is turned into what sensors would have measured (`sensors.py`).
+Physics runs in blocks (`physics.py`), and `sensors.py` makes measured states of each block.
 
 The physics step is 0.25 ms, and that has converged. On the bench the Bode gains of hip_roll,
 hip_pitch and knee differ by 0.004, 0.003 and 0.002 dB at most from those at 25 us (40 kHz, the rate
@@ -34,7 +33,7 @@ from pronk.virtual.capture import Capture, Recorder
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.physics import Physics, Transport
 from pronk.virtual.plant import build_plant, legs_of
-from pronk.virtual.sensors import Sensors, TrunkMotion
+from pronk.virtual.sensors import Sensors
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
 TIMESTEP_S = 0.25e-3
@@ -72,15 +71,15 @@ class VirtualRobot:
 
         Args:
             robot: Structure, masses, drives.
-            sim_params: In what the machine differs.
+            sim_params: How the machine differs from `robot`.
             seed: Of all noise.
-            base: `bench`: the body is fixed to its stand; `ground`: it stands and moves freely.
-            ground: What it stands on; None is the parameters' own floor. On the ground only.
-            start: How it is set down on the ground; None is in the default pose at the origin.
+            base: `bench`: the body is fixed to its stand; `ground`: it moves freely.
+            ground: None is the parameters' own floor. On the ground only.
+            start: None is in the default pose at the origin. On the ground only.
             log_rate_hz: States per second.
-            capture_rate_hz: Samples per second of `capture`, on the ground; None keeps none, for
-                runs without end (a second takes 0.7 MB at 1 kHz).
-            legs: Legs to simulate on the bench; None for all. Joints of absent legs report their
+            capture_rate_hz: Samples per second of `capture`, on the ground; None keeps none (a
+                second takes 0.7 MB at 1 kHz).
+            legs: To simulate on the bench; None for all. Joints of absent legs report their
                 default position and no speed.
             timestep_s: Physics step.
         """
@@ -108,12 +107,6 @@ class VirtualRobot:
         self._start = start or Start()
         self._rate, self._capture_rate, self._dt = log_rate_hz, capture_rate_hz, timestep_s
         self._plant = build_plant(robot, sim_params, legs or known, timestep_s, self._ground)
-        # Columns of the present joints in file order, and their encoders' error.
-        names = robot.joint_names
-        self._columns = np.array([names.index(name) for name in self._plant.joints], dtype=np.intp)
-        self._offset = np.array(
-            [sim_params.joints[name].encoder_offset for name in self._plant.joints]
-        )
         self._recorder: Recorder | None = None
         self._open = False
 
@@ -129,19 +122,11 @@ class VirtualRobot:
         settle = _SETTLE_S
         if self._ground is not None:
             pose, settle = pose + self._start.offset(len(pose)), self._start.settle_s
-        free = self._ground is not None
-        self._trunk = TrunkMotion(plant, 1.0 / self._rate, free=free)
         self._sensors = Sensors(robot, self._sim_params, plant, rate_hz=self._rate, seed=self._seed)
         self._transport = Transport(len(pose), machine.command_delay_s, self._dt)
-        self._physics = Physics(
-            plant,
-            machine,
-            pose=pose,
-            columns=self._columns,
-            offset=self._offset,
-            # Steps are counted from the clock's zero; settling happens before it.
-            first_step=-round(settle / self._dt),
-        )
+        # Steps are counted from the clock's zero; settling happens before it.
+        first_step = -round(settle / self._dt)
+        self._physics = Physics(plant, machine, pose=pose, first_step=first_step)
         self._recorder = None
         if self._ground is not None:
             self._ground.set_down(plant.model, self._physics.data, plant.feet, self._start)
@@ -231,7 +216,7 @@ class VirtualRobot:
         self._check_open()
         if self._ground is None:
             raise HardwareError("nothing is captured on the bench; use base='ground'.")
-        return self._physics.look()
+        return self._physics.snapshot()
 
     def close(self) -> None:
         """Damp and close; closing twice does no harm."""
@@ -244,15 +229,14 @@ class VirtualRobot:
             raise HardwareError("the virtual robot is not connected; call connect() first.")
 
     def _run(self, count: int) -> list[State]:
-        """Advance over the next `count` ticks and return what the sensors say of them."""
+        """Advance over the next `count` ticks and return their states."""
         first = self._sensors.sequence
         ticks = np.arange(first, first + count) / self._rate
         # A state was measured some time before its timestamp.
         delay = self._sim_params.machine.measurement_delay_s
         steps = np.rint((ticks - delay) / self._dt).astype(int)
-        block = self._physics.run(steps.tolist(), self._transport)
-        motion = self._trunk.at(block.qpos, block.qvel)
-        return self._sensors.read(ticks, steps * self._dt, block, motion)
+        rows = self._physics.run(steps.tolist(), self._transport)
+        return self._sensors.read(ticks, steps * self._dt, self._plant.unpack(rows))
 
 
 def open_sim(
@@ -263,9 +247,6 @@ def open_sim(
     params: str | None = None,
     **common: Any,
 ) -> VirtualRobot:
-    """Make the virtual robot of an address `sim://BASE?seed=0&params=FILE`, BASE bench or ground.
-
-    What else links take (`common`) is of no effect.
-    """
+    """Make the virtual robot of `sim://BASE?seed=0&params=FILE`, BASE bench or ground."""
     base: Any = interface or "ground"
     return VirtualRobot(robot, load_sim_params(params, robot), seed=seed, base=base)

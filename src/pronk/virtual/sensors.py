@@ -1,14 +1,14 @@
 """Sensors of the virtual robot: states from true values.
 
-Encoders sit on the rotors and have the grid of their bits seen through the gear; their mounts
-shake slowly (coloured noise). Speed is the drive's own first difference of that grid. Torque is
-current times the constant that the drive assumes. The accelerometer gives the mean over the time
-since the last state, as a unit that integrates inside does. The attitude filter is off by a
-constant, by something that wanders, and by a heading that starts anywhere. Timestamps jitter.
+Encoders are on the rotors, quantized by their bits divided by the gear ratio; their mounts vibrate
+slowly (coloured noise). Speed is the drive's own first difference of the quantized angle. Torque is
+current times the constant that the drive assumes. The accelerometer gives the mean since the last
+state, as a unit that integrates does. The attitude filter has a constant error, a slowly varying
+one, and an arbitrary heading. Timestamps jitter.
 
 A block of ticks is read at once; reading the same ticks in other blocks gives the same numbers.
-Quaternions are rows w, x, y, z, written out because the loop runs a thousand times a second on a
-handful of rows, where a general library spends its time on preparations.
+Quaternions are rows w, x, y, z. Their algebra is written out here, for a general library is slow on
+the few rows of a block.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from pronk.links.machine import State
 from pronk.robots.robot import RobotSpec
-from pronk.virtual.physics import Block
-from pronk.virtual.plant import Plant
+from pronk.virtual.plant import Plant, RawStates
 from pronk.virtual.sim_params import SimParams
 
 Array = NDArray[np.float64]
@@ -73,45 +72,6 @@ def _cross(a: Array, b: Array) -> Array:
     return across
 
 
-class Motion(NamedTuple):
-    """Of the trunk, at n instants."""
-
-    orientation: Array
-    """Trunk to world, quaternions w, x, y, z. (n, 4)"""
-    rate: Array
-    """Angular velocity in the trunk's frame [rad/s]. (n, 3)"""
-    force: Array
-    """Specific force in the trunk's frame, its mean since the instant before [m/s^2]. (n, 3)"""
-
-
-class TrunkMotion:
-    """Motion of the trunk, free on the ground or on its stand. Keeps the last instant."""
-
-    def __init__(self, plant: Plant, period_s: float, *, free: bool) -> None:
-        """Begin at rest, with a period between instants [s]."""
-        self._stand, self._period, self._free = plant.stand, period_s, free
-        self._last: Array | None = None
-        self._still: Motion | None = None
-        """On a rigid stand, for as many instants as last time."""
-
-    def at(self, qpos: Array, qvel: Array) -> Motion:
-        """The motion at instants, from the plant's positions (n, nq) and velocities (n, nv)."""
-        if self._free:
-            orientation, velocity = qpos[:, 3:7], qvel[:, :3]
-            now = np.concatenate([orientation, velocity], axis=1)
-            path = np.concatenate([now[:1] if self._last is None else self._last, now])
-            self._last = now[-1:]
-            force = moving_force(path[:, 4:], path[:, :4], self._period)
-            return Motion(orientation, qvel[:, 3:6], force)
-        if len(self._stand):
-            tilt = qpos[:, self._stand]
-            return Motion(of_vector(tilt), qvel[:, self._stand], resting_force(tilt))
-        if self._still is None or len(self._still.rate) != len(qpos):
-            tilt = np.zeros((len(qpos), 3))
-            self._still = Motion(of_vector(tilt), tilt, resting_force(tilt))
-        return self._still
-
-
 def resting_force(tilt: Array) -> Array:
     """Reading of an accelerometer at rest at small tilts (roll, pitch, yaw) (n, 3) [rad, m/s^2]."""
     roll, pitch = tilt[:, 0], tilt[:, 1]
@@ -135,40 +95,30 @@ def moving_force(velocity: Array, orientation: Array, period_s: float) -> Array:
 
 
 class Noise(NamedTuple):
-    """Errors of the sensors at n ticks; joints are all of the robot's."""
+    """Errors of the sensors at n ticks, for all joints of the robot."""
 
-    jitter: Array
-    """Of the instant of sampling about its tick [s]. (n,)"""
-    stamp: Array
-    """Of the timestamp beyond that [s]. (n,)"""
-    position: Array
-    """[rad]. (n, joints)"""
-    velocity: Array
-    """[rad/s]. (n, joints)"""
-    torque: Array
-    """[N m]. (n, joints)"""
-    gyro: Array
-    """With its bias [rad/s]. (n, 3)"""
-    force: Array
-    """With its bias [m/s^2]. (n, 3)"""
-    tilt: Array
-    """Rotation of the attitude in the trunk's frame, quaternion. (n, 4)"""
-    heading: Array
-    """Rotation of the attitude about the vertical, quaternion. (n, 4)"""
+    jitter: Array  # of the instant of sampling about its tick [s], (n,)
+    stamp: Array  # of the timestamp beyond that [s], (n,)
+    position: Array  # [rad], (n, joints)
+    velocity: Array  # [rad/s], (n, joints)
+    torque: Array  # [N m], (n, joints)
+    gyro: Array  # with its bias [rad/s], (n, 3)
+    force: Array  # with its bias [m/s^2], (n, 3)
+    tilt: Array  # rotation of the attitude in the trunk's frame, quaternion, (n, 4)
+    heading: Array  # rotation of the attitude about the vertical, quaternion, (n, 4)
 
 
 class NoiseSource:
-    """Noise, tick after tick."""
+    """Noise of a seed, tick after tick."""
 
     def __init__(self, sim_params: SimParams, joints: int, *, rate_hz: float, seed: int) -> None:
-        """Start the noise of all `joints` anew, at a rate [Hz], from a seed."""
         self._machine, self._filter = machine, off = sim_params.machine, sim_params.attitude
         self._joints, self._period = joints, 1.0 / rate_hz
         self._rng = np.random.default_rng(seed)
         # A stream of its own: noise of the joints does not depend on the attitude's.
         self._attitude_rng = np.random.default_rng([seed, 1])
         self._yaw = self._attitude_rng.uniform(-math.pi, math.pi)
-        # What is left of the slow noise after a tick, and how large what is added is.
+        # Share of the slow noise that is left after a tick, and size of what is added.
         each = [joints, 3]
         corner = np.repeat([machine.position_noise_corner_hz, off.noise_corner_hz], each)
         self._keep = np.exp(-2.0 * math.pi * corner * self._period)
@@ -199,7 +149,12 @@ class NoiseSource:
         # Clipped so that neither may ever put two states out of order.
         most = 0.4 * self._period
         normals = self._attitude_rng.standard_normal((n, 3))
-        slow = self._low_passed(np.concatenate([mount, normals], axis=1))
+        slow: Array = self._fresh * np.concatenate([mount, normals], axis=1)
+        last = self._last
+        for row in slow:  # low-passed
+            row += self._keep * last
+            last = row
+        self._last = last.copy()
         ticks = np.arange(self._drawn, self._drawn + n) * self._period
         self._drawn += n
         return Noise(
@@ -215,74 +170,59 @@ class NoiseSource:
             heading=about_z(np.asarray(self._yaw + off.yaw_drift * ticks, dtype=np.float64)),
         )
 
-    def _low_passed(self, normals: Array) -> Array:
-        """First-order low-passed noise, of the mounts and of the attitude, that goes on."""
-        slow: Array = self._fresh * normals
-        last = self._last
-        for row in slow:
-            row += self._keep * last
-            last = row
-        self._last = last.copy()
-        return slow
-
 
 class Sensors:
-    """Turns true values into states."""
+    """Makes states of true values, with the noise of a seed."""
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        sim_params: SimParams,
-        plant: Plant,
-        *,
-        rate_hz: float,
-        seed: int,
+        self, robot: RobotSpec, sim_params: SimParams, plant: Plant, *, rate_hz: float, seed: int
     ) -> None:
-        """Start anew, with the noise of a seed, for the joints that are in the plant."""
-        machine = sim_params.machine
-        self._machine, self._plant = machine, plant
-        names, joints = robot.joint_names, plant.joints
-        self._columns = np.array([names.index(name) for name in joints], dtype=np.intp)
+        self._machine, self._plant = sim_params.machine, plant
+        self._period, self._free = 1.0 / rate_hz, len(plant.feet) > 0
         self._default = np.array([joint.default_position for joint in robot.joints])
-        self._offset = np.array([sim_params.joints[name].encoder_offset for name in joints])
-        self._scale = np.array([sim_params.joints[name].torque_scale for name in joints])
-        gears = np.array([robot.joint(name).drive.gear_ratio for name in joints])
-        self._count = 2.0 * math.pi / 2.0**machine.encoder_bits / gears
-        self._noise = NoiseSource(sim_params, len(names), rate_hz=rate_hz, seed=seed)
+        self._scale = np.array([sim_params.joints[name].torque_scale for name in plant.joints])
+        gears = np.array([robot.joint(name).drive.gear_ratio for name in plant.joints])
+        self._count = 2.0 * math.pi / 2.0**self._machine.encoder_bits / gears
+        self._noise = NoiseSource(sim_params, len(robot.joints), rate_hz=rate_hz, seed=seed)
+        self._trunk: Array | None = None
+        """Orientation and velocity of the trunk at the last state."""
         self.sequence = 0
         """Number of the next state."""
 
-    def read(self, tick: Array, instant: Array, block: Block, motion: Motion) -> list[State]:
-        """The states of a block of ticks, joints that are absent at rest in the default pose.
+    def read(self, tick: Array, instant: Array, raw: RawStates) -> list[State]:
+        """Make the states of a block of ticks; absent joints rest in the default pose.
 
         Args:
             tick: Nominal instants of the states on the machine's clock [s], shape (n,).
             instant: Of the physics steps nearest to the measurements [s], shape (n,).
-            block: The plant at those steps.
-            motion: Of the trunk at those steps.
+            raw: The plant at those steps.
         """
-        noise, total = self._noise.take(len(tick)), len(self._default)
+        plant, noise = self._plant, self._noise.take(len(tick))
         stamp = tick + noise.jitter + noise.stamp
         # To first order from the physics step to the instant of sampling, at most half a step plus
         # the jitter away: 1e-5 rad of error at 500 rad/s^2.
         late = tick - self._machine.measurement_delay_s + noise.jitter - instant
-        true = block.qpos.take(self._plant.rotor_qpos, axis=1)
-        speed = block.qvel.take(self._plant.rotor, axis=1)
-        angle = true + speed * late[:, None] + self._offset
-        shaken = angle + self._present(noise.position)
+        true = raw.position.take(plant.rotor_qpos, axis=1)
+        speed = raw.velocity.take(plant.rotor, axis=1)
+        angle = true + speed * late[:, None] + plant.encoder_offset
+        shaken = angle + noise.position[:, plant.columns]
         position = np.rint(shaken / self._count) * self._count
-        # First difference of the encoder's grid over the drive's window.
+        # First difference of the quantized angle over the drive's window.
         window = self._machine.velocity_window_s
         before = np.rint((angle - speed * window) / self._count)
         velocity = (np.rint(angle / self._count) - before) * self._count / window
-        velocity += self._present(noise.velocity)
-        torque = block.torque / self._scale + self._present(noise.torque)
-        if len(self._columns) < total:
-            position = self._spread(position, self._default)
-            velocity, torque = self._spread(velocity, 0.0), self._spread(torque, 0.0)
-        gyro, force = motion.rate + noise.gyro, motion.force + noise.force
-        orientation = product(noise.heading, product(motion.orientation, noise.tilt))
-        rows = (position, velocity, torque, gyro, force, orientation)
+        velocity += noise.velocity[:, plant.columns]
+        torque = raw.torque / self._scale + noise.torque[:, plant.columns]
+        true_orientation, rate, force = self._motion(raw)
+        orientation = product(noise.heading, product(true_orientation, noise.tilt))
+        rows = (
+            self._spread(position, self._default),
+            self._spread(velocity, 0.0),
+            self._spread(torque, 0.0),
+            rate + noise.gyro,
+            force + noise.force,
+            orientation,
+        )
         states = [
             State(
                 time=time,
@@ -290,25 +230,37 @@ class Sensors:
                 position=q,
                 velocity=v,
                 torque=t,
-                gyro=rate,
+                gyro=gyro,
                 accelerometer=acceleration,
                 bus_voltage=voltage,
                 orientation=quaternion,
             )
-            for sequence, (time, voltage, q, v, t, rate, acceleration, quaternion) in enumerate(
-                zip(stamp.tolist(), block.voltage.tolist(), *rows, strict=True), self.sequence
+            for sequence, (time, voltage, q, v, t, gyro, acceleration, quaternion) in enumerate(
+                zip(stamp.tolist(), raw.voltage.tolist(), *rows, strict=True), self.sequence
             )
         ]
         self.sequence += len(states)
         return states
 
-    def _present(self, values: Array) -> Array:
-        """Columns of the joints that are present."""
-        return values if len(self._columns) == values.shape[1] else values[:, self._columns]
+    def _motion(self, raw: RawStates) -> tuple[Array, Array, Array]:
+        """Orientation (n, 4), rate (n, 3) and specific force (n, 3) of the trunk."""
+        if self._free:
+            orientation, velocity = raw.position[:, 3:7], raw.velocity[:, :3]
+            now = np.concatenate([orientation, velocity], axis=1)
+            path = np.concatenate([now[:1] if self._trunk is None else self._trunk, now])
+            self._trunk = now[-1:]
+            force = moving_force(path[:, 4:], path[:, :4], self._period)
+            return orientation, raw.velocity[:, 3:6], force
+        stand = self._plant.stand
+        tilt = raw.position[:, stand] if len(stand) else np.zeros((len(raw.position), 3))
+        rate = raw.velocity[:, stand] if len(stand) else tilt
+        return of_vector(tilt), rate, resting_force(tilt)
 
     def _spread(self, values: Array, absent: Array | float) -> Array:
         """Columns of all joints, those that are absent with a value of their own."""
+        if len(self._plant.columns) == len(self._default):
+            return values
         whole = np.empty((len(values), len(self._default)))
         whole[:] = absent
-        whole[:, self._columns] = values
+        whole[:, self._plant.columns] = values
         return whole

@@ -1,9 +1,8 @@
 """The hidden parameters of a virtual robot.
 
-The file (schema `pronk/sim_params/1`) holds how the virtual robot differs from the model that is
-matched and trained in; `pronk.match` and `pronk.train` cannot import this module. The entries
-`trunk`, `attitude` and `ground` matter off the bench only; a file may leave them, or some of their
-fields, at their defaults.
+They hold how the virtual robot differs from the model that is matched and trained in; `pronk.match`
+and `pronk.train` cannot import this module. `trunk`, `attitude` and `ground` have no effect on the
+bench and have defaults.
 
 Joint quantities are in joint coordinates (through the gear) unless the name contains motor.
 Vectors are in the trunk's frame: x forward, y left, z up.
@@ -33,39 +32,45 @@ SCHEMA = "pronk/sim_params/1"
 SHIPPED_ROBOT = "mini_cheetah"
 SHIPPED = Path(__file__).with_name("mini_cheetah_sim_params.yaml")
 
-# Parts of vectors.
+# Bounds exclude errors by a factor of ten or more in a file.
+_Share = Annotated[float, Meta(ge=0.1, le=10.0)]
+_UpTo10 = Annotated[float, Meta(ge=0.0, le=10.0)]
+_UpTo100 = Annotated[float, Meta(ge=0.0, le=100.0)]
+_Delay = Annotated[float, Meta(ge=0.0, le=0.5)]
+_Jitter = Annotated[float, Meta(ge=0.0, le=1e-3)]
+_Span = Annotated[float, Meta(ge=1e-6, le=0.1)]
+_Spring = Annotated[float, Meta(ge=1.0, le=1e5)]
 _Rate = Annotated[float, Meta(ge=-1.0, le=1.0)]
 _Force = Annotated[float, Meta(ge=-5.0, le=5.0)]
 _Offset = Annotated[float, Meta(ge=-0.2, le=0.2)]
-_Scale = Annotated[float, Meta(ge=0.1, le=10.0)]
 _Angle = Annotated[float, Meta(ge=-0.5, le=0.5)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointParams(Bounded):
-    """One joint of the virtual robot. Bounds exclude slips of the pen (a factor of ten)."""
+    """One joint of the virtual robot."""
 
-    torque_scale: Annotated[float, Meta(ge=0.1, le=10.0)]
+    torque_scale: _Share
     """Torque that the motor gives per torque that its drive computes [1]."""
-    link_inertia_scale: Annotated[float, Meta(ge=0.1, le=10.0)]
+    link_inertia_scale: _Share
     """Mass and inertia of the link this joint moves, relative to the model's [1]."""
     rotor_inertia: Annotated[float, Meta(ge=1e-9, le=1.0)]
     """Inertia of the rotor about its own axis, motor side [kg m^2]."""
-    belt_stiffness: Annotated[float, Meta(ge=1.0, le=1e5)]
+    belt_stiffness: _Spring
     """Between rotor (reflected) and link [N m/rad]."""
-    belt_damping: Annotated[float, Meta(ge=0.0, le=100.0)]
+    belt_damping: _UpTo100
     """Between rotor (reflected) and link [N m s/rad]."""
-    coulomb: Annotated[float, Meta(ge=0.0, le=100.0)]
+    coulomb: _UpTo100
     """Dry friction of the rotor while it slips [N m]."""
-    breakaway: Annotated[float, Meta(ge=0.0, le=100.0)]
+    breakaway: _UpTo100
     """Dry friction at the onset of slip; the Stribeck peak, not below `coulomb` [N m]."""
     stribeck_speed: Annotated[float, Meta(ge=1e-6, le=100.0)]
     """Speed at which the peak has fallen to 1/e of its height over `coulomb` [rad/s]."""
     presliding_stiffness: Annotated[float, Meta(ge=1e-3, le=1e6)]
     """Of the bristles before slip, LuGre sigma_0 [N m/rad]."""
-    presliding_damping: Annotated[float, Meta(ge=0.0, le=100.0)]
+    presliding_damping: _UpTo100
     """Of the bristles, LuGre sigma_1 [N m s/rad]."""
-    viscous: Annotated[float, Meta(ge=0.0, le=100.0)]
+    viscous: _UpTo100
     """Viscous friction of the rotor [N m s/rad]."""
     encoder_offset: Annotated[float, Meta(ge=-0.1, le=0.1)]
     """Reading minus true angle; the drive closes its loop on the reading [rad]."""
@@ -84,42 +89,42 @@ class JointParams(Bounded):
 class MachineParams(Bounded):
     """What the joints share: timing, supply, sensors, the stand."""
 
-    command_delay_s: Annotated[float, Meta(ge=0.0, le=0.5)]
+    command_delay_s: _Delay
     """From sending a command to the drives acting on it [s]."""
-    measurement_delay_s: Annotated[float, Meta(ge=0.0, le=0.5)]
+    measurement_delay_s: _Delay
     """From the instant a state was measured to its timestamp [s]."""
-    sampling_jitter_s: Annotated[float, Meta(ge=0.0, le=1e-3)]
+    sampling_jitter_s: _Jitter
     """Standard deviation of the sampling instant about its tick, contained in timestamps [s]."""
-    timestamp_error_s: Annotated[float, Meta(ge=0.0, le=1e-3)]
+    timestamp_error_s: _Jitter
     """Standard deviation of the timestamp about the sampling instant plus delay [s]."""
-    drive_lag_s: Annotated[float, Meta(ge=1e-6, le=0.1)]
+    drive_lag_s: _Span
     """Time constant from a drive's torque command to its motor's torque: sampling, averaging of
     the speed, current loop [s]."""
     bus_voltage: Annotated[float, Meta(ge=1.0, le=1e3)]
     """Open-circuit voltage of the battery [V]."""
-    bus_resistance: Annotated[float, Meta(ge=0.0, le=10.0)]
+    bus_resistance: _UpTo10
     """Of battery and wiring [ohm]."""
     encoder_bits: Annotated[int, Meta(ge=4, le=32)]
     """Of the absolute encoder on each rotor, motor side [bit per revolution]."""
-    velocity_window_s: Annotated[float, Meta(ge=1e-6, le=0.1)]
+    velocity_window_s: _Span
     """Span over which a drive differentiates its encoder [s]."""
-    velocity_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    velocity_noise: _UpTo10
     """White, standard deviation [rad/s]."""
     position_noise: Annotated[float, Meta(ge=0.0, le=0.1)]
     """Coloured (vibration of the encoder mount), standard deviation [rad]."""
     position_noise_corner_hz: Annotated[float, Meta(ge=0.1, le=1e5)]
     """Corner of the first-order low-pass that colours it [Hz]."""
-    torque_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    torque_noise: _UpTo10
     """White, of the current measurement as torque, standard deviation [N m]."""
-    gyro_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    gyro_noise: _UpTo10
     """White, standard deviation per sample [rad/s]."""
     gyro_bias: tuple[_Rate, _Rate, _Rate]
     """[rad/s]"""
-    accelerometer_noise: Annotated[float, Meta(ge=0.0, le=10.0)]
+    accelerometer_noise: _UpTo10
     """White, standard deviation per sample [m/s^2]."""
     accelerometer_bias: tuple[_Force, _Force, _Force]
     """[m/s^2]"""
-    clamp_stiffness: Annotated[float, Meta(ge=1.0, le=1e5)]
+    clamp_stiffness: _Spring
     """Of the fixture that holds a clamped link [N m/rad]."""
     clamp_damping: Annotated[float, Meta(ge=0.0, le=1e3)]
     """[N m s/rad]"""
@@ -137,7 +142,7 @@ class TrunkParams(Bounded):
     """Added to the trunk's mass; its inertia grows alike [kg]."""
     com_offset: tuple[_Offset, _Offset, _Offset] = (0.0, 0.0, 0.0)
     """Added to its centre of mass [m]."""
-    inertia_scale: tuple[_Scale, _Scale, _Scale] = (1.0, 1.0, 1.0)
+    inertia_scale: tuple[_Share, _Share, _Share] = (1.0, 1.0, 1.0)
     """Its principal moments (about x, y, z) relative to the model's, beyond `mass_offset` [1].
     Together they must still be those of a body: the largest not above the sum of the others."""
 
@@ -199,8 +204,6 @@ def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    """Entries of a file; their fields are read by `read`."""
-
     schema: str
     robot: str
     machine: Any
@@ -219,9 +222,8 @@ def parse_sim_params(body: Any, source: str) -> SimParams:
     try:
         file = msgspec.convert(body, _File)
     except msgspec.ValidationError as error:
-        raise RobotError(
-            f"{source}: {plain(error)}; the entries are {', '.join(_FIELDS)}."
-        ) from None
+        known = ", ".join(_File.__struct_fields__)
+        raise RobotError(f"{source}: {plain(error)}; the entries are {known}.") from None
     return SimParams(
         robot=file.robot,
         machine=read(MachineParams, f"{source}: machine", file.machine),
@@ -236,14 +238,10 @@ def parse_sim_params(body: Any, source: str) -> SimParams:
     )
 
 
-_FIELDS = [entry.name for entry in msgspec.structs.fields(_File)]
-
-
 def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = None) -> SimParams:
-    """Read a parameter file; None is the shipped one, whose match is the paper's Table I.
+    """Read a parameter file, by default the shipped one, whose match is the paper's Table I.
 
-    Without a file, parameters of a `robot` other than the shipped one's are derived
-    (`default_sim_params`).
+    Without a file, those of a `robot` other than the shipped one's are `default_sim_params`.
     """
     if path is None and robot is not None and robot.name != SHIPPED_ROBOT:
         return default_sim_params(robot)
@@ -266,12 +264,12 @@ _PRESLIDING_RAD = 1e-3
 def default_sim_params(robot: RobotSpec) -> SimParams:
     """Derive the hidden parameters of a robot that has no file of its own, for the bench.
 
-    Tolerances between drawing and machine, of the size that the virtual Mini Cheetah has:
-    torque 10 % over and link inertia 3 % under the model's, rotor inertia 10 % under the drive's (a
-    tenth of the link's where the model has none), dry friction 20 % under (at least 0.2 % of the
-    effort limit), its break-away 25 % more, viscous friction 20 % over; belt at 100 Hz with 4 % of
-    critical damping; encoders off by 1 mrad. Timing and noise are those of the shipped file, the
-    encoders as fine at the joint as its hips'.
+    Tolerances are of the size that the virtual Mini Cheetah has: torque 10 % over and link inertia
+    3 % under the model's, rotor inertia 10 % under the drive's (a tenth of the link's where the
+    model has none), dry friction 20 % under (at least 0.2 % of the effort limit), break-away 25 %
+    above that, viscous friction 20 % over; belt at 100 Hz with 4 % of critical damping; encoders
+    off by 1 mrad. Timing and noise are those of the shipped file, the encoders as fine at the joint
+    as its hips'.
     """
     shipped = load_sim_params(SHIPPED).machine
     drives = [joint.drive for joint in robot.joints]
@@ -294,7 +292,7 @@ def _default_joint(robot: RobotSpec, joint: Joint) -> JointParams:
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, full)
     dof = int(model.joint(joint.name).dofadr[0])
-    # What the belt feels of the link, the others of its chain free to move.
+    # Inertia of the link at the belt, the others of its chain free to move.
     link = 1.0 / float(np.linalg.inv(full)[dof, dof]) - float(model.dof_armature[dof])
     link = max(link, 0.1 * float(full[dof, dof] - model.dof_armature[dof]))
     rotor = 0.9 * joint.drive.armature or 0.1 * link
