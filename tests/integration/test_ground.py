@@ -477,7 +477,7 @@ def over(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
         (lambda: over(capture_rate_hz=1e5), "capture_rate_hz"),
         (lambda: standing(start=Start(joint_offset=(0.0, 0.0, 0.0))), "joint_offset"),
         (lambda: Start(drop=-1.0), "drop"),
-        (lambda: Start(yaw=math.inf), "finite"),
+        (lambda: Start(yaw=math.inf), "yaw"),
         (lambda: Box(center=(0.0, 0.0, 0.0), half_size=(1.0, 0.0, 1.0)), "half_size"),
         (lambda: Box(center=(0.0, math.nan, 0.0), half_size=(1.0, 1.0, 1.0)), "center"),
         (lambda: Ground(friction=0.0), "friction"),

@@ -27,7 +27,8 @@ class Bounded:
 
     def __post_init__(self) -> None:
         """Convert fields to their types; RobotError names a wrong type or a value out of bounds."""
-        for name, hint in _hints(type(self)).items():
+        kind: Any = type(self)
+        for name, hint in _hints(kind).items():
             value = getattr(self, name)
             try:
                 converted = msgspec.convert(_builtin(value), hint)
