@@ -1,16 +1,14 @@
 """TrainingGains: the gains that training draws about, from `gains.yaml` or the naive ones.
 
-Naive is what a user trains with without a measurement of the robot: the gains of the real drive,
-put
-into the simulator as they are (paper S4, reading A20). Everything else stays the same, so that
-two policies differ by their nominal gains and by nothing else.
+Naive gains are those of the real drives, put into the simulator as they are (paper S4, reading
+A20). Everything else stays the same, so that two policies differ by their nominal gains alone.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -35,7 +33,7 @@ GainsName = Literal["naive", "matched"]
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingGains:
-    """Nominal gains and their ranges, per joint group, and what they rest on."""
+    """Nominal gains and their ranges by joint group, and their origin."""
 
     name: GainsName
     robot: str
@@ -133,15 +131,15 @@ def _naive(robot: RobotSpec, group: str) -> GroupGains:
 
 def _about(nominal: GroupGains, ranges: GroupGains) -> GroupGains:
     """The ranges of one group about the nominal gains of another."""
-    shift = (nominal.stiffness - ranges.stiffness, nominal.damping - ranges.damping)
     center = ranges.ellipsoid_center
-    return GroupGains(
+    return replace(
+        ranges,
         stiffness=nominal.stiffness,
         damping=nominal.damping,
-        stiffness_range=ranges.stiffness_range,
-        damping_range=ranges.damping_range,
-        ellipsoid=ranges.ellipsoid,
-        ellipsoid_center=(center[0] + shift[0], center[1] + shift[1]),
+        ellipsoid_center=(
+            center[0] + (nominal.stiffness - ranges.stiffness),
+            center[1] + (nominal.damping - ranges.damping),
+        ),
     )
 
 
