@@ -1,0 +1,516 @@
+"""The state of a jump: trajectories by hand, and properties of any trajectory."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, fields, replace
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pronk.errors import PronkError
+from pronk.robots.legged import legged
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("mjlab")
+
+from pronk.train.mdp.jump import JumpSettings, JumpState
+
+pytestmark = pytest.mark.train
+
+DT = 1 / 64
+"""A power of two, so that times add up exactly."""
+SETTINGS = JumpSettings(
+    liftoff_velocity=2.5,
+    ready_s=DT,
+    prompt_s=16 * DT,
+    late_s=16 * DT,
+    stride_velocity=0.5,
+    settle_s=8 * DT,
+    max_travel=0.5,
+    crouch=0.1875,
+    max_gap=0.75,
+    fall=8.0,
+    fall_s=8 * DT,
+    similarity_std=0.0625,
+    overspeed_std=1e6,
+)
+"""Even a lift-off in the first step earns everything, after a running start of any speed."""
+PATIENT = replace(SETTINGS, ready_s=8 * DT)
+GAINS = ("score_gain", "travel_gain", "flight_gain", "gap_gain")
+TRACES = (
+    *GAINS,
+    *("hop", "mode", "since", "best_score", "lowest", "travel", "overspeed", "best_flight"),
+    *("best_gap", "similarity", "liftoffs", "airborne"),
+)
+
+Feet = tuple[tuple[float, float], ...]
+STANCE: Feet = ((0.25, -0.125), (0.25, 0.125), (-0.25, -0.125), (-0.25, 0.125))
+"""Feet of a robot at the origin that faces along x: FR, FL, HR, HL."""
+ALL = (True, True, True, True)
+
+
+@dataclass(frozen=True)
+class Step:
+    """Command and motion of one robot in a step."""
+
+    jump: bool = False
+    air: bool = False
+    height: float = 0.3
+    vertical: float = 0.0
+    velocity_error: float = 0.0
+    turn: float = 0.0
+    along: float = 0.0
+    excess: float = 0.0
+    ground: tuple[bool, ...] = (True, False, False, False)
+    """Feet on the ground, unless the robot is in the air."""
+    feet: Feet = STANCE
+    direction: tuple[float, float] = (0.0, 0.0)
+    extension: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+
+
+GIVEN = [f.name for f in fields(Step) if f.name not in ("air", "ground")]
+
+
+def script(jump: str, air: str, vertical: dict[int, float] | None = None) -> list[Step]:
+    """Strings of 0 and 1, one sign a step; vertical velocities of some steps."""
+    return [
+        Step(jump=j == "1", air=a == "1", vertical=(vertical or {}).get(i, 0.0))
+        for i, (j, a) in enumerate(zip(jump, air, strict=True))
+    ]
+
+
+def play(robots: list[list[Step]], state: JumpState) -> dict[str, list[list[float]]]:
+    """Every trace of every robot: name to robots to steps."""
+    traces: dict[str, list[list[float]]] = {name: [[] for _ in robots] for name in TRACES}
+    for steps in zip(*robots, strict=True):
+        state.advance(
+            contact=torch.tensor([[g and not s.air for g in s.ground] for s in steps]),
+            dt=DT,
+            **{name: torch.tensor([getattr(s, name) for s in steps]) for name in GIVEN},
+        )
+        for name in TRACES:
+            for trace, value in zip(traces[name], getattr(state, name).tolist(), strict=True):
+                trace.append(float(value))
+    return traces
+
+
+def alone(
+    steps: list[Step], given: JumpSettings = SETTINGS, std: float = 1.0
+) -> dict[str, list[float]]:
+    """The traces of a single robot."""
+    traces = play([steps], JumpState(1, "cpu", given, std))
+    return {name: trace[0] for name, trace in traces.items()}
+
+
+def at(trace: list[float]) -> list[int]:
+    """Steps in which a trace is not zero."""
+    return [i for i, value in enumerate(trace) if value]
+
+
+# --- Mode and time -------------------------------------------------------------------------------
+
+
+def test_one_jump() -> None:
+    """Commanded in step 2, in the air from step 5 to 7, down in step 8."""
+    seen = alone(script("0011110000", "0000011100", {4: 2.0, 5: 1.75, 6: 1.0}))
+    assert seen["mode"] == [0, 0] + [1] * 8
+    assert seen["since"] == [0, 0, *(i * DT for i in range(1, 9))]
+    assert seen["liftoffs"] == [0] * 5 + [1] * 5
+    # The faster of the samples before and after lift-off, 2.0: exp(-(2.0 - 2.5)^2 / 2).
+    assert seen["score_gain"] == pytest.approx([0] * 5 + [math.exp(-0.125)] + [0] * 4)
+    assert seen["best_score"] == pytest.approx([0] * 5 + [math.exp(-0.125)] * 5)
+    assert not any(seen["hop"])
+
+
+@pytest.mark.parametrize(
+    ("jump", "air", "mode"),
+    [
+        # settle_s is 8 steps: step 4 stands with the input off, and seven more from step 10 on.
+        ("0011" + "0" * 18, "00000" + "11111" + "0" * 12, [0, 0] + [1] * 14 + [0] * 6),
+        ("0111" + "0" * 14, "0001111" + "0" * 11, [0] + [1] * 13 + [0] * 4),
+        ("1" + "0" * 40, "0" + "1" * 40, [1] * 41),
+        ("1" * 40, "0" * 40, [1] * 40),
+        ("0" * 8, "00110100", [0] * 8),
+    ],
+)
+def test_jump_mode_ends_after_settling_on_the_ground(jump: str, air: str, mode: Any) -> None:
+    seen = alone(script(jump, air))
+    assert seen["mode"] == mode
+    assert all(since > 0.0 for since, on in zip(seen["since"], mode, strict=True) if on)
+    assert not any(since for since, on in zip(seen["since"], mode, strict=True) if not on)
+
+
+def test_nothing_is_rewarded_without_a_command() -> None:
+    seen = alone([replace(s, along=3.0) for s in script("0" * 8, "00110100", {2: 2.5, 5: 2.5})])
+    assert not any(any(seen[name]) for name in (*GAINS, "hop", "liftoffs", "similarity"))
+
+
+@pytest.mark.parametrize(
+    ("jump", "air", "vertical", "gains", "hops"),
+    [
+        # In the air already when the command comes: the next lift-off is the first.
+        ("00111111", "01110010", {6: 2.5}, [6], []),
+        # A lift-off after the input went off belongs to the command.
+        ("0100000", "0000001", {6: 2.5}, [6], []),
+        # Each command is rewarded anew.
+        ("1110111111", "0010000100", {2: 2.5, 7: 2.5}, [2, 7], []),
+        # A second lift-off of the same velocity improves nothing, and is a hop.
+        ("1" * 10, "0010000100", {2: 2.5, 7: 2.5}, [2], [7]),
+        # Strides are no hops; fast in the sample before lift-off is fast enough.
+        ("1" * 10, "0010010010", {2: 2.5, 5: 0.25, 7: 0.75, 8: -1.0}, [2], [8]),
+    ],
+)
+def test_liftoffs_of_a_command(
+    jump: str, air: str, vertical: dict[int, float], gains: list[int], hops: list[int]
+) -> None:
+    seen = alone(script(jump, air, vertical))
+    assert (at(seen["score_gain"]), at(seen["hop"])) == (gains, hops)
+
+
+# --- Score ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("motion", "changes", "std", "score"),
+    [
+        # exp(-(v - 2.5)^2 / (2 std^2)): one standard deviation off earns exp(-1/2).
+        ({"vertical": 2.5}, {}, 1.0, 1.0),
+        ({"vertical": 1.5}, {}, 1.0, 0.606531),
+        ({"vertical": 3.5}, {}, 1.0, 0.606531),
+        ({"vertical": 2.1}, {}, 0.4, 0.606531),
+        ({"vertical": 0.5}, {}, 1.0, 0.135335),
+        # 1/2 + exp(-(error / aim_std)^2 / 2 - (turn / turn_std)^2 / 2) / 2.
+        ({"velocity_error": 0.3}, {"aim_std": 0.3}, 1.0, 0.803265),
+        ({"turn": 0.8}, {"turn_std": 0.8}, 1.0, 0.803265),
+        ({"velocity_error": 0.3, "turn": 0.8}, {"aim_std": 0.3, "turn_std": 0.8}, 0.7, 0.683940),
+        ({"velocity_error": 1.0}, {"aim_std": 0.1}, 0.7, 0.5),
+    ],
+)
+def test_score_of_a_liftoff(motion: Any, changes: Any, std: float, score: float) -> None:
+    liftoff = replace(Step(jump=True, air=True, vertical=2.5), **motion)
+    seen = alone([*script("011", "000"), liftoff], replace(SETTINGS, **changes), std)
+    assert seen["score_gain"] == pytest.approx([0, 0, 0, score], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ready", "steps", "scale"),
+    [
+        # Late: in full until 16 steps after the command, then a line to zero after 32.
+        *((1, n, scale) for n, scale in [(1, 1.0), (16, 1.0), (20, 0.75), (24, 0.5), (40, 0.0)]),
+        # Early: the square of the time's fraction of ready_s.
+        *((8, n, scale) for n, scale in [(1, 1 / 64), (4, 0.25), (6, 0.5625), (8, 1.0)]),
+        *((16, n, scale) for n, scale in [(8, 0.25), (16, 1.0), (24, 0.5), (32, 0.0)]),
+    ],
+)
+def test_reward_scale_by_the_time_of_liftoff(ready: int, steps: int, scale: float) -> None:
+    """The scale holds for the score, the flight and the gap alike; it stays a jump."""
+    stands = Step(jump=True, ground=ALL, direction=(1.0, 0.0))
+    flies = replace(stands, air=True, vertical=2.5, along=2.0)
+    lands = replace(stands, feet=moved(1.0, 0.0))
+    steps_ = [Step(), *[stands] * (steps - 1), flies, flies, flies, lands]
+    seen = alone(steps_, replace(SETTINGS, ready_s=ready * DT))
+    assert seen["liftoffs"][-1] == 1
+    assert sum(seen["score_gain"]) == pytest.approx(scale)
+    assert sum(seen["flight_gain"]) == pytest.approx(scale * 2 * 2.0 * DT)
+    # All four stood from the second step on; with one step the robot had not stood at all.
+    assert steps == 1 or sum(seen["gap_gain"]) == pytest.approx(scale * 0.5)
+
+
+def test_only_an_improvement_on_the_best_is_rewarded() -> None:
+    vertical = {2: 1.0, 5: 1.5, 8: 1.25, 11: 1.5}
+    seen = alone(script("1" * 13, "0010010010010", vertical))
+    first, best = math.exp(-1.125), math.exp(-0.5)
+    expected = [0.0] * 13
+    expected[2], expected[5] = first, best - first
+    assert seen["score_gain"] == pytest.approx(expected)
+    assert at(seen["hop"]) == [5, 8, 11]
+    # Too early, 3 of 8 steps, then on time: 9/64 and the rest.
+    seen = alone(script("1" * 10, "0010000001", {2: 2.5, 9: 2.5}), PATIENT)
+    assert seen["score_gain"] == pytest.approx([0, 0, 9 / 64, *[0] * 6, 55 / 64])
+
+
+@pytest.mark.parametrize(
+    ("excess", "scale"), [(0.5, math.exp(-0.5)), (1.0, math.exp(-2.0)), (-1.0, 1.0), (0.0, 1.0)]
+)
+def test_overspeed_at_the_command_lowers_the_reward(excess: float, scale: float) -> None:
+    """By a kernel of the excess in the step of the command; later excess has no effect."""
+    first, *others = script("1" * 9, "0" * 8 + "1", {8: 2.5})
+    steps = [replace(first, excess=excess), *(replace(s, excess=0.7) for s in others)]
+    seen = alone(steps, replace(PATIENT, overspeed_std=0.5))
+    assert seen["score_gain"][-1] == pytest.approx(scale)
+    assert seen["overspeed"] == [max(excess, 0.0)] * 9
+
+
+# --- Height, flight, gap -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("jump", "air", "heights", "gains"),
+    [
+        # From the lowest trunk before to the highest after; up to max_travel.
+        (
+            "0111111111",
+            "0" * 10,
+            [0.3, 0.25, 0.2, 0.28, 0.5, 0.4, 0.6, 0.9, 1.0, 0.3],
+            [0, 0, 0.05, 0.03, 0.22, 0, 0.1, 0.1, 0, 0],
+        ),
+        # A deep landing after the lift-off in step 2 is no crouch.
+        ("111111", "001100", [0.3, 0.25, 0.4, 0.5, 0.1, 0.3], [0, 0.05, 0.1, 0.1, 0, 0]),
+        # Below `crouch`, .1875, the height does not count.
+        ("11111", "00000", [0.25, 0.1, 0.125, 0.25, 0.5], [0, 0.0625, 0, 0, 0.25]),
+        ("01111", "00000", [0.1, 0.1, 0.15, 0.25, 0.3], [0, 0, 0, 0.0625, 0.05]),
+        # The next command begins at its own height.
+        ("11011", "00000", [0.3, 0.6, 0.3, 0.3, 0.4], [0, 0.3, 0, 0, 0.1]),
+    ],
+)
+def test_travel_gain(jump: str, air: str, heights: list[float], gains: list[float]) -> None:
+    steps = [
+        replace(s, height=h, vertical=2.0) for s, h in zip(script(jump, air), heights, strict=True)
+    ]
+    assert alone(steps)["travel_gain"] == pytest.approx(gains, abs=1e-6)
+
+
+def test_a_stride_does_not_end_the_crouch() -> None:
+    heights, vertical = [0.3, 0.3, 0.3, 0.2, 0.4, 0.2], {1: 0.25, 4: 2.0}
+    script_ = script("1" * 6, "010010", vertical)
+    seen = alone([replace(s, height=h) for s, h in zip(script_, heights, strict=True)])
+    assert seen["lowest"] == pytest.approx([0.3, 0.3, 0.3, 0.2, 0.2, 0.2])
+    assert seen["travel_gain"] == pytest.approx([0, 0, 0, 0.1, 0.1, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("jump", "air", "along", "excess", "gains"),
+    [
+        # Two flights; the first step of each is its lift-off. The longer is rewarded once.
+        ("1" * 11, "00111011110", "44421442214", 0.0, [0, 0, 0, 2, 1, 0, 0, 0, 1, 1, 0]),
+        # A running start half a metre a second too fast is subtracted.
+        ("1" * 6, "001110", "444444", 0.5, [0, 0, 0, 3.5, 3.5, 0]),
+        ("1" * 6, "001110", "444444", -0.5, [0, 0, 0, 4, 4, 0]),
+        # A flight that was under way when the command came.
+        ("001111", "011110", "444444", 0.0, [0, 0, 0, 0, 0, 0]),
+        ("0" * 6, "011110", "444444", 0.0, [0, 0, 0, 0, 0, 0]),
+    ],
+)
+def test_flight_gain(jump: str, air: str, along: str, excess: float, gains: list[float]) -> None:
+    steps = [
+        replace(s, along=float(v), excess=excess)
+        for s, v in zip(script(jump, air), along, strict=True)
+    ]
+    seen = alone(steps)
+    assert seen["flight_gain"] == pytest.approx([DT * value for value in gains])
+    back = alone([replace(s, along=-s.along) for s in steps])
+    assert excess or not any(back["flight_gain"])
+
+
+def moved(x: float, y: float) -> Feet:
+    return tuple((a + x, b + y) for a, b in STANCE)
+
+
+def jumps(*places: Feet, direction: tuple[float, float] = (1.0, 0.0)) -> list[Step]:
+    """Two steps on the ground at every place, and two steps of flight to the next.
+
+    Landings are in steps 4, 8, 12, ... In the air all feet are far ahead, which clears nothing.
+    """
+    stands = Step(jump=True, ground=ALL, direction=direction)
+    flies = replace(stands, air=True, vertical=2.0, feet=moved(*(50.0 * v for v in direction)))
+    steps = [(flies, flies, *[replace(stands, feet=place)] * 2) for place in places]
+    return list(itertools.chain.from_iterable(steps))[2:]
+
+
+@pytest.mark.parametrize(
+    ("direction", "to", "gap"),
+    [
+        # Fore feet left at .25, hind feet come to -.25 + .75.
+        ((1.0, 0.0), (0.75, 0.0), 0.25),
+        # To the right: right feet left at -.125, left feet come to .125 - .5.
+        ((0.0, -1.0), (0.0, -0.5), 0.25),
+        # Motion across the direction has no effect.
+        ((1.0, 0.0), (0.75, 3.0), 0.25),
+        # FL left at .6 .25 + .8 .125 = .25, HR comes to -.25 + .6 .5 + .8 .5 = .45.
+        ((0.6, 0.8), (0.5, 0.5), 0.2),
+        # 2.0 - .5 clears 1.5 m, of which max_gap counts.
+        ((1.0, 0.0), (2.0, 0.0), 0.75),
+        # Hind feet come down where fore feet left, or behind; no direction.
+        ((1.0, 0.0), (0.5, 0.0), 0.0),
+        ((1.0, 0.0), (-2.0, 0.0), 0.0),
+        ((0.0, 0.0), (0.75, 0.0), 0.0),
+    ],
+)
+def test_gap_gain(direction: tuple[float, float], to: tuple[float, float], gap: float) -> None:
+    """From the front-most foot that left to the hind-most that comes."""
+    seen = alone(jumps(STANCE, moved(*to), direction=direction))
+    assert seen["gap_gain"] == pytest.approx([0, 0, 0, 0, gap, 0], abs=1e-6)
+    assert seen["best_gap"] == pytest.approx([0, 0, 0, 0, gap, gap], abs=1e-6)
+
+
+def test_gap_of_several_flights_and_commands() -> None:
+    """.25, .125 and .375 m: the third earns what it is wider than the first."""
+    steps = jumps(STANCE, moved(0.75, 0.0), moved(1.375, 0.0), moved(2.25, 0.0))
+    again = [replace(s, jump=i != 5) for i, s in enumerate(steps)]
+    without = [replace(s, jump=False) for s in steps]
+    fast = [replace(steps[0], excess=0.5), *steps[1:6]]
+    for given_, expected in (
+        (steps, {4: 0.25, 12: 0.125}),
+        (again, {4: 0.25, 8: 0.125, 12: 0.25}),
+        (without, {}),
+        # Two steps in the air, half a metre a second too fast at the command.
+        (fast, {4: 0.25 - 2 * 0.5 * DT}),
+    ):
+        trace = alone(given_)["gap_gain"]
+        assert {i: trace[i] for i in at(trace)} == pytest.approx(expected)
+
+
+def test_gap_is_between_last_stances_and_all_feet_at_landing() -> None:
+    """FR lifts first, at .25, and HL last, where it had stepped to: .375.
+
+    FR lands first, at 1.25; HR is then still in the air, at .75.
+    """
+    contact_and_x = [
+        (ALL, (0.25, 0.125, -0.25, -0.25)),
+        ((False, True, False, True), (0.5, 0.125, 0.0, 0.375)),
+        ((False, False, False, True), (0.625, 0.5, 0.25, 0.375)),
+        ((False,) * 4, (1.0, 0.75, 0.5, 0.5)),
+        ((True, False, False, False), (1.25, 1.0, 0.75, 0.875)),
+        (ALL, (1.25, 1.0, 1.0, 1.0)),
+    ]
+    jump = Step(jump=True, vertical=2.0, direction=(1.0, 0.0))
+    steps = [
+        replace(jump, ground=ground, feet=tuple((v, 0.0) for v in x)) for ground, x in contact_and_x
+    ]
+    assert alone(steps)["gap_gain"] == pytest.approx([0, 0, 0, 0, 0.75 - 0.375, 0])
+
+
+# --- Countermovement -----------------------------------------------------------------------------
+
+
+def test_a_countermovement_falls_brakes_and_pushes() -> None:
+    """8 m/s^2 down for 1/8 s, 1/16 m; then 3.5 m/s up in 1/8 s: at rest after 2/7 of that."""
+    times = [0.0, 0.0625, 0.125, 0.125 + 0.125 * 2 / 7, 0.25]
+    rests = 0.0625 + 0.5 * 1.0 * 0.125 * 2 / 7
+    rises = 0.5 * 2.5 * 0.125 * 5 / 7
+    found = SETTINGS.countermovement(torch.tensor(times))
+    expected = [0.0, -0.015625, -0.0625, -rests, rises - rests]
+    assert found.tolist() == pytest.approx(expected, abs=1e-6)
+    # The usual one is within reach of a leg: from a trunk at .2 m to less than a straight leg.
+    body, usual = legged("mini_cheetah"), JumpSettings()
+    found = usual.countermovement(torch.linspace(0.0, usual.prompt_s, 100))
+    assert float(found.min()) + body.standing_height == pytest.approx(0.2, abs=0.01)
+    length = float(found[-1]) + body.standing_height - body.foot_radius
+    assert 0.3 < length < 0.95 * (body.thigh_length + body.shank_length)
+
+
+def test_similarity_from_the_command_to_the_first_jump() -> None:
+    """Commanded in step 2. A stride (in the air at 4, 5) goes on, the jump at 7 ends it."""
+    way = [-4 * (DT * i) ** 2 for i in range(1, 7)]
+    legs = {i + 2: (value,) * 4 for i, value in enumerate(way)}
+    legs[4] = (way[2] - 0.0625,) * 4
+    legs[6] = (way[4] + 0.0625, way[4] - 0.125, way[4], way[4])
+    steps = [
+        replace(s, extension=legs.get(i, s.extension))
+        for i, s in enumerate(script("0011111111", "0000110110", {6: 2.0, 7: 2.0}))
+    ]
+    two = (math.exp(-0.5) + math.exp(-2.0) + 2.0) / 4.0
+    expected = [0, 0, 1, 1, math.exp(-0.5), 1, two, 0, 0, 0]
+    assert alone(steps)["similarity"] == pytest.approx(expected, abs=1e-6)
+    # Without a jump it lasts until prompt_s, and begins again with the next command.
+    waits = alone(script("1" * 20 + "000000000" + "1", "0" * 30))["similarity"]
+    assert all(value > 0.0 for value in waits[:16])
+    assert waits[16:29] == [0] * 13
+    assert waits[29] == waits[0]
+
+
+# --- Any trajectory ------------------------------------------------------------------------------
+
+
+def runs(draw: st.DrawFn) -> list[bool]:
+    """Runs of False and True, 60 steps in all."""
+    spans = draw(st.lists(st.tuples(st.booleans(), st.integers(1, 20)), min_size=12, max_size=12))
+    found = [value for value, n in spans for _ in range(n)]
+    return (found * 60)[:60]
+
+
+@st.composite
+def scripts(draw: st.DrawFn) -> list[Step]:
+    jump, air = runs(draw), runs(draw)
+    random = Random(draw(st.integers(0, 2**32 - 1)))
+    direction = draw(st.sampled_from([(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)]))
+    steps, x, y = [], 0.0, 0.0
+    for j, a in zip(jump, air, strict=True):
+        far = random.uniform(-0.25, 0.75)
+        x, y = x + far * direction[0], y + far * direction[1]
+        contact = random.randrange(1, 16)
+        steps.append(
+            Step(
+                jump=j,
+                air=a,
+                height=random.uniform(0.125, 1.0),
+                vertical=random.uniform(-3.0, 4.0),
+                velocity_error=random.uniform(0.0, 1.0),
+                turn=random.uniform(0.0, 2.0),
+                along=random.uniform(-1.0, 4.0),
+                excess=random.uniform(-0.5, 1.0),
+                ground=tuple(bool(contact >> i & 1) for i in range(4)),
+                feet=tuple((x + random.uniform(-0.25, 0.25), y + 0.1 * i) for i in range(4)),
+                direction=direction,
+                extension=tuple(random.uniform(-0.125, 0.0625) for _ in range(4)),
+            )
+        )
+    return steps
+
+
+@settings(max_examples=50)
+@given(steps=scripts(), given_=st.sampled_from([SETTINGS, PATIENT, JumpSettings()]))
+def test_a_command_earns_at_most_one_good_jump(steps: list[Step], given_: JumpSettings) -> None:
+    seen = alone(steps, given_)
+    edges = [i for i, now in enumerate(steps) if now.jump and not (i and steps[i - 1].jump)]
+    for begin, end in itertools.pairwise([*edges, len(steps)]):
+        score, travel, flight, gap = (seen[name][begin:end] for name in GAINS)
+        assert min(*score, *travel, *flight, *gap) >= 0.0
+        assert sum(score) == pytest.approx(max(seen["best_score"][begin:end]), abs=1e-5)
+        assert sum(score) <= 1.0 + 1e-5
+        assert sum(travel) <= given_.max_travel + 1e-5
+        assert sum(flight) == pytest.approx(max(seen["best_flight"][begin:end]), abs=1e-5)
+        assert sum(gap) == pytest.approx(max(seen["best_gap"][begin:end]), abs=1e-5)
+        assert sum(gap) <= given_.max_gap + 1e-5
+        assert sum(seen["hop"][begin:end]) == max(max(seen["liftoffs"][begin:end]) - 1, 0)
+
+
+@settings(max_examples=20)
+@given(robots=st.lists(scripts(), min_size=2, max_size=3))
+def test_robots_are_independent(robots: list[list[Step]]) -> None:
+    together = play(robots, JumpState(len(robots), "cpu", SETTINGS, 1.0))
+    for i, steps in enumerate(robots):
+        apart = alone(steps)
+        for name in TRACES:
+            assert together[name][i] == pytest.approx(apart[name], abs=1e-6)
+
+
+@settings(max_examples=20)
+@given(steps=scripts())
+def test_reset_clears_one_robot_and_no_other(steps: list[Step]) -> None:
+    state = JumpState(2, "cpu", SETTINGS, 1.0)
+    play([steps[:30]] * 2, state)
+    state.reset(torch.tensor([1]))
+    after = play([steps[30:]] * 2, state)
+    whole, anew = alone(steps), alone(steps[30:])
+    for name in TRACES:
+        assert after[name] == [whole[name][30:], anew[name]]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({f.name: bad} for f in fields(JumpSettings) for bad in (0.0, -0.1, math.nan)),
+        {"ready_s": 0.4, "prompt_s": 0.3},
+        {"fall_s": 0.3},
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(PronkError, match=next(iter(changes))):
+        JumpSettings(**changes)
