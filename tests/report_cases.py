@@ -231,7 +231,7 @@ def write_trial(
                 path = f"captures/{name}_{case.name}_{number:03d}.npz".replace(" ", "_")
                 if keep:
                     captures.save(folder / path, capture)
-                figures = measure(capture, script, ROBOT, began=0.0, mass=12.0, rules=rules)
+                figures = measure(capture, script, ROBOT, began=0.0, rules=rules)
                 rows.append(row(name, case, number, figures, capture=path if keep else ""))
     timing = {"seconds": 2.0, "simulated_s": 9.0, "processes": 1}
     extra = {"cases": cases, "rows": tuple(rows), "rules": asdict(rules), "timing": timing}

@@ -32,6 +32,24 @@ TUCKED = 0.12
 SCRIPT = Script(command=(1.0, 0.0, 0.0), stand_s=1.0, run_s=2.0, stop_s=3.0)
 
 
+def motion(time: np.ndarray, **arrays: Any) -> Capture:
+    """A capture of a robot that stands at the origin, but for the given arrays."""
+    count = len(time)
+    kept: dict[str, Any] = {
+        "position": np.tile([0.0, 0.0, STANDING], (count, 1)),
+        "orientation": np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        "velocity": np.zeros((count, 3)),
+        "angular_velocity": np.zeros((count, 3)),
+        "foot_position": np.zeros((count, 4, 3)),
+        "contact": np.ones((count, 4), dtype=bool),
+        "other_contact": np.zeros(count, dtype=bool),
+        **dict.fromkeys(("joint_position", "joint_velocity", "torque"), np.zeros((count, 12))),
+        "electrical_power": np.full(count, 100.0),
+        "bus_voltage": np.full(count, 24.0),
+    }
+    return Capture(time=time, **(kept | arrays))
+
+
 def seen_jump(*, up: float = 2.0, speed: float = 1.0, yaw: float = 0.0) -> Capture:
     """The jump of the module.
 
@@ -54,7 +72,6 @@ def seen_jump(*, up: float = 2.0, speed: float = 1.0, yaw: float = 0.0) -> Captu
     x = speed * (np.clip(time, SCRIPT.start, down) - SCRIPT.start)
     ahead = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-ahead[1], ahead[0]])
-    zeros = np.zeros((len(time), 12))
     vz = np.where(flying, up - G * flight, 0.0)
     moving = (time >= SCRIPT.start) & (time < down)
     # Feet stand under the hips as the trunk passes: their place is that of the trunk at all times.
@@ -62,20 +79,13 @@ def seen_jump(*, up: float = 2.0, speed: float = 1.0, yaw: float = 0.0) -> Captu
     lift = np.where(flying, np.sin(np.pi * np.clip(flight / (down - off), 0.0, 1.0)), 0.0)
     low = np.maximum(0.0, z - Z_OFF) * flying + TUCKED * lift
     foot_z = np.repeat((BODY.foot_radius + low)[:, None], 4, axis=1)
-    return Capture(
-        time=time,
+    return motion(
+        time,
         position=np.column_stack([x[:, None] * ahead, z]),
         orientation=np.tile([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], (len(time), 1)),
         velocity=np.column_stack([np.where(moving, speed, 0.0)[:, None] * ahead, vz]),
-        angular_velocity=np.zeros((len(time), 3)),
         foot_position=np.concatenate([plane, foot_z[:, :, None]], axis=2),
         contact=np.repeat(~flying[:, None], 4, axis=1),
-        other_contact=np.zeros(len(time), dtype=bool),
-        joint_position=zeros,
-        joint_velocity=zeros,
-        torque=zeros,
-        electrical_power=np.full(len(time), 100.0),
-        bus_voltage=np.full(len(time), 24.0),
     )
 
 

@@ -205,9 +205,9 @@ def job(tmp_path: Path) -> Job:
 
 
 def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: Job) -> None:
-    before = repr(run_job(job).row)
+    before = repr(run_job(job))
     recording = trial.Recording(job)
-    assert repr(run_job(job).row) == before
+    assert repr(run_job(job)) == before
     assert recording.replay() > 0.0
     steps, control, motors = recording.blocks[-1]
     recording.blocks[-1] = (steps - 1, control, motors)

@@ -14,19 +14,16 @@ from benchmarks.synthetic_log import Excitation, synthetic_log
 from hopper import ROBOT, write_hopper
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import results, variation, walk
-from pronk.evaluation.bodies import gains_errors
-from pronk.evaluation.protocol import Case
-from pronk.evaluation.trial import Plan
-from pronk.evaluation.variation import (
+from pronk.evaluation.bodies import (
     GROUP_TORQUE,
-    NOMINAL,
     TOLERANCES,
-    VARIATION,
-    Parameter,
-    add_variation,
     draw_robot,
+    gains_errors,
     save_sim_params,
 )
+from pronk.evaluation.protocol import Case
+from pronk.evaluation.trial import Plan
+from pronk.evaluation.variation import NOMINAL, VARIATION, Parameter, add_variation
 from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings

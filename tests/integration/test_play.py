@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 
 from command_line import invoke
-from hopper import DEFAULT, ROBOT, write_hopper
+from hopper import ROBOT, write_hopper
 from pronk.errors import PronkError
+from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.live.page import WebPage, free_port, readout
 from pronk.evaluation.live.play import JUMP_S, Gauge, Joystick, play
 from pronk.policy.runtime import load_policy
@@ -29,6 +30,7 @@ from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.teleop import OperatorCommand
 from pronk.virtual.capture import Capture
 from pronk.virtual.sim_params import load_sim_params
+from seen_jump import motion
 
 BODY = legged("mini_cheetah")
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
@@ -88,26 +90,18 @@ def test_a_policy_without_jump_input_gets_none() -> None:
 
 
 def sample(time: float, z: float, vz: float, *, airborne: bool, tilt: float = 0.0) -> Capture:
-    return Capture(
-        time=np.array([time]),
+    return motion(
+        np.array([time]),
         position=np.array([[1.5 * time, 0.0, z]]),
         orientation=np.array([[math.cos(0.5 * tilt), math.sin(0.5 * tilt), 0.0, 0.0]]),
         velocity=np.array([[1.5, 0.0, vz]]),
-        angular_velocity=np.zeros((1, 3)),
-        foot_position=np.zeros((1, 4, 3)),
         contact=np.full((1, 4), not airborne),
-        other_contact=np.zeros(1, dtype=bool),
-        joint_position=DEFAULT[None],
-        joint_velocity=np.zeros((1, 12)),
-        torque=np.zeros((1, 12)),
-        electrical_power=np.zeros(1),
-        bus_voltage=np.array([24.0]),
     )
 
 
 def flown(speed: float) -> Gauge:
     """A ballistic flight from standing height, sampled every 2 ms."""
-    gauge = Gauge()
+    gauge = Gauge(JumpRules.of(ROBOT))
     for time_ in np.arange(0.0, 1.2, 0.002):
         t = time_ - 0.3
         airborne = 0.0 <= t <= 2.0 * speed / GRAVITY
@@ -128,7 +122,7 @@ def test_a_jump_is_measured() -> None:
 
 
 def test_a_fall_is_detected() -> None:
-    gauge = Gauge()
+    gauge = Gauge(JumpRules.of(ROBOT))
     gauge.add(sample(0.0, 0.29, 0.0, airborne=False))
     assert not gauge.fallen
     gauge.add(sample(0.1, 0.15, 0.0, airborne=False, tilt=1.5))

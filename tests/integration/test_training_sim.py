@@ -18,24 +18,33 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from tensordict import TensorDict
 
-from pronk.cli.evaluate import run
 from pronk.errors import ArtefactError, PronkError
-from pronk.evaluation.jumps import JumpRules, Series, measure_jump
+from pronk.evaluation.jumps import JumpRules, measure
 from pronk.evaluation.protocol import Case
+from pronk.evaluation.training_sim.adapter import (
+    TERM,
+    blank_actor,
+    evaluate,
+    evaluation_cfg,
+    load_subject,
+)
 from pronk.evaluation.training_sim.evaluation import NEVER, Evaluation, Plan, evaluate_policy
-from pronk.evaluation.training_sim.run import TERM, blank_actor, evaluation_cfg, load_subject
 from pronk.robots import load_robot
+from pronk.runtime.script import STILL, Script
 from pronk.train.gains import training_gains
 from pronk.train.phases import TASKS
 from pronk.train.provenance import SCHEMA, RunFolder
 from pronk.train.rl import checkpoint
 from pronk.train.rl.export import contract_for, export_policy
 from pronk.train.tasks import load_task
+from pronk.virtual.capture import Capture
 
 DT = 0.005
 DROP = 0.3
 """Height of the fall at the start [m]."""
+ROBOT = load_robot("mini_cheetah")
 SHORT = Plan(
+    robot=ROBOT,
     robots=2,
     seed=7,
     walks=(
@@ -45,13 +54,10 @@ SHORT = Plan(
     jumps=(Case(name="side +1", command=(0.0, 1.0, 0.0)),),
     walk_s=1.5,
     settle_s=0.8,
-    stand_s=0.6,
-    run_s=0.2,
+    script=Script(command=STILL, stand_s=0.6, run_s=0.2, jump_s=0.4, keep_s=0.1),
     spread_s=0.2,
-    jump_s=0.4,
-    keep_s=0.1,
     # No grace: the fall at the start is a flight without a jump input.
-    rules=JumpRules(search_s=0.2, tail_s=0.1, upright_s=0.2, grace_s=0.001),
+    rules=JumpRules.of(ROBOT, search_s=0.2, tail_s=0.1, upright_s=0.2, grace_s=0.001),
 )
 BIAS = 0.1
 """Error of the estimate, forward [m/s]."""
@@ -62,9 +68,7 @@ class Observed:
     """An evaluation, its run, and each time the policy read its command."""
 
     evaluation: Evaluation
-    state: np.ndarray
-    feet: np.ndarray
-    other: np.ndarray
+    captures: list[Capture]
     fell_at: np.ndarray
     reads: list[tuple[int, np.ndarray, np.ndarray]]
     shares: list[float]
@@ -103,28 +107,23 @@ def observed() -> Observed:
 
     found = evaluate_policy(policy, env, SHORT, estimate=estimate, progress=shares.append)
     env.close()
-    recordings = runs[0].recordings
-    shortest = min(len(each.state) for each in recordings)
-    state, feet, other = (
-        np.concatenate([getattr(each, name)[:shortest].numpy() for each in recordings], axis=1)
-        for name in ("state", "feet", "other")
-    )
-    return Observed(found, state, feet, other, runs[0].fell_at.numpy(), reads, shares)
+    captures = [one for i in range(3) for one in runs[0].captures(i)]
+    return Observed(found, captures, runs[0].fell_at.numpy(), reads, shares)
 
 
 def test_contacts_belong_to_the_positions_they_are_paired_with(observed: Observed) -> None:
     """The feet meet the ground when the trunk is at standing height: 12 mm a sample by then."""
-    z = observed.state[:, 0, 2]
-    landing = int(np.argmax(observed.feet[:, 0].any(axis=-1)))
+    z = observed.captures[0].position[:, 2]
+    landing = int(np.argmax(observed.captures[0].contact.any(axis=-1)))
     samples = np.arange(landing)
-    fall = SHORT.rules.standing_height + DROP - 0.5 * 9.81 * DT**2 * samples * (samples + 1)
+    fall = SHORT.jump_rules.standing_height + DROP - 0.5 * 9.81 * DT**2 * samples * (samples + 1)
     assert z[:landing] == pytest.approx(fall, abs=1e-4)
     assert z[landing - 1] - z[landing] == pytest.approx(0.012, abs=1e-3)
-    assert z[landing] <= SHORT.rules.standing_height < z[landing - 1]
+    assert z[landing] <= SHORT.jump_rules.standing_height < z[landing - 1]
     # Held by soft drives alone the robots sink onto their knees, feet first.
-    first = observed.other[:, :5].argmax(axis=0)
-    feet = observed.feet[:, :5].any(axis=-1).argmax(axis=0)
-    assert np.all((first > feet) & (first < feet + 40))
+    for capture in observed.captures[:5]:
+        first, feet = capture.other_contact.argmax(), capture.contact.any(axis=-1).argmax()
+        assert feet < first < feet + 40
 
 
 def test_the_policy_reads_the_command_of_the_moment(observed: Observed) -> None:
@@ -144,23 +143,19 @@ def test_figures_are_those_of_the_recorded_motion(observed: Observed) -> None:
     assert highest == pytest.approx([DROP] * 3, abs=2e-3)
     # The standing one of the two jumping robots.
     on = next(sample for sample, _, jump in observed.reads if jump[4])
-    series = Series(
-        position=observed.state[:, 4, :3].astype(float),
-        velocity=observed.state[:, 4, 7:10].astype(float),
-        orientation=observed.state[:, 4, 3:7].astype(float),
-        contact=observed.feet[:, 4],
-        dt=DT,
-    )
-    figures, _ = measure_jump(series, on, (0.0, 1.0), SHORT.rules)
+    standing = observed.captures[4]
+    script = replace(SHORT.script, command=(0.0, 1.0, 0.0), run_s=on * DT - SHORT.script.start)
+    figures = measure(standing, script, ROBOT, began=0.0, rules=SHORT.rules)
     (jump,) = found.jumps
-    assert jump["height"].mean == pytest.approx(figures["height"])
-    assert jump["non_foot_contact"].mean == observed.other[on : on + 41, 4].any() / 2
+    assert jump["height"].mean == pytest.approx(figures.height)
+    assert jump["non_foot_contact"].mean == standing.other_contact[on : on + 41].any() / 2
     # Walks from 0.8 to 1.5 s.
-    walked = observed.state[160:300, :4]
-    turns = Rotation.from_quat(np.roll(walked[..., 3:7].reshape(-1, 4), -1, axis=-1))
-    velocity = turns.inv().apply(walked[..., 7:10].reshape(-1, 3))[:, :2].reshape(140, 4, 2)
-    errors = np.linalg.norm(velocity - SHORT.commands()[:4, :2], axis=-1).mean(axis=0)
-    for walk, expected in zip(found.walks, (errors[:2].mean(), errors[2:].mean()), strict=True):
+    errors = []
+    for capture, command in zip(observed.captures[:4], SHORT.commands(), strict=False):
+        turns = Rotation.from_quat(capture.orientation[160:], scalar_first=True)
+        own = turns.inv().apply(capture.velocity[160:])
+        errors.append(np.linalg.norm(own[:, :2] - command[:2], axis=-1).mean())
+    for walk, expected in zip(found.walks, np.reshape(errors, (2, 2)).mean(axis=1), strict=True):
         assert walk["speed_error"].mean == pytest.approx(expected, abs=1e-5)
         assert walk["fell"].mean == 0.0
 
@@ -294,7 +289,7 @@ def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> 
     plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
     gains = training_gains("naive", load_robot("mini_cheetah"))
     before = {"forward 2": 0.1}
-    found = run(load_subject(trained[0], "cpu"), gains, plan, "cpu", "full", before)
+    found = evaluate(load_subject(trained[0], "cpu"), gains, plan, device="cpu", before=before)
     assert [walk.name for walk in found.walks] == ["forward 2", "stand"]
     assert found.jumps == ()
     assert found.before == before

@@ -125,7 +125,7 @@ def test_a_trial_keeps_what_it_ran(tried: Path, hopper: Path) -> None:
     assert kept == ["matched_forward_1_000.npz", "naive_forward_1_000.npz"]
     for row in made.rows:
         seen = capture.load(tried / row.capture)
-        again = measure(seen, row.script, ROBOT, began=row.began, mass=made.mass)
+        again = measure(seen, row.script, ROBOT, began=row.began)
         assert repr(again) == repr(row.figures)
     jump = made.rows[0].figures
     assert jump.found

@@ -36,6 +36,7 @@ from pronk.virtual.ground import Ground
 from pronk.virtual.sim_params import load_sim_params
 from seen_jump import DELAY, SCRIPT, changed, seen_jump
 
+RULES = JumpRules.of(ROBOT)
 FORWARD, BACK, LEFT = (2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 1.0, 0.0)
 # At 2 m/s the trunk of `seen_jump` is at 4.0 m at the jump input and at 4.4 m at lift-off; the
 # flight of 2 * 2.0 / g = 0.408 s takes it to 5.216 m. Feet stand 0.21 m before and behind it.
@@ -59,7 +60,7 @@ GAP = obstacle()
 def settled(
     seen: Capture, obstacle: Obstacle = GAP, triggered: float | None = SCRIPT.on
 ) -> CrossingFigures:
-    return measure_crossing(seen, obstacle, triggered=triggered, rules=JumpRules())
+    return measure_crossing(seen, obstacle, triggered=triggered, rules=RULES)
 
 
 # --- The course ---------------------------------------------------------------------------------
@@ -185,10 +186,10 @@ def climb(
 
     def run(tasks: list[Attempt]) -> list[Row]:
         done.extend(tasks)
-        return [replace(task.job.row, figures=figures(task)) for task in tasks]
+        return [replace(task.row, figures=figures(task)) for task in tasks]
 
     def figures(task: Attempt) -> CrossingFigures:
-        kind, size, number = task.obstacle.kind, task.obstacle.size, task.job.row.number
+        kind, size, number = task.obstacle.kind, task.obstacle.size, task.row.number
         if kind == "flat":
             return CrossingFigures(size=0.0, lead=0.0, reach=reach + 0.1 * number)
         good = number < crossed[size, round(task.lead - 0.55, 6)]
@@ -243,7 +244,7 @@ def test_a_robot_that_does_not_jump_crosses_nothing() -> None:
 
 def test_starts_depend_on_command_and_number_alone() -> None:
     def starts(plan: CrossingPlan) -> list[object]:
-        return [(a.job.start, a.job.row.seed) for a in climb({}, plan, reach=math.nan)[1]]
+        return [(a.start, a.row.seed) for a in climb({}, plan, reach=math.nan)[1]]
 
     other = Case(name="back 2", command=BACK)
     both = starts(replace(PLAN, cases=(other, CASE)))

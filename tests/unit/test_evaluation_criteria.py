@@ -24,8 +24,9 @@ from pronk.evaluation.training_sim.evaluation import (
     load_speed_errors,
     save,
 )
+from pronk.robots import load_robot
 
-DT = 0.005
+DT, ROBOT = 0.005, load_robot("mini_cheetah")
 
 
 def spread(mean: float, std: float = 0.01) -> Spread:
@@ -135,7 +136,7 @@ def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
 
 
 def test_every_robot_has_its_command_and_its_times() -> None:
-    plan = Plan(robots=200, seed=4)
+    plan = Plan(robot=ROBOT, robots=200, seed=4)
     assert plan.size == 14 * 200
     commands = plan.commands()
     assert commands[0].tolist() == [2.0, 0.0, 0.0]
@@ -158,4 +159,4 @@ def test_every_robot_has_its_command_and_its_times() -> None:
 
 def test_an_empty_plan_is_refused() -> None:
     with pytest.raises(PronkError, match="robots"):
-        Plan(robots=0)
+        Plan(robot=ROBOT, robots=0)

@@ -1,10 +1,10 @@
-"""Flight phases and figures of a jump, on series whose figures are known in closed form."""
+"""Flight phases and figures of a jump, on motion whose figures are known in closed form."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,18 +14,39 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from pronk.evaluation.jumps import (
+    FIGURES,
+    JumpFigures,
     JumpRules,
-    Series,
     along,
     flights,
     heading,
-    measure_jump,
+    measure,
     uncommanded_height,
 )
+from pronk.robots import load_robot
+from pronk.runtime.script import Script
+from pronk.virtual.capture import Capture
+from seen_jump import (
+    CROUCH,
+    DELAY,
+    DT,
+    FEET,
+    SCRIPT,
+    STANDING,
+    TUCKED,
+    Z_OFF,
+    G,
+    changed,
+    motion,
+    seen_jump,
+)
 
-DT, G, STAND = 0.005, 9.81, 0.3
-RULES = JumpRules(standing_height=STAND)
-COMMAND = (1.0, 0.0)
+ROBOT = load_robot("mini_cheetah")
+RULES = JumpRules(standing_height=STANDING)
+
+# --- Flights ------------------------------------------------------------------------------------
+
+STEP, STAND = 0.005, STANDING
 Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Height, vertical velocity, contact."""
 
@@ -36,35 +57,39 @@ def ground(samples: int, height: float = STAND) -> Piece:
 
 def hop(samples: int) -> Piece:
     """Ballistic flight between two samples on the ground, `samples` + 1 steps apart."""
-    time = DT * np.arange(1, samples + 1)
-    speed = 0.5 * G * DT * (samples + 1)
+    time = STEP * np.arange(1, samples + 1)
+    speed = 0.5 * G * STEP * (samples + 1)
     return STAND + speed * time - 0.5 * G * time**2, speed - G * time, np.zeros(samples, bool)
 
 
-def series(*pieces: Piece, forward: float = 0.0, left: float = 0.0, yaw: float = 0.0) -> Series:
+def series(*pieces: Piece, forward: float = 0.0, left: float = 0.0, yaw: float = 0.0) -> Capture:
     z, vz, touching = (np.concatenate(part) for part in zip(*pieces, strict=True))
-    time = DT * np.arange(len(z))
+    time = STEP * np.arange(len(z))
     turn = np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
-    return Series(
+    return motion(
+        time,
         position=np.column_stack([forward * time, left * time, z]),
         velocity=np.column_stack([np.full_like(z, forward), np.full_like(z, left), vz]),
         orientation=np.tile(turn, (len(z), 1)),
         # One foot is enough.
         contact=touching[:, None] & np.array([True, False, False, False]),
-        dt=DT,
     )
 
 
 def jump_of(
-    whole: Series, on: int, rules: JumpRules = RULES, command: tuple[float, float] = COMMAND
-) -> SimpleNamespace:
-    return SimpleNamespace(**measure_jump(whole, on, command, rules)[0])
+    whole: Capture,
+    on: int,
+    rules: JumpRules = RULES,
+    command: tuple[float, float, float] = (1.0, 0.0, 0.0),
+) -> JumpFigures:
+    script = Script(command=command, stand_s=0.0, run_s=on * STEP)
+    return measure(whole, script, ROBOT, began=0.0, rules=rules)
 
 
 def test_a_ballistic_jump_has_the_figures_of_the_parabola() -> None:
     """101 steps in the air: v = g T / 2 = 2.477 m/s, apex v^2 / 2 g = .3128 m."""
     air, wait, on = 101, 200, 160
-    flight = (air + 1) * DT
+    flight = (air + 1) * STEP
     speed = 0.5 * G * flight
     found = jump_of(series(ground(wait), hop(air), ground(500), forward=2.0), on)
     assert found.found
@@ -72,21 +97,21 @@ def test_a_ballistic_jump_has_the_figures_of_the_parabola() -> None:
     assert (found.flights, found.high_flights) == (1, 1)
     assert found.height == pytest.approx(speed**2 / (2.0 * G), abs=1e-9)
     assert found.apex_gain == pytest.approx(speed**2 / (2.0 * G), abs=1e-9)
-    assert found.delay == pytest.approx((wait - on) * DT)
+    assert found.delay == pytest.approx((wait - on) * STEP)
     # Sampling cuts one step off the start.
-    assert found.duration == pytest.approx(flight - DT)
-    assert found.lift_off_velocity == pytest.approx(speed - G * DT)
+    assert found.duration == pytest.approx(flight - STEP)
+    assert found.lift_off_velocity == pytest.approx(speed - G * STEP)
     assert found.horizontal_velocity == pytest.approx(2.0)
-    assert found.distance == pytest.approx(2.0 * (flight - DT))
+    assert found.distance == pytest.approx(2.0 * (flight - STEP))
 
 
 def test_distance_along_the_command_is_signed_and_turns_with_the_trunk() -> None:
-    flown = 99 * DT
+    flown = 99 * STEP
     # The trunk looks along world y; commanded to the right, it flies along world x.
     whole = series(ground(100), hop(99), ground(500), forward=1.5, left=0.5, yaw=math.pi / 2)
-    assert jump_of(whole, 80, command=(0.0, -1.0)).along == pytest.approx(1.5 * flown)
-    assert jump_of(whole, 80, command=(-2.0, 0.0)).along == pytest.approx(-0.5 * flown)
-    assert math.isnan(jump_of(whole, 80, command=(0.0, 0.0)).along)
+    assert jump_of(whole, 80, command=(0.0, -1.0, 0.0)).along == pytest.approx(1.5 * flown)
+    assert jump_of(whole, 80, command=(-2.0, 0.0, 0.0)).along == pytest.approx(-0.5 * flown)
+    assert math.isnan(jump_of(whole, 80, command=(0.0, 0.0, 0.0)).along)
 
 
 LOW = (hop(40)[0] - 0.1, *hop(40)[1:])
@@ -111,7 +136,7 @@ def test_which_flights_are_jumps(
     assert (found.flights, found.high_flights) == counts
     assert found.found == (delay is not None)
     if delay is not None and duration is not None:
-        assert (found.delay, found.duration) == pytest.approx((delay * DT, duration * DT))
+        assert (found.delay, found.duration) == pytest.approx((delay * STEP, duration * STEP))
 
 
 @pytest.mark.parametrize(("excess", "count"), [(1e-4, 1), (-1e-4, 0)])
@@ -122,7 +147,7 @@ def test_a_high_flight_is_more_than_3_cm_over_standing_height(excess: float, cou
 
 
 def test_height_is_of_the_crouch_before_and_the_half_second_after() -> None:
-    top = (0.5 * G * 102 * DT) ** 2 / (2.0 * G)
+    top = (0.5 * G * 102 * STEP) ** 2 / (2.0 * G)
     before = series(ground(90), ground(10, 0.2), hop(101), ground(500))
     assert jump_of(before, 80).height == pytest.approx(STAND + top - 0.2)
     assert jump_of(before, 100).height == pytest.approx(top, abs=1e-9)
@@ -148,7 +173,7 @@ def test_upright_is_measured_two_seconds_after_touchdown() -> None:
     whole = series(ground(100), hop(80), ground(401))
     for degrees in (29.0, 31.0):
         half = math.radians(degrees) / 2
-        roll = np.tile([math.cos(half), math.sin(half), 0.0, 0.0], (len(whole.position), 1))
+        roll = np.tile([math.cos(half), math.sin(half), 0.0, 0.0], (len(whole.time), 1))
         assert jump_of(replace(whole, orientation=roll), 90).upright == (degrees < 30.0)
     # A robot that falls one sample earlier has no such moment.
     assert not jump_of(series(ground(100), hop(80), ground(400)), 90).upright
@@ -182,3 +207,155 @@ def test_heading_is_the_yaw_whatever_the_tilt(yaw: float, pitch: float, roll: fl
     assert heading(quaternion) == pytest.approx(yaw, abs=1e-9)
     ahead = np.array([math.cos(yaw), math.sin(yaw)])
     assert along(2.0 * ahead, quaternion, (3.0, 0.0)) == pytest.approx(2.0)
+
+
+# --- All figures ---------------------------------------------------------------------------------
+
+UP = 2.0
+FLIGHT = round(2.0 * UP / G, 3)
+ON, OFF, DOWN = SCRIPT.on, SCRIPT.on + DELAY, SCRIPT.on + DELAY + FLIGHT
+
+
+def figures(capture: Capture, **changes: Any) -> JumpFigures:
+    kept: dict[str, Any] = {"began": 0.0, "rules": RULES}
+    return measure(capture, SCRIPT, ROBOT, **(kept | changes))
+
+
+def at(*times: float) -> slice:
+    return slice(*(round(t / DT) for t in times))
+
+
+def test_a_jump_by_hand() -> None:
+    found = figures(seen_jump(up=UP, speed=1.0))
+    apex = Z_OFF + UP**2 / (2.0 * G)
+    flags = ("standing", "found", "upright", "success", "non_foot_contact", "fell")
+    assert [getattr(found, name) for name in flags] == [True] * 4 + [False] * 2
+    assert found.delay == pytest.approx(DELAY)
+    assert found.duration == pytest.approx(FLIGHT)
+    assert found.height == pytest.approx(apex - (STANDING - CROUCH), abs=1e-5)
+    assert found.apex_gain == pytest.approx(apex - STANDING, abs=1e-5)
+    assert found.rise == pytest.approx(UP**2 / (2.0 * G), abs=1e-5)
+    assert found.ballistic == pytest.approx(UP**2 / (2.0 * G))
+    assert found.lift_off_velocity == pytest.approx(UP)
+    assert found.horizontal_velocity == pytest.approx(1.0)
+    assert found.distance == pytest.approx(FLIGHT)
+    assert found.along == pytest.approx(FLIGHT)
+    # The trunk is lowest .1 s after the jump input and .1 s after touchdown.
+    assert found.distance_minima == pytest.approx(DELAY - 0.1 + FLIGHT, abs=2e-3)
+    # The feet are as wide apart as the hips: what is left of the distance is the gap (A16). Their
+    # last stand is one sample before lift-off.
+    assert found.gap == pytest.approx(FLIGHT + DT - (FEET[0, 0] - FEET[2, 0]))
+    assert found.flights == found.high_flights == 1.0
+    assert found.speed == pytest.approx(1.0)
+
+
+def test_clearance_by_hand() -> None:
+    found = figures(seen_jump(up=UP))
+    rise = UP**2 / (2.0 * G)
+    assert found.clearance == pytest.approx(rise + TUCKED, abs=1e-4)
+    # A quarter of the flight away from the apex: 3/4 of the rise, sin(pi / 4) of the tuck.
+    expected = 0.75 * rise + math.sin(math.pi / 4.0) * TUCKED
+    assert found.clearance_half == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_gap_is_between_footholds() -> None:
+    seen = seen_jump(up=UP)
+    before = figures(seen).gap
+    # A front foot that has left the ground .3 s before: its foothold is .3 m further back.
+    early = changed(seen, "contact", (at(OFF - 0.3, OFF), [0, 1]), False)
+    # Then the hind feet's last stand, .42 m behind, is still further back.
+    assert figures(early).gap == pytest.approx(before + 0.3, abs=2e-3)
+    # A hind foot that comes down .05 m further back takes that off.
+    foot = seen.foot_position[-1, 3, 0] - 0.05
+    back = changed(seen, "foot_position", (at(DOWN, 8.0), 3, 0), foot)
+    assert figures(back).gap == pytest.approx(before - 0.05)
+
+
+def test_without_a_jump() -> None:
+    seen = seen_jump()
+    found = figures(replace(seen, contact=np.ones_like(seen.contact)))
+    assert (found.standing, found.found, found.success) == (True, False, False)
+    assert all(math.isnan(each) for each in (found.distance, found.gap, found.apex_gain))
+    # Height is that of the 1.5 s after the input.
+    assert found.height == pytest.approx(Z_OFF + UP**2 / (2.0 * G) - (STANDING - CROUCH), abs=1e-5)
+    assert found.flights == found.high_flights == 0.0
+
+
+def test_a_fall_before_the_jump_input() -> None:
+    found = figures(changed(seen_jump(), "position", (at(ON - 0.5, 9.0), 2), 0.05))
+    assert (found.standing, found.fell, found.success) == (False, True, False)
+    assert all(
+        math.isnan(getattr(found, name)) for name, each in FIGURES.items() if not each.joints
+    )
+
+
+@pytest.mark.parametrize("after", [0.1, 1.9])
+def test_a_fall_after_landing_is_no_success(after: float) -> None:
+    # Lying on its side: x of the quaternion is sin(45 degrees).
+    seen = seen_jump()
+    side = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0])
+    found = figures(changed(seen, "orientation", at(DOWN + after, 9.0), side))
+    flags = (found.found, found.fell, found.upright, found.success)
+    assert flags == (True, True, False, False)
+    assert found.distance == pytest.approx(FLIGHT)
+
+
+@pytest.mark.parametrize(
+    ("when", "touches"),
+    [(ON - 0.1, False), (ON + 0.01, True), (DOWN + 1.9, True), (DOWN + 2.1, False)],
+)
+def test_a_knee_on_the_ground_is_no_success(when: float, touches: bool) -> None:
+    found = figures(changed(seen_jump(), "other_contact", at(when, when + 0.05), True))
+    assert found.non_foot_contact is touches
+    assert found.success is not touches
+    assert found.upright
+
+
+def test_rates_are_those_of_the_acceleration() -> None:
+    seen = seen_jump()
+    time = seen.time
+    rates = np.zeros((len(time), 3))
+    wave = np.sin(2.0 * np.pi * 5.0 * time)
+    rates[:, 0], rates[:, 1] = 3.0 * wave, -2.0 * wave
+    rates[time < SCRIPT.start] = rates[time >= ON] = 50.0
+    found = figures(replace(seen, angular_velocity=rates))
+    assert found.roll_rate_peak == pytest.approx(3.0, rel=1e-4)
+    assert found.roll_rate_rms == pytest.approx(3.0 / math.sqrt(2.0), rel=1e-3)
+    assert found.pitch_rate_peak == pytest.approx(2.0, rel=1e-4)
+    assert found.pitch_rate_rms == pytest.approx(2.0 / math.sqrt(2.0), rel=1e-3)
+
+
+def test_energy_and_cost_of_transport_by_hand() -> None:
+    found = figures(seen_jump())
+    # 100 W from the input to .5 s after touchdown; 1 m/s.
+    assert found.energy == pytest.approx(100.0 * (DELAY + FLIGHT + 0.5), abs=0.2)
+    assert found.cost_of_transport == pytest.approx(100.0 / (12.0 * G), rel=1e-6)
+
+
+def test_loads_by_hand() -> None:
+    seen = seen_jump()
+    knee = ROBOT.joint_names.index("FR_knee")
+    drive = ROBOT.joints[knee].drive
+    # The knee turns at half its no-load speed and is pushed on at half of what it can give then.
+    speed = 0.5 * drive.no_load_speed
+    limit = min(drive.effort_limit, 0.5 * drive.stall_torque)
+    turned = changed(seen, "joint_position", (slice(None), knee), speed * seen.time)
+    loaded = changed(turned, "torque", (at(ON, DOWN), knee), 0.5 * limit)
+    # What happens long before the input is of no interest.
+    loaded = changed(loaded, "torque", (at(0.0, 1.0), 0), 100.0)
+    found = figures(loaded)
+    assert found.peak_speed[knee] == pytest.approx(speed)
+    assert found.peak_torque[knee] == pytest.approx(0.5 * limit)
+    assert found.torque_margin[knee] == pytest.approx(0.5 * limit / drive.effort_limit)
+    assert found.peak_torque[0] == found.peak_speed[0] == 0.0
+    assert found.torque_margin[0] == pytest.approx(1.0)
+    beyond = changed(seen, "torque", (at(ON, DOWN), 1), -1.2 * ROBOT.joints[1].drive.effort_limit)
+    assert figures(beyond).torque_margin[1] == pytest.approx(-0.2)
+
+
+def test_began_shifts_the_script() -> None:
+    seen = seen_jump()
+    later = replace(seen, time=seen.time + 3.0)
+    ours, theirs = figures(later, began=3.0), figures(seen)
+    for name, figure in FIGURES.items():
+        assert getattr(ours, name) == pytest.approx(getattr(theirs, name), nan_ok=True), figure

@@ -86,7 +86,7 @@ def trial(
         sim_params={"file": "shipped with pronk", "sha256": "ab" * 32},
         script=SCRIPT,
         spread_s=0.5,
-        rules=asdict(JumpRules()),
+        rules=asdict(JumpRules.of(ROBOT)),
         mass=12.0,
         versions={"pronk": "0.1.0"},
         timing={"seconds": 1.0},

@@ -15,7 +15,7 @@ from hopper import ROBOT
 from pronk.evaluation.walk import SETTLE_S, WalkFigures, measure_walk, walk_script
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
-from seen_jump import STANDING, changed
+from seen_jump import STANDING, changed, motion
 
 DT = 0.002
 POWER, MASS = 120.0, 12.0
@@ -38,21 +38,13 @@ def walked(
     rates = np.zeros((len(time), 3))
     rates[:, 2] = yaw_rate
     rates[:, 1] = 0.6 * np.sin(2.0 * np.pi * 4.0 * time)
-    zeros = np.zeros((len(time), 12))
-    return Capture(
-        time=time,
+    return motion(
+        time,
         position=position,
         orientation=orientation,
         velocity=velocity,
         angular_velocity=rates,
-        foot_position=np.zeros((len(time), 4, 3)),
-        contact=np.ones((len(time), 4), dtype=bool),
-        other_contact=np.zeros(len(time), dtype=bool),
-        joint_position=zeros,
-        joint_velocity=zeros,
-        torque=zeros,
         electrical_power=np.full(len(time), POWER),
-        bus_voltage=np.full(len(time), 24.0),
     )
 
 
@@ -61,8 +53,7 @@ def script(command: tuple[float, float, float] = COMMAND) -> Script:
 
 
 def measured(seen: Capture, **changes: Any) -> WalkFigures:
-    kept: dict[str, Any] = {"began": 0.0, "mass": MASS}
-    return measure_walk(seen, changes.pop("script", script()), ROBOT, **(kept | changes))
+    return measure_walk(seen, changes.pop("script", script()), ROBOT, began=0.0, **changes)
 
 
 def test_a_steady_walk_in_closed_form() -> None:

@@ -133,23 +133,12 @@ def jump_and_film(
     An existing trial is replaced. Without policies the results are None and no film.
     """
     from pronk.evaluation.pictures.video import record_all
-    from pronk.evaluation.trial import VIDEOS, Plan, cores, run_trial
-    from pronk.files import sha256
-    from pronk.robots import load_robot
-    from pronk.virtual.sim_params import SHIPPED, load_sim_params
+    from pronk.evaluation.trial import VIDEOS, Plan, run_trial, setup_of
 
     if not policies:
         return None, ()
-    trial = run_trial(
-        policies,
-        Plan(jumps=jumps, seed=seed),
-        robot=load_robot(ROBOT),
-        sim_params=load_sim_params(SHIPPED),
-        out=out,
-        about={"file": "shipped with pronk", "sha256": sha256(SHIPPED)},
-        overwrite=True,
-        processes=cores(),
-    )
+    setup = setup_of(policies[0], out)
+    trial = run_trial(policies, Plan(jumps=jumps, seed=seed), overwrite=True, **setup)
     first = replace(trial, subjects=trial.subjects[:1])
     films = record_all(first, out, out / VIDEOS, warn=console.warn, cases=(FILMED,), slow=2.0)
     return trial, films

@@ -5,18 +5,12 @@ from __future__ import annotations
 import io
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from pronk.cli import console
 from pronk.errors import PronkError
-
-if TYPE_CHECKING:
-    from pronk.evaluation.training_sim.evaluation import Evaluation, Plan
-    from pronk.evaluation.training_sim.run import Subject
-    from pronk.train.gains import TrainingGains
-
 
 What = Literal["all", "walk", "jump"]
 Drawn = Literal["full", "noise", "none"]
@@ -57,83 +51,44 @@ def evaluate(
     require_extra()
     if out.suffix != ".json":
         raise PronkError(f"--out {out}: expected a name that ends in .json, as in evaluation.json.")
+    where = "cuda:0" if find_devices(device).device == "cuda" else "cpu"
+
+    from pronk.evaluation.training_sim import adapter
+    from pronk.evaluation.training_sim.evaluation import load_speed_errors, save, sheets
+    from pronk.train.gains import training_gains
+    from pronk.train.tasks import load_task
+
+    errors = {} if before is None else load_speed_errors(before)
+    subject = adapter.load_subject(policy, where)
+    robot = load_task(subject.robot).robot
     plan = Plan(
+        robot=robot,
         robots=robots,
         seed=seed,
         walks=() if what == "jump" else WALKS,
         jumps=() if what == "walk" else JUMPS,
     )
-    where = "cuda:0" if find_devices(device).device == "cuda" else "cpu"
-
-    from pronk.evaluation.tables import evaluation_sheets
-    from pronk.evaluation.training_sim.evaluation import load_speed_errors, save
-    from pronk.evaluation.training_sim.run import load_subject
-    from pronk.train.gains import training_gains
-    from pronk.train.tasks import load_task
-
-    errors = {} if before is None else load_speed_errors(before)
-    subject = load_subject(policy, where)
     if plan.jumps and not subject.jump:
         raise PronkError(
             f"{policy}: a policy without the jump input; evaluate it with --what walk."
         )
-    drives = training_gains(gains, load_task(subject.robot).robot, like=like)
+    drives = training_gains(gains, robot, like=like)
     if not subject.knows(drives):
         console.warn(
             f"{policy} was not trained with these gains; it is evaluated with {drives.name} ones"
         )
-    found = run(subject, drives, plan, where, randomization, errors)
-    save(out, found)
-    for sheet in evaluation_sheets(found):
-        console.show_sheet(sheet)
-    console.wrote(out)
-
-
-def run(
-    subject: Subject,
-    gains: TrainingGains,
-    plan: Plan,
-    device: str,
-    randomization: str,
-    before: dict[str, float],
-) -> Evaluation:
-    """Build the simulator on a device, `cpu` or `cuda:0`, and evaluate in it.
-
-    `before` has speed errors to compare with; `randomization` is one of `RANDOMIZATIONS`.
-    """
-    from mjlab.envs import ManagerBasedRlEnv
-
-    from pronk.evaluation.training_sim.evaluation import evaluate_policy
-    from pronk.evaluation.training_sim.run import evaluation_cfg
-    from pronk.train.devices import device_facts
-    from pronk.train.phases import TASKS
-    from pronk.train.rl.export import versions
-    from pronk.train.tasks import load_task
-
-    task = load_task(subject.robot)
     # mjlab and Warp print to standard output.
     with console.progress() as report, redirect_stdout(io.StringIO()):
-        report("building", 0.0)
-        cfg = task.env_cfg(task.robot, gains, iterations=TASKS["all"], seed=plan.seed)
-        cfg = evaluation_cfg(cfg, plan, randomization)
-        env = ManagerBasedRlEnv(cfg=cfg, device=device)
-        report("building", 1.0)
-        about = {
-            "policy": subject.about,
-            "gains": {"name": gains.name, "sha256": gains.sha256, "virtual": gains.virtual},
-            "randomization": randomization,
-            "device": device_facts(device.partition(":")[0], 1),
-            "versions": versions(),
-        }
-        try:
-            return evaluate_policy(
-                subject.act,
-                env,
-                plan,
-                estimate=subject.estimate,
-                progress=report.bar("walking and jumping"),
-                about=about,
-                before=before,
-            )
-        finally:
-            env.close()
+        found = adapter.evaluate(
+            subject,
+            drives,
+            plan,
+            device=where,
+            randomization=randomization,
+            before=errors,
+            progress=report,
+        )
+    save(out, found)
+    for sheet in sheets(found):
+        console.show_sheet(sheet)
+    console.wrote(out)

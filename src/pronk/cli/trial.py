@@ -72,12 +72,8 @@ def trial(
     from pronk.evaluation.pictures.video import record_all
     from pronk.evaluation.protocol import parse_cases
     from pronk.evaluation.results import SUMMARY, TABLE
-    from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, cores, run_trial
-    from pronk.files import sha256
-    from pronk.policy.runtime import load_policy
+    from pronk.evaluation.trial import CAPTURES, VIDEOS, Plan, run_trial, setup_of
     from pronk.report.build import write_report
-    from pronk.robots import load_robot
-    from pronk.virtual.sim_params import SHIPPED, load_sim_params
 
     if own and not bodies:
         raise PronkError("--own without --bodies; it names policies that are tried on those.")
@@ -87,18 +83,8 @@ def trial(
         rates=0 if commands else RATES_JUMPS,
         seed=seed,
     )
-    file, policies = sim_params or SHIPPED, [policy, *also]
-    known = load_robot(robot or load_policy(policy).contract.robot)
-    setup: dict[str, Any] = {
-        "robot": known,
-        "sim_params": load_sim_params(sim_params, known),
-        "out": out,
-        "about": {
-            "file": str(sim_params) if sim_params else "shipped with pronk",
-            "sha256": sha256(file),
-        },
-        "processes": cores() if processes is None else processes,
-    }
+    policies = [policy, *also]
+    setup: Any = setup_of(policy, out, sim_params, robot, processes=processes)
     with console.progress() as report:
         found = run_trial(
             policies,
@@ -155,7 +141,7 @@ def trial(
 def _extra_sheets(
     names: Sequence[str],
     policies: Sequence[Path],
-    setup: dict[str, Any],
+    setup: Any,
     seed: int,
     jumps: int,
     own: Sequence[Path],
@@ -186,5 +172,5 @@ def _extra_sheets(
         plan_n = Plan(jumps=jumps, seed=seed)
         trained = [[path] for path in own]
         yield bodies.table(
-            bodies.add_bodies(policies, plan_n, own=trained, seed=seed, progress=report, **setup)
+            bodies.add_bodies(policies, plan_n, own=trained, seed=seed, stages=report, **setup)
         )

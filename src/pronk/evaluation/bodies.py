@@ -1,7 +1,7 @@
 """Randomized robots: other virtual robots, each matched by its own sweep, and the same trial.
 
-Every robot is drawn around given parameters (`pronk.evaluation.variation.draw_robot`), excited by
-its own sweep, matched, and tried with the same script. Its folder holds all of it:
+Every robot is drawn around given parameters within `TOLERANCES`, excited by its own sweep, matched,
+and tried with the same script. Its folder holds all of it:
 
     sim_params.yaml    the robot, for `--sim-params`
     logs/              its sweep
@@ -9,10 +9,8 @@ its own sweep, matched, and tried with the same script. Its folder holds all of 
     match.npz
     trial/             trials.csv and summary.json
 
-The gains are those of the training simulator; the drives keep their own, 17 / 0.4. A policy that is
-tried here was trained with the gains of another robot, or with the robot's own `gains.yaml`. The
-error of gains on a robot's sweep, by the estimator of the measured response, over the joint's band
-(paper F11), contains nothing that was outside the sweep (ground, mass, delay):
+The error of gains on a robot, over each joint's band (paper F11), contains nothing that was outside
+the sweep (ground, mass, delay):
 
     error(f) = 20 log10 |H_simulated(f)| / |H_measured(f)|                [dB]
 """
@@ -22,23 +20,24 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Unpack
 
 import msgspec
 import numpy as np
+import yaml
 
 from pronk.errors import PronkError
 from pronk.evaluation.results import Results, Subject, load_json, save_json
 from pronk.evaluation.results import load as load_results
-from pronk.evaluation.tables import Sheet, number, sheet
-from pronk.evaluation.trial import Plan, load_subjects, run_trial, versions
-from pronk.evaluation.variation import GROUP_TORQUE, TOLERANCES, draw_robot, save_sim_params
+from pronk.evaluation.tables import Sheet, landed, number, sheet
+from pronk.evaluation.trial import Plan, Setup, load_subjects, run_trial, versions
 from pronk.evaluation.virtual_sweep import sweep_virtual
 from pronk.excitation.plan import make_plan
-from pronk.files import sha256
+from pronk.files import sha256, write_text
 from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import read_logs
 from pronk.match import gains as gains_file
@@ -50,7 +49,8 @@ from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import MujocoSimulator
-from pronk.virtual.sim_params import SimParams, load_sim_params
+from pronk.virtual.sim_params import SCHEMA as PARAMS_SCHEMA
+from pronk.virtual.sim_params import JointParams, SimParams, load_sim_params
 
 SCHEMA = "pronk/trial-bodies/4"
 FILE = "bodies.json"
@@ -110,16 +110,12 @@ def add_bodies(
     policies: Sequence[Path],
     plan: Plan | None = None,
     *,
-    robot: RobotSpec,
-    sim_params: SimParams,
-    out: Path,
-    about: Mapping[str, Any] | None = None,
     count: int = 3,
     own: Sequence[Sequence[Path]] = (),
     repeats: int = 3,
     seed: int = 0,
-    processes: int = 1,
-    progress: Callable[[str, float], None] | None = None,
+    stages: Callable[[str, float], None] = lambda stage, share: None,
+    **setup: Unpack[Setup],
 ) -> Bodies:
     """Draw robots, match each, try policies on each, and write `bodies.json`.
 
@@ -129,41 +125,38 @@ def add_bodies(
     Args:
         policies: All of them are tried on every robot.
         plan: Of the trials; 20 jumps with each of the paper's commands if None.
-        robot: The robot of the policies.
-        sim_params: To draw around.
-        out: The robots' folders are made in `bodies` in it.
-        about: Source of the parameters, kept with the results.
         count: Robots.
         own: For each robot, in order, policies that were trained with its gains.
         repeats: Of the sweep of each joint.
         seed: The robots are drawn from `1000 seed + 1` and on.
-        processes: Jobs at once; the numbers do not depend on it.
-        progress: Called with the stage and the share of it that is done.
+        stages: Called with the stage and the share of it that is done.
+        setup: As of `run_trial`; the robots are drawn around its parameters, into `bodies` in its
+            folder.
 
     Raises:
         PronkError: Of policies, parameters or plan, before the first step.
     """
-    begun = time.perf_counter()
+    begun, robot, out = time.perf_counter(), setup["robot"], setup["out"]
+    processes = setup.get("processes", 1)
     if len(own) > count:
         raise PronkError(f"own policies for {len(own)} bodies; there are {count}.")
-    report = progress or (lambda stage, share: None)
     subjects = load_subjects(policies, robot)
     given = [[*policies, *(own[i] if i < len(own) else ())] for i in range(count)]
     for paths in given:
         load_subjects(paths, robot)
     seeds = [1000 * seed + number for number in range(1, count + 1)]
-    drawn = [draw_robot(sim_params, robot, seed=one) for one in seeds]
+    drawn = [draw_robot(setup["sim_params"], robot, seed=one) for one in seeds]
     bodies = []
-    for i, (params, paths) in enumerate(zip(drawn, given, strict=True)):
-        name, folder = f"body {i + 1}", out / FOLDER / f"body_{i + 1}"
+    for i, (params, paths) in enumerate(zip(drawn, given, strict=True), start=1):
+        name, folder = f"body {i}", out / FOLDER / f"body_{i}"
         matched, logs = match_body(
             robot,
             params,
             folder,
-            seed=seeds[i],
+            seed=seeds[i - 1],
             repeats=repeats,
             processes=processes,
-            progress=lambda what, share, name=name: report(f"{name}: {what}", share),  # type: ignore[misc]
+            progress=lambda what, share, name=name: stages(f"{name}: {what}", share),  # type: ignore[misc]
         )
         digest = sha256(folder / SIM_PARAMS)
         trial = run_trial(
@@ -175,28 +168,155 @@ def add_bodies(
             about={"file": str(folder / SIM_PARAMS), "sha256": digest},
             overwrite=True,
             processes=processes,
-            progress=partial(report, f"{name}: jump"),
+            progress=partial(stages, f"{name}: jump"),
         )
-        bodies.append(
-            Body(
-                name=name,
-                folder=str(folder.relative_to(out)),
-                seed=seeds[i],
-                sha256=digest,
-                errors=_errors(robot, logs, matched, trial.subjects),
-                trial=trial,
-            )
+        body = Body(
+            name=name,
+            folder=str(folder.relative_to(out)),
+            seed=seeds[i - 1],
+            sha256=digest,
+            errors=_errors(robot, logs, matched, trial.subjects),
+            trial=trial,
         )
+        bodies.append(body)
     found = Bodies(
         robot=robot.name,
         subjects=subjects,
-        sim_params=dict(about or {}),
+        sim_params=dict(setup.get("about") or {}),
         seed=seed,
         seconds=time.perf_counter() - begun,
         bodies=tuple(bodies),
     )
     save(out, found)
     return found
+
+
+# ---- draws ----
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How far a number is drawn from the one it is drawn around, uniformly."""
+
+    kind: Literal["relative", "about"]
+    """`relative`: a share of the number; `about`: about `centre`, whatever the number was."""
+    centre: float
+    half: float
+    """Half-width of the draw."""
+    why: str
+
+
+def _relative(half: float, why: str) -> Tolerance:
+    return Tolerance("relative", 0.0, half, why)
+
+
+def _about(centre: float, half: float, why: str) -> Tolerance:
+    return Tolerance("about", centre, half, why)
+
+
+GROUP_TORQUE = 0.06
+"""Relative half-width of a factor on `torque_scale` that the joints of one group share: motors of
+one batch have one magnet material and one winding."""
+
+TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
+    "joints": {
+        "torque_scale": _relative(0.03, "beside the batch: motor to motor, current sensor"),
+        "link_inertia_scale": _relative(0.03, "castings, screws, cables"),
+        "rotor_inertia": _relative(0.05, "makers give +-5 to 10 %"),
+        "belt_stiffness": _relative(0.2, "belt tension, gear preload"),
+        "belt_damping": _relative(0.3, "the same"),
+        "coulomb": _relative(0.3, "preload of gears and seals, grease"),
+        "breakaway": _relative(0.3, "moves with coulomb"),
+        "stribeck_speed": _relative(0.3, "grease"),
+        "presliding_stiffness": _relative(0.2, "grease, preload"),
+        "presliding_damping": _relative(0.2, "the same"),
+        "viscous": _relative(0.3, "grease and its temperature"),
+        "encoder_offset": _about(0.0, 0.004, "zeroed by hand against a stop [rad]"),
+    },
+    "machine": {
+        "command_delay_s": _about(0.003, 0.002, "half to two and a half 500 Hz cycles [s]"),
+        "measurement_delay_s": _about(0.00125, 0.00075, "up to a 500 Hz cycle [s]"),
+        "drive_lag_s": _about(0.0005, 0.0002, "filter of the speed, current loop [s]"),
+        "bus_voltage": _about(24.1, 1.1, "a 6S battery from nearly flat to full [V]"),
+        "bus_resistance": _relative(0.5, "age and cold of the cells"),
+        "gyro_bias": _about(0.0, 0.006, "after some minutes of warming up [rad/s]"),
+        "accelerometer_bias": _about(0.0, 0.08, "8 mg, a MEMS unit's data sheet [m/s^2]"),
+    },
+    "trunk": {
+        "mass_offset": _about(0.3, 0.6, "another battery, a payload [kg]; training drew -0.4..1.6"),
+        "com_offset": _about(0.0, 0.008, "where battery and computer sit [m]"),
+        "inertia_scale": _relative(0.02, "castings, screws, cables"),
+    },
+    "attitude": {
+        "bias": _about(0.0, 0.012, "IMU mounted askew by 0.7 degrees [rad]"),
+        "yaw_drift": _about(0.0, 0.004, "gyro bias that is left [rad/s]"),
+    },
+    "ground": {
+        "friction": _about(0.8, 0.2, "rubber on vinyl to rubber on concrete [1]"),
+        "stiffness": _relative(0.4, "shore hardness of the feet, mats"),
+        "damping": _relative(0.4, "the same"),
+    },
+}
+"""By part of the parameters and name of the number."""
+
+
+def draw_robot(sim_params: SimParams, robot: RobotSpec, *, seed: int) -> SimParams:
+    """Draw a random robot: every number of `TOLERANCES` anew about given parameters.
+
+    Raises:
+        RobotError: The parameters are not of this robot, or a drawn robot cannot exist.
+    """
+    sim_params.check_joints(robot.joint_names)
+    rng = np.random.default_rng([seed, 0x707])
+    batch = {group: 1.0 + GROUP_TORQUE * rng.uniform(-1.0, 1.0) for group in robot.groups}
+    joints: dict[str, JointParams] = {}
+    for joint in robot.joints:
+        own = sim_params.joints[joint.name]
+        drawn = _drawn(own, "joints", rng)
+        drawn["torque_scale"] = _rounded(drawn["torque_scale"] * batch[joint.group])
+        # Break-away is friction's peak: it moves with the friction, and is never below it.
+        ratio = own.breakaway / own.coulomb if own.coulomb else 1.0
+        drawn["breakaway"] = max(_rounded(drawn["coulomb"] * ratio), drawn["coulomb"])
+        joints[joint.name] = replace(own, **drawn)
+    parts: dict[str, Any] = {"joints": joints}
+    for name in ("machine", "trunk", "attitude", "ground"):
+        part = getattr(sim_params, name)
+        parts[name] = replace(part, **_drawn(part, name, rng))
+    return replace(sim_params, **parts)
+
+
+def _drawn(part: object, name: str, rng: np.random.Generator) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for field_, tolerance in TOLERANCES[name].items():
+        value = getattr(part, field_)
+        spread = tolerance.half * rng.uniform(-1.0, 1.0, np.shape(value))
+        centre = np.asarray(tolerance.centre if tolerance.kind == "about" else value)
+        new = centre * (1.0 + spread) if tolerance.kind == "relative" else centre + spread
+        values[field_] = tuple(map(_rounded, new)) if np.ndim(new) else _rounded(float(new))
+    return values
+
+
+def _rounded(value: float) -> float:
+    """Five digits, so that a written file holds the number exactly."""
+    return float(f"{value:.5g}")
+
+
+def save_sim_params(path: Path, sim_params: SimParams, *, says: str) -> None:
+    """Write parameters as YAML for `--sim-params`, whole or not at all, under a comment.
+
+    Raises:
+        PronkError: There are blocks or a lowered floor, which a file does not hold.
+    """
+    if sim_params.ground != replace(sim_params.ground, terrain=(), floor=0.0):
+        raise PronkError(f"{path}: a sim_params file holds no terrain; take the blocks away first.")
+    body = msgspec.to_builtins(sim_params)
+    for name in ("terrain", "floor"):
+        del body["ground"][name]
+    joints = body.pop("joints")
+    whole = {"schema": PARAMS_SCHEMA, **body, "joints": joints}
+    text = yaml.safe_dump(whole, default_flow_style=None, sort_keys=False, width=100)
+    head = "".join(f"# {line}".rstrip() + "\n" for line in says.splitlines())
+    write_text(path, f"{head}\n{text}")
 
 
 # ---- sweep and match ----
@@ -222,7 +342,11 @@ def match_body(
         HardwareError: It did.
     """
     files = [folder / LOGS / f"{joint}.mcap" for joint in robot.joint_names]
-    if not _is_matched(folder, sim_params):
+    same = False
+    if (folder / GAINS).exists():  # written last
+        with suppress(PronkError):
+            same = load_sim_params(folder / SIM_PARAMS) == sim_params
+    if not same:
         (folder / GAINS).unlink(missing_ok=True)
         says = f"A randomized virtual robot, drawn by `{WRITER}`, seed {seed}."
         save_sim_params(folder / SIM_PARAMS, sim_params, says=says)
@@ -246,16 +370,6 @@ def match_body(
     return gains_file.load(folder / GAINS), read_logs(files, processes=processes, robot=robot)
 
 
-def _is_matched(folder: Path, sim_params: SimParams) -> bool:
-    """Whether a folder has exactly this robot with its gains, which are written last."""
-    if not (folder / SIM_PARAMS).exists() or not (folder / GAINS).exists():
-        return False
-    try:
-        return load_sim_params(folder / SIM_PARAMS) == sim_params
-    except PronkError:
-        return False
-
-
 # ---- error of gains ----
 
 
@@ -268,8 +382,7 @@ def gains_errors(
 ) -> dict[str, float]:
     """Return the errors of several sets of gains, by name, on one robot's sweep [dB RMS].
 
-    The largest amplitude of each joint is compared; `robot` is that of the training simulator,
-    `settings` are those of the match.
+    The largest amplitude of each joint is compared; `settings` are those of the match.
 
     Raises:
         LogError: The logs excite no joint or cannot be used.
@@ -285,12 +398,10 @@ def gains_errors(
     requests = [SimRequest(goal, *pairs[goal.joint]) for pairs in gains.values() for goal in goals]
     with MujocoSimulator(robot, threads=settings.threads, device=settings.device) as simulator:
         simulated = iter(responses(simulator, requests))
-    return {
-        name: float(
-            np.sqrt(np.mean([np.mean(goal.error_db(next(simulated)) ** 2) for goal in goals]))
-        )
-        for name in gains
+    squares = {
+        name: [np.mean(goal.error_db(next(simulated)) ** 2) for goal in goals] for name in gains
     }
+    return {name: float(np.sqrt(np.mean(each))) for name, each in squares.items()}
 
 
 def _errors(
@@ -300,9 +411,8 @@ def _errors(
     pairs: dict[str, Pairs] = {}
     for subject in subjects:
         names, *own = (subject.contract[name] for name in ("joint_names", "stiffness", "damping"))
-        pairs[f"training gains of {subject.name}"] = dict(
-            zip(names, zip(*own, strict=True), strict=True)
-        )
+        both = zip(*own, strict=True)
+        pairs[f"training gains of {subject.name}"] = dict(zip(names, both, strict=True))
     pairs[NAIVE] = {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints}
     pairs[MATCHED] = {name: (one.stiffness, one.damping) for name, one in matched.joints.items()}
     groups = {name: (one.stiffness, one.damping) for name, one in matched.groups.items()}
@@ -345,15 +455,14 @@ def table(found: Bodies) -> Sheet:
             cells = [cell for cell in body.trial.cells if cell.policy == name]
             best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
             trained = body.errors[f"training gains of {name}"]
-            rows.append(
-                {
-                    "body: policy": f"{body.name}: {name}",
-                    "error of its match [dB]": number(body.errors[MATCHED]),
-                    "error of the policy's training gains [dB]": number(trained),
-                    "landed": f"{sum(c.succeeded for c in cells)}/{sum(c.n for c in cells)}",
-                    "best mean height [m]": number(best),
-                }
-            )
+            row = {
+                "body: policy": f"{body.name}: {name}",
+                "error of its match [dB]": number(body.errors[MATCHED]),
+                "error of the policy's training gains [dB]": number(trained),
+                "landed": landed(cells),
+                "best mean height [m]": number(best),
+            }
+            rows.append(row)
     return sheet(
         "Randomized virtual robots, each matched by its own sweep",
         rows,

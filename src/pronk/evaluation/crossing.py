@@ -46,22 +46,10 @@ from pronk.evaluation.jumps import (
     jump_flights,
     number,
     sample_at,
-    series_of,
 )
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.results import Kind, Results, Row, Subject, save
-from pronk.evaluation.trial import (
-    Job,
-    Setup,
-    build,
-    case_rng,
-    in_processes,
-    job_of,
-    load_subjects,
-    opened,
-    set_down,
-    versions,
-)
+from pronk.evaluation.results import Kind, Results, Row, Subject
+from pronk.evaluation.trial import Job, Setup, case_rng, finished, in_processes, load_subjects
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import ticks
@@ -228,7 +216,7 @@ def measure_crossing(
     settled = landed + round(rules.upright_s / seen.dt)
     legs = np.arange(feet.shape[1])
     figures: dict[str, Any] = {"speed": float(seen.velocity[on, :2] @ along)}
-    main = jump_flights(series_of(seen, whole=True), on, rules).main
+    main = jump_flights(seen, on, rules, count).main
     if main is not None:
         before = seen.contact[: main.liftoff]
         stood = feet[main.liftoff - 1 - before[::-1].argmax(axis=0), legs]
@@ -262,11 +250,9 @@ def _stepped_in(seen: Capture, obstacle: Obstacle) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attempt:
-    """One run at an obstacle, with all that it depends on."""
+class Attempt(Job):
+    """One run at an obstacle; the row's script has `stand_s`, `jump_s` and `keep_s`."""
 
-    job: Job
-    """Its script has the command and the times `stand_s`, `jump_s` and `keep_s`."""
     obstacle: Obstacle
     lead: float
     """From the trunk to it when the jump input rises [m]."""
@@ -274,18 +260,17 @@ class Attempt:
 
 def attempt(task: Attempt) -> Row:
     """Run once at an obstacle and measure it."""
-    job, script, rules, obstacle = task.job, task.job.row.script, task.job.rules, task.obstacle
-    along, machine = direction(script.command), set_down(job)
-
-    def where() -> float:
-        return float(machine.snapshot().position[0, :2] @ along)
-
-    operator = Operator(script, trigger_at=obstacle.edge - task.lead, where=where)
+    script, rules, obstacle = task.row.script, task.rules, task.obstacle
+    along, machine = direction(script.command), task.set_down()
+    operator = Operator(
+        script,
+        trigger_at=obstacle.edge - task.lead,
+        where=lambda: float(machine.snapshot().position[0, :2] @ along),
+    )
     # Time to lift off, to fly and land on all feet, and to stand.
     after = rules.search_s + 1.0 + rules.upright_s
-    late = script.stand_s + LATE * (RUN_UP_S + PHASE_S)
-    began, policy = machine.now(), opened(job.policy, job.sha256)
-    for tick in ticks(machine, policy, load_robot(job.robot), operator):
+    late, began = script.stand_s + LATE * (RUN_UP_S + PHASE_S), machine.now()
+    for tick in ticks(machine, task.policy(), load_robot(task.robot), operator):
         if operator.triggered is None:
             if tick.since > late:
                 break
@@ -294,7 +279,7 @@ def attempt(task: Attempt) -> Row:
     triggered = None if operator.triggered is None else began + operator.triggered
     figures = measure_crossing(machine.capture(), obstacle, triggered=triggered, rules=rules)
     measured = replace(figures, obstacle=obstacle.kind, size=obstacle.size, lead=task.lead)
-    return replace(job.row, figures=measured)
+    return replace(task.row, figures=measured)
 
 
 # ---- many runs ----
@@ -347,7 +332,8 @@ class CrossingPlan:
     """Times `stand_s`, `jump_s` and `keep_s`."""
     joint_offset: float = 0.05
     """Half-width of the joints' offsets from the default pose at the start [rad]."""
-    rules: JumpRules = field(default_factory=JumpRules)
+    rules: JumpRules | None = None
+    """Those of the robot if None."""
 
 
 def attempts(
@@ -365,17 +351,23 @@ def attempts(
     """Return runs at one obstacle; their starts are alike for all obstacles and leads."""
     speed, found = math.hypot(*case.command[:2]), []
     obstacle = Obstacle(kind=kind, size=size, command=case.command, edge=RUN_UP_S * speed)
+    script = replace(plan.script, command=case.command)
     for count in range(runs):
         rng = case_rng(plan.seed, case, count)
         x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
         offset = rng.uniform(-plan.joint_offset, plan.joint_offset, len(robot.joints))
-        yaw = float(rng.uniform(-STEERED, STEERED))
-        script = replace(plan.script, command=case.command)
-        start = Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist()))
-        seed = int(rng.integers(2**31))
-        job = job_of(subject, case, count, script, start, seed, robot, sim_params, plan.rules)
-        job = replace(job, ground=obstacle.on(sim_params.ground))
-        found.append(Attempt(job=job, obstacle=obstacle, lead=lead))
+        yaw, seed = float(rng.uniform(-STEERED, STEERED)), int(rng.integers(2**31))
+        task = Attempt(
+            row=Row(policy=subject.name, case=case.name, number=count, seed=seed, script=script),
+            subject=subject,
+            robot=robot.source,
+            sim_params=replace(sim_params, ground=obstacle.on(sim_params.ground)),
+            start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
+            rules=plan.rules or JumpRules.of(robot),
+            obstacle=obstacle,
+            lead=lead,
+        )
+        found.append(task)
     return found
 
 
@@ -392,40 +384,28 @@ def search(
     pairs = [(subject, case) for subject in subjects for case in plan.cases]
     practice: Any = {"lead": 0.0, "runs": plan.practice, **who}
     rows = run([task for s, c in pairs for task in attempts(s, c, "flat", 0.0, **practice)])
-    reach: dict[tuple[str, str], float] = {}
+    climbing: dict[tuple[str, str, Shape], tuple[Subject, Case, int, float]] = {}
     for subject, case in pairs:
-        own = [row for row in rows if (row.policy, row.case) == (subject.name, case.name)]
-        known = [r.figures.reach for r in own if math.isfinite(r.figures.reach)]
-        if known:  # without a jump there is nothing to cross
-            reach[subject.name, case.name] = float(np.mean(known))
-    climbing = {
-        (subject.name, case.name, kind): (subject, case, 0)
-        for subject, case in pairs
-        if (subject.name, case.name) in reach
-        for kind in plan.ladders
-    }
-    while climbing:
-        tasks = [
-            task
-            for (policy, command, kind), (subject, case, rung) in climbing.items()
-            for lead in plan.ladders[kind].leads
-            for task in attempts(
-                subject,
-                case,
-                kind,
-                plan.ladders[kind].size(rung),
-                lead=round(reach[policy, command] + lead, 4),
-                runs=plan.runs,
-                **who,
-            )
+        own = [
+            row.figures.reach for row in rows if (row.policy, row.case) == (subject.name, case.name)
         ]
+        if known := list(filter(math.isfinite, own)):  # without a jump there is nothing to cross
+            for kind in plan.ladders:
+                climbing[subject.name, case.name, kind] = subject, case, 0, float(np.mean(known))
+    while climbing:
+        tasks = []
+        for (_, _, kind), (subject, case, rung, reach) in climbing.items():
+            ladder = plan.ladders[kind]
+            for lead in (round(reach + beyond, 4) for beyond in ladder.leads):
+                size = ladder.size(rung)
+                tasks += attempts(subject, case, kind, size, lead=lead, runs=plan.runs, **who)
         found = run(tasks)
         rows += found
-        for key, (subject, case, rung) in list(climbing.items()):
+        for key, (subject, case, rung, reach) in list(climbing.items()):
             tried = [r for r in found if (r.policy, r.case, r.figures.obstacle) == key]
             higher = plan.ladders[key[2]].size(rung + 1) <= plan.most + 1e-9
             if rung_of(tried).crossed >= plan.enough and higher:
-                climbing[key] = subject, case, rung + 1
+                climbing[key] = subject, case, rung + 1, reach
             else:
                 del climbing[key]
     return rows
@@ -438,42 +418,37 @@ def add_crossings(
 
     Arguments and errors as of `run_trial`; the progress is an estimate.
     """
-    begun, plan = time.perf_counter(), plan or CrossingPlan()
-    robot, out, rounds = setup["robot"], setup["out"], 0
-    subjects, progress = load_subjects(policies, robot), setup.get("progress")
+    begun, plan, robot, rounds = time.perf_counter(), plan or CrossingPlan(), setup["robot"], 0
+    subjects = load_subjects(policies, robot)
+    progress = setup.get("progress") or (lambda share: None)
 
     def run(tasks: list[Attempt]) -> list[Row]:
         """Run one round; about five more follow each."""
         nonlocal rounds
-        build(tasks[0].job)  # refuses impossible parameters
-
-        def share(part: float) -> None:
-            if progress is not None:
-                progress((rounds + part) / (rounds + part + 5.0))
-
-        found = in_processes(attempt, tasks, processes=setup.get("processes", 1), progress=share)
+        tasks[0].build()  # refuses impossible parameters
+        found = in_processes(
+            attempt,
+            tasks,
+            processes=setup.get("processes", 1),
+            progress=lambda part: progress((rounds + part) / (rounds + part + 5.0)),
+        )
         rounds += 1
         return found
 
     rows = search(subjects, plan, robot=robot, sim_params=setup["sim_params"], run=run)
-    if progress is not None:
-        progress(1.0)
-    results = Results(
-        kind=CROSSING,
-        robot=robot.name,
-        subjects=subjects,
+    progress(1.0)
+    return finished(
+        CROSSING,
+        subjects,
+        rows,
+        setup,
         cases=plan.cases,
-        rows=tuple(rows),
         seed=plan.seed,
-        sim_params=dict(setup.get("about") or {}),
         script=plan.script,
-        rules=asdict(plan.rules),
+        rules=asdict(plan.rules or JumpRules.of(robot)),
         settings={"kinds": list(plan.ladders), "runs": plan.runs, "enough": plan.enough},
-        versions=versions(),
         timing={"seconds": time.perf_counter() - begun},
     )
-    save(out, results)
-    return results
 
 
 # ---- sums ----

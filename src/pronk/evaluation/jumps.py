@@ -1,8 +1,7 @@
 """Flight phases and the figures of a jump, from the recorded motion of one robot.
 
-Trials of the virtual robot (`measure`) and the evaluation in the training simulator
-(`measure_jump`) record trunk and foot contacts at every physics step; a sample's contacts belong to
-its position. A series ends where the robot falls.
+Trials of the virtual robot and the evaluation in the training simulator record trunk and foot
+contacts; a sample's contacts belong to its position. What follows a fall is not measured.
 
 A flight phase is a stretch of `flight_s` or longer without a foot on the ground, from its lift-off
 (first sample in the air) to its touchdown (first sample on the ground). A jump input that rises at
@@ -18,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +43,6 @@ AVERAGE_S = 0.01
 """Over which joint speeds are averaged [s]."""
 SETTLE_S = 1.0
 """Time to reach the commanded speed, left out of the figures of the run [s]."""
-BODY = legged("mini_cheetah")
 SYMBOLS = (
     "c: the jump input rises. l, d: lift-off and touchdown of the main flight, the longest in "
     "which the trunk rises more than 3 cm over standing. e: d + 0.5 s. p, z, v: position, height "
@@ -71,10 +69,15 @@ class JumpRules:
     """Largest tilt of an upright robot [deg]."""
     grace_s: float = 0.5
     """Time after the start in which flights are not counted: the robot is set down."""
-    standing_height: float = BODY.standing_height
+    standing_height: float
     """Of the trunk, in the default pose."""
     rise: float = RISE
     """Over standing height, what a high flight exceeds."""
+
+    @classmethod
+    def of(cls, robot: RobotSpec, **times: float) -> Self:
+        """Return the rules with the standing height of a robot."""
+        return cls(standing_height=legged(robot.source).standing_height, **times)
 
     @property
     def high(self) -> float:
@@ -87,69 +90,7 @@ class JumpRules:
         return math.cos(math.radians(self.tilt_deg))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Series:
-    """The recorded motion of one robot, from its start to its fall or to the end."""
-
-    position: Array
-    """Trunk, world frame, z up [m]. (T, 3)"""
-    velocity: Array
-    """Trunk, world frame [m/s]. (T, 3)"""
-    orientation: Array
-    """Trunk to world, unit quaternions w, x, y, z. (T, 4)"""
-    contact: Mask
-    """Feet on the ground. (T, 4)"""
-    dt: float
-    """Time between samples [s]."""
-
-    def steps(self, seconds: float) -> int:
-        """Samples in a time, to the nearest."""
-        return steps(seconds, self.dt)
-
-
-@dataclass(frozen=True)
-class Flight:
-    """A flight phase: samples `liftoff` .. `touchdown` - 1."""
-
-    liftoff: int
-    touchdown: int
-
-    @property
-    def samples(self) -> int:
-        """Length in samples."""
-        return self.touchdown - self.liftoff
-
-
-@dataclass(frozen=True)
-class JumpFlights:
-    """The flight phases of one jump input, the high ones of them, and all others."""
-
-    all: tuple[Flight, ...]
-    high: tuple[Flight, ...]
-    uncommanded: tuple[Flight, ...]
-
-    @property
-    def main(self) -> Flight | None:
-        """The longest of the high ones; None if there was no jump."""
-        return max(self.high, key=lambda phase: phase.samples, default=None)
-
-
-@dataclass(frozen=True, kw_only=True)
-class JumpEvents:
-    """Rise and fall of the jump input, lift-off and touchdown, on the capture's clock [s]."""
-
-    on: float
-    off: float
-    liftoff: float
-    touchdown: float
-
-
-# ---- trunk ----
-
-
-def steps(seconds: float, dt: float) -> int:
-    """Whole steps in a time, to the nearest."""
-    return round(seconds / dt)
+# ---- motion ----
 
 
 def heading(orientation: Array) -> Array:
@@ -168,16 +109,62 @@ def cosine_of_tilt(orientation: Array) -> Array:
 def along(displacement: Array, orientation: Array, command: Sequence[float]) -> float:
     """Part of a horizontal displacement along the commanded direction [m].
 
-    Args:
-        displacement: World frame [m]. (2,)
-        orientation: Of the trunk at lift-off, w, x, y, z. (4,)
-        command: Horizontal velocity in the trunk's frame [m/s]; zero gives NaN.
+    `displacement` (2,) is in the world, `orientation` the trunk's at lift-off, `command` a velocity
+    in the trunk's frame; NaN for one without a horizontal part.
     """
     yaw, (forward, left) = float(heading(orientation)), command[:2]
     speed = math.hypot(forward, left)
     x = math.cos(yaw) * forward - math.sin(yaw) * left
     y = math.sin(yaw) * forward + math.cos(yaw) * left
     return float(displacement[0] * x + displacement[1] * y) / speed if speed else math.nan
+
+
+def steps(capture: Capture, seconds: float) -> int:
+    """Samples in a time, to the nearest."""
+    return round(seconds / capture.dt)
+
+
+def sample_at(capture: Capture, time: float) -> int:
+    """First sample at or after a time on the capture's clock [s]."""
+    return int(np.searchsorted(capture.time, time - 1e-3 * capture.dt))
+
+
+def fallen_at(capture: Capture) -> int:
+    """First sample at which the robot lies or leans too far; the sample count if it never does.
+
+    A robot whose motion is not finite has fallen.
+    """
+    upright = cosine_of_tilt(capture.orientation) >= FALLEN_COSINE
+    fallen = ~(upright & (capture.position[:, 2] >= FALLEN_HEIGHT))
+    return int(np.argmax(fallen)) if fallen.any() else len(fallen)
+
+
+# ---- flights ----
+
+
+class Flight(NamedTuple):
+    """A flight phase: samples `liftoff` .. `touchdown` - 1."""
+
+    liftoff: int
+    touchdown: int
+
+    @property
+    def samples(self) -> int:
+        """Length in samples."""
+        return self.touchdown - self.liftoff
+
+
+class JumpFlights(NamedTuple):
+    """The flight phases of one jump input, the high ones of them, and all others."""
+
+    all: tuple[Flight, ...]
+    high: tuple[Flight, ...]
+    uncommanded: tuple[Flight, ...]
+
+    @property
+    def main(self) -> Flight | None:
+        """The longest of the high ones; None if there was no jump."""
+        return max(self.high, key=lambda phase: phase.samples, default=None)
 
 
 def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
@@ -191,75 +178,34 @@ def flights(contact: Mask, *, least: int) -> tuple[Flight, ...]:
     return tuple(Flight(begin, end) for begin, end in pairs if end - begin >= least)
 
 
-def jump_flights(series: Series, on: int | None, rules: JumpRules) -> JumpFlights:
-    """Sort the flight phases by whether they belong to the jump input that rises at sample `on`."""
-    z = series.position[:, 2]
-    phases = flights(series.contact, least=series.steps(rules.flight_s))
-    last = -1 if on is None else on + series.steps(rules.search_s)
+def jump_flights(capture: Capture, on: int | None, rules: JumpRules, end: int) -> JumpFlights:
+    """Sort the flight phases by whether they belong to the jump input that rises at sample `on`.
+
+    Samples from `end` on are left out.
+    """
+    z = capture.position[:, 2]
+    phases = flights(capture.contact[:end], least=steps(capture, rules.flight_s))
+    last = -1 if on is None else on + steps(capture, rules.search_s)
     own = tuple(phase for phase in phases if on is not None and on <= phase.liftoff <= last)
-    long = (phase for phase in own if phase.samples >= series.steps(rules.long_s))
-    high = tuple(phase for phase in long if z[phase.liftoff : phase.touchdown].max() > rules.high)
+    long = (phase for phase in own if phase.samples >= steps(capture, rules.long_s))
+    high = tuple(phase for phase in long if z[slice(*phase)].max() > rules.high)
     return JumpFlights(own, high, tuple(phase for phase in phases if phase not in own))
 
 
-def uncommanded_height(series: Series, on: int | None, rules: JumpRules) -> float:
+def uncommanded_height(capture: Capture, on: int | None, rules: JumpRules) -> float:
     """Highest trunk in a flight phase that belongs to no jump input [m]; NaN without one.
 
     `on` is the first sample with the jump input, None for a robot that only walks.
     """
     tops = [
-        series.position[phase.liftoff : phase.touchdown, 2].max()
-        for phase in jump_flights(series, on, rules).uncommanded
-        if phase.liftoff >= series.steps(rules.grace_s)
+        capture.position[slice(*phase), 2].max()
+        for phase in jump_flights(capture, on, rules, fallen_at(capture)).uncommanded
+        if phase.liftoff >= steps(capture, rules.grace_s)
     ]
     return float(max(tops, default=math.nan))
 
 
-def measure_jump(
-    series: Series, on: int, command: Sequence[float], rules: JumpRules
-) -> tuple[dict[str, Any], Flight | None]:
-    """Measure the jump of the input that rises at sample `on`.
-
-    Returns:
-        The trunk's figures by name; without a jump only `found`, `flights`, `high_flights` and
-        `height`. And the main flight, or None.
-    """
-    dt, plane, z = series.dt, series.position[:, :2], series.position[:, 2]
-    found = jump_flights(series, on, rules)
-    main = found.main
-    figures: dict[str, Any] = {
-        "found": main is not None,
-        "flights": float(len(found.all)),
-        "high_flights": float(len(found.high)),
-    }
-    if main is None:
-        window = z[on : on + series.steps(rules.search_s) + 1]
-        return figures | {"height": float(np.ptp(window))}, None
-    up, down = main.liftoff, main.touchdown
-    end = down + series.steps(rules.tail_s) + 1
-    settled = down + series.steps(rules.upright_s)
-    displacement, vertical = plane[down] - plane[up], float(series.velocity[up, 2])
-    before, after = on + int(np.argmin(z[on : up + 1])), down + int(np.argmin(z[down:end]))
-    apex = float(z[up:down].max())
-    return figures | {
-        "upright": bool(
-            settled < len(z) and cosine_of_tilt(series.orientation[settled]) >= rules.upright_cosine
-        ),
-        "height": float(np.ptp(z[on:end])),
-        "apex_gain": apex - rules.standing_height,
-        "rise": float(apex - z[up]),
-        "ballistic": vertical**2 / (2.0 * GRAVITY),
-        "distance": float(np.hypot(*displacement)),
-        "along": along(displacement, series.orientation[up], command),
-        "distance_minima": float(np.hypot(*(plane[after] - plane[before]))),
-        "lift_off_velocity": vertical,
-        "horizontal_velocity": float(np.hypot(*series.velocity[up, :2])),
-        "delay": (up - on) * dt,
-        "duration": main.samples * dt,
-    }, main
-
-
-# ---- figures of a capture ----
+# ---- definitions of figures ----
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,17 +214,16 @@ class Figure:
 
     name: str
     unit: str
-    """`1` for a number without one."""
     says: str
     """Its equation."""
     joints: bool = False
-    """True if there is one for every joint."""
+    """One number for each joint."""
 
     @property
     def column(self) -> str:
-        """Name and unit, as a column of a table is called: `height_m`, `peak_torque_N_m`."""
-        unit = "" if self.unit == "1" else "_" + self.unit.replace("/", "_per_").replace(" ", "_")
-        return self.name + unit
+        """Heading of its column in a table, unit included."""
+        unit = self.unit.replace("/", "_per_").replace(" ", "_")
+        return self.name if unit == "1" else f"{self.name}_{unit}"
 
 
 def number(unit: str, says: str) -> Any:
@@ -377,36 +322,32 @@ def figures_of(kind: type[Any]) -> dict[str, Figure]:
 FIGURES: Mapping[str, Figure] = figures_of(JumpFigures)
 
 
-def series_of(capture: Capture, *, whole: bool = False) -> Series:
-    """Return the trunk and the contacts, up to the fall unless `whole`."""
-    end = len(capture.time) if whole else fallen_at(capture)
-    names = ("position", "velocity", "orientation", "contact")
-    return Series(**{name: getattr(capture, name)[:end] for name in names}, dt=capture.dt)
+# ---- figures of a capture ----
 
 
-def fallen_at(capture: Capture) -> int:
-    """First sample at which the robot lies or leans too far; the sample count if it never does."""
-    cosine = cosine_of_tilt(capture.orientation)
-    fallen = (cosine < FALLEN_COSINE) | (capture.position[:, 2] < FALLEN_HEIGHT)
-    return int(np.argmax(fallen)) if fallen.any() else len(fallen)
+@dataclass(frozen=True, kw_only=True)
+class JumpEvents:
+    """Rise and fall of the jump input, lift-off and touchdown, on the capture's clock [s]."""
+
+    on: float
+    off: float
+    liftoff: float
+    touchdown: float
 
 
-def sample_at(capture: Capture, time: float) -> int:
-    """First sample at or after a time on the capture's clock [s]."""
-    return int(np.searchsorted(capture.time, time - 1e-3 * capture.dt))
-
-
-def jump_events(capture: Capture, script: Script, *, began: float = 0.0) -> JumpEvents | None:
+def jump_events(
+    capture: Capture, script: Script, rules: JumpRules, *, began: float = 0.0
+) -> JumpEvents | None:
     """Return the times of the main flight, or None without a jump.
 
     `began` is when the policy took over, on the capture's clock [s].
     """
-    series, rise = series_of(capture), began + script.on
+    rise, end = began + script.on, fallen_at(capture)
     on = sample_at(capture, rise)
-    main = jump_flights(series, on, JumpRules()).main if on < len(series.position) else None
+    main = jump_flights(capture, on, rules, end).main if on < end else None
     if main is None:
         return None
-    up, down = (float(capture.time[k]) for k in (main.liftoff, main.touchdown))
+    up, down = (float(capture.time[k]) for k in main)
     return JumpEvents(on=rise, off=began + script.off, liftoff=up, touchdown=down)
 
 
@@ -416,47 +357,80 @@ def measure(
     robot: RobotSpec,
     *,
     began: float,
-    mass: float,
     rules: JumpRules | None = None,
 ) -> JumpFigures:
     """Return the figures of one run.
 
-    Args:
-        capture: The recorded run.
-        script: What was commanded.
-        robot: Its drives' limits give the torque margin.
-        began: When the policy took over, on the capture's clock [s].
-        mass: Of the robot, for the cost of transport [kg].
-        rules: Of the definitions.
+    `began` is when the policy took over, on the capture's clock [s]; `rules` are those of the robot
+    if None.
     """
-    rules = rules or JumpRules()
-    series = series_of(capture)
+    rules, body = rules or JumpRules.of(robot), legged(robot.source)
     run, on = (sample_at(capture, began + t) for t in (script.start, script.on))
-    fell = len(series.position) < len(capture.time)
-    if on >= len(series.position):
+    count = fallen_at(capture)
+    fell = count < len(capture.time)
+    if on >= count:
         return JumpFigures(standing=False, fell=fell)
-    figures, main = measure_jump(series, on, script.command, rules)
+    found = jump_flights(capture, on, rules, count)
+    main = found.main
     seconds = rules.search_s if main is None else rules.tail_s
-    last = (on if main is None else main.touchdown) + series.steps(seconds)
-    end = min(last, len(series.position) - 1)
-    settled = (main.touchdown + series.steps(rules.upright_s)) if main else end
-    figures |= {
-        "non_foot_contact": bool(capture.other_contact[on : settled + 1].any()),
-        "energy": float(capture.electrical_power[on : end + 1].sum() * capture.dt),
+    last = (on if main is None else main.touchdown) + steps(capture, seconds)
+    end = min(last, count - 1)
+    settled = (main.touchdown + steps(capture, rules.upright_s)) if main else end
+    figures: dict[str, Any] = {
+        **_rates(capture, run, on),
+        **_run(capture, script, run + steps(capture, SETTLE_S), on, mass=body.total_mass),
+        **_loads(capture, robot, on, end),
     }
-    figures |= _rates(capture, run, on)
-    figures |= _run(capture, script, run + series.steps(SETTLE_S), on, mass=mass)
-    figures |= _loads(capture, robot, on, end)
     if main is not None:
-        feet = capture.foot_position[main.liftoff : main.touchdown, :, 2]
-        low = feet.min(axis=1) - BODY.foot_radius
-        quarter = len(low) // 4
-        figures |= {
-            "clearance": float(low.max()),
-            "clearance_half": float(low[quarter : len(low) - quarter].min()),
-            "gap": _gap(capture, main),
-        }
-    return JumpFigures(standing=True, fell=fell, **figures)
+        figures |= _flight(capture, script, on, main, end, rules, body.foot_radius)
+    return JumpFigures(
+        standing=True,
+        fell=fell,
+        found=main is not None,
+        flights=float(len(found.all)),
+        high_flights=float(len(found.high)),
+        upright=main is not None
+        and settled < count
+        and bool(cosine_of_tilt(capture.orientation[settled]) >= rules.upright_cosine),
+        height=float(np.ptp(capture.position[on : end + 1, 2])),
+        non_foot_contact=bool(capture.other_contact[on : settled + 1].any()),
+        energy=float(capture.electrical_power[on : end + 1].sum() * capture.dt),
+        **figures,
+    )
+
+
+def _flight(
+    capture: Capture,
+    script: Script,
+    on: int,
+    main: Flight,
+    end: int,
+    rules: JumpRules,
+    foot_radius: float,
+) -> dict[str, float]:
+    """The figures of the main flight."""
+    up, down = main
+    plane, z = capture.position[:, :2], capture.position[:, 2]
+    displacement, vertical = plane[down] - plane[up], float(capture.velocity[up, 2])
+    before, after = on + int(np.argmin(z[on : up + 1])), down + int(np.argmin(z[down : end + 1]))
+    apex = float(z[up:down].max())
+    low = capture.foot_position[up:down, :, 2].min(axis=1) - foot_radius
+    quarter = len(low) // 4
+    return {
+        "apex_gain": apex - rules.standing_height,
+        "rise": float(apex - z[up]),
+        "ballistic": vertical**2 / (2.0 * GRAVITY),
+        "clearance": float(low.max()),
+        "clearance_half": float(low[quarter : len(low) - quarter].min()),
+        "distance": float(np.hypot(*displacement)),
+        "along": along(displacement, capture.orientation[up], script.command),
+        "distance_minima": float(np.hypot(*(plane[after] - plane[before]))),
+        "gap": _gap(capture, main),
+        "lift_off_velocity": vertical,
+        "horizontal_velocity": float(np.hypot(*capture.velocity[up, :2])),
+        "delay": (up - on) * capture.dt,
+        "duration": main.samples * capture.dt,
+    }
 
 
 def _rates(capture: Capture, start: int, on: int) -> dict[str, float]:
@@ -491,18 +465,17 @@ def _run(capture: Capture, script: Script, start: int, on: int, *, mass: float) 
 def _loads(capture: Capture, robot: RobotSpec, on: int, end: int) -> dict[str, tuple[float, ...]]:
     """Peaks of each joint, and how near to its torque-speed curve they come."""
     # Links ring on their belts at 100 Hz and more; what the motors turn at is the average.
-    half = max(1, round(0.5 * AVERAGE_S / capture.dt))
-    late = np.minimum(np.arange(on, end + 1) + half, len(capture.time) - 1)
-    early = np.maximum(np.arange(on, end + 1) - half, 0)
+    samples, half = np.arange(on, end + 1), max(1, round(0.5 * AVERAGE_S / capture.dt))
+    late, early = np.minimum(samples + half, len(capture.time) - 1), np.maximum(samples - half, 0)
     turned = capture.joint_position[late] - capture.joint_position[early]
     speed = turned / (capture.time[late] - capture.time[early])[:, None]
     torque = capture.torque[on : end + 1]
     margins = []
-    for i, joint in enumerate(robot.joints):
-        limits = (joint.drive.stall_torque, joint.drive.no_load_speed, joint.drive.effort_limit)
+    for i, motor in enumerate(joint.drive for joint in robot.joints):
+        limits = (motor.stall_torque, motor.no_load_speed, motor.effort_limit)
         low, high = drive.torque_limits(speed[:, i], *limits)
         least = np.minimum(high - torque[:, i], torque[:, i] - low).min()
-        margins.append(float(least) / joint.drive.effort_limit)
+        margins.append(float(least) / motor.effort_limit)
     return {
         "peak_torque": tuple(np.abs(torque).max(axis=0).tolist()),
         "peak_speed": tuple(np.abs(speed).max(axis=0).tolist()),
@@ -515,7 +488,7 @@ def _gap(capture: Capture, flight: Flight) -> float:
 
     NaN if a foot never stood before or never touches again, or nothing was travelled.
     """
-    up, down = flight.liftoff, flight.touchdown
+    up, down = flight
     displacement = capture.position[down, :2] - capture.position[up, :2]
     length = float(np.hypot(*displacement))
     before, after = capture.contact[:up], capture.contact[down:]

@@ -94,10 +94,10 @@ class Row:
     """0 for the first run with this command."""
     seed: int
     """Of the virtual robot's noise."""
-    figures: Any
-    """Of the kind's class, `JumpFigures` for jumps."""
     script: Script
     """With the time of this run's jump input."""
+    figures: Any = None
+    """Of the kind's class, `JumpFigures` for jumps; None before the run."""
     capture: str = ""
     """The capture's file beside the table; empty if it was not kept."""
     began: float = 0.0
@@ -146,7 +146,6 @@ class Cell:
     parameter: str
     value: float
     n: int
-    """Runs."""
     standing: int
     """Robots that had not fallen when the jump input came."""
     found: int
@@ -161,7 +160,7 @@ class Cell:
     figures: Mapping[str, Spread]
     """Over the runs with a jump; over all runs of another kind."""
     joints: Mapping[str, Mapping[str, Spread]]
-    """Figures of every joint: by figure, then by joint."""
+    """By figure, then by joint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,54 +243,47 @@ class Results:
         return next(c for c in self.cells if (c.policy, c.case) == (policy, case))
 
     def _cell(self, rows: Sequence[Row]) -> Cell:
-        figures = [row.figures for row in rows]
-        found = [each for each in figures if getattr(each, "found", True)]
-        counts = {
-            name: sum(getattr(each, name, name == "standing") for each in figures)
-            for name in ("standing", "fell", "non_foot_contact")
-        }
-        succeeded, known = sum(each.success for each in figures), figures_of(self.kind.figures)
-
-        def spread(name: str, joint: int | None = None) -> Spread:
-            values = (getattr(each, name) for each in found)
-            return Spread.of([v if joint is None else v[joint] if v else math.nan for v in values])
-
+        every = [row.figures for row in rows]
+        found = [each for each in every if getattr(each, "found", True)]
+        succeeded, figures, joints = sum(each.success for each in every), {}, {}
+        for name, figure in figures_of(self.kind.figures).items():
+            values = [getattr(each, name) for each in found]
+            if figure.joints:
+                known = [value for value in values if value]
+                columns = zip(*known, strict=True) if known else [()] * len(self.joint_names)
+                joints[name] = dict(zip(self.joint_names, map(Spread.of, columns), strict=True))
+            else:
+                figures[name] = Spread.of(values)
         return Cell(
             **{name: getattr(rows[0], name) for name in ("policy", "case", "parameter", "value")},
-            **counts,
+            **{
+                name: sum(getattr(each, name, name == "standing") for each in every)
+                for name in ("standing", "fell", "non_foot_contact")
+            },
             n=len(rows),
             found=len(found),
             succeeded=succeeded,
             success=succeeded / len(rows),
             success_ci95=share_interval(succeeded, len(rows)),
-            figures={name: spread(name) for name, each in known.items() if not each.joints},
-            joints={
-                name: {joint: spread(name, i) for i, joint in enumerate(self.joint_names)}
-                for name, each in known.items()
-                if each.joints
-            },
+            figures=figures,
+            joints=joints,
         )
 
     @cached_property
     def ratios(self) -> tuple[Ratio, ...]:
         """Scatter of every other policy over that of the first, by command and altogether."""
-        return tuple(
-            self._ratio(figure, other.name, case)
-            for other in self.subjects[1:]
-            for figure in self.kind.compared
-            for case in (None, *(case.name for case in self.cases))
-        )
-
-    def _ratio(self, figure: str, other: str, case: str | None) -> Ratio:
-        first = self.subjects[0].name
-        cases = self.pooled if case is None else (case,)
-        own, others = (
-            [self.values(name, each, figure) for each in cases] for name in (first, other)
-        )
-        value, low, high = ratio_of_scatter(own, others, seed=self.seed)
-        n = (sum(map(len, own)), sum(map(len, others)))
-        who: Any = {"figure": figure, "case": case, "policy": first, "other": other}
-        return Ratio(**who, value=value, low=low, high=high, n=n)
+        first, found = self.subjects[0].name, []
+        for other in (subject.name for subject in self.subjects[1:]):
+            for figure in self.kind.compared:
+                for case in (None, *(case.name for case in self.cases)):
+                    cases = self.pooled if case is None else (case,)
+                    own = [self.values(first, each, figure) for each in cases]
+                    others = [self.values(other, each, figure) for each in cases]
+                    value, low, high = ratio_of_scatter(own, others, seed=self.seed)
+                    n = (sum(map(len, own)), sum(map(len, others)))
+                    who: Any = {"figure": figure, "case": case, "policy": first, "other": other}
+                    found.append(Ratio(**who, value=value, low=low, high=high, n=n))
+        return tuple(found)
 
 
 def share_interval(count: int, n: int) -> tuple[float, float]:
@@ -358,17 +350,10 @@ def _columns(kind: Kind, joint_names: Sequence[str]) -> Iterator[tuple[str, str,
             yield column, name, None
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(int(value))
-    return value if isinstance(value, str) else repr(value) if math.isfinite(value) else ""
-
-
 def to_csv(results: Results) -> str:
     """One row a run; unknown figures are empty, flags 1 and 0, numbers exact."""
-    text, columns = io.StringIO(), list(_columns(results.kind, results.joint_names))
-    varied = any(row.parameter for row in results.rows)
-    table = []
+    columns = list(_columns(results.kind, results.joint_names))
+    varied, table = any(row.parameter for row in results.rows), []
     for row in results.rows:
         cells: dict[str, Any] = {"policy": row.policy, "command": row.case}
         cells |= {"parameter": row.parameter, "value": row.value} if varied else {}
@@ -377,42 +362,34 @@ def to_csv(results: Results) -> str:
         for column, name, joint in columns:
             value = getattr(row.figures, name)
             cells[column] = value if joint is None else value[joint] if value else math.nan
-        table.append({column: _text(value) for column, value in cells.items()})
+        table.append({k: int(v) if isinstance(v, bool) else v for k, v in cells.items()})
+    text = io.StringIO()
     writer = csv.DictWriter(text, list(table[0]) if table else [], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(table)
+    writer.writerows({k: "" if v != v else v for k, v in cells.items()} for cells in table)
     return text.getvalue()
 
 
-def _rows(table: str, head: Results, path: Path) -> Iterator[Row]:
-    commands = {case.name: case.command for case in head.cases}
-    columns = list(_columns(head.kind, head.joint_names))
-    for line, entry in enumerate(csv.DictReader(io.StringIO(table)), start=2):
-        try:
-            figures: dict[str, Any] = {}
-            for column, name, joint in columns:
-                if (text := entry[column]) is None:
-                    raise ValueError("the line is cut off")
-                if text:
-                    figures[name] = text if joint is None else (*figures.get(name, ()), text)
-            command = commands[entry["command"]]
-            yield Row(
-                policy=entry["policy"],
-                case=entry["command"],
-                number=int(entry["number"]),
-                seed=int(entry["seed"]),
-                figures=msgspec.convert(figures, head.kind.figures, strict=False),
-                script=replace(head.script, command=command, run_s=float(entry["run_s"])),
-                capture=entry["capture"],
-                began=float(entry["began_s"]),
-                parameter=entry.get("parameter", ""),
-                value=float(entry.get("value") or "nan"),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ArtefactError(
-                f"{path}: line {line} cannot be read ({type(error).__name__}: {error}); "
-                f"`{head.kind.writer}` writes it anew."
-            ) from None
+def _row(entry: Mapping[str, str], head: Results) -> Row:
+    figures: dict[str, Any] = {}
+    for column, name, joint in _columns(head.kind, head.joint_names):
+        if (text := entry[column]) is None:
+            raise ValueError("the line is cut off")
+        if text:
+            figures[name] = text if joint is None else (*figures.get(name, ()), text)
+    command = {case.name: case.command for case in head.cases}[entry["command"]]
+    return Row(
+        policy=entry["policy"],
+        case=entry["command"],
+        number=int(entry["number"]),
+        seed=int(entry["seed"]),
+        figures=msgspec.convert(figures, head.kind.figures, strict=False),
+        script=replace(head.script, command=command, run_s=float(entry["run_s"])),
+        capture=entry["capture"],
+        began=float(entry["began_s"]),
+        parameter=entry.get("parameter", ""),
+        value=float(entry.get("value") or "nan"),
+    )
 
 
 def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
@@ -475,17 +452,23 @@ def load(folder: Path, kind: Kind = JUMPS) -> Results:
         stored = {name: body[name] for name in _HEAD}
         head = replace(msgspec.convert(stored, Results), kind=kind)
         counts = [(cell["policy"], cell["case"], cell["n"]) for cell in body["cells"]]
-    path = folder / kind.table
+    path, rows = folder / kind.table, []
     try:
-        table = path.read_text(encoding="utf-8")
+        for entry in csv.DictReader(io.StringIO(path.read_text("utf-8"))):
+            rows.append(_row(entry, head))
     except OSError as error:
         raise ArtefactError(
             f"{path}: cannot be read ({error.strerror}); `{kind.writer}` writes it."
         ) from None
-    results = replace(head, rows=tuple(_rows(table, head, path)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ArtefactError(
+            f"{path}: line {len(rows) + 2} cannot be read ({type(error).__name__}: {error}); "
+            f"`{kind.writer}` writes it anew."
+        ) from None
+    results = replace(head, rows=tuple(rows))
     if counts != [(cell.policy, cell.case, cell.n) for cell in results.cells]:
         raise ArtefactError(
-            f"{path}: {len(results.rows)} runs do not fit the counts of {kind.summary}; run the "
-            "trial again."
+            f"{path}: {len(rows)} runs do not fit the counts of {kind.summary}; run the trial "
+            "again."
         )
     return results

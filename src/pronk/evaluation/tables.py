@@ -5,15 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from pronk.evaluation.criteria import JUMPS, Check, evaluation_checks, trial_checks
+from pronk.evaluation.criteria import JUMPS, Check, trial_checks
 from pronk.evaluation.jumps import FIGURES, SYMBOLS
 from pronk.evaluation.protocol import PAPER_RATIOS, TABLE_III, in_paper_order
 from pronk.evaluation.results import FEWEST, Cell, Ratio, Results, Spread
-
-if TYPE_CHECKING:
-    from pronk.evaluation.training_sim.evaluation import Evaluation
 
 DEFINITIONS = "Definitions"
 """Title of the table of equations."""
@@ -34,6 +30,9 @@ def sheet(title: str, rows: Iterable[Mapping[str, str]], *notes: str) -> Sheet:
     rows = list(rows)
     cells = tuple(tuple(row.values()) for row in rows)
     return Sheet(title=title, columns=tuple(rows[0]) if rows else (), rows=cells, notes=notes)
+
+
+# ---- cells ----
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -60,6 +59,11 @@ def interval(ratio: Ratio) -> str:
     return f"{ratio.value:.2f} ({f'{ratio.low:.2f} to {ratio.high:.2f}' if known else 'too few'})"
 
 
+def landed(cells: Sequence[Cell]) -> str:
+    """Format the count of landings among all runs."""
+    return f"{sum(cell.succeeded for cell in cells)}/{sum(cell.n for cell in cells)}"
+
+
 def place(trial: Results) -> str:
     """Where it was measured, in words."""
     return "virtual robot" if trial.virtual else "robot"
@@ -70,6 +74,9 @@ def virtual_note(trial: Results) -> str:
     where = "pronk's virtual robot, not a real one" if trial.virtual else "the real robot"
     params = str(trial.sim_params.get("sha256", "-"))[:12]
     return f"ours: {where}; seed {trial.seed}, sim_params {params}."
+
+
+# ---- tables of a trial ----
 
 
 def sheets(trial: Results) -> tuple[Sheet, ...]:
@@ -87,26 +94,26 @@ def sheets(trial: Results) -> tuple[Sheet, ...]:
 
 def table_iii(trial: Results, figure: str) -> Sheet:
     """The paper's Table III beside ours, for `height` or `distance`."""
-    paper = {case: getattr(cell, figure) for case, cell in TABLE_III.items()}
-    names = in_paper_order(subject.name for subject in trial.subjects)
-    rows = [{"command": case.name} for case in trial.cases] + [{"command": "mean scatter"}]
     columns: dict[str, tuple[dict[str, str], list[float]]] = {}
     for gains in ("naive", "matched"):
-        cells = {case: f"{own[gains][0]:.3f} +- {own[gains][1]:.3f}" for case, own in paper.items()}
-        columns[f"paper, {gains}"] = cells, [own[gains][1] for own in paper.values()]
-    for name in names:
+        paper = {case: getattr(cell, figure)[gains] for case, cell in TABLE_III.items()}
+        cells = {case: f"{mean:.3f} +- {std:.3f}" for case, (mean, std) in paper.items()}
+        columns[f"paper, {gains}"] = cells, [std for _, std in paper.values()]
+    for name in in_paper_order(subject.name for subject in trial.subjects):
         found = {case.name: trial.cell(name, case.name) for case in trial.cases}
         cells = {k: f"{spread(c.figures[figure])} ({c.found}/{c.n})" for k, c in found.items()}
         stds = [found[case].figures[figure].std for case in trial.pooled]
         columns[f"{name}, {place(trial)}"] = cells, stds
-    for column, (cells, stds) in columns.items():
-        mean = number(sum(stds) / len(stds))
-        scattered = {"mean scatter": mean if mean == "-" else f"+- {mean}"}
-        for row in rows:
-            row[column] = (cells | scattered).get(row["command"], "-")
+    rows = [
+        {"command": case.name}
+        | {column: cells.get(case.name, "-") for column, (cells, _) in columns.items()}
+        for case in trial.cases
+    ]
+    means = {column: number(sum(stds) / len(stds)) for column, (_, stds) in columns.items()}
+    scattered = {column: mean if mean == "-" else f"+- {mean}" for column, mean in means.items()}
     return sheet(
         f"{figure.capitalize()} [m]: mean +- standard deviation (jumps of commanded)",
-        rows,
+        [*rows, {"command": "mean scatter", **scattered}],
         f"{figure}: {FIGURES[figure].says}.",
         f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
         "paper: five jumps a cell on the real robot, of one policy each (E2, A21).",
@@ -116,23 +123,24 @@ def table_iii(trial: Results, figure: str) -> Sheet:
 
 def landings(trial: Results) -> Sheet:
     """The outcome of every commanded jump."""
+    rows = [
+        {
+            "policy: command": f"{cell.policy}: {cell.case}",
+            "commanded": str(cell.n),
+            "standing": str(cell.standing),
+            "jumped": str(cell.found),
+            "landed": str(cell.succeeded),
+            "success [%] (95 %)": "{:.0f} ({:.0f} to {:.0f})".format(
+                *(100.0 * share for share in (cell.success, *cell.success_ci95))
+            ),
+            "fell": str(cell.fell),
+            "high flights": spread(cell.figures["high_flights"], 2),
+        }
+        for cell in trial.cells
+    ]
     return sheet(
         "Landings",
-        (
-            {
-                "policy: command": f"{cell.policy}: {cell.case}",
-                "commanded": str(cell.n),
-                "standing": str(cell.standing),
-                "jumped": str(cell.found),
-                "landed": str(cell.succeeded),
-                "success [%] (95 %)": "{:.0f} ({:.0f} to {:.0f})".format(
-                    *(100.0 * share for share in (cell.success, *cell.success_ci95))
-                ),
-                "fell": str(cell.fell),
-                "high flights": spread(cell.figures["high_flights"], 2),
-            }
-            for cell in trial.cells
-        ),
+        rows,
         "landed: upright 2 s after touchdown, and nothing but feet touched the ground; of all "
         "commanded. fell: at any time of the run.",
     )
@@ -141,14 +149,14 @@ def landings(trial: Results) -> Sheet:
 def more(trial: Results, policy: str) -> Sheet:
     """Every other figure of one policy, with every command."""
     cells = [cell for cell in trial.cells if policy == cell.policy]
-    shown = ("height", "distance", "flights", "high_flights")
+    elsewhere = ("height", "distance", "flights", "high_flights")
     return Sheet(
         title=f"Every other figure of {policy}: mean +- standard deviation",
         columns=("figure", *(cell.case for cell in cells)),
         rows=tuple(
             figure_row(name, figure.unit, cells)
             for name, figure in FIGURES.items()
-            if not figure.joints and name not in shown
+            if not figure.joints and name not in elsewhere
         ),
         notes=(virtual_note(trial),),
     )
@@ -164,28 +172,22 @@ def drives(trial: Results) -> Sheet:
     """The largest loads of the drives over all jumps, by joint."""
     rows = []
     for policy in (subject.name for subject in trial.subjects):
-        cells = [cell.joints for cell in trial.cells if cell.policy == policy and cell.found]
+        loads = [cell.joints for cell in trial.cells if cell.policy == policy and cell.found]
         for joint in trial.joint_names:
             torque, speed = (
-                max((own[name][joint].most for own in cells), default=math.nan)
+                max((own[name][joint].most for own in loads), default=math.nan)
                 for name in ("peak_torque", "peak_speed")
             )
-            margin = min((own["torque_margin"][joint].least for own in cells), default=math.nan)
-            rows.append(
-                {
-                    "policy: joint": f"{policy}: {joint}",
-                    "torque [N m]": number(torque, 1),
-                    "speed [rad/s]": number(speed, 1),
-                    "margin [1]": number(margin),
-                }
-            )
+            margin = min((own["torque_margin"][joint].least for own in loads), default=math.nan)
+            row = {"policy: joint": f"{policy}: {joint}", "torque [N m]": number(torque, 1)}
+            rows.append(row | {"speed [rad/s]": number(speed, 1), "margin [1]": number(margin)})
     return sheet(
         "Drives: the greatest of all jumps", rows, f"margin: {FIGURES['torque_margin'].says}."
     )
 
 
 def check_sheet(title: str, checks: Sequence[Check], *notes: str) -> Sheet:
-    """Number, limit, and whether it passed, of every check."""
+    """Number, limit, and whether it passed, of every check; PASSED in a note counts them."""
     rows = [
         {
             "what": check.what,
@@ -212,32 +214,22 @@ def criteria(trial: Results) -> Sheet:
 
 def definitions() -> Sheet:
     """The equation of every figure."""
-    rows = [
-        {"figure": name, "unit": figure.unit, "equation": figure.says}
-        for name, figure in FIGURES.items()
-    ]
+    rows = [{"figure": f.name, "unit": f.unit, "equation": f.says} for f in FIGURES.values()]
     return sheet(DEFINITIONS, rows, SYMBOLS)
 
 
 def scatter(trial: Results, other: str | None = None) -> Sheet:
     """Standard deviations of another policy, the second if None, over those of the first."""
     first, other = trial.subjects[0].name, other or trial.subjects[1].name
-    found = [ratio for ratio in trial.ratios if ratio.other == other]
-    rows = [
-        {
-            "figure": figure,
-            **{
-                r.case or "all": interval(r).replace(" to ", "-")
-                for r in found
-                if r.figure == figure
-            },
-            "paper, all": number(PAPER_RATIOS.get(figure, math.nan), 2),
-        }
-        for figure in trial.kind.compared
-    ]
+    rows = {figure: {"figure": figure} for figure in trial.kind.compared}
+    for ratio in trial.ratios:
+        if ratio.other == other:
+            rows[ratio.figure][ratio.case or "all"] = interval(ratio).replace(" to ", "-")
+    for figure, row in rows.items():
+        row["paper, all"] = number(PAPER_RATIOS.get(figure, math.nan), 2)
     return sheet(
         f"Standard deviations, {other} over {first}, with 95 % bootstrap intervals",
-        rows,
+        rows.values(),
         f"all: ratio of the means over {', '.join(trial.pooled)}.",
         "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30 "
         "(reading A4).",
@@ -271,66 +263,3 @@ def verdict(trial: Results, other: str) -> str:
     if more_alike:
         end = f"so {first} repeats its jumps better in {' and '.join(more_alike)}"
     return f"scatter of {other} against {first} on the {place(trial)}: {'; '.join(parts)}; {end}."
-
-
-def evaluation_sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
-    """The tables of an evaluation in the training simulator."""
-    errors = (("speed error [m/s]", "speed_error"), ("yaw rate error [rad/s]", "yaw_error"))
-    walks = [
-        {"command": walk.name}
-        | {
-            words: f"{number(walk[name].mean)} ({number(walk[f'{name}_averaged'].mean)})"
-            for words, name in errors
-        }
-        | {
-            "mean velocity [m/s, m/s, rad/s]": ", ".join(
-                number(walk[name].mean, 2) for name in ("forward", "left", "yaw_rate")
-            ),
-            "drift [m]": number(walk["drift"].mean, 2),
-            "falls [%]": percent(walk["fell"].mean),
-            "flight over standing [cm]": percent(walk["uncommanded"].most),
-        }
-        for walk in evaluation.walks
-    ]
-    jumps = [
-        {
-            "command": jump.name,
-            "height [m]": spread(jump["height"]),
-            "distance [m]": spread(jump["distance"], 2),
-            "lift-off up [m/s]": spread(jump["lift_off_velocity"], 2),
-            "after [s]": spread(jump["delay"], 2),
-            "along [m]": number(jump["along"].mean, 2),
-            "flights": number(jump["flights"].mean, 2),
-            "high ones": number(jump["high_flights"].mean, 2),
-            "one [%]": percent(jump["single"].mean),
-            "jumped [%]": percent(jump["found"].mean),
-            "upright [%]": percent(jump["upright"].mean),
-            "non-foot contact [%]": percent(jump["non_foot_contact"].mean),
-        }
-        for jump in evaluation.jumps
-    ]
-    notes, estimator = [], evaluation.estimator
-    if estimator:
-        axes = " / ".join(f"{estimator[axis]:.3f}" for axis in ("forward", "left", "up"))
-        notes.append(
-            f"estimator while walking: velocity RMSE {estimator['velocity']:.3f} m/s (forward / "
-            f"left / up {axes}), contacts right {percent(estimator['contacts_right'])} %"
-        )
-    notes.append(
-        f"PASSED; {evaluation.plan['robots']} robots a command, randomization "
-        f"{evaluation.about.get('randomization', '-')}, seed {evaluation.plan['seed']}, "
-        f"{evaluation.seconds:.0f} s"
-    )
-    found = (
-        sheet(
-            "Walking: mean over robots and time; in brackets with the stride averaged out", walks
-        ),
-        sheet(
-            "Jumping: mean +- standard deviation over robots",
-            jumps,
-            "non-foot contact: anything but a foot on the ground, from the jump input to 2 s after "
-            "touchdown; a trial counts no such jump as a success.",
-        ),
-        check_sheet("Acceptance criteria", evaluation_checks(evaluation), *notes),
-    )
-    return tuple(one for one in found if one.rows)

@@ -5,7 +5,7 @@
 Each jump has a new virtual robot with its own heading, joint offsets and noise, and a jump input
 that rises up to `spread_s` later, so that it meets every phase of the gait. All of it is drawn from
 seed, command and number of the jump alone: every policy meets the same starts, and another command
-changes nothing. Walks and varied bodies run the same way.
+changes nothing. Walks, crossings and varied robots run the same way.
 
     trials.csv, summary.json    one row a jump; what was run, and the sums
     captures/, videos/          recorded runs, and films of them
@@ -20,9 +20,10 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -34,47 +35,46 @@ import numpy as np
 import pronk
 from pronk.errors import ArtefactError, HardwareError, PronkError
 from pronk.evaluation.jumps import JumpRules, measure
-from pronk.evaluation.pictures.video import ENDINGS
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.results import JUMPS, SUMMARY, TABLE, Kind, Results, Row, Subject, save
+from pronk.files import sha256
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
+from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import check_standing, ticks
 from pronk.runtime.script import STILL, Script
 from pronk.virtual import capture as captures
-from pronk.virtual.ground import Ground, Start
+from pronk.virtual.ground import Start
 from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import SimParams
+from pronk.virtual.sim_params import SHIPPED, SHIPPED_ROBOT, SimParams, load_sim_params
 
 J = TypeVar("J")
 R = TypeVar("R")
 Keep = Literal["none", "some", "all"]
-Progress = Callable[[float], None]
-"""Called with the share done, 0 to 1."""
+"""Captures: of no jump, of the first with each command and those at `RATES`, of every jump."""
 
 CAPTURES, VIDEOS = "captures", "videos"
 """Folders beside the table."""
 _OFFSETS = (1.0, 0.5, 0.0)
 """Shares of the drawn joint offsets that are tried until the robot stands."""
-_LEFT_OUT = ("observation", "provenance")
-"""Fields of a policy's contract that a trial does not keep."""
 
 
 class Setup(TypedDict):
-    """What every kind of trial runs on: the policies' robot, the virtual robot, the folder.
-
-    `about` is the source of the parameters, kept with the results; `processes` are the runs at
-    once, on which no number depends.
-    """
+    """What every kind of trial runs on."""
 
     robot: RobotSpec
+    """Of the policies."""
     sim_params: SimParams
+    """Of the virtual robot; its ground is the terrain."""
     out: Path
     about: NotRequired[Mapping[str, Any] | None]
+    """Source of the parameters, kept with the results."""
     processes: NotRequired[int]
-    progress: NotRequired[Progress | None]
+    """Runs at once; no number depends on it."""
+    progress: NotRequired[Callable[[float], None] | None]
+    """Called with the share done, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,8 @@ class Plan:
     joint_offset: float = 0.05
     """Half-width of the joints' offsets from the default pose at the start [rad]. With drives this
     soft it tilts the trunk by 5 degrees, by 13 at most; 0.1 may tip the robot over."""
-    rules: JumpRules = field(default_factory=JumpRules)
+    rules: JumpRules | None = None
+    """Those of the robot if None."""
 
     def __post_init__(self) -> None:
         """Raise `PronkError` for an empty plan or a negative seed."""
@@ -106,8 +107,8 @@ class Plan:
             raise PronkError(f"seed {self.seed}; expected 0 or more.")
         names = [case.name for case in self.tried]
         if not names or len(set(names)) != len(names):
-            shown = ", ".join(names) or "none"
-            raise PronkError(f"the commands are {shown}; expected one or more, all different.")
+            given = ", ".join(names) or "none"
+            raise PronkError(f"the commands are {given}; expected one or more, all different.")
 
     @property
     def tried(self) -> tuple[Case, ...]:
@@ -144,100 +145,77 @@ class Job:
 
     row: Row
     """The run, without figures."""
-    policy: Path
-    sha256: str
+    subject: Subject
     robot: str
+    """Name or path."""
     sim_params: SimParams
     start: Start
-    ground: Ground | None = None
-    """None for that of the parameters."""
     rules: JumpRules
     keep: Path | None = None
     """File for the capture; None for none."""
     measure: Callable[..., Any] = measure
     """From capture to figures; a function of a module."""
 
+    def build(self, share: float = 1.0) -> VirtualRobot:
+        """Build the virtual robot, not connected, at a share of the joint offsets."""
+        offset = tuple(share * each for each in self.start.joint_offset or ())
+        return VirtualRobot(
+            load_robot(self.robot),
+            self.sim_params,
+            seed=self.row.seed,
+            base="ground",
+            start=replace(self.start, joint_offset=offset or None),
+        )
 
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """One run with its figures, its wall time and its processor time [s]."""
+    def set_down(self) -> VirtualRobot:
+        """Return the virtual robot, standing, held by its drives alone.
 
-    row: Row
-    seconds: float
-    cpu_s: float
+        A robot that tips over, as a heavier one may, is set down again nearer to the default pose.
+
+        Raises:
+            HardwareError: It does not stand even in the default pose.
+        """
+        for share in _OFFSETS:
+            machine = self.build(share)
+            machine.connect()
+            try:
+                check_standing(load_robot(self.robot), machine.latest())
+                break
+            except HardwareError:
+                if share == _OFFSETS[-1]:
+                    raise
+        return machine
+
+    def policy(self) -> Policy:
+        """Return the policy, which each process opens once."""
+        return _opened(self.subject.path, self.subject.sha256)
 
 
 @lru_cache(maxsize=4)
-def opened(path: Path, sha256: str) -> Policy:
-    """Open a policy once in each process.
-
-    Raises:
-        ArtefactError: It was changed since the trial began.
-    """
-    policy = load_policy(path)
+def _opened(path: str, sha256: str) -> Policy:
+    policy = load_policy(Path(path))
     if policy.sha256 != sha256:
         raise ArtefactError(f"{path}: was changed while the trial ran; run the trial again.")
     return policy
 
 
-@lru_cache(maxsize=4)
-def mass_of(robot: str) -> float:
-    """Mass of a whole robot, by name, from its model [kg]."""
-    return float(load_robot(robot).build_spec().compile().body_mass.sum())
-
-
-def build(job: Job, offset: float = 1.0) -> VirtualRobot:
-    """Build the virtual robot of a job, not connected, at a share of its joint offsets."""
-    start = job.start
-    if start.joint_offset is not None:
-        start = replace(start, joint_offset=tuple(offset * each for each in start.joint_offset))
-    return VirtualRobot(
-        load_robot(job.robot),
-        job.sim_params,
-        seed=job.row.seed,
-        base="ground",
-        ground=job.ground,
-        start=start,
-    )
-
-
-def set_down(job: Job) -> VirtualRobot:
-    """Return the virtual robot of a job, standing, held by its drives alone.
-
-    A robot that tips over, as a heavier one may, is set down again nearer to the default pose.
-
-    Raises:
-        HardwareError: It does not stand even in the default pose.
-    """
-    for offset in _OFFSETS:
-        machine = build(job, offset)
-        machine.connect()
-        try:
-            check_standing(load_robot(job.robot), machine.latest())
-            break
-        except HardwareError:
-            if offset == _OFFSETS[-1]:
-                raise
-    return machine
-
-
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> Row:
     """Run one job and measure it."""
-    begun, begun_cpu = time.perf_counter(), time.process_time()
-    machine, robot, script = set_down(job), load_robot(job.robot), job.row.script
-    policy = opened(job.policy, job.sha256)
-    taken = list(ticks(machine, policy, robot, script.commanded, seconds=script.seconds))
+    machine, robot, script = job.set_down(), load_robot(job.robot), job.row.script
+    taken = list(ticks(machine, job.policy(), robot, script.commanded, seconds=script.seconds))
     if not taken:
         raise HardwareError("the policy made no step; let it run for one tick or more.")
-    seen, began, mass = machine.capture(), taken[0].time, mass_of(job.robot)
-    figures = job.measure(seen, script, robot, began=began, mass=mass, rules=job.rules)
+    recorded, began = machine.capture(), taken[0].time
+    figures = job.measure(recorded, script, robot, began=began, rules=job.rules)
     if job.keep is not None:
-        captures.save(job.keep, seen)
-    return Outcome(
-        row=replace(job.row, figures=figures, began=began),
-        seconds=time.perf_counter() - begun,
-        cpu_s=time.process_time() - begun_cpu,
-    )
+        captures.save(job.keep, recorded)
+    return replace(job.row, figures=figures, began=began)
+
+
+def _timed(job: Job) -> tuple[Row, float, float]:
+    """The run, its wall time and its processor time [s]."""
+    begun, begun_cpu = time.perf_counter(), time.process_time()
+    return run_job(job), time.perf_counter() - begun, time.process_time() - begun_cpu
 
 
 # ---- many runs ----
@@ -245,10 +223,8 @@ def run_job(job: Job) -> Outcome:
 
 def cores() -> int:
     """Cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on every system
-        return os.cpu_count() or 1
+    some = getattr(os, "sched_getaffinity", None)  # not on every system
+    return len(some(0)) if some else os.cpu_count() or 1
 
 
 def in_processes(
@@ -256,7 +232,7 @@ def in_processes(
     jobs: Sequence[J],
     *,
     processes: int = 1,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> list[R]:
     """Do every job, in this process or in several, and return the results in the order of the jobs.
 
@@ -267,54 +243,25 @@ def in_processes(
     """
     if processes < 1:
         raise PronkError(f"{processes} processes; expected 1 or more.")
-    report = progress or (lambda share: None)
-    if processes == 1 or len(jobs) <= 1:
-        done = []
-        for job in jobs:
-            done.append(work(job))
-            report(len(done) / len(jobs))
-        return done
-    # A fork of a process that has threads can deadlock.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
-        futures: list[Future[R]] = [pool.submit(work, job) for job in jobs]
+    done: list[R] = []
+    with ExitStack() as stack:
+        run: Callable[..., Iterator[R]] = map
+        if processes > 1 and len(jobs) > 1:
+            # A fork of a process that has threads can deadlock.
+            context = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context)
+            run = stack.enter_context(pool).map
         try:
-            for count, future in enumerate(as_completed(futures), start=1):
-                future.result()
-                report(count / len(jobs))
+            for result in run(work, jobs):
+                done.append(result)
+                if progress is not None:
+                    progress(len(done) / len(jobs))
         except BrokenProcessPool:
             raise PronkError(
                 "one of the processes was killed, most likely for want of memory; "
                 "try again with --processes 1."
             ) from None
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return [future.result() for future in futures]
-
-
-def job_of(
-    subject: Subject,
-    case: Case,
-    number: int,
-    script: Script,
-    start: Start,
-    seed: int,
-    robot: RobotSpec,
-    sim_params: SimParams,
-    rules: JumpRules,
-) -> Job:
-    """Return one run of a policy with one command."""
-    who: Any = {"policy": subject.name, "case": case.name, "number": number, "seed": seed}
-    return Job(
-        row=Row(**who, figures=None, script=script),
-        policy=Path(subject.path),
-        sha256=subject.sha256,
-        robot=robot.name,
-        sim_params=sim_params,
-        start=start,
-        rules=rules,
-    )
+    return done
 
 
 def plan_jobs(
@@ -327,12 +274,8 @@ def plan_jobs(
     keep: Keep = "none",
     measure: Callable[..., Any] = measure,
 ) -> list[Job]:
-    """Return every run of a plan.
-
-    With `keep="some"` the captures of the first jump with each command and of those at `RATES` are
-    kept in `out`.
-    """
-    found = []
+    """Return every run of a plan; captures are kept in `out`."""
+    rules, found = plan.rules or JumpRules.of(robot), []
     runs = [
         (subject, case, number)
         for subject in subjects
@@ -340,15 +283,29 @@ def plan_jobs(
         for number in range(plan.jumps if case in plan.cases else plan.rates)
     ]
     for subject, case, number in runs:
-        stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
-        some = number == 0 or case not in plan.cases
-        kept = out if keep == "all" or (keep == "some" and some) else None
-        capture = f"{CAPTURES}/{stem}.npz" if kept else ""
         script, start, seed = draw(plan, case, number, robot)
-        job = job_of(subject, case, number, script, start, seed, robot, sim_params, plan.rules)
-        row = replace(job.row, capture=capture)
-        where = kept / capture if kept else None
-        found.append(replace(job, row=row, keep=where, measure=measure))
+        some = number == 0 or case not in plan.cases
+        kept = keep == "all" or (keep == "some" and some)
+        stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
+        capture = f"{CAPTURES}/{stem}.npz" if kept else ""
+        job = Job(
+            row=Row(
+                policy=subject.name,
+                case=case.name,
+                number=number,
+                seed=seed,
+                script=script,
+                capture=capture,
+            ),
+            subject=subject,
+            robot=robot.source,
+            sim_params=sim_params,
+            start=start,
+            rules=rules,
+            keep=out / capture if kept else None,
+            measure=measure,
+        )
+        found.append(job)
     return found
 
 
@@ -376,39 +333,54 @@ def run_plan(
     how: Any = {"robot": robot, "out": out, "keep": keep, "measure": measure}
     for parameter, value, params in varied or [("", math.nan, setup["sim_params"])]:
         made = plan_jobs(subjects, plan, sim_params=params, **how)
-        build(made[0])  # refuses impossible parameters
+        made[0].build()  # refuses impossible parameters
         jobs += [replace(j, row=replace(j.row, parameter=parameter, value=value)) for j in made]
     if overwrite is not None:
         prepare(out, overwrite=overwrite)
     begun = time.perf_counter()
-    done = in_processes(run_job, jobs, processes=processes, progress=setup.get("progress"))
-    simulated = sum(job.row.script.seconds for job in jobs)
-    results = Results(
-        kind=kind,
-        robot=robot.name,
-        subjects=subjects,
+    done = in_processes(_timed, jobs, processes=processes, progress=setup.get("progress"))
+    rows, seconds, cpu_s = zip(*done, strict=True)
+    simulated = sum(row.script.seconds for row in rows)
+    timing = {
+        "seconds": time.perf_counter() - begun,
+        "simulated_s": simulated,
+        "processes": processes,
+        "cores": os.cpu_count() or 1,
+        "simulated_s_per_s_and_process": simulated / sum(seconds),
+        # Does not depend on other work on the machine.
+        "simulated_s_per_cpu_s": simulated / sum(cpu_s),
+    }
+    return finished(
+        kind,
+        subjects,
+        rows,
+        setup,
         cases=plan.tried,
-        rows=tuple(each.row for each in done),
         joint_names=robot.joint_names,
         seed=plan.seed,
-        sim_params=dict(setup.get("about") or {}),
         script=plan.script,
         spread_s=plan.spread_s,
-        rules=asdict(plan.rules),
-        mass=mass_of(robot.name),
+        rules=asdict(jobs[0].rules),
+        mass=legged(robot.source).total_mass,
         settings=dict(settings or {}),
-        versions=versions(),
-        timing={
-            "seconds": time.perf_counter() - begun,
-            "simulated_s": simulated,
-            "processes": processes,
-            "cores": os.cpu_count() or 1,
-            "simulated_s_per_s_and_process": simulated / sum(each.seconds for each in done),
-            # Does not depend on other work on the machine.
-            "simulated_s_per_cpu_s": simulated / sum(each.cpu_s for each in done),
-        },
+        timing=timing,
     )
-    save(out, results)
+
+
+def finished(
+    kind: Kind, subjects: tuple[Subject, ...], rows: Sequence[Row], setup: Setup, **rest: Any
+) -> Results:
+    """Save and return the results of runs; `rest` are further fields of `Results`."""
+    results = Results(
+        kind=kind,
+        robot=setup["robot"].name,
+        subjects=subjects,
+        rows=tuple(rows),
+        sim_params=dict(setup.get("about") or {}),
+        versions=versions(),
+        **rest,
+    )
+    save(setup["out"], results)
     return results
 
 
@@ -422,18 +394,42 @@ def run_trial(
 ) -> Results:
     """Let policies jump on the virtual robot and write the results.
 
-    Args:
-        policies: `policy.onnx` of each; scatter is compared with that of the first.
-        plan: Commands and draws.
-        keep_captures: Keep the capture of every jump, not of the first with each command alone.
-        overwrite: Replace a trial in the folder.
-        setup: What it runs on.
+    Scatter is compared with that of the first policy. With `keep_captures` the capture of every
+    jump is kept, not of the first with each command alone; with `overwrite` a trial in the folder
+    is replaced.
 
     Raises:
         PronkError: Of policies, parameters or folder, before the first step.
     """
     keep: Keep = "all" if keep_captures else "some"
     return run_plan(policies, plan, keep=keep, overwrite=overwrite, **setup)
+
+
+def setup_of(
+    policy: Path,
+    out: Path,
+    sim_params: Path | None = None,
+    robot: str | None = None,
+    *,
+    processes: int | None = None,
+) -> Setup:
+    """Return what a trial of a policy runs on: its robot, on as many processes as there are cores.
+
+    Without a file of parameters they are those that ship with pronk, or derived from the robot.
+    """
+    known = load_robot(robot or load_policy(policy).contract.robot)
+    file = sim_params or (SHIPPED if known.name == SHIPPED_ROBOT else None)
+    source = "shipped with pronk" if file else f"derived from the model of {known.name}"
+    return {
+        "robot": known,
+        "sim_params": load_sim_params(sim_params, known),
+        "out": out,
+        "about": {
+            "file": str(sim_params) if sim_params else source,
+            "sha256": sha256(file) if file else "",
+        },
+        "processes": cores() if processes is None else processes,
+    }
 
 
 def load_subjects(
@@ -464,31 +460,18 @@ def load_subjects(
         raise PronkError(
             f"{', '.join(map(str, paths))}: the same policy twice; give each policy once."
         )
-    return tuple(
-        Subject(
-            name=name,
-            path=str(path),
-            sha256=policy.sha256,
-            contract={
-                key: dict(value) if isinstance(value, Mapping) else value
-                for key, value in msgspec.structs.asdict(policy.contract).items()
-                if key not in _LEFT_OUT
-            },
-        )
-        for name, path, policy in zip(
-            _names(paths, [policy.contract.gains for policy in policies]),
-            paths,
-            policies,
-            strict=True,
-        )
-    )
-
-
-def _names(paths: Sequence[Path], gains: list[str]) -> list[str]:
-    for names in (gains, [path.stem for path in paths], [path.parent.name for path in paths]):
-        if len(set(names)) == len(names) and all(names):
-            return names
-    return [f"{name} {i}" for i, name in enumerate(gains, start=1)]
+    gains = [policy.contract.gains for policy in policies]
+    choices = (gains, [path.stem for path in paths], [path.parent.name for path in paths])
+    numbered = [f"{name} {i}" for i, name in enumerate(gains, start=1)]
+    distinct = (names for names in choices if len(set(names)) == len(names) and all(names))
+    names, found = next(distinct, numbered), []
+    for name, path, policy in zip(names, paths, policies, strict=True):
+        contract = msgspec.to_builtins(policy.contract)
+        kept = {
+            k: v for k, v in contract.items() if k not in ("schema", "observation", "provenance")
+        }
+        found.append(Subject(name=name, path=str(path), sha256=policy.sha256, contract=kept))
+    return tuple(found)
 
 
 def prepare(out: Path, *, overwrite: bool = False) -> None:
@@ -501,24 +484,26 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
     """
     if out.exists() and not out.is_dir():
         raise PronkError(f"--out {out}: a file; expected the name of a folder.")
+    old = [out / SUMMARY, out / TABLE]
     try:
-        filled = out.is_dir() and any(out.iterdir())
-        old = (out / SUMMARY, out / TABLE)
-        if filled and not overwrite:
-            raise PronkError(
-                f"--out {out}: not empty; give another folder, or --overwrite to replace the "
-                "trial in it."
-            )
-        # An interrupted trial leaves captures alone.
-        if filled and not any(path.exists() for path in (*old, out / CAPTURES)):
-            raise PronkError(
-                f"--out {out}: holds no trial to overwrite; give a new or an empty folder."
-            )
+        if out.is_dir() and any(out.iterdir()):
+            if not overwrite:
+                raise PronkError(
+                    f"--out {out}: not empty; give another folder, or --overwrite to replace the "
+                    "trial in it."
+                )
+            # An interrupted trial leaves captures alone.
+            if not any(path.exists() for path in (*old, out / CAPTURES)):
+                raise PronkError(
+                    f"--out {out}: holds no trial to overwrite; give a new or an empty folder."
+                )
         out.mkdir(parents=True, exist_ok=True)
         # Fails now, not after an hour, if the folder cannot be written to.
         with tempfile.NamedTemporaryFile(dir=out):
             pass
-        films = (path for ending in ENDINGS for path in (out / VIDEOS).glob(f"*{ending}"))
+        films = (
+            path for kind in ("mp4", "gif", "png") for path in (out / VIDEOS).glob(f"*.{kind}")
+        )
         for path in (*old, *(out / CAPTURES).glob("*.npz"), *films):
             path.unlink(missing_ok=True)
     except OSError as error:

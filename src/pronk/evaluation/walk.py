@@ -16,6 +16,7 @@ from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pronk.evaluation.jumps import (
     GRAVITY,
@@ -25,12 +26,12 @@ from pronk.evaluation.jumps import (
     figures_of,
     number,
     sample_at,
-    series_of,
     uncommanded_height,
 )
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Kind, Results
 from pronk.evaluation.trial import Plan, Setup, run_plan
+from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import STILL, Script, Velocity
 from pronk.virtual.capture import Capture
@@ -110,31 +111,14 @@ def velocity_errors(
     first: int,
     average: int,
 ) -> tuple[dict[str, float], Array]:
-    """Compare a walk with its command.
+    """Compare a walk with its command, from sample `first` on.
 
-    Args:
-        velocity: Trunk, world frame [m/s]. (T, 3)
-        orientation: Trunk to world, unit quaternions w, x, y, z. (T, 4)
-        angular_velocity: Trunk's frame [rad/s]. (T, 3)
-        command: Forward, left [m/s], yaw rate [rad/s].
-        first: First sample that counts.
-        average: Window of the moving average [samples].
-
-    Returns:
-        Errors and means by name, and the averaged velocity of the samples that count. (T', 3)
+    Trunk velocity [m/s] (T, 3) and orientation w, x, y, z (T, 4) are in the world, angular velocity
+    [rad/s] (T, 3) and command in the trunk's frame; `average` is the window of the moving average
+    [samples]. Returns errors and means by name, and the averaged velocity (T', 3).
     """
-    w, x, y, z = orientation.T
-    # The first two columns of the rotation of the trunk to the world: its x and its y axis.
-    ahead = np.stack(
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)], axis=1
-    )
-    left = np.stack(
-        [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)], axis=1
-    )
-    own = np.stack(
-        [(ahead * velocity).sum(axis=1), (left * velocity).sum(axis=1), angular_velocity[:, 2]],
-        axis=1,
-    )
+    own = Rotation.from_quat(orientation, scalar_first=True).apply(velocity, inverse=True)
+    own[:, 2] = angular_velocity[:, 2]
     total = np.cumsum(own, axis=0)
     total[average:] -= total[:-average].copy()
     counts = np.minimum(np.arange(1, len(own) + 1), average)
@@ -151,44 +135,41 @@ def velocity_errors(
 def measure_walk(
     capture: Capture,
     script: Script,
-    robot: RobotSpec | None = None,
+    robot: RobotSpec,
     *,
     began: float,
-    mass: float,
     rules: JumpRules | None = None,
+    settle_s: float = SETTLE_S,
 ) -> WalkFigures:
     """Return the figures of one walk; arguments as of `pronk.evaluation.jumps.measure`."""
-    dt = capture.dt
+    dt, down = capture.dt, fallen_at(capture)
     start, end = (
         min(sample_at(capture, began + t), len(capture.time)) for t in (script.start, script.stop)
     )
-    down = fallen_at(capture)
-    last = min(down, end)
+    first, last = start + round(settle_s / dt), min(down, end)
     figures: dict[str, Any] = {
         "fell": down < end,
         "non_foot_contact": bool(capture.other_contact[start:last].any()),
         "lasted": max(0, last - start) * dt,
-        "uncommanded": uncommanded_height(series_of(capture), None, rules or JumpRules()),
+        "uncommanded": uncommanded_height(capture, None, rules or JumpRules.of(robot)),
     }
-    first = start + round(SETTLE_S / dt)
     if first >= last:
         return WalkFigures(**figures)
-    motion = (capture.velocity, capture.orientation, capture.angular_velocity)
-    velocity, orientation, turning = (part[:last] for part in motion)
     errors, averaged = velocity_errors(
-        velocity,
-        orientation,
-        turning,
+        capture.velocity[:last],
+        capture.orientation[:last],
+        capture.angular_velocity[:last],
         script.command,
         first=first,
         average=round(AVERAGE_S / dt),
     )
-    rates = np.sqrt(np.mean(turning[first:, :2] ** 2, axis=0)).tolist()
+    rates = np.sqrt(np.mean(capture.angular_velocity[first:last, :2] ** 2, axis=0)).tolist()
     power = float(capture.electrical_power[first:last].mean())
     figures |= errors | {"roll_rate_rms": rates[0], "pitch_rate_rms": rates[1], "power": power}
     path = float(np.hypot(averaged[:, 0], averaged[:, 1]).sum() * dt)
     if path > NO_PATH and any(script.command[:2]):
-        figures["cost_of_transport"] = power * (last - first) * dt / (mass * GRAVITY * path)
+        weight = legged(robot.source).total_mass * GRAVITY
+        figures["cost_of_transport"] = power * (last - first) * dt / (weight * path)
     return WalkFigures(**figures)
 
 

@@ -115,7 +115,7 @@ class Hop:
 class Gauge:
     """Height, speed and jumps of a running robot, by the rules of `pronk.evaluation.jumps`."""
 
-    rules: JumpRules = field(default_factory=JumpRules)
+    rules: JumpRules
     hops: list[Hop] = field(default_factory=list)
     height: float = math.nan
     """Of the trunk over the floor [m]."""
@@ -204,7 +204,7 @@ def play(
         HardwareError: The robot cannot stand.
         RobotError: The parameters are of another robot.
     """
-    gauge = Gauge()
+    gauge = Gauge(JumpRules.of(robot))
     machine = _Sampled(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
     began, simulated, resets, over = time.perf_counter(), 0.0, 0, False
     try:

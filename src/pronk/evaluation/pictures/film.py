@@ -21,7 +21,7 @@ FPS = 25.0
 SCHEMA = "pronk/film/2"
 
 _BEFORE_S, _AFTER_S = 1.0, 1.2
-"""Shown before lift-off and after touchdown."""
+"""Before lift-off and after touchdown."""
 _AROUND_S = 0.06
 """Time before lift-off and after touchdown that is slowed down with the flight."""
 _FOLLOW_S = 0.25
@@ -40,6 +40,7 @@ class Film:
     """F frames to render, and the P poses of the strip (none without a jump)."""
 
     robot: str
+    """Name or path."""
     title: str
     """The command."""
     note: str
@@ -82,14 +83,13 @@ def plan(
     note: str = "",
     virtual: bool = True,
     events: JumpEvents | None = None,
-    start: float | None = None,
-    end: float | None = None,
+    span: tuple[float, float] | None = None,
     slow: float = 1.0,
 ) -> Film:
-    """Plan a film of a capture, which shows the flight `slow` times slower than real time.
+    """Plan a film of a capture in which the flight is `slow` times slower than real time.
 
-    Without `start` and `end` [s] it is from 1 s before lift-off to 1.2 s after touchdown; without
-    `events`, those of the jump, it is the whole capture.
+    Without `span`, the first and the last moment [s], it is from 1 s before lift-off to 1.2 s after
+    touchdown; without `events` either, those of the jump, it is the whole capture.
 
     Raises:
         PronkError: No frame is left, or `slow` is below 1.
@@ -97,22 +97,29 @@ def plan(
     if not 1.0 <= slow < math.inf:
         raise PronkError(f"slow is {slow:g}; expected 1 (real time) or more, as in 4.")
     first, last = (float(capture.time[0]), float(capture.time[-1])) if len(capture.time) else (0, 0)
-    if start is None:
-        start = events.liftoff - _BEFORE_S if events else first
-    if end is None:
-        end = events.touchdown + _AFTER_S if events else last
-    begin, finish = max(first, start), min(last, end)
-    if not begin < finish:
+    jump = (events.liftoff - _BEFORE_S, events.touchdown + _AFTER_S) if events else (first, last)
+    begin, end = span or jump
+    begin, end = max(first, begin), min(last, end)
+    if not begin < end:
         raise PronkError(
-            f"a film from {begin:g} to {finish:g} s of a capture from {first:g} to {last:g} s; "
+            f"a film from {begin:g} to {end:g} s of a capture from {first:g} to {last:g} s; "
             "expected an end after the start."
         )
-    time, rate = _clock(begin, finish, events, slow)
-    frames = _samples(capture, time)
+    now, times, rates = begin, [], []
+    while now <= end + 1e-9:
+        since, until = (events.liftoff, events.touchdown) if events else (math.inf, math.inf)
+        times.append(now)
+        rates.append(1.0 / slow if since - _AROUND_S <= now < until + _AROUND_S else 1.0)
+        now += rates[-1] / FPS
+    frames = _samples(capture, *times)
     poses, labels = _poses(capture, events) if events else (frames[:0], ())
-    zero = _sample(capture, events.liftoff if events else begin)
-    direction = _direction(capture, events, begin, finish)
+    (zero,) = _samples(capture, events.liftoff if events else begin)
+    direction = _direction(capture, events, begin, end)
     facing = math.cos(direction - float(heading(capture.orientation[zero])))
+    # The trunk's path, smoothed, with half of its rise.
+    look = gaussian_filter1d(capture.position, _FOLLOW_S / capture.dt, axis=0, mode="nearest")
+    look[:, 2] = _LOOK_HEIGHT + 0.5 * (look[:, 2] - np.median(capture.position[:, 2]))
+    qpos = np.hstack([capture.position, capture.orientation, capture.joint_position])
     return Film(
         robot=robot,
         title=title,
@@ -122,69 +129,39 @@ def plan(
         origin=(float(capture.position[zero, 0]), float(capture.position[zero, 1])),
         direction=direction,
         azimuth=direction + 0.5 * math.pi + math.copysign(_QUARTER, facing),
-        time=time,
-        rate=rate,
-        qpos=_qpos(capture, frames),
-        look=_look(capture)[frames],
+        time=np.array(times),
+        rate=np.array(rates),
+        qpos=qpos[frames],
+        look=look[frames],
         labels=labels,
         pose_time=capture.time[poses] - (events.liftoff if events else 0.0),
-        pose_qpos=_qpos(capture, poses),
+        pose_qpos=qpos[poses],
     )
 
 
-def _clock(
-    begin: float, finish: float, events: JumpEvents | None, slow: float
-) -> tuple[Array, Array]:
-    """Times of the frames, and the film's speed at each."""
-    times, rates, now = [], [], begin
-    while now <= finish + 1e-9:
-        flying = events is not None and (
-            events.liftoff - _AROUND_S <= now < events.touchdown + _AROUND_S
-        )
-        times.append(now)
-        rates.append(1.0 / slow if flying else 1.0)
-        now += rates[-1] / FPS
-    return np.array(times), np.array(rates)
-
-
-def _samples(capture: Capture, times: Array) -> Samples:
+def _samples(capture: Capture, *times: float) -> Samples:
+    """The nearest samples to times on the capture's clock [s]."""
     dt = capture.dt if len(capture.time) > 1 else 1.0
-    nearest = np.rint((times - capture.time[0]) / dt).astype(np.intp)
+    nearest = np.rint((np.array(times) - capture.time[0]) / dt).astype(np.intp)
     clipped: Samples = np.clip(nearest, 0, len(capture.time) - 1)
     return clipped
 
 
-def _sample(capture: Capture, time: float) -> int:
-    return int(_samples(capture, np.array([time]))[0])
-
-
-def _qpos(capture: Capture, samples: Samples) -> Array:
-    parts = (capture.position, capture.orientation, capture.joint_position)
-    return np.concatenate([part[samples] for part in parts], axis=1)
-
-
-def _look(capture: Capture) -> Array:
-    """The trunk's path, smoothed, with half of its rise [m]. (T, 3)."""
-    look = gaussian_filter1d(capture.position, _FOLLOW_S / capture.dt, axis=0, mode="nearest")
-    look[:, 2] = _LOOK_HEIGHT + 0.5 * (look[:, 2] - np.median(capture.position[:, 2]))
-    return look
-
-
-def _direction(capture: Capture, events: JumpEvents | None, begin: float, finish: float) -> float:
+def _direction(capture: Capture, events: JumpEvents | None, begin: float, end: float) -> float:
     """Of travel: in flight, else over the film, else the robot's heading [rad]."""
     spans = [(events.liftoff, events.touchdown)] if events else []
-    for a, b in (*spans, (begin, finish)):
-        way = capture.position[_sample(capture, b), :2] - capture.position[_sample(capture, a), :2]
-        if float(np.hypot(*way)) >= _MEASURED:
-            return math.atan2(way[1], way[0])
-    return float(heading(capture.orientation[_sample(capture, begin)]))
+    for span in (*spans, (begin, end)):
+        x, y, _ = np.diff(capture.position[_samples(capture, *span)], axis=0)[0]
+        if math.hypot(x, y) >= _MEASURED:
+            return math.atan2(y, x)
+    return float(heading(capture.orientation[_samples(capture, begin)])[0])
 
 
 def _poses(capture: Capture, events: JumpEvents) -> tuple[Samples, tuple[str, ...]]:
     """Samples of the strip and their labels."""
-    up, down = _sample(capture, events.liftoff), _sample(capture, events.touchdown)
-    z, on = capture.position[:, 2], min(_sample(capture, events.on), up)
-    top = up + int(np.argmax(z[up : down + 1]))
+    z = capture.position[:, 2]
+    on, up, down = _samples(capture, events.on, events.liftoff, events.touchdown).tolist()
+    on, top = min(on, up), up + int(np.argmax(z[up : down + 1]))
     labelled = {
         "crouch": on + int(np.argmin(z[on : up + 1])),
         "lift-off": up,

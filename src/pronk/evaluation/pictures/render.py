@@ -18,7 +18,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from pronk.errors import PronkError
@@ -28,18 +27,14 @@ from pronk.evaluation.pictures.overlay import DISTANCE, ELEVATION, FOV_DEG, TAPE
 from pronk.files import load_artefact, written_whole
 from pronk.robots import load_robot
 
-Array = NDArray[np.float64]
-
 WIDTH, HEIGHT = 640, 400
 """Of a frame [px]."""
 STRIP_WIDTH = 270
 """Of a pose in a strip [px]."""
 GIF_WIDTH = 360
 """[px]"""
-_GIF_BEFORE_S, _GIF_AFTER_S = 0.6, 0.8
-"""Around the jump."""
-_GIF_SKIP = 2
-"""A GIF has one frame of so many."""
+_GIF_BEFORE_S, _GIF_AFTER_S, _GIF_SKIP = 0.6, 0.8, 2
+"""A GIF has every second frame of the jump and a little around it."""
 _OVERSAMPLE = 2
 """Pixels rendered for each pixel of the image, each way."""
 _WORLD = f"""
@@ -72,11 +67,7 @@ _WORLD = f"""
 
 
 def stage(film: Film) -> Any:
-    """Build the robot on its ground, with a tape every 20 cm (paper E7), for drawing only.
-
-    Returns:
-        mujoco.MjModel
-    """
+    """Build a mujoco.MjModel of the robot on its ground, with a tape every 20 cm (paper E7)."""
     spec = mujoco.MjSpec.from_string(_WORLD)
     right = np.array([math.sin(film.azimuth), -math.cos(film.azimuth), 0.0])
     ahead = np.array([math.cos(film.azimuth), math.sin(film.azimuth), 0.0])
@@ -102,8 +93,7 @@ def images(film: Film) -> Iterator[Image.Image]:
     """Render the film's frames, then the poses of its strip, without text."""
     model = stage(film)
     data = mujoco.MjData(model)
-    joints = load_robot(film.robot).joint_names
-    columns = np.array([model.joint(name).qposadr[0] for name in joints])
+    columns = [model.joint(name).qposadr[0] for name in load_robot(film.robot).joint_names]
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     camera.distance, camera.elevation = DISTANCE, math.degrees(ELEVATION)
     camera.azimuth = math.degrees(film.azimuth)
@@ -124,80 +114,72 @@ def images(film: Film) -> Iterator[Image.Image]:
 
 
 def in_gif(film: Film) -> range:
-    """Frames of the GIF: the jump and a little around it, every second one."""
-    first, last = 0, len(film.time)
-    if film.events:
-        around = (film.time >= film.events.liftoff - _GIF_BEFORE_S) & (
-            film.time <= film.events.touchdown + _GIF_AFTER_S
-        )
-        first, last = int(around.argmax()), last - int(around[::-1].argmax())
-    return range(first, last, _GIF_SKIP)
+    """Frames of the GIF."""
+    if not film.events:
+        return range(0, len(film.time), _GIF_SKIP)
+    span = film.events.liftoff - _GIF_BEFORE_S, film.events.touchdown + _GIF_AFTER_S
+    first, last = np.searchsorted(film.time, span[0]), np.searchsorted(film.time, span[1], "right")
+    return range(int(first), int(last), _GIF_SKIP)
 
 
 def write_gif(path: Path, frames: list[Image.Image]) -> None:
     """Write an animation that loops, with one palette and no dither: what stands still is small."""
-    width, height = frames[0].size
     chosen = frames[:: max(1, len(frames) // 5)]
-    montage = Image.new("RGB", (width, height * len(chosen)))
-    for row, image in enumerate(chosen):
-        montage.paste(image, (0, row * height))
+    montage = Image.fromarray(np.vstack([np.asarray(image) for image in chosen]))
     palette = montage.quantize(80, Image.Quantize.MAXCOVERAGE)
     first, *rest = [i.quantize(palette=palette, dither=Image.Dither.NONE) for i in frames]
     duration = round(1000.0 * _GIF_SKIP / FPS)
     first.save(path, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
 
 
+def movie(path: Path) -> Any:
+    """Open an MP4 in H.264, 4:2:0, which every browser plays; frames are sent to it."""
+    import imageio_ffmpeg
+
+    options = "-crf 23 -preset veryfast -movflags +faststart -threads 1"
+    return imageio_ffmpeg.write_frames(
+        str(path),
+        (WIDTH, HEIGHT),
+        fps=FPS,
+        codec="libx264",
+        quality=None,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        output_params=options.split(),
+    )
+
+
 def render(film: Film, files: dict[str, Path]) -> None:
     """Render a film into files by suffix (.mp4, .gif, .png), each whole or not at all."""
-    count, poses = len(film.time), len(film.labels)
-    strip = Image.new("RGB", (STRIP_WIDTH * max(1, poses), HEIGHT))
     kept = set(in_gif(film)) if ".gif" in files else set()
-    animation = []
+    animation, strip = [], []
     with ExitStack() as stack:
         aside = {end: stack.enter_context(written_whole(path)) for end, path in files.items()}
-        movie: Any = None
-        if ".mp4" in files:
-            import imageio_ffmpeg
-
-            # H.264 in 4:2:0, which every browser plays.
-            options = ["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"]
-            movie = imageio_ffmpeg.write_frames(
-                str(aside[".mp4"]),
-                (WIDTH, HEIGHT),
-                fps=FPS,
-                codec="libx264",
-                quality=None,
-                macro_block_size=2,
-                ffmpeg_log_level="error",
-                output_params=[*options, "-threads", "1"],
-            )
-            stack.enter_context(closing(movie)).send(None)
+        mp4 = stack.enter_context(closing(movie(aside[".mp4"]))) if ".mp4" in files else None
+        if mp4 is not None:
+            mp4.send(None)
         for index, image in enumerate(images(film)):
-            if index >= count:
+            if index >= len(film.time):
                 left = (WIDTH - STRIP_WIDTH) // 2
-                pose = image.crop((left, 0, left + STRIP_WIDTH, HEIGHT))
-                strip.paste(pose, ((index - count) * STRIP_WIDTH, 0))
+                strip.append(np.asarray(image)[:, left : left + STRIP_WIDTH])
                 continue
             if index in kept:
                 size = (GIF_WIDTH, GIF_WIDTH * HEIGHT // WIDTH)
                 animation.append(image.resize(size, Image.Resampling.BOX))
                 overlay.draw_frame(animation[-1], film, index)
-            if movie is not None:
+            if mp4 is not None:
                 overlay.draw_frame(image, film, index)
-                movie.send(image.tobytes())
+                mp4.send(image.tobytes())
         if ".gif" in files:
             write_gif(aside[".gif"], animation)
         if ".png" in files:
-            overlay.draw_strip(strip, film)
-            strip.save(aside[".png"], "PNG", optimize=True)
+            still = Image.fromarray(np.hstack(strip))
+            overlay.draw_strip(still, film)
+            still.save(aside[".png"], "PNG", optimize=True)
 
 
 def check_gl() -> None:
-    """Render one small image.
-
-    Raises:
-        PronkError: It is black.
-    """
+    """Render one small image; raise `PronkError` if it is black."""
     world = "<mujoco><worldbody><light/><geom size='1'/></worldbody></mujoco>"
     model = mujoco.MjModel.from_xml_string(world)
     data = mujoco.MjData(model)
@@ -209,19 +191,13 @@ def check_gl() -> None:
             raise PronkError("the image is black.")
 
 
-def main(paths: list[Path]) -> int:
-    """Render the first path, a film, into the others; return the exit status."""
-    try:
-        if not paths:
-            check_gl()
-        else:
-            film = load_artefact(paths[0], Film, SCHEMA, what="a film", writer="pronk trial")
-            render(film, {path.suffix: path for path in paths[1:]})
-    except Exception as error:
-        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main([Path(word) for word in sys.argv[1:]]))
+    source, *targets = map(Path, sys.argv[1:] or [""])
+    try:
+        if targets:
+            made = load_artefact(source, Film, SCHEMA, what="a film", writer="pronk trial")
+            render(made, {path.suffix: path for path in targets})
+        else:
+            check_gl()
+    except Exception as error:
+        sys.exit(f"{type(error).__name__}: {' '.join(str(error).split())}")

@@ -12,27 +12,26 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 from pronk import opengl
 from pronk.errors import PronkError
-from pronk.evaluation.jumps import jump_events
+from pronk.evaluation.jumps import JumpRules, jump_events
 from pronk.evaluation.pictures.film import SCHEMA, Film, plan
 from pronk.evaluation.results import Results, Row
 from pronk.files import save_artefact
 from pronk.virtual import capture as captures
 
-ENDINGS = (".mp4", ".gif", ".png")
-"""Of the files that `record` writes."""
 SLOW = 4.0
-"""How many times slower than real time a flight is shown."""
+"""How many times slower than real time a flight is."""
 _BEFORE_S, _AFTER_S = 0.8, 2.5
-"""Shown around the jump input, for a robot that did not jump."""
+"""Around the jump input, of a robot that did not jump."""
 _PROBE_S = 60.0
-_MODULE = "pronk.evaluation.pictures.render"
 
 
 class VideoError(PronkError):
@@ -66,17 +65,25 @@ def find_gl() -> str:
     if chosen := opengl.requested():
         candidates = [chosen] + [name for name in candidates if name != chosen]
     for name in candidates:
-        command = [sys.executable, "-m", _MODULE]
-        try:
-            subprocess.run(
-                command, env=environment(name), capture_output=True, timeout=_PROBE_S, check=True
-            )
-        except (subprocess.TimeoutExpired, subprocess.CalledProcessError):
-            continue
-        return name
+        with suppress(subprocess.TimeoutExpired):
+            if not _run(name, timeout=_PROBE_S).returncode:
+                return name
     raise VideoError(
         f"no video: of {' and '.join(candidates) or 'the system'} no OpenGL renders offscreen "
         "here; `apt-get install libosmesa6` gives one that needs neither GPU nor display."
+    )
+
+
+def _run(backend: str, *files: Path, timeout: float | None = None) -> Any:
+    """Run `render` with a GL backend."""
+    return subprocess.run(
+        [sys.executable, "-m", "pronk.evaluation.pictures.render", *files],
+        env=environment(backend),
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout,
+        check=False,
     )
 
 
@@ -100,22 +107,15 @@ def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path
     else:
         endings.insert(0, ".mp4")
     files = tuple(stem.with_name(f"{stem.name}{ending}") for ending in endings)
+    try:
+        backend = find_gl()
+    except VideoError as error:
+        warn(str(error))
+        return ()
     with tempfile.TemporaryDirectory() as folder:
-        plan_file = Path(folder) / "film.npz"
-        save_artefact(plan_file, film, SCHEMA)
-        try:
-            backend = find_gl()
-        except VideoError as error:
-            warn(str(error))
-            return ()
-        done = subprocess.run(
-            [sys.executable, "-m", _MODULE, plan_file, *files],
-            env=environment(backend),
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            check=False,
-        )
+        source = Path(folder) / "film.npz"
+        save_artefact(source, film, SCHEMA)
+        done = _run(backend, source, *files)
     if done.returncode:
         lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
         last = lines[-1].rstrip(".") if lines else f"the process ended with {done.returncode}"
@@ -129,38 +129,36 @@ def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path
 
 def films_of(
     found: Results, folder: Path, *, cases: Container[str] | None = None, slow: float = SLOW
-) -> Iterator[tuple[str, Film]]:
-    """Plan a film of each policy with each command, or those of `cases`, and a name for its files.
+) -> dict[str, Film]:
+    """Plan a film of each policy with each command, or those of `cases`, by the name of its files.
 
-    A robot that did not jump is shown as well. `folder` has the captures.
+    A robot that did not jump is filmed as well. `folder` has the captures.
 
     Raises:
         ArtefactError: A capture is missing or damaged.
     """
     first: dict[tuple[str, str], Row] = {}
-    for row in found.rows:
-        if row.capture and (cases is None or row.case in cases):
-            first.setdefault((row.policy, row.case), row)
     policies = {subject.name for subject in found.subjects}
-    for row in (row for row in first.values() if row.policy in policies):
+    for row in found.rows:
+        if row.capture and row.policy in policies and (cases is None or row.case in cases):
+            first.setdefault((row.policy, row.case), row)
+    films = {}
+    for row in first.values():
         capture = captures.load(folder / row.capture)
-        events = jump_events(capture, row.script, began=row.began)
-        on = row.began + row.script.on
+        rules, on = JumpRules(**found.rules), row.began + row.script.on
+        events = jump_events(capture, row.script, rules, began=row.began)
         # The name is without what a shell or a link would trip over.
-        yield (
-            re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{row.policy}_{row.case}"),
-            plan(
-                capture,
-                robot=found.robot,
-                title=row.case if "," in row.case else f"{row.case} m/s",
-                note=f"policy: {row.policy}" + ("" if events else ", no jump"),
-                virtual=found.virtual,
-                events=events,
-                start=None if events else on - _BEFORE_S,
-                end=None if events else on + _AFTER_S,
-                slow=slow,
-            ),
+        films[re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{row.policy}_{row.case}")] = plan(
+            capture,
+            robot=found.robot,
+            title=row.case if "," in row.case else f"{row.case} m/s",
+            note=f"policy: {row.policy}" + ("" if events else ", no jump"),
+            virtual=found.virtual,
+            events=events,
+            span=None if events else (on - _BEFORE_S, on + _AFTER_S),
+            slow=slow,
         )
+    return films
 
 
 def record_all(
@@ -184,7 +182,7 @@ def record_all(
     except VideoError as error:
         warn(str(error))
         return ()
-    planned = dict(films_of(found, folder, cases=cases, slow=slow))
+    planned = films_of(found, folder, cases=cases, slow=slow)
     warnings: dict[str, None] = {}
     files: list[Path] = []
     with ThreadPoolExecutor(max(1, at_once)) as threads:

@@ -1,6 +1,6 @@
 """Evaluate a policy in the training simulator: every command at once, many robots each.
 
-    plan = Plan(robots=1000)
+    plan = Plan(robot=robot, robots=1000)
     env = ManagerBasedRlEnv(evaluation_cfg(env_cfg(gains=gains), plan), device="cuda:0")
     evaluation = evaluate_policy(policy, env, plan, estimate=actor.estimate)
     save(Path("evaluation.json"), evaluation)
@@ -9,15 +9,15 @@ Walking robots have one velocity from the first sample on. Jumping robots do wha
 did (E1): stand, accelerate, jump while running, run on for a moment, stop. The jump input rises at
 each robot's own time, so that it meets every phase of the gait. `run` records the robots,
 `pronk.evaluation.jumps` and `walk` measure them; `pronk.evaluation.criteria` has the acceptance
-criteria.
+criteria; `adapter` has all that is of `pronk.train`.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,17 +26,26 @@ from numpy.typing import NDArray
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.criteria import evaluation_checks
-from pronk.evaluation.jumps import JumpRules, Series, measure_jump, steps, uncommanded_height
+from pronk.evaluation.jumps import (
+    JumpRules,
+    fallen_at,
+    measure,
+    sample_at,
+    uncommanded_height,
+)
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.results import Spread, load_json, save_json
-from pronk.evaluation.walk import velocity_errors
+from pronk.evaluation.tables import Sheet, check_sheet, number, percent, sheet, spread
+from pronk.evaluation.walk import measure_walk, walk_script
+from pronk.robots.robot import RobotSpec
+from pronk.runtime.script import STILL, Script
+from pronk.virtual.capture import Capture
 
 if TYPE_CHECKING:
-    from pronk.evaluation.training_sim.run import Estimate, Policy, Recording
+    from pronk.evaluation.training_sim.run import Estimate, Policy
 
 SCHEMA = "pronk/evaluation/3"
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Samples = NDArray[np.int64]
 
 NEVER = 2**30
@@ -60,8 +69,9 @@ JUMPS = PAPER_COMMANDS
 class Plan:
     """The commands of an evaluation, and their times."""
 
+    robot: RobotSpec
     robots: int = 1000
-    """Robots for each command."""
+    """For each command."""
     seed: int = 0
     """Of noise, pushes, starts and the times of the jumps."""
     walks: tuple[Case, ...] = WALKS
@@ -70,24 +80,22 @@ class Plan:
     """Length of a walk [s]."""
     settle_s: float = 2.0
     """Time to accelerate, left out of the errors [s]."""
-    average_s: float = 0.5
-    """Window of the moving average, which takes the stride out of the velocity [s]."""
-    stand_s: float = 1.0
-    """Of a jumping robot, before the velocity command [s]."""
-    run_s: float = 2.5
-    """From there to the jump input, at least [s]."""
+    script: Script = field(default_factory=lambda: Script(command=STILL))
+    """Times of a jump; the command is each case's."""
     spread_s: float = 0.5
     """The jump input rises up to this much later, uniformly [s]."""
-    jump_s: float = 0.5
-    """Its length [s]."""
-    keep_s: float = 0.5
-    """From its end to the zero command [s]."""
-    rules: JumpRules = field(default_factory=JumpRules)
+    rules: JumpRules | None = None
+    """Those of the robot if None."""
 
     def __post_init__(self) -> None:
         """Raise `PronkError` for an empty plan."""
         if self.robots < 1:
             raise PronkError(f"{self.robots} robots for each command; expected 1 or more.")
+
+    @property
+    def jump_rules(self) -> JumpRules:
+        """The definitions of a jump."""
+        return self.rules or JumpRules.of(self.robot)
 
     @property
     def size(self) -> int:
@@ -102,8 +110,8 @@ class Plan:
     @property
     def jump_seconds(self) -> float:
         """Time until the latest jump is measured [s]; a flight takes less than 1 s."""
-        latest = self.stand_s + self.run_s + self.spread_s
-        return latest + self.rules.search_s + 1.0 + self.rules.upright_s if self.jumps else 0.0
+        after = self.jump_rules.search_s + 1.0 + self.jump_rules.upright_s
+        return self.script.on + self.spread_s + after if self.jumps else 0.0
 
     @property
     def seconds(self) -> float:
@@ -120,20 +128,16 @@ class Plan:
 
         For each robot, in samples of `dt`, (N,); `NEVER` for what does not happen.
         """
-        count = self.size - self.walkers
-        rng = np.random.default_rng(self.seed)
-        on = np.rint((self.stand_s + self.run_s + self.spread_s * rng.random(count)) / dt)
-        off = on + steps(self.jump_s, dt)
-        jumping = {
-            "start": np.full(count, steps(self.stand_s, dt)),
-            "stop": off + steps(self.keep_s, dt),
+        jumping = np.arange(self.size) >= self.walkers
+        draws = np.random.default_rng(self.seed).random(self.size - self.walkers)
+        on = np.full(self.size, NEVER)
+        on[jumping] = np.rint((self.script.on + self.spread_s * draws) / dt)
+        off = np.where(jumping, on + round(self.script.jump_s / dt), NEVER)
+        return {
+            "start": np.where(jumping, round(self.script.start / dt), 0),
+            "stop": np.where(jumping, off + round(self.script.keep_s / dt), NEVER),
             "on": on,
             "off": off,
-        }
-        walking = {"start": 0, "stop": NEVER, "on": NEVER, "off": NEVER}
-        return {
-            name: np.concatenate([np.full(self.walkers, walking[name]), times]).astype(np.int64)
-            for name, times in jumping.items()
         }
 
 
@@ -168,7 +172,7 @@ class Evaluation:
     (`forward`, `left`, `up`) and of the vector (`velocity`), and the share of feet and policy steps
     at which the contact estimate is right (`contacts_right`). Empty without estimator or walks."""
     plan: Mapping[str, Any]
-    """Times, counts and the seed: `asdict` of the plan."""
+    """Fields of the plan."""
     seconds: float
     """Wall time [s]."""
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -187,21 +191,15 @@ def evaluate_policy(
     plan: Plan,
     *,
     estimate: Estimate | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
     about: Mapping[str, Any] | None = None,
     before: Mapping[str, float] | None = None,
 ) -> Evaluation:
     """Run the whole plan in one batch and measure every robot.
 
-    Args:
-        policy: Under evaluation.
-        env: Built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
-            random generators of the process are seeded with the plan's seed.
-        plan: Of the evaluation.
-        estimate: The policy's estimator, if it is evaluated too.
-        progress: Called with the share done, 0 to 1.
-        about: As of `Evaluation`.
-        before: As of `Evaluation`.
+    `env` was built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
+    random generators of the process are seeded with the plan's seed. `estimate` is the policy's
+    estimator, if it is evaluated too; `about` and `before` are as of `Evaluation`.
 
     Raises:
         PronkError: The environment was not built for this plan.
@@ -209,112 +207,57 @@ def evaluate_policy(
     from pronk.evaluation.training_sim.run import Run
 
     began = time.perf_counter()
-    run = Run(env.unwrapped, plan).go(policy, estimate, progress or (lambda share: None))
-    fell_at, on, diverged = (each.cpu().numpy() for each in (run.fell_at, run.on, run.non_finite))
+    run = Run(env.unwrapped, plan)
+    run.go(policy, estimate, progress)
+    facts = [part.cpu().numpy() for part in (run.fell_at, run.on, run.diverged)]
     results = []
-    for i, (case, recording) in enumerate(
-        zip((*plan.walks, *plan.jumps), run.recordings, strict=True)
-    ):
-        own = slice(i * plan.robots, (i + 1) * plan.robots)
-        robots = zip(_series(recording, fell_at[own], run.dt), fell_at[own], on[own], strict=True)
-        measured = [
-            (
-                _walk(case, *seen, int(fell), plan)
-                if i < len(plan.walks)
-                else _jump(case, *seen, int(fell), int(rise), plan.rules)
-            )
-            for seen, fell, rise in robots
-        ]
-        names = dict.fromkeys(name for figures in measured for name in figures)
-        figures = {n: Spread.of([each.get(n, math.nan) for each in measured]) for n in names}
-        figures["non_finite"] = Spread.of(diverged[own])
-        results.append(CommandResult(name=case.name, command=case.command, figures=figures))
-    *squares, right, count = run.estimates.tolist()
-    estimator = {}
-    if count:
-        estimator = {
-            name: math.sqrt(total / count)
-            for name, total in zip(
-                ("forward", "left", "up", "velocity"), (*squares, sum(squares)), strict=True
-            )
-        }
-        estimator["contacts_right"] = right / count
+    for i, case in enumerate((*plan.walks, *plan.jumps)):
+        own = (part[i * plan.robots : (i + 1) * plan.robots] for part in facts)
+        robots = []
+        for capture, fell, on, diverged in zip(run.captures(i), *own, strict=True):
+            if i < len(plan.walks):
+                figures = _walk(capture, case, plan)
+            else:
+                figures = _jump(capture, case, plan, on=float(on) * run.dt)
+            robots.append(figures | {"fell": fell < NEVER, "non_finite": diverged})
+        spreads = {name: Spread.of([each[name] for each in robots]) for name in robots[0]}
+        results.append(CommandResult(name=case.name, command=case.command, figures=spreads))
     return Evaluation(
         walks=tuple(results[: len(plan.walks)]),
         jumps=tuple(results[len(plan.walks) :]),
-        estimator=estimator,
-        plan=asdict(plan),
+        estimator=run.estimator_errors(),
+        plan=vars(plan) | {"robot": plan.robot.name, "rules": plan.jump_rules},
         seconds=time.perf_counter() - began,
         about=dict(about or {}),
         before=dict(before or {}),
     )
 
 
-def _series(
-    recording: Recording, fell_at: Samples, dt: float
-) -> Iterator[tuple[Series, Array, Mask]]:
-    """Motion, angular velocity and non-foot contacts of each robot.
-
-    The motion ends at the robot's fall or at its first number that is not finite.
-    """
-    state, feet, other = (
-        getattr(recording, name).cpu().numpy() for name in ("state", "feet", "other")
-    )
-    for i, fell in enumerate(fell_at):
-        finite = np.isfinite(state[:, i]).all(axis=-1)
-        end = min(int(fell), len(finite) if finite.all() else int(np.argmin(finite)))
-        own = state[:end, i].astype(float)
-        series = Series(
-            position=own[:, :3],
-            orientation=own[:, 3:7],
-            velocity=own[:, 7:10],
-            contact=feet[:end, i],
-            dt=dt,
-        )
-        yield series, own[:, 10:], other[:, i]
-
-
-def _walk(
-    case: Case, series: Series, turning: Array, _: Mask, fell: int, plan: Plan
-) -> dict[str, float]:
+def _walk(capture: Capture, case: Case, plan: Plan) -> dict[str, float]:
     """The figures of a robot that walks."""
-    first, rules = series.steps(plan.settle_s), plan.rules
-    over = uncommanded_height(series, None, rules) - rules.standing_height
-    figures = {"fell": fell <= series.steps(plan.walk_s), "uncommanded": over}
-    if len(series.position) > first:
-        figures |= velocity_errors(
-            series.velocity,
-            series.orientation,
-            turning,
-            case.command,
-            first=first,
-            average=series.steps(plan.average_s),
-        )[0]
-        way = series.position[-1, :2] - series.position[first, :2]
-        figures["drift"] = float(np.hypot(*way))
-    return figures
+    script, rules = walk_script(case.command, seconds=plan.walk_s), plan.jump_rules
+    script = replace(script, stand_s=0.0)
+    how: Any = {"began": 0.0, "rules": rules, "settle_s": plan.settle_s}
+    found = measure_walk(capture, script, plan.robot, **how)
+    first, last = round(plan.settle_s / capture.dt), fallen_at(capture) - 1
+    x, y, _ = capture.position[last] - capture.position[min(first, last)]
+    return vars(found) | {
+        "uncommanded": found.uncommanded - rules.standing_height,
+        "drift": math.hypot(x, y) if first <= last else math.nan,
+    }
 
 
-def _jump(
-    case: Case, series: Series, _: Array, other: Mask, fell: int, rise: int, rules: JumpRules
-) -> dict[str, float]:
-    """The figures of a robot that jumps; its jump input rises at sample `rise`."""
-    count = len(series.position)
-    standing = rise < count
-    over = uncommanded_height(series, rise if standing else None, rules) - rules.standing_height
-    flags = dict.fromkeys(("found", "upright", "non_foot_contact"), False)
-    figures = {"fell": fell < NEVER, "standing": standing, "uncommanded": over, **flags}
-    if standing:
-        measured, main = measure_jump(series, rise, case.command, rules)
-        seconds = rules.search_s if main is None else rules.upright_s
-        settled = (rise if main is None else main.touchdown) + series.steps(seconds)
-        # A robot that fell within that time after a jump lies on the ground.
-        lies = main is not None and count <= settled and fell < NEVER
-        touches = bool(other[rise : min(count, settled + 1)].any())
-        figures |= measured
-        figures["non_foot_contact"] = lies or touches
-        figures["single"] = measured["high_flights"] == 1.0
-    return figures
+def _jump(capture: Capture, case: Case, plan: Plan, *, on: float) -> dict[str, float]:
+    """The figures of a robot that jumps; its jump input rises at `on` [s]."""
+    rules, run_s = plan.jump_rules, on - plan.script.start
+    script = replace(plan.script, command=case.command, run_s=run_s)
+    found = measure(capture, script, plan.robot, began=0.0, rules=rules)
+    rise = sample_at(capture, on) if found.standing else None
+    figures = {name: value for name, value in vars(found).items() if not isinstance(value, tuple)}
+    return figures | {
+        "uncommanded": uncommanded_height(capture, rise, rules) - rules.standing_height,
+        "single": float(found.high_flights == 1.0) if found.standing else math.nan,
+    }
 
 
 def save(path: Path, evaluation: Evaluation) -> None:
@@ -337,3 +280,66 @@ def load_speed_errors(path: Path) -> dict[str, float]:
     if not errors:
         raise ArtefactError(f"{path}: has no walks; evaluate that policy with --what walk.")
     return errors
+
+
+def sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
+    """The tables of an evaluation."""
+    errors = (("speed error [m/s]", "speed_error"), ("yaw rate error [rad/s]", "yaw_error"))
+    walks = [
+        {"command": walk.name}
+        | {
+            words: f"{number(walk[name].mean)} ({number(walk[f'{name}_averaged'].mean)})"
+            for words, name in errors
+        }
+        | {
+            "mean velocity [m/s, m/s, rad/s]": ", ".join(
+                number(walk[name].mean, 2) for name in ("forward", "left", "yaw_rate")
+            ),
+            "drift [m]": number(walk["drift"].mean, 2),
+            "falls [%]": percent(walk["fell"].mean),
+            "flight over standing [cm]": percent(walk["uncommanded"].most),
+        }
+        for walk in evaluation.walks
+    ]
+    jumps = [
+        {
+            "command": jump.name,
+            "height [m]": spread(jump["height"]),
+            "distance [m]": spread(jump["distance"], 2),
+            "lift-off up [m/s]": spread(jump["lift_off_velocity"], 2),
+            "after [s]": spread(jump["delay"], 2),
+            "along [m]": number(jump["along"].mean, 2),
+            "flights": number(jump["flights"].mean, 2),
+            "high ones": number(jump["high_flights"].mean, 2),
+            "one [%]": percent(jump["single"].mean),
+            "jumped [%]": percent(jump["found"].mean),
+            "upright [%]": percent(jump["upright"].mean),
+            "non-foot contact [%]": percent(jump["non_foot_contact"].mean),
+        }
+        for jump in evaluation.jumps
+    ]
+    notes, estimator = [], evaluation.estimator
+    if estimator:
+        axes = " / ".join(f"{estimator[axis]:.3f}" for axis in ("forward", "left", "up"))
+        notes.append(
+            f"estimator while walking: velocity RMSE {estimator['velocity']:.3f} m/s (forward / "
+            f"left / up {axes}), contacts right {percent(estimator['contacts_right'])} %"
+        )
+    notes.append(
+        f"PASSED; {evaluation.plan['robots']} robots a command, randomization "
+        f"{evaluation.about.get('randomization', '-')}, seed {evaluation.plan['seed']}, "
+        f"{evaluation.seconds:.0f} s"
+    )
+    found = (
+        sheet(
+            "Walking: mean over robots and time; in brackets with the stride averaged out", walks
+        ),
+        sheet(
+            "Jumping: mean +- standard deviation over robots",
+            jumps,
+            "non-foot contact: anything but a foot on the ground, from the jump input to 2 s after "
+            "touchdown; a trial counts no such jump as a success.",
+        ),
+        check_sheet("Acceptance criteria", evaluation_checks(evaluation), *notes),
+    )
+    return tuple(one for one in found if one.rows)
