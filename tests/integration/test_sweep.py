@@ -15,7 +15,7 @@ from pronk.excitation.signals import Chirp
 from pronk.links.machine import Command, State
 from pronk.logs.mcap_log import read_mcap
 from pronk.robots import load_robot
-from pronk.runtime.safety import filtered
+from pronk.runtime.safety import SafetyFilter
 from pronk.runtime.sweep import SweepTask, logged_joints, record
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params
@@ -56,7 +56,7 @@ def plan_of(*joints: str, **options: object) -> SweepPlan:
 
 
 def sweep(machine: Watched, plan: SweepPlan, out_dir: Path, **options: Any) -> list[Path]:
-    progress = options.pop("progress", lambda share, what: None)
+    progress = options.pop("progress", lambda share: None)
     return record(machine, SweepTask(plan=plan, out_dir=out_dir, **options), progress)
 
 
@@ -180,10 +180,10 @@ def test_a_command_beyond_a_limit_is_clamped_by_the_filter(tmp_path: Path) -> No
 def test_every_command_of_a_sweep_passes_the_filter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    passed, sent = [], []
+    passed, sent, judge = [], [], SafetyFilter.judge
 
     def counted(*given: Any, **more: Any) -> Any:
-        result = filtered(*given, **more)
+        result = judge(*given, **more)
         passed.append(result[0])
         return result
 
@@ -192,7 +192,7 @@ def test_every_command_of_a_sweep_passes_the_filter(
             sent.append(command)
             super().send(command)
 
-    monkeypatch.setattr("pronk.runtime.sweep.filtered", counted)
+    monkeypatch.setattr(SafetyFilter, "judge", counted)
     sweep(Counted(), plan_of("FR_knee"), tmp_path)
     assert sent
     assert all(one is other for one, other in zip(sent, passed, strict=True))
@@ -201,7 +201,7 @@ def test_every_command_of_a_sweep_passes_the_filter(
 def test_the_interrupt_key_damps_the_joints_and_keeps_the_log(tmp_path: Path) -> None:
     machine = Watched()
 
-    def impatient(share: float, what: str) -> None:
+    def impatient(share: float) -> None:
         if share > 0.3:
             raise KeyboardInterrupt
 
@@ -226,7 +226,7 @@ def test_a_silent_machine_is_an_error(tmp_path: Path) -> None:
 def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:
     plan = plan_of("FR_hip_roll", "FR_knee", amplitudes=(0.1,))
     shares: list[float] = []
-    one = {"joints": ("FR_knee",), "progress": lambda share, _: shares.append(share)}
+    one = {"joints": ("FR_knee",), "progress": shares.append}
     paths = sweep(Watched(), plan, tmp_path, **one)
     assert [path.name for path in paths] == ["FR_knee.mcap"]
     assert list(tmp_path.iterdir()) == paths

@@ -74,7 +74,7 @@ class Run:
         stick["request"] = request
         stick["requests"] += request is not OperatorRequest.NONE
         while not there():
-            assert time.monotonic() < end, (self.servo.machine_state.mode, self.said)
+            assert time.monotonic() < end, (self.servo.modes.mode, self.said)
             stick["time"], stick["held"] = time.monotonic(), 1
             self.shared.operator.write(stick)
             self.receive()
@@ -82,7 +82,7 @@ class Run:
         self.receive()
 
     def mode(self, mode: Mode, request: OperatorRequest = OperatorRequest.NONE) -> None:
-        self.until(lambda: self.servo.machine_state.mode is mode, request)
+        self.until(lambda: self.servo.modes.mode is mode, request)
 
     def receive(self) -> None:
         self.said += [

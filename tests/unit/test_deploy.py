@@ -24,6 +24,7 @@ from pronk.links.realtime import Histogram, Pace
 from pronk.logs.mcap import DamagedError, McapWriter, records
 from pronk.robots import load_robot
 from pronk.runtime.ipc import (
+    ACTIONS,
     EVENT,
     STEP,
     TICK,
@@ -31,7 +32,6 @@ from pronk.runtime.ipc import (
     Mailbox,
     Mode,
     OperatorRequest,
-    PolicyAction,
     Ring,
     Shared,
     block,
@@ -41,7 +41,7 @@ from pronk.runtime.ipc import (
 )
 from pronk.runtime.log import SCHEMA, TOPICS, DeployLogWriter, is_deploy_log, read_deploy_log
 from pronk.runtime.preflight import delay_objection, refusals
-from pronk.runtime.safety import FilterAction, FilterState, Limits, Reason, fault
+from pronk.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
 from pronk.runtime.script import Script
 from pronk.runtime.state_machine import (
     FIRST_ACTION_S,
@@ -240,9 +240,9 @@ class Run:
 
     def __init__(self, **times: float) -> None:
         self.machine = StateMachine(ROBOT, Timing(**times))
-        self.memory = FilterState()
+        self.safety = SafetyFilter(limits=LIMITS)
         self.t = 0.0
-        self.action: PolicyAction | None = None
+        self.action: Any = None
         self.objection = ""
 
     @property
@@ -258,23 +258,18 @@ class Run:
         self.t += seconds
         if request is not OperatorRequest.NONE:
             self.machine.request(request)
-        desired, self.memory = self.machine.step(
-            self.t, state(position=q), self.memory, self.action, objection=self.objection
-        )
-        if self.memory.faulted:
+        desired = self.machine.step(self.t, q, self.safety, self.action, self.objection)
+        if self.safety.faulted:
             self.machine.faulted(self.t)
         return desired
 
     def give(self, target: np.ndarray, entry: int | None = None) -> None:
-        self.action = PolicyAction(
-            sequence=0 if self.action is None else self.action.sequence + 1,
-            state_sequence=3,
-            state_time=self.t,
-            made=self.t,
-            valid_for=0.05,
-            entry=self.machine.entry if entry is None else entry,
-            position=target,
-        )
+        made, self.action = self.action, np.zeros((), dtype=ACTIONS)
+        self.action["sequence"] = 0 if made is None else made["sequence"] + 1
+        self.action["state_sequence"], self.action["valid_for"] = 3, 0.05
+        self.action["state_time"] = self.action["made"] = self.t
+        self.action["entry"] = self.machine.entry if entry is None else entry
+        self.action["position"] = target
 
     def standing(self) -> Run:
         self.machine.preflighted((), self.t)
@@ -287,21 +282,20 @@ class Run:
 
 def test_nothing_is_sent_before_and_without_the_checks() -> None:
     run = Run()
-    assert run.tick().silent
-    run.machine.enter(Mode.PREFLIGHT, run.t)
-    assert run.tick(request=OperatorRequest.STAND).silent
-    run.machine.preflighted(("the battery is empty.",), run.t)
-    assert run.mode is Mode.IDLE
-    assert run.tick(5.0, OperatorRequest.STAND).silent
-    assert run.machine.refusals == ("the battery is empty.",)
+    for mode in (Mode.IDLE, Mode.PREFLIGHT, Mode.IDLE):
+        if mode is not run.mode:
+            run.machine.enter(Mode.PREFLIGHT, run.t)
+        assert run.tick(5.0, OperatorRequest.STAND).command is None
+        assert run.machine.silent
+        run.machine.preflighted(("the battery is empty.",), run.t)
+        assert run.mode is Mode.IDLE
 
 
 def test_the_whole_course() -> None:
     run = Run(blend_s=0.4, halt_s=1.0, sit_s=1.5)
     run.machine.preflighted((), 0.0)
-    desired = run.tick()
-    assert not desired.silent
-    assert desired.command is None
+    assert run.tick().command is None
+    assert not run.machine.silent
     run.tick(0.5, OperatorRequest.STAND)
     assert run.mode is Mode.DAMP, "it has not sunk yet"
     desired = run.tick(0.5)
@@ -322,8 +316,7 @@ def test_the_whole_course() -> None:
     desired = run.tick(0.2)
     assert desired.blend == pytest.approx(0.5)
     np.testing.assert_allclose(desired.command.position, POSE + 0.2)
-    assert run.action is not None
-    assert (desired.command.made, desired.command.state_sequence) == (run.action.made, 3)
+    assert (desired.command.made, desired.command.state_sequence) == (run.action["made"], 3)
     np.testing.assert_allclose(run.tick(0.2).command.position, POSE + 0.4)
     # Down: the policy first comes to a halt.
     desired = run.tick(0.0, OperatorRequest.SIT)
@@ -341,7 +334,7 @@ def test_damping_comes_at_once(request_: OperatorRequest) -> None:
     run = Run().standing()
     assert run.tick(0.0, request_).command is None
     assert run.mode is Mode.DAMP
-    assert run.machine.quitting() is (request_ is OperatorRequest.QUIT)
+    assert run.machine.quitting is (request_ is OperatorRequest.QUIT)
 
 
 def test_a_policy_without_a_first_action_is_a_fault() -> None:
@@ -349,7 +342,7 @@ def test_a_policy_without_a_first_action_is_a_fault() -> None:
     run.tick(0.0, OperatorRequest.WALK)
     assert run.tick(FIRST_ACTION_S - 0.01).command is not None
     assert run.tick(0.02).command is None
-    assert (run.memory.reason, run.mode) == (Reason.EXPIRED, Mode.FAULT)
+    assert (run.safety.reason, run.mode) == (Reason.EXPIRED, Mode.FAULT)
 
 
 @pytest.mark.parametrize("later", [0, 1])
@@ -370,7 +363,7 @@ def test_commanded_to_sit_at_once_the_policy_still_acts(later: int) -> None:
     assert desired.blend == pytest.approx(1.0)
     np.testing.assert_allclose(desired.command.position, POSE + 0.4)
     run.tick(1.0)
-    assert (run.mode, run.memory.faulted) == (Mode.SIT, False)
+    assert (run.mode, run.safety.faulted) == (Mode.SIT, False)
 
 
 def test_an_objection_keeps_the_policy_from_starting() -> None:
@@ -385,16 +378,16 @@ def test_an_objection_keeps_the_policy_from_starting() -> None:
 
 def test_a_latched_fault_needs_a_reset_and_another_its_second() -> None:
     run = Run().standing()
-    run.memory = fault(FilterState(), FilterAction.LATCH, Reason.TILT, run.t)
+    run.safety.fault(FilterAction.LATCH, Reason.TILT, run.t)
     run.tick()
     assert run.mode is Mode.FAULT
     run.tick(2.0, OperatorRequest.STAND)
     assert run.mode is Mode.FAULT
     assert "reset" in run.machine.notice
     run.tick(0.0, OperatorRequest.RESET)
-    assert (run.mode, run.memory.faulted) == (Mode.DAMP, False)
+    assert (run.mode, run.safety.faulted) == (Mode.DAMP, False)
     run = Run(damp_s=0.0).standing()
-    run.memory = fault(FilterState(), FilterAction.DAMP, Reason.DEAD_MAN, run.t)
+    run.safety.fault(FilterAction.DAMP, Reason.DEAD_MAN, run.t)
     run.machine.faulted(run.t)
     run.tick(0.5, OperatorRequest.STAND)
     assert run.mode is Mode.FAULT

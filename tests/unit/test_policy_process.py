@@ -1,4 +1,4 @@
-"""The policy's process: warm_ups, and what its steps write, with the shipped policy."""
+"""The policy's process: warm-ups, and what its steps write, with the shipped policy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pronk
 from pronk.links.machine import State
 from pronk.links.realtime import Pace
 from pronk.policy.runtime import load_policy
-from pronk.runtime.ipc import OPERATOR, STATE, Mode, Shared, put_state
+from pronk.runtime.ipc import OPERATOR, Mode, Shared, put_state, state_dtype
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.policy_process import LEAD_S, PolicyProcess, standing, warm_up_until
 
@@ -55,13 +55,13 @@ def states(count: int) -> list[State]:
 
 
 def publish(process: PolicyProcess, state: State, mode: Mode, entry: int) -> None:
-    """What servo and operator say before a step."""
-    record, stick = np.zeros((), dtype=STATE), np.zeros((), dtype=OPERATOR)
+    """What servo and operator write before a step."""
+    record, operator = np.zeros((), dtype=state_dtype(12)), np.zeros((), dtype=OPERATOR)
     put_state(record, state)
     record["mode"], record["entry"] = mode, entry
     process.shared.state.write(record)
-    stick["command"], stick["jump"] = (1.0, -0.3, 99.0), state.sequence % 3 == 0
-    process.shared.operator.write(stick)
+    operator["command"], operator["jump"] = (1.0, -0.3, 99.0), state.sequence % 3 == 0
+    process.shared.operator.write(operator)
 
 
 def decided(process: PolicyProcess, warm_ups: int, seen: list[State]) -> list[bytes]:
@@ -113,7 +113,7 @@ def test_the_policy_is_never_commanded_beyond_what_it_was_trained_for() -> None:
         np.testing.assert_allclose(step["command"], (1.0, -0.3, most))
 
 
-def test_a_state_that_is_none_gives_no_order_and_one_complaint() -> None:
+def test_a_state_that_is_not_finite_gives_no_action_and_one_event() -> None:
     spoilt = State(**vars(states(1)[0]) | {"velocity": np.full(12, np.nan)})
     with running() as process:
         for _ in range(3):

@@ -15,15 +15,13 @@ from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 from pronk.runtime.safety import (
     LEAST_DAMPING_S,
+    Decision,
     FilterAction,
-    FilterState,
     Limits,
     Reason,
+    SafetyFilter,
     SafetyInput,
     apply_rules,
-    fault,
-    filtered,
-    released,
     tilt,
 )
 
@@ -61,10 +59,18 @@ def command(**changes: Any) -> Command:
     return Command(**(whole | changes))
 
 
-def found(
-    s: State, c: Command, t: float = 0.0, memory: FilterState | None = None, **more: Any
-) -> tuple[FilterAction, Reason]:
-    decision = filtered(s, c, memory or FilterState(), LIMITS, t, **more)[1]
+def judged(
+    s: State, c: Command, t: float = 0.0, *, limits: Limits = LIMITS, **more: Any
+) -> tuple[Command | None, Decision, SafetyFilter]:
+    """What a filter makes of a state and a command, and the filter."""
+    held, earlier = more.pop("held", True), more.pop("earlier", [])
+    safety = SafetyFilter(limits=limits, **more)
+    sent, decision = safety.judge([*earlier, s], c, t, held=held)
+    return sent, decision, safety
+
+
+def found(s: State, c: Command, t: float = 0.0, **more: Any) -> tuple[FilterAction, Reason]:
+    _, decision, _ = judged(s, c, t, **more)
     return decision.level, decision.reason
 
 
@@ -80,13 +86,11 @@ def turned(angle: float) -> np.ndarray:
 
 def test_a_command_within_all_limits_passes_unchanged() -> None:
     target = POSE + 0.1
-    sent, decision, memory = filtered(
-        state(), command(position=target), FilterState(), LIMITS, 0.001
-    )
+    sent, decision, safety = judged(state(), command(position=target), 0.001)
     assert sent is not None
-    assert memory.last is not None
+    assert safety.last is not None
     assert (decision.level, decision.reason) == (FilterAction.PASS, Reason.NONE)
-    for values in (sent.position, memory.last):
+    for values in (sent.position, safety.last):
         np.testing.assert_array_equal(values, target)
     assert sent.stiffness is KP
     assert sent.damping is KD
@@ -107,8 +111,8 @@ def test_an_old_state_holds_then_damps_then_latches(
     age_s: float, level: FilterAction, reason: Reason
 ) -> None:
     last = POSE + 0.2
-    desired, memory = command(position=POSE + 0.4, made=age_s), FilterState(last=last)
-    sent, decision, _ = filtered(state(), desired, memory, LIMITS, age_s)
+    desired = command(position=POSE + 0.4, made=age_s)
+    sent, decision, _ = judged(state(), desired, age_s, last=last)
     assert (decision.level, decision.reason) == (level, reason)
     if level is FilterAction.HOLD:
         assert sent is not None
@@ -156,11 +160,11 @@ def test_a_command_of_another_shape_latches(shape: Any) -> None:
     ],
 )
 def test_faults_latch_with_their_reason(s: State, c: Command, reason: Reason) -> None:
-    sent, decision, memory = filtered(s, c, FilterState(), LIMITS, 0.0)
+    sent, decision, safety = judged(s, c)
     assert sent is None
     assert (decision.level, decision.reason) == (FilterAction.LATCH, reason)
-    assert memory.faulted
-    assert memory.last is None
+    assert safety.faulted
+    assert safety.last is None
     assert reason.text in decision.text
     assert "\n" not in decision.text
     # In an earlier state of the tick it counts too.
@@ -177,42 +181,42 @@ def test_just_within_the_limits_is_no_fault() -> None:
         sequence=130,
     )
     last = np.minimum(s.position, 2.5)
-    assert found(s, command(position=last), 0.0, FilterState(last=last))[0] <= FilterAction.LIMIT
+    assert found(s, command(position=last), last=last)[0] <= FilterAction.LIMIT
     assert found(state(), command(), held=False) == (FilterAction.DAMP, Reason.DEAD_MAN)
 
 
-def test_a_fault_lasts_a_second_and_a_latched_one_until_it_is_reset() -> None:
-    soft, hard = (
-        fault(FilterState(), level, Reason.TILT, 10.0)
-        for level in (FilterAction.DAMP, FilterAction.LATCH)
-    )
-    for memory in (soft, hard):
-        sent, decision, after = filtered(state(time=10.0), command(made=10.0), memory, LIMITS, 10.0)
-        assert sent is None
-        assert decision.level == memory.level
-        assert after.faulted
-        assert released(memory, 10.0 + LEAST_DAMPING_S - 1e-6, acknowledged=True).faulted
-    assert not released(soft, 10.0 + LEAST_DAMPING_S).faulted
-    assert released(hard, 1e6).faulted
-    assert not released(hard, 10.0 + LEAST_DAMPING_S, acknowledged=True).faulted
+@pytest.mark.parametrize("level", [FilterAction.DAMP, FilterAction.LATCH])
+def test_a_fault_lasts_a_second_and_a_latched_one_until_it_is_reset(level: FilterAction) -> None:
+    safety = SafetyFilter(limits=LIMITS)
+    safety.fault(level, Reason.TILT, 10.0)
+    sent, decision = safety.judge([state(time=10.0)], command(made=10.0), 10.0)
+    assert (sent, decision) == (None, Decision(level, Reason.TILT))
+    safety.release(10.0 + LEAST_DAMPING_S - 1e-6, acknowledged=True)
+    assert safety.faulted
+    safety.release(1e6)
+    assert safety.faulted is (level is FilterAction.LATCH)
+    safety.release(1e6, acknowledged=True)
+    assert not safety.faulted
 
 
 def test_a_fault_can_only_become_worse() -> None:
-    _, _, memory = filtered(state(), command(made=0.06), FilterState(), LIMITS, 0.06)
-    assert (memory.level, memory.reason) == (FilterAction.DAMP, Reason.NO_STATE)
-    _, decision, memory = filtered(state(), command(made=0.11), memory, LIMITS, 0.11)
-    assert (memory.level, memory.reason) == (FilterAction.LATCH, Reason.STATE_LOST)
-    assert memory.since == 0.06
-    assert decision.level is FilterAction.LATCH
-    assert fault(memory, FilterAction.DAMP, Reason.DEAD_MAN, 0.2) is memory
+    safety = SafetyFilter(limits=LIMITS)
+    for t, level, reason in (
+        (0.06, FilterAction.DAMP, Reason.NO_STATE),
+        (0.11, FilterAction.LATCH, Reason.STATE_LOST),
+    ):
+        _, decision = safety.judge([state()], command(made=t), t)
+        assert (decision.level, decision.reason) == (safety.level, safety.reason) == (level, reason)
+    safety.fault(FilterAction.DAMP, Reason.DEAD_MAN, 0.2)
+    assert (safety.level, safety.reason) == (FilterAction.LATCH, Reason.STATE_LOST)
+    assert safety.since == 0.06
 
 
 def moved(
     s: State, target: np.ndarray, last: np.ndarray | None = None, limits: Limits = LIMITS
 ) -> tuple[np.ndarray, Reason]:
     """The target that is sent, and why it was moved."""
-    memory = FilterState(last=last)
-    sent, decision, _ = filtered(s, command(position=target), memory, limits, 0.0)
+    sent, decision, _ = judged(s, command(position=target), limits=limits, last=last)
     assert sent is not None
     assert decision.level is FilterAction.LIMIT
     return sent.position, decision.reason
@@ -391,14 +395,10 @@ def test_any_input_gives_a_command_within_the_limits_or_damping(
         valid_for=ages[2],
         state_sequence=sequences[1],
     )
-    sent, decision, memory = filtered(s, c, FilterState(), LIMITS, 0.0, held=held)
-    assert (sent is None) == (decision.level >= FilterAction.DAMP) == memory.faulted
+    sent, decision, safety = judged(s, c, held=held)
+    assert (sent is None) == (decision.level >= FilterAction.DAMP) == safety.faulted
     if sent is not None:
         assert np.isfinite(sent.position).all()
         assert (sent.position >= LIMITS.low).all()
         assert (sent.position <= LIMITS.high).all()
         assert held
-
-
-def test_every_reason_has_a_line() -> None:
-    assert len({reason.text for reason in Reason if reason.text}) == len(Reason)

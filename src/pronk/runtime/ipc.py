@@ -30,9 +30,8 @@ Record = np.ndarray[Any, Any] | np.void
 
 def block(record: np.dtype[Any], slots: int) -> np.dtype[Any]:
     """The memory of a mailbox or ring: records written, taken and dropped, and the slots."""
-    slot = [("number", "<u8"), ("checksum", "<u8"), ("record", record)]
-    slot_type = np.dtype(slot, align=True)
-    return np.dtype([("counts", "<u8", 3), ("slots", slot_type, slots)], align=True)
+    slot = np.dtype([("number", "<u8"), ("checksum", "<u8"), ("record", record)], align=True)
+    return np.dtype([("counts", "<u8", 3), ("slots", slot, slots)], align=True)
 
 
 class _Slots:
@@ -43,7 +42,6 @@ class _Slots:
         self._number, self._checksum, self._records = (
             memory["slots"][name] for name in ("number", "checksum", "record")
         )
-        self.size = len(self._records)
 
     @property
     def written(self) -> int:
@@ -61,16 +59,15 @@ class _Slots:
 
     def _store(self, record: Record) -> None:
         number = self.written
-        place = number % self.size
+        place = number % len(self._records)
         self._number[place] = 0
         self._records[place] = record
         self._checksum[place] = zlib.crc32(record.tobytes(), number + 1 & 0xFFFFFFFF)
-        self._number[place] = number + 1
-        self._counts[0] = number + 1
+        self._number[place] = self._counts[0] = number + 1
 
     def _load(self, number: int) -> np.void | None:
         """Record `number`, or None if its slot holds another or is half written."""
-        place = number % self.size
+        place = number % len(self._records)
         data = self._records[place].tobytes()
         checksum = zlib.crc32(data, number + 1 & 0xFFFFFFFF)
         if self._number[place] != number + 1 or self._checksum[place] != checksum:
@@ -89,10 +86,9 @@ class Mailbox(_Slots):
     def read(self) -> np.void | None:
         """The newest record; None before the first, or if the writer is too fast to be read."""
         for _ in range(8):
-            written = self.written
-            if not written:
-                return None
-            record = self._load(written - 1)
+            if not self.written:
+                break
+            record = self._load(self.written - 1)
             if record is not None:
                 return record
         return None
@@ -103,7 +99,7 @@ class Ring(_Slots):
 
     def put(self, record: Record) -> bool:
         """Add a record; False if it did not fit."""
-        fits = self.written - int(self._counts[1]) < self.size
+        fits = self.written - int(self._counts[1]) < len(self._records)
         if fits:
             self._store(record)
         else:
@@ -143,10 +139,10 @@ class Mode(IntEnum):
     """Sitting down."""
     FAULT = 7
     """Joints damped after a fault."""
-    SWEEP = 9
-    """Joints are excited one after another."""
     ENDED = 8
     """The link is closed."""
+    SWEEP = 9
+    """Joints are excited one after another."""
 
 
 class OperatorRequest(IntEnum):
@@ -162,10 +158,10 @@ class OperatorRequest(IntEnum):
     """Stop, sit down, damp."""
     RESET = 5
     """Clear a latched fault whose cause is gone."""
-    CLAMPED = 7
-    """The joints of a sweep are clamped as requested."""
     QUIT = 6
     """Damp and end."""
+    CLAMPED = 7
+    """The joints of a sweep are clamped as requested."""
 
 
 def _fields(kind: str, names: str, *shape: int) -> list[Any]:
@@ -173,13 +169,24 @@ def _fields(kind: str, names: str, *shape: int) -> list[Any]:
     return [(name, f"<{kind}", shape) for name in names.split()]
 
 
-_STATE = _fields("i8", "sequence") + _fields("f8", "time bus_voltage robot_time")
-_STATE += _fields("f8", "position velocity torque temperature", JOINTS)
-_STATE += _fields("f8", "gyro accelerometer", 3) + _fields("f8", "orientation", 4)
+def _state(joints: int) -> list[Any]:
+    return [
+        *_fields("i8", "sequence"),
+        *_fields("f8", "time bus_voltage robot_time"),
+        *_fields("f8", "position velocity torque temperature", joints),
+        *_fields("f8", "gyro accelerometer", 3),
+        *_fields("f8", "orientation", 4),
+    ]
 
-STATE = np.dtype(_STATE + _fields("f8", "now start progress") + _fields("i8", "mode entry"))
-"""Servo to all, every tick: the newest state, the time of tick 0 (`start`), the mode, the number of
-mode changes (`entry`) and the share of a sweep that is done (`progress`)."""
+
+def state_dtype(joints: int) -> np.dtype[Any]:
+    """Servo to all, every tick: the newest state, the time of tick 0 (`start`) and of this one.
+
+    And the mode, the number of mode changes (`entry`) and the share of a sweep that is done.
+    """
+    more = _fields("f8", "now start progress") + _fields("i8", "mode entry")
+    return np.dtype(_state(joints) + more)
+
 
 ACTIONS = np.dtype(
     _fields("i8", "sequence state_sequence entry")
@@ -197,7 +204,7 @@ OPERATOR = np.dtype(
 and jump input."""
 
 TICK = np.dtype(
-    _STATE
+    _state(JOINTS)
     + _fields("i8", "tick mode damped level reason action action_state")
     + _fields("f8", "deadline begun done blend stiffness latency")
     + _fields("f8", "desired sent", JOINTS)
@@ -237,7 +244,7 @@ TEXT = 240
 
 
 def sample_dtype(joints: int) -> np.dtype[Any]:
-    """Record of a sweep, in the order of its log; `kind` is a `SampleKind`.
+    """Servo to logger during a sweep, in the order of its log; `kind` is a `SampleKind`.
 
     `number` of a sample is the index of its excitation, -1 between excitations.
     """
@@ -249,8 +256,6 @@ def sample_dtype(joints: int) -> np.dtype[Any]:
     )
 
 
-SAMPLE = sample_dtype(JOINTS)
-"""Servo to logger during a sweep."""
 EVENT = np.dtype(
     _fields("f8", "time") + _fields("i8", "reason level") + [("kind", "S16"), ("text", f"S{TEXT}")]
 )
@@ -338,66 +343,52 @@ def serve(process: Any, shared: Shared, end: Connection) -> None:
         shared.close()
 
 
-@dataclass(frozen=True, kw_only=True)
-class PolicyAction:
-    """Joint targets of the policy, on the servo's clock."""
-
-    sequence: int
-    state_sequence: int
-    state_time: float
-    made: float
-    valid_for: float
-    entry: int
-    """`StateMachine.entry` that it was computed for."""
-    position: NDArray[np.float64]
-
-
-_MAILBOXES = {"state": STATE, "actions": ACTIONS, "operator": OPERATOR}
-_RINGS = {"ticks": (TICK, 2048), "samples": (SAMPLE, 2048), "steps": (STEP, 256)} | dict.fromkeys(
-    ("events", "policy_events", "events_seen"), (EVENT, 256)
-)
-"""Queues with their sizes: four seconds of ticks."""
-_MEMORY = np.dtype(
-    # The writer of a mailbox is always two slots or more from the one that is read.
-    [(name, block(record, 4)) for name, record in _MAILBOXES.items()]
-    + [(name, block(record, slots)) for name, (record, slots) in _RINGS.items()],
-    align=True,
-)
-
-
 class Shared:
     """The shared memory of a run, made by its first process and attached by the others."""
 
-    def __init__(self, name: str | None = None) -> None:
-        """Make it, or attach to the one of this name."""
-        self._owner = name is None
+    state: Mailbox
+    """Servo to all: `state_dtype`."""
+    actions: Mailbox
+    """Policy to servo: `ACTIONS`."""
+    operator: Mailbox
+    """Operator to servo and policy: `OPERATOR`."""
+    ticks: Ring
+    """Servo to logger: `TICK`. Four seconds of them fit."""
+    samples: Ring
+    """Servo to logger, during a sweep: `sample_dtype`."""
+    steps: Ring
+    """Policy to logger: `STEP`."""
+    events: Ring
+    """Servo to logger: `EVENT`."""
+    policy_events: Ring
+    """Policy to logger: `EVENT`."""
+    events_seen: Ring
+    """Servo to operator: `EVENT`."""
+
+    def __init__(self, name: str | None = None, joints: int = JOINTS) -> None:
+        """Make it, or attach to the one of this name; `joints` of the robot."""
+        mailboxes = {"state": state_dtype(joints), "actions": ACTIONS, "operator": OPERATOR}
+        rings = {"ticks": (TICK, 2048), "samples": (sample_dtype(joints), 2048)}
+        rings |= {"steps": (STEP, 256)}
+        rings |= dict.fromkeys(("events", "policy_events", "events_seen"), (EVENT, 256))
+        # The writer of a mailbox is always two slots or more from the one that is read.
+        blocks = [(each, block(record, 4)) for each, record in mailboxes.items()]
+        blocks += [(each, block(*record_slots)) for each, record_slots in rings.items()]
+        layout = np.dtype(blocks, align=True)
         # A child shares its parent's resource tracker, so nothing is removed when it ends.
         self._memory = (
-            shared_memory.SharedMemory(create=True, size=_MEMORY.itemsize)
+            shared_memory.SharedMemory(create=True, size=layout.itemsize)
             if name is None
             else shared_memory.SharedMemory(name=name)
         )
+        self._owner = name is None
         self.name = self._memory.name
         """Other processes attach by it."""
-        memory: NDArray[Any] = np.ndarray((), dtype=_MEMORY, buffer=self._memory.buf)
-        self.state = Mailbox(memory["state"])
-        """Servo to all: `STATE`."""
-        self.actions = Mailbox(memory["actions"])
-        """Policy to servo: `ACTIONS`."""
-        self.operator = Mailbox(memory["operator"])
-        """Operator to servo and policy: `OPERATOR`."""
-        self.ticks = Ring(memory["ticks"])
-        """Servo to logger: `TICK`."""
-        self.samples = Ring(memory["samples"])
-        """Servo to logger, during a sweep: `SAMPLE`."""
-        self.steps = Ring(memory["steps"])
-        """Policy to logger: `STEP`."""
-        self.events = Ring(memory["events"])
-        """Servo to logger: `EVENT`."""
-        self.policy_events = Ring(memory["policy_events"])
-        """Policy to logger: `EVENT`."""
-        self.events_seen = Ring(memory["events_seen"])
-        """Servo to operator: `EVENT`."""
+        memory: NDArray[Any] = np.ndarray((), dtype=layout, buffer=self._memory.buf)
+        for each in mailboxes:
+            setattr(self, each, Mailbox(memory[each]))
+        for each in rings:
+            setattr(self, each, Ring(memory[each]))
 
     def dropped(self) -> dict[str, int]:
         """Records that did not fit into the queues to the logger."""

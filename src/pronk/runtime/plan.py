@@ -129,10 +129,10 @@ class Plan:
         """The robot of the link."""
         return load_robot(self.link.robot) if self.sweep is None else self.sweep.plan.robot
 
-    def safety(self) -> Limits:
-        """The limits of the safety filter."""
+    def safety(self, torque_kind: TorqueKind = "absent") -> Limits:
+        """The limits of the safety filter, for a machine with such torques."""
         if self.sweep is not None:
-            return self.sweep.limits("absent", **self.limits)
+            return self.sweep.limits(torque_kind, **self.limits)
         return Limits.of(self.robot, **self.limits)
 
     def wanted(self, priority: int, core: int) -> Wanted:

@@ -1,12 +1,12 @@
-"""The safety filter: limits, rules and the memory from one tick to the next.
+"""The safety filter: limits, rules, and the fault that lasts from one tick to the next.
 
-All functions are pure. The rules take arrays with any leading shape (...,) and joints last. Their
-order is that of the faults in `apply_rules`: the first that is met gives the reason. A command
-passes unchanged, or its target is moved into the range that all limits allow, or it is replaced by
+`apply_rules` is a pure function of arrays with any leading shape (...,) and joints last. Its rules
+have an order, that of its table of faults: the first that is met gives the reason. A command passes
+unchanged, or its target is moved into the range that all limits allow, or it is replaced by
 damping. Gains are never changed: a robot with another stiffness is not the one that was matched.
 
-A fault damps for at least one second. `released` clears it; a latched fault needs the operator's
-reset.
+`SafetyFilter` judges the states and the command of a tick by these rules. A fault damps for at
+least one second; a latched fault needs the operator's reset.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -92,7 +93,6 @@ class Limits:
     low: Array
     """Mechanical [rad]."""
     high: Array
-    """Mechanical [rad]."""
     speed: Array
     """Largest measured speed [rad/s]."""
     torque: Array
@@ -159,6 +159,19 @@ class Limits:
                 "they must not fall."
             )
 
+    @cached_property
+    def measured(self) -> tuple[Array, Array]:
+        """Least and largest position, velocity, torque and temperature. Each (4 joints,)."""
+        torque, hot = self.torque * self.measured_torque, np.full_like(self.low, self.temperature)
+        least = (self.low - self.overrun, -self.speed, -torque, np.full_like(hot, -np.inf))
+        most = (self.high + self.overrun, self.speed, torque, hot)
+        return np.concatenate(least), np.concatenate(most)
+
+    @cached_property
+    def gains(self) -> Array:
+        """Largest stiffness and damping of a command. (2 joints,)."""
+        return np.repeat([self.stiffness, self.damping], len(self.joints))
+
     @classmethod
     def of(cls, robot: RobotSpec, **changed: float) -> Limits:
         """The robot's ranges and effort limits, speeds 1.2 times the no-load speed (impacts).
@@ -192,37 +205,59 @@ _ABSURD = 1e6
 _NO_STIFFNESS = 1e-9
 """Stiffness below which a target moves nothing [N m/rad]."""
 
+_DAMP, _LATCH = FilterAction.DAMP, FilterAction.LATCH
+FAULTS = {
+    Reason.STATE_NOT_FINITE: _LATCH,
+    Reason.COMMAND_NOT_FINITE: _LATCH,
+    Reason.GAINS: _LATCH,
+    Reason.CLOCK: _LATCH,
+    Reason.EXPIRED: _LATCH,
+    Reason.STATE_LOST: _LATCH,
+    Reason.NO_STATE: _DAMP,
+    Reason.LAG: _LATCH,
+    Reason.OVERRUN: _LATCH,
+    Reason.TILT: _LATCH,
+    Reason.SPEED: _LATCH,
+    Reason.TEMPERATURE: _LATCH,
+    # After the measurements, which explain more.
+    Reason.IMPOSSIBLE: _LATCH,
+    Reason.DEAD_MAN: _DAMP,
+    Reason.OVERLOAD: _LATCH,
+}
+"""Faults that the rules find, in their order: the first that is met gives the reason."""
+# As plain numbers: members of an enumeration cost as much as a rule.
+_REASONS, _LEVELS = (np.array([int(x) for x in each]) for each in (FAULTS, FAULTS.values()))
+_LIMIT, _HOLD, _OLD_STATE = int(FilterAction.LIMIT), int(FilterAction.HOLD), int(Reason.OLD_STATE)
+_POSITION, _CHANGE, _TORQUE, _POWER = (
+    int(each) for each in (Reason.POSITION, Reason.CHANGE, Reason.TORQUE, Reason.POWER)
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyInput:
-    """Input of the rules. Arrays (..., n) have a number a joint, scalars broadcast to (...,)."""
+    """Input of the rules: states (...,), and a command that broadcasts to them, of n joints.
+
+    Units and frames as in `State` and `Command`; what is not measured is NaN. `position` to
+    `temperature`, `target` to `last` are (..., n), `orientation` (..., 4), `gyro` (..., 3), the
+    others (...,). Ages in seconds.
+    """
 
     position: Array
-    """Measured [rad]. (..., n)"""
     velocity: Array
-    """Measured [rad/s]. (..., n)"""
     torque: Array
-    """Measured [N m]; NaN where it is not. (..., n)"""
     temperature: Array
-    """Of the motors [deg C]; NaN where it is not measured. (..., n)"""
     orientation: Array
-    """Trunk to world, unit quaternion w, x, y, z. (..., 4)"""
     gyro: Array
-    """[rad/s] (..., 3)"""
     state_age: Array | float
     target: Array
-    """Commanded position [rad]. (..., n)"""
     stiffness: Array
-    """[N m/rad] (..., n)"""
     damping: Array
-    """[N m s/rad] (..., n)"""
+    last: Array
+    """The target sent a tick ago, or the measured position after damping [rad]."""
     command_age: Array | float
     valid_for: Array | float
-    """The command's own validity [s]."""
     lag: Array | float
     """States between the newest and the one that the command was computed from."""
-    last: Array
-    """The target sent a tick ago, or the measured position after damping [rad]. (..., n)"""
     held: Mask | bool
     """Whether the dead-man button is held."""
 
@@ -236,18 +271,12 @@ class SafetyResult(NamedTuple):
 
 
 def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
-    """Apply all rules, in order."""
-    n = given.position.shape[-1]
-    parts = (given.position, given.velocity, given.orientation, given.gyro)
-    commanded = (given.target, given.stiffness, given.damping, given.last)
-    values = np.concatenate((*parts, *commanded), axis=-1)
-    fine = np.abs(values) < _ABSURD  # false for NaN too
-    numbers = values if fine.all() else np.where(fine, values, 0.0)
-    q, v, quaternion = numbers[..., :n], numbers[..., n : 2 * n], numbers[..., 2 * n : 2 * n + 4]
-    measured = 2 * n + 7
-    target, kp, kd, last = (
-        numbers[..., measured + k * n : measured + (k + 1) * n] for k in range(4)
-    )
+    """Apply all rules."""
+    n = len(limits.joints)
+    state_fine, seen = _finite(given.position, given.velocity, given.orientation, given.gyro)
+    command_fine, wanted = _finite(given.target, given.stiffness, given.damping, given.last)
+    q, v, quaternion = seen[..., :n], seen[..., n : 2 * n], seen[..., 2 * n : 2 * n + 4]
+    target, kp, kd, last = (wanted[..., k * n : (k + 1) * n] for k in range(4))
     square = (quaternion * quaternion).sum(axis=-1)
     # The trunk's z axis against the world's: the last entry of the rotation matrix.
     sideways = quaternion[..., 1] ** 2 + quaternion[..., 2] ** 2
@@ -258,43 +287,52 @@ def apply_rules(given: SafetyInput, limits: Limits) -> SafetyResult:
         target = np.where(hold[..., None], last, target)
     fitted, why, possible = fit(q, v, target, last, kp, kd, limits)
 
-    damp, latch = FilterAction.DAMP, FilterAction.LATCH
-    # A quaternion far from unit length is no attitude. What is not measured is NaN, and NaN is
-    # within every limit.
-    state_wrong = ~fine[..., :measured].all(axis=-1) | np.isnan(state_age)
-    state_wrong |= np.abs(square - 1.0) > 0.1
-    command_wrong = ~fine[..., measured:].all(axis=-1) | np.isnan(command_age)
-    gains = (kp < 0.0) | (kp > limits.stiffness) | (kd < 0.0) | (kd > limits.damping)
-    overrun = (q < limits.low - limits.overrun) | (q > limits.high + limits.overrun)
-    overload = np.abs(given.torque) > limits.torque * limits.measured_torque
-    faults: tuple[tuple[Reason, FilterAction, Mask], ...] = (
-        (Reason.STATE_NOT_FINITE, latch, state_wrong),
-        (Reason.COMMAND_NOT_FINITE, latch, command_wrong | np.isnan(given.valid_for)),
-        (Reason.GAINS, latch, gains.any(axis=-1)),
-        (Reason.CLOCK, latch, np.minimum(state_age, command_age) < -limits.future_s),
-        (Reason.EXPIRED, latch, command_age > np.minimum(given.valid_for, limits.expiry_s)),
-        (Reason.STATE_LOST, latch, state_age > limits.latch_s),
-        (Reason.NO_STATE, damp, state_age > limits.damp_s),
-        (Reason.LAG, latch, np.asarray(given.lag > limits.lag)),
-        (Reason.OVERRUN, latch, overrun.any(axis=-1)),
-        (Reason.TILT, latch, upright < math.cos(min(limits.tilt, math.pi)) - _SLACK),
-        (Reason.SPEED, latch, (np.abs(v) > limits.speed).any(axis=-1)),
-        (Reason.TEMPERATURE, latch, (given.temperature > limits.temperature).any(axis=-1)),
-        # After the measurements, which explain more.
-        (Reason.IMPOSSIBLE, latch, ~possible),
-        (Reason.DEAD_MAN, damp, np.logical_not(given.held)),
-        (Reason.OVERLOAD, latch, overload.any(axis=-1)),
+    # NaN, where a quantity is not measured, is within every limit.
+    least, most = limits.measured
+    quantities = np.concatenate((q, v, given.torque, given.temperature), axis=-1)
+    outside = (quantities < least) | (quantities > most)
+    beyond = np.asarray(outside.reshape(*q.shape[:-1], 4, n).any(axis=-1))
+    gains = wanted[..., n : 3 * n]
+    gains_wrong = ((gains < 0.0) | (gains > limits.gains)).any(axis=-1)
+    # A quaternion far from unit length is no attitude.
+    state_wrong = ~state_fine | np.isnan(state_age) | (np.abs(square - 1.0) > 0.1)
+    command_wrong = ~command_fine | np.isnan(command_age) | np.isnan(given.valid_for)
+    # In the order of `FAULTS`.
+    faults: tuple[Mask, ...] = (
+        state_wrong,
+        command_wrong,
+        gains_wrong,
+        np.minimum(state_age, command_age) < -limits.future_s,
+        command_age > np.minimum(given.valid_for, limits.expiry_s),
+        state_age > limits.latch_s,
+        state_age > limits.damp_s,
+        np.asarray(given.lag > limits.lag),
+        beyond[..., 0],
+        upright < math.cos(min(limits.tilt, math.pi)) - _SLACK,
+        beyond[..., 1],
+        beyond[..., 3],
+        ~possible,
+        np.logical_not(given.held),
+        beyond[..., 2],
     )
     found = np.empty((*why.shape, len(faults)), dtype=np.bool_)
-    for k, (_, _, met) in enumerate(faults):
+    for k, met in enumerate(faults):
         found[..., k] = met
-    level = np.where(hold, FilterAction.HOLD, np.where(why > 0, FilterAction.LIMIT, 0))
-    reason = np.where(hold, Reason.OLD_STATE, why)
+    level, reason = np.where(why > 0, _LIMIT, 0), why
+    if hold.any():
+        level, reason = np.where(hold, _HOLD, level), np.where(hold, _OLD_STATE, reason)
     if found.any():
         first, faulted = found.argmax(axis=-1), found.any(axis=-1)
-        level = np.where(faulted, np.array([action for _, action, _ in faults])[first], level)
-        reason = np.where(faulted, np.array([what for what, _, _ in faults])[first], reason)
+        level = np.where(faulted, _LEVELS[first], level)
+        reason = np.where(faulted, _REASONS[first], reason)
     return SafetyResult(level=level, reason=reason, target=fitted)
+
+
+def _finite(*parts: Array) -> tuple[Mask, Array]:
+    """Join parts; whether all numbers of a row are finite, and 0 for those that are not."""
+    values = np.concatenate(parts, axis=-1)
+    fine = np.abs(values) < _ABSURD  # false for NaN too
+    return fine.all(axis=-1), (values if fine.all() else np.where(fine, values, 0.0))
 
 
 def fit(
@@ -308,9 +346,8 @@ def fit(
     nearest to the given target in their intersection. If the bus power there is too large, all
     torques are scaled by one factor, the solution of a quadratic equation.
 
-    `q`, `v`, `target` and `last` (sent a tick ago) in rad and rad/s, `kp` and `kd` not negative,
-    all (..., n). Returns the targets (..., n); the limit that moved them, as a `Reason`, or 0
-    (...,); and whether there is a target within all limits (...,).
+    Arguments (..., n) in rad and rad/s, gains not negative. Returns the targets (..., n); the limit
+    that moved them, as a `Reason`, or 0 (...,); and whether any target is within all limits (...,).
     """
     stiff = kp > _NO_STIFFNESS
     divisor = np.where(stiff, kp, 1.0)
@@ -321,20 +358,19 @@ def fit(
     rest = q + kd * v / divisor
     reach = np.where(stiff, limits.torque / divisor, np.inf)
     intervals = (
-        (Reason.POSITION, floor, ceiling),
-        (Reason.CHANGE, last - limits.change, last + limits.change),
-        (Reason.TORQUE, rest - reach, rest + reach),
+        (_POSITION, floor, ceiling),
+        (_CHANGE, last - limits.change, last + limits.change),
+        (_TORQUE, rest - reach, rest + reach),
     )
     low = np.maximum(np.maximum(intervals[0][1], intervals[1][1]), intervals[2][1])
     high = np.minimum(np.minimum(intervals[0][2], intervals[1][2]), intervals[2][2])
     fitted = np.minimum(np.maximum(target, low), high)
-    possible = (low <= high).all(axis=-1)
+    powerless = stiff | (kd * np.abs(v) <= limits.torque)
+    possible: Mask = ((low <= high) & powerless).all(axis=-1)
     why = np.zeros(q.shape[:-1], dtype=np.int64)
     if (fitted != target).any():
         for name, bottom, top in intervals:
-            out = ((target < bottom) | (target > top)).any(axis=-1)
-            why = np.where(out, name, why)
-    possible &= (stiff | (kd * np.abs(v) <= limits.torque)).all(axis=-1)
+            why = np.where(((target < bottom) | (target > top)).any(axis=-1), name, why)
 
     given = _given(q, v, fitted, kp, kd, limits)
     work, loss = _work_and_loss(v, given, limits)
@@ -347,7 +383,7 @@ def fit(
     scaled = q + (given * share[..., None] + kd * v) / divisor
     scaled = np.minimum(np.maximum(scaled, low), high)
     fitted = np.where(much[..., None] & stiff, scaled, fitted)
-    why = np.where(much, Reason.POWER, why)
+    why = np.where(much, _POWER, why)
     work, loss = _work_and_loss(v, _given(q, v, fitted, kp, kd, limits), limits)
     possible &= work + loss <= limits.power_w * (1.0 + _SLACK)
     return fitted, why, possible
@@ -370,28 +406,8 @@ LEAST_DAMPING_S = 1.0
 """Shortest time that a fault damps [s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterState:
-    """The filter's memory of the ticks before."""
-
-    last: Array | None = None
-    """The target sent a tick ago [rad], (joints,); None after damping."""
-    level: FilterAction = FilterAction.PASS
-    """`DAMP` or `LATCH` while a fault lasts."""
-    reason: Reason = Reason.NONE
-    """Of the fault."""
-    since: float = 0.0
-    """When it began [s]."""
-
-    @property
-    def faulted(self) -> bool:
-        """Whether a fault lasts."""
-        return self.level >= FilterAction.DAMP
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterDecision:
-    """The filter's action on a command, and `detail`: joint and numbers of a new fault."""
+class Decision(NamedTuple):
+    """The filter's action on a command; `detail` has joint and numbers of a new fault."""
 
     level: FilterAction
     reason: Reason
@@ -403,82 +419,98 @@ class FilterDecision:
         return f"{self.reason.text} ({self.detail})" if self.detail else self.reason.text
 
 
-def filtered(
-    state: State,
-    command: Command,
-    memory: FilterState,
-    limits: Limits,
-    t: float,
-    *,
-    held: bool = True,
-    earlier: Sequence[State] = (),
-) -> tuple[Command | None, FilterDecision, FilterState]:
-    """Apply the rules to one command.
+@dataclass(kw_only=True)
+class SafetyFilter:
+    """Limits, and what lasts from one tick to the next. Times are on the machine's clock [s]."""
 
-    `memory` is from the tick before, `t` is now on the machine's clock [s], `held` the dead-man
-    button; a fault in any of the `earlier` states since the tick before counts. Returns the command
-    to send, None for damping; the decision; and the memory for the next tick.
-    """
-    n = len(limits.joints)
-    states = (*earlier, state)
-    position = _stacked([each.position for each in states], n)
+    limits: Limits
+    level: FilterAction = FilterAction.PASS
+    """`DAMP` or `LATCH` while a fault lasts."""
+    reason: Reason = Reason.NONE
+    """Of the fault."""
+    since: float = 0.0
+    """When it began [s]."""
+    last: Array | None = None
+    """The target sent a tick ago [rad], (joints,); None after damping."""
 
-    def repeated(values: object) -> Array:
-        return np.repeat(_stacked([values], n), len(states), axis=0)
+    @property
+    def faulted(self) -> bool:
+        """Whether a fault lasts."""
+        return self.level >= _DAMP
 
-    lag = state.sequence - command.state_sequence if command.state_sequence >= 0 else 0
-    result = apply_rules(
-        SafetyInput(
+    def fault(self, level: FilterAction, reason: Reason, t: float) -> None:
+        """Begin a fault, or make one more severe; one that is at least as severe stays."""
+        if level > self.level:
+            self.since = self.since if self.faulted else t
+            self.level, self.reason = level, reason
+
+    def release(self, t: float, *, acknowledged: bool = False) -> None:
+        """End a fault that has lasted long enough; a latched one only if `acknowledged`."""
+        over = self.faulted and t - self.since >= LEAST_DAMPING_S
+        if over and (acknowledged or self.level is FilterAction.DAMP):
+            self.level, self.reason, self.last = FilterAction.PASS, Reason.NONE, None
+
+    def damped(self) -> Decision:
+        """Note a tick without a target; the next one is limited to near the measured position."""
+        self.last = None
+        return Decision(self.level, self.reason)
+
+    def judge(
+        self, states: Sequence[State], command: Command, t: float, *, held: bool = True
+    ) -> tuple[Command | None, Decision]:
+        """Apply the rules to one command; returns what to send, None for damping.
+
+        `states` are those since the tick before, at least one, the newest last; a fault in any of
+        them counts. `held` is the dead-man button.
+        """
+        result = apply_rules(self._input(states, command, t, held), self.limits)
+        # A fault in any of the states decides; the newest if there is none.
+        faulted = result.level >= _DAMP
+        row = int(np.argmax(faulted)) if faulted.any() else -1
+        level, reason = FilterAction(int(result.level[row])), Reason(int(result.reason[row]))
+        if self.faulted or level >= _DAMP:
+            detail = "" if self.faulted else _detail(reason, states[row], command, self.limits, t)
+            if level >= _DAMP:
+                self.fault(level, reason, t)
+            return None, self.damped()._replace(detail=detail)
+        self.last = result.target[-1]
+        return replace(command, position=self.last), Decision(level, reason)
+
+    def _input(
+        self, states: Sequence[State], command: Command, t: float, held: bool
+    ) -> SafetyInput:
+        n, newest = len(self.limits.joints), states[-1]
+        position = _rows([each.position for each in states], n)
+        return SafetyInput(
             position=position,
-            velocity=_stacked([each.velocity for each in states], n),
-            torque=_stacked([each.torque for each in states], n),
-            orientation=_stacked([each.orientation for each in states], 4),
-            gyro=_stacked([each.gyro for each in states], 3),
-            # Temperatures that are not measured are NaN, and NaN is below every limit.
-            temperature=_stacked([each.temperature for each in states], n),
-            state_age=t - state.time,
-            target=repeated(command.position),
-            stiffness=repeated(command.stiffness),
-            damping=repeated(command.damping),
+            velocity=_rows([each.velocity for each in states], n),
+            torque=_rows([each.torque for each in states], n),
+            orientation=_rows([each.orientation for each in states], 4),
+            gyro=_rows([each.gyro for each in states], 3),
+            temperature=_rows([each.temperature for each in states], n),
+            state_age=t - newest.time,
+            target=_rows([command.position], n),
+            stiffness=_rows([command.stiffness], n),
+            damping=_rows([command.damping], n),
             command_age=t - command.made,
             valid_for=float(command.valid_for),
-            lag=lag,
-            last=repeated(position[-1] if memory.last is None else memory.last),
+            lag=newest.sequence - command.state_sequence if command.state_sequence >= 0 else 0,
+            last=position[-1:] if self.last is None else self.last[None],
             held=held,
-        ),
-        limits,
-    )
-    # A fault in any of the states decides; the newest if there is none.
-    faulted = result.level >= FilterAction.DAMP
-    row = int(np.argmax(faulted)) if faulted.any() else -1
-    level, reason = FilterAction(int(result.level[row])), Reason(int(result.reason[row]))
-    if memory.faulted:
-        # A fault can only become worse.
-        if level is FilterAction.LATCH and memory.level is FilterAction.DAMP:
-            memory = replace(memory, level=level, reason=reason)
-        lasting = FilterDecision(level=memory.level, reason=memory.reason)
-        return None, lasting, replace(memory, last=None)
-    if level >= FilterAction.DAMP:
-        numbers = _detail(reason, states[row], command, limits, t)
-        decision = FilterDecision(level=level, reason=reason, detail=numbers)
-        return None, decision, FilterState(level=level, reason=reason, since=t)
-    target = result.target[-1]
-    sent = replace(command, position=target)
-    return sent, FilterDecision(level=level, reason=reason), FilterState(last=target)
+        )
 
 
-def fault(memory: FilterState, level: FilterAction, reason: Reason, t: float) -> FilterState:
-    """The memory with a fault found elsewhere; a fault at least as severe is kept."""
-    if memory.level >= level:
-        return memory
-    return FilterState(level=level, reason=reason, since=memory.since if memory.faulted else t)
-
-
-def released(memory: FilterState, t: float, *, acknowledged: bool = False) -> FilterState:
-    """Clear a fault that has lasted long enough; a latched one only if `acknowledged`."""
-    if not memory.faulted or t - memory.since < LEAST_DAMPING_S:
-        return memory
-    return FilterState() if acknowledged or memory.level is FilterAction.DAMP else memory
+def _rows(rows: Sequence[object], count: int) -> Array:
+    """Rows of numbers; a row that is not `count` numbers is all NaN. (rows, count)."""
+    try:
+        array = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape == (len(rows), count):
+        return array
+    if len(rows) == 1 or all(row is None for row in rows):
+        return np.full((len(rows), count), np.nan)
+    return np.concatenate([_rows([row], count) for row in rows])
 
 
 def _detail(reason: Reason, state: State, command: Command, limits: Limits, t: float) -> str:
@@ -514,18 +546,3 @@ def tilt(orientation: Array) -> float:
     """
     _, x, y, _ = np.asarray(orientation) / np.linalg.norm(orientation)
     return float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))
-
-
-def _stacked(rows: Sequence[object], count: int) -> Array:
-    """Rows of numbers; a row that is not `count` numbers is all NaN. (rows, count)."""
-    if all(row is None for row in rows):
-        return np.full((len(rows), count), np.nan)
-    try:
-        array = np.array(rows, dtype=float)
-    except (TypeError, ValueError):
-        array = np.empty(0)
-    if array.shape == (len(rows), count):
-        return array
-    if len(rows) == 1:
-        return np.full((1, count), np.nan)
-    return np.concatenate([_stacked([row], count) for row in rows])

@@ -1,6 +1,7 @@
 """The state machine of the servo, and the paths on which the robot stands up and sits down.
 
     Idle -> Preflight -> Damp -> Stand -> Policy -> Halt -> Sit -> Damp
+                      -> Sweep -> Damp
                                    any fault -> Fault (damped) -> Damp -> ...
 
 It gives the desired command; the safety filter decides what is sent. Time, states and requests are
@@ -12,26 +13,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import RobotError
-from pronk.links.machine import Command, State
+from pronk.links.machine import Command
 from pronk.robots.robot import RobotSpec
-from pronk.runtime.ipc import Mode, OperatorRequest, PolicyAction
-from pronk.runtime.safety import FilterAction, FilterState, Reason, released
+from pronk.runtime.ipc import Mode, OperatorRequest, Record
+from pronk.runtime.safety import FilterAction, Reason, SafetyFilter
 
 Array = NDArray[np.float64]
 
 PREFLIGHT_S = 0.5
 """How long states are checked before anything is sent [s]."""
 VALID_S = 0.05
-"""How long a target while standing up or sitting down may be repeated [s]."""
+"""How long a target of the servo's own may be repeated [s]."""
 FIRST_ACTION_S = 0.2
 """In which the policy must give its first action [s]."""
 
-_SILENT = (Mode.IDLE, Mode.PREFLIGHT, Mode.ENDED)
+SILENT = (Mode.IDLE, Mode.PREFLIGHT, Mode.ENDED)
+"""Modes in which nothing is sent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,11 +102,6 @@ class Path:
         return t >= self.began + sum(self.seconds)
 
 
-def default_pose(robot: RobotSpec) -> Array:
-    """[rad], (joints,)."""
-    return np.array([joint.default_position for joint in robot.joints])
-
-
 def folded_pose(robot: RobotSpec) -> Array:
     """[rad], (joints,).
 
@@ -121,9 +119,10 @@ def folded_pose(robot: RobotSpec) -> Array:
 
 def stand_up(robot: RobotSpec, measured: Array, began: float, timing: Timing) -> Path:
     """From the measured pose through the folded to the default pose, with growing stiffness."""
+    default = np.array([joint.default_position for joint in robot.joints])
     return Path(
         began=began,
-        poses=(measured.copy(), folded_pose(robot), default_pose(robot)),
+        poses=(measured.copy(), folded_pose(robot), default),
         seconds=(timing.fold_s, timing.rise_s),
         ramp_s=timing.ramp_s,
     )
@@ -134,13 +133,11 @@ def sit_down(robot: RobotSpec, measured: Array, began: float, timing: Timing) ->
     return Path(began=began, poses=(measured.copy(), folded_pose(robot)), seconds=(timing.sit_s,))
 
 
-@dataclass(frozen=True, kw_only=True)
-class DesiredCommand:
+class DesiredCommand(NamedTuple):
     """The command of a tick, before the safety filter."""
 
-    command: Command | None
-    """None: damp, or send nothing if `silent`."""
-    silent: bool = False
+    command: Command | None = None
+    """None: damp, or send nothing in a mode of `SILENT`."""
     blend: float = 0.0
     """Share of the policy in the targets."""
     stiffness: float = 0.0
@@ -159,18 +156,26 @@ class StateMachine:
         """Number of mode changes."""
         self.since = 0.0
         """Time of the last one [s]."""
-        self.refusals: tuple[str, ...] = ()
-        """Of the pre-flight checks."""
         self.notice = ""
         """Why the last request was not granted; empty if it was."""
-        self.controller: Callable[[float, State], DesiredCommand | None] | None = None
-        """Of a sweep: the command at a time [s]; None once the sweep is over."""
+        self.sweep: Callable[[float], Command | None] | None = None
+        """The command of a sweep at a time [s]; None once the sweep is over."""
         self._kp = np.array([joint.stiffness for joint in robot.joints])
         self._kd = np.array([joint.damping for joint in robot.joints])
         self._path: Path | None = None
         self._blending: float | None = None
         self._first_entry = 0
         self._request = OperatorRequest.NONE
+
+    @property
+    def silent(self) -> bool:
+        """Whether nothing is sent."""
+        return self.mode in SILENT
+
+    @property
+    def quitting(self) -> bool:
+        """Whether the operator has requested the end."""
+        return self._request is OperatorRequest.QUIT
 
     def enter(self, mode: Mode, t: float) -> None:
         """Change the mode."""
@@ -179,134 +184,120 @@ class StateMachine:
 
     def preflighted(self, refusals: Sequence[str], t: float) -> None:
         """Leave the pre-flight checks: idle if there are refusals, else damp or begin the sweep."""
-        self.refusals = tuple(refusals)
-        go = Mode.DAMP if self.controller is None else Mode.SWEEP
+        go = Mode.DAMP if self.sweep is None else Mode.SWEEP
         self.enter(Mode.IDLE if refusals else go, t)
 
     def request(self, request: OperatorRequest) -> None:
         """Take a request; it is kept until it can be granted or another comes."""
         self._request = request
 
-    def quitting(self) -> bool:
-        """Whether the operator has requested the end."""
-        return self._request is OperatorRequest.QUIT
-
     def faulted(self, t: float) -> None:
         """Enter `FAULT`, because the filter damps; a fault ends a sweep."""
-        if self.mode is not Mode.FAULT and self.mode not in _SILENT:
-            if self.controller is not None:
+        if self.mode is not Mode.FAULT and not self.silent:
+            if self.sweep is not None:
                 self._request = OperatorRequest.QUIT
-            elif self._request is not OperatorRequest.QUIT:
+            elif not self.quitting:
                 self._request = OperatorRequest.NONE
             self.enter(Mode.FAULT, t)
 
     def step(
         self,
         t: float,
-        state: State,
-        memory: FilterState,
-        action: PolicyAction | None,
-        *,
+        position: Array,
+        safety: SafetyFilter,
+        action: Record | None,
         objection: str = "",
-    ) -> tuple[DesiredCommand, FilterState]:
+    ) -> DesiredCommand:
         """Compute the desired command of one tick.
 
-        `objection` says why the policy may not start. Returns the command, and the filter's memory
-        with a fault released or added.
+        `position` is measured, `action` the policy's newest, a record of `ACTIONS`; `objection`
+        says why the policy may not start. May release a fault of the filter, or add one.
         """
-        memory = self._grant(t, state, memory, objection)
-        if self.mode in _SILENT:
-            return DesiredCommand(command=None, silent=True), memory
-        if self.mode is Mode.SWEEP and self.controller is not None:
-            desired = self.controller(t, state)
-            if desired is not None:
-                return desired, memory
+        self._grant(t, position, safety, objection)
+        if self.mode is Mode.SWEEP and self.sweep is not None:
+            command = self.sweep(t)
+            if command is not None:
+                return DesiredCommand(command, stiffness=1.0)
             self._request = OperatorRequest.QUIT
             self.enter(Mode.DAMP, t)
         if self.mode is Mode.HALT and t - self.since >= self.timing.halt_s:
-            self._sit(t, state)
-        if self._path is None:
-            return DesiredCommand(command=None), memory
-        if self.mode in (Mode.POLICY, Mode.HALT):
-            return self._follow(t, self._path.target(t), action, memory)
-        if self.mode is Mode.SIT and self._path.done(t):
+            self._sit(t, position)
+        if self._path is not None and self.mode in (Mode.POLICY, Mode.HALT):
+            return self._follow(t, self._path.target(t), action, safety)
+        if self._path is not None and self.mode in (Mode.STAND, Mode.SIT):
+            if self.mode is Mode.STAND or not self._path.done(t):
+                return self._pose(t, self._path.target(t), self._path.stiffness(t))
             self.enter(Mode.DAMP, t)
-        if self.mode in (Mode.STAND, Mode.SIT):
-            share = self._path.stiffness(t)
-            return self._pose(t, self._path.target(t), share), memory
-        return DesiredCommand(command=None), memory
+        return DesiredCommand()
 
-    def _grant(self, t: float, state: State, memory: FilterState, objection: str) -> FilterState:
+    def _grant(self, t: float, position: Array, safety: SafetyFilter, objection: str) -> None:
         """Carry out the request as far as the mode allows."""
         request, mode = self._request, self.mode
         stand, reset = OperatorRequest.STAND, OperatorRequest.RESET
         self.notice = ""
         if request in (OperatorRequest.DAMP, OperatorRequest.QUIT):
-            if mode not in (*_SILENT, Mode.FAULT, Mode.DAMP):
+            if mode not in (*SILENT, Mode.FAULT, Mode.DAMP):
                 self.enter(Mode.DAMP, t)
         elif request is OperatorRequest.SIT and mode is Mode.POLICY:
             self.enter(Mode.HALT, t)
         elif request is OperatorRequest.SIT and mode is Mode.STAND:
-            self._sit(t, state)
+            self._sit(t, position)
         elif request in (stand, reset) and mode is Mode.FAULT:
-            memory = released(memory, t, acknowledged=request is reset)
-            if not memory.faulted:
+            safety.release(t, acknowledged=request is reset)
+            if not safety.faulted:
                 self.enter(Mode.DAMP, t)
-            elif memory.level is FilterAction.LATCH and request is stand:
+            elif safety.level is FilterAction.LATCH and request is stand:
                 self.notice = "the fault is latched; request a reset once its cause is gone"
                 self._request = OperatorRequest.NONE
         elif request is stand and mode is Mode.DAMP:
             if t - self.since >= self.timing.damp_s:
-                self._path = stand_up(self.robot, state.position, t, self.timing)
+                self._path = stand_up(self.robot, position, t, self.timing)
                 self._request = OperatorRequest.NONE
                 self.enter(Mode.STAND, t)
         elif request is OperatorRequest.WALK and mode is Mode.STAND and self._stands(t):
-            self._request = OperatorRequest.NONE
-            if objection:
-                self.notice = objection
-            else:
+            self.notice, self._request = objection, OperatorRequest.NONE
+            if not objection:
                 self._blending = None
                 self.enter(Mode.POLICY, t)
                 self._first_entry = self.entry
         if self.mode is not mode and request not in (OperatorRequest.QUIT, stand):
             self._request = OperatorRequest.NONE
-        return memory
 
     def _stands(self, t: float) -> bool:
         return self._path is not None and self._path.done(t)
 
-    def _sit(self, t: float, state: State) -> None:
-        self._path = sit_down(self.robot, state.position, t, self.timing)
+    def _sit(self, t: float, position: Array) -> None:
+        self._path = sit_down(self.robot, position, t, self.timing)
         self.enter(Mode.SIT, t)
 
     def _pose(self, t: float, target: Array, share: float) -> DesiredCommand:
         command = Command(
             position=target, stiffness=share * self._kp, damping=self._kd, made=t, valid_for=VALID_S
         )
-        return DesiredCommand(command=command, stiffness=share)
+        return DesiredCommand(command, stiffness=share)
 
     def _follow(
-        self, t: float, pose: Array, action: PolicyAction | None, memory: FilterState
-    ) -> tuple[DesiredCommand, FilterState]:
+        self, t: float, pose: Array, action: Record | None, safety: SafetyFilter
+    ) -> DesiredCommand:
         """The policy's targets, blended in; the standing pose until the first of them."""
         # Halted before its first action, the policy may act for either mode.
-        if self._blending is None and (action is None or action.entry < self._first_entry):
+        if self._blending is None and (action is None or action["entry"] < self._first_entry):
             if t - self.since > FIRST_ACTION_S:
-                late = FilterState(level=FilterAction.LATCH, reason=Reason.EXPIRED, since=t)
-                return DesiredCommand(command=None), late
-            return self._pose(t, pose, 1.0), memory
+                safety.fault(FilterAction.LATCH, Reason.EXPIRED, t)
+                return DesiredCommand()
+            return self._pose(t, pose, 1.0)
         assert action is not None
         if self._blending is None:
             self._blending = t
         length = self.timing.blend_s
         share = minimum_jerk((t - self._blending) / length) if length > 0.0 else 1.0
         command = Command(
-            position=pose + share * (action.position - pose),
+            position=pose + share * (action["position"] - pose),
             stiffness=self._kp,
             damping=self._kd,
-            sequence=action.sequence,
-            state_sequence=action.state_sequence,
-            made=action.made,
-            valid_for=action.valid_for,
+            sequence=int(action["sequence"]),
+            state_sequence=int(action["state_sequence"]),
+            made=float(action["made"]),
+            valid_for=float(action["valid_for"]),
         )
-        return DesiredCommand(command=command, blend=share, stiffness=1.0), memory
+        return DesiredCommand(command, blend=share, stiffness=1.0)

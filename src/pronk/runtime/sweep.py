@@ -1,10 +1,10 @@
 """Sweeps: excite each joint with its signals and log the response, under the safety filter.
 
 Commands change at the policy's rate on the machine's own clock; every measured state is logged with
-the command in force. `SweepController` gives the commands. `record` runs it on a machine whose
-clock waits (the virtual robot in this process); on a machine in real time the servo runs it
-(`pronk.runtime.servo`). In both, every command passes the safety filter, and whatever happens, the
-joints are left damped and the log up to then stays readable.
+the command in force. `SweepController` gives the commands and the log's records, which `SweepLogs`
+writes. `record` runs it on a machine whose clock waits (the virtual robot in this process); on a
+machine in real time the servo runs it (`pronk.runtime.servo`). In both, every command passes the
+safety filter, and whatever happens, the joints are left damped and the log stays readable.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +27,10 @@ from pronk.logs.joint_log import Segment
 from pronk.logs.mcap_log import LogHeader, McapLogWriter, reason_of
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import TEXT, Record, SampleKind, sample_dtype
-from pronk.runtime.safety import FilterState, Limits, filtered
+from pronk.runtime.safety import Limits, SafetyFilter
+from pronk.runtime.state_machine import VALID_S
 
 Array = NDArray[np.float64]
-Progress = Callable[[float, str], None]
-"""Called with the share that is done, 0 to 1, and what is being done."""
 
 _SAG = 0.05
 """How much farther out than at first a joint may be on the way to its pose [rad]."""
@@ -141,27 +140,28 @@ class SweepLogs:
         kind, time, number = int(record["kind"]), float(record["time"]), int(record["number"])
         writer, columns = self._writer, self._columns
         if kind == SampleKind.OPEN:
-            torque_kind = bytes(record["text"].item()).decode("ascii")
-            self._torque = torque_kind != "absent"
-            self._open(number, virtual=bool(record["virtual"]), torque_kind=torque_kind)
+            self._open(number, bool(record["virtual"]), bytes(record["text"]).decode("ascii"))
         elif writer is None:
             return
         elif kind == SampleKind.SEGMENT:
             writer.segment(self._segment(number, time))
         elif kind == SampleKind.END:
-            reason = bytes(record["text"].item()).decode("ascii")
+            reason = bytes(record["text"]).decode("ascii")
             self.end(complete=not reason, reason=reason)
         else:
-            names = ("command", "position", "velocity", "torque")
-            command, position, velocity, torque = (record[name][columns] for name in names)
-            measured = torque if self._torque else None
+            command, position, velocity = (
+                record[name][columns] for name in ("command", "position", "velocity")
+            )
+            torque = record["torque"][columns] if self._torque else None
             frequency = float(record["frequency"])
-            writer.sample(time, command, position, velocity, measured, frequency, number)
+            writer.sample(time, command, position, velocity, torque, frequency, number)
 
-    def _open(self, index: int, *, virtual: bool, torque_kind: str) -> None:
+    def _open(self, index: int, virtual: bool, torque_kind: str) -> None:
         plan, self._joint = self.task.plan, self.task.excited[index]
+        self._torque = torque_kind != "absent"
         names = logged_joints(plan.robot, self._joint)
         self._columns = columns = [plan.robot.joint_names.index(name) for name in names]
+        rate = f"{plan.rate_hz:g}"
         header = LogHeader(
             robot=plan.robot.name,
             joints=names,
@@ -170,12 +170,8 @@ class SweepLogs:
             pose=plan.pose[columns].tolist(),
             units=("rad",) * len(names),
             virtual=virtual,
-            metadata={
-                "command_rate_hz": f"{plan.rate_hz:g}",
-                "excited": self._joint,
-                "torque": torque_kind,
-                **self.task.metadata,
-            },
+            metadata={"command_rate_hz": rate, "excited": self._joint, "torque": torque_kind}
+            | dict(self.task.metadata),
         )
         self._writer = McapLogWriter(self.task.paths[index], header)
 
@@ -232,88 +228,77 @@ class SweepController:
         self,
         task: SweepTask,
         machine: Machine,
+        safety: SafetyFilter,
         sink: Callable[[Record], object],
         *,
         state: State,
+        start: float,
         real_time: bool,
-        progress: Progress = lambda share, what: None,
-        limits: Mapping[str, float] | None = None,
+        progress: Callable[[float], None] = lambda share: None,
+        written: Callable[[str], None] = lambda name: None,
     ) -> None:
-        """Begin on a machine that is connected.
+        """Begin on a connected machine at `start` on its clock [s], from a measured `state`.
 
-        `sink` takes the log's records (`sample_dtype`); in `real_time` the joints are stiffened
-        first, and held while the operator clamps others; `limits` are other scalar limits of the
-        filter.
+        Until the joints are at the pose, the limits of `safety` are as wide as the joints are at
+        first. In `real_time` the joints are stiffened first, and held while the operator clamps
+        others. `sink` takes the log's records (`sample_dtype`), `progress` the share done, 0 to 1,
+        and `written` the name of each log that is complete.
         """
-        self.task, self.plan, self.machine = task, task.plan, machine
-        self.progress = progress
-        self.tick = 1.0 / self.plan.rate_hz
-        excited = [each for name in task.excited for each in task.excitations(name)]
-        self._seconds = sum(self.plan.seconds(each) for each in excited)
-        self.strict = task.limits(machine.torque_kind, **(limits or {}))
-        q, low, high = state.position, self.strict.low, self.strict.high
-        self.limits = replace(
-            self.strict,
+        self.task, self.plan, self.machine, self.safety = task, task.plan, machine, safety
+        self._sink, self._progress, self._written = sink, progress, written
+        self._real_time, self._state, self._start = real_time, state, start
+        self._tick, self._ticks, self._pose = 1.0 / self.plan.rate_hz, 0, self.plan.pose
+        self._strict = safety.limits
+        q, low, high = state.position, self._strict.low, self._strict.high
+        safety.limits = replace(
+            self._strict,
             low=np.where(q < low, q - _SAG, low),
             high=np.where(q > high, q + _SAG, high),
         )
-        """Of the filter: until the joints are at the pose, as wide as they were at first."""
-        self._sink = sink
-        self._record: NDArray[Any] = np.zeros((), dtype=sample_dtype(len(q)))
-        self._record["virtual"] = machine.virtual
-        self._real_time = real_time
-        self._state = state
+        self._dtype = sample_dtype(len(q))
         self._step = SweepStep(q.copy(), stiffness=0.0 if real_time else 1.0)
-        self._steps = self._all()
-        self._start: float | None = None
-        self._ticks = 0
+        self._steps = self._sequence()
         self._logging = False
         self._sent: deque[tuple[float, Array, float, int]] = deque(maxlen=16)
         self._waiting: list[State] = []
         self._recent: list[State] = []
         self._half = 0.0
+        """Half the spacing of the states [s]."""
 
     @property
     def now(self) -> float:
-        """The present tick on the machine's clock, counted so that rounding never adds up [s]."""
-        assert self._start is not None
-        return self._start + self._ticks * self.tick
+        """The next tick on the machine's clock, counted so that rounding never adds up [s]."""
+        return self._start + self._ticks * self._tick
 
-    def due(self, t: float, slack: float = 0.0) -> bool:
-        """Whether a new command is due [s]."""
-        return self._start is None or t >= self.now - slack
+    def command(self, t: float, states: Sequence[State], slack: float = 0.0) -> Command | None:
+        """The command at `t` [s], a new one once the next tick is due; None once all are over.
 
-    def begin(self, t: float) -> None:
-        """Set the time of the first tick [s]."""
-        self._start = t
-
-    def advance(self, t: float) -> SweepStep | None:
-        """Log the tick that is over and give the next command; None at the end.
+        `states` were measured since the last call, oldest first.
 
         Raises:
             HardwareError: A joint is far from its pose or could not be clamped.
         """
-        if self._start is None:
-            self._start = t
-        if len(self._recent) > 1:
-            first, last = self._recent[0].time, self._recent[-1].time
-            self._half = 0.5 * (last - first) / (len(self._recent) - 1)
-        self._recent.clear()
-        self._log(t)
-        step = next(self._steps, None)
-        if step is not None:
+        self._waiting += states
+        self._recent += states
+        if states:
+            self._state = states[-1]
+        if t >= self.now - slack:
+            if len(self._recent) > 1:
+                first, last = self._recent[0].time, self._recent[-1].time
+                self._half = 0.5 * (last - first) / (len(self._recent) - 1)
+            self._recent.clear()
+            self._log(t)
+            step = next(self._steps, None)
+            if step is None:
+                return None
             self._step = step
             self._ticks += 1
-        return step
-
-    def command(self, t: float, valid_for: float = np.inf) -> Command:
-        """The command of the present tick, made at `t` [s]."""
         return Command(
             position=self._step.target,
             stiffness=self.plan.stiffness * self._step.stiffness,
             damping=self.plan.damping,
             made=t,
-            valid_for=valid_for,
+            valid_for=VALID_S,
         )
 
     def sent(self, t: float, position: Array) -> None:
@@ -323,13 +308,6 @@ class SweepController:
         if last is None or last[2:] != entry[2:] or not np.array_equal(last[1], position):
             self._sent.append(entry)
 
-    def take(self, states: Sequence[State]) -> None:
-        """Note measured states, oldest first."""
-        self._waiting += states
-        self._recent += states
-        if states:
-            self._state = states[-1]
-
     def end(self, reason: str) -> None:
         """Log what is waiting and end an open log; `reason` is empty if the log is complete."""
         if self._logging:
@@ -338,10 +316,11 @@ class SweepController:
         self._logging = False
 
     def _put(self, kind: SampleKind, *, number: int = 0, time: float = 0.0, text: str = "") -> None:
-        record = self._record
+        record = np.zeros(1, dtype=self._dtype)
+        record["virtual"] = self.machine.virtual
         record["kind"], record["number"], record["time"] = kind, number, time
         record["text"] = text.encode("ascii", "replace")[:TEXT]
-        self._sink(record)
+        self._sink(record[0])
 
     def _log(self, until: float) -> None:
         """Log the waiting states whose command is known: those before the next tick.
@@ -350,57 +329,64 @@ class SweepController:
         jitters about the tick, so states less than half their own spacing before it count as at it:
         the command is logged at the nearest state, not at the next.
         """
-        if not self._logging:
-            self._waiting.clear()
+        edge, waiting = until - self._half, self._waiting if self._logging else []
+        states = [state for state in waiting if state.time < edge]
+        self._waiting = [state for state in waiting if state.time >= edge]
+        if not states:
             return
-        edge, record = until - self._half, self._record
-        for state in self._waiting:
-            # A number that is not finite ends the sweep, and would make the log unreadable.
-            if state.time >= edge or not np.isfinite([state.position, state.velocity]).all():
-                continue
-            _, command, frequency, segment = next(
-                (s for s in reversed(self._sent) if s[0] - self._half <= state.time), self._sent[0]
+        records = np.zeros(len(states), dtype=self._dtype)
+        for name in ("time", "position", "velocity", "torque"):
+            records[name] = [getattr(state, name) for state in states]
+        # A number that is not finite ends the sweep, and would make the log unreadable.
+        fine = np.isfinite(records["position"]) & np.isfinite(records["velocity"])
+        for record, loggable in zip(records, fine.all(axis=1), strict=True):
+            _, record["command"], record["frequency"], record["number"] = next(
+                (s for s in reversed(self._sent) if s[0] - self._half <= record["time"]),
+                self._sent[0],
             )
-            record["command"], record["position"] = command, state.position
-            record["velocity"], record["torque"] = state.velocity, state.torque
-            record["frequency"] = frequency
-            self._put(SampleKind.SAMPLE, number=segment, time=state.time)
-        self._waiting = [state for state in self._waiting if state.time >= edge]
+            if loggable:
+                self._sink(record)
 
     # --- the sequence -----------------------------------------------------------------------------
 
-    def _all(self) -> Iterator[SweepStep]:
-        ticks = round(_STIFFEN_S / self.tick) if self._real_time else 0
+    def _sequence(self) -> Iterator[SweepStep]:
+        ticks = round(_STIFFEN_S / self._tick) if self._real_time else 0
         for k in range(1, ticks + 1):
             yield SweepStep(self._step.target, stiffness=k / ticks)
-        done = 0.0
-        for index, (joint, path) in enumerate(zip(self.task.excited, self.task.paths, strict=True)):
-            excitations = self.task.excitations(joint)
+        task, plan = self.task, self.plan
+        all_excitations = [each for name in task.excited for each in task.excitations(name)]
+        whole, done = sum(plan.seconds(each) for each in all_excitations), 0.0
+        for index, (joint, path) in enumerate(zip(task.excited, task.paths, strict=True)):
+            excitations = task.excitations(joint)
             self._waiting.clear()
             self._put(SampleKind.OPEN, number=index, text=self.machine.torque_kind)
             self._logging = True
             yield from self._clamp(())
-            yield from self._move(self.plan.pose)
+            yield from self._move(self._pose)
             yield from self._rest()
             self._check_at_pose()
             yield from self._clamp(excitations[0].clamped)
             yield from self._rest()
             for number, excitation in enumerate(excitations):
-                yield from self._excite(number, excitation, done)
-                done += self.plan.seconds(excitation)
+                for k, step in enumerate(self._excite(number, excitation)):
+                    if k % _PROGRESS_TICKS == 0:
+                        self._progress(min((done + k * self._tick) / whole, 1.0))
+                    yield step
+                done += plan.seconds(excitation)
             yield from self._clamp(())
             self.end("")
-            self.progress(done / self._seconds, f"wrote {path.name}")
+            self._progress(done / whole)
+            self._written(path.name)
 
     def _rest(self, segment: int = -1) -> Iterator[SweepStep]:
-        for _ in range(round(self.plan.settle_s / self.tick)):
-            yield SweepStep(self.plan.pose, segment=segment)
+        for _ in range(round(self.plan.settle_s / self._tick)):
+            yield SweepStep(self._pose, segment=segment)
 
     def _move(self, goal: Array) -> Iterator[SweepStep]:
         """Half a cosine from the present target to the goal."""
         start = self._step.target
         seconds = max(POSE_RAMP_S, float(np.abs(goal - start).max()) / _SOFT_SPEED)
-        ticks = round(seconds / self.tick)
+        ticks = round(seconds / self._tick)
         for k in range(1, ticks + 1):
             yield SweepStep(start + (goal - start) * (0.5 * (1.0 - np.cos(np.pi * k / ticks))))
 
@@ -426,35 +412,32 @@ class SweepController:
 
     def _check_at_pose(self) -> None:
         """Refuse to go on from another pose; from here on the strict limits hold."""
-        away = np.abs(self._state.position - self.plan.pose)
+        away = np.abs(self._state.position - self._pose)
         i = int(np.argmax(away))
         if not away[i] <= _AT_POSE:
             raise HardwareError(
-                f"{self.limits.joints[i]} rests {away[i]:.3f} rad from its pose, expected at most "
+                f"{self._strict.joints[i]} rests {away[i]:.3f} rad from its pose, expected at most "
                 f"{_AT_POSE:g} rad; free the joint, check its drive, or raise the gains."
             )
-        self.limits = self.strict
+        self.safety.limits = self._strict
 
-    def _excite(self, number: int, excitation: Excitation, done: float) -> Iterator[SweepStep]:
+    def _excite(self, number: int, excitation: Excitation) -> Iterator[SweepStep]:
         """One excitation and the rest after it."""
-        rate, signal = self.plan.rate_hz, excitation.signal
+        rate = self.plan.rate_hz
         column = self.plan.robot.joint_names.index(excitation.joint)
-        frequency = signal.frequency(rate)
+        frequency = excitation.signal.frequency(rate)
         # An excitation begins one tick after the last one's rest, so that no sample is in both.
-        yield SweepStep(self.plan.pose)
+        yield SweepStep(self._pose)
         self._put(SampleKind.SEGMENT, number=number, time=self.now)
-        what = f"{excitation.joint}: {signal.amplitude:g} rad, repeat {excitation.repeat + 1}"
         for k, offset in enumerate(excitation.offsets(rate)):
-            target = self.plan.pose.copy()
+            target = self._pose.copy()
             target[column] += offset
             yield SweepStep(target, frequency=float(frequency[k]), segment=number)
-            if k % _PROGRESS_TICKS == 0:
-                self.progress(min((done + k * self.tick) / self._seconds, 1.0), what)
         yield from self._rest(segment=number)
 
 
 def record(
-    machine: Machine, task: SweepTask, progress: Progress = lambda share, what: None
+    machine: Machine, task: SweepTask, progress: Callable[[float], None] = lambda share: None
 ) -> list[Path]:
     """Carry out a sweep on a machine whose clock waits; the link is opened here and closed again.
 
@@ -474,39 +457,42 @@ def record(
     task.check()
     machine.connect()
     try:
-        sink, state = SweepLogs(task).replay, machine.latest()
-        _run(SweepController(task, machine, sink, state=state, real_time=False, progress=progress))
+        states = [machine.latest()]
+        safety = SafetyFilter(limits=task.limits(machine.torque_kind))
+        controller = SweepController(
+            task,
+            machine,
+            safety,
+            SweepLogs(task).replay,
+            state=states[0],
+            start=states[0].time,
+            real_time=False,
+            progress=progress,
+        )
+        try:
+            while True:
+                t = machine.now()
+                command = controller.command(t, states, slack=np.inf)
+                if command is None:
+                    break
+                sent, decision = safety.judge(states, command, t)
+                if sent is None:
+                    raise HardwareError(f"{decision.text}; the joints were damped.")
+                machine.send(sent)
+                controller.sent(t, sent.position)
+                states = machine.wait(controller.now)
+                if not states:
+                    raise HardwareError(
+                        f"{machine.robot} sent no state between {t:.3f} and {controller.now:.3f} "
+                        "s; check the link and that the machine's program runs."
+                    )
+        except BaseException as error:
+            # Damp before the file is finished: the joints come first.
+            machine.damp()
+            controller.end(reason_of(error))
+            raise
     finally:
         # In every case, the interrupt key included, the joints are damped.
         machine.damp()
         machine.close()
     return task.paths
-
-
-def _run(controller: SweepController) -> None:
-    """Commands, filter and log, on a machine whose clock waits."""
-    machine, memory = controller.machine, FilterState()
-    controller.begin(machine.latest().time)
-    states: list[State] = []
-    try:
-        while controller.advance(machine.now()) is not None:
-            t, limits = machine.now(), controller.limits
-            sent, decision, memory = filtered(
-                machine.latest(), controller.command(t), memory, limits, t, earlier=states[:-1]
-            )
-            if sent is None:
-                raise HardwareError(f"{decision.text}; the joints were damped.")
-            machine.send(sent)
-            controller.sent(t, sent.position)
-            states = machine.wait(controller.now)
-            if not states:
-                raise HardwareError(
-                    f"{machine.robot} sent no state between {t:.3f} and {controller.now:.3f} s; "
-                    "check the link and that the machine's program runs."
-                )
-            controller.take(states)
-    except BaseException as error:
-        # Damp before the file is finished: the joints come first.
-        machine.damp()
-        controller.end(reason_of(error))
-        raise
