@@ -144,7 +144,7 @@ def write_log(plan: Plan, header: dict[str, Any], name: str, talk: Connection) -
     """
     leave()
     parent = os.getppid()
-    shared = Shared(name)
+    shared = Shared(name, len(plan.robot.joints))
     try:
         writer: DeployLogWriter | SweepLogs
         if plan.sweep is not None:

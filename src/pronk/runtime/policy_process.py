@@ -72,7 +72,7 @@ def serve_policy(plan: Plan, name: str, end: Connection) -> None:
     """Body of the policy's process."""
     leave()
     assert plan.policy is not None
-    shared = Shared(name)
+    shared = Shared(name, len(plan.robot.joints))
     process = PolicyProcess(plan, shared, load_policy(plan.policy))
     for line in enter(plan.wanted(POLICY_PRIORITY, 1)):
         shared.policy_events.put(event(time.monotonic(), "system", f"policy: {line}"))

@@ -129,7 +129,7 @@ class Deployment:
         """
         plan, context = self.plan, get_context("spawn")
         with terminal_blocked():
-            self.shared = Shared()
+            self.shared = Shared(joints=len(plan.robot.joints))
         name = self.shared.name
         self.write(OperatorCommand())
         self._servo_end, servo_end = context.Pipe(duplex=False)
