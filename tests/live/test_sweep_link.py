@@ -274,7 +274,7 @@ def test_the_interrupt_key_damps_and_keeps_the_log(port: int, tmp_path: Path) ->
     with Listener(port) as listener, pytest.raises(KeyboardInterrupt):
         run_sweep(plan, clamp_operator=Person(), progress=early(press))
     # By the servo's own clock: it logs up to the tick in which it damps.
-    assert 0.0 < cut(tmp_path, "interrupted").time[-1] - pressed[0] < DAMPED_S
+    assert abs(cut(tmp_path, "interrupted").time[-1] - pressed[0]) < DAMPED_S
     assert listener.damped
     assert not active_children()
 
@@ -300,7 +300,7 @@ def test_a_person_clamps_joints_when_requested(
             assert printed in out
             assert bool(printed) is bool(out)
         keys.close()
-        with pytest.raises(HardwareError, match="no person"):
+        with pytest.raises(HardwareError, match="clamp"):
             person(("FR_knee",))
 
 
