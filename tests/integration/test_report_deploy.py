@@ -195,7 +195,7 @@ def test_motor_temperatures_are_drawn_where_they_are_measured(tmp_path: Path) ->
 
 
 def page(path: Path) -> Part:
-    return deploy_page.part(path, path.parent)
+    return deploy_page.part(path)
 
 
 def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ Parts without an artefact are left out; a damaged artefact is an error.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from pronk.errors import ArtefactError, LogError
@@ -21,16 +22,16 @@ from pronk.runtime.log import is_deploy_log
 
 NAME = "report.html"
 LOGS = "*.mcap"
-KINDS: tuple[tuple[str, str, str, Callable[..., Part]], ...] = (
-    (SUMMARY, "trial", "Trial", trial_page.part),
-    (WALK.summary, "walk", "Walking", extra_pages.walk_part),
-    (CROSSING.summary, "crossing", "Crossing gaps and steps", extra_pages.crossing_part),
-    (VARIATION.summary, "variation", "Variation", extra_pages.variation_part),
-    (bodies.FILE, "bodies", "Randomized robots", extra_pages.bodies_part),
-    (LOGS, "deploy", "Deployment", deploy_page.part),
-    ("match.npz", "match", "Match", match_page.part),
-)
-"""Files, anchor, title and builder of each kind of part, in the order of the page."""
+KINDS: dict[str, Callable[[Path], Part]] = {
+    SUMMARY: trial_page.part,
+    WALK.summary: extra_pages.walk_part,
+    CROSSING.summary: extra_pages.crossing_part,
+    VARIATION.summary: extra_pages.variation_part,
+    bodies.FILE: extra_pages.bodies_part,
+    LOGS: deploy_page.part,
+    "match.npz": match_page.part,
+}
+"""How the part of each file is made, in the order of the page."""
 
 
 def artefacts(root: Path, pattern: str) -> list[Path]:
@@ -64,19 +65,22 @@ def write_report(
         )
     parts = []
     base = root if root.is_dir() else root.parent
-    for n, (pattern, anchor, title, make) in enumerate(KINDS):
+    for n, (pattern, make) in enumerate(KINDS.items()):
         progress("report", n / len(KINDS))
         paths = artefacts(root, pattern)
         for i, path in enumerate(paths):
             where = path.relative_to(base)
-            own = f"{title}: {where if pattern == LOGS else where.parent}"
             try:
-                titled = {"anchor": f"{anchor}{i or ''}", "title": own if paths[1:] else title}
-                parts.append(make(path, base, **titled))
+                part = replace(make(path), source=str(where), number=i)
             except LogError:
                 # A link that never opened leaves a log without a tick beside others with ticks.
                 if len(paths) == 1:
                     raise
+                continue
+            if len(paths) > 1:
+                own = where if pattern == LOGS else where.parent
+                part = replace(part, title=f"{part.title}: {own}")
+            parts.append(part)
     if not parts:
         raise ArtefactError(
             f"{root}: nothing to report; neither {SUMMARY} (`pronk trial POLICY --out DIR`) nor "

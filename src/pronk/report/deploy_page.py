@@ -176,7 +176,7 @@ def verdict(log: DeployLog) -> str:
     return f"{robot}: no fault; the policy was active for {active:.1f} s, {inputs}."
 
 
-def part(path: Path, root: Path, *, anchor: str = "deploy", title: str = "Deployment") -> Part:
+def part(path: Path) -> Part:
     """Make the part of a deployment's log.
 
     Raises:
@@ -187,80 +187,84 @@ def part(path: Path, root: Path, *, anchor: str = "deploy", title: str = "Deploy
         known = load_robot(str(log.header["robot"]))
         robot = known if known.joint_names == log.joints else None
     found, (begin, end, about) = run.delay(log, robot), window(log)
-    given = np.isfinite(log.desired).any(axis=1)
+    times, tracking = run.times(log), run.tracking(log)
+    problems = [event for event in log.events if event.kind in _PROBLEMS]
+    summary, given = verdict(log), np.isfinite(log.desired).any(axis=1)
     bad = np.flatnonzero(log.level >= FilterAction.DAMP)
     damped = bad[:1].tolist() if faults(log) else []
-    content = {
-        "log": log,
-        "file": path.name,
-        "later": [
-            (event.kind, float(seconds(log, event.time)), event.text)
-            for event in [event for event in log.events if event.kind in _PROBLEMS][1:]
-        ],
-        "stretches": run.stretches(log),
-        "damped": log.damped[damped[0] :] if damped else None,
-        "damped_age_ms": 1e3 * float(log.state_age[damped[0]]) if damped else None,
-        "given": int(given.sum()),
-        "moved": int((given & np.isin(log.level, (FilterAction.LIMIT, FilterAction.HOLD))).sum()),
-        "missed": run.missed(log),
-        "dropped": sum(log.figures.get("servo", {}).get("dropped", {}).values()),
-        "policy": log.header.get("policy", {}),
-        "overview": picture(overview(log), dense=True),
-        "events": _event_table(log),
-        "close_up": f"{end - begin:.1f} s {about}",
-        "joints": picture(joints(log, begin, end)),
-        "joint_table": _joint_table(log, robot),
-        "delay": found,
-        "delay_table": _delay_table(found),
-        "timing": _timing_table(log),
-        "interventions": _intervention_table(log),
-    }
-    problem = any(event.kind in _PROBLEMS for event in log.events)
-    return Part(
-        kind="deploy",
-        anchor=anchor,
-        title=title,
-        source=str(path.relative_to(root)),
-        virtual=log.virtual,
-        summary=verdict(log),
-        warning=problem or not log.complete or found.within is False,
-        content=content,
-        figures=_figures(log, found),
-    )
-
-
-def _figures(log: DeployLog, found: Delay) -> dict[str, Any]:
-    """Return what `--json` gives; times in s."""
-    of_kind = {kind: [e.text for e in log.events if e.kind == kind] for kind in _PROBLEMS}
-    return {
+    figures: dict[str, Any] = {  # of `--json`; times in s
         "kind": "deploy",
         "robot": log.header["robot"],
         "virtual": log.virtual,
         "complete": log.complete,
-        "verdict": verdict(log),
+        "verdict": summary,
         "modes": [(mode.name, begin, length) for mode, begin, length in run.stretches(log)],
-        "faults": of_kind["fault"],
-        "refusals": of_kind["refused"],
+        "faults": [event.text for event in problems if event.kind == "fault"],
+        "refusals": [event.text for event in problems if event.kind == "refused"],
         "missed_ticks": run.missed(log),
-        "times": {name: run.quantiles(values) for name, (values, _) in run.times(log).items()},
+        "times": {name: run.quantiles(values) for name, (values, _) in times.items()},
         "delay": vars(found) | {"within": found.within},
         "interventions": run.interventions(log),
-        "tracking_rms_rad": dict(zip(log.joints, run.tracking(log)["error"], strict=True)),
+        "tracking_rms_rad": dict(zip(log.joints, tracking["error"], strict=True)),
     }
-
-
-def _event_table(log: DeployLog) -> Sheet:
     events = sorted(log.events, key=lambda event: event.time)
-    rows = [(float(seconds(log, one.time)), one.kind, one.text) for one in events]
-    return table("time [s] | kind | text", rows)
+    content = {
+        "log": log,
+        "file": path.name,
+        "figures": figures,
+        "later": [(one.kind, float(seconds(log, one.time)), one.text) for one in problems[1:]],
+        "damped": log.damped[damped[0] :] if damped else None,
+        "damped_age_ms": 1e3 * float(log.state_age[damped[0]]) if damped else None,
+        "given": int(given.sum()),
+        "moved": int((given & np.isin(log.level, (FilterAction.LIMIT, FilterAction.HOLD))).sum()),
+        "dropped": sum(log.figures.get("servo", {}).get("dropped", {}).values()),
+        "policy": log.header.get("policy", {}),
+        "overview": picture(overview(log), dense=True),
+        "events": table(
+            "time [s] | kind | text",
+            [(float(seconds(log, one.time)), one.kind, one.text) for one in events],
+        ),
+        "close_up": f"{end - begin:.1f} s {about}",
+        "joints": picture(joints(log, begin, end)),
+        "joint_table": _joint_table(log, tracking, robot),
+        "delay": found,
+        "delay_table": _delay_table(found),
+        "timing": table(
+            "[ms] | n | 50 % | 95 % | 99 % | 99.9 % | max",
+            [
+                (name, one["n"], *(1e3 * value for value in list(one.values())[1:]))
+                for name, one in figures["times"].items()
+            ],
+            *(f"{name}: {meaning}." for name, (_, meaning) in times.items()),
+        ),
+        "interventions": table(
+            "action | ticks | first at [s];2 | largest change [rad] | joint | reason",
+            [
+                (
+                    one["level"].lower(),
+                    *(one[n] for n in ("ticks", "first", "largest", "joint", "why")),
+                )
+                for one in figures["interventions"]
+            ],
+            "joint: the one whose target was changed most often for this reason.",
+        ),
+    }
+    return Part(
+        kind="deploy",
+        title="Deployment",
+        virtual=log.virtual,
+        summary=summary,
+        warning=bool(problems) or not log.complete or found.within is False,
+        content=content,
+        figures=figures,
+    )
 
 
-def _joint_table(log: DeployLog, robot: RobotSpec | None) -> Sheet:
+def _joint_table(log: DeployLog, tracking: dict[str, Array], robot: RobotSpec | None) -> Sheet:
     unknown = [np.nan] * len(log.joints)
     effort = [joint.drive.effort_limit for joint in robot.joints] if robot else unknown
     speed = log.header.get("limits", {}).get("speed", unknown)
-    measures = (*run.tracking(log).values(), effort, speed)
-    rows = zip(map(joint_words, log.joints), *measures, strict=True)
+    rows = zip(map(joint_words, log.joints), *tracking.values(), effort, speed, strict=True)
     columns = "joint | error standing, RMS [rad] | error, RMS [rad] | largest error [rad]"
     columns += " | torque, RMS [N m];1 | largest torque [N m];1 | largest speed [rad/s];1"
     return table(
@@ -281,22 +285,3 @@ def _delay_table(found: Delay) -> Sheet:
     )
     scaled = [(name, 1e3 * low, 1e3 * high, source) for name, low, high, source in rows]
     return table("delay | from [ms];1 | to [ms];1 | source", scaled if found.command["n"] else ())
-
-
-def _timing_table(log: DeployLog) -> Sheet:
-    found, rows = run.times(log), []
-    for name, (values, _) in found.items():
-        n, *rest = run.quantiles(values).values()
-        rows.append((name, n, *(1e3 * value for value in rest)))
-    notes = [f"{name}: {meaning}." for name, (_, meaning) in found.items()]
-    return table("[ms] | n | 50 % | 95 % | 99 % | 99.9 % | max", rows, *notes)
-
-
-def _intervention_table(log: DeployLog) -> Sheet:
-    names = ("level", "ticks", "first", "largest", "joint", "why")
-    rows = [[one[name] for name in names] for one in run.interventions(log)]
-    return table(
-        "action | ticks | first at [s];2 | largest change [rad] | joint | reason",
-        [(row[0].lower(), *row[1:]) for row in rows],
-        "joint: the one whose target was changed most often for this reason.",
-    )

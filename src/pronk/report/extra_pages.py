@@ -35,16 +35,10 @@ _WALK_TABLE = (
 _OF_POLICY = "training gains of "
 
 
-def _part(
-    path: Path, root: Path, origin: Results | Bodies, content: dict[str, Any], **fields: Any
-) -> Part:
+def _part(origin: Results | Bodies, content: dict[str, Any], **fields: Any) -> Part:
     where = "virtual robot" if origin.virtual else "robot"
-    return Part(
-        source=str(path.relative_to(root)),
-        virtual=origin.virtual,
-        content=content | {"results": origin, "where": where},
-        **fields,
-    )
+    content |= {"results": origin, "where": where}
+    return Part(virtual=origin.virtual, content=content, **fields)
 
 
 def _definitions(figures: Iterable[Any]) -> Sheet:
@@ -70,8 +64,8 @@ def walk_tables(walks: Results) -> tuple[Sheet, ...]:
     return tuple(sheets)
 
 
-def walk_part(path: Path, root: Path, **names: str) -> Part:
-    """Make the part of the walks in `path`, a `walk.json`; `names` are its anchor and title."""
+def walk_part(path: Path) -> Part:
+    """Make the part of the walks in `path`, a `walk.json`."""
     walks, figure = results_file.load(path.parent, WALK), "speed_error_averaged"
     first = walks.subjects[0].name
     own = [cell for cell in walks.cells if cell.policy == first]
@@ -85,8 +79,8 @@ def walk_part(path: Path, root: Path, **names: str) -> Part:
         "definitions": _definitions(WALK_FIGURES.values()),
     }
     summary = f"{first}, {place(walks)}: {fell} of {n} walks ended in a fall."
-    fields = {"kind": "walk", "summary": summary, "warning": fell > 0}
-    return _part(path, root, walks, content, **fields, **names)
+    fields = {"kind": "walk", "title": "Walking", "warning": fell > 0}
+    return _part(walks, content, summary=summary, **fields)
 
 
 def climb_line(climb: Climb) -> Array:
@@ -121,8 +115,8 @@ def crossing_table(crossings: Results) -> Sheet:
     return table(columns, rows, *notes, title="Largest obstacles [m]")
 
 
-def crossing_part(path: Path, root: Path, **names: str) -> Part:
-    """Make the part of the crossings in `path`, a `crossing.json`, as `walk_part`."""
+def crossing_part(path: Path) -> Part:
+    """Make the part of the crossings in `path`, a `crossing.json`."""
     crossings = results_file.load(path.parent, CROSSING)
     first, found = crossings.subjects[0].name, climbs(crossings)
     panels = [
@@ -147,7 +141,9 @@ def crossing_part(path: Path, root: Path, **names: str) -> Part:
     figure = draw.lines(panels, columns=len(crossings.cases), mark=mark, bar="95 % interval")
     content = {"curves": picture(figure), "sheet": crossing_table(crossings)}
     summary = f"{first}, {place(crossings)}: gaps crossed {crossed or 'none'}."
-    return _part(path, root, crossings, content, kind="crossing", summary=summary, **names)
+    return _part(
+        crossings, content, kind="crossing", title="Crossing gaps and steps", summary=summary
+    )
 
 
 def by_value(variation: Results, parameter: str, policy: str) -> list[tuple[Cell, ...]]:
@@ -206,8 +202,8 @@ def variation_panels(variation: Results) -> list[Panel]:
     return found
 
 
-def variation_part(path: Path, root: Path, **names: str) -> Part:
-    """Make the part of the variation in `path`, a `variation.json`, as `walk_part`."""
+def variation_part(path: Path) -> Part:
+    """Make the part of the variation in `path`, a `variation.json`."""
     variation = results_file.load(path.parent, VARIATION)
     first, parameters = variation.subjects[0].name, parameters_of(variation)
     own = [cell for cell in variation.cells if cell.policy == first]
@@ -220,7 +216,7 @@ def variation_part(path: Path, root: Path, **names: str) -> Part:
         "definitions": _definitions(FIGURES[name] for name in varied.VARIED_FIGURES),
     }
     summary = f"{first}, {place(variation)}: {landed} of {n} jumps on varied robots landed."
-    return _part(path, root, variation, content, kind="variation", summary=summary, **names)
+    return _part(variation, content, kind="variation", title="Variation", summary=summary)
 
 
 def errors_db(bodies: Bodies) -> dict[str, float]:
@@ -260,8 +256,8 @@ def _gains_table(bodies: Bodies) -> Sheet:
     )
 
 
-def bodies_part(path: Path, root: Path, **names: str) -> Part:
-    """Make the part of the randomized robots in `path`, a `bodies.json`, as `walk_part`."""
+def bodies_part(path: Path) -> Part:
+    """Make the part of the randomized robots in `path`, a `bodies.json`."""
     bodies = bodies_file.load(path.parent)
     errors = errors_db(bodies)
     cells = [cell for body in bodies.bodies for cell in body.trial.cells]
@@ -284,4 +280,4 @@ def bodies_part(path: Path, root: Path, **names: str) -> Part:
     }
     where = "virtual robot" if bodies.virtual else "robot"
     summary = f"{len(bodies.bodies)} other {where}s: {landed} of {n} jumps landed."
-    return _part(path, root, bodies, content, kind="bodies", summary=summary, **names)
+    return _part(bodies, content, kind="bodies", title="Randomized robots", summary=summary)

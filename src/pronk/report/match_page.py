@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,15 +111,13 @@ def write_page(folder: Path, *, gains: str | None = None) -> tuple[Path, Part]:
 
     Arguments and errors as of `load`.
     """
-    made = part(folder / "match.npz", folder, gains=gains)
+    made = replace(part(folder / "match.npz", gains), source="match.npz")
     write_text(folder / PAGE_NAME, page(made.title, [made]))
     return folder / PAGE_NAME, made
 
 
-def part(
-    path: Path, root: Path, *, anchor: str = "match", title: str = "Match", gains: str | None = None
-) -> Part:
-    """Make the part of the match in `path`, a `match.npz`; other arguments as of `load`.
+def part(path: Path, gains: str | None = None) -> Part:
+    """Make the part of the match in `path`, a `match.npz`; `gains` as of `load`.
 
     Raises:
         ArtefactError: An artefact is missing or damaged.
@@ -163,9 +162,7 @@ def part(
     }
     return Part(
         kind="match",
-        anchor=anchor,
-        title=f"{title} of {own.robot}",
-        source=str(path.relative_to(root)),
+        title=f"Match of {own.robot}",
         virtual=own.virtual,
         summary=f"{found['matched']} of {found['joints']} joints matched.",
         warning=found["matched"] < found["joints"] or bool(found["flags"]),

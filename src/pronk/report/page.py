@@ -22,11 +22,7 @@ class Part:
 
     kind: str
     """Its template is `templates/KIND.html.j2`."""
-    anchor: str
-    """Begins the anchors of all its sections."""
     title: str
-    source: str
-    """The file it is made from, below the folder of the page."""
     virtual: bool
     """Measured on the virtual robot."""
     summary: str
@@ -37,6 +33,15 @@ class Part:
     """Variables of the template."""
     figures: Mapping[str, Any] = field(default_factory=dict)
     """What `--json` gives of it."""
+    source: str = ""
+    """The file it is made from, below the folder of the page."""
+    number: int = 0
+    """Among the parts of its kind on the page."""
+
+    @property
+    def anchor(self) -> str:
+        """Begins the anchors of all its sections."""
+        return f"{self.kind}{self.number or ''}"
 
 
 def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:

@@ -120,14 +120,15 @@ def _image(path: Path) -> str:
     return style.data_uri(data, path.suffix[1:])
 
 
-def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial") -> Part:
+def part(path: Path) -> Part:
     """Make the part of the trial in `path`, a `summary.json`.
 
     Raises:
         ArtefactError: The trial, a capture or a picture is damaged.
     """
     folder = path.parent
-    trial, where = load(folder), tables.place(load(folder))
+    trial = load(folder)
+    where = tables.place(trial)
     checks, first = trial_checks(trial), trial.subjects[0].name
     passed = sum(check.passed for check in checks)
     pictures, names = films(folder)
@@ -154,9 +155,7 @@ def part(path: Path, root: Path, *, anchor: str = "trial", title: str = "Trial")
     }
     return Part(
         kind="trial",
-        anchor=anchor,
-        title=title,
-        source=str(path.relative_to(root)),
+        title="Trial",
         virtual=trial.virtual,
         summary=f"{first}, {where}: {passed} of {len(checks)} acceptance criteria passed.",
         warning=passed < len(checks),
