@@ -1,0 +1,282 @@
+"""Commands: ranges, fractions, intervals, and what the jump state receives of the motion."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.stats import binomtest, kstest
+from torch import Tensor
+
+import training_env
+from pronk.train.mdp.commands import MotionCommand, motion_command
+from pronk.train.mdp.speed_ranges import Growth, SpeedRanges
+from training_env import N
+
+pytestmark = pytest.mark.train
+
+Array = NDArray[np.float64]
+DT = 0.02
+LIMITS = np.array([3.0, 1.0, 2.0])  # C1 to C3
+ALL = torch.arange(N)
+
+
+@pytest.fixture
+def env() -> Any:
+    return training_env.fresh(training_env.nominal())
+
+
+@pytest.fixture
+def command(env: Any) -> MotionCommand:
+    return motion_command(env)
+
+
+def velocities(command: MotionCommand, rounds: int) -> Array:
+    """Velocity commands at the beginning of many episodes. (rounds * N, 3)"""
+    found = []
+    for _ in range(rounds):
+        command.reset(ALL)
+        found.append(command.velocity.clone())
+    return np.float64(torch.cat(found).numpy())
+
+
+def test_velocities_are_uniform_in_the_given_fractions(command: MotionCommand) -> None:
+    """10 of 100 stand, 40 move along one axis, each as often; the others along all."""
+    command.ranges.grown.fill_(1e6)
+    velocity = velocities(command, 1000)
+    moves = velocity != 0.0
+    axes, total = moves.sum(axis=1), len(moves)
+    fractions = [(axes == 0, 0.1), (axes == 1, 0.4), (axes == 3, 0.5)]
+    fractions += [(moves[:, axis] & (axes == 1), 0.4 / 3) for axis in range(3)]
+    for found, fraction in fractions:
+        assert binomtest(int(found.sum()), total, fraction).pvalue > 1e-4
+    assert not (axes == 2).any()
+    for axis, limit in enumerate(LIMITS):
+        for rows in (axes == 3, (axes == 1) & moves[:, axis]):
+            test = kstest(velocity[rows, axis], "uniform", args=(-limit, 2 * limit))
+            assert test.pvalue > 1e-3
+    whole = velocity[axes == 3]
+    correlation = np.corrcoef(whole, rowvar=False)[np.triu_indices(3, 1)]
+    assert np.abs(correlation).max() < 4.0 / math.sqrt(len(whole))
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.65])
+def test_velocities_use_the_present_ranges(
+    command: MotionCommand, monkeypatch: pytest.MonkeyPatch, fraction: float
+) -> None:
+    monkeypatch.setattr(command, "ranges", SpeedRanges(Growth(start=fraction), "cpu"))
+    most = np.abs(velocities(command, 200)).max(axis=0)
+    assert (most <= fraction * LIMITS + 1e-6).all()
+    assert (most > 0.97 * fraction * LIMITS).all()
+
+
+@pytest.mark.parametrize("scripted", [False, True])
+def test_ranges_follow_the_tracking_unless_scripted(env: Any, scripted: bool) -> None:
+    """All robots are commanded to stand, and stand."""
+    command = motion_command(env)
+    command.scripted = scripted
+    for _ in range(5):
+        command.velocity.zero_()
+        env.step(torch.zeros(N, 12))
+    assert (float(command.ranges.tracking) > 0.02) is not scripted
+
+
+def test_velocities_last_two_to_six_seconds(command: MotionCommand) -> None:
+    command.reset(ALL)
+    passed = torch.tensor([DT] * (N - 1) + [0.0])
+    before = command.time_left.clone()
+    assert ((before >= 2.0) & (before <= 6.0)).all()
+    command.compute(passed)
+    torch.testing.assert_close(command.time_left, before - passed)
+    spans, left = [], command.time_left
+    for _ in range(6000):
+        before = command.time_left.clone()
+        command.compute(DT)
+        left = command.time_left
+        spans += left[left > before].tolist()
+    assert len(spans) > 150
+    assert kstest(spans, "uniform", args=(2.0, 4.0)).pvalue > 1e-3
+
+
+def test_jump_inputs_have_random_intervals_and_known_times() -> None:
+    """C4: half of the robots, always the same; on and off for times from their ranges."""
+    env = training_env.fresh(training_env.nominal(), "jump_a")
+    command = motion_command(env)
+    command.reset(ALL)
+    jumper = command.jumper.clone()
+    assert abs(int(jumper.sum()) - N // 2) <= 1
+    seen = []
+    for _ in range(6000):
+        left, before = command.jump_left.clone(), command.jump.clone()
+        command.compute(DT)
+        assert torch.equal(command.jump != before, jumper & (left <= DT))
+        assert not command.jump_left[~jumper].any()
+        seen.append(command.jump.clone())
+    jump = np.int64(torch.stack(seen).numpy())
+    assert (jump.any(axis=0) == jumper.numpy()).all()
+    on, off = [], []
+    for robot in jump.T[jumper.numpy()]:
+        for begin, end in itertools.pairwise(np.flatnonzero(np.diff(robot, prepend=0))):
+            (on if robot[begin] else off).append((end - begin) * DT)
+    for spans, (low, high) in ((on, command.cfg.jump_on_s), (off, command.cfg.jump_off_s)):
+        assert len(spans) > 100
+        assert low - 1e-5 <= min(spans)
+        assert max(spans) <= high + DT + 1e-5
+        assert kstest(spans, "uniform", args=(low, high - low + DT)).statistic < 0.15
+
+
+def tensors(command: MotionCommand) -> dict[str, Tensor]:
+    found = {name: getattr(command, name) for name in ("velocity", "jump", "time_left")}
+    found |= {f"state.{n}": t for n, t in vars(command.state).items() if torch.is_tensor(t)}
+    return {name: tensor.clone() for name, tensor in found.items()}
+
+
+@pytest.mark.parametrize("through_env", [False, True])
+def test_reset_affects_one_robot_alone(through_env: bool) -> None:
+    env = training_env.fresh(training_env.nominal(), "jump_a")
+    command = motion_command(env)
+    for _ in range(3):
+        command.jump[:] = True
+        env.step(torch.rand(N, 12) - 0.5)
+    command.jump[:] = True
+    before = tensors(command)
+    assert before["state.mode"].all()
+    ids = torch.tensor([3])
+    _ = env.reset(env_ids=ids) if through_env else command.reset(ids)
+    after = tensors(command)
+    for name in before:
+        assert torch.equal(after[name][ALL != 3], before[name][ALL != 3]), name
+        assert not (name.startswith("state.") and after[name][3].any()), name
+    assert not command.jump[3]
+    assert 2.0 <= float(command.time_left[3]) <= 6.0
+
+
+def test_scripted_commands_are_set_by_the_caller_alone() -> None:
+    env = training_env.fresh(training_env.nominal(), "jump_a", scripted=True)
+    command = motion_command(env)
+    velocity, jump = command.velocity, command.jump
+    velocity[:], jump[:] = torch.rand(N, 3), ALL % 2 == 0
+    given = velocity.clone()
+    env.episode_length_buf[1] = 10**6  # an episode that ends has no effect either
+    for _ in range(3):
+        env.step(torch.zeros(N, 12))
+    for _ in range(400):
+        command.compute(DT)
+    command.reset(ALL)
+    assert command.velocity is velocity
+    assert command.jump is jump
+    assert torch.equal(velocity, given)
+    assert jump.tolist() == [i % 2 == 0 for i in range(N)]
+    assert not command.state.mode.any(), "jumps under way are cleared all the same"
+
+
+@pytest.mark.parametrize(
+    ("velocity", "overspeed", "target"),
+    [
+        # .35 m/s more, in proportion below 1 m/s, in the same direction.
+        ((2.0, 0.0, 1.0), 0.0, (2.35, 0.0)),
+        ((-1.2, 0.9, 0.0), 0.0, (-1.48, 1.11)),
+        ((0.0, -0.5, 0.0), 0.0, (0.0, -0.675)),
+        ((0.0, 0.0, 1.0), 0.0, (0.0, 0.0)),
+        # The overspeed at the command is added.
+        ((2.0, 0.0, 1.0), 0.5, (2.85, 0.0)),
+        ((-1.2, 0.9, 0.0), 0.5, (-1.88, 1.41)),
+    ],
+)
+def test_target_velocity_in_jump_mode(
+    command: MotionCommand,
+    monkeypatch: pytest.MonkeyPatch,
+    velocity: tuple[float, ...],
+    overspeed: float,
+    target: tuple[float, float],
+) -> None:
+    monkeypatch.setattr(command.cfg, "jump_speed_added", 0.35)
+    command.velocity[:] = torch.tensor(velocity)
+    command.state.overspeed = torch.full((N,), overspeed)
+    command.state.mode = ALL == 1
+    assert command.target[0].tolist() == pytest.approx(list(velocity[:2]))
+    assert command.target[1].tolist() == pytest.approx(list(target))
+    assert not command.standing.any()
+    command.velocity.zero_()
+    assert command.standing.tolist() == [i != 1 for i in range(N)]
+
+
+def received(
+    env: Any, monkeypatch: pytest.MonkeyPatch, yaw: float, pitch: float, velocity: tuple[float, ...]
+) -> dict[str, Tensor]:
+    """What the jump state receives of robots with that attitude [deg] and velocity [m/s]."""
+    command, given = motion_command(env), {}
+    monkeypatch.setattr(command.state, "advance", given.update)
+    (cy, cp), (sy, sp) = (
+        [f(math.radians(angle) / 2.0) for angle in (yaw, pitch)] for f in (math.cos, math.sin)
+    )
+    # Yaw about z, then pitch about the turned y.
+    env.sim.data.qpos[:, 3:7] = torch.tensor([cy * cp, -sy * sp, cy * sp, sy * cp])
+    env.sim.data.qvel[:, :3] = torch.tensor(velocity)
+    env.common_step_counter += 1
+    assert command.motion is command.motion
+    return given
+
+
+@pytest.mark.parametrize("pitch", [0.0, 50.0])
+@pytest.mark.parametrize(
+    ("yaw", "velocity", "direction"),
+    [
+        (0.0, (2.0, 0.0, 0.0), (1.0, 0.0)),
+        (90.0, (0.5, 0.0, 1.0), (0.0, 1.0)),
+        (90.0, (0.6, 0.8, 0.0), (-0.8, 0.6)),
+        (-60.0, (-1.0, 0.0, 0.0), (-0.5, 0.866025)),
+        (90.0, (0.0, 0.0, 2.0), (0.0, 0.0)),
+    ],
+)
+def test_direction_of_a_jump_in_the_world(
+    env: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    yaw: float,
+    pitch: float,
+    velocity: tuple[float, ...],
+    direction: tuple[float, float],
+) -> None:
+    motion_command(env).velocity[:] = torch.tensor(velocity)
+    given = received(env, monkeypatch, yaw, pitch, (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(given["direction"], [direction] * N, atol=1e-5)
+    assert given["feet"] is motion_command(env).motion.foot_position
+
+
+@pytest.mark.parametrize(
+    ("commanded", "moves", "pitch", "jumps", "along", "excess", "error"),
+    [
+        # With .25 added the target is 2.25 m/s, and `along` goes up to it.
+        ((2.0, 0.0), (3.0, 1.0, 0.0), 0.0, True, 2.25, 1.0, math.hypot(0.75, 1.0)),
+        ((2.0, 0.0), (3.0, 1.0, 0.0), 0.0, False, 2.0, 1.0, math.hypot(1.0, 1.0)),
+        ((0.0, -0.5), (1.0, -0.4, 0.0), 0.0, True, 0.4, -0.1, math.hypot(1.0, 0.225)),
+        ((-1.0, 0.0), (0.5, 0.0, 0.0), 0.0, True, -0.5, -1.5, 1.75),
+        ((0.0, 0.0), (1.0, 1.0, 0.0), 0.0, True, 0.0, 0.0, math.sqrt(2.0)),
+        # Upward motion of a pitched trunk is no forward motion.
+        ((1.0, 0.0), (1.0, 0.0, 2.5), 17.0, False, 1.0, 0.0, 0.0),
+        ((-2.0, 0.0), (1.0, 0.0, 2.5), -17.0, False, -1.0, -3.0, 3.0),
+    ],
+)
+def test_speed_along_the_command(
+    env: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    commanded: tuple[float, float],
+    moves: tuple[float, ...],
+    pitch: float,
+    jumps: bool,
+    along: float,
+    excess: float,
+    error: float,
+) -> None:
+    command = motion_command(env)
+    monkeypatch.setattr(command.cfg, "jump_speed_added", 0.25)
+    command.state.mode[:] = jumps
+    command.velocity[:] = torch.tensor((*commanded, 1.5))
+    given = received(env, monkeypatch, 0.0, pitch, moves)
+    found = [given[name].tolist() for name in ("along", "excess", "velocity_error")]
+    np.testing.assert_allclose(found, [[along] * N, [excess] * N, [error] * N], atol=1e-5)

@@ -1,0 +1,132 @@
+"""The phases of training, as the environment has them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+import training_env
+from pronk.errors import PronkError
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.rewards import rewards
+from pronk.train.phases import PHASES, TASKS, curriculum, phase_at
+from training_env import N
+
+pytestmark = pytest.mark.train
+
+HEIGHT = 16.0, 16.0, 13.0, 10.0
+"""Weight of jump_height: in jump_a, and in jump_b at the beginning, the middle and the end."""
+
+
+@pytest.fixture
+def env() -> Any:
+    return training_env.fresh(training_env.nominal())
+
+
+@pytest.mark.parametrize(
+    ("task", "iteration", "expected"),
+    [
+        ("jump", 0, ("walk", 0.0)),
+        ("jump", 299, ("walk", 299 / 300)),
+        ("jump", 300, ("jump_a", 0.0)),
+        ("jump", 800, ("jump_b", 0.5)),
+        ("jump", 5000, ("jump_b", 1.0)),
+        ("walk", 300, ("walk", 1.0)),
+        ("together", 0, ("jump_a", 0.0)),
+        ("together", 520, ("jump_b", 0.0)),
+    ],
+)
+def test_phase_of_an_iteration(task: str, iteration: int, expected: tuple[str, float]) -> None:
+    assert phase_at(TASKS[task], iteration) == expected
+    with pytest.raises(PronkError, match="0 iterations"):
+        phase_at(dict.fromkeys(PHASES, 0), iteration)
+
+
+@pytest.mark.parametrize("done", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("name", PHASES)
+def test_weights_of_a_phase_are_applied(env: Any, name: str, done: float) -> None:
+    phase, command = PHASES[name], motion_command(env)
+    curriculum(env).apply(env, PHASES["jump_b"], 1.0)
+    curriculum(env).apply(env, phase, done)
+
+    def between(span: tuple[float, float]) -> float:
+        return span[0] * (1.0 - done) + span[1] * done
+
+    for term, initial in rewards().items():
+        found = env.reward_manager.get_term_cfg(term)
+        weight = between(phase.weights.get(term, (initial.weight,) * 2))
+        assert found.weight == pytest.approx(weight), term
+        scales = dict(initial.params)
+        if term in phase.jump_scales:
+            scales["jump_scale"] = between(phase.jump_scales[term])
+        assert dict(found.params) == pytest.approx(scales), term
+    assert command.state.liftoff_std == pytest.approx(between(phase.liftoff_std))
+    assert command.cfg.jump_fraction == (0.0 if name == "walk" else 0.5)
+    first, last = phase.guidance
+    assert command.guidance_scale == pytest.approx(last + (first - last) * (1.0 - done) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "done", "weight", "scale", "noise"),
+    [
+        ("walk", 0.0, 0.0, 1.0, float("inf")),
+        ("jump_a", 0.5, 16.0, 1.0, 0.65),
+        ("jump_b", 0.0, 16.0, 1.0, 0.65),
+        # Exponentially in the square: .65 (.2 / .65)^(1/4).
+        ("jump_b", 0.5, 13.0, 5.0, 0.484109),
+        ("jump_b", 1.0, 10.0, 9.0, 0.2),
+    ],
+)
+def test_values_of_a_phase_by_hand(
+    env: Any, name: str, done: float, weight: float, scale: float, noise: float
+) -> None:
+    curriculum(env).apply(env, PHASES[name], done)
+    term = env.reward_manager.get_term_cfg
+    assert term("jump_height").weight == pytest.approx(weight)
+    assert term("collision").params["jump_scale"] == pytest.approx(scale)
+    assert PHASES[name].largest_noise(done) == pytest.approx(noise, rel=1e-5)
+
+
+def test_the_step_counter_sets_the_phase_and_a_reset_logs_it(env: Any) -> None:
+    for index, name in enumerate(PHASES):
+        training_env.fresh(env, name)
+        assert motion_command(env).cfg.jump_fraction == (0.5 if index else 0.0)
+        env.reset(env_ids=torch.tensor([0]))
+        log = env.extras["log"]
+        assert float(log["Curriculum/phases/phase"]) == index
+        assert float(log["Curriculum/phases/done"]) == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_jump_inputs_are_zero_while_walking(name: str) -> None:
+    env = training_env.fresh(training_env.nominal(), name)
+    jump, critic = [], []
+    for _ in range(140):
+        seen = env.step(0.2 * torch.rand(N, 12))[0]
+        jump.append(seen["jump"].clone())
+        critic.append(seen["critic_jump"].clone())
+    found = torch.stack(jump).any(), torch.stack(critic).any()
+    assert found == ((False, False) if name == "walk" else (True, True))
+
+
+def test_guidance_is_added_to_the_targets_of_a_commanded_jump() -> None:
+    """The offsets run from the step of the command to `prompt_s`, scaled, then end."""
+    env = training_env.fresh(training_env.nominal(), "jump_a", scripted=True)
+    command, still = motion_command(env), torch.zeros(N, 12)
+    command.jump[:4] = True
+    added = []
+    for _ in range(18):
+        env.step(still)
+        added.append((command.position_target - command.default_position).clone())
+    offsets = torch.stack(added)
+    assert not offsets[:, 4:].any()
+    begun = offsets[:, 0].abs().amax(dim=1) > 0.0
+    steps = round(command.cfg.settings.prompt_s / env.step_dt)
+    assert int(begun.sum()) <= steps
+    assert begun[1]
+    assert not begun[-1]
+    curriculum(env).apply(env, PHASES["jump_a"], 1.0)
+    command.compute(0.0)
+    assert command.guidance_scale == pytest.approx(0.7)

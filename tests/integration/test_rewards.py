@@ -1,0 +1,350 @@
+"""Every reward against a number worked out by hand, the sum of all, and the paper's weights."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from mjlab.managers.reward_manager import RewardManager
+from torch import Tensor
+
+import training_env
+from pronk.train.mdp import commands
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.motion import Motion
+from pronk.train.mdp.reward_manager import StackedRewardManager
+from pronk.train.mdp.rewards import PAPER_UNIT, rewards
+from training_env import N
+
+pytestmark = pytest.mark.train
+
+STANDING = 0.298970  # .209 cos(.8) + .195 cos(.8) + .0175
+KNEE = 0.153358  # .195 cos(.8) + .0175
+JUMPER = 1
+"""The robot in jump mode; all others are not."""
+ROWS = rewards()
+
+
+@pytest.fixture
+def env(monkeypatch: pytest.MonkeyPatch) -> Any:
+    built = training_env.fresh(training_env.nominal(), scripted=True)
+    monkeypatch.setattr(motion_command(built).cfg, "jump_speed_added", 0.35)
+    built.action_manager.process_action(torch.zeros(N, 12))
+    return built
+
+
+def v(*values: float) -> Tensor:
+    return torch.tensor(values)
+
+
+def at(values: dict[int, float]) -> Tensor:
+    """Twelve zeros but for some."""
+    return torch.tensor([values.get(i, 0.0) for i in range(12)])
+
+
+def feet(*rows: tuple[float, float, float]) -> Tensor:
+    """Vectors of some feet, zeros of the rest."""
+    return torch.tensor([*rows, *[(0.0, 0.0, 0.0)] * (4 - len(rows))])
+
+
+def pretend(env: Any, **fields: Tensor) -> Any:
+    """All robots stand still in the default pose, but for some fields of `Motion`, of one robot.
+
+    `command` is the velocity command; `offset` is added to the default joint positions.
+    """
+    command = motion_command(env)
+    still = {name: torch.zeros(12) for name in ("velocity", "torque", "torque_change")}
+    still |= {name: torch.zeros(4, 3) for name in ("foot_velocity", "foot_velocity_change")}
+    still |= {"velocity_world": torch.zeros(3), "velocity_heading": torch.zeros(2)}
+    still |= {"angular_velocity": torch.zeros(3), "gravity": v(0.0, 0.0, -1.0)}
+    still |= {"heading": v(1.0, 0.0), "foot_position": torch.zeros(4, 2), "height": v(STANDING)[0]}
+    still |= {"contact": torch.ones(4, dtype=torch.bool), "force": torch.full((4,), 30.0)}
+    still |= {"foot_height": torch.zeros(4), "knee_height": torch.full((4,), KNEE)}
+    still |= {"leg_length": torch.full((4,), 0.28), "non_foot_contacts": torch.zeros(())}
+    still["position"] = command.default_position[0] + fields.pop("offset", torch.zeros(12))
+    command.velocity[:] = fields.pop("command", torch.zeros(3))
+    one = still | fields
+    motion = Motion(**{k: value.expand(N, *value.shape).clone() for k, value in one.items()})
+    env.common_step_counter += 1
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands, "measure_motion", lambda *_: motion)
+        assert command.motion is motion
+    command.state.mode = torch.arange(N) == JUMPER
+    return command
+
+
+def value(env: Any, name: str) -> Tensor:
+    term = ROWS[name]
+    found: Tensor = term.func(env, **term.params)
+    return found
+
+
+def only(jumper: float) -> list[float]:
+    return [jumper if i == JUMPER else 0.0 for i in range(N)]
+
+
+STRAY = v(0.10, 0.12, 0.14, 0.04)
+CASES: list[tuple[str, float, float | None, dict[str, Tensor]]] = [
+    # |(1 - .7, .5 - .1)|^2 = .25. In jump mode (1, .5) becomes .35 m/s faster: its length is
+    # sqrt(1.25), so times 1 + .35 / 1.118034 = 1.313050: errors .613050 and .556525.
+    (
+        "tracking_linear",
+        math.exp(-0.25 / 0.25),
+        math.exp(-(0.613050**2 + 0.556525**2) / 0.25),
+        {"command": v(1.0, 0.5, 0.0), "velocity_heading": v(0.7, 0.1)},
+    ),
+    # Below 1 m/s .35 m/s in proportion: -.4 becomes -.54.
+    (
+        "tracking_linear",
+        1.0,
+        math.exp(-(0.14**2) / 0.25),
+        {"command": v(0.0, -0.4, 2.0), "velocity_heading": v(0.0, -0.4)},
+    ),
+    (
+        "tracking_angular",
+        math.exp(-(0.3**2) / 0.25),
+        None,
+        {"command": v(1.0, 0.0, -1.0), "angular_velocity": v(5.0, 5.0, -0.7)},
+    ),
+    # The same with wide kernels: (1.2, .9) is 1.5 m/s, in jump mode 1.85.
+    ("approach_linear", math.exp(-2.25 / 4), math.exp(-3.4225 / 4), {"command": v(1.2, 0.9, 0.0)}),
+    ("approach_angular", math.exp(-4.0 / 4), None, {"command": v(1.0, 0.0, -2.0)}),
+    # .3^2 + .1^2; standing eight times that.
+    ("posture", 0.1, None, {"command": v(0.5, 0.0, 0.0), "offset": at({0: 0.3, 8: 0.1})}),
+    ("posture", 0.8, 0.1, {"offset": at({0: 0.3, 8: -0.1})}),
+    ("vertical_velocity", 0.36, None, {"velocity_world": v(2.0, 1.0, -0.6)}),
+    ("smoothness", 3.0**2 + 4.0**2, None, {"torque_change": at({2: 3.0, 11: -4.0})}),
+    # A roll of .3 rad.
+    ("orientation", math.sin(0.3) ** 2, None, {"gravity": v(0, -math.sin(0.3), -math.cos(0.3))}),
+    ("collision", 3.0, None, {"non_foot_contacts": torch.tensor(3.0)}),
+    # 17 N m/rad * -1.2 rad = -20.4 N m, 3.4 over the hip's 17. The knee: -17 * .5 - .4 * 50 =
+    # -28.5 of its 17 * 9.33 / 6 = 26.435, 2.065 over. Hip pitch has 8.5.
+    (
+        "torque_limits",
+        3.4 + 2.065,
+        None,
+        {"offset": at({0: 1.2, 4: -0.5, 5: 0.5}), "velocity": at({5: 50.0})},
+    ),
+    # Hip roll 1.7 of 1.6; hip pitch -.8 - 2.0 of -2.6; knee 1.6 + 1.3 of 2.6.
+    ("position_limits", 0.1 + 0.2 + 0.3, None, {"offset": at({0: 1.7, 4: -2.0, 8: 1.3})}),
+    (
+        "foot_acceleration",
+        math.sqrt(0.3**2 + 0.4**2 + 1.2**2),
+        None,
+        {"foot_velocity_change": feet((0.3, 0.0, 0.0), (0.0, -0.4, 1.2))},
+    ),
+    # (.09 - .05)^2 sqrt(.25) + (.09 - .10)^2 sqrt(4) = .0008 + .0002.
+    (
+        "foot_clearance",
+        0.001,
+        None,
+        {
+            "foot_height": v(0.05, 0.10, 0.0, 0.0),
+            "foot_velocity": feet((0.15, 0.2, 7.0), (0.0, -4.0, 1.0)),
+        },
+    ),
+    ("torque", 5.0**2 + 12.0**2, None, {"torque": at({1: 5.0, 5: -12.0})}),
+    # Mean 25; deviations -25, -15, 5, 35: variance (625 + 225 + 25 + 1225) / 4 = 525.
+    ("dense_jump", 0.0, math.sqrt(525.0), {"force": v(0.0, 10.0, 30.0, 60.0)}),
+    ("roll_pitch_rate", 0.25 + 1.44, None, {"angular_velocity": v(0.5, -1.2, 3.0)}),
+    # The third foot slides as fast but is in the air.
+    (
+        "slip",
+        0.09 + 0.16 + 0.04,
+        None,
+        {
+            "foot_velocity": feet((0.3, 0.4, 2.0), (0.2, 0.0, 0.0), (1.0, 1.0, 0.0)),
+            "contact": torch.tensor([True, True, False, True]),
+        },
+    ),
+    ("trunk_height", 0.05**2, None, {"height": torch.tensor(STANDING + 0.05)}),
+    ("trunk_height", 0.0, None, {"height": torch.tensor(0.2)}),
+    ("crouch", 0.03**2, None, {"height": torch.tensor(STANDING - 0.05)}),
+    ("crouch", 0.0, None, {"height": torch.tensor(STANDING - 0.01)}),
+    # Of .06 m half, all, a quarter and twice; 2 cm below the floor.
+    ("knees", 0.5 + 0.0 + 0.75 + 0.0, None, {"knee_height": v(0.03, 0.06, 0.015, 0.12)}),
+    ("knees", 4.0 / 3.0, None, {"knee_height": v(KNEE, KNEE, KNEE, -0.02)}),
+    # Mean .10, lowest .04, in the air, as the jump comes down; not on the way up.
+    (
+        "stray_foot",
+        0.0,
+        0.06,
+        {
+            "foot_height": STRAY,
+            "velocity_world": v(2.0, 0.0, -0.1),
+            "contact": torch.zeros(4, dtype=torch.bool),
+        },
+    ),
+    (
+        "stray_foot",
+        0.0,
+        0.0,
+        {
+            "foot_height": STRAY,
+            "velocity_world": v(2.0, 0.0, 0.1),
+            "contact": torch.zeros(4, dtype=torch.bool),
+        },
+    ),
+    ("stray_foot", 0.0, 0.0, {"foot_height": STRAY, "velocity_world": v(2.0, 0.0, -0.1)}),
+]
+
+
+@pytest.mark.parametrize(("name", "walking", "jumping", "fields"), CASES)
+def test_term_by_hand(
+    env: Any, name: str, walking: float, jumping: float | None, fields: dict[str, Tensor]
+) -> None:
+    """None: the same in jump mode, times the term's factor there."""
+    pretend(env, **fields)
+    expected = torch.full((N,), walking)
+    scale = ROWS[name].params.get("jump_scale", 1.0)
+    expected[JUMPER] = scale * (walking if jumping is None else jumping)
+    torch.testing.assert_close(value(env, name), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("decimation", [2, 6])
+@pytest.mark.parametrize(
+    ("name", "gain"),
+    [
+        ("sparse_jump", "score_gain"),
+        ("jump_height", "travel_gain"),
+        ("flight_distance", "flight_gain"),
+        ("clearance_gap", "gap_gain"),
+        ("hop", "hop"),
+    ],
+)
+def test_events_earn_their_weight_once(env: Any, name: str, gain: str, decimation: int) -> None:
+    """However long the policy step is (D1)."""
+    command = pretend(env)
+    env.cfg.decimation = decimation
+    setattr(command.state, gain, torch.arange(N) / 4)
+    found = value(env, name) * env.step_dt
+    assert found.tolist() == pytest.approx([i / 4 for i in range(N)])
+
+
+def test_a_fall_is_an_event_and_a_time_out_is_none(env: Any) -> None:
+    env.sim.data.qpos[2, 2:7] = v(0.3, 0.0, 1.0, 0.0, 0.0)
+    env.episode_length_buf[5] = 10**6
+    env.termination_manager.compute()
+    pretend(env)
+    assert (value(env, "termination") * env.step_dt).tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
+    motion_command(env).state.mode[2] = True
+    pretend(env)
+    env.sim.data.qpos[JUMPER] = env.sim.data.qpos[2]
+    env.termination_manager.compute()
+    assert float(value(env, "termination")[JUMPER] * env.step_dt) == 5.0
+
+
+def test_landing_after_a_jump(env: Any) -> None:
+    """5 cm too low: on the ground, in jump mode and after a lift-off."""
+    low = ROWS["landing"].params["height"] - 0.05
+    command = pretend(env, height=torch.tensor(low))
+    assert not value(env, "landing").any(), "a crouch"
+    command.state.liftoffs = torch.ones(N)
+    assert value(env, "landing").tolist() == pytest.approx(only(0.05))
+    command.state.airborne = torch.ones(N, dtype=torch.bool)
+    assert not value(env, "landing").any()
+
+
+def test_terms_of_actions_and_of_similarity(env: Any) -> None:
+    command = pretend(env)
+    command.state.similarity = torch.full((N,), 0.5)
+    assert value(env, "countermovement").tolist() == [0.5] * N
+    env.action_manager.process_action(torch.full((N, 12), 0.5))
+    second = torch.full((N, 12), 0.5)
+    second[0, 3], second[JUMPER, :2] = -0.5, v(1.0, 0.25)
+    env.action_manager.process_action(second)
+    assert value(env, "action_rate").tolist() == pytest.approx([1.0, 0.3125 / 4] + [0.0] * 6)
+    # Targets are .35 * 4 = 1.4 rad off: 17 * 1.4 = 23.8 N m, 6.8 over the hip's.
+    env.action_manager.process_action(at({3: 4.0}).expand(N, 12))
+    assert float(value(env, "torque_limits")[0]) == pytest.approx(6.8, rel=1e-5)
+
+
+def test_every_term_is_tested_and_of_one_robot_each(env: Any) -> None:
+    events = {"termination", "sparse_jump", "jump_height", "flight_distance", "clearance_gap"}
+    others = {"hop", "landing", "countermovement", "action_rate"}
+    assert {case[0] for case in CASES} | events | others == set(ROWS)
+    command = pretend(env, command=v(1.0, 0.0, 0.0))
+    before = {name: value(env, name).clone() for name in ROWS}
+    for field in vars(command.motion).values():
+        field[2] = ~field[2] if field.dtype == torch.bool else field[2] + 2.0
+    rest = torch.arange(N) != 2
+    for name, old in before.items():
+        assert value(env, name).shape == (N,)
+        assert torch.equal(value(env, name)[rest], old[rest]), name
+
+
+@pytest.mark.parametrize("by_dt", [True, False])
+def test_the_stacked_sum_is_that_of_mjlab(
+    env: Any, monkeypatch: pytest.MonkeyPatch, by_dt: bool
+) -> None:
+    """Step by step, with jumps, a fall and physics gone wrong; and in the log of episodes."""
+    managers = [
+        kind(env.cfg.rewards, env, scale_by_dt=by_dt)
+        for kind in (RewardManager, StackedRewardManager)
+    ]
+    monkeypatch.setattr(env, "reward_manager", managers[0])
+    seen = []
+
+    def both(dt: float) -> Tensor:
+        seen.append([type(manager).compute(manager, dt).clone() for manager in managers])
+        return seen[-1][0]
+
+    monkeypatch.setattr(managers[0], "compute", both)
+    for step in range(12):
+        for manager in managers:  # as a phase would
+            manager.get_term_cfg("sparse_jump").weight = 8.0 + step
+            manager.get_term_cfg("collision").params["jump_scale"] = 1.0 + step
+        motion_command(env).jump[::2] = step > 2
+        if step == 8:
+            env.sim.data.qpos[3, 2:7] = v(0.3, 0.0, 1.0, 0.0, 0.0)
+            env.sim.data.qvel[5] = math.nan
+        env.step(2.0 * torch.rand(N, 12) - 1.0)
+    own, stacked = (torch.stack(each) for each in zip(*seen, strict=True))
+    assert torch.isfinite(own).all()
+    assert own.abs().min() > 0.0
+    torch.testing.assert_close(stacked, own, rtol=1e-5, atol=1e-5)
+    for index in range(N):
+        ours, theirs = (dict(m.get_active_iterable_terms(index)) for m in managers[::-1])
+        assert ours.keys() == theirs.keys()
+        for name, rate in theirs.items():
+            assert ours[name] == pytest.approx(rate, rel=1e-5, abs=1e-6)
+    # mjlab's manager has logged two robots' episodes as they ended.
+    ids = torch.tensor([1, 4])
+    logs = [{k: float(x) for k, x in m.reset(ids).items()} for m in managers]
+    assert logs[1] == pytest.approx(logs[0], rel=1e-5, abs=1e-7)
+    assert not any(managers[1].reset(ids).values())
+
+
+def test_install_replaces_the_manager_once(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(env, "reward_manager", env.reward_manager)
+    StackedRewardManager.install(env)
+    first = env.reward_manager
+    StackedRewardManager.install(env)
+    assert env.reward_manager is first
+    assert first.active_terms == list(ROWS)
+
+
+@pytest.mark.parametrize(
+    ("name", "paper"),
+    [
+        ("tracking_linear", (45.0, 45.0)),
+        ("posture", (-5.0, 0.0)),
+        ("vertical_velocity", (-50.0, 0.0)),
+        ("position_limits", (-150.0, -150.0)),
+        ("foot_acceleration", (-0.5, -0.5)),
+        ("foot_clearance", (-250.0, 0.0)),
+        ("orientation", (-20.0, -60.0)),
+    ],
+)
+def test_weights_of_the_paper(name: str, paper: tuple[float, float]) -> None:
+    """The paper's, walking and jumping; foot clearance and orientation differ in jump mode."""
+    weight = ROWS[name].weight * PAPER_UNIT
+    assert (weight, weight * ROWS[name].params.get("jump_scale", 1.0)) == pytest.approx(paper)
+
+
+def test_no_jump_is_rewarded_in_phase_1() -> None:
+    jump = {"dense_jump", "sparse_jump", "jump_height", "flight_distance", "clearance_gap"}
+    jump |= {"countermovement", "hop", "landing"}
+    assert {name for name, term in ROWS.items() if term.weight == 0.0} == jump

@@ -1,0 +1,108 @@
+"""Training environments on Warp's CPU device, built once for all tests of a process."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cache
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mjlab")
+
+import torch
+from mjlab.envs import ManagerBasedRlEnv
+from torch import Tensor
+
+from pronk.match.gains import GroupGains
+from pronk.robots import load_robot
+from pronk.train.gains import TrainingGains, training_gains
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.observations import CRITIC, randomized_parameters
+from pronk.train.phases import PHASES, STEPS_PER_ITERATION
+from pronk.train.tasks import load_task
+from pronk.train.tasks.jump_env_cfg import without_randomization
+
+N = 8
+"""Robots of the nominal environment."""
+MANY = 64
+"""Robots of the randomized one."""
+ITERATIONS = 10**9
+"""Of each phase: no test comes to the end of one."""
+ROBOT = load_robot("mini_cheetah")
+MATCHED = TrainingGains(
+    name="matched",
+    robot="mini_cheetah",
+    groups={
+        "hip_roll": GroupGains(
+            stiffness=20.0, damping=0.45, stiffness_range=2.0, damping_range=0.1
+        ),
+        "hip_pitch": GroupGains(
+            stiffness=17.5, damping=0.4, stiffness_range=1.5, damping_range=0.05
+        ),
+        "knee": GroupGains(
+            stiffness=21.5,
+            damping=0.55,
+            stiffness_range=1.0,
+            damping_range=0.05,
+            ellipsoid=((0.5, 0.008), (0.008, 0.0004)),
+            ellipsoid_center=(22.0, 0.54),
+        ),
+    },
+    delay_s=0.0055,
+)
+_starts = itertools.count(step=10**6)
+
+
+def config(num_envs: int, gains: TrainingGains) -> Any:
+    """The task's environment, with phases that do not end."""
+    task = load_task("mini_cheetah")
+    return task.env_cfg(
+        task.robot, gains, iterations=dict.fromkeys(PHASES, ITERATIONS), num_envs=num_envs
+    )
+
+
+@cache
+def nominal() -> Any:
+    """`N` nominal robots with naive gains, exact measurements, no delay."""
+    cfg = config(N, training_gains("naive", ROBOT))
+    without_randomization(cfg)
+    return _built(cfg)
+
+
+@cache
+def randomized() -> Any:
+    """`MANY` robots with matched gains and everything randomized, as in training."""
+    return _built(config(MANY, MATCHED))
+
+
+def _built(cfg: Any) -> Any:
+    # So few robots are faster on one thread than on several that wait for each other.
+    torch.set_num_threads(1)
+    return ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def fresh(env: Any, phase: str = "walk", *, scripted: bool = False) -> Any:
+    """The environment at the beginning of a phase and of all episodes, at the nominal rate."""
+    command = motion_command(env)
+    command.scripted = scripted
+    command.ranges.grown.zero_()
+    command.ranges.tracking.zero_()
+    env.cfg.decimation = ROBOT.decimation
+    # A step that was never counted, so that nothing measured before is taken for this step's.
+    first = list(PHASES).index(phase) * ITERATIONS * STEPS_PER_ITERATION
+    env.common_step_counter = first + next(_starts)
+    env.reset(seed=0)
+    command.velocity.zero_()
+    command.jump.zero_()
+    env.termination_manager.compute()  # no robot fell
+    return env
+
+
+def drawn(env: Any) -> dict[str, Tensor]:
+    """The randomized parameters by name, (N, size) each; gains in the robot's order of joints."""
+    parts, names, groups = randomized_parameters(env), list(CRITIC)[-9:], len(ROBOT.groups)
+    single, gains = parts[: -2 * groups], parts[-2 * groups :]
+    # Each group's gains are one part, leg by leg.
+    both = [torch.stack(half, dim=-1).flatten(1) for half in (gains[:groups], gains[groups:])]
+    return {n: part.clone() for n, part in zip(names, [*single, *both], strict=True)}
