@@ -1,0 +1,359 @@
+"""Motion and observations against MuJoCo and SciPy: values, places in the vectors, noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+from torch import Tensor
+
+import training_env
+from parts import where
+from pronk.policy import layout
+from pronk.robots.legged import legged
+from pronk.train.mdp.commands import motion_command
+from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
+from training_env import MANY, ROBOT, N
+
+pytestmark = pytest.mark.train
+
+Array = NDArray[np.float64]
+BODY = legged("mini_cheetah")
+DEFAULT = np.array([joint.default_position for joint in ROBOT.joints])
+STAND = torch.tensor([0.0, 0.2, -0.7] * 4).expand(N, 12)
+"""Knees a little straighter, so that soft drives carry the robot at its usual height."""
+
+
+@pytest.fixture
+def env() -> Any:
+    built = training_env.fresh(training_env.nominal(), scripted=True)
+    motion_command(built).velocity[:] = torch.rand(N, 3)
+    return built
+
+
+def ids(env: Any, kind: str, pattern: str) -> list[int]:
+    """Ids of a part of every leg in the model."""
+    return [getattr(env.sim.mj_model, kind)(f"robot/{leg}_{pattern}").id for leg in BODY.legs]
+
+
+def rotations(qpos: Any) -> Rotation:
+    return Rotation.from_quat(np.float64(qpos[:, 3:7]), scalar_first=True)
+
+
+def put(env: Any) -> tuple[Array, Array]:
+    """Put every robot into a random state; return positions and velocities."""
+    qpos, qvel = env.sim.data.qpos, env.sim.data.qvel
+    qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(env.num_envs, 4), dim=1)
+    qpos[:, 7:] += torch.rand(env.num_envs, 12) - 0.5
+    qvel[:] = torch.randn(qvel.shape)
+    env.sim.forward()
+    return np.float64(qpos.numpy()), np.float64(qvel.numpy())
+
+
+def observe(env: Any) -> dict[str, Tensor]:
+    found = env.observation_manager.compute(update_history=True)
+    return {name: group.clone() for name, group in found.items()}
+
+
+def measured(observation: dict[str, Tensor], name: str) -> Tensor:
+    return observation["measured"][:, list(layout.MEASURED[name].indices)]
+
+
+def close(found: Tensor, expected: Any, atol: float = 1e-5) -> None:
+    np.testing.assert_allclose(found.numpy(), expected, atol=atol, rtol=1e-5)
+
+
+# --- Motion --------------------------------------------------------------------------------------
+
+
+def references(env: Any, qpos: Array, qvel: Array, ctrl: Any = None) -> list[mujoco.MjData]:
+    """The same states in MuJoCo."""
+    found = []
+    for i in range(len(qpos)):
+        data = mujoco.MjData(env.sim.mj_model)
+        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+        if ctrl is not None:
+            data.ctrl[:] = ctrl[i]
+        mujoco.mj_forward(env.sim.mj_model, data)
+        found.append(data)
+    return found
+
+
+def contacts(data: mujoco.MjData, geoms: list[int]) -> list[float]:
+    """1 for each geom that touches something."""
+    touching = {int(geom) for contact in data.contact for geom in contact.geom}
+    return [float(geom in touching) for geom in geoms]
+
+
+def test_motion_is_that_of_mujoco(env: Any) -> None:
+    """Positions and velocities are of now; derived quantities of one physics step before."""
+    for _ in range(4):
+        env.step(2.0 * torch.rand(N, 12) - 1.0)
+    env.cfg.decimation = 1
+    data, model = env.sim.data, env.sim.mj_model
+    qpos, qvel = np.float64(data.qpos.numpy()), np.float64(data.qvel.numpy())
+    env.step(torch.rand(N, 12))
+    motion = motion_command(env).motion
+    sites, balls, knees, hips = (
+        ids(env, kind, name)
+        for kind, name in (
+            ("site", "foot"),
+            ("geom", "foot_collision"),
+            ("joint", "knee"),
+            ("joint", "hip_pitch"),
+        )
+    )
+    before = references(env, qpos, qvel, data.ctrl.numpy())
+    twist, wrench = np.zeros(6), np.zeros(6)
+    for i, reference in enumerate(before):
+        force, speed = np.zeros((4, 3)), []
+        for k, contact in enumerate(reference.contact):
+            mujoco.mj_contactForce(model, reference, k, wrench)
+            for foot in (balls.index(g) for g in contact.geom if g in balls):
+                force[foot] += contact.frame.reshape(3, 3).T @ wrench[:3]
+        for site in sites:
+            mujoco.mj_objectVelocity(model, reference, mujoco.mjtObj.mjOBJ_SITE, site, twist, 0)
+            speed.append(twist[3:].copy())
+        size = np.linalg.norm(force, axis=1)
+        np.testing.assert_array_equal(motion.contact[i], size > 0.0)
+        np.testing.assert_allclose(motion.force[i], size, rtol=0.02, atol=0.5)
+        close(motion.foot_height[i], reference.site_xpos[sites, 2] - 0.0175)
+        close(motion.foot_position[i], reference.site_xpos[sites, :2])
+        close(motion.knee_height[i], reference.xanchor[knees, 2])
+        close(motion.foot_velocity[i], speed, atol=1e-4)
+        close(motion.torque[i], reference.qfrc_actuator[6:], atol=1e-4)
+    assert {bool(x) for x in motion.contact.flatten()} == {True, False}
+    qpos, qvel = np.float64(data.qpos.numpy()), np.float64(data.qvel.numpy())
+    trunk = rotations(qpos)
+    x, y, _ = trunk.apply([1.0, 0.0, 0.0]).T
+    heading = Rotation.from_euler("z", np.arctan2(y, x)[:, None])
+    expected = {
+        "position": qpos[:, 7:],
+        "velocity": qvel[:, 6:],
+        "height": qpos[:, 2],
+        "velocity_world": qvel[:, :3],
+        "velocity_heading": heading.inv().apply(qvel[:, :3])[:, :2],
+        "angular_velocity": qvel[:, 3:6],
+        "gravity": trunk.inv().apply([0.0, 0.0, -1.0]),
+        "heading": heading.apply([1.0, 0.0, 0.0])[:, :2],
+    }
+    for name, value in expected.items():
+        close(getattr(motion, name), value)
+    # In the leg's plane: the foot is beside it by as much as the knee.
+    for i, reference in enumerate(references(env, qpos, qvel)):
+        far = np.linalg.norm(reference.site_xpos[sites] - reference.xanchor[hips], axis=1)
+        close(motion.leg_length[i], np.sqrt(far**2 - 0.004**2))
+
+
+def test_changes_are_since_the_step_before(env: Any) -> None:
+    """Of a robot that begins an episode, since zero. Each step is measured once."""
+    command = motion_command(env)
+    command.jump[:] = True
+    for _ in range(2):
+        env.step(2.0 * torch.rand(N, 12) - 1.0)
+    before = command.motion
+    kept = {name: value.clone() for name, value in vars(before).items()}
+    assert command.motion is before
+    assert command.state.since.tolist() == pytest.approx([0.04] * N)
+    env.reset(env_ids=torch.tensor([2]))
+    env.step(2.0 * torch.rand(N, 12) - 1.0)
+    after = command.motion
+    for name in ("torque", "foot_velocity"):
+        last = kept[name]
+        last[2] = 0.0
+        assert torch.equal(getattr(after, f"{name}_change"), getattr(after, name) - last)
+    for name in ("height", "gravity", "foot_position", "knee_height", "leg_length"):
+        assert torch.equal(getattr(before, name), kept[name]), "a copy"
+
+
+def test_non_foot_contacts_are_counted(env: Any) -> None:
+    """Upside down: the trunk; thighs level and shanks folded: knees and trunk; standing."""
+    qpos = env.sim.data.qpos
+    poses = [
+        (0.04, (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        (0.03, (1.0, 0.0, 0.0, 0.0), (0.0, -1.6, 2.5)),
+        (0.299, (1.0, 0.0, 0.0, 0.0), (0.0, -0.8, 1.6)),
+    ]
+    for i, (height, orientation, joints) in enumerate(poses):
+        qpos[i, 2] = height
+        qpos[i, 3:] = torch.tensor([*orientation, *joints * 4])
+    env.sim.data.qvel.zero_()
+    env.cfg.decimation = 1
+    parts = [env.sim.mj_model.geom("robot/trunk_collision").id]
+    parts += ids(env, "geom", "thigh_collision") + ids(env, "geom", "shank_collision")
+    states = references(env, qpos.numpy()[:3], np.zeros((3, 18)))
+    expected = [sum(contacts(state, parts)) for state in states]
+    env.step(torch.zeros(N, 12))
+    assert expected[::2] == [1.0, 0.0]
+    assert expected[1] >= 5.0
+    assert motion_command(env).motion.non_foot_contacts[:3].tolist() == expected
+
+
+# --- Measured vector -----------------------------------------------------------------------------
+
+
+def test_layout_of_the_measured_vector(env: Any) -> None:
+    """Written out once more, since policies depend on it; histories run from old to new."""
+    states, actions = [], []
+    for _ in range(3):
+        actions.append(torch.rand(N, 12))
+        env.action_manager.process_action(actions[-1])
+        states.append(put(env))
+        seen = observe(env)["measured"]
+    qpos, qvel = states[-1]
+    assert seen.shape == (N, 105)
+    close(seen[:, 0:3], qvel[:, 3:6])
+    close(seen[:, 3:6], rotations(qpos).inv().apply([0.0, 0.0, -1.0]))
+    close(seen[:, 6:42], np.hstack([q[:, 7:] - DEFAULT for q, _ in states]))
+    close(seen[:, 42:78], np.hstack([v[:, 6:] for _, v in states]))
+    close(seen[:, 78:102], np.hstack(actions[1:]))
+    close(seen[:, 102:105], motion_command(env).velocity)
+
+
+def test_measured_vector_of_steps_and_of_a_new_episode(env: Any) -> None:
+    """The state at the end of the step, the two before, and the actions that led there."""
+    states, actions = [], []
+    for _ in range(4):
+        actions.append(torch.rand(N, 12) - 0.5)
+        seen = {name: group.clone() for name, group in env.step(actions[-1])[0].items()}
+        position = env.sim.data.qpos[:, 7:].numpy() - DEFAULT
+        states.append((position, env.sim.data.qvel[:, 6:].clone()))
+    close(measured(seen, "joint_position"), np.hstack([q for q, _ in states[-3:]]))
+    close(measured(seen, "joint_velocity"), np.hstack([v for _, v in states[-3:]]))
+    close(measured(seen, "action"), np.hstack(actions[-2:]))
+    actor = seen["measured"][:, list(layout.ACTOR_INDICES)]
+    close(actor[:, 9:], np.hstack([*states[-1], actions[-1]]))
+    # A new episode begins with the present as its past; the other robots' histories stay.
+    anew = env.reset(env_ids=torch.tensor([4]))[0]
+    position = env.sim.data.qpos[4, 7:].numpy() - DEFAULT
+    close(measured(anew, "joint_position")[4], np.tile(position, 3))
+    close(measured(anew, "action")[4], 0.0)
+    others = torch.arange(N) != 4
+    for name in ("joint_position", "joint_velocity", "action"):
+        assert torch.equal(measured(anew, name)[others], measured(seen, name)[others])
+
+
+def test_noise_is_uniform_and_on_the_measured_vector_alone() -> None:
+    """D7 to D10: drawn anew for every number of every measurement, which keeps it in histories."""
+    env = training_env.fresh(training_env.randomized(), scripted=True)
+    widths = {"joint_position": 0.05, "joint_velocity": 0.5}
+    widths |= {"angular_velocity": 0.2, "projected_gravity": 0.05}
+    found: dict[str, list[Array]] = {name: [] for name in widths}
+    for _ in range(5):
+        qpos, qvel = put(env)
+        first, second = observe(env), observe(env)
+        exact = {
+            "angular_velocity": qvel[:, 3:6],
+            "projected_gravity": rotations(qpos).inv().apply([0.0, 0.0, -1.0]),
+            "joint_position": qpos[:, 7:] - DEFAULT,
+            "joint_velocity": qvel[:, 6:],
+        }
+        for name, value in exact.items():
+            size = value.shape[1]
+            for seen in (first, second):
+                found[name].append(measured(seen, name)[:, -size:].numpy() - value)
+            if measured(first, name).shape[1] > size:
+                then = measured(second, name)[:, -2 * size : -size]
+                assert torch.equal(then, measured(first, name)[:, -size:])
+        for name in ("jump", "critic", "critic_jump", "estimator_target"):
+            assert torch.equal(first[name], second[name])
+        assert torch.equal(measured(first, "command"), motion_command(env).velocity)
+    for name, width in widths.items():
+        noise = np.concatenate(found[name]) / width
+        assert np.abs(noise).max() <= 1.0 + 1e-4
+        assert kstest(noise.ravel(), "uniform", args=(-1.0, 2.0)).pvalue > 1e-3
+        correlation = np.corrcoef(noise, rowvar=False)[np.triu_indices(noise.shape[1], 1)]
+        assert np.abs(correlation).max() < 5.0 / np.sqrt(10 * MANY)
+
+
+# --- Critic and estimator ------------------------------------------------------------------------
+
+
+def test_layout_of_the_critic_vector(env: Any) -> None:
+    command = motion_command(env)
+    action = torch.rand(N, 12)
+    env.action_manager.process_action(action)
+    qpos, qvel = put(env)
+    command.time_left[:] = torch.arange(N) / 4
+    seen = observe(env)
+    trunk, feet = rotations(qpos), ids(env, "site", "foot")
+    force = env.scene["feet"].data.force.norm(dim=-1)
+    expected = {
+        "angular_velocity": qvel[:, 3:6],
+        "projected_gravity": trunk.inv().apply([0.0, 0.0, -1.0]),
+        "command": command.velocity,
+        "time_left": np.arange(N)[:, None] / 4,
+        "joint_position": qpos[:, 7:] - DEFAULT,
+        "joint_velocity": qvel[:, 6:],
+        "action": action,
+        "linear_velocity": trunk.inv().apply(qvel[:, :3]),
+        "height": qpos[:, 2:3],
+        "foot_contact": seen["estimator_target"][:, :4],
+        "foot_force": force / (12.0 * 9.81),
+        "foot_height": [d.site_xpos[feet, 2] for d in references(env, qpos, qvel)],
+        # Nominal.
+        "voltage": 1.0,
+        "no_load": 1.0,
+        "drop": 0.0,
+        "friction": env.sim.mj_model.geom("robot/FR_foot_collision").friction[0],
+        "base_mass": BODY.base_mass,
+        "delay": 0.0,
+        "shank_length": BODY.shank_length,
+        "stiffness": 17.0,
+        "damping": 0.4,
+    }
+    assert list(expected) == list(CRITIC)
+    for name, value in expected.items():
+        close(seen["critic"][:, where(CRITIC, name)], value)
+    close(seen["estimator_target"][:, 4:], trunk.inv().apply(qvel[:, :3]))
+
+
+@pytest.mark.parametrize("resets", [False, True])
+def test_contacts_are_those_of_the_present_state(env: Any, resets: bool) -> None:
+    """Whether or not another robot's episode ends."""
+    seen, expected = [], []
+    for _ in range(6):
+        if resets:
+            env.episode_length_buf[0] = 10**6
+        groups = env.step(2.0 * torch.rand(N, 12) - 1.0)[0]
+        seen.append(groups["estimator_target"][1:, :4])
+        assert torch.equal(groups["critic"][1:, where(CRITIC, "foot_contact")], seen[-1])
+        data, feet = env.sim.data, ids(env, "geom", "foot_collision")
+        states = references(env, data.qpos.numpy()[1:], data.qvel.numpy()[1:])
+        expected.append([contacts(state, feet) for state in states])
+    close(torch.stack(seen), expected)
+    assert 0.1 < np.mean(expected) < 0.9
+
+
+def test_a_standing_robot_is_carried_by_its_feet(env: Any) -> None:
+    for _ in range(20):
+        seen = env.step(STAND)[0]["critic"]
+    force = -env.scene["feet"].data.force[..., 2].sum(dim=-1) / (9.81 * BODY.total_mass)
+    assert force.tolist() == pytest.approx([1.0] * N, rel=0.05)
+    sizes = seen[:, where(CRITIC, "foot_force")].sum(dim=1)
+    assert sizes.tolist() == pytest.approx([1.0] * N, abs=0.15)
+    close(seen[:, where(CRITIC, "foot_height")], BODY.foot_radius, atol=0.005)
+    close(seen[:, where(CRITIC, "foot_contact")], 1.0)
+    assert not motion_command(env).motion.non_foot_contacts.any()
+
+
+def test_layout_of_the_critic_jump_vector() -> None:
+    env = training_env.fresh(training_env.nominal(), "jump_a", scripted=True)
+    command = motion_command(env)
+    command.jump[:] = torch.arange(N) % 2 == 0
+    for i, name in enumerate(CRITIC_JUMP):
+        if isinstance(value := getattr(command.state, name, None), Tensor):
+            value[:] = torch.arange(N) / N + i if value.dtype != torch.bool else torch.arange(N) < i
+    seen = observe(env)
+    close(seen["jump"][:, 0], [1.0, 0.0] * (N // 2))
+    assert seen["critic_jump"].shape == (N, len(CRITIC_JUMP))
+    for i, name in enumerate(CRITIC_JUMP):
+        expected = getattr(command.state, name, None)
+        expected = getattr(command, name) if expected is None else expected
+        close(seen["critic_jump"][:, i], expected.float())

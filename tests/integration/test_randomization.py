@@ -1,0 +1,323 @@
+"""Randomization, delays and batteries of the training environment."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chisquare, kstest
+from torch import Tensor
+
+import training_env
+from pronk.errors import PronkError
+from pronk.robots.legged import legged
+from pronk.train.mdp.actions import DelayedJointPositionActionCfg, joint_position_action
+from pronk.train.mdp.events import randomize_base_mass, randomize_decimation, reset_state
+from training_env import MANY, MATCHED, ROBOT, N, drawn
+
+pytestmark = pytest.mark.train
+
+BODY = legged("mini_cheetah")
+ALL = torch.arange(MANY)
+
+
+@pytest.fixture
+def env() -> Any:
+    return training_env.fresh(training_env.randomized(), scripted=True)
+
+
+def index(env: Any, kind: str, name: str) -> int:
+    return int(getattr(env.sim.mj_model, kind)(f"robot/{name}").id)
+
+
+def assert_uniform(values: Any, low: float, high: float) -> None:
+    """Within the range, uniform, and each draw another."""
+    values = np.float64(values)
+    assert low - 1e-6 <= values.min()
+    assert values.max() <= high + 1e-6
+    assert kstest(values.ravel(), "uniform", args=(low, high - low)).pvalue > 1e-3
+    assert len(np.unique(values)) > 0.99 * values.size
+
+
+def test_draws_are_uniform_and_independent(env: Any) -> None:
+    """Drawn again and again; nothing accumulates."""
+    rounds = []
+    for _ in range(10):
+        env.event_manager.apply(mode="startup")
+        rounds.append(drawn(env))
+    found = {name: torch.cat([r[name] for r in rounds]) for name in rounds[0]}
+    ranges = {
+        "friction": (0.05, 3.0),
+        "base_mass": (BODY.base_mass - 0.4, BODY.base_mass + 1.6),
+        "shank_length": (0.18, 0.20),
+        "no_load": (22.2 / 24.0, 25.2 / 24.0),
+        "drop": (1e3 * 4 * 0.03 / 24.0**2, 1e3 * 4 * 0.1 / 24.0**2),
+    }
+    for name, (low, high) in ranges.items():
+        assert_uniform(found[name], low, high)
+    joints = np.hstack([found["stiffness"], found["damping"]])
+    for i, joint in enumerate(ROBOT.joints):
+        g = MATCHED.groups[joint.group]
+        assert_uniform(
+            joints[:, i], g.stiffness - g.stiffness_range, g.stiffness + g.stiffness_range
+        )
+        assert_uniform(joints[:, 12 + i], g.damping - g.damping_range, g.damping + g.damping_range)
+    everything = np.hstack([joints, *(found[name] for name in ranges)])
+    correlation = np.corrcoef(everything, rowvar=False)
+    upper = np.triu_indices(len(correlation), 1)
+    assert np.abs(correlation[upper]).max() < 5.0 / math.sqrt(10 * MANY)
+
+
+def test_a_robot_keeps_its_parameters(env: Any) -> None:
+    before = drawn(env)
+    for _ in range(3):
+        env.step(torch.zeros(MANY, 12))
+    env.reset()
+    after = drawn(env)
+    for name in before.keys() - {"delay", "voltage"}:
+        assert torch.equal(after[name], before[name]), name
+
+
+def test_contacts_have_the_friction_of_the_foot(env: Any) -> None:
+    for _ in range(20):
+        env.step(torch.zeros(MANY, 12))
+    contact, n = env.sim.wp_data.contact, int(env.sim.wp_data.nacon.numpy()[0])
+    feet = [index(env, "geom", f"{leg}_foot_collision") for leg in BODY.legs]
+    touching = np.isin(contact.geom.numpy()[:n], feet).any(axis=1)
+    assert touching.sum() > MANY
+    friction = drawn(env)["friction"][contact.worldid.numpy()[:n][touching]].numpy()
+    expected = np.hstack([friction, friction, np.full_like(friction, 0.02)])
+    found = contact.friction.numpy()[:n][touching][:, :3]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_inertia_of_the_trunk_grows_with_its_mass(env: Any) -> None:
+    trunk, model = index(env, "body", "trunk"), env.sim.mj_model
+    mass = drawn(env)["base_mass"].numpy()
+    inertia = env.sim.model.body_inertia[:, trunk].numpy()
+    expected = mass / BODY.base_mass * model.body_inertia[trunk]
+    np.testing.assert_allclose(inertia, expected, rtol=1e-5)
+    # Derived constants follow, and no other body changes.
+    whole = env.sim.model.body_subtreemass[:, trunk].numpy()
+    np.testing.assert_allclose(whole, mass[:, 0] + BODY.total_mass - BODY.base_mass, rtol=1e-5)
+    masses = np.delete(env.sim.model.body_mass.numpy(), trunk, axis=1)
+    expected = np.delete(np.float32(model.body_mass), trunk)
+    np.testing.assert_array_equal(masses, np.tile(expected, (MANY, 1)))
+    base = env.event_manager.get_term_cfg("base_mass").params["base"]
+    with pytest.raises(PronkError, match="base_mass"):
+        randomize_base_mass(env, None, (-7.0, 1.0), base)
+
+
+def test_shank_length_moves_foot_and_capsule(env: Any) -> None:
+    data, model = env.sim.data, env.sim.model
+    robot = env.scene["robot"].data
+    data.qpos[:, 3:] = torch.cat([torch.tensor([1.0, 0.0, 0.0, 0.0]), robot.default_joint_pos[0]])
+    env.sim.forward()
+    for leg, length in zip(BODY.legs, drawn(env)["shank_length"].T, strict=True):
+        thigh, shank = (index(env, "body", f"{leg}_{part}") for part in ("thigh", "shank"))
+        foot, capsule = (index(env, "geom", f"{leg}_{p}_collision") for p in ("foot", "shank"))
+        site = data.site_xpos[:, index(env, "site", f"{leg}_foot")]
+        # Default pose: thigh .8 rad back, shank .8 rad forward, both from the vertical.
+        drop = data.xpos[:, thigh, 2] - data.geom_xpos[:, foot, 2]
+        torch.testing.assert_close(
+            drop, (BODY.thigh_length + length) * math.cos(0.8), atol=1e-5, rtol=0.0
+        )
+        torch.testing.assert_close(site, data.geom_xpos[:, foot], atol=1e-6, rtol=0.0)
+        # The capsule begins 2 cm below the knee and ends 3 cm above the foot; its bounds follow.
+        centre = (data.geom_xpos[:, capsule] - data.xpos[:, shank]).norm(dim=-1)
+        half = model.geom_size[:, capsule, 1]
+        bounds = model.geom_rbound[:, capsule], model.geom_aabb[:, capsule, 1, 2]
+        found = torch.stack([centre - half, centre + half - length, *(b - half for b in bounds)])
+        expected = torch.tensor([0.02, -0.03, 0.01, 0.01])[:, None].expand(4, MANY)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
+
+
+def test_episodes_begin_about_the_initial_state(env: Any) -> None:
+    robot, data = env.scene["robot"].data, env.sim.data
+    how = {"place": 0.5, "speed": 0.3, "heading": math.pi, "joints": 0.1}
+    assert dict(env.event_manager.get_term_cfg("reset").params) == how
+    states = []
+    for _ in range(10):
+        reset_state(env, ALL, **how)
+        states.append(torch.cat([data.qpos.clone(), data.qvel.clone()], dim=1))
+        states[-1][:, :3] -= env.scene.env_origins
+    start = np.float64(torch.cat(states).numpy())
+    np.testing.assert_allclose(start[:, 2], robot.default_root_state[0, 2], rtol=1e-6)
+    np.testing.assert_array_equal(start[:, [4, 5, *range(21, 37)]], 0.0)
+    np.testing.assert_allclose(np.linalg.norm(start[:, 3:7], axis=1), 1.0, rtol=1e-6)
+    assert_uniform(2.0 * np.arctan2(start[:, 6], start[:, 3]), -math.pi, math.pi)
+    for axes, half in (((0, 1), 0.5), ((19, 20), 0.3)):
+        for axis in axes:
+            assert_uniform(start[:, axis], -half, half)
+    assert_uniform(start[:, 7:19] - robot.default_joint_pos[0].numpy(), -0.1, 0.1)
+    before = data.qpos.clone()
+    reset_state(env, ALL[::2], **how)
+    assert (data.qpos == before).all(dim=1).tolist() == [False, True] * (MANY // 2)
+
+
+def test_pushes_are_mild(env: Any) -> None:
+    push = env.event_manager.get_term_cfg("push")
+    assert push.interval_range_s == (5.0, 10.0)
+    before = env.sim.data.qvel.clone()
+    push.func(env, ALL[::2], **push.params)
+    change = (env.sim.data.qvel - before).numpy()
+    assert not change[1::2].any()
+    assert not change[:, 6:].any()
+    for axis in (0, 1, 5):
+        assert_uniform(change[::2, axis], -0.3, 0.3)
+    np.testing.assert_allclose(change[:, 2:5], 0.0, atol=1e-6)
+
+
+def test_length_of_the_policy_step_is_drawn_each_step(env: Any) -> None:
+    seen = []
+    for _ in range(12):
+        planned, before = env.cfg.decimation, env.sim.data.time.clone()
+        env.step(torch.zeros(MANY, 12))
+        passed = env.sim.data.time[env.episode_length_buf > 0] - before[env.episode_length_buf > 0]
+        torch.testing.assert_close(passed, torch.full_like(passed, 0.005 * planned))
+        seen.append(planned)
+    assert len(set(seen)) > 2
+    assert set(seen) <= {2, 3, 4, 5, 6}
+    # A resumed run restores the counter and has the same draw.
+    planned = env.cfg.decimation
+    randomize_decimation(env, None, **env.event_manager.get_term_cfg("decimation").params)
+    assert env.cfg.decimation == planned
+
+
+# --- Delay ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("delay", [(0, 0), (0, 2), (1, 3), (2, 7)])
+def test_targets_arrive_exactly_a_delay_later(env: Any, delay: tuple[int, int]) -> None:
+    """Against a list of all targets, for policy steps of any length and a reset on the way."""
+    term = DelayedJointPositionActionCfg(
+        entity_name="robot", actuator_names=(".*",), scale=0.35, delay_steps=delay
+    ).build(env)
+    robot = env.scene["robot"].data
+    default = robot.default_joint_pos
+    term.reset()
+    issued = [default.clone() for _ in range(delay[1] + 1)]
+    """The newest target at each physics step so far."""
+    generator = np.random.default_rng(3)
+    for step in range(40):
+        if step == 25:
+            robot.joint_pos_target[ALL[::2]] = 0.0  # as a reset of the entity does
+            term.reset(ALL[::2])
+            for past in issued:
+                past[::2] = default[::2]
+        action = torch.tensor(generator.normal(size=(MANY, 12)), dtype=torch.float32)
+        term.process_actions(action)
+        for _ in range(generator.integers(1, 7)):
+            issued.append(default + 0.35 * action)
+            term.apply_actions()
+            then = len(issued) - 1 - term.lag[:, 0]
+            torch.testing.assert_close(robot.joint_pos_target, torch.stack(issued)[then, ALL])
+    assert set(term.lag[:, 0].tolist()) == set(range(delay[0], delay[1] + 1))
+
+
+def test_delays_are_drawn_per_episode_and_torques_follow_the_drawn_gains(env: Any) -> None:
+    """5.5 ms is one physics step, +- 1; all joints of a robot have the same delay."""
+    first = drawn(env)
+    counts = Counter(first["delay"][:, 0].tolist())
+    assert counts.keys() == {0, 1, 2}
+    assert chisquare(list(counts.values())).pvalue > 1e-3
+    robot, action = env.scene["robot"].data, torch.rand(MANY, 12) - 0.5
+    for step in range(4):
+        env.cfg.decimation = 1
+        position, velocity = robot.joint_pos.clone(), robot.joint_vel.clone()
+        env.step(action)
+        target = robot.default_joint_pos + 0.35 * action * (first["delay"] <= step)
+        torque = first["stiffness"] * (target - position) - first["damping"] * velocity
+        torch.testing.assert_close(robot.qfrc_actuator, torque, rtol=0.0, atol=1e-4)
+        assert torque.abs().max() < 17.0, "no limit is reached"
+    env.reset(env_ids=ALL[::2])
+    second = drawn(env)["delay"]
+    assert torch.equal(second[1::2], first["delay"][1::2])
+    assert 0.4 < (second[::2] != first["delay"][::2]).float().mean() < 0.95
+
+
+# --- Battery -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def batteries() -> Any:
+    """Nominal robots; a test gives them batteries."""
+    env = training_env.fresh(training_env.nominal(), scripted=True)
+    battery = joint_position_action(env).battery
+    assert battery.ideal
+    yield env, battery
+    battery.set(torch.full((N, 1), 24.0), torch.zeros(N, 1), rated=24.0)
+    battery.ideal = True
+
+
+def give(battery: Any, volts: float, ohms: float) -> None:
+    """The first robot has an ideal battery, the others that."""
+    voltage, resistance = torch.full((N, 1), volts), torch.full((N, 1), ohms)
+    voltage[0], resistance[0] = 24.0, 0.0
+    battery.set(voltage, resistance, rated=24.0)
+
+
+@pytest.mark.parametrize(("torque", "speed"), [(10.0, 5.0), (-8.0, -3.0), (6.0, -9.0), (0.0, 20.0)])
+def test_voltage_is_the_fixed_point_of_the_power(
+    batteries: Any, torque: float, speed: float
+) -> None:
+    """V = U - R P / V, with P of brushed motors with K = 2 gear kt and the winding's resistance."""
+    env, battery = batteries
+    give(battery, 25.0, 0.08)
+    for _ in range(100):
+        env.sim.data.qfrc_actuator[:, 6:], env.sim.data.qvel[:, 6:] = torque, speed
+        battery.advance()
+    power = 0.0
+    for joint in ROBOT.joints:
+        constant, winding = 2.0 * joint.drive.gear_ratio * 0.05, 0.173 * 2.0 / 1.5
+        power += torque * speed + winding * (torque / constant) ** 2
+    volts = 12.5 + math.sqrt(12.5**2 - 0.08 * power)
+    assert float(battery.voltage[1]) * 24.0 == pytest.approx(volts, rel=1e-4)
+    assert float(battery.voltage[0]) == pytest.approx(1.0, rel=1e-6)
+    # Beyond the greatest power half of the voltage is left.
+    for _ in range(100):
+        env.sim.data.qfrc_actuator[:, 6:], env.sim.data.qvel[:, 6:] = 26.0, 20.0
+        battery.advance()
+    assert float(battery.voltage[1]) * 24.0 == pytest.approx(12.5, rel=1e-4)
+
+
+def test_stall_torque_is_in_proportion_to_the_voltage(batteries: Any) -> None:
+    env, battery = batteries
+    give(battery, 18.0, 0.0)
+    for drive in env.scene["robot"].actuators:
+        rated = ROBOT.joint(drive.target_names[0]).drive
+        stall = drive.saturation_effort[:2, 0].tolist()
+        assert stall == pytest.approx([rated.stall_torque, 0.75 * rated.stall_torque], rel=1e-5)
+        # The torque lost to speed is the same, so the no-load speed falls alike.
+        slope = drive.back_emf[:2, 0].tolist()
+        assert slope == pytest.approx([rated.stall_torque / rated.no_load_speed] * 2, rel=1e-5)
+
+
+def test_a_full_push_lowers_the_voltage(batteries: Any) -> None:
+    env, battery = batteries
+    give(battery, 24.0, 0.1)
+    least: Tensor = torch.ones(N)
+    for step in range(12):
+        push = torch.zeros(N, 12)
+        push[:, 2::3] = 0.0 if step < 4 else -6.0
+        env.step(push)
+        least = torch.minimum(least, battery.voltage[:, 0])
+    assert float(least[0]) == pytest.approx(1.0, rel=1e-5)
+    assert 0.5 <= float(least[1:].min()) < 0.9
+
+
+def test_physics_gone_wrong_leaves_a_battery(env: Any) -> None:
+    """A power that is not finite must not stay in the voltage, nor in the drives' limits."""
+    battery, still = joint_position_action(env).battery, torch.zeros(MANY, 12)
+    env.step(still)
+    env.sim.data.qvel[3, 7] = float("nan")
+    env.step(still)
+    assert env.termination_manager.get_term("non_finite")[3]
+    assert float(battery.voltage[3]) == pytest.approx(float(battery.no_load[3]))
+    env.step(still)
+    assert all(torch.isfinite(d.saturation_effort).all() for d in env.scene["robot"].actuators)
+    assert 0.7 < float(battery.voltage[3]) < 1.1
