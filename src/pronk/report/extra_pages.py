@@ -12,7 +12,7 @@ import numpy as np
 from pronk.evaluation import bodies as bodies_file
 from pronk.evaluation import results as results_file
 from pronk.evaluation import variation as varied
-from pronk.evaluation.bodies import Bodies
+from pronk.evaluation.bodies import Bodies, Body
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.crossing import CROSSING, Climb, climbs
 from pronk.evaluation.jumps import FIGURES
@@ -25,7 +25,7 @@ from pronk.report import trial_page
 from pronk.report.page import Part, table
 from pronk.report.paper import GAPS, WALKS, published_jumps
 from pronk.report.style import picture
-from pronk.report.trial_figures import Array, Panel, Values
+from pronk.report.trial_figures import Array, Panel
 
 _OBSTACLES = {"gap": "gap", "up": "step up", "down": "step down"}
 _WALK_TABLE = (
@@ -229,20 +229,11 @@ def errors_db(bodies: Bodies) -> dict[str, float]:
     }
 
 
-def by_body(bodies: Bodies, figure: str) -> Values:
-    """Return one figure of every jump, by `POLICY, BODY` and command."""
-    return {
-        f"{policy}, {body.name}": own
-        for body in bodies.bodies
-        for policy, own in trial_page.values(body.trial, figure).items()
-    }
-
-
-def _criteria_passed(body: bodies_file.Body) -> str:
+def _verdict(body: Body) -> str:
     first, *others = (subject.name for subject in body.trial.subjects)
     checks = trial_checks(body.trial)
-    passed = f"{sum(check.passed for check in checks)} of {len(checks)} acceptance criteria"
-    own = f"{body.name}: {passed} passed by {first}"
+    passed = sum(check.passed for check in checks)
+    own = f"{body.name}: {passed} of {len(checks)} acceptance criteria passed by {first}"
     return "; ".join([own, *(verdict(body.trial, other) for other in others)])
 
 
@@ -262,18 +253,15 @@ def bodies_part(path: Path) -> Part:
     errors = errors_db(bodies)
     cells = [cell for body in bodies.bodies for cell in body.trial.cells]
     landed, n = sum(c.succeeded for c in cells), sum(c.n for c in cells)
-    panels = {f"{name} [m]": by_body(bodies, name) for name in ("height", "distance")}
-    figures = {}
+    panels, figures = {}, {}
     for name in ("height", "distance"):
-        paper, label = published_jumps(name), f"{name} [m]"
-        jumps = [
-            (f"{one.name}\n{label}", trial_page.values(one.trial, name), paper)
-            for one in bodies.bodies
-        ]
-        figures[name] = picture(draw.cells(jumps))
+        label, paper = f"{name} [m]", published_jumps(name)
+        own = {one.name: trial_page.values(one.trial, name) for one in bodies.bodies}
+        panels[label] = {f"{p}, {b}": jumps for b, by in own.items() for p, jumps in by.items()}
+        figures[name] = picture(draw.cells([(f"{b}\n{label}", by, paper) for b, by in own.items()]))
     content = {
         "sheet": bodies_file.table(bodies),
-        "verdicts": list(map(_criteria_passed, bodies.bodies)),
+        "verdicts": list(map(_verdict, bodies.bodies)),
         "gains_table": _gains_table(bodies),
         "scatter": picture(draw.scatter_over_error(errors, panels)) if len(errors) > 1 else None,
         "cells": figures,

@@ -50,16 +50,6 @@ def find_gains(folder: Path) -> Path:
     raise ArtefactError(f"{folder}: {what} gains.yaml; `pronk match LOG... --out` writes one.")
 
 
-def load(folder: Path, gains: str | None = None) -> MatchResult:
-    """Read the match of a folder; `gains` is the name of its gains file, found if None.
-
-    Raises:
-        ArtefactError: The folder has no gains or no `match.npz`, or one of them is damaged.
-    """
-    path = folder / gains if gains else find_gains(folder)
-    return result_file.load(folder / "match.npz", gains_file.load(path))
-
-
 def robot_joints(gains: MatchedGains) -> dict[str, Joint]:
     """Return the robot's description of each matched joint; empty for an unknown robot."""
     try:
@@ -107,23 +97,22 @@ def verdict(result: MatchResult) -> dict[str, Any]:
 
 
 def write_page(folder: Path, *, gains: str | None = None) -> tuple[Path, Part]:
-    """Write the page of the match in a folder; return its path and its part.
-
-    Arguments and errors as of `load`.
-    """
+    """Write the page of the match in a folder, as of `part`; return its path and its part."""
     made = replace(part(folder / "match.npz", gains), source="match.npz")
     write_text(folder / PAGE_NAME, page(made.title, [made]))
     return folder / PAGE_NAME, made
 
 
 def part(path: Path, gains: str | None = None) -> Part:
-    """Make the part of the match in `path`, a `match.npz`; `gains` as of `load`.
+    """Make the part of the match in `path`, a `match.npz`.
+
+    `gains` is the name of its gains file, found if None.
 
     Raises:
-        ArtefactError: An artefact is missing or damaged.
+        ArtefactError: There are no gains, or an artefact is missing or damaged.
     """
     gains_path = path.parent / gains if gains else find_gains(path.parent)
-    result = load(path.parent, gains_path.name)
+    result = result_file.load(path, gains_file.load(gains_path))
     own, found = result.gains, verdict(result)
     fits = {name: fit for name, fit in result.joints.items() if fit.responses}
     # Without a grid several joints moved at once and were fitted in time.

@@ -14,7 +14,7 @@ from pronk.errors import ArtefactError
 from pronk.evaluation import tables
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.protocol import RATES, in_paper_order
-from pronk.evaluation.results import SUMMARY, Results, Subject, load, share_interval
+from pronk.evaluation.results import SUMMARY, Results, load, share_interval
 from pronk.report import style
 from pronk.report import trial_figures as draw
 from pronk.report.page import Part, table
@@ -81,12 +81,6 @@ def traces(trial: Results, folder: Path) -> tuple[Traces, int] | None:
         for what, trace in own.items():
             found[what][row.policy].setdefault(row.case, []).append(trace)
     return found, len(kept) - len(present)
-
-
-def _training_gains(subject: Subject) -> dict[str, tuple[float, float]]:
-    """Stiffness [N m/rad] and damping [N m s/rad] by joint, as of the contract."""
-    fields = (subject.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping"))
-    return {name: (stiffness, damping) for name, stiffness, damping in zip(*fields, strict=False)}
 
 
 def films(folder: Path) -> tuple[dict[str, str], list[str]]:
@@ -200,18 +194,15 @@ def rate_rms(runs: Mapping[str, Sequence[Array]]) -> float:
 
 
 def _setup(trial: Results) -> tables.Sheet:
-    columns = "policy | gains | stiffness [N m/rad] / damping [N m s/rad] | file | SHA-256"
-    rows = [
-        (one.name, one.contract.get("gains", "unknown"), _groups(one), one.path, one.sha256)
-        for one in trial.subjects
-    ]
-    return table(columns, rows)
-
-
-def _groups(subject: Subject) -> str:
-    """Gains that a policy was trained with, once for each joint group."""
-    found: dict[str, str] = {}
-    for name, (stiffness, damping) in _training_gains(subject).items():
-        group = style.joint_words(name.removeprefix(f"{style.leg_of(name)}_"))
-        found.setdefault(group, f"{group} {stiffness:.1f} / {damping:.3f}")
-    return ", ".join(found.values())
+    """Return files of the policies and the gains that they were trained with, by joint group."""
+    rows = []
+    for one in trial.subjects:
+        columns = [one.contract.get(name, ()) for name in ("joint_names", "stiffness", "damping")]
+        groups: dict[str, str] = {}
+        for name, stiffness, damping in zip(*columns, strict=False):
+            group = style.joint_words(name.removeprefix(f"{style.leg_of(name)}_"))
+            groups.setdefault(group, f"{group} {stiffness:.1f} / {damping:.3f}")
+        gains = one.contract.get("gains", "unknown")
+        rows.append((one.name, gains, ", ".join(groups.values()), one.path, one.sha256))
+    heads = "policy | gains | stiffness [N m/rad] / damping [N m s/rad] | file | SHA-256"
+    return table(heads, rows)
