@@ -44,39 +44,27 @@ def contract(**changes: Any) -> Contract:
 
 
 def write_hopper(path: Path, strength: float = 1.0, **changes: Any) -> Path:
-    """Write it as ONNX: action = jump * straight / scale; contacts all 1, velocity 0.
-
-    Args:
-        path: Where to.
-        strength: Share of the way to straight legs.
-        changes: Of the contract.
-    """
+    """Write it as ONNX: action = jump * strength * straight / scale; contacts 1, velocity 0."""
     onnx = pytest.importorskip("onnx")
-    helper, numpy_helper = onnx.helper, onnx.numpy_helper
-    made = contract(**changes)
-    action = (strength * STRAIGHT / np.array(made.action_scale))[None].astype(np.float32)
+    helper, made = onnx.helper, contract(**changes)
     weights = {
-        "pick": np.eye(MEASURED_SIZE, 1, dtype=np.float32),
-        "nothing": np.zeros((1, JOINTS), np.float32),
-        "still": np.zeros((1, ESTIMATE["linear_velocity"]), np.float32),
-        "on_ground": np.zeros((1, ESTIMATE["contact"]), np.float32),
-        "one": np.ones((1, 1), np.float32),
-        "straight": action,
+        "still": np.zeros((MEASURED_SIZE, ESTIMATE["linear_velocity"])),
+        "in_air": np.zeros((MEASURED_SIZE, ESTIMATE["contact"])),
+        "one": np.ones((1, 1)),
+        "rest": np.zeros((MEASURED_SIZE, JOINTS)),
+        "straight": (strength * STRAIGHT / np.array(made.action_scale))[None],
     }
     nodes = [
-        helper.make_node("MatMul", ["measured", "pick"], ["some"]),
-        helper.make_node("MatMul", ["some", "nothing"], ["zero"]),
-        helper.make_node("MatMul", ["some", "still"], ["linear_velocity"]),
-        helper.make_node("MatMul", ["some", "on_ground"], ["none"]),
+        helper.make_node("MatMul", ["measured", "still"], ["linear_velocity"]),
+        helper.make_node("MatMul", ["measured", "in_air"], ["none"]),
         helper.make_node("Add", ["none", "one"], ["contact"]),
+        helper.make_node("MatMul", ["measured", "rest"], ["resting" if made.jump else "action"]),
     ]
     inputs = {"measured": MEASURED_SIZE}
     if made.jump:
         inputs["jump"] = 1
         nodes.append(helper.make_node("MatMul", ["jump", "straight"], ["thrown"]))
-        nodes.append(helper.make_node("Add", ["zero", "thrown"], ["action"]))
-    else:
-        nodes.append(helper.make_node("Identity", ["zero"], ["action"]))
+        nodes.append(helper.make_node("Add", ["resting", "thrown"], ["action"]))
 
     def values(sizes: dict[str, int]) -> list[Any]:
         kind = onnx.TensorProto.FLOAT
@@ -87,7 +75,7 @@ def write_hopper(path: Path, strength: float = 1.0, **changes: Any) -> Path:
         "hopper",
         values(inputs),
         values({"action": JOINTS, **ESTIMATE}),
-        [numpy_helper.from_array(value, name) for name, value in weights.items()],
+        [onnx.numpy_helper.from_array(w.astype(np.float32), name) for name, w in weights.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     helper.set_model_props(model, {METADATA_KEY: to_json(made)})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,13 +23,14 @@ from pronk.evaluation.bodies import (
     save_sim_params,
 )
 from pronk.evaluation.protocol import Case
+from pronk.evaluation.results import Results
 from pronk.evaluation.trial import Plan
-from pronk.evaluation.variation import NOMINAL, VARIATION, Parameter, add_variation
+from pronk.evaluation.variation import NOMINAL, Parameter, add_variation
 from pronk.excitation.signals import Chirp
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.response.response import Estimator
-from pronk.runtime.script import Script
+from pronk.runtime.script import STILL, Script
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params
 
@@ -103,28 +105,28 @@ def test_gains_are_as_wrong_as_the_match_says(tmp_path: Path) -> None:
     assert found["naive"] == pytest.approx(matched.naive_error_db, rel=1e-4)
 
 
-# --- One number at a time -----------------------------------------------------------------------
+# --- Other runs than jumps ----------------------------------------------------------------------
+
+
+def setup(out: Path) -> Any:
+    return {"robot": ROBOT, "sim_params": SIM_PARAMS, "out": out}
+
+
+def reloaded(found: Results, folder: Path) -> Results:
+    read = results.load(folder, found.kind)
+    assert repr((read.rows, read.cells)) == repr((found.rows, found.cells))
+    return read
 
 
 def test_only_the_varied_number_differs(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     policy = write_hopper(tmp_path / "policy.onnx")
-    on_the_spot = Script(
-        command=(0.0, 0.0, 0.0), stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=1.0
-    )
-    plan = Plan(
-        cases=(Case(name="spot", command=(0.0, 0.0, 0.0)),),
-        jumps=1,
-        script=on_the_spot,
-        spread_s=0.0,
-    )
+    script = Script(command=STILL, stand_s=0.1, run_s=0.1, jump_s=0.14, keep_s=0.0, stop_s=1.0)
+    plan = Plan(cases=(Case(name="spot", command=STILL),), jumps=1, script=script, spread_s=0.0)
     own = SIM_PARAMS.machine.bus_voltage
-    volts = Parameter(
-        name="bus_voltage", says="battery", unit="V", values=(18.0, own), trained="24 V"
-    )
-    found = add_variation(
-        [policy], plan, robot=ROBOT, sim_params=SIM_PARAMS, out=tmp_path, parameters=(volts,)
-    )
+    changes = {"says": "battery", "unit": "V", "trained": "24 V"}
+    volts = Parameter(name="bus_voltage", values=(18.0, own), **changes)
+    found = add_variation([policy], plan, parameters=(volts,), **setup(tmp_path))
     nominal, low, same = found.rows
     assert nominal.parameter == NOMINAL
     # The same value again is the same jump, to the last digit; another is another.
@@ -133,37 +135,21 @@ def test_only_the_varied_number_differs(tmp_path: Path) -> None:
     line = variation.line(found, "bus_voltage", "matched", "spot")
     assert [cell.value for cell in line] == [18.0, own, own]
     assert [cell.n for cell in line] == [1, 1, 1]
-    read = results.load(tmp_path, VARIATION)
-    assert repr(read.rows) == repr(found.rows)
-    assert repr(read.cells) == repr(found.cells)
-    assert variation.parameters_of(read) == (volts,)
+    assert variation.parameters_of(reloaded(found, tmp_path)) == (volts,)
 
 
 def test_a_walking_policy_stands(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     policy = write_hopper(tmp_path / "policy.onnx", jump=False)
-    cases = (
-        Case(name="stand", command=(0.0, 0.0, 0.0)),
-        Case(name="slow", command=(0.1, 0.0, 0.0)),
-    )
-    found = walk.add_walks(
-        [policy],
-        robot=ROBOT,
-        sim_params=load_sim_params(),
-        out=tmp_path,
-        cases=cases,
-        runs=1,
-        seconds=2.4,
-    )
+    cases = (Case(name="stand", command=STILL), Case(name="slow", command=(0.1, 0.0, 0.0)))
+    found = walk.add_walks([policy], cases=cases, runs=1, seconds=2.4, **setup(tmp_path))
     stand, slow = (found.cell("matched", case.name) for case in cases)
     assert (stand.n, stand.fell, stand.non_foot_contact) == (1, 0, 0)
     # It stands whatever the command.
     assert stand.figures["speed_error"].mean < 0.01
     assert slow.figures["speed_error"].mean == pytest.approx(0.1, abs=0.01)
     assert stand.figures["lasted"].mean == pytest.approx(2.4)
-    read = results.load(tmp_path, walk.WALK)
-    assert repr(read.rows) == repr(found.rows)
-    assert repr(read.cells) == repr(found.cells)
+    reloaded(found, tmp_path)
     path = tmp_path / walk.WALK.table
     path.write_text(path.read_text().replace("speed_error_m", "error_m"))
     with pytest.raises(ArtefactError, match="--walk"):

@@ -89,45 +89,36 @@ def test_a_policy_without_jump_input_gets_none() -> None:
     assert not any(jumps(joystick, 0.0, 50))
 
 
-def sample(time: float, z: float, vz: float, *, airborne: bool, tilt: float = 0.0) -> Capture:
-    return motion(
-        np.array([time]),
-        position=np.array([[1.5 * time, 0.0, z]]),
-        orientation=np.array([[math.cos(0.5 * tilt), math.sin(0.5 * tilt), 0.0, 0.0]]),
-        velocity=np.array([[1.5, 0.0, vz]]),
-        contact=np.full((1, 4), not airborne),
-    )
-
-
-def flown(speed: float) -> Gauge:
-    """A ballistic flight from standing height, sampled every 2 ms."""
+def flown(speed: float, *, tilt: float = 0.0) -> Gauge:
+    """A ballistic flight from standing height, sampled every 2 ms; then the trunk leans."""
     gauge = Gauge(JumpRules.of(ROBOT))
-    for time_ in np.arange(0.0, 1.2, 0.002):
-        t = time_ - 0.3
+    for time_ in np.arange(0.0, 1.2, 0.002).tolist():
+        t, lean = time_ - 0.3, 0.5 * tilt * (time_ > 1.0)
         airborne = 0.0 <= t <= 2.0 * speed / GRAVITY
         z = BODY.standing_height + (speed * t - 0.5 * GRAVITY * t * t if airborne else 0.0)
-        vz = speed - GRAVITY * t if airborne else 0.0
-        gauge.add(sample(float(time_), z, vz, airborne=airborne))
+        sample = motion(
+            np.array([time_]),
+            position=np.array([[1.5 * time_, 0.0, z]]),
+            orientation=np.array([[math.cos(lean), math.sin(lean), 0.0, 0.0]]),
+            velocity=np.array([[1.5, 0.0, speed - GRAVITY * t if airborne else 0.0]]),
+            contact=np.full((1, 4), not airborne),
+        )
+        gauge.add(sample)
     return gauge
 
 
-def test_a_jump_is_measured() -> None:
-    (hop,) = flown(2.0).hops
+def test_jumps_and_falls_are_measured() -> None:
+    gauge = flown(2.0)
+    (hop,) = gauge.hops
     assert hop.vertical == pytest.approx(2.0, abs=0.03)
     assert hop.apex == pytest.approx(BODY.standing_height + 4.0 / (2.0 * GRAVITY), abs=1e-3)
     assert hop.duration == pytest.approx(4.0 / GRAVITY, abs=0.005)
     assert hop.distance == pytest.approx(1.5 * hop.duration)
     # v^2 / 2g is 2.5 cm: less than the 3 cm of a jump.
     assert flown(0.7).hops == []
-
-
-def test_a_fall_is_detected() -> None:
-    gauge = Gauge(JumpRules.of(ROBOT))
-    gauge.add(sample(0.0, 0.29, 0.0, airborne=False))
-    assert not gauge.fallen
-    gauge.add(sample(0.1, 0.15, 0.0, airborne=False, tilt=1.5))
-    assert gauge.fallen
-    assert "fell" in readout(gauge, 1.0)
+    fallen = flown(2.0, tilt=1.5)
+    assert (gauge.fallen, fallen.fallen) == (False, True)
+    assert "fell" in readout(fallen, 1.0)
 
 
 class Heights:
@@ -146,8 +137,10 @@ def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_hopper(tmp_path_factory.mktemp("hopper") / "policy.onnx")
 
 
-def played(hopper: Path, act: str, at: float, end: float) -> tuple[Any, list[float]]:
-    """Play until `end` [s]; jump or reset once from `at` [s] on."""
+@pytest.mark.parametrize(("act", "at", "end"), [("jump", 0.1, 1.0), ("reset", 0.2, 0.3)])
+def test_the_robot_hops_and_resets_no_faster_than_real_time(
+    hopper: Path, act: str, at: float, end: float
+) -> None:
     joystick, page, done = Joystick(ranges=RANGES), Heights(), []
 
     def until(simulated: float) -> bool:
@@ -157,23 +150,17 @@ def played(hopper: Path, act: str, at: float, end: float) -> tuple[Any, list[flo
         return simulated >= end
 
     figures = play(ROBOT, load_policy(hopper), load_sim_params(), joystick, page, until=until)
-    return figures, page.heights
-
-
-def test_the_robot_hops_on_command_and_no_faster_than_real_time(hopper: Path) -> None:
-    figures, heights = played(hopper, "jump", 0.1, 1.0)
-    assert figures.simulated_s == pytest.approx(1.0)
-    assert figures.wall_s >= 0.97
+    heights = page.heights
+    assert figures.wall_s >= 0.97 * end
     assert heights[0] == pytest.approx(BODY.standing_height, abs=0.06)
-    assert max(heights) > heights[0] + 0.05
-    assert len(heights) == 51
-
-
-def test_after_a_reset_the_same_run_begins_again(hopper: Path) -> None:
-    figures, heights = played(hopper, "reset", 0.2, 0.3)
-    assert figures.resets == 1
-    again = heights[11:]
-    assert again == heights[: len(again)]
+    if act == "jump":
+        assert figures.simulated_s == pytest.approx(1.0)
+        assert max(heights) > heights[0] + 0.05
+        assert len(heights) == 51
+    else:
+        assert figures.resets == 1
+        again = heights[11:]
+        assert again == heights[: len(again)]
 
 
 def wait_for(what: Callable[[], bool]) -> None:
@@ -254,18 +241,13 @@ def test_without_viser_one_sentence_names_the_extra(
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_port_that_is_taken_is_passed_over() -> None:
+def test_a_port_that_is_taken_is_passed_over_and_bad_addresses_are_refused() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
         assert port < free_port("127.0.0.1", port) < port + 20
-
-
-@pytest.mark.parametrize(
-    ("host", "port"), [("127.0.0.1", 0), ("300.1.1.1", 8080), ("192.0.2.1", 8080)]
-)
-def test_a_bad_address_is_refused(host: str, port: int) -> None:
-    """The last one is set aside for documents, so no machine has it."""
-    with pytest.raises(PronkError, match=r"--(port|host)"):
-        free_port(host, port)
+    # The last one is set aside for documents, so no machine has it.
+    for host, port in (("127.0.0.1", 0), ("300.1.1.1", 8080), ("192.0.2.1", 8080)):
+        with pytest.raises(PronkError, match=r"--(port|host)"):
+            free_port(host, port)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hopper import DEFAULT, ROBOT, STRAIGHT, write_hopper
 from pronk.errors import ArtefactError, HardwareError
-from pronk.links.machine import Command, State
+from pronk.links.machine import Command
 from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.rollout import (
     Tick,
@@ -53,20 +53,6 @@ def standing(seed: int = 0) -> Tapped:
     return machine
 
 
-def state(**changes: object) -> State:
-    kept = State(
-        time=0.0,
-        sequence=0,
-        position=DEFAULT,
-        velocity=np.zeros(12),
-        torque=np.zeros(12),
-        gyro=np.array([0.1, 0.2, 0.3]),
-        accelerometer=np.zeros(3),
-        bus_voltage=24.0,
-    )
-    return replace(kept, **changes)  # type: ignore[arg-type]
-
-
 def test_gravity_is_that_of_the_rotation() -> None:
     rng = np.random.default_rng(0)
     for rotation in Rotation.random(50, rng=rng):
@@ -90,12 +76,12 @@ def test_commands_are_sent_on_time_with_the_gains_of_the_drives(policy: Policy) 
         assert command.damping == pytest.approx(0.4)
         assert command.position == pytest.approx(tick.target)
     assert machine.now() == pytest.approx(HOP.seconds)
-    jump = np.array([tick.jump for tick in taken])
-    command = np.array([tick.command for tick in taken])
-    target = np.array([tick.target for tick in taken])
+    jump, velocity, target = (
+        np.array([getattr(tick, name) for tick in taken]) for name in ("jump", "command", "target")
+    )
     assert np.flatnonzero(jump).tolist() == [10, 11, 12, 13, 14]
-    assert command[:5] == pytest.approx(0.0)
-    assert command[5:15] == pytest.approx(np.tile(HOP.command, (10, 1)))
+    assert velocity[:5] == pytest.approx(0.0)
+    assert velocity[5:15] == pytest.approx(np.tile(HOP.command, (10, 1)))
     assert target == pytest.approx(DEFAULT + jump[:, None] * STRAIGHT, abs=1e-6)
     for tick in taken:
         assert tick.action == pytest.approx((tick.target - DEFAULT) / 0.5, abs=1e-6)
@@ -112,15 +98,6 @@ def test_a_repeat_is_the_same_to_the_last_digit(policy: Policy) -> None:
     )
     assert np.array_equal(one, two)
     assert not np.array_equal(one, other)
-
-
-def test_a_caller_can_stop(policy: Policy) -> None:
-    machine = standing()
-    for tick in ticks(machine, policy, ROBOT, lambda t: (STILL, False)):
-        if tick.since > 0.09:
-            break
-    assert len(machine.sent) == 6
-    assert machine.now() == pytest.approx(0.1)
 
 
 def test_a_clock_that_runs_ahead_loses_ticks_and_no_time(policy: Policy) -> None:
@@ -155,6 +132,7 @@ def test_a_policy_of_another_robot_sends_nothing(tmp_path: Path) -> None:
     ],
 )
 def test_a_robot_that_does_not_stand_is_refused(changes: dict[str, Any], found: str) -> None:
-    check_standing(ROBOT, state())
+    state = standing().latest()
+    check_standing(ROBOT, state)
     with pytest.raises(HardwareError, match=found):
-        check_standing(ROBOT, state(**changes))
+        check_standing(ROBOT, replace(state, **changes))

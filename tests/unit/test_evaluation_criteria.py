@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from pronk.errors import ArtefactError, PronkError
@@ -34,14 +33,8 @@ def spread(mean: float, std: float = 0.01) -> Spread:
 
 
 GOOD_WALK = {"speed_error": 0.1, "yaw_error": 0.1, "speed_error_averaged": 0.04, "fell": 0.0}
-GOOD_JUMP = {
-    "height": 0.5,
-    "distance": 1.2,
-    "lift_off_velocity": 2.4,
-    "delay": 0.2,
-    "upright": 1.0,
-    "single": 1.0,
-}
+GOOD_JUMP = {"height": 0.5, "distance": 1.2, "lift_off_velocity": 2.4, "delay": 0.2}
+GOOD_JUMP |= {"upright": 1.0, "single": 1.0}
 
 
 def command_result(name: str, jump: bool, **changes: float | Spread) -> CommandResult:
@@ -54,16 +47,9 @@ def evaluation(**changes: Any) -> Evaluation:
     whole = Evaluation(
         walks=tuple(command_result(case.name, jump=False) for case in WALKS),
         jumps=tuple(command_result(case.name, jump=True) for case in JUMPS),
-        estimator={
-            "forward": 0.1,
-            "left": 0.1,
-            "up": 0.0,
-            "velocity": 0.14,
-            "contacts_right": 0.96,
-        },
+        estimator={"velocity": 0.14, "contacts_right": 0.96},
         plan={"robots": 10, "seed": 3},
         seconds=1.0,
-        about={"policy": {"file": "policy.onnx"}, "randomization": "full"},
     )
     return replace(whole, **changes)
 
@@ -138,25 +124,19 @@ def test_speed_errors_come_back_from_a_saved_evaluation(tmp_path: Path) -> None:
 def test_every_robot_has_its_command_and_its_times() -> None:
     plan = Plan(robot=ROBOT, robots=200, seed=4)
     assert plan.size == 14 * 200
-    commands = plan.commands()
-    assert commands[0].tolist() == [2.0, 0.0, 0.0]
-    assert commands[plan.walkers - 1].tolist() == [0.0, 0.0, 0.0]
-    assert commands[-1].tolist() == [-2.0, 0.0, 0.0]
+    commands = plan.commands()[[0, plan.walkers - 1, -1], 0]
+    assert commands.tolist() == [2.0, 0.0, -2.0]
     times = plan.times(DT)
     walking = {name: set(values[: plan.walkers].tolist()) for name, values in times.items()}
     assert walking == {"start": {0}, "stop": {NEVER}, "on": {NEVER}, "off": {NEVER}}
-    on = times["on"][plan.walkers :] * DT
+    start, stop, on, off = (times[name][plan.walkers :] for name in ("start", "stop", "on", "off"))
     # 1 s of standing, 2.5 s of running, up to half a second more, evenly.
-    assert 3.5 <= on.min() < 3.51
-    assert 3.99 < on.max() <= 4.0
-    assert on.mean() == pytest.approx(3.75, abs=0.02)
-    assert np.array_equal(times["off"] - times["on"], np.r_[[0] * plan.walkers, [100] * 1000])
-    assert set((times["stop"] - times["off"])[plan.walkers :]) == {100}
-    assert set(times["start"][plan.walkers :]) == {200}
+    assert 3.5 <= DT * on.min() < 3.51
+    assert 3.99 < DT * on.max() <= 4.0
+    assert DT * on.mean() == pytest.approx(3.75, abs=0.02)
+    assert set(start) == {200}
+    assert set(off - on) == set(stop - off) == {100}
     assert plan.seconds == 20.0
     assert replace(plan, walks=()).seconds == pytest.approx(4.0 + 1.5 + 1.0 + 2.0)
-
-
-def test_an_empty_plan_is_refused() -> None:
     with pytest.raises(PronkError, match="robots"):
         Plan(robot=ROBOT, robots=0)

@@ -86,25 +86,6 @@ def jump_of(
     return measure(whole, script, ROBOT, began=0.0, rules=rules)
 
 
-def test_a_ballistic_jump_has_the_figures_of_the_parabola() -> None:
-    """101 steps in the air: v = g T / 2 = 2.477 m/s, apex v^2 / 2 g = .3128 m."""
-    air, wait, on = 101, 200, 160
-    flight = (air + 1) * STEP
-    speed = 0.5 * G * flight
-    found = jump_of(series(ground(wait), hop(air), ground(500), forward=2.0), on)
-    assert found.found
-    assert found.upright
-    assert (found.flights, found.high_flights) == (1, 1)
-    assert found.height == pytest.approx(speed**2 / (2.0 * G), abs=1e-9)
-    assert found.apex_gain == pytest.approx(speed**2 / (2.0 * G), abs=1e-9)
-    assert found.delay == pytest.approx((wait - on) * STEP)
-    # Sampling cuts one step off the start.
-    assert found.duration == pytest.approx(flight - STEP)
-    assert found.lift_off_velocity == pytest.approx(speed - G * STEP)
-    assert found.horizontal_velocity == pytest.approx(2.0)
-    assert found.distance == pytest.approx(2.0 * (flight - STEP))
-
-
 def test_distance_along_the_command_is_signed_and_turns_with_the_trunk() -> None:
     flown = 99 * STEP
     # The trunk looks along world y; commanded to the right, it flies along world x.
@@ -170,13 +151,10 @@ def test_a_jump_lifts_off_within_the_search_time() -> None:
 
 
 def test_upright_is_measured_two_seconds_after_touchdown() -> None:
-    whole = series(ground(100), hop(80), ground(401))
-    for degrees in (29.0, 31.0):
-        half = math.radians(degrees) / 2
+    for degrees, wait, upright in ((29.0, 401, True), (31.0, 401, False), (0.0, 400, False)):
+        whole, half = series(ground(100), hop(80), ground(wait)), math.radians(degrees) / 2
         roll = np.tile([math.cos(half), math.sin(half), 0.0, 0.0], (len(whole.time), 1))
-        assert jump_of(replace(whole, orientation=roll), 90).upright == (degrees < 30.0)
-    # A robot that falls one sample earlier has no such moment.
-    assert not jump_of(series(ground(100), hop(80), ground(400)), 90).upright
+        assert jump_of(replace(whole, orientation=roll), 90).upright is upright
 
 
 def test_the_highest_flight_without_a_jump_input() -> None:
@@ -227,31 +205,33 @@ def at(*times: float) -> slice:
 
 def test_a_jump_by_hand() -> None:
     found = figures(seen_jump(up=UP, speed=1.0))
-    apex = Z_OFF + UP**2 / (2.0 * G)
+    rise = UP**2 / (2.0 * G)
     flags = ("standing", "found", "upright", "success", "non_foot_contact", "fell")
     assert [getattr(found, name) for name in flags] == [True] * 4 + [False] * 2
-    assert found.delay == pytest.approx(DELAY)
-    assert found.duration == pytest.approx(FLIGHT)
-    assert found.height == pytest.approx(apex - (STANDING - CROUCH), abs=1e-5)
-    assert found.apex_gain == pytest.approx(apex - STANDING, abs=1e-5)
-    assert found.rise == pytest.approx(UP**2 / (2.0 * G), abs=1e-5)
-    assert found.ballistic == pytest.approx(UP**2 / (2.0 * G))
-    assert found.lift_off_velocity == pytest.approx(UP)
-    assert found.horizontal_velocity == pytest.approx(1.0)
-    assert found.distance == pytest.approx(FLIGHT)
-    assert found.along == pytest.approx(FLIGHT)
+    expected = {
+        "delay": DELAY,
+        "duration": FLIGHT,
+        "height": Z_OFF + rise - (STANDING - CROUCH),
+        "apex_gain": Z_OFF + rise - STANDING,
+        "rise": rise,
+        "ballistic": rise,
+        "lift_off_velocity": UP,
+        "horizontal_velocity": 1.0,
+        "distance": FLIGHT,
+        "along": FLIGHT,
+        # The feet are as wide apart as the hips: what is left of the distance is the gap (A16).
+        # Their last stand is one sample before lift-off.
+        "gap": FLIGHT + DT - (FEET[0, 0] - FEET[2, 0]),
+        "flights": 1.0,
+        "high_flights": 1.0,
+        "speed": 1.0,
+    }
+    assert {name: getattr(found, name) for name in expected} == pytest.approx(expected, abs=1e-5)
     # The trunk is lowest .1 s after the jump input and .1 s after touchdown.
     assert found.distance_minima == pytest.approx(DELAY - 0.1 + FLIGHT, abs=2e-3)
-    # The feet are as wide apart as the hips: what is left of the distance is the gap (A16). Their
-    # last stand is one sample before lift-off.
-    assert found.gap == pytest.approx(FLIGHT + DT - (FEET[0, 0] - FEET[2, 0]))
-    assert found.flights == found.high_flights == 1.0
-    assert found.speed == pytest.approx(1.0)
-
-
-def test_clearance_by_hand() -> None:
-    found = figures(seen_jump(up=UP))
-    rise = UP**2 / (2.0 * G)
+    # 100 W from the input to .5 s after touchdown; 1 m/s.
+    assert found.energy == pytest.approx(100.0 * (DELAY + FLIGHT + 0.5), abs=0.2)
+    assert found.cost_of_transport == pytest.approx(100.0 / (12.0 * G), rel=1e-6)
     assert found.clearance == pytest.approx(rise + TUCKED, abs=1e-4)
     # A quarter of the flight away from the apex: 3/4 of the rise, sin(pi / 4) of the tuck.
     expected = 0.75 * rise + math.sin(math.pi / 4.0) * TUCKED
@@ -281,23 +261,18 @@ def test_without_a_jump() -> None:
     assert found.flights == found.high_flights == 0.0
 
 
-def test_a_fall_before_the_jump_input() -> None:
-    found = figures(changed(seen_jump(), "position", (at(ON - 0.5, 9.0), 2), 0.05))
-    assert (found.standing, found.fell, found.success) == (False, True, False)
-    assert all(
-        math.isnan(getattr(found, name)) for name, each in FIGURES.items() if not each.joints
-    )
-
-
-@pytest.mark.parametrize("after", [0.1, 1.9])
-def test_a_fall_after_landing_is_no_success(after: float) -> None:
-    # Lying on its side: x of the quaternion is sin(45 degrees).
+def test_falls() -> None:
     seen = seen_jump()
-    side = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0])
-    found = figures(changed(seen, "orientation", at(DOWN + after, 9.0), side))
-    flags = (found.found, found.fell, found.upright, found.success)
-    assert flags == (True, True, False, False)
-    assert found.distance == pytest.approx(FLIGHT)
+    early = figures(changed(seen, "position", (at(ON - 0.5, 9.0), 2), 0.05))
+    assert (early.standing, early.fell, early.success) == (False, True, False)
+    numbers = (name for name, each in FIGURES.items() if not each.joints)
+    assert all(math.isnan(getattr(early, name)) for name in numbers)
+    for after in (0.1, 1.9):  # lying on its side: x of the quaternion is sin(45 degrees)
+        side = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0])
+        found = figures(changed(seen, "orientation", at(DOWN + after, 9.0), side))
+        flags = (found.found, found.fell, found.upright, found.success)
+        assert flags == (True, True, False, False)
+        assert found.distance == pytest.approx(FLIGHT)
 
 
 @pytest.mark.parametrize(
@@ -313,23 +288,12 @@ def test_a_knee_on_the_ground_is_no_success(when: float, touches: bool) -> None:
 
 def test_rates_are_those_of_the_acceleration() -> None:
     seen = seen_jump()
-    time = seen.time
-    rates = np.zeros((len(time), 3))
-    wave = np.sin(2.0 * np.pi * 5.0 * time)
-    rates[:, 0], rates[:, 1] = 3.0 * wave, -2.0 * wave
-    rates[time < SCRIPT.start] = rates[time >= ON] = 50.0
+    rates = np.outer(np.sin(2.0 * np.pi * 5.0 * seen.time), [3.0, -2.0, 0.0])
+    rates[seen.time < SCRIPT.start] = rates[seen.time >= ON] = 50.0
     found = figures(replace(seen, angular_velocity=rates))
-    assert found.roll_rate_peak == pytest.approx(3.0, rel=1e-4)
-    assert found.roll_rate_rms == pytest.approx(3.0 / math.sqrt(2.0), rel=1e-3)
-    assert found.pitch_rate_peak == pytest.approx(2.0, rel=1e-4)
-    assert found.pitch_rate_rms == pytest.approx(2.0 / math.sqrt(2.0), rel=1e-3)
-
-
-def test_energy_and_cost_of_transport_by_hand() -> None:
-    found = figures(seen_jump())
-    # 100 W from the input to .5 s after touchdown; 1 m/s.
-    assert found.energy == pytest.approx(100.0 * (DELAY + FLIGHT + 0.5), abs=0.2)
-    assert found.cost_of_transport == pytest.approx(100.0 / (12.0 * G), rel=1e-6)
+    for axis, peak in (("roll", 3.0), ("pitch", 2.0)):
+        assert getattr(found, f"{axis}_rate_peak") == pytest.approx(peak, rel=1e-4)
+        assert getattr(found, f"{axis}_rate_rms") == pytest.approx(peak / math.sqrt(2.0), rel=1e-3)
 
 
 def test_loads_by_hand() -> None:
