@@ -120,21 +120,10 @@ def add_bodies(
     """Draw robots, match each, try policies on each, and write `bodies.json`.
 
     A robot whose folder has its parameters and gains already is not excited again: a policy trained
-    with those gains finds them unchanged.
-
-    Args:
-        policies: All of them are tried on every robot.
-        plan: Of the trials; 20 jumps with each of the paper's commands if None.
-        count: Robots.
-        own: For each robot, in order, policies that were trained with its gains.
-        repeats: Of the sweep of each joint.
-        seed: The robots are drawn from `1000 seed + 1` and on.
-        stages: Called with the stage and the share of it that is done.
-        setup: As of `run_trial`; the robots are drawn around its parameters, into `bodies` in its
-            folder.
-
-    Raises:
-        PronkError: Of policies, parameters or plan, before the first step.
+    with those gains finds them unchanged. Robots are drawn from `1000 seed + 1` and on around the
+    parameters of `setup`; `own` has for each, in order, policies that were trained with its gains.
+    `repeats` is of each joint's sweep; `stages` is called with a stage and its share done. Without
+    a plan, 20 jumps with each of the paper's commands are tried.
     """
     begun, robot, out = time.perf_counter(), setup["robot"], setup["out"]
     processes = setup.get("processes", 1)
@@ -206,14 +195,8 @@ class Tolerance:
     why: str
 
 
-def _relative(half: float, why: str) -> Tolerance:
-    return Tolerance("relative", 0.0, half, why)
-
-
-def _about(centre: float, half: float, why: str) -> Tolerance:
-    return Tolerance("about", centre, half, why)
-
-
+_relative = partial(Tolerance, "relative", 0.0)
+_about = partial(Tolerance, "about")
 GROUP_TORQUE = 0.06
 """Relative half-width of a factor on `torque_scale` that the joints of one group share: motors of
 one batch have one magnet material and one winding."""
@@ -336,10 +319,6 @@ def match_body(
 
     The match reads the logs and nothing else. A folder that has the robot's gains is read. `seed`
     is of all noise; `repeats` of the sweep of each joint; `processes` sweep legs at once.
-
-    Raises:
-        PlanError: The sweep could exceed a limit of the robot.
-        HardwareError: It did.
     """
     files = [folder / LOGS / f"{joint}.mcap" for joint in robot.joint_names]
     same = False
@@ -383,10 +362,6 @@ def gains_errors(
     """Return the errors of several sets of gains, by name, on one robot's sweep [dB RMS].
 
     The largest amplitude of each joint is compared; `settings` are those of the match.
-
-    Raises:
-        LogError: The logs excite no joint or cannot be used.
-        IdentifiabilityError: A joint's band is mostly incoherent.
     """
     goals = [
         max(

@@ -73,6 +73,8 @@ PHASE_S = 0.5
 """Starts lie up to this many seconds of the command further back: more than a stride [s]."""
 LATE = 3.0
 """A run ends if the robot has not reached the edge after this many times the run-up."""
+OFFSET = 0.05
+"""Half-width of the joints' offsets from the default pose at the start [rad]."""
 STEERED = 0.02
 """Half-width of the headings at the start: the robot is aimed at the edge [rad]."""
 
@@ -330,10 +332,6 @@ class CrossingPlan:
     seed: int = 0
     script: Script = field(default_factory=lambda: Script(command=STILL))
     """Times `stand_s`, `jump_s` and `keep_s`."""
-    joint_offset: float = 0.05
-    """Half-width of the joints' offsets from the default pose at the start [rad]."""
-    rules: JumpRules | None = None
-    """Those of the robot if None."""
 
 
 def attempts(
@@ -355,7 +353,7 @@ def attempts(
     for count in range(runs):
         rng = case_rng(plan.seed, case, count)
         x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
-        offset = rng.uniform(-plan.joint_offset, plan.joint_offset, len(robot.joints))
+        offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
         yaw, seed = float(rng.uniform(-STEERED, STEERED)), int(rng.integers(2**31))
         task = Attempt(
             row=Row(policy=subject.name, case=case.name, number=count, seed=seed, script=script),
@@ -363,7 +361,7 @@ def attempts(
             robot=robot.source,
             sim_params=replace(sim_params, ground=obstacle.on(sim_params.ground)),
             start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
-            rules=plan.rules or JumpRules.of(robot),
+            rules=JumpRules.of(robot),
             obstacle=obstacle,
             lead=lead,
         )
@@ -445,7 +443,7 @@ def add_crossings(
         cases=plan.cases,
         seed=plan.seed,
         script=plan.script,
-        rules=asdict(plan.rules or JumpRules.of(robot)),
+        rules=asdict(JumpRules.of(robot)),
         settings={"kinds": list(plan.ladders), "runs": plan.runs, "enough": plan.enough},
         timing={"seconds": time.perf_counter() - begun},
     )

@@ -51,6 +51,8 @@ class Kind:
     """Dataclass of one run's figures: flags, texts, and numbers with `Figure` metadata."""
     compared: tuple[str, ...] = ()
     """Figures whose scatter is compared between policies."""
+    jump: bool = True
+    """The policies need the jump input."""
 
 
 JUMPS = Kind(

@@ -96,8 +96,6 @@ class Plan:
     joint_offset: float = 0.05
     """Half-width of the joints' offsets from the default pose at the start [rad]. With drives this
     soft it tilts the trunk by 5 degrees, by 13 at most; 0.1 may tip the robot over."""
-    rules: JumpRules | None = None
-    """Those of the robot if None."""
 
     def __post_init__(self) -> None:
         """Raise `PronkError` for an empty plan or a negative seed."""
@@ -275,7 +273,7 @@ def plan_jobs(
     measure: Callable[..., Any] = measure,
 ) -> list[Job]:
     """Return every run of a plan; captures are kept in `out`."""
-    rules, found = plan.rules or JumpRules.of(robot), []
+    rules, found = JumpRules.of(robot), []
     runs = [
         (subject, case, number)
         for subject in subjects
@@ -309,33 +307,34 @@ def plan_jobs(
     return found
 
 
-def run_plan(
+def run_trial(
     policies: Sequence[Path],
     plan: Plan,
     *,
     kind: Kind = JUMPS,
-    jump: bool = True,
     varied: Sequence[tuple[str, float, SimParams]] = (),
     settings: Mapping[str, Any] | None = None,
-    keep: Keep = "none",
-    overwrite: bool | None = None,
     measure: Callable[..., Any] = measure,
+    keep_captures: bool = False,
+    overwrite: bool = False,
     **setup: Unpack[Setup],
 ) -> Results:
-    """Run, measure, save and return all jobs of a plan, as `run_trial` does.
+    """Run policies on the virtual robot, measure and save; scatter is compared with the first's.
 
-    With `jump` the policies need the jump input. `varied` has parameter, value and body of every
-    body, if there are more than that of `setup`. With `overwrite` None the results are added to the
-    folder. `measure` is as in `Job`.
+    Of jumps `keep_captures` keeps every capture, not the first with each command alone, and
+    `overwrite` replaces a trial in the folder; other kinds are added to it. `varied` has parameter,
+    value and body of every body, if there are more than that of `setup`; `measure` is as in `Job`.
+    A `PronkError` of policies, parameters or folder comes before the first step.
     """
     robot, out, processes = setup["robot"], setup["out"], setup.get("processes", 1)
-    subjects, jobs = load_subjects(policies, robot, jump=jump), []
+    subjects, jobs = load_subjects(policies, robot, jump=kind.jump), []
+    keep: Keep = "none" if kind is not JUMPS else "all" if keep_captures else "some"
     how: Any = {"robot": robot, "out": out, "keep": keep, "measure": measure}
     for parameter, value, params in varied or [("", math.nan, setup["sim_params"])]:
         made = plan_jobs(subjects, plan, sim_params=params, **how)
         made[0].build()  # refuses impossible parameters
         jobs += [replace(j, row=replace(j.row, parameter=parameter, value=value)) for j in made]
-    if overwrite is not None:
+    if kind is JUMPS:
         prepare(out, overwrite=overwrite)
     begun = time.perf_counter()
     done = in_processes(_timed, jobs, processes=processes, progress=setup.get("progress"))
@@ -382,27 +381,6 @@ def finished(
     )
     save(setup["out"], results)
     return results
-
-
-def run_trial(
-    policies: Sequence[Path],
-    plan: Plan,
-    *,
-    keep_captures: bool = False,
-    overwrite: bool = False,
-    **setup: Unpack[Setup],
-) -> Results:
-    """Let policies jump on the virtual robot and write the results.
-
-    Scatter is compared with that of the first policy. With `keep_captures` the capture of every
-    jump is kept, not of the first with each command alone; with `overwrite` a trial in the folder
-    is replaced.
-
-    Raises:
-        PronkError: Of policies, parameters or folder, before the first step.
-    """
-    keep: Keep = "all" if keep_captures else "some"
-    return run_plan(policies, plan, keep=keep, overwrite=overwrite, **setup)
 
 
 def setup_of(

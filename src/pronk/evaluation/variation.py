@@ -16,7 +16,7 @@ import msgspec
 from pronk.evaluation.jumps import JumpFigures
 from pronk.evaluation.results import Cell, Kind, Results
 from pronk.evaluation.tables import Sheet, landed, number, sheet
-from pronk.evaluation.trial import Plan, Setup, run_plan
+from pronk.evaluation.trial import Plan, Setup, run_trial
 from pronk.virtual.sim_params import SimParams, with_changes
 
 VARIATION = Kind(
@@ -130,7 +130,7 @@ def add_variation(
         for each in parameters
         for value in each.values
     ]
-    return run_plan(
+    return run_trial(
         policies,
         plan or Plan(jumps=5),
         kind=VARIATION,

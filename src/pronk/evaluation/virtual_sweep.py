@@ -25,16 +25,9 @@ def sweep_virtual(
 ) -> list[Path]:
     """Excite the virtual robot and return the logs in the order of its joints.
 
-    On a rigid bench limbs do not affect each other, so each is simulated by itself.
-
-    Args:
-        plan: What to excite; checked by the caller.
-        sim_params: Of the virtual robot.
-        out: Folder for the logs.
-        seed: Of all noise; each limb derives its own.
-        processes: Limbs at once; the logs do not depend on it.
-        overwrite: Replace logs that exist.
-        progress: Called with the share done, 0 to 1.
+    On a rigid bench limbs do not affect each other: each is simulated by itself, with noise of its
+    own derived from `seed`, `processes` at once, which the logs do not depend on. The caller has
+    checked the plan; `overwrite` replaces logs; `progress` is called with the share done.
     """
     robot, metadata, jobs = plan.robot, {"link": "virtual robot, in this program"}, []
     for index, limb in enumerate(legs_of(robot)):

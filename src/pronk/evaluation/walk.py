@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pronk.evaluation.jumps import (
@@ -30,13 +29,11 @@ from pronk.evaluation.jumps import (
 )
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Kind, Results
-from pronk.evaluation.trial import Plan, Setup, run_plan
+from pronk.evaluation.trial import Plan, Setup, run_trial
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import STILL, Script, Velocity
 from pronk.virtual.capture import Capture
-
-Array = NDArray[np.float64]
 
 SETTLE_S = 2.0
 """Time to reach the velocity, left out of the figures [s]."""
@@ -99,37 +96,8 @@ WALK = Kind(
     schema="pronk/trial-walk/3",
     writer="pronk trial POLICY --walk",
     figures=WalkFigures,
+    jump=False,
 )
-
-
-def velocity_errors(
-    velocity: Array,
-    orientation: Array,
-    angular_velocity: Array,
-    command: Sequence[float],
-    *,
-    first: int,
-    average: int,
-) -> tuple[dict[str, float], Array]:
-    """Compare a walk with its command, from sample `first` on.
-
-    Trunk velocity [m/s] (T, 3) and orientation w, x, y, z (T, 4) are in the world, angular velocity
-    [rad/s] (T, 3) and command in the trunk's frame; `average` is the window of the moving average
-    [samples]. Returns errors and means by name, and the averaged velocity (T', 3).
-    """
-    own = Rotation.from_quat(orientation, scalar_first=True).apply(velocity, inverse=True)
-    own[:, 2] = angular_velocity[:, 2]
-    total = np.cumsum(own, axis=0)
-    total[average:] -= total[:-average].copy()
-    counts = np.minimum(np.arange(1, len(own) + 1), average)
-    averaged: Array = (total / counts[:, None])[first:]
-    figures = {}
-    for name, values in (("", own[first:]), ("_averaged", averaged)):
-        error = values - np.asarray(command)
-        figures[f"speed_error{name}"] = float(np.hypot(error[:, 0], error[:, 1]).mean())
-        figures[f"yaw_error{name}"] = float(np.abs(error[:, 2]).mean())
-    means = own[first:].mean(axis=0).tolist()
-    return figures | dict(zip(("forward", "left", "yaw_rate"), means, strict=True)), averaged
 
 
 def measure_walk(
@@ -155,17 +123,22 @@ def measure_walk(
     }
     if first >= last:
         return WalkFigures(**figures)
-    errors, averaged = velocity_errors(
-        capture.velocity[:last],
-        capture.orientation[:last],
-        capture.angular_velocity[:last],
-        script.command,
-        first=first,
-        average=round(AVERAGE_S / dt),
-    )
+    turns = Rotation.from_quat(capture.orientation[:last], scalar_first=True)
+    own = turns.apply(capture.velocity[:last], inverse=True)
+    own[:, 2] = capture.angular_velocity[:last, 2]
+    total, window = np.cumsum(own, axis=0), round(AVERAGE_S / dt)
+    total[window:] -= total[:-window].copy()
+    counts = np.minimum(np.arange(1, last + 1), window)
+    averaged = (total / counts[:, None])[first:]
+    for name, values in (("", own[first:]), ("_averaged", averaged)):
+        error = values - np.asarray(script.command)
+        figures[f"speed_error{name}"] = float(np.hypot(error[:, 0], error[:, 1]).mean())
+        figures[f"yaw_error{name}"] = float(np.abs(error[:, 2]).mean())
+    means = own[first:].mean(axis=0).tolist()
+    figures |= dict(zip(("forward", "left", "yaw_rate"), means, strict=True))
     rates = np.sqrt(np.mean(capture.angular_velocity[first:last, :2] ** 2, axis=0)).tolist()
     power = float(capture.electrical_power[first:last].mean())
-    figures |= errors | {"roll_rate_rms": rates[0], "pitch_rate_rms": rates[1], "power": power}
+    figures |= {"roll_rate_rms": rates[0], "pitch_rate_rms": rates[1], "power": power}
     path = float(np.hypot(averaged[:, 0], averaged[:, 1]).sum() * dt)
     if path > NO_PATH and any(script.command[:2]):
         weight = legged(robot.source).total_mass * GRAVITY
@@ -193,4 +166,4 @@ def add_walks(
     """
     script = walk_script(STILL, seconds=seconds)
     plan = Plan(cases=cases, jumps=runs, seed=seed, script=script, spread_s=0.0)
-    return run_plan(policies, plan, kind=WALK, jump=False, measure=measure_walk, **setup)
+    return run_trial(policies, plan, kind=WALK, measure=measure_walk, **setup)

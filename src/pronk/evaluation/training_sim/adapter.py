@@ -47,11 +47,6 @@ if TYPE_CHECKING:
 TERM = "evaluation"
 """The metrics term's name."""
 
-RANDOMIZATIONS = ("full", "noise", "none")
-"""What differs between robots. `full`: as in training. `noise`: the nominal body and gains,
-undisturbed, with noise, timing (D1) and command delay drawn as in training; the closest to the
-paper's figures, of one robot measured several times. `none`: only starts and times are drawn."""
-
 
 class StepListener:
     """A metrics term that calls a listener after every physics step."""
@@ -72,7 +67,10 @@ def evaluation_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Make an environment of training one to evaluate in; changes `cfg` and returns it.
 
-    As many robots as the plan has, no time-out, no rewards, and the step listener.
+    As many robots as the plan has, no time-out, no rewards, and the step listener. Randomization
+    `full` is as in training. `noise` is the nominal body and gains, undisturbed, with noise, timing
+    (D1) and command delay drawn as in training: the closest to the paper's figures, of one robot
+    measured several times. With `none` only starts and times are drawn.
     """
     if randomization != "full":
         without_randomization(cfg, noise=randomization == "noise")
@@ -96,7 +94,7 @@ def evaluate(
 ) -> Evaluation:
     """Build the simulator on a device, `cpu` or `cuda:0`, and evaluate in it.
 
-    `before` has speed errors to compare with; `randomization` is one of `RANDOMIZATIONS`.
+    `before` has speed errors to compare with; `randomization` is as of `evaluation_cfg`.
     """
     progress("building", 0.0)
     task = load_task(subject.robot)
