@@ -51,12 +51,9 @@ def motion(time: np.ndarray, **arrays: Any) -> Capture:
 
 
 def seen_jump(*, up: float = 2.0, speed: float = 1.0, yaw: float = 0.0) -> Capture:
-    """The jump of the module.
+    """The jump of the module, with a lift-off velocity `up` [m/s] and a heading `yaw` [rad].
 
-    Args:
-        up: Vertical velocity at lift-off; must make a flight of whole milliseconds [m/s].
-        speed: Along the heading from the command to run on to touchdown [m/s].
-        yaw: Heading [rad].
+    The flight must last whole milliseconds; `speed` is along the heading until touchdown [m/s].
     """
     time = np.arange(8001) * DT
     off = SCRIPT.on + DELAY

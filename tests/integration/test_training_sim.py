@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +28,7 @@ from pronk.evaluation.training_sim.adapter import (
     evaluation_cfg,
     load_subject,
 )
-from pronk.evaluation.training_sim.evaluation import NEVER, Evaluation, Plan, evaluate_policy
+from pronk.evaluation.training_sim.evaluation import NEVER, Plan, evaluate_policy
 from pronk.robots import load_robot
 from pronk.runtime.script import STILL, Script
 from pronk.train.gains import training_gains
@@ -37,7 +37,6 @@ from pronk.train.provenance import SCHEMA, RunFolder
 from pronk.train.rl import checkpoint
 from pronk.train.rl.export import contract_for, export_policy
 from pronk.train.tasks import load_task
-from pronk.virtual.capture import Capture
 
 DT = 0.005
 DROP = 0.3
@@ -63,19 +62,8 @@ BIAS = 0.1
 """Error of the estimate, forward [m/s]."""
 
 
-@dataclass
-class Observed:
-    """An evaluation, its run, and each time the policy read its command."""
-
-    evaluation: Evaluation
-    captures: list[Capture]
-    fell_at: np.ndarray
-    reads: list[tuple[int, np.ndarray, np.ndarray]]
-    shares: list[float]
-
-
 @pytest.fixture(scope="module")
-def observed() -> Observed:
+def observed() -> SimpleNamespace:
     """Six robots fall 0.3 m onto their feet; steps of 2 to 6 samples; one lies down."""
     task = load_task("mini_cheetah")
     cfg = task.env_cfg(task.robot, training_gains("naive", task.robot), iterations=TASKS["all"])
@@ -108,10 +96,16 @@ def observed() -> Observed:
     found = evaluate_policy(policy, env, SHORT, estimate=estimate, progress=shares.append)
     env.close()
     captures = [one for i in range(3) for one in runs[0].captures(i)]
-    return Observed(found, captures, runs[0].fell_at.numpy(), reads, shares)
+    return SimpleNamespace(
+        evaluation=found,
+        captures=captures,
+        fell_at=runs[0].fell_at.numpy(),
+        reads=reads,
+        shares=shares,
+    )
 
 
-def test_contacts_belong_to_the_positions_they_are_paired_with(observed: Observed) -> None:
+def test_contacts_belong_to_the_positions_they_are_paired_with(observed: SimpleNamespace) -> None:
     """The feet meet the ground when the trunk is at standing height: 12 mm a sample by then."""
     z = observed.captures[0].position[:, 2]
     landing = int(np.argmax(observed.captures[0].contact.any(axis=-1)))
@@ -126,7 +120,7 @@ def test_contacts_belong_to_the_positions_they_are_paired_with(observed: Observe
         assert feet < first < feet + 40
 
 
-def test_the_policy_reads_the_command_of_the_moment(observed: Observed) -> None:
+def test_the_policy_reads_the_command_of_the_moment(observed: SimpleNamespace) -> None:
     commands, times = SHORT.commands(), SHORT.times(DT)
     assert {2, 3, 4, 5, 6} == set(np.diff([sample for sample, _, _ in observed.reads]))
     for sample, command, jump in observed.reads:
@@ -135,7 +129,7 @@ def test_the_policy_reads_the_command_of_the_moment(observed: Observed) -> None:
         assert np.array_equal(jump > 0.0, (times["on"] <= sample) & (sample < times["off"]))
 
 
-def test_figures_are_those_of_the_recorded_motion(observed: Observed) -> None:
+def test_figures_are_those_of_the_recorded_motion(observed: SimpleNamespace) -> None:
     found = observed.evaluation
     results = (*found.walks, *found.jumps)
     assert [r["uncommanded"].n for r in results] == [2, 2, 2]
@@ -160,7 +154,7 @@ def test_figures_are_those_of_the_recorded_motion(observed: Observed) -> None:
         assert walk["fell"].mean == 0.0
 
 
-def test_a_robot_that_lies_down_is_out(observed: Observed) -> None:
+def test_a_robot_that_lies_down_is_out(observed: SimpleNamespace) -> None:
     (jump,) = observed.evaluation.jumps
     assert (observed.fell_at[:5] == NEVER).all()
     assert observed.fell_at[5] < SHORT.times(DT)["on"][5]
@@ -168,7 +162,7 @@ def test_a_robot_that_lies_down_is_out(observed: Observed) -> None:
     assert (jump["found"].mean, jump["upright"].mean) == (0.0, 0.0)
 
 
-def test_the_estimate_is_compared_with_the_target(observed: Observed) -> None:
+def test_the_estimate_is_compared_with_the_target(observed: SimpleNamespace) -> None:
     estimator = observed.evaluation.estimator
     expected = {"forward": BIAS, "left": 0.0, "up": 0.0, "velocity": BIAS, "contacts_right": 1.0}
     assert estimator == pytest.approx(expected, abs=1e-6)
@@ -195,13 +189,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     actor = blank_actor()
     torch.nn.init.normal_(actor.mlp[0].jump_weight)
     folder = RunFolder(tmp_path_factory.mktemp("run"))
-    folder.write(
-        {
-            "schema": SCHEMA,
-            "settings": {"robot": "mini_cheetah"},
-            "gains": {"name": "matched", "sha256": "ab" * 32},
-        }
-    )
+    gains = {"name": "matched", "sha256": "ab" * 32}
+    folder.write({"schema": SCHEMA, "settings": {"robot": "mini_cheetah"}, "gains": gains})
     keys = (*checkpoint.NETWORKS, *checkpoint.OPTIMIZERS, "infos")
     state: dict[str, Any] = {key: {} for key in keys}
     state |= {"actor_state_dict": actor.state_dict(), "iter": 7}
@@ -220,7 +209,7 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
         assert torch.equal(subject.estimate(obs)[1], actor.estimate(obs)[1])
     assert subject.jump
     assert subject.about["iteration"] == 7
-    naive = training_gains("naive", load_robot("mini_cheetah"))
+    naive = training_gains("naive", ROBOT)
     assert not subject.knows(naive)
     matched = replace(naive, name="matched", sha256="ab" * 32)
     assert subject.knows(matched)
@@ -229,20 +218,20 @@ def test_a_run_is_evaluated_by_its_last_checkpoint(trained: tuple[Path, Any]) ->
 
 def test_other_files_are_refused(trained: tuple[Path, Any], tmp_path: Path) -> None:
 
-    with pytest.raises(ArtefactError, match="no checkpoints in it; expected the folder of a run"):
-        load_subject(tmp_path, "cpu")
-    with pytest.raises(ArtefactError, match="no such file"):
-        load_subject(tmp_path / "policy.onnx", "cpu")
-    with pytest.raises(ArtefactError, match="no such file"):
-        load_subject(tmp_path / "model_3.pt", "cpu")
-    (tmp_path / "model_3.pt").write_bytes(b"PK not a checkpoint")
-    with pytest.raises(ArtefactError, match="not a checkpoint"):
-        load_subject(tmp_path / "model_3.pt", "cpu")
     state = checkpoint.read(trained[0] / "model_7.pt")
     del state["actor_state_dict"]["mlp.0.bias"]
     checkpoint.write(tmp_path / "model_4.pt", state)
-    with pytest.raises(ArtefactError, match="its actor is not that"):
-        load_subject(tmp_path / "model_4.pt", "cpu")
+    (tmp_path / "model_3.pt").write_bytes(b"PK not a checkpoint")
+    (tmp_path / "empty").mkdir()
+    for name, what in (
+        ("empty", "no checkpoints"),
+        ("policy.onnx", "no such file"),
+        ("model_2.pt", "no such file"),
+        ("model_3.pt", "not a checkpoint"),
+        ("model_4.pt", "its actor is not that"),
+    ):
+        with pytest.raises(ArtefactError, match=what):
+            load_subject(tmp_path / name, "cpu")
 
 
 def test_an_exported_policy_does_what_its_checkpoint_does(
@@ -250,17 +239,10 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
 ) -> None:
     pytest.importorskip("onnxruntime")
 
-    robot = load_robot("mini_cheetah")
-    gains = training_gains("naive", robot)
-    contract = contract_for(
-        robot,
-        gains,
-        action_scale=0.35,
-        delay_steps=(0, 1),
-        command_limits=(3.0, 1.0, 2.0),
-        lift_off_velocity=2.5,
-        provenance={},
-    )
+    gains = training_gains("naive", ROBOT)
+    settings = {"action_scale": 0.35, "delay_steps": (0, 1), "command_limits": (3.0, 1.0, 2.0)}
+    settings |= {"lift_off_velocity": 2.5, "provenance": {}}
+    contract = contract_for(ROBOT, gains, **settings)  # type: ignore[arg-type]
     path = tmp_path / "policy.onnx"
     export_policy(trained[1], contract, path)
     subject, original = load_subject(path, "cpu"), load_subject(trained[0], "cpu")
@@ -274,11 +256,9 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
             groups = {"measured": torch.randn(count, 105), "jump": torch.ones(count, 1)}
             obs = TensorDict(groups, [count])
             with torch.no_grad():
-                assert torch.allclose(subject.act(obs), original.act(obs), atol=1e-5)
-                for got, expected in zip(
-                    subject.estimate(obs), original.estimate(obs), strict=True
-                ):
-                    assert torch.allclose(got, expected, atol=1e-5)
+                got, expected = ((s.act(obs), *s.estimate(obs)) for s in (subject, original))
+            for ours, theirs in zip(got, expected, strict=True):
+                assert torch.allclose(ours, theirs, atol=1e-5)
 
 
 # --- The command ---------------------------------------------------------------------------------
@@ -287,7 +267,7 @@ def test_an_exported_policy_does_what_its_checkpoint_does(
 def test_a_run_is_evaluated_with_everything_drawn(trained: tuple[Path, Any]) -> None:
 
     plan = replace(SHORT, robots=1, walk_s=1.0, jumps=())
-    gains = training_gains("naive", load_robot("mini_cheetah"))
+    gains = training_gains("naive", ROBOT)
     before = {"forward 2": 0.1}
     found = evaluate(load_subject(trained[0], "cpu"), gains, plan, device="cpu", before=before)
     assert [walk.name for walk in found.walks] == ["forward 2", "stand"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,13 +46,8 @@ TOOK_OFF, LANDED = 4.398 + 0.21, 5.216 - 0.21
 EDGE = 4.65
 
 
-def obstacle(
-    kind: crossing.Shape = "gap",
-    size: float = 0.3,
-    command: tuple[float, float, float] = FORWARD,
-    edge: float = EDGE,
-) -> Obstacle:
-    return Obstacle(kind=kind, size=size, command=command, edge=edge)
+def obstacle(kind: crossing.Shape = "gap", **changes: Any) -> Obstacle:
+    return Obstacle(kind=kind, **({"size": 0.3, "command": FORWARD, "edge": EDGE} | changes))
 
 
 GAP = obstacle()
@@ -90,10 +86,10 @@ def test_the_floor_is_where_it_should_be(
     assert obstacle("flat", command=command).on(Ground()) == Ground()
 
 
-@pytest.mark.parametrize("command", [(1.0, 1.0, 0.0), STILL])
-def test_a_course_leads_straight_on(command: tuple[float, float, float]) -> None:
-    with pytest.raises(PronkError, match="course"):
-        direction(command)
+def test_a_course_leads_straight_on() -> None:
+    for command in ((1.0, 1.0, 0.0), STILL):
+        with pytest.raises(PronkError, match="course"):
+            direction(command)
 
 
 def test_the_operator_looks_at_the_trunk() -> None:
@@ -117,7 +113,6 @@ def test_the_operator_looks_at_the_trunk() -> None:
 
 def test_a_gap_that_was_crossed() -> None:
     found = settled(SEEN)
-    assert found.success
     assert found.take_off == pytest.approx(EDGE - TOOK_OFF, abs=1e-9)
     assert found.reach == pytest.approx(TOOK_OFF - 4.0, abs=1e-9)
     assert found.reach == pytest.approx(2.0 * (DELAY - 1e-3) + 0.21)
@@ -139,18 +134,20 @@ LAY = changed(SEEN, "orientation", span(4.5, 4.6), [0.7, 0.714, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
-    ("seen", "size", "why"),
+    ("seen", "size", "why", "ends"),
     [
-        (LOW, 0.3, crossing.STEPPED_IN),
-        (changed(SEEN, "other_contact", 4000, True), 0.3, crossing.NON_FOOT_CONTACT),
-        (SEEN, 0.4, crossing.NOT_OVER),  # the hind feet come down 6 mm before the far edge
-        (LEANT, 0.3, crossing.FELL),
-        (LAY, 0.3, crossing.FELL),
-        (changed(SEEN, "position", (span(5.0), 0), 4.9), 0.3, crossing.NOT_OVER),  # went back
+        (SEEN, 0.3, "", False),
+        (LOW, 0.3, crossing.STEPPED_IN, True),
+        (changed(SEEN, "other_contact", 4000, True), 0.3, crossing.NON_FOOT_CONTACT, False),
+        (SEEN, 0.4, crossing.NOT_OVER, False),  # the hind feet land 6 mm before the far edge
+        (LEANT, 0.3, crossing.FELL, False),
+        (LAY, 0.3, crossing.FELL, True),
+        (changed(SEEN, "position", (span(5.0), 0), 4.9), 0.3, crossing.NOT_OVER, False),  # back
     ],
 )
-def test_a_gap_that_was_not_crossed(seen: Capture, size: float, why: str) -> None:
+def test_why_a_gap_was_not_crossed(seen: Capture, size: float, why: str, ends: bool) -> None:
     assert settled(seen, obstacle(size=size)).why == why
+    assert lost(seen, obstacle(size=size)) is ends
 
 
 def test_what_happens_elsewhere_does_not_count() -> None:
@@ -160,13 +157,8 @@ def test_what_happens_elsewhere_does_not_count() -> None:
     assert settled(SEEN, triggered=None).why == crossing.NOT_TRIGGERED
     # Steps have no bottom to fall into.
     assert settled(LOW, obstacle("down")).success
-    up = settled(LOW, obstacle("up"))
-    assert up.landing == pytest.approx(LANDED - EDGE, abs=2e-3)
-
-
-def test_a_lost_run_is_seen_at_once() -> None:
-    cases = ((SEEN, GAP), (LAY, GAP), (LOW, GAP), (LOW, obstacle("up")))
-    assert [lost(*case) for case in cases] == [False, True, True, False]
+    assert settled(LOW, obstacle("up")).landing == pytest.approx(LANDED - EDGE, abs=2e-3)
+    assert not lost(LOW, obstacle("up"))
 
 
 # --- The search ---------------------------------------------------------------------------------
@@ -214,12 +206,8 @@ def result(rows: list[Row]) -> Results:
 
 
 def test_sizes_grow_until_no_lead_does() -> None:
-    counts = ((1, 3), (2, 2), (0, 1))
-    crossed = {
-        (round(0.1 * size, 6), lead): count
-        for size, pair in enumerate(counts, start=1)
-        for lead, count in zip(LADDER.leads, pair, strict=True)
-    }
+    crossed = {(0.1, 0.0): 1, (0.1, 0.1): 3, (0.2, 0.0): 2, (0.2, 0.1): 2}
+    crossed |= {(0.3, 0.0): 0, (0.3, 0.1): 1}
     rows, _ = climb(crossed)
     # Two jumps of practice, then three runs for each of two leads at three sizes.
     assert len(rows) == 2 + 3 * 2 * 3

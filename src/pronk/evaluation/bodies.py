@@ -244,11 +244,7 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
 
 
 def draw_robot(sim_params: SimParams, robot: RobotSpec, *, seed: int) -> SimParams:
-    """Draw a random robot: every number of `TOLERANCES` anew about given parameters.
-
-    Raises:
-        RobotError: The parameters are not of this robot, or a drawn robot cannot exist.
-    """
+    """Draw a random robot: every number of `TOLERANCES` anew about given parameters."""
     sim_params.check_joints(robot.joint_names)
     rng = np.random.default_rng([seed, 0x707])
     batch = {group: 1.0 + GROUP_TORQUE * rng.uniform(-1.0, 1.0) for group in robot.groups}
@@ -285,11 +281,7 @@ def _rounded(value: float) -> float:
 
 
 def save_sim_params(path: Path, sim_params: SimParams, *, says: str) -> None:
-    """Write parameters as YAML for `--sim-params`, whole or not at all, under a comment.
-
-    Raises:
-        PronkError: There are blocks or a lowered floor, which a file does not hold.
-    """
+    """Write parameters as YAML for `--sim-params`, whole, under a comment; terrain is refused."""
     if sim_params.ground != replace(sim_params.ground, terrain=(), floor=0.0):
         raise PronkError(f"{path}: a sim_params file holds no terrain; take the blocks away first.")
     body = msgspec.to_builtins(sim_params)
@@ -411,11 +403,7 @@ def save(folder: Path, found: Bodies) -> Path:
 
 
 def load(folder: Path) -> Bodies:
-    """Read what `save` wrote, and each robot's trial.
-
-    Raises:
-        ArtefactError: A file is missing, damaged or of another schema.
-    """
+    """Read what `save` wrote, and each robot's trial."""
     with load_json(folder / FILE, SCHEMA, WRITER) as stored:
         for body in stored["bodies"]:
             body["trial"] = load_results(folder / body["folder"] / TRIAL)

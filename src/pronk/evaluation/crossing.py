@@ -125,11 +125,7 @@ class Obstacle:
 
 
 def direction(command: Velocity) -> Array:
-    """Unit vector of a command in the plane. (2,).
-
-    Raises:
-        PronkError: It points neither forward or back nor to a side.
-    """
+    """Unit vector in the plane of a command straight forward, back or to a side. (2,)."""
     forward, left, _ = command
     if bool(forward) == bool(left):
         raise PronkError(

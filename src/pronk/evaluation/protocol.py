@@ -45,11 +45,7 @@ def parse_cases(texts: Iterable[str]) -> tuple[Case, ...]:
 
 
 def parse_case(text: str) -> Case:
-    """Return the case of a command written as `1,0` or `1,0,0`; one of the paper's keeps its name.
-
-    Raises:
-        PronkError: Not two or three finite numbers.
-    """
+    """Return the case of a command as `1,0` or `1,0,0`; one of the paper's keeps its name."""
     try:
         values = [float(part) for part in text.split(",")]
         if len(values) not in (2, 3) or not all(map(math.isfinite, values)):

@@ -406,11 +406,7 @@ def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
 
 @contextmanager
 def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
-    """Read a JSON file of one schema; errors of the block count as damage of the file.
-
-    Raises:
-        ArtefactError: Missing, damaged or of another schema; the message names the file.
-    """
+    """Read a JSON file of one schema; errors of the block count as damage of the file."""
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -445,11 +441,7 @@ _HEAD = {entry.name for entry in fields(Results)} - {"kind", "rows"}
 
 
 def load(folder: Path, kind: Kind = JUMPS) -> Results:
-    """Read what `save` wrote.
-
-    Raises:
-        ArtefactError: Missing, damaged or of another schema; the message names file and field.
-    """
+    """Read what `save` wrote."""
     with load_json(folder / kind.summary, kind.schema, kind.writer) as body:
         stored = {name: body[name] for name in _HEAD}
         head = replace(msgspec.convert(stored, Results), kind=kind)

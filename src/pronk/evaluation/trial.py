@@ -168,10 +168,8 @@ class Job:
     def set_down(self) -> VirtualRobot:
         """Return the virtual robot, standing, held by its drives alone.
 
-        A robot that tips over, as a heavier one may, is set down again nearer to the default pose.
-
-        Raises:
-            HardwareError: It does not stand even in the default pose.
+        A robot that tips over, as a heavier one may, is set down again nearer to the default pose;
+        one that does not stand even in it raises a `HardwareError`.
         """
         for share in _OFFSETS:
             machine = self.build(share)
@@ -235,9 +233,6 @@ def in_processes(
     """Do every job, in this process or in several, and return the results in the order of the jobs.
 
     `work` is a function of a module; jobs are pickled.
-
-    Raises:
-        PronkError: Fewer than one process, or one was killed; and what `work` raises.
     """
     if processes < 1:
         raise PronkError(f"{processes} processes; expected 1 or more.")
@@ -415,11 +410,8 @@ def load_subjects(
 ) -> tuple[Subject, ...]:
     """Open, check and name policies.
 
-    A policy is named after the gains of its training; two of a kind, after their files.
-
-    Raises:
-        ArtefactError: Missing, damaged, not for the robot, or without the jump input where `jump`.
-        PronkError: The same policy twice.
+    A policy is named after the gains of its training; two of a kind, after their files. With `jump`
+    it needs the jump input. The same policy twice is refused.
     """
     policies = []
     for path in paths:
@@ -456,9 +448,6 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
     """Make the folder of a trial, before anything is computed.
 
     With `overwrite` a folder that holds a trial is taken, and that trial's own files are deleted.
-
-    Raises:
-        PronkError: A file, a folder that is not empty, or one that cannot be written to.
     """
     if out.exists() and not out.is_dir():
         raise PronkError(f"--out {out}: a file; expected the name of a folder.")

@@ -33,11 +33,7 @@ _PORTS = 20
 
 
 def modules() -> tuple[ModuleType, ModuleType]:
-    """Import `viser` and `mjviser`.
-
-    Raises:
-        PronkError: One is not installed.
-    """
+    """Import `viser` and `mjviser`."""
     try:
         import mjviser
         import viser
@@ -50,11 +46,7 @@ def modules() -> tuple[ModuleType, ModuleType]:
 
 
 def free_port(host: str, port: int) -> int:
-    """The first port that can be bound, of twenty from `port` on (viser itself waits for ever).
-
-    Raises:
-        PronkError: A wrong number, another machine's address, or all are taken.
-    """
+    """The first port that can be bound, of twenty from `port` on (viser itself waits for ever)."""
     if not 0 < port < 65536:
         raise PronkError(f"--port {port}; expected a number from 1 to 65535, as in 8080.")
     last = min(port + _PORTS, 65536)
@@ -91,11 +83,7 @@ class WebPage:
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
-        """Start the server, at the first free port from `port` on; `title` is Markdown.
-
-        Raises:
-            PronkError: viser or mjviser is not installed, or `free_port` finds none.
-        """
+        """Start the server, at the first free port from `port` on; `title` is Markdown."""
         viser, mjviser = modules()
         port = free_port(host, port)
         spec = mujoco.MjSpec()

@@ -198,11 +198,6 @@ def play(
     """Run the robot in real time until Ctrl-C; a fallen one goes on until it is reset.
 
     `until`, called with the simulated time [s], ends the run as well.
-
-    Raises:
-        ArtefactError: The contract does not fit.
-        HardwareError: The robot cannot stand.
-        RobotError: The parameters are of another robot.
     """
     gauge = Gauge(JumpRules.of(robot))
     machine = _Sampled(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)

@@ -90,9 +90,6 @@ def plan(
 
     Without `span`, the first and the last moment [s], it is from 1 s before lift-off to 1.2 s after
     touchdown; without `events` either, those of the jump, it is the whole capture.
-
-    Raises:
-        PronkError: No frame is left, or `slow` is below 1.
     """
     if not 1.0 <= slow < math.inf:
         raise PronkError(f"slow is {slow:g}; expected 1 (real time) or more, as in 4.")

@@ -57,9 +57,6 @@ def find_gl() -> str:
     """The GL backend (a value of MUJOCO_GL) that renders offscreen here; found by trying.
 
     One that is set in the environment is tried first.
-
-    Raises:
-        VideoError: None does.
     """
     candidates = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
     if chosen := opengl.requested():
@@ -133,9 +130,6 @@ def films_of(
     """Plan a film of each policy with each command, or those of `cases`, by the name of its files.
 
     A robot that did not jump is filmed as well. `folder` has the captures.
-
-    Raises:
-        ArtefactError: A capture is missing or damaged.
     """
     first: dict[tuple[str, str], Row] = {}
     policies = {subject.name for subject in found.subjects}

@@ -145,11 +145,7 @@ class Subject:
 
 
 def load_subject(path: Path, device: str) -> Subject:
-    """Read `policy.onnx`, a checkpoint, or the last checkpoint of the folder of a run.
-
-    Raises:
-        ArtefactError: Missing, damaged, or none of these.
-    """
+    """Read `policy.onnx`, a checkpoint, or the last checkpoint of the folder of a run."""
     if path.suffix == ".onnx":
         return _exported(path, device)
     found = RunFolder(path).checkpoint() if path.is_dir() else path

@@ -200,9 +200,6 @@ def evaluate_policy(
     `env` was built with `evaluation_cfg` for the same plan, wrapped or not. It is reset, and the
     random generators of the process are seeded with the plan's seed. `estimate` is the policy's
     estimator, if it is evaluated too; `about` and `before` are as of `Evaluation`.
-
-    Raises:
-        PronkError: The environment was not built for this plan.
     """
     from pronk.evaluation.training_sim.run import Run
 
@@ -267,11 +264,7 @@ def save(path: Path, evaluation: Evaluation) -> None:
 
 
 def load_speed_errors(path: Path) -> dict[str, float]:
-    """Read the mean speed errors by walk [m/s] of a saved evaluation.
-
-    Raises:
-        ArtefactError: Missing, damaged or of another schema, or it has no walks.
-    """
+    """Read the mean speed errors by walk [m/s] of a saved evaluation."""
     with load_json(path, SCHEMA, "pronk evaluate") as body:
         errors = {
             str(walk["name"]): float(walk["figures"]["speed_error"]["mean"] or math.nan)

@@ -32,11 +32,7 @@ class Run:
     """A plan under way in an environment."""
 
     def __init__(self, env: ManagerBasedRlEnv, plan: Plan) -> None:
-        """Prepare, with memory of 58 bytes a robot and sample.
-
-        Raises:
-            PronkError: The environment was not built with `evaluation_cfg` for this plan.
-        """
+        """Prepare, with memory of 58 bytes a robot and sample."""
         terms = getattr(env.metrics_manager, "cfg", None) or {}
         if TERM not in terms or env.num_envs != plan.size:
             raise PronkError(
