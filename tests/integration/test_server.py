@@ -1,8 +1,9 @@
-"""The virtual robot behind a wire, step by step, without a clock on the wall."""
+"""The virtual robot behind a wire, step by step on its own clock."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -11,14 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from broken_message import mutated
 from command_line import invoke
-from pronk.errors import HardwareError
+from pronk.errors import RobotError
+from pronk.links.lcm.codec import encode_command
+from pronk.links.lcm.layout import CHEETAH, CONTROL_PARAMETER, MESSAGES, VIRTUAL_ROBOT, WTW, Layout
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 from pronk.virtual.capture import load
-from pronk.virtual.faults import Faults, parse_faults
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.server import TICK_S, Corrupt, RobotServer, Watchdog, hold_of
+from pronk.virtual.faults import flip_bit, parse_faults
+from pronk.virtual.robot import VirtualRobot, hold_of
+from pronk.virtual.server import TICK_S, Corrupt, RobotServer, Watchdog
 from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
@@ -48,180 +52,212 @@ class Wire:
     def contend(self, command: Command) -> None:
         self.inbox.append(command)
 
-    def close(self) -> None:
-        pass
 
-
-def made(
-    faults: str = "", watchdog: Watchdog | None = None, legs: tuple[str, ...] = ("FR",)
-) -> tuple[RobotServer, Wire, VirtualRobot]:
-    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=3, legs=legs)
+def connected(**options: Any) -> VirtualRobot:
+    machine = VirtualRobot(ROBOT, load_sim_params(None), seed=3, **options)
     machine.connect()
-    wire = Wire()
-    server = RobotServer(
-        machine, wire, hold=HOLD, faults=parse_faults(faults), watchdog=watchdog, seed=1
-    )  # fmt: skip
-    return server, wire, machine
+    return machine
 
 
-def live(server: RobotServer, start: float, end: float) -> None:
+def served(faults: str = "", watchdog: Watchdog | None = None) -> tuple[RobotServer, Wire]:
+    wire, known = Wire(), parse_faults(faults)
+    machine = connected(legs=("FR",))
+    return RobotServer(machine, wire, hold=HOLD, faults=known, watchdog=watchdog, seed=1), wire
+
+
+def run(server: RobotServer, start: float, end: float) -> None:
     for k in range(round(start / TICK_S) + 1, round(end / TICK_S) + 1):
         server.step(k * TICK_S)
 
 
-def test_states_are_those_of_the_machine_at_its_rate() -> None:
-    server, wire, _ = made()
-    live(server, 0.0, 0.2)
-    alone = VirtualRobot(ROBOT, load_sim_params(None), seed=3, legs=("FR",))
-    alone.connect()
-    expected = alone.wait(0.2)
+def test_states_and_commands_pass_unchanged() -> None:
+    server, wire = served()
+    run(server, 0.0, 0.2)
+    expected = connected(legs=("FR",)).wait(0.2)
     assert len(wire.sent) == len(expected) == 100
     for sent, known in zip(wire.sent, expected, strict=True):
         np.testing.assert_array_equal(sent.position, known.position)
         assert sent.sequence == known.sequence
         assert sent.robot_time == sent.time == known.time
-
-
-def test_a_command_moves_the_machine() -> None:
-    server, wire, _ = made()
-    live(server, 0.0, 0.1)
-    before = wire.sent[-1].position[2]
     wire.inbox.append(RAISED)
-    live(server, 0.1, 0.6)
-    assert wire.sent[-1].position[2] - before == pytest.approx(0.3, abs=0.1)
+    run(server, 0.2, 0.7)
+    assert wire.sent[-1].position[2] - expected[-1].position[2] == pytest.approx(0.3, abs=0.1)
     assert server.figures()["server"] == {"commands applied": 1}
 
 
-@pytest.mark.parametrize("action", ["hold", "zero", "damp"])
-def test_what_the_drives_do_when_commands_stop(action: str) -> None:
-    server, wire, _ = made(watchdog=Watchdog(action=action, after_s=0.1))  # type: ignore[arg-type]
-    live(server, 0.0, 0.5)
-    # Before the first command: the drives hold what they held.
+@pytest.mark.parametrize("silence", ["hold", "zero", "damp"])
+def test_drives_act_on_silence_after_the_first_command(silence: Any) -> None:
+    server, wire = served(watchdog=Watchdog(silence=silence, silence_after=0.1))
+    run(server, 0.0, 0.5)
     assert "silences" not in server.counts
-    for k in range(20):
-        wire.inbox.append(RAISED)
-        live(server, 0.5 + 0.02 * k, 0.52 + 0.02 * k)
-    live(server, 0.9, 1.9)
-    sunk = np.abs(wire.sent[-1].position[:3] - RAISED.position[:3]).max()
-    torque = np.abs(wire.sent[-1].torque[:3]).max()
-    if action == "hold":
-        assert "silences" not in server.counts
-        assert sunk < 0.15
-    else:
-        assert server.counts["silences"] == 1
-        assert sunk > 0.3
-        # Nothing but noise is left of the torque, save for damping.
-        assert torque < (0.3 if action == "zero" else 3.0)
+
+    def command(start: float) -> None:
         for k in range(20):
             wire.inbox.append(RAISED)
-            live(server, 1.9 + 0.05 * k, 1.95 + 0.05 * k)
-        assert np.abs(wire.sent[-1].position[:3] - RAISED.position[:3]).max() < 0.15
+            run(server, start + 0.05 * k, start + 0.05 * (k + 1))
+
+    def sunk() -> float:
+        return float(np.abs(wire.sent[-1].position[:3] - RAISED.position[:3]).max())
+
+    command(0.5)
+    run(server, 1.5, 2.5)
+    if silence == "hold":
+        assert "silences" not in server.counts
+        assert sunk() < 0.15
+        return
+    assert server.counts["silences"] == 1
+    assert sunk() > 0.3
+    # Nothing but noise is left of the torque, save for damping.
+    assert np.abs(wire.sent[-1].torque[:3]).max() < (0.3 if silence == "zero" else 3.0)
+    command(2.5)
+    assert sunk() < 0.15
 
 
-def test_a_rival_commands_from_its_time_on_and_the_robots_own_controller_until_released() -> None:
-    server, wire, _ = made("rival=0.2")
-    live(server, 0.0, 0.19)
+@pytest.mark.parametrize(("faults", "mode"), [("rival=0.2", ""), ("", "locomotion")])
+def test_rivals_command_at_100_hz(faults: str, mode: str) -> None:
+    server, wire = served(faults)
+    run(server, 0.0, 0.19)
     assert server.counts["commands applied"] == 0
-    live(server, 0.19, 0.4)
-    assert 19 <= server.counts["commands applied"] <= 21
-    server, wire, _ = made()
-    wire.mode = "locomotion"
-    live(server, 0.0, 0.2)
-    assert 19 <= server.counts["commands applied"] <= 21
-    wire.mode = ""
-    live(server, 0.2, 0.4)
-    assert 19 <= server.counts["commands applied"] <= 21
+    wire.mode = mode
+    run(server, 0.19, 0.4)
+    assert 19 <= server.counts["commands applied"] <= 22
+    if mode:
+        before, wire.mode = server.counts["commands applied"], ""
+        run(server, 0.4, 0.6)
+        assert server.counts["commands applied"] == before
 
 
-def test_frozen_values_with_a_live_count() -> None:
-    server, wire, _ = made("freeze=0.1:0.1")
-    live(server, 0.0, 0.3)
+def test_frozen_values_have_a_live_count() -> None:
+    server, wire = served("freeze=0.1:0.1")
+    run(server, 0.0, 0.3)
     assert [state.sequence for state in wire.sent] == list(range(1, 151))
-    times = np.diff([state.time for state in wire.sent])
-    assert times.min() > 0.0
+    assert np.diff([state.time for state in wire.sent]).min() > 0.0
     frozen = [s for s in wire.sent if 0.102 < s.time < 0.198]
     assert len({s.position.tobytes() + s.gyro.tobytes() for s in frozen}) == 1
-    live_ones = [s for s in wire.sent if s.time < 0.098 or s.time > 0.202]
-    assert len({s.velocity.tobytes() for s in live_ones}) == len(live_ones)
+    changing = [s for s in wire.sent if s.time < 0.098 or s.time > 0.202]
+    assert len({s.velocity.tobytes() for s in changing}) == len(changing)
 
 
-def test_the_robots_clock_jumps() -> None:
-    server, wire, _ = made("clock=0.1:-5")
-    live(server, 0.0, 0.2)
+def test_clock_jump_nan_loss_and_bit_flips() -> None:
+    server, wire = served("clock=0.1:-5")
+    run(server, 0.0, 0.2)
     offsets = np.array([s.robot_time - s.time for s in wire.sent])  # type: ignore[operator]
     np.testing.assert_allclose(offsets[:48], 0.0)
     np.testing.assert_allclose(offsets[50:], -5.0)
 
-
-def test_some_states_hold_no_number() -> None:
-    server, wire, _ = made("state.nan=0.2")
-    live(server, 0.0, 1.0)
+    server, wire = served("state.nan=0.2")
+    run(server, 0.0, 1.0)
     names = ("position", "velocity", "gyro", "accelerometer", "orientation")
     broken = [sum(int(np.isnan(getattr(s, n)).sum()) for n in names) for s in wire.sent]
     assert set(broken) == {0, 1}
     assert 60 < sum(broken) < 140
     assert server.figures()["state_faults"] == {"nan": sum(broken)}
 
-
-def test_lost_commands_are_not_applied_and_lost_states_not_published() -> None:
-    server, wire, _ = made("loss=1,after=0.1")
-    live(server, 0.0, 0.1)
+    server, wire = served("loss=1,after=0.1")
+    run(server, 0.0, 0.1)
     wire.inbox.append(RAISED)
-    live(server, 0.1, 0.3)
-    # The tick at 0.1 s itself has lost its state.
-    assert len(wire.sent) == 49
+    run(server, 0.1, 0.3)
+    assert len(wire.sent) == 49  # the tick at 0.1 s itself has lost its state
     assert server.counts["commands applied"] == 0
     assert server.figures()["command_faults"] == {"lost": 1}
 
-
-def test_bits_are_flipped_where_the_wire_lets_them() -> None:
-    server, wire, _ = made("command.flip=1")
-    live(server, 0.0, 0.01)
+    server, wire = served("command.flip=1")
+    run(server, 0.0, 0.01)
     assert wire.corrupt_out is bytes
-    data = bytes(100)
-    changed = wire.corrupt_in(data)
-    assert sum(byte.bit_count() for byte in changed) == 1
+    assert sum(byte.bit_count() for byte in wire.corrupt_in(bytes(100))) == 1
     assert wire.corrupt_in(b"") == b""
 
 
-def test_clamps_of_the_bench() -> None:
-    server, wire, _ = made(legs=("FR",))
+def test_clamps_hold_on_the_bench_and_are_refused_on_the_ground() -> None:
+    server, wire = served()
     wire.clamps = ("FR_hip_roll", "FR_hip_pitch")
-    live(server, 0.0, 0.1)
+    run(server, 0.0, 0.1)
     wire.inbox.append(replace(HOLD, position=HOLD.position + 0.3))
-    live(server, 0.1, 0.6)
+    run(server, 0.1, 0.6)
     moved = wire.sent[-1].position[:3] - wire.sent[0].position[:3]
     # The clamp is on the link, the encoder on the rotor behind the belt.
     assert np.abs(moved[:2]).max() < 0.02
     assert moved[2] == pytest.approx(0.3, abs=0.1)
 
-
-def test_on_the_ground_nothing_is_clamped_and_nothing_falls_over_it() -> None:
-    machine = VirtualRobot(ROBOT, load_sim_params(None), base="ground")
-    machine.connect()
     wire = Wire()
-    server = RobotServer(machine, wire, hold=HOLD)
+    server = RobotServer(connected(base="ground"), wire, hold=HOLD)
     wire.clamps = ("FR_knee",)
-    live(server, 0.0, 0.05)
+    run(server, 0.0, 0.05)
     assert wire.clamps == ()
     assert server.counts["clamps refused"] == 1
     assert len(wire.sent) == 25
 
 
-def test_real_time_goes_on_and_ends() -> None:
-    server, wire, machine = made()
-    calls: list[int] = []
-
-    def stop() -> bool:
-        calls.append(1)
-        return len(calls) > 400
-
-    server.run(stop)
-    figures = server.figures()
-    assert figures["ticks"] == 400
-    assert machine.now() == pytest.approx(400 * TICK_S)
+def test_real_time_run_ends_when_requested() -> None:
+    server, wire = served()
+    stops = iter([False] * 400 + [True])
+    server.run(lambda: next(stops))
+    figures: Any = server.figures()
+    assert figures["lateness"]["n"] == 400
+    assert figures["duration_s"] == pytest.approx(400 * TICK_S)
     assert len(wire.sent) == 100
-    assert Faults() == parse_faults("")
+
+
+# --- Broken messages ----------------------------------------------------------------------------
+
+
+def broken(layout: Layout, good: bytes, rng: np.random.Generator) -> bytes:
+    """A message that is no possible command, in another way each time."""
+    kind = rng.integers(5)
+    if kind == 0:
+        return flip_bit(good, int(rng.integers(64)))
+    if kind == 1:
+        others = [message for message in MESSAGES if message is not layout.command]
+        return others[rng.integers(len(others))].encode()
+    if kind == 2:
+        fields = np.frombuffer(good, layout.command.dtype)[0].copy()
+        name = ("q_des", layout.fields["stiffness"], layout.fields["damping"])[rng.integers(3)]
+        bad = (math.nan, math.inf, -math.inf, 1e9, -1e9)[rng.integers(5)]
+        fields[name][rng.integers(12)] = bad
+        return fields.tobytes()
+    if kind == 3:  # noise behind the right fingerprint and of the right length
+        return good[:8] + rng.bytes(len(good) - 8)
+    data = mutated(good, rng)
+    return data if len(data) != len(good) else data[:-1]
+
+
+@pytest.mark.parametrize("layout", [CHEETAH, WTW], ids=["cheetah", "wtw"])
+def test_broken_lcm_messages_change_no_bit_of_the_motion(layout: Layout) -> None:
+    pytest.importorskip("lcm")
+    from pronk.virtual.lcm_server import LcmServerTransport
+
+    steps, count = 200, 50_000
+    machine = connected(legs=("FR",))
+    wire = LcmServerTransport(ROBOT, layout=layout.name, url="memq://")
+    server = RobotServer(machine, wire, hold=HOLD)
+    good = encode_command(layout, replace(HOLD, position=HOLD.position + 0.5))
+    rng, states = np.random.default_rng(2), []
+    # Nor may any of these have an effect on the channels of requests.
+    channels = (layout.command.channel,) * 8 + (VIRTUAL_ROBOT.channel, CONTROL_PARAMETER.channel)
+    for step in range(steps):
+        for k in range(count // steps):
+            data = broken(layout, good, rng)
+            # A complete message of a service is valid on that service's channel.
+            wire.receive(channels[0] if len(data) in (28, 146) else channels[k % 10], data)
+        server.step((step + 1) * 0.002)
+        states.append(machine.latest())
+    assert wire.counts["commands"] == 0
+    refused = {name: n for name, n in wire.counts.items() if name.startswith("refused")}
+    assert sum(refused.values()) == count
+    reasons = ("fingerprint", "length", "not finite", "out of range")
+    assert {f"refused: {reason}" for reason in reasons} <= set(refused)
+    assert (wire.mode, wire.clamps) == ("", ())
+    undisturbed = connected(legs=("FR",)).wait(steps * 0.002)
+    for one, other in zip(states, undisturbed, strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+        np.testing.assert_array_equal(one.torque, other.torque)
+    wire.receive(layout.command.channel, good)
+    run(server, steps * 0.002, steps * 0.002 + 0.8)
+    moved = machine.latest().position[:3] - undisturbed[-1].position[:3]
+    np.testing.assert_allclose(moved, 0.5, atol=0.15)
+
+
+# --- The command --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -229,36 +265,35 @@ def test_real_time_goes_on_and_ends() -> None:
     [
         (["--faults", "los=1"], "los=1"),
         (["--capture", "there.npz"], "--base ground"),
-        (["--silence-after", "0"], "0"),
-        (["--domain", "3"], "--domain"),
-        (["--link", "dds", "--port", "9000"], "--port"),
+        (["--silence-after", "0"], "silence_after"),
+        (["--domain", "3"], "domain"),
+        (["--link", "dds", "--port", "9000"], "port"),
         (["--port", "7667"], "7667"),
+        (["--mode", "dance"], "dance"),
     ],
 )
-def test_a_server_that_cannot_be_is_one_sentence(words: list[str], named: str) -> None:
+def test_impossible_servers_are_refused(words: list[str], named: str) -> None:
     done = invoke(["simulate", *words])
     assert done.exit_code == 2
     assert named in done.stderr
 
 
-@pytest.mark.parametrize("options", [{"action": "sleep"}, {"after_s": 0.0}])
-def test_impossible_watchdogs_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(HardwareError, match="silence"):
-        Watchdog(**options)
+def test_unknown_watchdog_actions_are_refused() -> None:
+    with pytest.raises(RobotError, match="silence"):
+        Watchdog(silence="sleep")  # type: ignore[arg-type]
 
 
-def test_a_server_ends_by_itself_and_writes_its_figures(tmp_path: Path) -> None:
+def test_simulate_ends_after_its_duration_and_writes_its_figures(tmp_path: Path) -> None:
     pytest.importorskip("lcm")
-    seen, figures = tmp_path / "seen.npz", tmp_path / "figures.json"
+    capture, figures = tmp_path / "capture.npz", tmp_path / "figures.json"
     done = invoke(
         ["simulate", "--base", "ground", "--duration", "0.3", "--port", "7913",
-         "--mode", "locomotion",
-         "--capture", str(seen), "--json", str(figures)],
+         "--mode", "locomotion", "--capture", str(capture), "--json", str(figures)],
     )  # fmt: skip
     assert done.exit_code == 0
-    assert "ready: the virtual mini_cheetah on the ground, seed 0, on LCM" in done.output
+    assert "lcm://?layout=cheetah&port=7913" in done.output
     written = json.loads(figures.read_text(encoding="utf-8"))
     assert written["virtual"] is True
     # Its own controller commands over the wire itself.
     assert written["wire"]["commands"] > 0
-    assert load(seen).time[-1] == pytest.approx(written["duration_s"], abs=0.01)
+    assert load(capture).time[-1] == pytest.approx(written["duration_s"], abs=0.01)

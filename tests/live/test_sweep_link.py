@@ -30,7 +30,8 @@ from pronk.errors import HardwareError, LogError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
 from pronk.links.address import Address
-from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
+from pronk.links.lcm.codec import decode_command, encode_command
+from pronk.links.lcm.layout import CHEETAH
 from pronk.links.lcm.link import url_of
 from pronk.links.link import Freshness
 from pronk.links.machine import Command
@@ -40,7 +41,7 @@ from pronk.robots import load_robot
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import Recorded, run_sweep
 from pronk.runtime.sweep import SweepTask
-from pronk.virtual.server import hold_of
+from pronk.virtual.robot import hold_of
 
 pytestmark = pytest.mark.live
 

@@ -13,22 +13,28 @@ import yaml
 from pronk.errors import RobotError
 from pronk.robots import load_robot
 from pronk.virtual.plant import build_plant
-from pronk.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params
+from pronk.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params, with_changes
 
 BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
 ROBOT = load_robot("mini_cheetah")
 
 
-def changed(*path: str, value: Any) -> dict[str, Any]:
+MISSING = object()
+
+
+def changed(path: str, value: Any) -> dict[str, Any]:
+    """The shipped file with one entry replaced, or without it."""
     body = copy.deepcopy(BODY)
-    entry = body
-    for key in path[:-1]:
+    entry, *keys = body, *path.split(".")
+    for key in keys[:-1]:
         entry = entry[key]
-    entry[path[-1]] = value
+    entry[keys[-1]] = value
+    if value is MISSING:
+        del entry[keys[-1]]
     return body
 
 
-def test_the_shipped_file_is_of_the_mini_cheetah_and_plausible() -> None:
+def test_shipped_parameters_are_plausible_and_differ_between_joints() -> None:
     sim_params = load_sim_params()
     sim_params.check_joints(ROBOT.joint_names)
     assert sim_params.robot == ROBOT.name
@@ -39,13 +45,9 @@ def test_the_shipped_file_is_of_the_mini_cheetah_and_plausible() -> None:
         # Between the two published figures (reading A11), less or more some per cent.
         assert 0.95 * 63e-6 <= joint.rotor_inertia <= 1.05 * 72e-6, name
         assert 0.0 < joint.coulomb < 0.25, name
-
-
-def test_no_two_joints_are_alike() -> None:
-    joints = list(load_sim_params().joints.values())
     for name in ("coulomb", "link_inertia_scale", "belt_stiffness", "encoder_offset"):
-        values = [getattr(joint, name) for joint in joints]
-        assert len(set(values)) > len(joints) // 2, name
+        values = {getattr(joint, name) for joint in sim_params.joints.values()}
+        assert len(values) > len(sim_params.joints) // 2, name
 
 
 @pytest.mark.parametrize(
@@ -71,33 +73,23 @@ def test_no_two_joints_are_alike() -> None:
         ("robot", 7),
         ("colour", "red"),
         ("schema", "pronk/gains/1"),
+        ("joints.FR_knee.coulomb", MISSING),
     ],
 )
-def test_impossible_is_refused_in_one_sentence_naming_the_field(path: str, value: Any) -> None:
+def test_impossible_fields_are_named(path: str, value: Any) -> None:
     with pytest.raises(RobotError, match=path.split(".")[-1]) as caught:
-        parse_sim_params(changed(*path.split("."), value=value), "my.yaml")
+        parse_sim_params(changed(path, value), "my.yaml")
     assert str(caught.value).startswith("my.yaml: ")
     assert "\n" not in str(caught.value)
 
 
-def test_missing_field_is_named() -> None:
-    body = copy.deepcopy(BODY)
-    del body["joints"]["FR_knee"]["coulomb"]
-    with pytest.raises(RobotError, match=r"joints\.FR_knee\.coulomb is missing"):
-        parse_sim_params(body, "my.yaml")
-
-
-def test_missing_and_foreign_joints_are_named() -> None:
+def test_other_joints_and_too_stiff_belts_are_refused() -> None:
     sim_params = load_sim_params()
     joints = dict(sim_params.joints)
     knee = joints.pop("HR_knee")
     for wrong, name in ((joints, "HR_knee"), (joints | {"HR_knee": knee, "tail": knee}, "tail")):
         with pytest.raises(RobotError, match=rf"joints\.{name}"):
             build_plant(ROBOT, replace(sim_params, joints=wrong), ("FR",), 0.25e-3)
-
-
-def test_belt_too_stiff_for_the_step_is_refused_with_the_stiffest_that_fits() -> None:
-    sim_params = load_sim_params()
     stiff = replace(sim_params.joints["FR_hip_roll"], belt_stiffness=9e4)
     broken = replace(sim_params, joints={**sim_params.joints, "FR_hip_roll": stiff})
     with pytest.raises(RobotError, match="belt_stiffness"):
@@ -105,25 +97,31 @@ def test_belt_too_stiff_for_the_step_is_refused_with_the_stiffest_that_fits() ->
     build_plant(ROBOT, broken, ("FR",), 0.025e-3)
 
 
-def test_files_that_are_refused(tmp_path: Path) -> None:
-    bad = tmp_path / "bad.yaml"
+def test_files_are_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
     for text in (None, "joints: [unclosed", ""):
         if text is not None:
-            bad.write_text(text)
-        with pytest.raises(RobotError, match=r"bad\.yaml"):
-            load_sim_params(bad)
-
-
-def test_a_file_of_ones_own_replaces_the_shipped_one(tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump(changed("machine", "bus_voltage", value=22.0)))
-    assert load_sim_params(path) == replace(
-        load_sim_params(), machine=replace(load_sim_params().machine, bus_voltage=22.0)
-    )
-
-
-def test_parts_for_the_ground_may_be_left_out_of_a_file() -> None:
+            path.write_text(text)
+        with pytest.raises(RobotError, match=r"mine\.yaml"):
+            load_sim_params(path)
+    path.write_text(yaml.safe_dump(changed("machine.bus_voltage", 22.0)))
+    assert load_sim_params(path) == with_changes(load_sim_params(), bus_voltage=22.0)
     body = {name: BODY[name] for name in ("schema", "robot", "machine", "joints")}
     sim_params = parse_sim_params(body | {"trunk": {"mass_offset": 1}}, "my.yaml")
     assert sim_params.trunk.mass_offset == 1.0
     assert sim_params.attitude.noise == 0.0
+
+
+def test_numbers_are_changed_by_name() -> None:
+    was = load_sim_params()
+    now = with_changes(
+        was, trunk_mass_offset=1.0, friction=0.5, command_delay_s=0.01, bus_voltage=20.0
+    )
+    assert now.trunk == replace(was.trunk, mass_offset=1.0)
+    assert now.ground == replace(was.ground, friction=0.5)
+    assert now.machine == replace(was.machine, command_delay_s=0.01, bus_voltage=20.0)
+    assert now.joints is was.joints
+    assert with_changes(was) == was
+    for wrong in ({"mass": 1.0}, {"friction": -1.0}):
+        with pytest.raises(RobotError, match=next(iter(wrong))):
+            with_changes(was, **wrong)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import signal
+import math
 import time
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
@@ -14,21 +15,22 @@ from pronk.cli.options import Base, Layout
 from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
-    from pronk.robots.robot import RobotSpec
-    from pronk.virtual.server import RobotServer, ServerTransport
+    from pronk.virtual.server import ServerTransport
 
 _PRIORITY = 30
 """Of SCHED_FIFO; below that of the commanding process."""
 _LATE_MS = 5.0
 """Lateness of one tick in a hundred above which the measured timing is not representative."""
 
-WireLink = Literal["lcm", "dds"]
-Silence = Literal["hold", "zero", "damp"]
+_SERVERS = {
+    "lcm": "pronk.virtual.lcm_server:LcmServerTransport",
+    "dds": "pronk.virtual.dds_server:DdsServerTransport",
+}
 
 
 def simulate(
     robot: tyro.conf.Positional[str] = "mini_cheetah",
-    link: WireLink = "lcm",
+    link: Literal["lcm", "dds"] = "lcm",
     layout: Layout = "cheetah",
     base: Base = "bench",
     sim_params: Path | None = None,
@@ -36,7 +38,7 @@ def simulate(
     port: int | None = None,
     domain: int | None = None,
     faults: str = "",
-    silence: Silence = "hold",
+    silence: Literal["hold", "zero", "damp"] = "hold",
     silence_after: float = 0.1,
     mode: str = "",
     duration: float | None = None,
@@ -70,40 +72,40 @@ def simulate(
         realtime: Request real-time scheduling.
         json_file: Also write the figures to this file.
     """
-    from pronk.links.realtime import Wanted, enter
+    from pronk.links.address import Address
+    from pronk.links.realtime import Interrupts, Wanted, enter
     from pronk.robots import load_robot
     from pronk.virtual.capture import save
     from pronk.virtual.faults import parse_faults
-    from pronk.virtual.robot import VirtualRobot
-    from pronk.virtual.server import RobotServer, Watchdog, hold_of
+    from pronk.virtual.robot import VirtualRobot, hold_of
+    from pronk.virtual.server import RobotServer, Watchdog
     from pronk.virtual.sim_params import load_sim_params
 
     if capture is not None and base != "ground":
         raise HardwareError("--capture needs --base ground: on the bench the trunk cannot move.")
     known, wrong = load_robot(robot), parse_faults(faults)
-    watchdog = Watchdog(action=silence, after_s=silence_after)
-    machine = VirtualRobot(
-        known,
-        load_sim_params(sim_params, known),
-        seed=seed,
-        base=base,
-        capture_rate_hz=1000.0 if capture else None,
-    )
+    watchdog = Watchdog(silence=silence, silence_after=silence_after)
+    of_lcm = layout if link == "lcm" else None
+    address = Address.parse(link, layout=of_lcm, port=port, domain=domain)
+    hidden, rate = load_sim_params(sim_params, known), 1000.0 if capture else None
+    machine = VirtualRobot(known, hidden, seed=seed, base=base, capture_rate_hz=rate)
     if realtime:
         # Before the wire is open, so that its threads are scheduled alike.
         for granted in enter(Wanted(priority=_PRIORITY, lock=False)):
             console.say(granted)
-    wire, where = _open_wire(link, known, layout, port, domain, mode)
+    wire: ServerTransport = resolve_name(_SERVERS[link])(known, mode=mode, **address.options)
     try:
         machine.connect()
         server = RobotServer(
             machine, wire, hold=hold_of(known), faults=wrong, watchdog=watchdog, seed=seed
         )
         console.say(
-            f"ready: the virtual {known.name} on the {base}, seed {seed}, on {where}; "
+            f"ready: the virtual {known.name} on the {base}, seed {seed}, at {address}; "
             "Ctrl-C ends it"
         )
-        _run(server, duration)
+        end = time.monotonic() + (math.inf if duration is None else duration)
+        with Interrupts() as interrupts:
+            server.run(lambda: interrupts.received or time.monotonic() >= end)
         figures = server.figures()
         if capture is not None:
             save(capture, machine.capture())
@@ -113,71 +115,24 @@ def simulate(
         machine.close()
     _report(figures)
     console.write_json(json_file, figures)
-    options: dict[str, str | int | None]
-    options = {"link": link, "layout": layout if link == "lcm" else None}
-    options |= {"port": port, "domain": domain}
-    way = " ".join(f"--{name} {value}" for name, value in options.items() if value is not None)
-    console.following(f"pronk sweep {robot} {way} --out DIR   # while a virtual robot runs")
-
-
-def _open_wire(
-    link: WireLink,
-    robot: RobotSpec,
-    layout: Layout,
-    port: int | None,
-    domain: int | None,
-    mode: str,
-) -> tuple[ServerTransport, str]:
-    """The robot's end of the wire, and its address in words."""
-    if link == "lcm":
-        from pronk.links.lcm.codec import layout_of
-        from pronk.links.lcm.link import url_of
-        from pronk.virtual.lcm_server import LcmServerTransport
-
-        if domain is not None:
-            raise HardwareError("--domain is of DDS; with --link lcm give --port.")
-        url = url_of(port=port)
-        wire = LcmServerTransport(robot, layout_of(layout), url, mode=mode)
-        return wire, f"LCM, messages of {layout}, {url}"
-    from pronk.links.dds.link import DdsNetwork
-    from pronk.virtual.dds_server import DdsServerTransport
-
-    if port is not None:
-        raise HardwareError("--port is of LCM; with --link dds give --domain.")
-    network = DdsNetwork() if domain is None else DdsNetwork(domain=domain)
-    return DdsServerTransport(robot, network, mode=mode), str(network)
-
-
-def _run(server: RobotServer, duration: float | None) -> None:
-    """Serve until Ctrl-C, a SIGTERM, or the end of the duration."""
-    signals: list[int] = []
-    end = time.monotonic() + duration if duration is not None else float("inf")
-    before = {
-        number: signal.signal(number, lambda got, _: signals.append(got))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        server.run(lambda: bool(signals) or time.monotonic() >= end)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    console.following(f"pronk sweep {robot} --link '{address}' --out DIR   # while it runs")
 
 
 def _report(figures: dict[str, Any]) -> None:
     """Print counts and punctuality."""
     wire: dict[str, int] = figures["wire"]
     refused = sum(count for name, count in wire.items() if name.startswith("refused"))
-    late = figures["lateness_ms"]
+    late = figures["lateness"]
     console.say(
         f"the virtual robot ran {figures['duration_s']:.1f} s: {wire.get('states', 0)} states, "
         f"{wire.get('commands', 0)} commands, {refused} messages refused; ticks late by "
-        f"{late['p50']:.2f} ms (median), {late['p99']:.2f} ms (p99); "
+        f"{late['p50_ms']:.2f} ms (median), {late['p99_ms']:.2f} ms (p99); "
         f"{100 * figures['cpu_share']:.0f} % of one core"
     )
-    if late["p99"] > _LATE_MS:
+    if late["p99_ms"] > _LATE_MS:
         console.warn(
-            f"1 in 100 ticks was late by {late['p99']:.0f} ms or more: this computer is too busy "
-            "for timing measurements"
+            f"1 in 100 ticks was late by {late['p99_ms']:.0f} ms or more: this computer is too "
+            "busy for timing measurements"
         )
     if figures["slipped_s"]:
         console.warn(

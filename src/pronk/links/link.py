@@ -28,7 +28,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from pronk.errors import HardwareError
-from pronk.links.machine import Command, RefusedError, State, TorqueKind, damping_command
+from pronk.links.machine import Array, Command, RefusedError, State, TorqueKind, damping_command
 from pronk.robots.robot import RobotSpec
 
 ClampOperator = Callable[[tuple[str, ...]], None]
@@ -81,6 +81,18 @@ def await_rest(latest: Callable[[], State | None]) -> None:
         if spent >= _LEAST_DAMP_S and speed < _AT_REST:
             break
         time.sleep(_POLL_S)
+
+
+def unit_quaternion(name: str, values: Array) -> Array:
+    """Normalize an attitude; RefusedError `quaternion` for a length that is not 1 within .02."""
+    length = math.sqrt(values @ values)
+    if not abs(length - 1.0) <= 0.02:
+        raise RefusedError(
+            "quaternion",
+            f"{name} has length {length:.3f}, expected 1 within .02; the inertial unit is not "
+            "running, or the order of the numbers is another.",
+        )
+    return values / length
 
 
 class StateNumbering:

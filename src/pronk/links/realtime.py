@@ -189,7 +189,8 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        self._received = False
+        self.received = False
+        """Whether a signal has come since the last check."""
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -211,9 +212,9 @@ class Interrupts:
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal has come since the last check."""
-        if self._received:
-            self._received = False
+        if self.received:
+            self.received = False
             raise KeyboardInterrupt
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        self._received = True
+        self.received = True

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from pronk.errors import HardwareError
 from pronk.links.dds import codec
 from pronk.links.dds.codec import decode_command, encode_command, encode_state, joint_map
 from pronk.links.dds.link import (
@@ -74,13 +73,9 @@ class Server:
 class DdsServerTransport(ServerTransport):
     """The robot's end in Unitree's messages, on loopback only."""
 
-    def __init__(self, robot: RobotSpec, network: DdsNetwork, *, mode: str = "") -> None:
-        """Join a domain on loopback, with the controller that holds the joints at first."""
-        if network.interface is not None:
-            raise HardwareError(
-                f"a virtual robot does not go to {network}, where real ones listen; leave the "
-                "interface out."
-            )
+    def __init__(self, robot: RobotSpec, *, domain: int | None = None, mode: str = "") -> None:
+        """Join a domain, with the controller that holds the joints at first."""
+        network = DdsNetwork(domain=domain)
         super().__init__(robot, mode, MODES)
         self._joints = joint_map(robot)
         own = Participant(network)

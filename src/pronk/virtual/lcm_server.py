@@ -7,12 +7,7 @@ Cheetah-Software would pass it to the motors.
 from __future__ import annotations
 
 from pronk.links.lcm.codec import (
-    BEACON_CHANNEL,
-    CONTROL_PARAMETER,
     MODES,
-    RESPONSE_CHANNEL,
-    VIRTUAL_ROBOT,
-    Layout,
     clamp_message,
     decode_command,
     encode_command,
@@ -20,7 +15,14 @@ from pronk.links.lcm.codec import (
     read_clamp_message,
     read_mode_request,
 )
-from pronk.links.lcm.link import open_lcm
+from pronk.links.lcm.layout import (
+    BEACON_CHANNEL,
+    CONTROL_PARAMETER,
+    RESPONSE_CHANNEL,
+    VIRTUAL_ROBOT,
+    layout_of,
+)
+from pronk.links.lcm.link import open_lcm, url_of
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.server import ServerTransport
@@ -34,16 +36,26 @@ _QUEUE = 1000
 class LcmServerTransport(ServerTransport):
     """The robot's end in the messages of a layout."""
 
-    def __init__(self, robot: RobotSpec, layout: Layout, url: str, *, mode: str = "") -> None:
-        """Open the robot's end at LCM's address, with the controller that holds it at first."""
+    def __init__(
+        self,
+        robot: RobotSpec,
+        *,
+        layout: str = "cheetah",
+        port: int | None = None,
+        mode: str = "",
+        url: str | None = None,
+    ) -> None:
+        """Open the robot's end on a port of this computer, or at an LCM address of its own.
+
+        `mode` names the controller that holds the joints at first.
+        """
         super().__init__(robot, mode, MODES.values())
-        self._layout = layout
-        self._lcm = open_lcm(url)
+        self._layout = known = layout_of(layout)
         # Another writer is another sender.
-        self._other = open_lcm(url)
+        self._lcm, self._other = (open_lcm(url or url_of(port=port)) for _ in range(2))
         self._arrived: list[Command] = []
         self._bench_request, self._requested = 0, False
-        for channel in (layout.command.channel, CONTROL_PARAMETER.channel, VIRTUAL_ROBOT.channel):
+        for channel in (known.command.channel, CONTROL_PARAMETER.channel, VIRTUAL_ROBOT.channel):
             self._lcm.subscribe(channel, self.receive).set_queue_capacity(_QUEUE)
 
     def poll(self) -> list[Command]:

@@ -22,6 +22,7 @@ policy that walks and jumps (means; n jumps with the same seeds at every step):
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -40,6 +41,15 @@ TIMESTEP_S = 0.25e-3
 """Physics step; see the module's docstring for why it suffices."""
 _SETTLE_S = 2.0
 """Time before the clock starts, on the bench: the legs settle into their drives' hold."""
+
+
+def hold_of(robot: RobotSpec) -> Command:
+    """The default pose at the drives' own gains."""
+    return Command(
+        position=np.array([joint.default_position for joint in robot.joints]),
+        stiffness=np.array([joint.stiffness for joint in robot.joints]),
+        damping=np.array([joint.damping for joint in robot.joints]),
+    )
 
 
 class VirtualRobot:
@@ -118,7 +128,7 @@ class VirtualRobot:
     def connect(self) -> None:
         """Set the robot down, let it settle, start the clock; the drives hold its pose."""
         robot, plant, machine = self._robot, self._plant, self._sim_params.machine
-        pose = np.array([joint.default_position for joint in robot.joints])
+        pose = np.asarray(hold_of(robot).position)
         settle = _SETTLE_S
         if self._ground is not None:
             pose, settle = pose + self._start.offset(len(pose)), self._start.settle_s
@@ -133,13 +143,7 @@ class VirtualRobot:
             if self._capture_rate is not None:
                 self._recorder = Recorder(plant, 1.0 / self._capture_rate)
         self._physics.recorder = self._recorder
-        self._physics.apply(
-            Command(
-                position=pose,
-                stiffness=np.array([joint.stiffness for joint in robot.joints]),
-                damping=np.array([joint.damping for joint in robot.joints]),
-            )
-        )
+        self._physics.apply(replace(hold_of(robot), position=pose))
         self._now = 0.0
         self._open = True
         self._latest = self._run(1)[0]

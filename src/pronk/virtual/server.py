@@ -10,21 +10,20 @@ import gc
 import math
 import time
 from abc import ABC, abstractmethod
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
-import numpy as np
-from numpy.typing import NDArray
+from msgspec import Meta
 
 from pronk.errors import HardwareError
 from pronk.links.machine import Command, Machine, RefusedError, State, damping_command
+from pronk.links.realtime import Histogram
 from pronk.robots.robot import RobotSpec
+from pronk.virtual.bounds import Bounded
 from pronk.virtual.faults import FaultChannel, Faults, flip_bit
 
-Array = NDArray[np.float64]
 Corrupt = Callable[[bytes], bytes]
 
 TICK_S = 0.5e-3
@@ -83,29 +82,14 @@ class ServerTransport(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Watchdog:
+class Watchdog(Bounded):
     """What the drives do when commands stop."""
 
-    action: Literal["hold", "zero", "damp"] = "hold"
+    silence: Literal["hold", "zero", "damp"] = "hold"
     """Go on with the last command for ever (the bridge of walk-these-ways, spi_debug_cmd), no
     torque (the motors' own time-out), or damping."""
-    after_s: float = 0.1
+    silence_after: Annotated[float, Meta(gt=0.0)] = 0.1
     """Time without a command after which they do it [s]."""
-
-    def __post_init__(self) -> None:
-        if self.action not in ("hold", "zero", "damp"):
-            raise HardwareError(f"silence {self.action!r}; expected hold, zero or damp.")
-        if not self.after_s > 0.0:
-            raise HardwareError(f"silence after {self.after_s} s; expected a time above 0.")
-
-
-def hold_of(robot: RobotSpec) -> Command:
-    """The default pose at the drives' own gains."""
-    return Command(
-        position=np.array([joint.default_position for joint in robot.joints]),
-        stiffness=np.array([joint.stiffness for joint in robot.joints]),
-        damping=np.array([joint.damping for joint in robot.joints]),
-    )
 
 
 class RobotServer:
@@ -137,8 +121,8 @@ class RobotServer:
         self._contended = -math.inf
         self._clamps: tuple[str, ...] = ()
         self._frozen: State | None = None
-        self._slipped = self._cpu = 0.0
-        self._late = array("f")
+        self._slipped, self._worked = 0.0, time.process_time()
+        self._late = Histogram()
         # Without bit flips the bytes are not even looked at.
         if self._faults.command.flip:
             wire.corrupt_in = lambda data: self._flip(self._commands, data)
@@ -154,10 +138,13 @@ class RobotServer:
             self._last_command = until
             self._machine.send(command)
             self.counts["commands applied"] += 1
-        if until - self._last_command > self._watchdog.after_s and self._watchdog.action != "hold":
+        if (
+            until - self._last_command > self._watchdog.silence_after
+            and self._watchdog.silence != "hold"
+        ):
             self.counts["silences"] += 1
             self._last_command = math.inf
-            damping = 1.0 if self._watchdog.action == "damp" else 0.0
+            damping = 1.0 if self._watchdog.silence == "damp" else 0.0
             self._machine.send(damping_command(len(self._hold.position), damping))
         if self._wire.clamps != self._clamps:
             try:
@@ -178,7 +165,7 @@ class RobotServer:
         # What was built until now lives as long as the server; the collector need not walk it.
         gc.freeze()
         start = time.monotonic() - self._machine.now()
-        worked = time.process_time()
+        self._worked = time.process_time()
         ticks = round(self._machine.now() / TICK_S)
         while not stop():
             ticks += 1
@@ -190,13 +177,11 @@ class RobotServer:
                 self.counts["slips"] += 1
                 self._slipped += late
                 start += late
-            self._late.append(late)
+            self._late.add(late)
             self.step(ticks * TICK_S)
-        self._cpu += time.process_time() - worked
 
     def figures(self) -> dict[str, object]:
         """Counts of server, wire and faults, lateness of ticks, and share of one core."""
-        late = np.array(self._late or [0.0], dtype=float) * 1e3
         return {
             "virtual": True,
             "duration_s": self._now,
@@ -205,12 +190,8 @@ class RobotServer:
             "command_faults": dict(self._commands.counts),
             "state_faults": dict(self._states.counts),
             "slipped_s": self._slipped,
-            "cpu_share": self._cpu / max(self._now, TICK_S),
-            "ticks": len(self._late),
-            "lateness_ms": {
-                name: float(np.percentile(late, share))
-                for name, share in {"p50": 50, "p99": 99, "max": 100}.items()
-            },
+            "cpu_share": (time.process_time() - self._worked) / max(self._now, TICK_S),
+            "lateness": self._late.figures(),
         }
 
     def _contend(self, now: float) -> None:

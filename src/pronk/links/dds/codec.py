@@ -46,7 +46,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from pronk.errors import HardwareError
-from pronk.links.link import StateNumbering
+from pronk.links.link import StateNumbering, unit_quaternion
 from pronk.links.machine import Command, RefusedError, State, check_command
 from pronk.robots.robot import RobotSpec
 
@@ -337,20 +337,13 @@ class StateDecoder(StateNumbering):
         motors = message["motor_state"]
         q, dq, _, tau = _finite("motor_state", _columns(motors, "q", "tau_est")).T
         imu = _finite("imu_state", message["imu_state"].view("<f4")[:_IMU])
-        length = math.sqrt(imu[:4] @ imu[:4])
-        if not abs(length - 1.0) <= 0.02:
-            raise RefusedError(
-                "quaternion",
-                f"imu_state.quaternion has length {length:.3f}, expected 1 within .02; the "
-                "inertial unit is not running.",
-            )
         self.virtual = tuple(int(word) for word in message["sn"][0]) == VIRTUAL
         temperature, tick = motors["temperature"][0, :_JOINTS], int(message["tick"][0])
         values = {
             "position": sign * q,
             "velocity": sign * dq,
             "torque": sign * tau,
-            "orientation": imu[:4] / length,
+            "orientation": unit_quaternion("imu_state.quaternion", imu[:4]),
             "gyro": imu[4:7],
             "accelerometer": imu[7:],
             "bus_voltage": float(message["power_v"][0]),

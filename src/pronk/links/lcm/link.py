@@ -20,16 +20,18 @@ from typing import Any
 
 from pronk.errors import HardwareError
 from pronk.links.lcm.codec import (
+    StateDecoder,
+    clamp_message,
+    encode_command,
+    mode_request,
+    read_clamp_message,
+)
+from pronk.links.lcm.layout import (
     BEACON_CHANNEL,
     CONTROL_PARAMETER,
     RESPONSE_CHANNEL,
     VIRTUAL_ROBOT,
-    StateDecoder,
-    clamp_message,
-    encode_command,
     layout_of,
-    mode_request,
-    read_clamp_message,
 )
 from pronk.links.link import RESPONSE_S, CommandWriter, NetworkLink, wait_for
 from pronk.robots.robot import RobotSpec
