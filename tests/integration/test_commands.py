@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 from scipy.stats import binomtest, kstest
+
+pytest.importorskip("mjlab")
+
+import torch
 from torch import Tensor
 
 import training_env

@@ -7,10 +7,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
+
+pytest.importorskip("mjlab")
+
+import torch
 from torch import Tensor
 
 import training_env

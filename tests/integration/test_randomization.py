@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import chisquare, kstest
+
+pytest.importorskip("mjlab")
+
+import torch
 from torch import Tensor
 
 import training_env

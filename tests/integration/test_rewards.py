@@ -6,6 +6,9 @@ import math
 from typing import Any
 
 import pytest
+
+pytest.importorskip("mjlab")
+
 import torch
 from mjlab.managers.reward_manager import RewardManager
 from torch import Tensor

@@ -6,8 +6,11 @@ import math
 from typing import Any
 
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
+
+pytest.importorskip("mjlab")
+
+import torch
 from torch import Tensor
 
 import training_env

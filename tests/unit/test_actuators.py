@@ -10,11 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import chisquare, kstest
 
+pytest.importorskip("mjlab")
+
+import torch
+
 import training_env
-from pronk.actuator.model import clip_torque
+from pronk.actuator.model import clip_torque, pd_torque
 from pronk.errors import PronkError, RobotError
 from pronk.match.gains import GroupGains
 from pronk.train.mdp.actions import DelayedJointPositionActionCfg
