@@ -1,4 +1,4 @@
-"""A policy made by hand: it stands still, and extends its legs at the jump input."""
+"""A constructed policy: it stands still, and extends its legs at the jump input."""
 
 from __future__ import annotations
 

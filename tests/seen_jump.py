@@ -1,4 +1,4 @@
-"""A jump made by hand, as cameras would have seen it: all of its figures are known in closed form.
+"""A jump as cameras would record it; all of its figures are known in closed form.
 
 Time runs in steps of 1 ms for 8 s. The trunk stands at `STANDING`, runs along x at `speed` from
 `start` on, drops by `CROUCH` within 0.1 s of the jump input, rises evenly to `z_off` and lifts off

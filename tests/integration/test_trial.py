@@ -1,4 +1,4 @@
-"""A whole trial with a policy made by hand: what is drawn, run, kept and refused."""
+"""A whole trial with a constructed policy: what is drawn, run, kept and refused."""
 
 from __future__ import annotations
 

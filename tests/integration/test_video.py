@@ -1,4 +1,4 @@
-"""Films of a capture: what is shown, when and from where; the files, where there is a GL."""
+"""Films of a capture: moments, camera and labels; the files, where there is a GL."""
 
 from __future__ import annotations
 

@@ -49,7 +49,15 @@ from pronk.evaluation.jumps import (
 )
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Kind, Results, Row, Subject
-from pronk.evaluation.trial import Job, Setup, case_rng, finished, in_processes, load_subjects
+from pronk.evaluation.trial import (
+    OFFSET,
+    Job,
+    Setup,
+    case_rng,
+    finished,
+    in_processes,
+    load_subjects,
+)
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import ticks
@@ -73,8 +81,6 @@ PHASE_S = 0.5
 """Starts lie up to this many seconds of the command further back: more than a stride [s]."""
 LATE = 3.0
 """A run ends if the robot has not reached the edge after this many times the run-up."""
-OFFSET = 0.05
-"""Half-width of the joints' offsets from the default pose at the start [rad]."""
 STEERED = 0.02
 """Half-width of the headings at the start: the robot is aimed at the edge [rad]."""
 
@@ -374,9 +380,9 @@ def search(
     run: Callable[[list[Attempt]], list[Row]],
 ) -> list[Row]:
     """Practise, then climb all ladders at once, a rung of each in every round; `run` runs one."""
-    who: Any = {"plan": plan, "robot": robot, "sim_params": sim_params}
+    common: Any = {"plan": plan, "robot": robot, "sim_params": sim_params}
     pairs = [(subject, case) for subject in subjects for case in plan.cases]
-    practice: Any = {"lead": 0.0, "runs": plan.practice, **who}
+    practice: Any = {"lead": 0.0, "runs": plan.practice, **common}
     rows = run([task for s, c in pairs for task in attempts(s, c, "flat", 0.0, **practice)])
     climbing: dict[tuple[str, str, Shape], tuple[Subject, Case, int, float]] = {}
     for subject, case in pairs:
@@ -392,7 +398,7 @@ def search(
             ladder = plan.ladders[kind]
             for lead in (round(reach + beyond, 4) for beyond in ladder.leads):
                 size = ladder.size(rung)
-                tasks += attempts(subject, case, kind, size, lead=lead, runs=plan.runs, **who)
+                tasks += attempts(subject, case, kind, size, lead=lead, runs=plan.runs, **common)
         found = run(tasks)
         rows += found
         for key, (subject, case, rung, reach) in list(climbing.items()):
@@ -504,6 +510,6 @@ def climbs(results: Results) -> tuple[Climb, ...]:
                 whole = enough.index(False) if False in enough else len(enough)
                 largest = sizes[whole - 1] if whole else 0.0
                 ever = max((r.figures.size for r in own if r.figures.success), default=0.0)
-                who = {"policy": policy, "case": case, "kind": kind}
-                found.append(Climb(**who, rungs=tuple(rungs), largest=largest, ever=ever))
+                names = {"policy": policy, "case": case, "kind": kind}
+                found.append(Climb(**names, rungs=tuple(rungs), largest=largest, ever=ever))
     return tuple(found)

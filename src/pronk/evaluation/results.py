@@ -283,8 +283,8 @@ class Results:
                     others = [self.values(other, each, figure) for each in cases]
                     value, low, high = ratio_of_scatter(own, others, seed=self.seed)
                     n = (sum(map(len, own)), sum(map(len, others)))
-                    who: Any = {"figure": figure, "case": case, "policy": first, "other": other}
-                    found.append(Ratio(**who, value=value, low=low, high=high, n=n))
+                    names: Any = {"figure": figure, "case": case, "policy": first, "other": other}
+                    found.append(Ratio(**names, value=value, low=low, high=high, n=n))
         return tuple(found)
 
 

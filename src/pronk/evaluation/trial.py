@@ -57,6 +57,9 @@ Keep = Literal["none", "some", "all"]
 
 CAPTURES, VIDEOS = "captures", "videos"
 """Folders beside the table."""
+OFFSET = 0.05
+"""Half-width of the joints' offsets from the default pose at the start [rad]. With drives this soft
+it tilts the trunk by 5 degrees, by 13 at most; 0.1 may tip the robot over."""
 _OFFSETS = (1.0, 0.5, 0.0)
 """Shares of the drawn joint offsets that are tried until the robot stands."""
 
@@ -91,11 +94,6 @@ class Plan:
     """Times; the command is each case's."""
     spread_s: float = 0.5
     """The jump input rises up to this much later, uniformly, in policy steps [s]."""
-    yaw: float = math.pi
-    """Half-width of the headings at the start [rad]."""
-    joint_offset: float = 0.05
-    """Half-width of the joints' offsets from the default pose at the start [rad]. With drives this
-    soft it tilts the trunk by 5 degrees, by 13 at most; 0.1 may tip the robot over."""
 
     def __post_init__(self) -> None:
         """Raise `PronkError` for an empty plan or a negative seed."""
@@ -124,8 +122,8 @@ def draw(plan: Plan, case: Case, number: int, robot: RobotSpec) -> tuple[Script,
     """Draw the script, the start and the noise seed of one jump, numbered from 0."""
     rng = case_rng(plan.seed, case, number)
     ticks = int(rng.integers(round(plan.spread_s * robot.policy_rate_hz) + 1))
-    yaw = float(rng.uniform(-plan.yaw, plan.yaw))
-    offset = rng.uniform(-plan.joint_offset, plan.joint_offset, len(robot.joints))
+    yaw = float(rng.uniform(-math.pi, math.pi))
+    offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
     later = plan.script.run_s + ticks / robot.policy_rate_hz
     return (
         replace(plan.script, command=case.command, run_s=later),

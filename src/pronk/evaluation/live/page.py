@@ -101,8 +101,8 @@ class WebPage:
         self._scene = mjviser.ViserMujocoScene(self.server, self._model, num_envs=1)
         self.server.initial_camera.position = (0.45, -1.35, 0.6)
         self.server.initial_camera.look_at = (0.0, 0.0, 0.25)
-        shown = "localhost" if host in ("127.0.0.1", "::1", "0.0.0.0", "::") else host
-        self.address = f"http://{shown}:{self.server.get_port()}"
+        name = "localhost" if host in ("127.0.0.1", "::1", "0.0.0.0", "::") else host
+        self.address = f"http://{name}:{self.server.get_port()}"
         """Where a browser finds it."""
         self._build(title)
 
