@@ -91,7 +91,7 @@ def test_the_step_has_converged_to_40_khz(joint: str) -> None:
     assert np.abs(coarse - fine).max() < 0.05
 
 
-def test_without_imperfections_a_joint_answers_as_its_equation_says() -> None:
+def test_response_of_an_ideal_joint_is_its_closed_form() -> None:
     joint = "FR_knee"
     scale, drive = 1.2, ROBOT.joint(joint).drive
     sim_params = with_joint(
@@ -193,7 +193,7 @@ def test_battery_sags_with_the_power_drawn() -> None:
 # --- Time ---------------------------------------------------------------------------------------
 
 
-def test_delays_shift_the_answer() -> None:
+def test_delays_shift_the_response() -> None:
     command = chirp(1.0)
     prompt, late = (
         column(excite(connected(quiet(**IDEAL, **delays)), "FR_knee", command), "FR_knee")
@@ -245,7 +245,7 @@ def test_positions_lie_on_the_grid_of_the_encoder() -> None:
     assert len(set(column(states, "FR_knee"))) > 20
 
 
-def test_position_noise_is_coloured_and_as_large_as_said() -> None:
+def test_position_noise_has_its_size_and_corner() -> None:
     sim_params = quiet(**IDEAL, position_noise=1e-3, position_noise_corner_hz=10.0)
     noise = column(connected(sim_params).wait(60.0), "FR_hip_roll")
     noise = noise - noise.mean()
@@ -254,7 +254,7 @@ def test_position_noise_is_coloured_and_as_large_as_said() -> None:
     assert neighbours == pytest.approx(np.exp(-2.0 * np.pi * 10.0 / 500.0), abs=0.02)
 
 
-def test_inertial_unit_feels_gravity_and_its_bias() -> None:
+def test_inertial_unit_measures_gravity_and_its_bias() -> None:
     machine = SIM_PARAMS.machine
     bias = {name: getattr(machine, name) for name in ("gyro_bias", "accelerometer_bias")}
     state = connected(quiet(**IDEAL, **bias)).latest()
@@ -264,7 +264,7 @@ def test_inertial_unit_feels_gravity_and_its_bias() -> None:
     )
 
 
-def test_a_compliant_stand_is_felt_by_the_gyro() -> None:
+def test_gyro_measures_a_compliant_stand() -> None:
     sim_params = quiet(**IDEAL, stand_stiffness=500.0, stand_damping=5.0)
     machine = connected(sim_params, legs=None)
     states = excite(machine, "FR_hip_pitch", chirp(3.0))
@@ -294,7 +294,7 @@ def test_clamp_holds_a_link_but_no_fixture_is_rigid() -> None:
     assert free > 0.15
 
 
-def test_legs_on_a_rigid_bench_do_not_feel_each_other() -> None:
+def test_legs_on_a_rigid_bench_are_independent() -> None:
     command = chirp(1.0)
     alone, together = (
         excite(connected(quiet(**IDEAL), legs=legs), "FR_knee", command) for legs in (("FR",), None)
