@@ -83,13 +83,6 @@ class Windows(NetworkLink):
     def _shut(self) -> None: ...
 
 
-def test_a_condition_is_waited_for_and_given_up(clock: Clock) -> None:
-    assert wait_for(lambda: clock.now > 1.5)
-    assert clock.now == pytest.approx(1.5, abs=0.01)
-    assert not wait_for(lambda: False, 0.5)
-    assert clock.now == pytest.approx(2.0, abs=0.01)
-
-
 REGULAR = np.arange(100) * 2e-3
 
 
@@ -167,15 +160,7 @@ def test_values_that_repeat_make_no_states_and_times_increase() -> None:
     assert later.time == pytest.approx(7.0 + 50e-6, abs=1e-8)
 
 
-def test_commands_of_other_programs_are_refused() -> None:
-    link = Windows()
-    link.check_exclusive()
-    link.counts["foreign"] = 3
-    with pytest.raises(HardwareError, match="3 commands"):
-        link.check_exclusive()
-
-
-def test_joints_are_clamped_by_a_person_or_not_at_all() -> None:
+def test_clamps_need_a_person() -> None:
     requests: list[tuple[str, ...]] = []
     Windows(clamp_operator=requests.append).clamp(("FL_knee",))
     assert requests == [("FL_knee",)]
@@ -198,7 +183,7 @@ def test_joints_are_clamped_by_a_person_or_not_at_all() -> None:
     ],
     ids=["no state", "slow enough", "in between", "never", "not a number"],
 )
-def test_a_robot_is_left_at_rest(
+def test_rest_is_awaited(
     newest: Callable[[float], State | None], takes: float, clock: Clock
 ) -> None:
     await_rest(lambda: newest(clock.now))
@@ -227,7 +212,7 @@ def test_the_writer_repeats_damping_and_nothing_else() -> None:
     assert len(written) == count
 
 
-def test_a_wire_that_fails_never_ends_the_damping() -> None:
+def test_damping_survives_a_failing_wire() -> None:
     wire: list[bytes] = []
     cut = threading.Event()
 
@@ -366,17 +351,15 @@ def test_a_link_is_found_by_its_entry_point_and_passes_the_check(
     assert machine.counts == {"speed": 115200}
     assert "serial" in addresses.link_names()
     check_link(ROBOT, Serial(), [message(0.0), message(0.1)], Loop)
-
-
-def test_a_link_whose_package_is_broken_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("serial", "no_such_package:serial", addresses.GROUP)
-    monkeypatch.setattr(addresses, "entry_points", lambda group: EntryPoints([point]))
+    monkeypatch.undo()
+    broken = EntryPoint("serial", "no_such_package:serial", addresses.GROUP)
+    monkeypatch.setattr(addresses, "entry_points", lambda group: EntryPoints([broken]))
     with pytest.raises(PronkError, match="no_such_package:serial"):
         Address.parse("serial://ttyUSB0")
 
 
 @pytest.mark.parametrize("wrong", ["decode", "encode", "local"])
-def test_a_link_with_a_defect_fails_the_check(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_defects_fail_the_check(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if wrong == "local":
         monkeypatch.setattr(Loop, "local", False)
     else:
