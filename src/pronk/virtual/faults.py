@@ -10,13 +10,17 @@ import heapq
 import math
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
+from msgspec import Meta
 
 from pronk.errors import HardwareError
+from pronk.virtual.bounds import Bounded
 
 T = TypeVar("T")
+_Span = Annotated[float, Meta(ge=0.0, le=1e9)]
+_Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 # Times in a specification may carry a unit; how many make a second.
 _UNITS = {"us": 1e6, "ms": 1e3, "s": 1.0, "": 1.0}
@@ -25,28 +29,21 @@ _JITTER_SHAPE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChannelFaults:
+class ChannelFaults(Bounded):
     """One direction. Probabilities are per message."""
 
-    delay: float = 0.0
+    delay: _Span = 0.0
     """[s]"""
-    jitter: float = 0.0
+    jitter: _Span = 0.0
     """Mean of what comes on top of the delay, gamma distributed of shape 2 [s]."""
-    loss: float = 0.0
-    duplicate: float = 0.0
-    reorder: float = 0.0
+    loss: _Probability = 0.0
+    duplicate: _Probability = 0.0
+    reorder: _Probability = 0.0
     """That a message waits for the next one and comes after it."""
-    nan: float = 0.0
+    nan: _Probability = 0.0
     """That one number of a state is not a number. Has no meaning for commands."""
-    flip: float = 0.0
+    flip: _Probability = 0.0
     """That one bit of a message is inverted."""
-
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            value, is_time = getattr(self, entry.name), entry.name in ("delay", "jitter")
-            if not 0.0 <= value <= (1e9 if is_time else 1.0):
-                kind = "a time of 0 s or more" if is_time else "a probability, 0 to 1"
-                raise HardwareError(f"{entry.name} is {value}; expected {kind}.")
 
 
 @dataclass(frozen=True, kw_only=True)

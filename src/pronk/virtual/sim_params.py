@@ -176,13 +176,13 @@ class SimParams:
     def check_joints(self, names: Iterable[str], source: str = "sim_params") -> None:
         """Refuse parameters that do not hold exactly these joints."""
         wanted = tuple(names)
-        for missing in (name for name in wanted if name not in self.joints):
-            raise RobotError(f"{source}: joints.{missing} is missing; {self.robot} has that joint.")
-        for extra in (name for name in self.joints if name not in wanted):
-            raise RobotError(
-                f"{source}: joints.{extra} is not a joint of {self.robot}; "
-                f"those are {', '.join(wanted)}."
-            )
+        for name in (*wanted, *self.joints):
+            if (name in wanted) != (name in self.joints):
+                wrong = "is missing" if name in wanted else "is unknown"
+                raise RobotError(
+                    f"{source}: joints.{name} {wrong}; the joints of {self.robot} are "
+                    f"{', '.join(wanted)}."
+                )
 
 
 def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
