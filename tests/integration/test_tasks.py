@@ -1,0 +1,177 @@
+"""The registered tasks: known to mjlab, and with the simulator that gains are matched in."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.metadata import entry_points
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+pytest.importorskip("mjlab")
+
+import torch
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+from scipy.signal import chirp
+
+from pronk.robots.model import bench_spec
+from pronk.simulators.command_trace import CommandTrace
+from pronk.simulators.mujoco import simulate
+from pronk.train.mdp.actions import NAME as ACTION
+from pronk.train.mdp.actuators import actuators
+from pronk.train.phases import TASKS
+from pronk.train.rl.runner import PronkRunner
+from training_env import MATCHED, ROBOT, config, fresh, nominal
+
+pytestmark = pytest.mark.train
+NAMES = {"Pronk-Jump-MiniCheetah": "jump", "Pronk-Walk-MiniCheetah": "walk"}
+
+
+def test_mjlab_knows_the_tasks_whatever_is_imported_first() -> None:
+    """mjlab loads the entry point while it is itself imported: here by a module of pronk."""
+    found = {point.name: point.value for point in entry_points(group="mjlab.tasks")}
+    assert found["pronk"] == "pronk.train.tasks"
+    code = (
+        "import pronk.train.mdp.commands, pronk.train.tasks\n"
+        "from mjlab.tasks.registry import list_tasks\n"
+        "print(*list_tasks())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"MJLAB_WARP_QUIET": "1"},
+    )
+    assert "Failed to load task package" not in done.stderr
+    assert set(NAMES) <= set(done.stdout.split())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_task_has_its_phases_and_a_nominal_robot_to_play_with(name: str) -> None:
+    cfg, learning = load_env_cfg(name), load_rl_cfg(name)
+    iterations = TASKS[NAMES[name]]
+    params = cfg.curriculum["phases"].params
+    assert {phase: params[phase] for phase in iterations} == iterations
+    assert learning.max_iterations == sum(iterations.values())
+    assert params["steps_per_iteration"] == learning.num_steps_per_env
+    assert load_runner_cls(name) is PronkRunner
+    assert cfg.decimation == ROBOT.decimation
+    assert cfg.sim.mujoco.timestep == ROBOT.timestep_s
+    assert cfg.sim.mujoco.integrator == "implicitfast"
+    play = load_env_cfg(name, play=True)
+    assert (play.scene.num_envs, set(play.events), play.curriculum) == (1, {"reset"}, {})
+    assert not any(term.time_out for term in play.terminations.values())
+
+
+def test_there_is_room_for_all_contacts() -> None:
+    """A robot pressed into the floor touches it with all its geoms."""
+    env = fresh(nominal(), scripted=True)
+    env.sim.data.qpos[:, 2] = -0.03
+    env.sim.data.qpos[:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    env.sim.forward()
+    data = env.sim.wp_data
+    # Four feet, two ends of eight capsules, four corners of the trunk.
+    assert int(data.nacon.numpy()[0]) == env.num_envs * 24 <= env.num_envs * env.cfg.sim.nconmax
+    # Three rows a contact; dry friction and a limit for each joint.
+    assert int(data.nefc.numpy().max()) == 24 * 3 + 12 <= env.cfg.sim.njmax - 12
+
+
+def at_rest(joint: str) -> dict[str, float]:
+    """Where gravity leaves the chain of a joint whose drives hold the default pose."""
+    model = bench_spec(ROBOT, joint).compile()
+    data = mujoco.MjData(model)
+    chain = ROBOT.joint(joint).chain
+    target = np.array([ROBOT.joint(name).default_position for name in chain])
+    stiffness = np.array([MATCHED.groups[ROBOT.joint(n).group].stiffness for n in chain])
+    data.qpos[:] = target
+    for _ in range(10):
+        mujoco.mj_forward(model, data)
+        data.qpos[:] = target - data.qfrc_bias / stiffness
+    return dict(zip(chain, data.qpos, strict=True))
+
+
+def on_the_bench(joint: str, delay: int) -> Any:
+    """The training environment with one joint's chain on a fixed base in place of the robot."""
+
+    def passive() -> mujoco.MjSpec:
+        spec = bench_spec(ROBOT, joint)
+        for element in (*spec.actuators, *spec.keys):
+            spec.delete(element)
+        spec.option.timestep, spec.option.disableflags = 0.002, 0  # the scene has its own
+        return spec
+
+    chain = ROBOT.joint(joint).chain
+    drives = [
+        replace(drive, target_names_expr=own)
+        for drive in actuators(ROBOT, MATCHED)
+        if (own := tuple(name for name in drive.target_names_expr if name in chain))
+    ]
+    cfg = config(1, MATCHED)
+    cfg.scene.entities["robot"] = EntityCfg(
+        spec_fn=passive,
+        init_state=EntityCfg.InitialStateCfg(
+            joint_pos={name: ROBOT.joint(name).default_position for name in chain},
+            joint_vel={".*": 0.0},
+        ),
+        articulation=EntityArticulationInfoCfg(actuators=tuple(drives)),
+    )
+    cfg.scene.sensors = ()
+    cfg.observations, cfg.commands, cfg.events, cfg.rewards = {}, {}, {}, {}
+    cfg.terminations, cfg.curriculum = {}, {}
+    action = cfg.actions[ACTION]
+    action.actuator_names, action.scale, action.delay_steps = (".*",), 1.0, (delay, delay)
+    cfg.viewer.body_name = "trunk"
+    return ManagerBasedRlEnv(cfg, device="cpu")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("joint", "delay"), [("FR_knee", 0), ("FR_hip_roll", 0), ("FR_knee", 6)])
+def test_the_training_simulator_responds_like_the_matched_one(joint: str, delay: int) -> None:
+    """The same chirp at policy rate; a delay of the action is that delay of the command."""
+    ticks = np.arange(150) / ROBOT.policy_rate_hz
+    offset = 0.25 * chirp(ticks, 0.1, ticks[-1], 15.0, phi=-90)
+    held = np.repeat(offset, ROBOT.decimation)
+    trace = CommandTrace(
+        joint=joint,
+        start=0.0,
+        timestep=ROBOT.timestep_s,
+        command=ROBOT.joint(joint).default_position
+        + np.concatenate([np.zeros(delay), held[: len(held) - delay]]),
+        pose=np.array([j.default_position for j in ROBOT.joints]),
+    )
+    group = MATCHED.groups
+    joints = tuple(
+        replace(j, stiffness=group[j.group].stiffness, damping=group[j.group].damping)
+        for j in ROBOT.joints
+    )
+    gains = group[ROBOT.joint(joint).group]
+    expected, other = (
+        simulate(replace(ROBOT, joints=joints), trace, stiffness, gains.damping)[
+            0, :: ROBOT.decimation
+        ]
+        for stiffness in (gains.stiffness, gains.stiffness - 0.1)
+    )
+    env = on_the_bench(joint, delay)
+    env.reset()
+    robot = env.scene["robot"]
+    rest = at_rest(joint)
+    start = torch.tensor([[rest[name] for name in robot.joint_names]], dtype=torch.float32)
+    robot.write_joint_state_to_sim(start, torch.zeros_like(start))
+    excited = robot.joint_names.index(joint)
+    response = []
+    for value in offset:
+        response.append(float(robot.data.joint_pos[0, excited]))
+        action = torch.zeros_like(start)
+        action[0, excited] = float(value)
+        env.step(action)
+    assert np.ptp(expected) > 0.3
+    np.testing.assert_allclose(np.array(response), expected, atol=2e-5)
+    assert np.abs(other - expected).max() > 2e-4
