@@ -90,7 +90,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "deploy: policy": (("deploy", "no.onnx"), "no.onnx"),
     "simulate: robot": (("simulate", "cheetah"), "mini_cheetah"),
     "simulate: faults": (("simulate", "--faults", "gremlins=1"), "gremlins"),
-    "simulate: domain of lcm": (("simulate", "--domain", "3"), "--port"),
+    "simulate: domain of lcm": (("simulate", "--domain", "3"), "port"),
     "simulate: capture": (("simulate", "--capture", "x.npz"), "ground"),
     "robot: model": (("robot", "new", "no.xml"), "no.xml"),
     "robot: out": (("robot", "new", "a.csv", "--out", "x/robot.yaml"), "beside"),

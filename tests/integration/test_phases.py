@@ -13,8 +13,8 @@ import torch
 import training_env
 from pronk.errors import PronkError
 from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.rewards import rewards
 from pronk.train.phases import PHASES, TASKS, curriculum, phase_at
+from pronk.train.reward_weights import reward_weights
 from training_env import N
 
 pytestmark = pytest.mark.train
@@ -57,7 +57,7 @@ def test_weights_of_a_phase_are_applied(env: Any, name: str, done: float) -> Non
     def between(span: tuple[float, float]) -> float:
         return span[0] * (1.0 - done) + span[1] * done
 
-    for term, initial in rewards().items():
+    for term, initial in reward_weights().items():
         found = env.reward_manager.get_term_cfg(term)
         weight = between(phase.weights.get(term, (initial.weight,) * 2))
         assert found.weight == pytest.approx(weight), term

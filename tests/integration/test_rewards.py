@@ -18,7 +18,7 @@ from pronk.train.mdp import commands
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.motion import Motion
 from pronk.train.mdp.reward_manager import StackedRewardManager
-from pronk.train.mdp.rewards import PAPER_UNIT, rewards
+from pronk.train.reward_weights import PAPER_UNIT, reward_weights
 from training_env import N
 
 pytestmark = pytest.mark.train
@@ -27,7 +27,7 @@ STANDING = 0.298970  # .209 cos(.8) + .195 cos(.8) + .0175
 KNEE = 0.153358  # .195 cos(.8) + .0175
 JUMPER = 1
 """The robot in jump mode; all others are not."""
-ROWS = rewards()
+ROWS = reward_weights()
 
 
 @pytest.fixture

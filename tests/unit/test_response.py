@@ -25,8 +25,8 @@ from pronk.response import (
     operators,
     save,
 )
-from pronk.response.averaged import layout, sums
 from pronk.response.grid import Grid, grid_over, held_mean
+from pronk.response.h1 import layout, sums
 from pronk.response.periodic import read_periods
 from synthetic_joint import (
     AMPLITUDE,

@@ -4,9 +4,9 @@ import sys
 from types import ModuleType
 
 from pronk.logs.joint_log import JointLog
-from pronk.response.averaged import H1Operator
 from pronk.response.diagnostics import DelayFit, fit_delay, third_harmonic
 from pronk.response.estimate import estimate, operators
+from pronk.response.h1 import H1Operator
 from pronk.response.response import Estimator, FrequencyResponse, load, save
 
 __all__ = [

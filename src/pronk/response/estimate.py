@@ -10,9 +10,9 @@ import numpy as np
 from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_motion
 from pronk.logs.joint_log import JointLog, Segment
-from pronk.response.averaged import H1Operator, estimate_averaged
 from pronk.response.diagnostics import fit_delay, third_harmonic
 from pronk.response.grid import analysis_rate
+from pronk.response.h1 import H1Operator, estimate_averaged
 from pronk.response.periodic import estimate_multisine, estimate_steps, multisine_operator
 from pronk.response.response import Estimator, FrequencyResponse
 

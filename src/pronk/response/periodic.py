@@ -21,8 +21,8 @@ from scipy.signal import get_window
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
-from pronk.response.averaged import H1Operator
 from pronk.response.grid import Grid, analysis_rate, held_mean, hold, interpolate
+from pronk.response.h1 import H1Operator
 from pronk.response.response import Estimator, FrequencyResponse
 
 Array = NDArray[np.float64]

@@ -34,12 +34,10 @@ Span = tuple[float, float]
 class Phase:
     """What changes from phase to phase; each value moves linearly unless said otherwise."""
 
-    iterations: int
-    """PPO iterations, unless the task has other numbers."""
     jump: bool
     """Whether half of the robots get the jump input."""
     weights: Mapping[str, Span] = field(default_factory=dict)
-    """Weights of rewards by name; the others keep those of `mdp.rewards`."""
+    """Weights of rewards by name; the others keep those of `reward_weights`."""
     jump_scales: Mapping[str, Span] = field(default_factory=dict)
     """Their factors in jump mode."""
     liftoff_std: Span = (1.0, 1.0)
@@ -72,21 +70,18 @@ _JUMP_A = {
 }
 
 PHASES: Mapping[str, Phase] = {
-    "walk": Phase(iterations=300, jump=False),
+    "walk": Phase(jump=False),
     # Jumping has to be found, and a countermovement with it: policies that had learned to push
     # without one never came to it. Rewarded by the trunk's velocity alone, seven of eight trainings
     # found a jump 40 to 400 iterations into 2b, and one none. The entropy bonus alone would raise
     # the noise from .5 to 1.0 in 170 iterations.
-    "jump_a": Phase(
-        iterations=220, jump=True, weights=_JUMP_A, noise=(0.65, 0.65), guidance=(1.0, 0.7)
-    ),
+    "jump_a": Phase(jump=True, weights=_JUMP_A, noise=(0.65, 0.65), guidance=(1.0, 0.7)),
     # Then alike every time: with a standard deviation of .59 after 560 iterations (.42 before the
     # first jump) a policy walks worse and its jumps scatter. The penalties of low landings and of
     # thighs and knees on the ground grow: in force before there is a jump, they might prevent it.
     # Jumps earn less: with as much as at first walking came to be .18 m/s too fast and turning .2
     # rad/s too slow.
     "jump_b": Phase(
-        iterations=560,
         jump=True,
         weights={
             **_JUMP_A,

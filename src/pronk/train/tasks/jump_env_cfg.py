@@ -35,8 +35,9 @@ from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
 from pronk.train import phases
 from pronk.train.gains import TrainingGains
-from pronk.train.mdp import actions, commands, events, observations, rewards, terminations
+from pronk.train.mdp import actions, commands, events, observations, terminations
 from pronk.train.mdp.actuators import actuators
+from pronk.train.reward_weights import reward_weights
 
 FOOT_CONTACT = (0.0105, 1.0)
 """Time constant [s] and damping ratio of a foot on the ground. With MuJoCo's .02 the feet of a
@@ -86,7 +87,7 @@ def jump_env_cfg(
         },
         commands={commands.NAME: commands.MotionCommandCfg(robot=robot.source, gains=gains)},
         events=_events(robot, gains, gain_shape),
-        rewards=rewards.rewards(),
+        rewards=reward_weights(),
         terminations={
             "time_out": TerminationTermCfg(
                 func=terminations.time_out,
