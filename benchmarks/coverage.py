@@ -21,8 +21,9 @@ from pronk.errors import PronkError
 from pronk.excitation.signals import Chirp
 from pronk.match.measured_joint import measured_joints
 from pronk.match.parameters import GAINS
-from pronk.match.response_fit import interval, refine
+from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
+from pronk.match.uncertainty import gain_interval
 from pronk.report.paper import published
 from pronk.response.estimate import operators
 from pronk.robots import load_robot
@@ -74,7 +75,7 @@ def run(trials: int, seed: int, progress: Progress, *, threads: int = 2) -> dict
                     each = replace(noisy.measured, response=response.mean(axis=0), repeats=response)
                     goals.append(replace(noisy, measured=each))
                 for k, fit in enumerate(refine(simulator, goals, [known] * count), start=begin):
-                    ci95 = interval(fit).ci95
+                    ci95 = gain_interval(fit.target, fit.solution).ci95
                     gains[k] = fit.stiffness, fit.damping
                     low[k], high[k] = zip(*(ci95[one] for one in GAINS), strict=True)
                 progress("trials", (index + (begin + count) / trials) / len(JOINTS))

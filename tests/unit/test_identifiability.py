@@ -108,3 +108,8 @@ def test_bench_experiment_of_the_papers_robot_allows_the_papers_search() -> None
 def test_bad_parameters_are_refused(fitted: tuple[str, ...], message: str) -> None:
     with pytest.raises(PronkError, match=message):
         identifiability(fitted, [ONE], nominal())
+
+
+def test_no_experiment_is_refused() -> None:
+    with pytest.raises(PronkError, match="experiments"):
+        require_identifiable(GAINS, [], nominal())

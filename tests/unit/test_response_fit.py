@@ -15,9 +15,10 @@ from pronk.excitation.signals import Chirp
 from pronk.match.measured_joint import MeasuredJoint, measured_joints
 from pronk.match.parameters import GAINS
 from pronk.match.pipeline import amplitude_flags, amplitude_gains, command_delay
-from pronk.match.response_fit import interval, refine
+from pronk.match.response_fit import refine
 from pronk.match.result import amplitude_spread
 from pronk.match.settings import MatchSettings
+from pronk.match.uncertainty import gain_interval
 from pronk.response.estimate import operators
 from pronk.response.response import Estimator
 from pronk.robots import load_robot
@@ -85,7 +86,10 @@ def test_intervals_cover_the_known_gains_under_coloured_noise() -> None:
     errors = noise((trials, repeats, len(operator.time))) @ operator.matrix(operator.time)
     goals = [repeated(measured, one) for one in known()[0].measured.response + errors]
     with MujocoSimulator(ROBOT) as simulator:
-        found = [interval(fit) for fit in refine(simulator, goals, [KNOWN] * trials)]
+        found = [
+            gain_interval(fit.target, fit.solution)
+            for fit in refine(simulator, goals, [KNOWN] * trials)
+        ]
     assert all(one.flags == () for one in found)
     for name, true in zip(GAINS, KNOWN, strict=True):
         covered = sum(low <= true <= high for low, high in (one.ci95[name] for one in found))
@@ -101,7 +105,7 @@ def test_each_repeat_is_fitted_by_itself() -> None:
     both = repeated(each[0], np.array([goal.measured.response for goal in each]))
     with MujocoSimulator(ROBOT) as simulator:
         fit = refine(simulator, [both], [(17.0, 0.4)])[0]
-    found = interval(fit)
+    found = gain_interval(fit.target, fit.solution)
     np.testing.assert_allclose(found.repeat_gains, others, rtol=1e-3)
     expected = np.cov(others.T) / 3
     np.testing.assert_allclose(found.covariance, expected, rtol=0.1)
@@ -115,7 +119,10 @@ def test_few_repeats_are_flagged() -> None:
     two = known(repeats=2, noise=list(0.002 * rng.standard_normal((2, 6000))))[0]
     one = replace(two, measured=replace(two.measured, repeats=two.measured.repeats[:1]))
     with MujocoSimulator(ROBOT) as simulator:
-        pair, single = (interval(fit) for fit in refine(simulator, [two, one], [KNOWN, KNOWN]))
+        pair, single = (
+            gain_interval(fit.target, fit.solution)
+            for fit in refine(simulator, [two, one], [KNOWN, KNOWN])
+        )
     assert "two repeats" in pair.flags[0]
     assert "one repeat" in single.flags[0]
     low, high = single.ci95["stiffness"]

@@ -22,18 +22,11 @@ from scipy import signal
 
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
-from pronk.match.fit import (
-    Estimate,
-    Problem,
-    Solution,
-    block_moves,
-    estimate,
-    jackknife,
-    solve,
-)
+from pronk.match.fit import Problem, Solution, solve
 from pronk.match.measured_joint import DB
 from pronk.match.parameters import PARAMETERS, checked_names
 from pronk.match.result import JointFit
+from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
 from pronk.response.estimate import estimate as estimate_response
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec

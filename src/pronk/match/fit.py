@@ -1,26 +1,21 @@
-"""Least squares over parameters of joint drives: problems, solvers, uncertainty.
+"""Least squares over parameters of joint drives: problems and solvers.
 
 Every fit is a `Problem`: residuals and their Jacobian as functions of searched numbers. Another
-kind of measurement is another subclass; solvers and uncertainty stay the same. The unit of
-uncertainty is a block: a repeat of a sweep, or 20 s of a recording in time. Noise on a robot is
-coloured and neighbouring frequencies and samples share it, so intervals that take them for
-independent are several times too narrow; blocks are independent whatever the colour. Intervals are
-Student's t over the blocks, which holds with as few as three.
+kind of measurement is another subclass; solvers and `uncertainty` stay the same.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.optimize import least_squares
 
-from pronk.match.parameters import GAINS, PARAMETERS
+from pronk.match.parameters import PARAMETERS
 
 Array = NDArray[np.float64]
 
@@ -167,101 +162,3 @@ def solve_together(
                 settled[i] = True
                 active.remove(i)
     return [Solution.at(*one) for one in zip(problems, best, settled, strict=True)]
-
-
-def jackknife(moves: Array) -> Array:
-    """Covariance of an optimum that moves by `moves` when one block is left out, shape (p, p).
-
-    `(n - 1) / n sum (move - mean) (move - mean)^T` for moves of shape (n, p); where the optimum is
-    the mean of n repeats, `moves = repeats / (n - 1)` gives their sample covariance over n.
-    """
-    about = moves - np.mean(moves, axis=0)
-    count = len(moves)
-    return np.asarray((count - 1) / count * about.T @ about)
-
-
-def block_moves(jacobian: Array, residual: Array, blocks: NDArray[np.int64]) -> Array:
-    """Where the optimum moves when one block of residuals is left out, shape (blocks, p).
-
-    To first order `(A - A_b)^-1 J_b^T r_b` with A = J^T J and A_b = J_b^T J_b; `blocks` holds the
-    number of the block of each residual, shape (m,).
-    """
-    whole = jacobian.T @ jacobian
-    # A parameter without effect must come out as very uncertain, not as an error.
-    whole = whole + 1e-12 * np.trace(whole) * np.eye(len(whole))
-    moves = []
-    for number in np.unique(blocks):
-        own = jacobian[blocks == number]
-        left = whole - own.T @ own
-        moves.append(np.linalg.lstsq(left, own.T @ residual[blocks == number], rcond=None)[0])
-    return np.array(moves)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """Parameters of one joint with their uncertainty."""
-
-    values: Mapping[str, float]
-    """Every parameter, fitted or held."""
-    covariance: Array
-    """Of (stiffness, damping), zero for what was held, shape (2, 2)."""
-    sd: Mapping[str, float]
-    """Standard deviation of each fitted parameter: relative, of delay and offset in [s], [rad]."""
-    ci95: Mapping[str, tuple[float, float]]
-    """95 % interval of each fitted parameter; empty without repeats."""
-    repeat_gains: Array = field(default_factory=lambda: np.empty((0, 2)))
-    """(stiffness, damping) of each repeat fitted by itself, shape (repeats, 2)."""
-    flags: tuple[str, ...] = ()
-
-    @property
-    def unidentified(self) -> tuple[str, ...]:
-        """Fitted parameters whose deviation is beyond the limit of `PARAMETERS`."""
-        return tuple(n for n, sd in self.sd.items() if not sd <= PARAMETERS[n].sd_max)
-
-
-def estimate(
-    fitted: Sequence[str],
-    x: Array,
-    covariance: Array,
-    freedom: float,
-    held: Mapping[str, float],
-    *,
-    symmetric: bool = False,
-) -> Estimate:
-    """Turn searched numbers into parameters with intervals.
-
-    Args:
-        fitted: Names of the searched numbers.
-        x: The optimum, shape (p,).
-        covariance: Of the searched numbers, shape (p, p); of the parameters if `symmetric`.
-        freedom: Degrees of freedom of the covariance; with 0 there are no intervals.
-        held: Values of the parameters that were not fitted.
-        symmetric: Intervals are symmetric about the parameters, not about the searched numbers.
-    """
-    best = {name: PARAMETERS[name].unscaled(float(at)) for name, at in zip(fitted, x, strict=True)}
-    sd, ci95 = np.sqrt(np.diag(covariance)), {}
-    quantile = stats.t.ppf(0.975, freedom) if freedom else np.nan
-    for name, at, half in zip(fitted, x, quantile * sd, strict=True):
-        if symmetric:
-            low, high = best[name] - half, best[name] + half
-        else:
-            # e^20 is as good as infinite and does not overflow.
-            low, high = (PARAMETERS[name].unscaled(at + s * min(half, 20.0)) for s in (-1, 1))
-        if freedom:
-            ci95[name] = (float(low if name == "offset" else max(low, 0.0)), float(high))
-    scale = np.array([best[name] if PARAMETERS[name].log else 1.0 for name in fitted])
-    if symmetric:
-        sd = sd / scale
-    else:
-        covariance = covariance * np.outer(scale, scale)
-    own = np.zeros((2, 2))
-    places = [(k, fitted.index(name)) for k, name in enumerate(GAINS) if name in fitted]
-    for k, i in places:
-        for n, j in places:
-            own[k, n] = covariance[i, j]
-    return Estimate(
-        values={**held, **best},
-        covariance=own,
-        sd=dict(zip(fitted, sd.tolist(), strict=True)),
-        ci95=ci95,
-    )

@@ -90,9 +90,11 @@ def identifiability(
             damping are needed, the rest is 0 if not given. A fitted parameter must be positive.
 
     Raises:
-        PronkError: A parameter is unknown, not positive though fitted, or there is none.
+        PronkError: There is no experiment or parameter, or one is unknown or not positive.
     """
     checked_names(parameters, FREE)
+    if not experiments:
+        raise PronkError("0 experiments; expected one or more, as from `bench_experiment`.")
     values = {**dict.fromkeys(FREE, 0.0), **nominal}
     for name in {*parameters, *GAINS}:
         if not values[name] > 0.0:

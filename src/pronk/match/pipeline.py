@@ -27,7 +27,6 @@ from pronk.match.response_fit import (
     Fit,
     Pair,
     fit_drive,
-    interval,
     refine,
     require_sweeps,
     response_fit,
@@ -35,6 +34,7 @@ from pronk.match.response_fit import (
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult, amplitude_spread
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
+from pronk.match.uncertainty import gain_interval
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together
@@ -266,7 +266,7 @@ def _joint_fit(
         "frictionloss": float("nan"),
         "delay": command_delay(goal.measured, matched, joint.band_hz),
     }
-    found, by_amplitude = interval(fit, held), amplitude_gains(fits)
+    found, by_amplitude = gain_interval(goal, fit.solution, held), amplitude_gains(fits)
     zero_db, zero_response = zero or (float("nan"), None)
     return response_fit(
         robot,

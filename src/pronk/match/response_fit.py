@@ -16,20 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError
-from pronk.match.fit import (
-    Estimate,
-    Problem,
-    Solution,
-    estimate,
-    jackknife,
-    solve,
-    solve_together,
-)
+from pronk.match.fit import Problem, Solution, solve, solve_together
 from pronk.match.identifiability import bench_experiment, require_identifiable
-from pronk.match.measured_joint import DB, FLOOR_DB, MeasuredJoint
+from pronk.match.measured_joint import DB, MeasuredJoint, residual_db
 from pronk.match.parameters import FREE, GAINS, PARAMETERS
 from pronk.match.result import JointFit
 from pronk.match.simulated import SimRequest, responses
+from pronk.match.uncertainty import Estimate, estimate, repeat_covariance
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import JointRigs
 
@@ -38,24 +31,8 @@ ComplexArray = NDArray[np.complex128]
 Pair = tuple[float, float]
 """Stiffness [N m/rad] and damping [N m s/rad]."""
 
-_SHARED = 1.5
-"""Equivalent noise bandwidth of the Hann window in bins (Harris 1978, table 1): how many
-neighbouring frequencies share their noise."""
 _NOISE_MIN = 0.01
 """Least standard deviation of the log response to plan with: no model is better than 1 %."""
-
-
-def residual_db(simulated: ComplexArray, measured: ComplexArray, phase: bool) -> Array:
-    """Simulated over measured response in dB, gain and then (if used) phase, shape (..., m).
-
-    A radian of phase counts as a neper of gain, 8.69 dB: noise turns a response as much as it
-    stretches it.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.log(np.asarray(simulated / measured, dtype=np.complex128))
-    if not phase:
-        return np.asarray(DB * ratio.real)
-    return np.concatenate([DB * ratio.real, DB * np.unwrap(ratio.imag, axis=-1)], axis=-1)
 
 
 class ResponseProblem(Problem):
@@ -100,7 +77,7 @@ class ResponseProblem(Problem):
                 # Its phase is -omega * delay.
                 late = np.concatenate([np.zeros(len(goal.omega)), -DB * goal.omega])
                 slope = np.vstack([slope, late])
-            weight = self.weight(goal)
+            weight = goal.weights(self.phase)
             parts.append(rows[0] * weight)
             slopes.append(slope * weight)
         self._cache[x.tobytes()] = np.concatenate(parts), np.concatenate(slopes, axis=1).T
@@ -113,32 +90,10 @@ class ResponseProblem(Problem):
         """Derivative of `residual` by forward differences, shape (m, p)."""
         return self._at(x)[1]
 
-    def weight(self, goal: MeasuredJoint) -> Array:
-        """Weight of each residual of an amplitude [1/dB]."""
-        return np.tile(1.0 / goal.deviation_db(), 1 + self.phase)
-
     def _at(self, x: Array) -> tuple[Array, Array]:
         if x.tobytes() not in self._cache:
             evaluate(self._rigs, [(self, x)])
         return self._cache[x.tobytes()]
-
-    def repeat_moves(self, solution: Solution) -> list[Array]:
-        """Where each repeat of each amplitude would move the optimum, shapes (repeats, p).
-
-        By one Gauss-Newton step with the simulator's own derivatives at the common optimum,
-        `(J^T J)^-1 J^T` times what the repeat differs from the mean: repeats differ by little.
-        """
-        influence = np.linalg.pinv(solution.jacobian)
-        out, first = [], 0
-        for goal in self.goals:
-            weight = self.weight(goal)
-            part = influence[:, first : first + len(weight)]
-            first += len(weight)
-            repeats = goal.measured.repeats[:, goal.fit_mask]
-            change = residual_db(repeats, goal.measured.response[goal.fit_mask], self.phase)
-            # Residuals are simulated less measured: a larger response needs larger gains there.
-            out.append((change * weight) @ part.T)
-        return out
 
 
 def evaluate(rigs: JointRigs, points: Sequence[tuple[ResponseProblem, Array]]) -> None:
@@ -155,13 +110,9 @@ def evaluate(rigs: JointRigs, points: Sequence[tuple[ResponseProblem, Array]]) -
 class Fit:
     """Gains of one joint at one amplitude, off the grid."""
 
-    problem: ResponseProblem
+    target: MeasuredJoint
+    """The measured response."""
     solution: Solution
-
-    @property
-    def target(self) -> MeasuredJoint:
-        """The measured response."""
-        return self.problem.goals[0]
 
     @property
     def stiffness(self) -> float:
@@ -200,39 +151,7 @@ def refine(rigs: JointRigs, targets: Sequence[MeasuredJoint], start: Sequence[Pa
         problems.append(ResponseProblem(rigs, [goal], GAINS, values, phase=False))
         problems[-1].begin = np.log(np.asarray(pair))
     solutions = solve_together(problems, lambda points: evaluate(rigs, points))
-    return [
-        Fit(problem=problem, solution=one) for problem, one in zip(problems, solutions, strict=True)
-    ]
-
-
-def interval(fit: Fit, held: Mapping[str, float] | None = None) -> Estimate:
-    """Uncertainty of refined gains, from the repeats of the measured response.
-
-    With one repeat there is nothing to compare; the interval is then that of the coherence
-    (Fisher information of the weighted fit, widened by the correlation of neighbouring
-    frequencies and by the misfit), which takes noise for white, and a flag states it.
-    """
-    goal, solution = fit.target, fit.solution
-    optimum, count = np.array(fit.gains), len(goal.measured.repeats)
-    freedom: float = count - 1
-    flags: tuple[str, ...] = ()
-    if count < 2:
-        deviation = goal.deviation_db()
-        white = np.maximum(deviation**2 - FLOOR_DB**2, 0.0) / deviation**2
-        influence = np.linalg.pinv(solution.jacobian)
-        free = max(len(solution.residual) - 2, 1)
-        misfit = max(1.0, float(solution.residual @ solution.residual) / free)
-        covariance = _SHARED * misfit * (influence * white) @ influence.T
-        covariance = covariance * np.outer(optimum, optimum)
-        gains, freedom = optimum[None, :], np.inf
-        flags = ("one repeat: the interval assumes white noise",)
-    else:
-        gains = optimum * np.exp(fit.problem.repeat_moves(solution)[0])
-        covariance = jackknife(gains / (count - 1))
-        if count == 2:
-            flags = ("two repeats: the interval is wide, three or more narrow it",)
-    found = estimate(GAINS, solution.x, covariance, freedom, held or {}, symmetric=True)
-    return replace(found, repeat_gains=gains, flags=flags)
+    return [Fit(target=one, solution=s) for one, s in zip(targets, solutions, strict=True)]
 
 
 def require_sweeps(
@@ -271,10 +190,7 @@ def fit_drive(
     known = dict(zip(FREE, (*on_drive, drive.armature, drive.frictionloss, 0.0), strict=True))
     problem = ResponseProblem(rigs, goals, fitted, known, phase=True)
     solution = solve(problem, tolerance=1e-7, rounds=100)
-    freedom, covariance = 0, np.zeros((len(fitted), len(fitted)))
-    for moves in problem.repeat_moves(solution):
-        if (more := len(moves) - 1) > 0:
-            freedom, covariance = freedom + more, covariance + jackknife(moves / more)
+    covariance, freedom = repeat_covariance(goals, solution, phase=True)
     found = estimate(fitted, solution.x, covariance, freedom, known)
     if freedom and found.unidentified:
         unknown = found.unidentified[0]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.files import load_artefact, save_artefact
-from pronk.match.fit import Estimate
 from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.uncertainty import Estimate
 from pronk.response.response import FrequencyResponse
 
 SCHEMA = "pronk/match/2"
