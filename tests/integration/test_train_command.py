@@ -59,6 +59,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
         (("walk", *NAIVE, "--envs", "1"), "envs is 1|2 or more"),
         (("walk", *NAIVE, "--seed", "-1"), "seed is -1|0 or more"),
         (("walk", *NAIVE, "--logger", "csv"), "tensorboard|wandb"),
+        (("walk", *NAIVE, "--ellipsoid"), "ellipsoid|box"),
+        (("walk", *NAIVE, "--ellipsoid", "--resume"), "holds no run"),
         (("walk", *NAIVE, "--robot", "so101"), "so101|no training task|mini_cheetah"),
         (("walk", *NAIVE, "--robot", "dragon"), "dragon|mini_cheetah"),
         (("walk", "--resume"), "holds no run|--resume"),

@@ -116,12 +116,12 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Robot) -> None:
     assert machine.counts["commands"] == machine.counts["repeats"] == 0
 
     # What has a wrong checksum, or commands the impossible, moves nothing.
-    stranger = Participant(network).writer(COMMANDS, idl.LowCmd)
-    assert eventually(lambda: len(stranger.get_matched_subscriptions()) >= 2)
+    other = Participant(network).writer(COMMANDS, idl.LowCmd)
+    assert eventually(lambda: len(other.get_matched_subscriptions()) >= 2)
     far = bytearray(encode_command(JOINTS, turned(0.5)))
     far[-1] ^= 1
     for _ in range(20):
-        stranger.write(Message(bytes(far)))
+        other.write(Message(bytes(far)))
         time.sleep(0.002)
     states = machine.wait(machine.now() + 0.2)
     assert max(abs(state.position[PITCH] - begun.position[PITCH]) for state in states) < 0.01
@@ -157,7 +157,7 @@ def test_a_robot_behind_dds_from_preflight_to_close(double: Robot) -> None:
 
     # And another writer in the middle of it all is followed by damping.
     machine.send(HOLD)
-    stranger.write(Message(encode_command(JOINTS, HOLD)))
+    other.write(Message(encode_command(JOINTS, HOLD)))
     assert eventually(lambda: machine.counts["foreign"] > 0)
     with pytest.raises(HardwareError, match="another program"):
         machine.send(HOLD)

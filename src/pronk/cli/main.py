@@ -7,6 +7,7 @@ defect of pronk, is named so, and ends with 1 (`PRONK_DEBUG=1` prints the traceb
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 import inspect
 import io
@@ -15,7 +16,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, get_type_hints
 
 from pronk import __version__, opengl
 from pronk.errors import PronkError
@@ -125,7 +126,10 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> C
     call.__signature__ = inspect.signature(command, eval_str=True)  # type: ignore[attr-defined]
     call.__doc__ = command.__doc__
     call.__annotations__ = inspect.get_annotations(command, eval_str=True)
-    for name, kind in call.__annotations__.items():
+    kinds = dict(call.__annotations__)
+    for kind in call.__annotations__.values():
+        kinds |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
+    for name, kind in kinds.items():
         if kind == bool | None:  # tyro wants a value there: --x True.
             option = name.replace("_", "-")
             values = {f"--{option}": "True", f"--no-{option}": "False"}

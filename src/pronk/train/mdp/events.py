@@ -66,14 +66,25 @@ def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor
 
     Box: uniform in nominal +- range. Ellipsoid: uniform in {x : (x - c)^T E^-1 (x - c) <= 1}, as
     x = c + L u with L L^T = E and u uniform in the unit disc.
-
-    Raises:
-        PronkError: The gains have no ellipsoid, or it reaches gains that are not positive.
     """
     if shape == "box":
         nominal = torch.tensor([gains.stiffness, gains.damping], device=device)
         half = torch.tensor([gains.stiffness_range, gains.damping_range], device=device)
         return nominal + half * (2.0 * torch.rand(n, 2, device=device) - 1.0)
+    check_ellipsoid(gains)
+    angle, area = torch.rand(2, n, device=device).unbind()
+    angle = 2.0 * torch.pi * angle
+    disc = area.sqrt() * torch.stack([angle.cos(), angle.sin()])
+    root: Tensor = torch.linalg.cholesky(torch.tensor(gains.ellipsoid, device=device))
+    return torch.tensor(gains.ellipsoid_center, device=device) + (root @ disc).transpose(0, 1)
+
+
+def check_ellipsoid(gains: GroupGains) -> None:
+    """Refuse gains without an ellipsoid, or whose ellipsoid reaches gains that are not positive.
+
+    Raises:
+        PronkError: The message names the gains.
+    """
     (a, b), (c, d) = gains.ellipsoid
     least = (
         gains.ellipsoid_center[0] - max(a, 0.0) ** 0.5,
@@ -85,11 +96,6 @@ def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor
             f"positive gains (it reaches down to {least[0]:g} and {least[1]:g}); draw them in the "
             "box, or use a gains.yaml whose joints differ."
         )
-    angle, area = torch.rand(2, n, device=device).unbind()
-    angle = 2.0 * torch.pi * angle
-    disc = area.sqrt() * torch.stack([angle.cos(), angle.sin()])
-    root: Tensor = torch.linalg.cholesky(torch.tensor(gains.ellipsoid, device=device))
-    return torch.tensor(gains.ellipsoid_center, device=device) + (root @ disc).transpose(0, 1)
 
 
 @requires_model_fields("geom_pos", "geom_size", "geom_rbound", "geom_aabb", "site_pos")  # type: ignore[untyped-decorator]

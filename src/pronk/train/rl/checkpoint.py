@@ -56,17 +56,14 @@ def read(path: Path, device: str = "cpu") -> dict[str, Any]:
 
 def latest(folder: Path) -> Path | None:
     """The numbered checkpoint of the highest iteration in a folder; None if there is none."""
-    return max(numbered(folder), key=_iteration, default=None)
+    found = numbered(folder)
+    return found[-1] if found else None
 
 
 def numbered(folder: Path) -> list[Path]:
     """All numbered checkpoints in a folder, `model_ITERATION.pt`, in order."""
     found = [path for path in folder.glob("model_*.pt") if re.fullmatch(r"model_\d+", path.stem)]
-    return sorted(found, key=_iteration)
-
-
-def _iteration(path: Path) -> int:
-    return int(path.stem.removeprefix("model_"))
+    return sorted(found, key=lambda path: int(path.stem.removeprefix("model_")))
 
 
 def not_finite(tree: Any, name: str = "") -> str | None:

@@ -245,6 +245,9 @@ def _events(
     shanks = SceneEntityCfg("robot", geom_names=".*_shank_collision")
     base = SceneEntityCfg("robot", body_names=robot.base_body)
     ranges = {joint.name: gains.groups[joint.group] for joint in robot.joints}
+    if gain_shape == "ellipsoid":
+        for group in gains.groups.values():
+            events.check_ellipsoid(group)
     body = legged(robot.source)
     rated = robot.joints[0].drive.bus_voltage
 
