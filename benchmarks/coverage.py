@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
-from benchmarks.runner import Progress, finish, table
+from benchmarks.runner import Progress, finish
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -91,13 +91,12 @@ def run(trials: int, seed: int, progress: Progress, *, threads: int = 2) -> dict
     return found
 
 
-def coverage(trials: int = 200, seed: int = 0, json_file: console.JsonFile = None) -> None:
+def coverage(trials: int = 200, seed: int = 0) -> console.Outcome:
     """How often the 95 % intervals hold the known gains under coloured noise.
 
     Args:
         trials: Logs of each joint.
         seed: Of the noise.
-        json_file: Also write the figures to this file.
     """
     with console.progress() as report:
         found = run(trials, seed, report)
@@ -119,4 +118,4 @@ def coverage(trials: int = 200, seed: int = 0, json_file: console.JsonFile = Non
     )
     title = "95 % intervals under coloured noise (stiffness / damping)"
     columns = ("joint", "hold the known value", "bias [%]", "scatter [%]", "half-width [%]")
-    finish(json_file, found, table(title, columns, rows, caption))
+    return finish(found, console.table(title, columns, rows, caption))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.runner import finish, table
+from benchmarks.runner import finish
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.excitation.signals import Chirp
@@ -75,12 +75,8 @@ def engine_gap(
     )
 
 
-def engine(json_file: console.JsonFile = None) -> None:
-    """The same drive at a 0.25 ms step and in the 5 ms training simulator, before and after.
-
-    Args:
-        json_file: Also write the figures to this file.
-    """
+def engine() -> console.Outcome:
+    """The same drive at a 0.25 ms step and in the 5 ms training simulator, before and after."""
     robot, gaps = load_robot(ROBOT), {}
     with console.progress() as report:
         for k, joint in enumerate(JOINTS, start=1):
@@ -100,4 +96,4 @@ def engine(json_file: console.JsonFile = None) -> None:
     columns += ["matched gains", "gap after the match, RMS [dB]"]
     title = "The same drive at a 0.25 ms step and in the 5 ms training simulator"
     figures = {joint: {"joint": joint} | vars(gap) for joint, gap in gaps.items()}
-    finish(json_file, figures, table(title, columns, rows))
+    return finish(figures, console.table(title, columns, rows))

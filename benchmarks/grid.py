@@ -18,7 +18,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from benchmarks.runner import Progress, finish, table
+from benchmarks.runner import Progress, finish
 from benchmarks.synthetic_log import Excitation, synthetic_log
 from pronk.cli import console
 from pronk.excitation.signals import Chirp
@@ -144,12 +144,11 @@ def _percent(found: Gains, expected: Gains) -> str:
     return "{:+.3f} / {:+.3f}".format(*errors)
 
 
-def grid(points: int = 50, json_file: console.JsonFile = None) -> None:
+def grid(points: int = 50) -> console.Outcome:
     """The paper's grid on twelve joints with known gains, beside a bare mujoco.rollout loop.
 
     Args:
         points: Points of each axis; the paper has 50.
-        json_file: Also write the figures to this file.
     """
     with console.progress() as report:
         found = run(report, points=points)
@@ -177,4 +176,4 @@ def grid(points: int = 50, json_file: console.JsonFile = None) -> None:
     )
     columns = ("joint", "known", "grid", "nearest cell", "refined off by [%]", "quick off [%]")
     title = "Known gains (Table I, training simulator, no noise)"
-    finish(json_file, found, table(title, columns, rows, caption))
+    return finish(found, console.table(title, columns, rows, caption))

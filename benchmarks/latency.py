@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.runner import Progress, finish, table
+from benchmarks.runner import Progress, finish
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.criteria import Check
@@ -190,14 +190,12 @@ def checks(rows: dict[str, Row]) -> list[Check]:
 def latency(
     policy: tyro.conf.Positional[Path],
     seconds: float = 40.0,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Lateness and latency of the policy at 50 Hz: idle, beside CPU hogs, real time or not.
 
     Args:
         policy: policy.onnx, which runs at each tick.
         seconds: Of each of the four cases.
-        json_file: Also write the figures to this file.
     """
     with console.progress() as report:
         rows = run(policy, seconds, report)
@@ -213,7 +211,7 @@ def latency(
             cells.append((f"  {way}", str(figures["network"]["n"]), *numbers, ""))
     columns = ["case", "n", "late: median", "99 %", "99.9 %", "largest", "network: median", "99 %"]
     columns += ["decision: median", "99 %", "missed"]
-    measured = table(f"A {RATE_HZ:g} Hz loop on this computer [ms]", columns, cells)
+    measured = console.table(f"A {RATE_HZ:g} Hz loop on this computer [ms]", columns, cells)
     found = checks(rows)
     limits = [
         (c.what, f"{c.value:.3f}", f"{c.sense} {c.limit:g}", "yes" if c.passed else "NO")
@@ -221,6 +219,6 @@ def latency(
     ]
     columns = ["what", "measured [ms]", "limit [ms]", "passed"]
     figures = {"cases": rows, "limits": [check.row() for check in found]}
-    finish(json_file, figures, measured, table("Limits, after warm-up", columns, limits))
+    return finish(figures, measured, console.table("Limits, after warm-up", columns, limits))
     for line in dict.fromkeys(line for row in rows.values() for line in row["granted"]):
         console.say(line)

@@ -23,7 +23,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.peers import POPULATION, Estimate, fit_cma, fit_sysid, import_peers
-from benchmarks.runner import Progress, finish, machine, table
+from benchmarks.runner import Progress, finish, machine
 from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -198,7 +198,7 @@ def summary(scenario: str, tool: str, estimates: Sequence[Estimate]) -> dict[str
 def show(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
     """Make a table with a section for each scenario."""
     columns = ["tool", "logs", "stiffness [%]", "damping [%]", "coverage", "half-widths [%]"]
-    made = table(title, [*columns, "fit [s]", "delay [ms]"], caption=caption)
+    made = console.table(title, [*columns, "fit [s]", "delay [ms]"], caption=caption)
     scenario = None
     for one in rows:
         if one["scenario"] != scenario:
@@ -222,13 +222,12 @@ def show(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
     return made
 
 
-def match(trials: int = 5, seed: int = 0, json_file: console.JsonFile = None) -> None:
+def match(trials: int = 5, seed: int = 0) -> console.Outcome:
     """Match logs with known gains by pronk, mujoco.sysid and CMA-ES; bias, coverage, time.
 
     Args:
         trials: Logs of each scenario, about 20 s each on two cores.
         seed: Of the noise.
-        json_file: Also write the figures to this file.
     """
     begin = time.perf_counter()
     with console.progress() as report:
@@ -250,4 +249,4 @@ def match(trials: int = 5, seed: int = 0, json_file: console.JsonFile = None) ->
     known = {"joint": JOINT, "known": KNOWN, "scenarios": [asdict(one) for one in SCENARIOS]}
     about = {"trials": trials, "seed": seed, "machine": computer, "seconds": seconds}
     figures = {"schema": "pronk/bench-match/3", "rows": rows} | known | about
-    finish(json_file, figures, show(rows, title, caption))
+    return finish(figures, show(rows, title, caption))

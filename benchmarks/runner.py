@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
-from rich.text import Text
 
 from pronk.cli import console
 
@@ -56,21 +54,8 @@ def machine(*packages: str) -> dict[str, str]:
     }
 
 
-def table(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]] = (), caption: str = ""
-) -> Table:
-    """Make a table whose first column is left-aligned."""
-    made = Table(title=Text(title), caption=Text(caption) if caption else None)
-    made.title_justify = made.caption_justify = "left"
-    for k, column in enumerate(columns):
-        made.add_column(Text(column), justify="right" if k else "left")
-    for cells in rows:
-        made.add_row(*map(Text, cells))
-    return made
-
-
-def finish(json_file: Path | None, figures: dict[str, Any], *tables: Table) -> None:
-    """Print the tables of a benchmark, and write its figures if a file was requested."""
+def finish(figures: dict[str, Any], *tables: Table) -> console.Outcome:
+    """Print the tables of a benchmark."""
     for each in tables:
         console.show(each)
-    console.write_json(json_file, figures)
+    return console.Outcome(figures=figures)

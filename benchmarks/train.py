@@ -22,7 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.runner import finish, in_turn, machine, paired_ratio, spread, table
+from benchmarks.runner import finish, in_turn, machine, paired_ratio, spread
 from pronk.cli import console
 from pronk.errors import PronkError
 
@@ -289,7 +289,7 @@ def rate_table(found: dict[str, Any]) -> Table:
 
     title = "Environment steps per second, in thousands: median (slowest to fastest block)"
     columns = ["environments", "what", *(one["task"] for one in found["pairs"][0]), "ratio"]
-    made = table(title, columns, caption=caption)
+    made = console.table(title, columns, caption=caption)
     for pair, ratios in zip(found["pairs"], found["ratios"], strict=True):
         made.add_section()
         for what, ratio in ratios.items():
@@ -310,8 +310,7 @@ def train(
     repeats: int = 4,
     device: str = "auto",
     gpu_ids: str = "0",
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Steps per second of the jump task and of mjlab's own Go1 task.
 
     Args:
@@ -321,7 +320,6 @@ def train(
         repeats: Blocks of each task, taken in turn.
         device: auto, cuda or cpu (to try it out).
         gpu_ids: GPUs, such as 0,1: training on one and on all of them as well.
-        json_file: Also write the figures to this file.
     """
     counts, gpus = ([word.strip() for word in text.split(",")] for text in (envs, gpu_ids))
     for option, words in (("--envs", counts), ("--gpu-ids", gpus)):
@@ -346,4 +344,4 @@ def train(
         device=f"cuda:{gpus[0]}" if on_gpu else "cpu",
         gpus=gpus if on_gpu else (),
     )
-    finish(json_file, found, rate_table(found))
+    return finish(found, rate_table(found))

@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from benchmarks.runner import Progress, finish, in_turn, machine, paired_ratio, spread, table
+from benchmarks.runner import Progress, finish, in_turn, machine, paired_ratio, spread
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.protocol import PAPER_COMMANDS
@@ -140,8 +140,7 @@ def trial(
     repeats: int = 7,
     sim_params: Path | None = None,
     seed: int = 0,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Simulated seconds per second of the whole trial loop and of bare mj_step, over one run.
 
     Args:
@@ -149,7 +148,6 @@ def trial(
         repeats: Runs of each loop, taken in turn.
         sim_params: Parameters of the virtual robot; those that ship with pronk if left out.
         seed: Of the jump's start and noise.
-        json_file: Also write the figures to this file.
     """
     with console.progress() as report:
         chosen = load_sim_params(sim_params)
@@ -170,4 +168,4 @@ def trial(
     ]
     columns = ("loop", "simulated s per s", "ratio", "least ratio")
     title = "Simulated seconds per second and core, virtual robot"
-    finish(json_file, found, table(title, columns, rows, caption))
+    return finish(found, console.table(title, columns, rows, caption))

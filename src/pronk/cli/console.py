@@ -7,14 +7,15 @@ piped into a file.
 from __future__ import annotations
 
 import json
-import math
+import os
 import select
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -22,28 +23,22 @@ from rich.table import Table
 from rich.text import Text
 
 from pronk.errors import HardwareError
+from pronk.files import write_text
 
 if TYPE_CHECKING:
     from pronk.evaluation.tables import Sheet
 
-JsonFile = Annotated[Path | None, tyro.conf.arg(name="json")]
-
 _LOOK_S = 0.2
 
 
-def out() -> Console:
-    """Standard output; made anew each time, so that a redirected stream is found."""
-    return Console(highlight=False, soft_wrap=True)
-
-
 def err() -> Console:
-    """Standard error."""
+    """Standard error; made anew each time, so that a redirected stream is found."""
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def say(text: str) -> None:
     """Print one line to standard output."""
-    out().print(text, markup=False)
+    Console(highlight=False, soft_wrap=True).print(text, markup=False)
 
 
 def warn(text: str) -> None:
@@ -51,30 +46,57 @@ def warn(text: str) -> None:
     err().print(f"warning: {text}", markup=False, style="yellow")
 
 
-def wrote(*paths: Path) -> None:
-    """Print what was written."""
-    for path in paths:
-        say(f"wrote {path}")
-
-
 def following(*commands: str) -> None:
     """Print what to do next."""
     say("\n  ".join(("next:", *commands)))
 
 
-def table(title: str, *columns: str, rows: Iterable[Sequence[str]] = ()) -> Table:
-    """Make a table whose first column is a name and whose others are numbers."""
-    made = Table(title=Text(title), title_justify="left", title_style="bold", header_style="bold")
+JsonFile = Annotated[
+    Path | None, tyro.conf.arg(name="json", help="Also write the figures to this file.")
+]
+"""The option `--json` of every command that returns an `Outcome`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a command leaves when it has ended."""
+
+    figures: Mapping[str, Any]
+    """What `--json` writes; arrays become lists, and numbers that are not finite null."""
+    wrote: Sequence[Path] = ()
+    following: Sequence[str] = ()
+    """Commands to run next."""
+    status: int = 0
+
+    def end(self, json_file: Path | None) -> int:
+        """Print what was written and what to do next, write the figures; return the exit status."""
+        for path in self.wrote:
+            say(f"wrote {path}")
+        if json_file is not None:
+            encoded = msgspec.json.encode(dict(self.figures), enc_hook=_plain)
+            write_text(json_file, json.dumps(msgspec.json.decode(encoded), indent=2) + "\n")
+            say(f"wrote {json_file}")
+        if self.following:
+            following(*self.following)
+        return self.status
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else os.fspath(value)
+
+
+def table(
+    title: str, columns: Iterable[str], rows: Iterable[Sequence[str]] = (), caption: str = ""
+) -> Table:
+    """Make a table of text without markup whose first column is a name, the others numbers."""
+    made = Table(title=Text(title), title_style="bold", header_style="bold")
+    made.caption = Text(caption) if caption else None
+    made.title_justify = made.caption_justify = "left"
     for i, column in enumerate(columns):
         made.add_column(Text(column), justify="right" if i else "left", no_wrap=not i)
     for cells in rows:
-        row(made, *cells)
+        made.add_row(*map(Text, cells))
     return made
-
-
-def row(made: Table, *cells: str) -> None:
-    """Add a row; brackets in a cell are not markup."""
-    made.add_row(*(Text(cell) for cell in cells))
 
 
 def show(made: Table) -> None:
@@ -84,62 +106,31 @@ def show(made: Table) -> None:
 
 
 def show_sheet(sheet: Sheet | None, title: str = "") -> None:
-    """Print a table of the report package and its notes."""
+    """Print a table and its notes."""
     if sheet is not None:
-        made = table(sheet.title or title, *sheet.columns, rows=sheet.rows)
+        made = table(sheet.title or title, sheet.columns, sheet.rows)
         made.columns[-1].justify = "left" if sheet.columns[-1] == "equation" else "right"
         show(made)
         for note in sheet.notes:
             say(f"  {note}")
 
 
-def show_rows(title: str, columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]]) -> None:
+def show_rows(title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> None:
     """Print some fields of rows: heading (and digits, as in `peak [dB];2`) to name of a field."""
-    from pronk.report.page import table
+    from pronk.evaluation.tables import table
 
     cells = [[row[name] for name in columns.values()] for row in rows]
     show_sheet(table(" | ".join(columns), cells, title=title))
 
 
-def number(value: float, digits: int = 2) -> str:
-    """Format a number; a dash where it is unknown."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
-
-
-def _plain(value: Any) -> Any:
-    """Convert to what strict JSON can hold; numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
-
-
-def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write a command's figures, if a file was requested."""
-    if path is not None:
-        from pronk.files import write_text
-
-        write_text(path, json.dumps(_plain(dict(figures)), indent=2, allow_nan=False) + "\n")
-        wrote(path)
-
-
-class Reporter:
-    """Progress of one command: named stages, each from 0 to 1."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._tasks: dict[str, Any] = {}
+class Reporter(Progress):
+    """Progress of one command on standard error: named stages, each from 0 to 1."""
 
     def __call__(self, stage: str, share: float) -> None:
         """Set the share of `stage` that is done, 0 to 1."""
-        if stage not in self._tasks:
-            self._tasks[stage] = self._progress.add_task(stage, total=1.0)
-        self._progress.update(self._tasks[stage], completed=min(max(share, 0.0), 1.0))
+        known = [task.id for task in self.tasks if task.description == stage]
+        task = known[0] if known else self.add_task(stage, total=1.0)
+        self.update(task, completed=min(max(share, 0.0), 1.0))
 
     def bar(self, stage: str) -> Callable[[float], None]:
         """Begin a stage; the result sets its share."""
@@ -147,18 +138,11 @@ class Reporter:
         return lambda share: self(stage, share)
 
 
-@contextmanager
-def progress() -> Iterator[Reporter]:
-    """Show progress on standard error inside the block."""
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=err()) as bars:
-        yield Reporter(bars)
+def progress() -> Reporter:
+    """Show progress inside a `with` block."""
+    share = TextColumn("{task.percentage:>3.0f} %")
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), share)
+    return Reporter(*columns, TimeElapsedColumn(), console=err())
 
 
 def confirm(robot: str, where: str) -> None:
@@ -182,9 +166,7 @@ def confirm(robot: str, where: str) -> None:
 class Person:
     """A person at the test rig who clamps joints and confirms it."""
 
-    def __init__(self) -> None:
-        """No joint is clamped yet."""
-        self._fixed: tuple[str, ...] = ()
+    _fixed: tuple[str, ...] = ()
 
     def __call__(self, joints: tuple[str, ...]) -> None:
         """Have these joints clamped and all others freed; returns when they are.

@@ -36,8 +36,7 @@ def demo(
     repeats: int = 3,
     seed: int = 0,
     quick: bool = False,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Sweep and match all joints of the virtual robot, let trained policies jump on it, report.
 
     Args:
@@ -47,7 +46,6 @@ def demo(
         repeats: Repeats of the matched amplitude.
         seed: Of the virtual robot's noise.
         quick: Search the linearized model instead of the grid.
-        json_file: Also write the figures to this file.
     """
     from pronk.evaluation import tables
     from pronk.report import figures, style
@@ -86,7 +84,6 @@ def demo(
         "Training is left out: it needs a CUDA GPU and `pip install 'pronk[train]'`. The policies "
         f"come with pronk. {seconds:.0f} s in all."
     )
-    console.wrote(out / "logs", out / "gains.yaml", out / "match.npz", hero, *films, page)
     found = {
         "cells_from_table_1": cells,
         "predictions": prediction_rows(replays),
@@ -94,12 +91,15 @@ def demo(
         "page": page,
         "seconds_total": seconds,
     }
-    console.write_json(json_file, summary(result) | found)
-    console.following(
-        f"open {page} in a browser",
-        f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
-        *(f"pronk trial {path} --out out/trial" for path in tried[:1]),
-        f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS",
+    return console.Outcome(
+        figures=summary(result) | found,
+        wrote=[out / "logs", out / "gains.yaml", out / "match.npz", hero, *films, page],
+        following=[
+            f"open {page} in a browser",
+            f"pronk train all --gains {out / 'gains.yaml'} --out runs/matched   # on a GPU",
+            *(f"pronk trial {path} --out out/trial" for path in tried[:1]),
+            f"pronk sweep {ROBOT} --link sim --sim-params YOUR_SIM_PARAMS.yaml --out YOUR_LOGS",
+        ],
     )
 
 
@@ -216,7 +216,7 @@ def show_match(
     result: MatchResult, replays: Sequence[JointPrediction], cells: dict[str, list[float]]
 ) -> None:
     """Print matched gains beside the paper's, and the errors with nominal and matched gains."""
-    from pronk.report.page import table
+    from pronk.evaluation.tables import table
     from pronk.report.paper import published
 
     paper = published(ROBOT)

@@ -34,8 +34,7 @@ def deploy(
     blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = 0.4,
     tilt: float = 0.8,
     ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False,
-    json_file: console.JsonFile = None,
-) -> int:
+) -> console.Outcome:
     """Stand up, let the policy walk and jump, sit down; every command through the safety filter.
 
     Args:
@@ -52,7 +51,6 @@ def deploy(
         blend: Time in which the policy takes over, in s; 0 as in training.
         tilt: Largest tilt of the trunk, in rad.
         ignore_latency: Start the policy even if the measured latency exceeds its training range.
-        json_file: Also write the figures to this file.
     """
     from pronk.links.address import SIM
     from pronk.policy.runtime import load_policy
@@ -82,16 +80,15 @@ def deploy(
         console.say(words)
         summary = run(plan, operator, _notify)
     _report(summary)
-    lost = [event.text for event in summary.events_seen if event.kind == "lost"]
-    console.wrote(*(path for path in (log, None if lost else capture) if path is not None))
-    console.write_json(json_file, summary.figures())
-    console.following(
-        f"pronk report {log}"
-        if log is not None
-        else f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
-    )
+    lost = any(event.kind == "lost" for event in summary.events_seen)
+    again = f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
     failed = bool(summary.faults or summary.refusals or lost)
-    return 1 if failed else 130 if summary.interrupted else 0
+    return console.Outcome(
+        figures=summary.figures(),
+        wrote=[path for path in (log, None if lost else capture) if path is not None],
+        following=[again if log is None else f"pronk report {log}"],
+        status=1 if failed else 130 if summary.interrupted else 0,
+    )
 
 
 def _operator(
@@ -147,7 +144,7 @@ def _notify(event: Event) -> None:
 
 def _report(summary: RunSummary) -> None:
     """Print the figures of the run."""
-    from pronk.report.page import table
+    from pronk.evaluation.tables import table
     from pronk.runtime.ipc import REAL, VIRTUAL
 
     servo, policy = summary.servo, summary.policy

@@ -91,4 +91,4 @@ def evaluate(
     save(out, found)
     for sheet in sheets(found):
         console.show_sheet(sheet)
-    console.wrote(out)
+    console.say(f"wrote {out}")

@@ -1,17 +1,18 @@
 """The command line: each command is a function whose parameters tyro makes into options.
 
-Bad input ends with one sentence on standard error and exit status 2. Any other exception is a
-defect of pronk, is named so, and ends with 1 (`PRONK_DEBUG=1` prints the traceback).
+A command that returns an `Outcome` also has the option `--json`. Bad input ends with one sentence
+on standard error and exit status 2. Any other exception is a defect of pronk, is named so, and
+ends with 1 (`PRONK_DEBUG=1` prints the traceback).
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 import inspect
 import io
 import os
+import pkgutil
 import re
 import sys
 import traceback
@@ -52,6 +53,7 @@ RENAMED = {
     "--from": "`--from` is now `--init-checkpoint`.",
 }
 """Names of the release before, each with the hint that replaces it."""
+_JSON = "json_file"
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -104,28 +106,39 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
     if name not in commands:
         hint = RENAMED.get(name) or f"the commands are {', '.join(commands)}."
         raise PronkError(f"there is no command {name!r}; {hint}")
-    module, _, function = commands[name][0].partition(":")
-    command = getattr(importlib.import_module(module), function)
-    status = _parse(command, arguments[1:], f"{program} {name}")()
-    return status if isinstance(status, int) else 0
+    command = pkgutil.resolve_name(commands[name][0])
+    values = _parse(command, arguments[1:], f"{program} {name}")
+    if values is None:  # The help was printed.
+        return 0
+    json_file = values.pop(_JSON, None)
+    outcome = command(**values)
+    return 0 if outcome is None else int(outcome.end(json_file))
 
 
-def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> Callable[[], Any]:
-    """Return the call that a command line means.
+def _parse(
+    command: Callable[..., Any], arguments: list[str], program: str
+) -> dict[str, Any] | None:
+    """Return the arguments that a command line means for a command; None where it means its help.
 
     Raises:
         PronkError: The options do not fit; one sentence.
     """
     import tyro
 
-    given: dict[str, Any] = {}
+    from pronk.cli.console import JsonFile, Outcome
 
-    def call(**values: Any) -> None:
-        given.update(values)
+    signature = inspect.signature(command, eval_str=True)
+    options = list(signature.parameters.values())
+    if signature.return_annotation is Outcome:
+        known = {"default": None, "annotation": JsonFile}
+        options.append(inspect.Parameter(_JSON, inspect.Parameter.KEYWORD_ONLY, **known))
 
-    call.__signature__ = inspect.signature(command, eval_str=True)  # type: ignore[attr-defined]
+    def call(**values: Any) -> dict[str, Any]:
+        return values
+
+    call.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
     call.__doc__ = command.__doc__
-    call.__annotations__ = inspect.get_annotations(command, eval_str=True)
+    call.__annotations__ = {option.name: option.annotation for option in options}
     kinds = dict(call.__annotations__)
     for kind in call.__annotations__.values():
         kinds |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
@@ -140,12 +153,11 @@ def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> C
     messages = io.StringIO()
     try:
         with contextlib.redirect_stderr(messages):
-            tyro.cli(call, prog=program, args=arguments, config=config)
+            return tyro.cli(call, prog=program, args=arguments, config=config)
     except SystemExit as stop:
         if not stop.code:
-            return lambda: 0
+            return None
         raise PronkError(_sentence(messages.getvalue(), arguments, program)) from None
-    return lambda: command(**given)
 
 
 def _sentence(box: str, arguments: list[str], program: str) -> str:

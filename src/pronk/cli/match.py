@@ -33,8 +33,7 @@ def match(
     simulator: str = "mujoco",
     device: str = "cpu",
     reading: Reading = Reading(),  # noqa: B008
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Find the gains with which the simulator responds like the robot.
 
     Args:
@@ -50,14 +49,13 @@ def match(
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
             pronk[train]).
         reading: How logs are read.
-        json_file: Also write the figures to this file.
     """
+    from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
     from pronk.match.pipeline import match_logs
     from pronk.match.settings import MatchSettings
     from pronk.report.match_page import write_page
-    from pronk.report.page import table
     from pronk.robots import load_robot
 
     known = load_robot(robot)
@@ -101,13 +99,13 @@ def match(
         figures["mode"] = mode
         figures["held"] = {name: joint.held for name, joint in joints if joint.held}
         figures["rmse"] = {name: {"published": a, "matched": b} for name, a, b in rows}
-    console.wrote(out, out.parent / "match.npz", page)
-    console.write_json(json_file, figures)
-    console.following(
+    following = [
         f"open {page} in a browser",
         f"pronk predict FRESH_LOG --robot {robot} --gains {out}",
         f"pronk export {out} --to mjlab --out actuators.py",
-    )
+    ]
+    wrote = [out, out.parent / "match.npz", page]
+    return console.Outcome(figures=figures, wrote=wrote, following=following)
 
 
 def summary(result: MatchResult) -> dict[str, Any]:
@@ -135,8 +133,7 @@ def predict(
     out: Path | None = None,
     simulator: str = "mujoco",
     reading: Reading = Reading(),  # noqa: B008
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Replay logs in the simulator with nominal and with matched gains; RMSE and R2 per joint.
 
     Args:
@@ -146,13 +143,12 @@ def predict(
         out: Folder for replays and figures; beside the gains.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         reading: How logs are read.
-        json_file: Also write the figures to this file.
     """
+    from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match.predict import predict as predict_log
     from pronk.match.predict import save_prediction
     from pronk.report import figures, style
-    from pronk.report.page import table
     from pronk.robots import load_robot
 
     known, matched = load_robot(robot), gains_file.load(gains)
@@ -186,10 +182,12 @@ def predict(
         console.warn(f"{source} was used by these gains: this is a check of the fit.")
     for reason in excluded.values():
         console.say(f"left out: {reason}")
-    console.wrote(*written)
-    console.write_json(json_file, {"predictions": rows, "fitted_on": fitted, "excluded": excluded})
-    if (folder / "match.npz").exists():
-        console.following(f"pronk report {folder}   # puts these replays on the page")
+    shown = f"pronk report {folder}   # puts these replays on the page"
+    return console.Outcome(
+        figures={"predictions": rows, "fitted_on": fitted, "excluded": excluded},
+        wrote=written,
+        following=[shown] if (folder / "match.npz").exists() else [],
+    )
 
 
 def prediction_rows(found: Iterable[JointPrediction]) -> list[dict[str, Any]]:
@@ -203,8 +201,7 @@ def export(
     to: Target,
     out: Path,
     robot: str | None = None,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Write matched gains as actuator configuration of mjlab, MuJoCo or Isaac Lab.
 
     Args:
@@ -212,7 +209,6 @@ def export(
         to: What reads the file.
         out: The file to write.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
-        json_file: Also write the figures to this file.
     """
     from pronk.files import write_text
     from pronk.match import gains as gains_file
@@ -221,5 +217,4 @@ def export(
 
     text = export_text(gains_file.load(gains), to, load_robot(robot) if robot else None)
     write_text(out, text)
-    console.wrote(out)
-    console.write_json(json_file, {"written": out, "to": to})
+    return console.Outcome(figures={"written": out, "to": to}, wrote=[out])

@@ -20,8 +20,7 @@ def play(
     host: str = "127.0.0.1",
     gamepad: bool | None = None,
     seed: int = 0,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Walk and jump the virtual robot from a browser: sliders, keys or gamepad.
 
     Args:
@@ -34,7 +33,6 @@ def play(
         gamepad: Use a gamepad that is plugged into this machine; if there is one, if
             left out.
         seed: Of the virtual robot's noise.
-        json_file: Also write the figures to this file.
     """
     from dataclasses import asdict
 
@@ -84,4 +82,4 @@ def play(
         f"{played.simulated_s:.0f} s of the virtual robot in {played.wall_s:.0f} s "
         f"({factor:.2f} x real time), {len(played.hops)} jumps"
     )
-    console.write_json(json_file, asdict(played))
+    return console.Outcome(figures=asdict(played))

@@ -9,24 +9,19 @@ import tyro
 from pronk.cli import console
 
 
-def report(
-    folder: tyro.conf.Positional[Path],
-    json_file: console.JsonFile = None,
-) -> None:
+def report(folder: tyro.conf.Positional[Path]) -> console.Outcome:
     """Write one HTML page of all matches, trials and deployments in a folder, or of one log.
 
     Args:
         folder: Folder that matches and trials were written to, or one above; or the log
             of a deployment, .mcap.
-        json_file: Also write the figures to this file.
     """
     from pronk.report import build
 
     with console.progress() as progress:
         page, found = build.write_report(folder, progress)
-    console.wrote(page)
-    console.write_json(
-        json_file,
-        {"page": page, "parts": [{"source": one.source, **one.figures} for one in found]},
+    return console.Outcome(
+        figures={"page": page, "parts": [{"source": one.source, **one.figures} for one in found]},
+        wrote=[page],
+        following=[f"open {page} in a browser"],
     )
-    console.following(f"open {page} in a browser")

@@ -25,8 +25,7 @@ def response(
     out: Path | None = None,
     plots: bool = True,
     reading: Reading = Reading(),  # noqa: B008
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Estimate the frequency response of every joint that was excited.
 
     Args:
@@ -35,7 +34,6 @@ def response(
         out: Folder for what is written; beside the log if left out.
         plots: Draw Bode plots.
         reading: How logs are read.
-        json_file: Also write the figures to this file.
     """
     from pronk.report import figures, style
     from pronk.response import Estimator, estimate, save
@@ -65,15 +63,17 @@ def response(
             rows += [summary(one) | {"log": log.source} for one in found]
             done((i + 1) / len(logs))
     virtual = any(row["virtual"] for row in rows)
-    console.show_rows("Responses of the virtual robot" if virtual else "Responses", COLUMNS, rows)
+    title = "Responses of the virtual robot" if virtual else "Responses"
+    console.show_rows(title, COLUMNS, rows)
     for log in logs:
         for note in log.notes:
             console.say(f"note: {Path(log.source).name}: {note}")
-    console.wrote(*written)
-    console.write_json(json_file, {"responses": rows, "written": written})
-    name = robot or logs[0].robot or "ROBOT"
-    where = " ".join(str(path) for path in paths)
-    console.following(f"pronk match {where} --robot {name} --out gains.yaml")
+    name, where = robot or logs[0].robot or "ROBOT", " ".join(map(str, paths))
+    return console.Outcome(
+        figures={"responses": rows, "written": written},
+        wrote=written,
+        following=[f"pronk match {where} --robot {name} --out gains.yaml"],
+    )
 
 
 def summary(found: FrequencyResponse) -> dict[str, Any]:

@@ -39,12 +39,12 @@ def robot(
     if target.parent.resolve() != path.parent.resolve():
         raise RobotError(f"--out {target}: the robot.yaml belongs beside its model {path}.")
     write_text(target, yaml_of_model(path))
-    console.wrote(target)
+    console.say(f"wrote {target}")
     console.following(f"pronk robot check {target}")
 
 
 def _check(path: Path) -> None:
-    from pronk.report.page import table
+    from pronk.evaluation.tables import table
     from pronk.robots import load_robot
     from pronk.robots.model import bench_spec
 

@@ -44,8 +44,7 @@ def simulate(
     duration: float | None = None,
     capture: Path | None = None,
     realtime: bool = False,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Run the virtual robot in real time, behind the messages of a real one.
 
     Nothing leaves this computer. It prints one line when it is ready, and runs until Ctrl-C.
@@ -70,7 +69,6 @@ def simulate(
         duration: End after this time, in s; Ctrl-C ends it too.
         capture: Write what a motion-capture rig would measure to this .npz (--base ground).
         realtime: Request real-time scheduling.
-        json_file: Also write the figures to this file.
     """
     from pronk.links.address import Address
     from pronk.links.realtime import Interrupts, Wanted, enter
@@ -109,13 +107,15 @@ def simulate(
         figures = server.figures()
         if capture is not None:
             save(capture, machine.capture())
-            console.wrote(capture)
     finally:
         wire.close()
         machine.close()
     _report(figures)
-    console.write_json(json_file, figures)
-    console.following(f"pronk sweep {robot} --link '{address}' --out DIR   # while it runs")
+    return console.Outcome(
+        figures=figures,
+        wrote=[capture] if capture else [],
+        following=[f"pronk sweep {robot} --link '{address}' --out DIR   # while it runs"],
+    )
 
 
 def _report(figures: dict[str, Any]) -> None:

@@ -15,16 +15,30 @@ from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
-    from pronk.links.address import Address
-    from pronk.links.link import Freshness
     from pronk.robots.robot import RobotSpec
     from pronk.runtime.ipc import Event
+    from pronk.runtime.plan import Link
     from pronk.runtime.run import Recorded
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
 """Excitation signals."""
 AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
+COLUMNS = {
+    "joint": "joint",
+    "amplitude [rad]": "amplitude_rad",
+    "lowest [rad];2": "lowest_rad",
+    "of;2": "range_low_rad",
+    "highest [rad];2": "highest_rad",
+    "of ;2": "range_high_rad",
+    "speed [rad/s];1": "speed_rad_s",
+    "of no-load;1": "no_load_speed_rad_s",
+    "torque [N m];1": "torque_nm",
+    "of limit;1": "effort_limit_nm",
+    "power [W];0": "electrical_power_w",
+    "bus [A];1": "bus_current_a",
+}
+"""Heading to field of a row of the plan."""
 
 
 def sweep(
@@ -37,8 +51,7 @@ def sweep(
     repeats: int = 3,
     plan_only: bool = False,
     overwrite: bool = False,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Excite every joint: plan, check against the limits, excite, record.
 
     Args:
@@ -51,11 +64,11 @@ def sweep(
         repeats: Times each amplitude is repeated.
         plan_only: Show what it would do to the robot and leave.
         overwrite: Replace logs that exist.
-        json_file: Also write the figures to this file.
     """
     from pronk.evaluation.virtual_sweep import sweep_virtual
     from pronk.links.address import SIM
     from pronk.robots import load_robot
+    from pronk.runtime.plan import Link
     from pronk.virtual.sim_params import load_sim_params
 
     known, address = load_robot(robot), machine.address()
@@ -70,7 +83,8 @@ def sweep(
         report("forecast", 0.0)
         plan = make(known, names or None, signal, amplitude or AMPLITUDES, repeats)
         report("forecast", 1.0)
-    show_plan(plan)
+    title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
+    console.show_rows(title, COLUMNS, plan.rows())
     plan.check()
     figures: dict[str, Any] = {
         "robot": known.name,
@@ -81,36 +95,21 @@ def sweep(
         "logs": [],
     }
     if plan_only:
-        console.write_json(json_file, figures)
-        console.say("next: the same command without --plan-only")
-        return
+        return console.Outcome(figures=figures, following=["the same command without --plan-only"])
     if not (address.local or machine.yes):
         console.confirm(known.name, str(address))
     with console.progress() as report:
-        bar = report.bar(f"excite over {address.kind}")
+        how: Any = {"overwrite": overwrite, "progress": report.bar(f"excite over {address.kind}")}
         if virtual:
             file = address.options.get("params")
             params = load_sim_params(None if file is None else str(file), known)
             params.check_joints(known.joint_names, str(file or "sim_params"))
-            figures["logs"] = sweep_virtual(
-                plan,
-                params,
-                out,
-                seed=int(address.options.get("seed", 0)),
-                processes=os.cpu_count() or 1,
-                overwrite=overwrite,
-                progress=bar,
-            )
+            seed, cpus = int(address.options.get("seed", 0)), os.cpu_count() or 1
+            logs = sweep_virtual(plan, params, out, seed=seed, processes=cpus, **how)
+            figures["logs"] = logs
         else:
-            recorded = record_wire(
-                plan,
-                out,
-                address,
-                release=machine.release,
-                overwrite=overwrite,
-                real_time=machine.real_time,
-                progress=bar,
-            )
+            link = Link(robot=known.source or known.name, address=address, release=machine.release)
+            recorded = record_wire(plan, out, link, real_time=machine.real_time, **how)
             figures |= vars(recorded)
     where = "the virtual robot" if figures["virtual"] else "a robot that is not the virtual one"
     console.say(f"wrote {len(figures['logs'])} logs of {where} to {out}")
@@ -120,11 +119,8 @@ def sweep(
             f"{late['p99_ms']:.2f} ms (99 %), {late['max_ms']:.1f} ms at most; "
             f"{late['missed']} missed"
         )
-    console.write_json(json_file, figures)
-    console.following(
-        f"pronk response {out}",
-        f"pronk match {out} --robot {robot} --out {out}/gains.yaml",
-    )
+    match = f"pronk match {out} --robot {robot} --out {out}/gains.yaml"
+    return console.Outcome(figures=figures, following=[f"pronk response {out}", match])
 
 
 def make(
@@ -147,52 +143,28 @@ def make(
     return make_plan(robot, joints, kinds[signal](), amplitudes=amplitudes, repeats=repeats)
 
 
-def show_plan(plan: SweepPlan) -> None:
-    """Print what the sweep will do to each joint, against its limits."""
-    columns = {
-        "joint": "joint",
-        "amplitude [rad]": "amplitude_rad",
-        "lowest [rad];2": "lowest_rad",
-        "of;2": "range_low_rad",
-        "highest [rad];2": "highest_rad",
-        "of ;2": "range_high_rad",
-        "speed [rad/s];1": "speed_rad_s",
-        "of no-load;1": "no_load_speed_rad_s",
-        "torque [N m];1": "torque_nm",
-        "of limit;1": "effort_limit_nm",
-        "power [W];0": "electrical_power_w",
-        "bus [A];1": "bus_current_a",
-    }
-    title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
-    console.show_rows(title, columns, plan.rows())
-
-
 def record_wire(
     plan: SweepPlan,
     out: Path,
-    address: Address,
+    link: Link,
     *,
-    release: bool = False,
     overwrite: bool = False,
     real_time: bool = False,
     limits: Mapping[str, float] | None = None,
-    fresh: Freshness | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Recorded:
     """Sweep a robot in real time, all joints over one connection of the servo's process.
 
     The caller has checked the plan. `limits` are other values for scalar limits of the safety
-    filter; `fresh` is how fresh states must be at first. If the robot may not be moved, the filter
-    stops it or a process is killed, a PronkError is raised and what was recorded stays.
+    filter. If the robot may not be moved, the filter stops it or a process is killed, a PronkError
+    is raised and what was recorded stays.
     """
-    from pronk.runtime.plan import Link, Plan
+    from pronk.runtime.plan import Plan
     from pronk.runtime.run import run_sweep
     from pronk.runtime.sweep import SweepTask
 
-    robot = plan.robot.source or plan.robot.name
-    metadata = {"link": str(address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
+    metadata = {"link": str(link.address), "servo_rate_hz": f"{Plan.servo_rate_hz:g}"}
     task = SweepTask(plan=plan, out_dir=out, overwrite=overwrite, metadata=metadata)
-    link = Link(robot=robot, address=address, release=release, fresh=fresh)
     whole: list[str] = []
 
     def notify(event: Event) -> None:

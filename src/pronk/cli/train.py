@@ -9,74 +9,57 @@ from typing import Any
 from pronk.cli import console
 from pronk.train.settings import TrainSettings
 
-CPU_RATE = 300.0
-"""Environment steps a second that two cores were seen to train with."""
 
-
-def train(settings: TrainSettings, json_file: console.JsonFile = None) -> None:
+def train(settings: TrainSettings) -> console.Outcome:
     """Train a policy that walks, runs and jumps on command.
 
     Args:
         settings: What is trained.
-        json_file: Also write the figures to this file.
     """
     from pronk.train.run import train as run
 
+    again = shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])
     try:
         found = run(settings, report=console.say)
     except KeyboardInterrupt:
-        console.following(_again(settings))
+        console.following(again)
         raise
-    _show(found)
-    console.write_json(json_file, found)
-    if not found["finished"]:
-        console.following(_again(settings))
-        if found["sessions"][-1]["stopped"].startswith("SIG"):
-            raise KeyboardInterrupt
-        return
-    console.following(*_next_steps(settings, found))
-
-
-def _show(found: Mapping[str, Any]) -> None:
+    columns = ("phase", "iterations", "environment steps", "steps/s", "wall clock [s]")
     rows = [
-        {
-            "phase": name,
-            "iterations": f"{one['iterations']}",
-            "environment steps": f"{one['env_steps']:,}",
-            "steps/s": f"{one['steps_per_second']:,.0f}",
-            "wall clock [s]": f"{one['seconds']:.1f}",
-        }
+        (
+            name,
+            f"{one['iterations']}",
+            f"{one['env_steps']:,}",
+            f"{one['steps_per_second']:,.0f}",
+            f"{one['seconds']:.1f}",
+        )
         for name, one in found["phases"].items()
     ]
     if rows:
-        console.show(console.table("Training", *rows[0], rows=[list(row.values()) for row in rows]))
+        console.show(console.table("Training", columns, rows))
     session = found["sessions"][-1]
     console.say(f"{session['seconds']:.0f} s, {session['build_s'] or 0.0:.0f} s of it building")
-    if session["stopped"]:
-        console.say(f"stopped: {session['stopped']}")
-
-
-def _again(settings: TrainSettings) -> str:
-    return shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])
+    if stopped := session["stopped"]:
+        console.say(f"stopped: {stopped}")
+    if found["finished"]:
+        return console.Outcome(figures=found, following=_next_steps(settings, found))
+    status = 130 if stopped.startswith("SIG") else 0
+    return console.Outcome(figures=found, following=[again], status=status)
 
 
 def _next_steps(settings: TrainSettings, found: Mapping[str, Any]) -> list[str]:
     folder = settings.out
-    copy = str(folder / "gains.yaml")
+    policy, copy = folder / "policy.onnx", folder / "gains.yaml"
     matched = found["gains"]["name"] == "matched"
     gains = ["--gains", copy if matched else "naive"]
     if not matched and found["gains"]["sha256"]:
         gains += ["--ranges-from", copy]
-    policy = folder / "policy.onnx"
+    walked = ["pronk", "train", "jump", "--init-checkpoint", folder, *gains]
     steps = [
-        shlex.join(
-            ["pronk", "evaluate", str(policy), *gains, "--out", str(folder / "evaluation.json")]
-        )
+        ["pronk", "evaluate", policy, *gains, "--out", folder / "evaluation.json"],
+        [*walked, "--out", f"{folder}_jump"]
+        if settings.task == "walk"
+        else ["pronk", "trial", policy],
+        ["tensorboard", "--logdir", folder],
     ]
-    if settings.task == "walk":
-        words = ["pronk", "train", "jump", "--init-checkpoint", str(folder), *gains]
-        steps.append(shlex.join([*words, "--out", f"{folder}_jump"]))
-    else:
-        steps.append(shlex.join(["pronk", "trial", str(policy)]))
-    steps.append(shlex.join(["tensorboard", "--logdir", str(folder)]))
-    return steps
+    return [shlex.join(map(str, words)) for words in steps]

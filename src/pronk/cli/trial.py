@@ -38,8 +38,7 @@ def trial(
     keep_captures: bool = False,
     overwrite: bool = False,
     definitions: bool = False,
-    json_file: console.JsonFile = None,
-) -> None:
+) -> console.Outcome:
     """Stand, run, jump, stop: 20 times with each command; the paper's table beside ours.
 
     Args:
@@ -65,7 +64,6 @@ def trial(
             command.
         overwrite: Replace the trial in that folder.
         definitions: Also print the equation of every figure.
-        json_file: Also write the figures to this file.
     """
     from pronk.evaluation import tables
     from pronk.evaluation.criteria import trial_checks
@@ -104,7 +102,6 @@ def trial(
         f"{timing['seconds']:.0f} s on {timing['processes']:.0f} processes; "
         f"{timing['simulated_s_per_cpu_s']:.1f} simulated seconds per second of a core"
     )
-    console.wrote(out / TABLE, out / SUMMARY, out / CAPTURES)
     wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
     films: tuple[Path, ...] = ()
     with console.progress() as report:
@@ -123,7 +120,6 @@ def trial(
         page, _ = write_report(out, report)
     for sheet in extra:
         console.show_sheet(sheet)
-    console.wrote(*([out / VIDEOS] if films else []), page)
     figures = {
         "virtual": found.virtual,
         "sheets": [asdict(sheet) for sheet in (*sheets, *extra)],
@@ -134,8 +130,12 @@ def trial(
         "page": page,
         "videos": films,
     }
-    console.write_json(json_file, figures)
-    console.following(f"open {page} in a browser", f"pronk play {policy}")
+    files = (TABLE, SUMMARY, CAPTURES, *[VIDEOS] * bool(films))
+    return console.Outcome(
+        figures=figures,
+        wrote=[*(out / name for name in files), page],
+        following=[f"open {page} in a browser", f"pronk play {policy}"],
+    )
 
 
 def _extra_sheets(

@@ -31,9 +31,10 @@ import numpy as np
 import yaml
 
 from pronk.errors import PronkError
+from pronk.evaluation import tables
 from pronk.evaluation.results import Results, Subject, load_json, save_json
 from pronk.evaluation.results import load as load_results
-from pronk.evaluation.tables import Sheet, landed, number, sheet
+from pronk.evaluation.tables import Sheet, landed
 from pronk.evaluation.trial import Plan, Setup, load_subjects, run_trial, versions
 from pronk.evaluation.virtual_sweep import sweep_virtual
 from pronk.excitation.plan import make_plan
@@ -417,18 +418,13 @@ def table(found: Bodies) -> Sheet:
         for name in (subject.name for subject in body.trial.subjects):
             cells = [cell for cell in body.trial.cells if cell.policy == name]
             best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
-            trained = body.errors[f"training gains of {name}"]
-            row = {
-                "body: policy": f"{body.name}: {name}",
-                "error of its match [dB]": number(body.errors[MATCHED]),
-                "error of the policy's training gains [dB]": number(trained),
-                "landed": landed(cells),
-                "best mean height [m]": number(best),
-            }
-            rows.append(row)
-    return sheet(
-        "Randomized virtual robots, each matched by its own sweep",
+            errors = (body.errors[MATCHED], body.errors[f"training gains of {name}"])
+            rows.append((f"{body.name}: {name}", *errors, landed(cells), best))
+    return tables.table(
+        "body: policy | error of its match [dB] | error of the policy's training gains [dB]"
+        " | landed | best mean height [m]",
         rows,
         "The policies were trained with the gains of another robot; the drives of all robots have "
         "their own gains, 17 / 0.4.",
+        title="Randomized virtual robots, each matched by its own sweep",
     )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from pronk.evaluation.criteria import JUMPS, Check, trial_checks
 from pronk.evaluation.jumps import FIGURES, SYMBOLS
@@ -25,14 +26,34 @@ class Sheet:
     notes: tuple[str, ...] = ()
 
 
-def sheet(title: str, rows: Iterable[Mapping[str, str]], *notes: str) -> Sheet:
-    """Return a table of rows by column."""
-    rows = list(rows)
-    cells = tuple(tuple(row.values()) for row in rows)
-    return Sheet(title=title, columns=tuple(rows[0]) if rows else (), rows=cells, notes=notes)
+def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:
+    """Return a table; without a row it is left out of the page.
+
+    Args:
+        columns: Headers with ` | ` between them; `;2` behind one sets the digits of its numbers,
+            3 without it.
+        rows: Cells: text, numbers, and intervals as pairs of numbers; `held` for an empty one.
+        notes: Below the table.
+        title: Above it.
+    """
+    heads = [head.partition(";") for head in columns.split(" | ")]
+    cells = tuple(
+        tuple(_cell(cell, int(head[2] or 3)) for cell, head in zip(row, heads, strict=True))
+        for row in rows
+    )
+    return Sheet(title=title, columns=tuple(head[0] for head in heads), rows=cells, notes=notes)
 
 
 # ---- cells ----
+
+
+def _cell(value: Any, digits: int) -> str:
+    if isinstance(value, str | int):
+        return str(value)
+    if isinstance(value, tuple):
+        same = value[0] == value[1]
+        return "held" if same else " to ".join(_cell(one, digits) for one in value)
+    return "-" if value is None else number(value, digits)
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -105,44 +126,39 @@ def table_iii(trial: Results, figure: str) -> Sheet:
         stds = [found[case].figures[figure].std for case in trial.pooled]
         columns[f"{name}, {place(trial)}"] = cells, stds
     rows = [
-        {"command": case.name}
-        | {column: cells.get(case.name, "-") for column, (cells, _) in columns.items()}
+        (case.name, *(cells.get(case.name, "-") for cells, _ in columns.values()))
         for case in trial.cases
     ]
-    means = {column: number(sum(stds) / len(stds)) for column, (_, stds) in columns.items()}
-    scattered = {column: mean if mean == "-" else f"+- {mean}" for column, mean in means.items()}
-    return sheet(
-        f"{figure.capitalize()} [m]: mean +- standard deviation (jumps of commanded)",
-        [*rows, {"command": "mean scatter", **scattered}],
-        f"{figure}: {FIGURES[figure].says}.",
-        f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
-        "paper: five jumps a cell on the real robot, of one policy each (E2, A21).",
-        virtual_note(trial),
+    means = [number(sum(stds) / len(stds)) for _, stds in columns.values()]
+    scattered = (mean if mean == "-" else f"+- {mean}" for mean in means)
+    return Sheet(
+        title=f"{figure.capitalize()} [m]: mean +- standard deviation (jumps of commanded)",
+        columns=("command", *columns),
+        rows=(*rows, ("mean scatter", *scattered)),
+        notes=(
+            f"{figure}: {FIGURES[figure].says}.",
+            f"mean scatter: mean of the standard deviations over {', '.join(trial.pooled)}.",
+            "paper: five jumps a cell on the real robot, of one policy each (E2, A21).",
+            virtual_note(trial),
+        ),
     )
 
 
 def landings(trial: Results) -> Sheet:
     """The outcome of every commanded jump."""
-    rows = [
-        {
-            "policy: command": f"{cell.policy}: {cell.case}",
-            "commanded": str(cell.n),
-            "standing": str(cell.standing),
-            "jumped": str(cell.found),
-            "landed": str(cell.succeeded),
-            "success [%] (95 %)": "{:.0f} ({:.0f} to {:.0f})".format(
-                *(100.0 * share for share in (cell.success, *cell.success_ci95))
-            ),
-            "fell": str(cell.fell),
-            "high flights": spread(cell.figures["high_flights"], 2),
-        }
-        for cell in trial.cells
-    ]
-    return sheet(
-        "Landings",
+    rows = []
+    for cell in trial.cells:
+        shares = (100.0 * share for share in (cell.success, *cell.success_ci95))
+        row = (f"{cell.policy}: {cell.case}", cell.n, cell.standing, cell.found, cell.succeeded)
+        success, flights = "{:.0f} ({:.0f} to {:.0f})".format(*shares), cell.figures["high_flights"]
+        rows.append((*row, success, cell.fell, spread(flights, 2)))
+    return table(
+        "policy: command | commanded | standing | jumped | landed | success [%] (95 %) | fell"
+        " | high flights",
         rows,
         "landed: upright 2 s after touchdown, and nothing but feet touched the ground; of all "
         "commanded. fell: at any time of the run.",
+        title="Landings",
     )
 
 
@@ -179,28 +195,23 @@ def drives(trial: Results) -> Sheet:
                 for name in ("peak_torque", "peak_speed")
             )
             margin = min((own["torque_margin"][joint].least for own in loads), default=math.nan)
-            row = {"policy: joint": f"{policy}: {joint}", "torque [N m]": number(torque, 1)}
-            rows.append(row | {"speed [rad/s]": number(speed, 1), "margin [1]": number(margin)})
-    return sheet(
-        "Drives: the greatest of all jumps", rows, f"margin: {FIGURES['torque_margin'].says}."
-    )
+            rows.append((f"{policy}: {joint}", torque, speed, margin))
+    columns = "policy: joint | torque [N m];1 | speed [rad/s];1 | margin [1]"
+    note = f"margin: {FIGURES['torque_margin'].says}."
+    return table(columns, rows, note, title="Drives: the greatest of all jumps")
 
 
 def check_sheet(title: str, checks: Sequence[Check], *notes: str) -> Sheet:
     """Number, limit, and whether it passed, of every check; PASSED in a note counts them."""
-    rows = [
-        {
-            "what": check.what,
-            "measured": f"{check.value:.4f} {check.unit}".strip()
-            if math.isfinite(check.value)
-            else "-",
-            "limit": f"{check.sense} {check.limit:g} {check.unit}".strip(),
-            "passed": "yes" if check.passed else "NO",
-        }
-        for check in checks
-    ]
+    rows = []
+    for check in checks:
+        known = math.isfinite(check.value)
+        measured = f"{check.value:.4f} {check.unit}".strip() if known else "-"
+        limit = f"{check.sense} {check.limit:g} {check.unit}".strip()
+        rows.append((check.what, measured, limit, "yes" if check.passed else "NO"))
     passed = f"{sum(check.passed for check in checks)} of {len(checks)} acceptance criteria passed"
-    return sheet(title, rows, *(note.replace("PASSED", passed) for note in notes))
+    notes = tuple(note.replace("PASSED", passed) for note in notes)
+    return table("what | measured | limit | passed", rows, *notes, title=title)
 
 
 def criteria(trial: Results) -> Sheet:
@@ -214,26 +225,29 @@ def criteria(trial: Results) -> Sheet:
 
 def definitions() -> Sheet:
     """The equation of every figure."""
-    rows = [{"figure": f.name, "unit": f.unit, "equation": f.says} for f in FIGURES.values()]
-    return sheet(DEFINITIONS, rows, SYMBOLS)
+    rows = ((one.name, one.unit, one.says) for one in FIGURES.values())
+    return table("figure | unit | equation", rows, SYMBOLS, title=DEFINITIONS)
 
 
 def scatter(trial: Results, other: str | None = None) -> Sheet:
     """Standard deviations of another policy, the second if None, over those of the first."""
     first, other = trial.subjects[0].name, other or trial.subjects[1].name
-    rows = {figure: {"figure": figure} for figure in trial.kind.compared}
-    for ratio in trial.ratios:
-        if ratio.other == other:
-            rows[ratio.figure][ratio.case or "all"] = interval(ratio).replace(" to ", "-")
-    for figure, row in rows.items():
-        row["paper, all"] = number(PAPER_RATIOS.get(figure, math.nan), 2)
-    return sheet(
-        f"Standard deviations, {other} over {first}, with 95 % bootstrap intervals",
-        rows.values(),
-        f"all: ratio of the means over {', '.join(trial.pooled)}.",
-        "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30 "
-        "(reading A4).",
-        verdict(trial, other),
+    ratios = [ratio for ratio in trial.ratios if ratio.other == other]
+    rows = []
+    for figure in trial.kind.compared:
+        cells = [interval(r).replace(" to ", "-") for r in ratios if r.figure == figure]
+        rows.append((figure, *cells, number(PAPER_RATIOS.get(figure, math.nan), 2)))
+    cases = dict.fromkeys(ratio.case or "all" for ratio in ratios)
+    return Sheet(
+        title=f"Standard deviations, {other} over {first}, with 95 % bootstrap intervals",
+        columns=("figure", *cases, "paper, all"),
+        rows=tuple(rows),
+        notes=(
+            f"all: ratio of the means over {', '.join(trial.pooled)}.",
+            "paper: naive over matched; its Table III gives 2.08 in distance, its text has 2.30 "
+            "(reading A4).",
+            verdict(trial, other),
+        ),
     )
 
 

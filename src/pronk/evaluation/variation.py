@@ -5,7 +5,6 @@ Every point has the script, starts, noise and times of every other point.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,9 +12,10 @@ from typing import Unpack
 
 import msgspec
 
+from pronk.evaluation import tables
 from pronk.evaluation.jumps import JumpFigures
 from pronk.evaluation.results import Cell, Kind, Results
-from pronk.evaluation.tables import Sheet, landed, number, sheet
+from pronk.evaluation.tables import Sheet, landed
 from pronk.evaluation.trial import Plan, Setup, run_trial
 from pronk.virtual.sim_params import SimParams, with_changes
 
@@ -152,17 +152,15 @@ def table(results: Results) -> Sheet:
                 lines = (line(results, each.name, policy, case.name) for case in results.cases)
                 cells = [cell for cells in lines for cell in cells if cell.value == value]
                 known = [cell.figures for cell in cells if cell.found]
-                row = {
-                    "parameter, policy": f"{each.says}, {policy}",
-                    "value": f"{value:g} {each.unit}".removesuffix(" 1"),
-                    "landed": landed(cells),
-                }
-                for name in ("height", "distance"):
-                    mean = sum(one[name].mean for one in known) / len(known) if known else math.nan
-                    row[f"{name} [m]"] = number(mean)
-                rows.append(row)
-    return sheet(
-        "Virtual robot, one parameter varied at a time",
+                means = [
+                    sum(one[name].mean for one in known) / len(known) if known else None
+                    for name in ("height", "distance")
+                ]
+                at = f"{value:g} {each.unit}".removesuffix(" 1")
+                rows.append((f"{each.says}, {policy}", at, landed(cells), *means))
+    return tables.table(
+        "parameter, policy | value | landed | height [m] | distance [m]",
         rows,
         "Means of the commands' means, over the jumps that there were.",
+        title="Virtual robot, one parameter varied at a time",
     )

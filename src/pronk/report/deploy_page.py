@@ -14,11 +14,11 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from pronk.errors import PronkError
-from pronk.evaluation.tables import Sheet
+from pronk.evaluation.tables import Sheet, table
 from pronk.report import deploy_run as run
 from pronk.report import style
 from pronk.report.deploy_run import Delay, faults, jumps, seconds
-from pronk.report.page import Part, table
+from pronk.report.page import Part
 from pronk.report.style import drawing, joint_words, key, legend, picture
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec

@@ -17,12 +17,12 @@ from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.crossing import CROSSING, Climb, climbs
 from pronk.evaluation.jumps import FIGURES
 from pronk.evaluation.results import Cell, Results, share_interval
-from pronk.evaluation.tables import Sheet, figure_row, number, place, verdict
+from pronk.evaluation.tables import Sheet, figure_row, number, place, table, verdict
 from pronk.evaluation.variation import VARIATION, parameters_of
 from pronk.evaluation.walk import SETTLE_S, WALK, WALK_FIGURES
 from pronk.report import trial_figures as draw
 from pronk.report import trial_page
-from pronk.report.page import Part, table
+from pronk.report.page import Part
 from pronk.report.paper import GAPS, WALKS, published_jumps
 from pronk.report.style import picture
 from pronk.report.trial_figures import Array, Panel

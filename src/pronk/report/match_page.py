@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pronk.errors import ArtefactError, RobotError
-from pronk.evaluation.tables import Sheet
+from pronk.evaluation.tables import Sheet, table
 from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
@@ -18,7 +18,7 @@ from pronk.match.gains import MatchedGains
 from pronk.match.predict import Prediction, load_prediction
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult
 from pronk.report import figures
-from pronk.report.page import Part, page, table
+from pronk.report.page import Part, page
 from pronk.report.paper import published
 from pronk.report.style import joint_words, picture, rms
 from pronk.robots import load_robot

@@ -5,15 +5,13 @@ A page holds everything it shows and needs no network.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import jinja2
-import numpy as np
 
 from pronk import __version__
-from pronk.evaluation.tables import Sheet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,34 +40,6 @@ class Part:
     def anchor(self) -> str:
         """Begins the anchors of all its sections."""
         return f"{self.kind}{self.number or ''}"
-
-
-def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:
-    """Return a table; without a row it is left out of the page.
-
-    Args:
-        columns: Headers with ` | ` between them; `;2` behind one sets the digits of its numbers,
-            3 without it.
-        rows: Cells: text, numbers, and intervals as pairs of numbers; `held` for an empty one.
-        notes: Below the table.
-        title: Above it.
-    """
-    heads = [head.partition(";") for head in columns.split(" | ")]
-    cells = tuple(
-        tuple(_cell(cell, int(head[2] or 3)) for cell, head in zip(row, heads, strict=True))
-        for row in rows
-    )
-    names = tuple(head[0] for head in heads)
-    return Sheet(title=title, columns=names, rows=cells, notes=notes)
-
-
-def _cell(value: Any, digits: int) -> str:
-    if isinstance(value, str | int):
-        return str(value)
-    if isinstance(value, tuple):
-        same = value[0] == value[1]
-        return "held" if same else " to ".join(_cell(one, digits) for one in value)
-    return f"{value:.{digits}f}" if value is not None and np.isfinite(value) else "-"
 
 
 def _signs(text: str) -> str:

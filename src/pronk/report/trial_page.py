@@ -17,7 +17,7 @@ from pronk.evaluation.protocol import RATES, in_paper_order
 from pronk.evaluation.results import SUMMARY, Results, load, share_interval
 from pronk.report import style
 from pronk.report import trial_figures as draw
-from pronk.report.page import Part, table
+from pronk.report.page import Part
 from pronk.report.paper import published_jumps
 from pronk.report.style import picture, rms
 from pronk.report.trial_figures import Values
@@ -180,7 +180,7 @@ def _trace_figures(trial: Results, folder: Path) -> dict[str, Any]:
         made["rates"] = picture(draw.traces(quantities, x_label=x_label, level=0.0), dense=True)
         rows = [(name, rate_rms(roll[name]), rate_rms(pitch[name])) for name in roll]
         columns = "policy | roll rate, RMS [rad/s];2 | pitch rate, RMS [rad/s];2"
-        made |= {"rates_table": table(columns, rows), "rates_case": RATES.name}
+        made |= {"rates_table": tables.table(columns, rows), "rates_case": RATES.name}
     made["captured"] = sum(len(runs) for cases in height.values() for runs in cases.values())
     standing = float(trial.rules.get("standing_height", np.nan))
     label = "time since the jump input [s]"
@@ -205,4 +205,4 @@ def _setup(trial: Results) -> tables.Sheet:
         gains = one.contract.get("gains", "unknown")
         rows.append((one.name, gains, ", ".join(groups.values()), one.path, one.sha256))
     heads = "policy | gains | stiffness [N m/rad] / damping [N m s/rad] | file | SHA-256"
-    return table(heads, rows)
+    return tables.table(heads, rows)

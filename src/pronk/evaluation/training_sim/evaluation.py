@@ -35,7 +35,7 @@ from pronk.evaluation.jumps import (
 )
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.results import Spread, load_json, save_json
-from pronk.evaluation.tables import Sheet, check_sheet, number, percent, sheet, spread
+from pronk.evaluation.tables import Sheet, check_sheet, number, percent, spread, table
 from pronk.evaluation.walk import measure_walk, walk_script
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import STILL, Script
@@ -277,38 +277,23 @@ def load_speed_errors(path: Path) -> dict[str, float]:
 
 def sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
     """The tables of an evaluation."""
-    errors = (("speed error [m/s]", "speed_error"), ("yaw rate error [rad/s]", "yaw_error"))
-    walks = [
-        {"command": walk.name}
-        | {
-            words: f"{number(walk[name].mean)} ({number(walk[f'{name}_averaged'].mean)})"
-            for words, name in errors
-        }
-        | {
-            "mean velocity [m/s, m/s, rad/s]": ", ".join(
-                number(walk[name].mean, 2) for name in ("forward", "left", "yaw_rate")
-            ),
-            "drift [m]": number(walk["drift"].mean, 2),
-            "falls [%]": percent(walk["fell"].mean),
-            "flight over standing [cm]": percent(walk["uncommanded"].most),
-        }
-        for walk in evaluation.walks
-    ]
+    walks = []
+    for walk in evaluation.walks:
+        errors = (
+            f"{number(walk[name].mean)} ({number(walk[f'{name}_averaged'].mean)})"
+            for name in ("speed_error", "yaw_error")
+        )
+        velocity = ", ".join(number(walk[n].mean, 2) for n in ("forward", "left", "yaw_rate"))
+        shares = percent(walk["fell"].mean), percent(walk["uncommanded"].most)
+        walks.append((walk.name, *errors, velocity, walk["drift"].mean, *shares))
     jumps = [
-        {
-            "command": jump.name,
-            "height [m]": spread(jump["height"]),
-            "distance [m]": spread(jump["distance"], 2),
-            "lift-off up [m/s]": spread(jump["lift_off_velocity"], 2),
-            "after [s]": spread(jump["delay"], 2),
-            "along [m]": number(jump["along"].mean, 2),
-            "flights": number(jump["flights"].mean, 2),
-            "high ones": number(jump["high_flights"].mean, 2),
-            "one [%]": percent(jump["single"].mean),
-            "jumped [%]": percent(jump["found"].mean),
-            "upright [%]": percent(jump["upright"].mean),
-            "non-foot contact [%]": percent(jump["non_foot_contact"].mean),
-        }
+        (
+            jump.name,
+            spread(jump["height"]),
+            *(spread(jump[name], 2) for name in ("distance", "lift_off_velocity", "delay")),
+            *(jump[name].mean for name in ("along", "flights", "high_flights")),
+            *(percent(jump[n].mean) for n in ("single", "found", "upright", "non_foot_contact")),
+        )
         for jump in evaluation.jumps
     ]
     notes, estimator = [], evaluation.estimator
@@ -324,14 +309,20 @@ def sheets(evaluation: Evaluation) -> tuple[Sheet, ...]:
         f"{evaluation.seconds:.0f} s"
     )
     found = (
-        sheet(
-            "Walking: mean over robots and time; in brackets with the stride averaged out", walks
+        table(
+            "command | speed error [m/s] | yaw rate error [rad/s] | mean velocity [m/s, m/s, rad/s]"
+            " | drift [m];2 | falls [%] | flight over standing [cm]",
+            walks,
+            title="Walking: mean over robots and time; in brackets with the stride averaged out",
         ),
-        sheet(
-            "Jumping: mean +- standard deviation over robots",
+        table(
+            "command | height [m] | distance [m] | lift-off up [m/s] | after [s] | along [m];2"
+            " | flights;2 | high ones;2 | one [%] | jumped [%] | upright [%]"
+            " | non-foot contact [%]",
             jumps,
             "non-foot contact: anything but a foot on the ground, from the jump input to 2 s after "
             "touchdown; a trial counts no such jump as a success.",
+            title="Jumping: mean +- standard deviation over robots",
         ),
         check_sheet("Acceptance criteria", evaluation_checks(evaluation), *notes),
     )
