@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace
-from pronk.simulators.mujoco import simulate
+from pronk.simulators.mujoco import MujocoSimulator
 from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
@@ -52,6 +52,30 @@ def coloured_noise(
     return np.asarray(deviation * lfilter([1.0], [1.0, -a], white, axis=-1))
 
 
+def simulate(
+    robot: RobotSpec,
+    trace: CommandTrace,
+    stiffness: ArrayLike,
+    damping: ArrayLike,
+    *,
+    armature: float | None = None,
+    frictionloss: float | None = None,
+    threads: int = 2,
+) -> Array:
+    """Simulate one command in the training simulator with many gain pairs; see `JointRigs.play`.
+
+    It begins at rest where gravity leaves the joint with its first command. Gains [N m/rad,
+    N m s/rad] are scalars or of shape (b,); the drive's armature and friction if None.
+    """
+    gains = np.broadcast_arrays(np.atleast_1d(stiffness), np.atleast_1d(damping))
+    values = dict(zip(("stiffness", "damping"), (np.asarray(g, float) for g in gains), strict=True))
+    for name, value in (("armature", armature), ("frictionloss", frictionloss)):
+        if value is not None:
+            values[name] = np.full(len(values["stiffness"]), value)
+    with MujocoSimulator(robot, threads=threads) as simulator:
+        return simulator.play(trace, values)
+
+
 def synthetic_log(
     robot: RobotSpec,
     joint: str,
@@ -78,7 +102,7 @@ def synthetic_log(
             log (signal by signal, repeat by repeat), each at least as long as the segment.
         delay_s: From a command to its effect [s], not necessarily whole steps.
         simulator: Rigs of another simulator, which then also gives the timestep.
-        options: Those of `pronk.simulators.mujoco.simulate`.
+        options: Those of `simulate`.
 
     Returns:
         A log of this joint alone; its `stiffness` and `damping` are those of the robot's drive, not

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pronk.policy.contract import METADATA_KEY, Contract, measured_layout, to_json
-from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
+from pronk.policy.observation import ESTIMATE, JOINTS, MEASURED_SIZE
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")

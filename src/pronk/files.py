@@ -65,14 +65,8 @@ def stored_arrays(
 ) -> Iterator[tuple[dict[str, Any], Mapping[str, Any]]]:
     """Open what `save_arrays` wrote: the header and the arrays by name, read inside the block.
 
-    Args:
-        path: The file.
-        schema: The schema that this pronk reads.
-        what: What the file is, for errors, as in `a match file`.
-        writer: The command that writes one, for errors.
-
-    Raises:
-        ArtefactError: Missing, damaged, of another schema, or the block fails.
+    An ArtefactError says that the file is missing, damaged, of another schema, or that the block
+    failed; it names `what` the file is (as in `a match file`) and the command that writes one.
     """
     try:
         with np.load(path, allow_pickle=False) as stored:

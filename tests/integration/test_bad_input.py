@@ -15,11 +15,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+import log_files
 from command_line import refused
-from log_files import write_csv, write_npz
 from pronk.errors import LogError, PronkError, RobotError
-from pronk.logs.joint_log import JointLog
-from pronk.logs.mcap_log import write_mcap
 from pronk.logs.readers import read_log, read_logs
 from pronk.robots import load_robot
 
@@ -238,17 +236,10 @@ class Files(dict[str, bytes]):
 
 @pytest.fixture(scope="module")
 def valid(tmp_path_factory: pytest.TempPathFactory) -> Files:
-    folder, time = tmp_path_factory.mktemp("valid"), np.arange(60) / 500.0
-    log = JointLog(
-        robot="mini_cheetah",
-        joints=("FR_knee",),
-        time=time,
-        command=np.sin(time)[:, None],
-        position=np.cos(time)[:, None],
-    )
-    write_csv(folder / "v.csv", log)
-    write_npz(folder / "v.npz", log)
-    write_mcap(folder / "v.mcap", log)
+    folder, log = tmp_path_factory.mktemp("valid"), log_files.example(60, ("FR_knee",))
+    log_files.write_csv(folder / "v.csv", log)
+    log_files.write_npz(folder / "v.npz", log)
+    log_files.write_mcap(folder / "v.mcap", log)
     (folder / "v.pt").write_bytes(archive(*pace()))
     for suffix, options in OPTIONS.items():
         assert len(read_log(folder / f"v{suffix}", robot=ROBOT, **options).time) == 60

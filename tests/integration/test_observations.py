@@ -18,7 +18,7 @@ from torch import Tensor
 
 import training_env
 from parts import where
-from pronk.policy import layout
+from pronk.policy.observation import ACTOR_INDICES, MEASURED
 from pronk.robots.legged import legged
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
@@ -65,7 +65,7 @@ def observe(env: Any) -> dict[str, Tensor]:
 
 
 def measured(observation: dict[str, Tensor], name: str) -> Tensor:
-    return observation["measured"][:, list(layout.MEASURED[name].indices)]
+    return observation["measured"][:, list(MEASURED[name])]
 
 
 def close(found: Tensor, expected: Any, atol: float = 1e-5) -> None:
@@ -230,7 +230,7 @@ def test_measured_vector_of_steps_and_of_a_new_episode(env: Any) -> None:
     close(measured(seen, "joint_position"), np.hstack([q for q, _ in states[-3:]]))
     close(measured(seen, "joint_velocity"), np.hstack([v for _, v in states[-3:]]))
     close(measured(seen, "action"), np.hstack(actions[-2:]))
-    actor = seen["measured"][:, list(layout.ACTOR_INDICES)]
+    actor = seen["measured"][:, list(ACTOR_INDICES)]
     close(actor[:, 9:], np.hstack([*states[-1], actions[-1]]))
     # A new episode begins with the present as its past; the other robots' histories stay.
     anew = env.reset(env_ids=torch.tensor([4]))[0]

@@ -1,4 +1,4 @@
-"""Log readers: round trips, real recordings, timestamps and plausibility."""
+"""Log readers: round trips, real recordings, timestamps, plausibility, bags, and plugins."""
 
 from __future__ import annotations
 
@@ -11,47 +11,22 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap_ros2.writer import Writer as RosWriter
 
 import pronk
-from log_files import write_csv, write_npz
+from command_line import invoke
+from log_files import example, write_csv, write_mcap, write_npz
 from pronk.errors import LogError, RobotError
-from pronk.logs.checks import check_motion, check_rate, check_unit, examine, time_at_ends
-from pronk.logs.joint_log import JointLog, Segment
-from pronk.logs.mcap_log import write_mcap
-from pronk.logs.readers import read_log, read_logs
+from pronk.logs.checks import check_motion, check_rate, check_unit, examine, saturation_note
+from pronk.logs.joint_log import JointLog
+from pronk.logs.readers import read_log, read_logs, readers
 from pronk.robots import load_robot
+from pronk.testing import check_reader
 
 SHARED = Path(pronk.__file__).parents[3] / "shared"
 SO101 = SHARED / "data" / "so101"
 RECORDINGS = ("backlash_detection", "chirp_sweep", "multisine", "sinusoidal_sweep", "step_response")
 recorded = pytest.mark.skipif(not SO101.is_dir(), reason="the shared recordings are not here")
-
-
-def example(n: int = 500) -> JointLog:
-    """Two joints of a leg at 500 Hz."""
-    time = np.arange(n) / 500.0
-    command = np.stack([0.2 * np.sin(6.0 * time), np.full(n, 0.5)], axis=1)
-    return JointLog(
-        robot="mini_cheetah",
-        joints=("FR_hip_roll", "FR_knee"),
-        time=time,
-        command=command,
-        position=0.9 * command,
-        velocity=np.gradient(command, time, axis=0),
-        torque=17.0 * 0.1 * command,
-        frequency=np.full(n, 6.0 / (2.0 * np.pi)),
-        segments=(
-            Segment(
-                kind="chirp",
-                joints=("FR_hip_roll",),
-                start=0.1,
-                stop=0.9,
-                amplitude=0.2,
-                band_hz=(0.1, 25.0),
-            ),
-        ),
-        pose=np.array([0.0, 0.5]),
-    )
 
 
 # --- real recordings ----------------------------------------------------------------------------
@@ -155,21 +130,18 @@ def test_sage_command_is_the_one_in_force(tmp_path: Path) -> None:
 # --- round trips --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["mcap", "npz", "csv"])
-def test_round_trip(tmp_path: Path, kind: str) -> None:
-    log = example()
-    path = tmp_path / f"a.{kind}"
-    {"mcap": write_mcap, "npz": write_npz, "csv": write_csv}[kind](path, log)
-    back = read_log(path, unit=None if kind == "mcap" else "rad")
-    for name in ("time", "command", "position", "velocity", "torque"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(log, name), err_msg=name)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("a.npz", {}), ("a.csv", {}), ("A.CSV", {}), ("a.txt", {"format": "csv"})],
+)
+def test_round_trip(tmp_path: Path, name: str, options: dict[str, str]) -> None:
+    log, path = example(), tmp_path / name
+    (write_npz if name == "a.npz" else write_csv)(path, log)
+    back = read_log(path, unit="rad", **options)  # type: ignore[arg-type]
+    for quantity in ("time", "command", "position", "velocity", "torque"):
+        np.testing.assert_array_equal(getattr(back, quantity), getattr(log, quantity))
     assert back.joints == log.joints
-    if kind != "mcap":
-        assert back.segments[0].amplitude == pytest.approx(0.2, rel=1e-3)
-    else:
-        assert back.segments == log.segments
-        assert back.robot == log.robot
-        np.testing.assert_array_equal(back.frequency, log.frequency)  # type: ignore[arg-type]
+    assert back.segments[0].amplitude == np.ptp(log.command[:, 0]) / 2.0
 
 
 @settings(max_examples=30, deadline=None)
@@ -236,12 +208,6 @@ def test_pace_recording_without_pytorch_gives_pytorchs_numbers(tmp_path: Path) -
     assert done.stdout.split() == ["j11", "False"]
 
 
-def test_an_upper_case_ending_and_an_explicit_format(tmp_path: Path) -> None:
-    for name, options in (("A.CSV", {}), ("a.txt", {"format": "csv"})):
-        write_csv(tmp_path / name, example())
-        assert len(read_log(tmp_path / name, unit="rad", **options).time) == 500
-
-
 # --- timing -------------------------------------------------------------------------------------
 
 
@@ -300,7 +266,7 @@ def test_exact_duplicates_can_be_dropped_and_are_mentioned(tmp_path: Path) -> No
     np.testing.assert_array_equal(back.time, log.time)
     assert any(note.startswith("3 rows") for note in back.notes)
     # The same timestamp with another value is not a duplicate, and stays an error.
-    text[9] = text[9].replace(",", ",1", 1)
+    text[9] = ",".join([repr(float(log.time[7])), "0.5", "0.5"])
     path.write_text("\n".join(text))
     with pytest.raises(LogError, match="repeats the timestamp"):
         read_log(path, unit="rad", drop_duplicates=True)
@@ -334,12 +300,12 @@ SWING = 0.25 * np.sin(2.0 * np.pi * np.cumsum(np.linspace(0.1, 8.0, 4000)) / 200
 
 def test_motion_that_passes() -> None:
     check_motion(moved(0.8 * SWING, SWING), "FR_knee")
-    assert time_at_ends(moved(0.8 * SWING, SWING), "FR_knee") == 0.0
+    assert not saturation_note(moved(0.8 * SWING, SWING), "FR_knee")
     # A joint with a dead band (play operator) rests at every turn, which is not saturation.
     position = np.zeros(len(SWING))
     for k in range(1, len(SWING)):
         position[k] = np.clip(position[k - 1], SWING[k] - 0.1, SWING[k] + 0.1)
-    assert time_at_ends(moved(position, SWING), "FR_knee") < 0.05
+    assert not saturation_note(moved(position, SWING), "FR_knee")
 
 
 @pytest.mark.parametrize("limits", [(-0.05, 1.0), (-1.0, 0.1)])
@@ -377,3 +343,178 @@ def test_a_log_of_another_robot_is_refused(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", replace(example(), robot="so101"))
     with pytest.raises(LogError, match=r"so101.*mini_cheetah"):
         read_log(tmp_path / "a.mcap", robot=load_robot("mini_cheetah"))
+
+
+# --- ROS 2 bags -----------------------------------------------------------------------------------
+
+JOINT_STATE = """\
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+ARRAY = "float64[] data\n"
+
+
+def bag(path: Path, *, stamped: bool = True, command: str = "/joint_command") -> None:
+    """Two joints at 200 Hz, commands at 50 Hz, recorded by rosbag2 into MCAP."""
+    with path.open("wb") as stream, RosWriter(stream) as writer:
+        state = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+        plain = writer.register_msgdef("std_msgs/msg/Float64MultiArray", ARRAY)
+        for k in range(400):
+            when = 100.0 + k / 200.0
+            nano = round(when * 1e9)
+            stamp = {"sec": int(when), "nanosec": round(when % 1.0 * 1e9)}
+            header = {"stamp": stamp if stamped else {"sec": 0, "nanosec": 0}, "frame_id": ""}
+            message = {"header": header, "velocity": [], "effort": []}
+            if k >= 8 and k % 4 == 0:
+                values = [np.sin(0.1 * k), 2.0]
+                if command == "/array":
+                    writer.write_message(command, plain, {"data": values}, nano, nano)
+                else:
+                    order = {"name": ["hip", "knee"], "position": values[::-1]}
+                    writer.write_message(command, state, message | order, nano, nano)
+            states = {"name": ["knee", "hip"], "position": [np.sin(0.1 * k - 0.2), 2.1]}
+            writer.write_message("/joint_states", state, message | states, nano, nano)
+
+
+def test_a_bag_with_two_joint_state_topics(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    bag(path)
+    log = read_log(path, command_topic="/joint_command")
+    assert log.joints == ("knee", "hip")
+    assert log.rate_hz == pytest.approx(200.0)
+    # States before the first command are dropped; the command is the last at or before a state.
+    assert len(log.time) == 392
+    k = np.arange(8, 400)
+    np.testing.assert_allclose(log.command[:, 0], np.sin(0.1 * (k - k % 4)))
+    np.testing.assert_allclose(log.command[:, 1], 2.0)
+    np.testing.assert_allclose(log.position[:, 0], np.sin(0.1 * k - 0.2))
+    assert log.velocity is None
+    assert any("8 states before the first command" in note for note in log.notes)
+
+
+def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    bag(tmp_path / "bag_0.mcap", stamped=False, command="/array")
+    log = read_log(tmp_path, command_topic="/array", command_field="data")
+    k = np.arange(8, 400)
+    np.testing.assert_allclose(log.command[:, 0], np.sin(0.1 * (k - k % 4)))
+    assert any("times of reception" in note for note in log.notes)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "command_topic is missing"),
+        ({"command_topic": "/elsewhere"}, "no commands on /elsewhere"),
+        ({"measured_topic": "/imu", "command_topic": "/joint_command"}, "no sensor_msgs.* on /imu"),
+        ({"command_topic": "/joint_command", "command_field": "velocity"}, "holds 0 values"),
+        ({"command_topic": "/joint_command", "command_field": "points.0"}, "no field 'points.0'"),
+        ({"command_topic": "/joint_command", "command_field": "header"}, "not a list of numbers"),
+    ],
+)
+def test_a_wrong_topic_or_field_lists_what_there_is(
+    tmp_path: Path, options: dict[str, str], words: str
+) -> None:
+    path = tmp_path / "bag.mcap"
+    bag(path)
+    with pytest.raises(LogError, match=words) as caught:
+        read_log(path, **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    if "topic" in words:
+        assert "/joint_states (sensor_msgs/msg/JointState)" in str(caught.value)
+
+
+def test_the_topics_are_options_of_the_command_line(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    bag(path)
+    done = invoke(["response", path, "--command-topic", "/elsewhere"])
+    assert done.exit_code == 2
+    assert "no commands on /elsewhere" in done.stderr
+
+
+# --- a format of another package ------------------------------------------------------------------
+
+READER = '''
+"""Reader of semicolon-separated logs: time; command; position, angles in turns."""
+
+import hashlib
+
+import numpy as np
+
+from pronk.errors import LogError
+from pronk.logs.joint_log import JointLog
+from pronk.logs.readers import reader
+
+
+@reader("turns", ".turns")
+def read_turns(path, *, robot=None, joint="knee", sign: float = 1.0):
+    """Read one joint."""
+    try:
+        data = path.read_bytes()
+        rows = np.array([[float(v) for v in line.split(b";")] for line in data.splitlines()])
+        time, command, position = rows.T
+    except (OSError, ValueError) as error:
+        raise LogError(f"{path}: no log in turns ({error}).") from None
+    scale = 2.0 * np.pi * sign
+    return JointLog(
+        robot="unknown" if robot is None else robot.name,
+        joints=(joint,),
+        time=time,
+        command=scale * command[:, None],
+        position=scale * position[:, None],
+        source=str(path),
+        sha256=hashlib.sha256(data).hexdigest(),
+    )
+'''
+
+
+@pytest.fixture
+def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Install the reader as a package of its own and write a log of its format."""
+    site = tmp_path / "site"
+    info = site / "turns_reader-1.0.dist-info"
+    info.mkdir(parents=True)
+    (site / "turns_reader.py").write_text(READER)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: turns-reader\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[pronk.readers]\nturns = turns_reader:read_turns\n")
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.delitem(sys.modules, "turns_reader", raising=False)
+    time = np.arange(5000) / 500.0
+    command = 0.04 * np.sin(2.0 * np.pi * (0.5 + 0.5 * time) * time)
+    position = 0.95 * np.interp(time - 0.01, time, command)
+    path = tmp_path / "chirp.turns"
+    np.savetxt(path, np.stack([time, command, position], axis=1), delimiter=";", fmt="%.9f")
+    return path
+
+
+def test_a_reader_of_another_package_is_found_and_conforms(recording: Path) -> None:
+    check_reader(readers()["turns"], recording)
+    log = read_log(recording, joint="elbow", sign=-1.0)
+    assert log.joints == ("elbow",)
+    assert np.abs(log.command).max() == pytest.approx(2.0 * np.pi * 0.04, rel=1e-3)
+    with pytest.raises(LogError, match="columns"):
+        read_log(recording, columns={"time": "t"})
+
+
+def test_the_command_line_reads_it(recording: Path, tmp_path: Path) -> None:
+    options = ["--reader-option", "joint=elbow", "--reader-option", "sign=-1"]
+    done = invoke(["response", recording, *options, "--out", tmp_path / "out", "--no-plots"])
+    assert done.exit_code == 0, done.stderr
+    assert "elbow" in done.stdout
+
+
+def test_a_broken_package_leaves_the_other_formats(recording: Path) -> None:
+    (recording.parent / "site" / "turns_reader.py").write_text("import no_such_module")
+    with pytest.warns(UserWarning, match="turns_reader"):
+        assert "turns" not in readers()

@@ -13,6 +13,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.synthetic_log import simulate
+
 pytest.importorskip("mjlab")
 
 import torch
@@ -23,7 +25,6 @@ from scipy.signal import chirp
 
 from pronk.robots.model import bench_spec
 from pronk.simulators.command_trace import CommandTrace
-from pronk.simulators.mujoco import simulate
 from pronk.train.mdp.actions import NAME as ACTION
 from pronk.train.mdp.actuators import actuators
 from pronk.train.phases import TASKS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import chirp
 
-from pronk.actuator.model import clip_torque, pd_torque
+from pronk.actuator.model import pd_torque, torque_limits
 from pronk.errors import RobotError
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec, free_spec, set_drive_gains, set_passive
@@ -76,9 +77,8 @@ def explicit_law(
         positions.append(data.qpos.copy())
         wanted = pd_torque(target, data.qpos, data.qvel, stiffness=stiffness, damping=damping)
         for i, drive in enumerate(drives):
-            data.ctrl[i] = clip_torque(
-                wanted[i], data.qvel[i], drive.stall_torque, drive.no_load_speed, drive.effort_limit
-            )
+            limits = drive.stall_torque, drive.no_load_speed, drive.effort_limit
+            data.ctrl[i] = np.clip(wanted[i], *torque_limits(data.qvel[i], *limits))
         clipped += bool(np.any(data.ctrl != wanted))
         mujoco.mj_step(model, data)
     return np.array(positions), clipped / len(command)
@@ -118,10 +118,15 @@ def test_bench_is_the_free_robot_with_its_base_held(name: str) -> None:
     np.testing.assert_allclose(small.site(foot).xpos, large.site(foot).xpos, atol=1e-12)
 
 
-def changed_knee(**changes: Any) -> RobotSpec:
-    knee = replace(CHEETAH.joint("FR_knee"), **changes)
-    joints = (knee if j.name == knee.name else j for j in CHEETAH.joints)
-    return replace(CHEETAH, joints=tuple(joints))
+def changed(
+    name: str = "FR_knee", drive: Mapping[str, float] | None = None, **own: Any
+) -> RobotSpec:
+    """The robot with other values of one joint and its drive."""
+    joint = CHEETAH.joint(name)
+    joint = replace(joint, drive=replace(joint.drive, **drive or {}), **own)
+    return replace(
+        CHEETAH, joints=tuple(joint if each.name == name else each for each in CHEETAH.joints)
+    )
 
 
 def assert_equal_models(a: mujoco.MjModel, b: mujoco.MjModel) -> None:
@@ -131,17 +136,15 @@ def assert_equal_models(a: mujoco.MjModel, b: mujoco.MjModel) -> None:
             np.testing.assert_array_equal(value, getattr(b, field), err_msg=field)
 
 
-def recompiled(name: str, **parameters: float) -> mujoco.MjModel:
-    return bench_spec(CHEETAH, name, **{k: {name: v} for k, v in parameters.items()}).compile()
-
-
 @pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll", "HL_hip_pitch"])
-@pytest.mark.parametrize("armature", [0.0, 0.005484])
-def test_edited_model_is_the_recompiled_one(name: str, armature: float) -> None:
-    model = recompiled(name, frictionloss=0.0)
-    set_drive_gains(model, name, CHEETAH.joint(name).drive, 21.8, 0.541)
-    set_passive(model, name, armature=armature, frictionloss=0.35)
-    again = recompiled(name, stiffness=21.8, damping=0.541, armature=armature, frictionloss=0.35)
+@pytest.mark.parametrize("rotor_inertia", [0.0, 63e-6])
+def test_edited_model_is_the_recompiled_one(name: str, rotor_inertia: float) -> None:
+    robot = changed(name, {"rotor_inertia": rotor_inertia, "frictionloss": 0.35})
+    drive = robot.joint(name).drive
+    model = bench_spec(CHEETAH, name).compile()
+    set_drive_gains(model, name, drive, 21.8, 0.541)
+    set_passive(model, name, armature=drive.armature, frictionloss=0.35)
+    again = bench_spec(robot, name, stiffness={name: 21.8}, damping={name: 0.541}).compile()
     assert_equal_models(model, again)
     command = commands(model, name, held_chirp(CHEETAH, 1.0, 0.1))
     np.testing.assert_array_equal(simulate(model, command), simulate(again, command))
@@ -156,12 +159,12 @@ def test_a_joint_that_is_absent_or_not_in_the_chain_is_refused() -> None:
     with pytest.raises(RobotError, match="FR_kneee"):
         bench_spec(CHEETAH, "FR_knee", stiffness={"FR_kneee": 1.0})
     with pytest.raises(RobotError, match="FR_hip_pitch"):
-        bench_spec(changed_knee(clamped=("FR_hip_roll",)), "FR_knee")
+        bench_spec(changed(clamped=("FR_hip_roll",)), "FR_knee")
 
 
 def test_knee_alone_is_the_second_order_joint_of_the_paper() -> None:
     """M2 at a fine step: I s^2 + (Kd + b) s + Kp, with I from the CAD figures by hand."""
-    spec = bench_spec(CHEETAH, "FR_knee", frictionloss={"FR_knee": 0.0})
+    spec = bench_spec(changed(drive={"frictionloss": 0.0}), "FR_knee")
     spec.option.timestep = 1e-4
     spec.option.gravity = (0.0, 0.0, 0.0)
     model = spec.compile()
@@ -180,9 +183,7 @@ def test_knee_alone_is_the_second_order_joint_of_the_paper() -> None:
     np.testing.assert_allclose(position, expected, atol=3e-4)
 
 
-WEAK = changed_knee(
-    drive=replace(CHEETAH.joint("FR_knee").drive, stall_torque=12.0, no_load_speed=10.0)
-)
+WEAK = changed(drive={"stall_torque": 12.0, "no_load_speed": 10.0})
 """A weak motor, so that back-EMF rather than the effort limit is what saturates."""
 
 

@@ -61,12 +61,11 @@ def test_limits_at_stall_corner_no_load_and_beyond() -> None:
     np.testing.assert_allclose(high[2:5], line, atol=1e-12)
 
 
-@given(speed=st.floats(-100.0, 100.0), torque=st.floats(-100.0, 100.0))
-def test_clip_is_odd_bounded_and_idempotent(speed: float, torque: float) -> None:
-    out = drive.clip_torque(torque, speed, *LINE)
-    assert abs(out) <= 17.0
-    assert drive.clip_torque(-torque, -speed, *LINE) == -out
-    assert drive.clip_torque(out, speed, *LINE) == out
+@given(speed=st.floats(-100.0, 100.0))
+def test_limits_are_odd_and_bounded(speed: float) -> None:
+    low, high = drive.torque_limits(speed, *LINE)
+    assert -17.0 <= low <= high <= 17.0
+    assert drive.torque_limits(-speed, *LINE) == (-high, -low)
 
 
 def test_winding_loss_is_copper_loss() -> None:

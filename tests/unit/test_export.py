@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pronk.actuator.model import clip_torque
+from pronk.actuator.model import torque_limits
 from pronk.errors import PronkError
 from pronk.match.export import EXPORTS, export_text, group_drives
 from pronk.match.gains import JointGains, MatchedGains
@@ -112,13 +112,8 @@ def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law(robot: str) -> None:
             torque = group.stiffness * (data.actuator(joint.name).ctrl[0] - q)
             torque -= group.damping * speed
             drive = joint.drive
-            expected = clip_torque(
-                torque,
-                speed,
-                stall_torque=drive.stall_torque,
-                no_load_speed=drive.no_load_speed,
-                effort_limit=drive.effort_limit,
-            )
+            limits = drive.stall_torque, drive.no_load_speed, drive.effort_limit
+            expected = np.clip(torque, *torque_limits(speed, *limits))
             assert data.actuator(joint.name).force[0] == pytest.approx(float(expected), abs=1e-4)
             assert model.dof_armature[at.dofadr[0]] == pytest.approx(drive.armature, rel=1e-4)
 

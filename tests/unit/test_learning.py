@@ -26,7 +26,7 @@ from ppo_case import (
     weights,
 )
 from pronk.errors import ArtefactError, PronkError
-from pronk.policy.layout import ACTOR_INDICES, ESTIMATOR_INDICES
+from pronk.policy.observation import ACTOR_INDICES, ESTIMATOR_INDICES
 from pronk.train.rl import checkpoint
 from pronk.train.rl.networks import JUMP_WEIGHT, Estimator, RolloutNormalization
 from pronk.train.rl.ppo import EstimatorPPO

@@ -16,8 +16,7 @@ import pytest
 from hopper import DEFAULT, ROBOT, contract
 from pronk.errors import ArtefactError, PronkError
 from pronk.policy.contract import METADATA_KEY, check, from_json, measured_layout, to_json
-from pronk.policy.layout import MEASURED, MEASURED_SIZE
-from pronk.policy.observation import History, Measurement, finite
+from pronk.policy.observation import MEASURED, MEASURED_SIZE, History, Measurement, finite
 from pronk.policy.runtime import Policy, load_policy
 
 SCALE = np.full(12, 0.5)
@@ -163,7 +162,7 @@ def test_history_by_hand() -> None:
                 "command": command,
             }
             for name, values in expected.items():
-                found = vector[list(MEASURED[name].indices)]
+                found = vector[list(MEASURED[name])]
                 np.testing.assert_allclose(found, values, atol=1e-6)
             assert vector.dtype == np.float32
         history.reset()

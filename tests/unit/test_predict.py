@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from benchmarks.synthetic_log import simulate
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.predict import predict, r2, rmse
 from pronk.robots import load_robot
 from pronk.simulators.command_trace import command_trace
-from pronk.simulators.mujoco import simulate
 from pronk.simulators.simulator import SimulatorInfo
 
 ROBOT = load_robot("mini_cheetah")

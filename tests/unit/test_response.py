@@ -20,7 +20,6 @@ from pronk.response import (
     FrequencyResponse,
     H1Operator,
     estimate,
-    fit_delay,
     load,
     operators,
     save,
@@ -215,7 +214,7 @@ def test_ramped_and_unequal_periods_fall_out() -> None:
     time, command = multisine_command(500.0)
     ramped = [(time, command * np.clip(time / 1.0, 0.0, 1.0), None)]
     log = make_log(ramped, KNEE_JOINT, kind="multisine", period=4.0)
-    read = read_periods(log, "knee", Estimator())
+    read = read_periods(log, "knee", Estimator(), 500.0)
     assert len(read.command) == 3
     known = second_order(read.omega, **KNEE)
     assert np.abs(read.position / read.command / read.factor / known - 1.0).max() < 2e-4
@@ -237,15 +236,10 @@ def test_delay_is_recovered(delay: float) -> None:
     assert (gain < 0.005, phase < 0.5) == (True, True)
 
 
-def test_the_standard_error_of_the_delay_is_its_scatter() -> None:
-    fits = [
-        fit_delay(estimate(chirps(4, rate=500.0, noise=3e-3, seed=seed), "knee")[0])
-        for seed in range(12)
-    ]
-    delays = np.array([fit.delay_s for fit in fits])
-    claimed = float(np.mean([fit.standard_error_s for fit in fits]))
-    assert np.abs(delays).max() < 3e-4
-    assert 0.4 < float(delays.std(ddof=1)) / claimed < 2.5
+def test_noise_moves_the_delay_little() -> None:
+    for seed in range(4):
+        (response,) = estimate(chirps(4, rate=500.0, noise=3e-3, seed=seed), "knee")
+        assert abs(response.delay_s) < 3e-4
 
 
 def test_friction_shows_in_the_third_harmonic() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.integrate import cumulative_simpson
 
 from pronk.errors import PlanError
 from pronk.excitation.signals import Chirp, LogChirp, Multisine, Signal, SineSteps, ramps
-from pronk.logs.checks import correlation, correlation_note
+from pronk.logs.checks import correlation_note
 
 ALL: tuple[Signal, ...] = (Chirp(), LogChirp(), Multisine(), SineSteps())
 
@@ -140,14 +141,13 @@ def test_a_shifted_copy_is_found_though_it_does_not_correlate_at_lag_zero() -> N
     time = np.arange(2000) / 50.0
     pair = np.stack([np.sin(2 * np.pi * time), np.cos(2 * np.pi * time)], axis=1)
     assert abs(np.corrcoef(pair.T)[0, 1]) < 1e-3
-    assert correlation(pair, 50.0)[0, 1] > 0.95
-    note = correlation_note(pair, ["pan", "lift"], 50.0)
-    assert "pan" in note
-    assert "lift" in note
+    note = correlation_note(time, pair, ["pan", "lift"])
+    assert re.search(r"lift and pan correlate to (0\.9[5-9]|1\.00)", note)
 
 
 def test_still_commands_and_independent_noise_pass() -> None:
-    pair = np.stack([np.full(500, 0.3), np.sin(np.arange(500))], axis=1)
-    np.testing.assert_allclose(correlation(pair, 50.0), np.eye(2))
+    time = np.arange(6000) / 50.0
+    pair = np.stack([np.full(6000, 0.3), np.sin(time)], axis=1)
+    assert correlation_note(time, pair, ["pan", "lift"]) == ""
     noise = np.random.default_rng(0).normal(size=(6000, 4))
-    assert correlation_note(noise, list("abcd"), 50.0) == ""
+    assert correlation_note(time, noise, list("abcd")) == ""

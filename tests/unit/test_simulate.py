@@ -1,8 +1,9 @@
-"""Command traces and the test rig: the trajectories are those of the training simulator."""
+"""Simulators: command traces, trajectories of the training simulator, the protocol."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import mujoco.rollout
@@ -11,16 +12,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pronk.errors import LogError
+from benchmarks.synthetic_log import Excitation, simulate, synthetic_log
+from pronk.errors import LogError, PronkError
 from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog, Segment
+from pronk.match import MatchSettings, match_logs, predict
 from pronk.robots import load_robot
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace, policy_clock
-from pronk.simulators.mujoco import JointTestRig, simulate
+from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
+from pronk.simulators.simulator import RolloutRigs, joint_rigs, load_simulator
+from pronk.testing import check_simulator
 
 ROBOT = load_robot("mini_cheetah")
+EXAMPLE = f"{Path(__file__).parents[2] / 'examples' / 'my_simulator.py'}:Pendulum"
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
 
 
@@ -41,40 +47,23 @@ def short_chirp(amplitude: float = 0.25) -> np.ndarray:
 
 
 @pytest.mark.parametrize("joint", ["FR_hip_pitch", "FR_knee"])
-def test_positions_are_those_of_the_explicit_drive_stepped_in_python(joint: str) -> None:
+def test_positions_are_those_of_the_bench_model_stepped_from_rest(joint: str) -> None:
     trace = trace_of(joint, short_chirp(0.5))
     found = simulate(ROBOT, trace, 20.0, 0.5)[0]
-    spec = bench_spec(ROBOT, joint)
-    for actuator in list(spec.actuators):
-        name = actuator.target
-        spec.delete(actuator)
-        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    for key in list(spec.keys):
-        spec.delete(key)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    names = [model.joint(i).name for i in range(model.njnt)]
-    drives = [ROBOT.joint(name).drive for name in names]
-    kp = np.array([20.0 if name == joint else ROBOT.joint(name).stiffness for name in names])
-    kd = np.array([0.5 if name == joint else ROBOT.joint(name).damping for name in names])
-    target = np.array([ROBOT.joint(name).default_position for name in names])
-    index = names.index(joint)
+    model = bench_spec(ROBOT, joint, stiffness={joint: 20.0}, damping={joint: 0.5}).compile()
+    data, key = mujoco.MjData(model), model.key("default")
+    chain = ROBOT.joint(joint).chain
+    kp = np.array([20.0 if name == joint else ROBOT.joint(name).stiffness for name in chain])
     # Begin where the match begins: at rest, gravity carried by the drives.
-    data.qpos[:] = target
+    data.qpos[:] = key.qpos
     for _ in range(8):
         mujoco.mj_forward(model, data)
-        data.qpos[:] = target - data.qfrc_bias / kp
+        data.qpos[:] = key.qpos - data.qfrc_bias / kp
+    data.ctrl[:] = key.ctrl
     positions = []
     for command in trace.command:
-        target[index] = command
-        positions.append(data.qpos[index])
-        torque = kp * (target - data.qpos) - kd * data.qvel
-        for i, drive in enumerate(drives):
-            line = data.qvel[i] / drive.no_load_speed
-            high = min(drive.effort_limit, drive.stall_torque * (1.0 - line))
-            low = max(-drive.effort_limit, drive.stall_torque * (-1.0 - line))
-            data.ctrl[i] = np.clip(torque[i], low, high)
+        data.ctrl[chain.index(joint)] = command
+        positions.append(data.qpos[chain.index(joint)])
         mujoco.mj_step(model, data)
     np.testing.assert_allclose(found, positions, atol=1e-6)
 
@@ -217,3 +206,56 @@ def test_a_segment_that_cannot_be_simulated_is_refused() -> None:
     ):
         with pytest.raises(LogError, match=words):
             command_trace(bad, bad.segments[0], joint, ROBOT)
+
+
+# --- the protocol ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("choice", ["mujoco", EXAMPLE])
+def test_simulators_keep_the_protocol(choice: str) -> None:
+    check_simulator(load_simulator(choice, ROBOT))
+
+
+def test_a_check_names_the_rule_that_is_broken() -> None:
+    simulator = load_simulator(EXAMPLE, ROBOT)
+    simulator.parameters = simulator.parameters | {"mass"}
+    with pytest.raises(PronkError, match="mass"):
+        check_simulator(simulator)
+
+
+@pytest.mark.parametrize("joint", ["FR_knee", "FR_hip_pitch"])
+def test_a_rollout_of_mujoco_gives_the_positions_of_its_rig(joint: str) -> None:
+    chirp = Excitation(offsets=Chirp(length_s=2.0).samples())
+    with MujocoSimulator(ROBOT) as simulator:
+        rigs = RolloutRigs(simulator, ROBOT)
+        logs = [
+            synthetic_log(ROBOT, joint, [chirp], 20.0, 0.5, simulator=s) for s in (simulator, rigs)
+        ]
+    np.testing.assert_allclose(logs[0].position, logs[1].position, atol=1e-9)
+
+
+def test_gains_matched_in_another_simulator_are_those_it_was_swept_with() -> None:
+    chirp = Excitation(offsets=Chirp(length_s=8.0).samples())
+    rigs = joint_rigs(EXAMPLE, ROBOT)
+    log = synthetic_log(ROBOT, "FR_knee", [chirp], 19.3, 0.41, simulator=rigs)
+    settings = MatchSettings(simulator=EXAMPLE, grid_points=8)
+    gains = match_logs([log], ROBOT, settings=settings).gains
+    found = gains.joints["FR_knee"]
+    assert found.stiffness == pytest.approx(19.3, rel=2e-3)
+    assert found.damping == pytest.approx(0.41, rel=5e-3)
+    assert gains.simulator == rigs.info
+    replay = predict(log, ROBOT, gains, simulator=EXAMPLE).joints[0]
+    assert replay.rmse_matched < 0.1 * replay.rmse_naive
+
+
+@pytest.mark.parametrize(
+    ("choice", "named"),
+    [
+        ("bullet", "mujoco"),
+        ("missing.py:Pendulum", "missing.py"),
+        (EXAMPLE.replace("Pendulum", "Cart"), "Pendulum"),
+    ],
+)
+def test_an_unknown_simulator_is_refused(choice: str, named: str) -> None:
+    with pytest.raises(PronkError, match=named):
+        load_simulator(choice, ROBOT)

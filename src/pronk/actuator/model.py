@@ -83,18 +83,6 @@ def torque_limits(
     return np.clip(low, -effort_limit, effort_limit), np.clip(high, -effort_limit, effort_limit)
 
 
-def clip_torque(
-    torque: ArrayLike,
-    speed: ArrayLike,
-    stall_torque: float,
-    no_load_speed: float,
-    effort_limit: float,
-) -> Array:
-    """Limit a commanded torque to what the drive can give at `speed` (`torque_limits`) [N m]."""
-    low, high = torque_limits(speed, stall_torque, no_load_speed, effort_limit)
-    return np.asarray(np.clip(torque, low, high))
-
-
 def winding_loss(
     torque: ArrayLike,
     *,

@@ -172,8 +172,38 @@ def forecast(
         torque = pd_torque(
             steps[:, i], q, v, stiffness=scale * stiffness[name], damping=scale * damping[name]
         )
-        amplitude = float(np.abs(offsets).max()) if name == joint else 0.0
-        forecasts.append(_extremes(robot, joint, name, amplitude, q, v, torque))
+        drive = robot.joint(name).drive
+        limits = drive.stall_torque, drive.no_load_speed, drive.effort_limit
+        low, high = torque_limits(v, *limits)
+        # A drive that can give nothing at this speed exceeds its limit with any command.
+        available = np.maximum(np.where(torque >= 0.0, high, -low), 1e-6)
+        given = np.clip(torque, low, high)
+        power = electrical_power(
+            given,
+            v,
+            gear_ratio=drive.gear_ratio,
+            torque_constant=drive.torque_constant,
+            stall_torque=drive.stall_torque,
+            bus_voltage=drive.bus_voltage,
+        )
+        forecasts.append(
+            Forecast(
+                joint=name,
+                excited=joint,
+                amplitude=float(np.abs(offsets).max()) if name == joint else 0.0,
+                lowest=float(q.min()),
+                highest=float(q.max()),
+                range=robot.joint(name).range,
+                speed=float(np.abs(v).max()),
+                no_load_speed=drive.no_load_speed,
+                torque=float(np.abs(torque).max()),
+                effort_limit=drive.effort_limit,
+                torque_share=float((np.abs(torque) / available).max()),
+                mechanical_power=float((given * v).max()),
+                electrical_power=float(power.max()),
+                bus_current=float(bus_current(power, drive.bus_voltage).max()),
+            )
+        )
     return forecasts
 
 
@@ -223,44 +253,3 @@ def _roll(
     columns = np.array([model.joint(n).qposadr[0] for n in order])
     rates = np.array([model.joint(n).dofadr[0] for n in order])
     return before[..., 1 + columns], before[..., 1 + model.nq + rates]
-
-
-def _extremes(
-    robot: RobotSpec,
-    excited: str,
-    name: str,
-    amplitude: float,
-    position: Array,
-    velocity: Array,
-    torque: Array,
-) -> Forecast:
-    """Extremes over time and corners, shapes (corners, n)."""
-    drive = robot.joint(name).drive
-    low, high = torque_limits(velocity, drive.stall_torque, drive.no_load_speed, drive.effort_limit)
-    # A drive that can give nothing at this speed exceeds its limit with any command.
-    available = np.maximum(np.where(torque >= 0.0, high, -low), 1e-6)
-    given = np.clip(torque, low, high)
-    power = electrical_power(
-        given,
-        velocity,
-        gear_ratio=drive.gear_ratio,
-        torque_constant=drive.torque_constant,
-        stall_torque=drive.stall_torque,
-        bus_voltage=drive.bus_voltage,
-    )
-    return Forecast(
-        joint=name,
-        excited=excited,
-        amplitude=amplitude,
-        lowest=float(position.min()),
-        highest=float(position.max()),
-        range=robot.joint(name).range,
-        speed=float(np.abs(velocity).max()),
-        no_load_speed=drive.no_load_speed,
-        torque=float(np.abs(torque).max()),
-        effort_limit=drive.effort_limit,
-        torque_share=float((np.abs(torque) / available).max()),
-        mechanical_power=float((given * velocity).max()),
-        electrical_power=float(power.max()),
-        bus_current=float(bus_current(power, drive.bus_voltage).max()),
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,28 +164,22 @@ def check_motion(log: JointLog, joint: str) -> None:
         )
 
 
-def time_at_ends(log: JointLog, joint: str) -> float:
-    """Share of the time that a joint stays at an end of its travel while its command moves on."""
+def saturation_note(log: JointLog, joint: str) -> str:
+    """A warning for a joint that rests at an end while its command moves on, or ""."""
     column = log.column(joint)
     position, command = log.position[:, column], log.command[:, column]
     travel, commanded = float(np.ptp(position)), float(np.ptp(command))
     if travel == 0.0 or commanded == 0.0:
-        return 0.0
+        return ""
     total = 0.0
     for sign in (1.0, -1.0):
         near = sign * position >= (sign * position).max() - _NEAR_END * travel
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], near.astype(np.int8), [0]))))
-        for first, stop in edges.reshape(-1, 2):
+        for first, stop in np.flatnonzero(np.diff(np.pad(near, 1))).reshape(-1, 2):
             length = float(log.time[stop - 1] - log.time[first])
             outward = sign * command[first:stop]
             if length >= _LONG_RUN_S and outward.max() - outward[0] > _MOVES_ON * commanded:
                 total += length
-    return total / float(log.time[-1] - log.time[0])
-
-
-def saturation_note(log: JointLog, joint: str) -> str:
-    """A warning for a joint that is saturated, or ""."""
-    if (share := time_at_ends(log, joint)) <= _SATURATED:
+    if (share := total / float(log.time[-1] - log.time[0])) <= _SATURATED:
         return ""
     return (
         f"{joint} is saturated: for {100.0 * share:.0f} % of the time it stays at an end of its "
@@ -209,38 +204,34 @@ def check_radians(log: JointLog, joint: str) -> None:
     )
 
 
-def correlation(commands: Array, rate_hz: float) -> Array:
-    """Largest absolute correlation of each pair of commands over lags up to half a second.
+def correlation_note(time: Array, command: Array, joints: Sequence[str]) -> str:
+    """A warning naming the two most alike commands, or "" where none exceeds the limit.
 
-    With correlated commands, the motion that one joint causes in another looks like a response to
-    the other's own command: the coherence stays near one while the response is wrong.
+    The largest absolute correlation over lags up to half a second counts. With correlated commands,
+    the motion that one joint causes in another looks like a response to the other's own command:
+    the coherence stays near one while the response is wrong.
 
-    Commands are uniformly sampled, shape (n, joints). Returns a symmetric matrix in 0..1 with ones
-    on the diagonal; a command that never changes correlates with nothing.
+    Commands are held from each timestamp [s] to the next, shape (n, joints); one that never changes
+    correlates with nothing.
     """
-    centred = commands - commands.mean(axis=0)
-    energy = np.sqrt((centred**2).sum(axis=0))
-    still = energy <= 1e-9 * np.sqrt(len(commands))
-    unit = np.where(still, 0.0, centred / np.where(still, 1.0, energy))
-    middle = len(commands) - 1
+    # The command is held, so reading it on a uniform grid moves no edge by more than a sample.
+    rate_hz = (len(time) - 1) / float(time[-1] - time[0])
+    grid = time[0] + np.arange(len(time)) / rate_hz
+    index = np.clip(np.searchsorted(time, grid + 0.5 / rate_hz) - 1, 0, len(time) - 1)
+    centred = command[index] - command[index].mean(axis=0)
+    size = np.linalg.norm(centred, axis=0)
+    moving = np.flatnonzero(size > 1e-9 * np.sqrt(len(time)))
+    middle = len(time) - 1
     reach = min(round(_REACH_S * rate_hz), middle)
-    found = np.eye(commands.shape[1])
-    for i in range(len(found)):
-        for j in range(i):
-            lags = correlate(unit[:, i], unit[:, j], method="fft")
-            peak = np.abs(lags[middle - reach : middle + reach + 1]).max()
-            found[i, j] = found[j, i] = min(float(peak), 1.0)
-    return found
-
-
-def correlation_note(commands: Array, joints: Sequence[str], rate_hz: float) -> str:
-    """A warning naming the two most alike commands, or "" where none exceeds the limit."""
-    alike = correlation(commands, rate_hz) - np.eye(len(joints))
-    i, j = divmod(int(np.argmax(alike)), len(joints))
-    if len(joints) < 2 or alike[i, j] <= CORRELATION_LIMIT:
-        return ""
-    return (
-        f"the commands of {joints[j]} and {joints[i]} correlate to {alike[i, j]:.2f} (limit "
+    largest, alike = CORRELATION_LIMIT, ""
+    for one, other in combinations(moving, 2):
+        pair = (centred[:, i] / size[i] for i in (other, one))
+        lags = correlate(*pair, method="fft")
+        peak = float(np.abs(lags[middle - reach : middle + reach + 1]).max())
+        if peak > largest:
+            largest, alike = peak, f"{joints[other]} and {joints[one]}"
+    return alike and (
+        f"the commands of {alike} correlate to {min(largest, 1.0):.2f} (limit "
         f"{CORRELATION_LIMIT:g}): a response may contain the effect of one joint on the other; "
         "excite one joint at a time or use multisines on different harmonics"
     )

@@ -129,7 +129,8 @@ def import_columns(
         for joint, peak in travel.items()
         if peak > 0.0
     )
-    if note := _correlation(time, command, joints):
+    # A command that is not finite is refused below, by name.
+    if np.isfinite(command).all() and (note := correlation_note(time, command, joints)):
         notes.append(note)
     return JointLog(
         robot=robot.name if robot is not None else columns.robot,
@@ -183,18 +184,6 @@ def _joint_names(columns: Columns, robot: RobotSpec | None, names: Names | None)
             "the file's order."
         )
     return joints
-
-
-def _correlation(time: Array, command: Array, joints: tuple[str, ...]) -> str:
-    """Warning where the commands of several joints are alike."""
-    moving = np.flatnonzero(np.ptp(command, axis=0) > 0.0)
-    if len(moving) < 2 or not np.isfinite(command).all():
-        return ""
-    # The command is held, so reading it on a uniform grid moves no edge by more than a sample.
-    rate_hz = (len(time) - 1) / float(time[-1] - time[0])
-    grid = time[0] + np.arange(len(time)) / rate_hz
-    index = np.clip(np.searchsorted(time, grid + 0.5 / rate_hz) - 1, 0, len(time) - 1)
-    return correlation_note(command[index][:, moving], [joints[i] for i in moving], rate_hz)
 
 
 def in_force(sent: Array, time: Array) -> NDArray[np.intp]:

@@ -12,17 +12,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.files import sha256, written_whole
+from pronk.files import sha256
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.mcap import (
     BOOLEAN,
@@ -54,7 +53,6 @@ TOPICS: dict[str, dict[str, Any]] = {
     | {"torque": NUMBERS, "frequency": NUMBER, "segment": INTEGER},
     END: {"complete": BOOLEAN, "reason": STRING},
 }
-_COLUMNS = ("time", "command", "position", "velocity", "torque", "frequency")
 _FLUSH_SAMPLES = 256
 """Samples in a chunk: half a second at 500 Hz."""
 
@@ -74,7 +72,7 @@ class LogHeader:
 
 
 class McapLogWriter:
-    """Writes a log as it is recorded. Leaving the context by an error ends it as cut short.
+    """Writes a log as it is recorded.
 
     The file is not written aside and renamed: a recording that is interrupted must stay.
     """
@@ -82,29 +80,14 @@ class McapLogWriter:
     def __init__(self, path: Path, header: LogHeader) -> None:
         """Open `path`, which is replaced, and write the header."""
         self._file = McapWriter(path, TOPICS)
-        self._pending = self._segments = 0
-        self._ended = False
-        self._last = 0.0
+        self._pending, self._last = 0, 0.0
         self._file.put(HEADER, 0.0, {"schema": SCHEMA, **vars(header)})
         self.flush()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.end(complete=error is None, reason=reason_of(error))
-
-    def segment(self, segment: Segment) -> int:
-        """Write a segment, before its samples; returns its number."""
+    def segment(self, segment: Segment) -> None:
+        """Write a segment, before its samples."""
         self._file.put(SEGMENT, segment.start, vars(segment))
         self.flush()
-        self._segments += 1
-        return self._segments - 1
 
     def sample(
         self,
@@ -135,36 +118,14 @@ class McapLogWriter:
         self._pending = 0
 
     def end(self, *, complete: bool = True, reason: str = "") -> None:
-        """Write the end and close the file; ending twice has no effect."""
-        if not self._ended:
-            self._ended = True
-            self._file.put(END, self._last, {"complete": complete, "reason": reason})
-            self._file.close()
+        """Write the end and close the file."""
+        self._file.put(END, self._last, {"complete": complete, "reason": reason})
+        self._file.close()
 
 
 def reason_of(error: BaseException | None) -> str:
     """Why a log ends, in words; empty without an error."""
     return "" if error is None else f"{type(error).__name__}: {error}".rstrip(": ")
-
-
-def write_mcap(path: Path, log: JointLog) -> None:
-    """Write a log that is in memory, whole or not at all."""
-    lists = {
-        name: values.tolist() if isinstance(values, np.ndarray) else values
-        for name, values in vars(log).items()
-    }
-    header = LogHeader(**{field.name: lists[field.name] for field in fields(LogHeader)})
-    columns = {name: lists[name] for name in _COLUMNS if lists[name] is not None}
-    columns["segment"] = np.full(len(log.time), -1)
-    for i, segment in enumerate(log.segments):
-        columns["segment"][(log.time >= segment.start) & (log.time <= segment.stop)] = i
-    with written_whole(path) as aside, McapLogWriter(aside, header) as writer:
-        for segment in log.segments:
-            writer.segment(segment)
-        for row in zip(*columns.values(), strict=True):
-            writer.sample(**dict(zip(columns, row, strict=True)))
-        reason = "" if log.complete else "the log was already cut short"
-        writer.end(complete=log.complete, reason=reason)
 
 
 def read_mcap(
@@ -183,9 +144,10 @@ def read_mcap(
         path: The file.
         robot: The robot, for a file that does not name it.
         measured_topic: Topic of the measured sensor_msgs/msg/JointState (rosbag2 only).
-        command_topic: Topic of the commands (rosbag2 only).
-        command_field: Where in a command message the positions are, dots between names
-            (rosbag2 only), for instance `points.0.positions`.
+        command_topic: Topic of the commands: JointState, or any message with the field below
+            (rosbag2 only).
+        command_field: Where in a command message the positions are, dots between names, numbers
+            for indices (rosbag2 only), for instance `points.0.positions`.
 
     Raises:
         LogError: Not MCAP, nothing usable in it, or a topic that is not there.

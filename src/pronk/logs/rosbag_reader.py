@@ -37,19 +37,11 @@ def read_joint_states(
     command_topic: str | None,
     command_field: str,
 ) -> JointLog:
-    """Join the measured states of one topic with the commands of another.
+    """Join the measured states of one topic with the commands of another; see `read_mcap`.
 
     Header stamps are used where both topics have them, times of reception otherwise: two clocks
-    are never mixed. The command in force at a state is the last one at or before it.
-
-    Args:
-        path: The file, for messages.
-        found: Its messages.
-        damage: Why reading ended early, or "".
-        robot: Name of the robot.
-        measured_topic: Topic of the measured JointState.
-        command_topic: Topic of the commands: JointState, or any message with the field below.
-        command_field: Positions in a command message, dots between names, numbers for indices.
+    are never mixed. The command in force at a state is the last one at or before it. `damage` says
+    why reading ended early, or is "".
 
     Raises:
         LogError: A topic is missing or holds something else; the message lists what there is.

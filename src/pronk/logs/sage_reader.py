@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import Columns, in_force
-from pronk.logs.csv_reader import read_rows, read_text
+from pronk.logs.tables import read_rows, read_text
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
@@ -37,11 +37,10 @@ SAGE_JOINTS = {
 
 Jaw is on a 0 to 1 scale whose travel in radians is not recorded: not an angle. (Its encoder moves
 in steps of 0.00065660, and a servo's step is 2 pi / 4096: 2.336 rad a unit; its velocity column,
-which is an angle's, gives 2.33. The recordings state neither, so neither is assumed.)"""
-SAGE_MAPPING = {name: (1.0, 0.0) for name in SAGE_JOINTS if name != "Jaw"}
-"""(sign, offset): joint position [rad] = sign * recorded position + offset.
+which is an angle's, gives 2.33. The recordings state neither, so neither is assumed.)
 
-Evidence for +1: in all four recordings about their pose the three joints that carry weight sit
+Positions are taken as they are: joint position [rad] = +1 * recorded position + 0. Evidence for +1:
+in all four recordings about their pose the three joints that carry weight sit
 beside their mean command in the direction gravity pulls them in the [cad] model, and in
 proportion: +.038, +.037, +.010 rad for gravity torques of +.49, +.40, +.10 N m (Pitch, Elbow,
 Wrist_Pitch; 11 to 13 N m/rad), the other two within .003 rad. No recording determines the sign of

@@ -133,6 +133,9 @@ def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
     drives = group_drives(gains, robot)
     by_joint = {joint: drive for drive in drives for joint in drive.joints}
     spec = free_spec(robot)
+    for name, drive in by_joint.items():
+        spec.joint(name).armature = drive.armature
+        spec.joint(name).frictionloss = drive.drive.frictionloss
     spec.option.timestep = gains.simulator.timestep_s
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     add_drives(
@@ -141,8 +144,6 @@ def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
         robot.joint_names,
         stiffness={name: drive.stiffness for name, drive in by_joint.items()},
         damping={name: drive.damping for name, drive in by_joint.items()},
-        armature={name: drive.armature for name, drive in by_joint.items()},
-        frictionloss={name: drive.drive.frictionloss for name, drive in by_joint.items()},
     )
     spec.compile()
     late = [f"{d.group} {d.delay_steps} steps" for d in drives if d.delay_steps]

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from pronk.errors import ArtefactError
-from pronk.policy.layout import ACTIONS, HISTORY, MEASURED
+from pronk.policy.observation import ACTIONS, HISTORY, MEASURED
 from pronk.robots.robot import RobotSpec
 
 SCHEMA = "pronk/policy/1"
@@ -46,7 +46,7 @@ class ObservationPart(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def measured_layout(policy_rate_hz: float) -> tuple[ObservationPart, ...]:
-    """The layout that this pronk trains and runs with (see `pronk.policy.layout`).
+    """The layout that this pronk trains and runs with (see `pronk.policy.observation`).
 
     Joint positions are relative to the default position, actions are outputs of the network, and
     vectors are in the trunk's frame (x forward, y left, z up).
@@ -60,7 +60,7 @@ def measured_layout(policy_rate_hz: float) -> tuple[ObservationPart, ...]:
     }
     return tuple(
         ObservationPart(
-            name=name, size=part.size, times_s=times.get(name, (0.0,)), unit=_UNITS[name]
+            name=name, size=len(part), times_s=times.get(name, (0.0,)), unit=_UNITS[name]
         )
         for name, part in MEASURED.items()
     )

@@ -1,4 +1,21 @@
-"""The measured vector of one robot, as training's observation manager builds it.
+"""The observation vector of a policy, number by number, and its history.
+
+The measured part is one vector with a short history, so that actor and estimator read the same
+measurement with the same noise. The jump input is separate: phase 1 has none, phase 2 adds it at
+the end (paper N3).
+
+    measured   angular velocity 3, projected gravity 3, position 3 x 12, velocity 3 x 12,
+               previous actions 2 x 12, command 3                                     = 105
+    jump       0 or 1                                                                 =   1
+
+Histories run from old to new: t-0.04, t-0.02, t (positions and velocities); t-0.04, t-0.02
+(actions). The estimator reads all but the command (102, with the jump input 103: paper N1, reading
+A19); the actor reads the estimate (7), then the current samples (45): 52, with the jump input 53
+(paper N2, reading A19 of one previous action).
+
+Frames and units: angular velocity [rad/s] and gravity (unit vector) in the trunk's frame (x
+forward, y left, z up), position [rad] relative to the default pose, velocity [rad/s], actions as
+the network gave them, command (vx, vy [m/s], yaw rate [rad/s]) in the trunk's frame.
 
 At a reset the first sample fills the whole history, and the actions before it are zero, as at the
 beginning of an episode in training.
@@ -8,14 +25,57 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import ArtefactError
-from pronk.policy.layout import ACTIONS, HISTORY, JOINTS, MEASURED
 
 Floats = NDArray[np.float32]
+
+JOINTS = 12
+HISTORY = 3
+"""Samples of position and velocity."""
+ACTIONS = 2
+"""Samples of previous actions."""
+
+_LENGTHS = {
+    "angular_velocity": 3,
+    "projected_gravity": 3,
+    "joint_position": HISTORY * JOINTS,
+    "joint_velocity": HISTORY * JOINTS,
+    "action": ACTIONS * JOINTS,
+    "command": 3,
+}
+MEASURED_SIZE = sum(_LENGTHS.values())
+MEASURED = {
+    name: range(stop - _LENGTHS[name], stop)
+    for name, stop in zip(_LENGTHS, accumulate(_LENGTHS.values()), strict=True)
+}
+"""The parts of the measured vector, in order: their positions in it."""
+
+ACTOR_INDICES: tuple[int, ...] = (
+    *MEASURED["angular_velocity"],
+    *MEASURED["projected_gravity"],
+    *MEASURED["command"],
+    *MEASURED["joint_position"][-JOINTS:],
+    *MEASURED["joint_velocity"][-JOINTS:],
+    *MEASURED["action"][-JOINTS:],
+)
+"""Part of the measured vector that the actor reads, behind the estimate."""
+
+ESTIMATOR_INDICES: tuple[int, ...] = tuple(range(MEASURED["command"].start))
+"""Part of the measured vector that the estimator reads."""
+
+ESTIMATE = {"contact": 4, "linear_velocity": 3}
+"""Outputs of the estimator: contact probability per foot (FR, FL, HR, HL), trunk velocity in the
+trunk's frame [m/s]. The actor reads it in this order, in front of its own part."""
+
+ESTIMATE_SIZE = sum(ESTIMATE.values())
+ACTOR_SIZE = ESTIMATE_SIZE + len(ACTOR_INDICES)
+ESTIMATOR_SIZE = len(ESTIMATOR_INDICES)
+
 _SIZES = {"angular_velocity": 3, "projected_gravity": 3, "position": JOINTS, "velocity": JOINTS}
 
 
@@ -53,7 +113,7 @@ class History:
         self._actions = np.zeros((ACTIONS, JOINTS), np.float32)
 
     def observe(self, measurement: Measurement, command: ArrayLike) -> Floats:
-        """Add a sample; returns the measured vector, laid out as `layout.MEASURED`. (105,).
+        """Add a sample; returns the measured vector, laid out as `MEASURED`. (105,).
 
         The command is forward and left [m/s], yaw rate [rad/s], in the trunk's frame (3,). One that
         is not finite is refused by an ArtefactError, and nothing is added.

@@ -14,8 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from pronk.errors import ArtefactError, PronkError
 from pronk.policy.contract import METADATA_KEY, Contract, from_json, measured_layout
-from pronk.policy.layout import ESTIMATE, JOINTS, MEASURED_SIZE
-from pronk.policy.observation import Floats, History, Measurement, finite
+from pronk.policy.observation import (
+    ESTIMATE,
+    JOINTS,
+    MEASURED_SIZE,
+    Floats,
+    History,
+    Measurement,
+    finite,
+)
 
 WRITER = "`pronk train` writes one"
 _OUTPUTS = {"action": JOINTS, **ESTIMATE}
@@ -124,10 +131,7 @@ class Policy:
 
 
 def load_policy(path: Path | str) -> Policy:
-    """Open a policy; `pronk.policy.contract.check` checks that it fits a robot.
-
-    Args:
-        path: `policy.onnx`, as `pronk train` writes it.
+    """Open a `policy.onnx`; `pronk.policy.contract.check` checks that it fits a robot.
 
     Raises:
         ArtefactError: Missing, damaged, without a contract, or laid out in another way than this

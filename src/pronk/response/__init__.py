@@ -4,22 +4,18 @@ import sys
 from types import ModuleType
 
 from pronk.logs.joint_log import JointLog
-from pronk.response.diagnostics import DelayFit, fit_delay, third_harmonic
 from pronk.response.estimate import estimate, operators
 from pronk.response.h1 import H1Operator
 from pronk.response.response import Estimator, FrequencyResponse, load, save
 
 __all__ = [
-    "DelayFit",
     "Estimator",
     "FrequencyResponse",
     "H1Operator",
     "estimate",
-    "fit_delay",
     "load",
     "operators",
     "save",
-    "third_harmonic",
 ]
 
 

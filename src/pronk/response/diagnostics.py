@@ -17,7 +17,7 @@ amplitude.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,9 @@ from pronk.response.periodic import read_steps
 from pronk.response.response import Estimator, FrequencyResponse
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
+_TOP_HZ = 25.0
+"""Highest frequency that takes part in the fit of the delay [Hz]."""
 _COHERENT = 0.8
 """Least coherence of a frequency that takes part in the fit of the delay."""
 _FLOOR = 1e-3
@@ -40,7 +41,7 @@ _FLOOR = 1e-3
 _FEWEST = 8
 """Fewest frequencies for four parameters: twice as many real equations as twice the unknowns."""
 
-LOW_BAND_HZ = (1.0, 4.0)
+_LOW_BAND_HZ = (1.0, 4.0)
 """Where the third harmonic is measured. A chirp of 0.1 to 25 Hz in 20 s is past its ramp of 0.5 s
 at 1 Hz (the ramp itself reads as 0.008); three times 4 Hz is inside the bandwidth of the joints."""
 _FEWEST_CYCLES = 3.0
@@ -51,40 +52,15 @@ _SHAPE = {1: 4, 2: 2, 3: 2}
 """Harmonic and degree of the polynomial that its size and phase follow over the band."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DelayFit:
-    """Delay beyond a second-order joint; NaN if too few frequencies are coherent."""
+def fit_delay(response: FrequencyResponse) -> float:
+    """Delay beyond a second-order joint [s]; NaN if too few frequencies are coherent.
 
-    delay_s: float = float("nan")
-    """[s]"""
-    standard_error_s: float = float("nan")
-    """Over repeats where there are three or more, else from the residual of the fit [s]."""
-
-
-def _fit(
-    omega: Array, response: ComplexArray, weight: Array, start: Array
-) -> tuple[Array, Array, Array]:
-    """Parameters (log ratio, log natural, log zeta, delay), residuals and Jacobian."""
-
-    def residual(parameters: Array) -> Array:
-        log_ratio, log_natural, log_zeta, delay = parameters
-        x = 1j * omega / np.exp(log_natural)
-        joint = np.exp(log_ratio - 1j * omega * delay) / (x**2 + 2.0 * np.exp(log_zeta) * x + 1.0)
-        off = np.log(response / joint)
-        return np.asarray(np.concatenate([weight * off.real, weight * off.imag]))
-
-    found = least_squares(residual, start, x_scale=[0.1, 0.1, 0.1, 1e-3], method="trf")
-    return np.asarray(found.x), np.asarray(found.fun), np.asarray(found.jac)
-
-
-def fit_delay(response: FrequencyResponse, *, max_hz: float = 25.0) -> DelayFit:
-    """Fit joint and delay to the coherent part of a response, up to `max_hz`.
-
-    Frequencies of coherence below 0.8 take no part, the rest weigh `coherence / (1 - coherence)`.
+    Joint and delay are fitted to the response up to 25 Hz. Frequencies of coherence below 0.8 take
+    no part, the rest weigh `coherence / (1 - coherence)`.
     """
-    use = response.band(0.0, max_hz, _COHERENT) & (response.gain > 0.0)
+    use = response.band(0.0, _TOP_HZ, _COHERENT) & (response.gain > 0.0)
     if int(use.sum()) < _FEWEST:
-        return DelayFit()
+        return math.nan
     omega, values = response.omega[use], response.response[use]
     coherence = response.coherence[use]
     weight = np.sqrt(coherence / np.maximum(1.0 - coherence, _FLOOR))
@@ -93,18 +69,20 @@ def fit_delay(response: FrequencyResponse, *, max_hz: float = 25.0) -> DelayFit:
     phase = np.unwrap(np.angle(values))
     natural = float(omega[int(np.argmin(np.abs(phase + np.pi / 2.0)))])
     start = np.array([np.log(abs(values[0])), np.log(natural), np.log(0.7), 0.0])
-    best, residual, jacobian = _fit(omega, values, weight, start)
-    if len(response.repeats) >= 3:
-        each = [_fit(omega, row[use], weight, best)[0][3] for row in response.repeats]
-        error = float(np.std(each, ddof=1) / np.sqrt(len(each)))
-    else:
-        variance = float(residual @ residual) / (len(residual) - len(best))
-        error = float(np.sqrt(variance * np.linalg.pinv(jacobian.T @ jacobian)[3, 3]))
-    return DelayFit(delay_s=float(best[3]), standard_error_s=error)
+
+    def residual(parameters: Array) -> Array:
+        log_ratio, log_natural, log_zeta, delay = parameters
+        x = 1j * omega / np.exp(log_natural)
+        joint = np.exp(log_ratio - 1j * omega * delay) / (x**2 + 2.0 * np.exp(log_zeta) * x + 1.0)
+        off = np.log(values / joint)
+        return np.asarray(np.concatenate([weight * off.real, weight * off.imag]))
+
+    found = least_squares(residual, start, x_scale=[0.1, 0.1, 0.1, 1e-3], method="trf")
+    return float(found.x[3])
 
 
-def third_harmonic(log: JointLog, joint: str, band_hz: tuple[float, float] = LOW_BAND_HZ) -> float:
-    """Third harmonic of the response to one excitation (`JointLog.cut`) in a band [Hz].
+def third_harmonic(log: JointLog, joint: str) -> float:
+    """Third harmonic of the response to one excitation (`JointLog.cut`), at 1 to 4 Hz.
 
     Sine steps are read exactly, chirps by demodulation.
 
@@ -112,41 +90,39 @@ def third_harmonic(log: JointLog, joint: str, band_hz: tuple[float, float] = LOW
         RMS at 3 f over RMS at f; NaN where the log lacks the frequency, and for multisines.
     """
     if log.frequency is None or not log.segments or log.segments[0].kind == "multisine":
-        return float("nan")
+        return math.nan
     if log.segments[0].kind == "sine_steps":
-        estimator = Estimator(min_hz=band_hz[0], max_hz=band_hz[1])
+        estimator = Estimator(min_hz=_LOW_BAND_HZ[0], max_hz=_LOW_BAND_HZ[1])
         try:
             ratios = read_steps(log, joint, estimator, analysis_rate([log.time])).third
         except LogError:
             # No step in the low band.
-            return float("nan")
+            return math.nan
         known = ratios[np.isfinite(ratios)]
-        return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
-    return _of_chirp(log.time, log.position[:, log.column(joint)], log.frequency, band_hz)
+        return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+    return _of_chirp(log.time, log.position[:, log.column(joint)], log.frequency)
 
 
-def _of_chirp(
-    time: Array, position: Array, frequency: Array, band_hz: tuple[float, float]
-) -> float:
+def _of_chirp(time: Array, position: Array, frequency: Array) -> float:
     """Third harmonic by demodulation at three times the frequency of a chirp.
 
     The phase is the integral of the frequency; the position is fitted by its first three harmonics,
     each with a size and phase that change smoothly over the band, and by a straight line.
     """
     known = np.nan_to_num(frequency, nan=-1.0)
-    inside = (known >= band_hz[0]) & (known <= band_hz[1])
+    low, high = _LOW_BAND_HZ
+    inside = (known >= low) & (known <= high)
     if int(inside.sum()) < 50:
-        return float("nan")
+        return math.nan
     # The longest stretch: a chirp passes the band once.
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], inside, [False]))))
-    stretches = edges.reshape(-1, 2)
+    stretches = np.flatnonzero(np.diff(np.pad(inside, 1))).reshape(-1, 2)
     first, stop = stretches[int(np.argmax(stretches[:, 1] - stretches[:, 0]))]
     t, y, f = time[first:stop], position[first:stop], frequency[first:stop]
     phase = 2.0 * np.pi * cumulative_trapezoid(f, t, initial=0)
-    thin = max(1, int(len(t) / ((t[-1] - t[0]) * band_hz[1] * _SAMPLES_A_TURN)))
+    thin = max(1, int(len(t) / ((t[-1] - t[0]) * high * _SAMPLES_A_TURN)))
     t, y, f, phase = t[::thin], y[::thin], f[::thin], phase[::thin]
     if phase[-1] < 2.0 * np.pi * _FEWEST_CYCLES or np.ptp(f) == 0.0:
-        return float("nan")
+        return math.nan
     x = 2.0 * (f - f.min()) / np.ptp(f) - 1.0
     line = np.linspace(-1.0, 1.0, len(t))
     columns, harmonics = [np.ones_like(line), line], [0, 0]
@@ -162,4 +138,4 @@ def _of_chirp(
         own = np.array(harmonics) == harmonic
         return float(np.sqrt(np.mean((basis[:, own] @ size[own]) ** 2)))
 
-    return rms(3) / rms(1) if rms(1) > 0.0 else float("nan")
+    return rms(3) / rms(1) if rms(1) > 0.0 else math.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,10 +14,8 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.response.diagnostics import fit_delay, third_harmonic
 from pronk.response.grid import analysis_rate
 from pronk.response.h1 import H1Operator, estimate_averaged
-from pronk.response.periodic import estimate_multisine, estimate_steps, multisine_operator
+from pronk.response.periodic import estimate_periodic, multisine_operator
 from pronk.response.response import Estimator, FrequencyResponse
-
-_ESTIMATORS = {"multisine": estimate_multisine, "sine_steps": estimate_steps}
 
 
 def excited_joints(log: JointLog) -> tuple[str, ...]:
@@ -44,10 +43,8 @@ def excitations(log: JointLog, joint: str) -> list[list[JointLog]]:
     where = log.source or "log"
     segments = [segment for segment in log.segments if joint in segment.joints]
     if not log.segments:
-        start, stop = float(log.time[0]), float(log.time[-1])
-        nan = float("nan")
-        whole = Segment(kind="unknown", joints=log.joints, start=start, stop=stop, amplitude=nan)
-        segments = [whole]
+        ends = {"start": float(log.time[0]), "stop": float(log.time[-1])}
+        segments = [Segment(kind="unknown", joints=log.joints, amplitude=math.nan, **ends)]
     if not segments:
         excited = sorted({name for segment in log.segments for name in segment.joints})
         raise LogError(f"{where}: {joint} was not excited; {', '.join(excited)} were.")
@@ -95,17 +92,13 @@ def estimate(
     for parts in groups:
         for part in parts:
             check_motion(part, joint)
-        read = _ESTIMATORS.get(parts[0].segments[0].kind, estimate_averaged)
-        response = read(parts, joint, settings, rate_hz)
+        periodic = parts[0].segments[0].kind in ("multisine", "sine_steps")
+        average = estimate_periodic if periodic else estimate_averaged
+        response = average(parts, joint, settings, rate_hz)
         third = np.array([third_harmonic(part, joint) for part in parts])
         known = third[np.isfinite(third)]
-        found.append(
-            replace(
-                response,
-                delay_s=fit_delay(response).delay_s,
-                third_harmonic=float(known.mean()) if len(known) else float("nan"),
-            )
-        )
+        mean = float(known.mean()) if len(known) else math.nan
+        found.append(replace(response, delay_s=fit_delay(response), third_harmonic=mean))
     return found
 
 
@@ -121,7 +114,7 @@ def operator(part: JointLog, joint: str, estimator: Estimator, rate_hz: float) -
             "match a chirp or a multisine and keep the steps to check it."
         )
     if segment.kind == "multisine" and segment.period_s is not None:
-        return multisine_operator(part.time, command, segment.period_s, estimator, rate_hz=rate_hz)
+        return multisine_operator(part.time, command, segment.period_s, estimator, rate_hz)
     return H1Operator.build(part.time, command, estimator, rate_hz=rate_hz)
 
 

@@ -21,7 +21,7 @@ from scipy.signal import get_window
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
-from pronk.response.grid import Grid, analysis_rate, held_mean, hold, interpolate
+from pronk.response.grid import Grid, held_mean, hold, interpolate
 from pronk.response.h1 import H1Operator
 from pronk.response.response import Estimator, FrequencyResponse
 
@@ -83,15 +83,14 @@ class _Lines:
 
 
 def _lines(
-    time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float | None
+    time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
 ) -> _Lines:
     """Find the periods that count and the lines excited in them.
 
     The periods are those in which the command repeats the period before; ramps fall out by
     themselves, and the first steady period is dropped as the transient.
     """
-    rate = analysis_rate([time]) if rate_hz is None else rate_hz
-    samples = max(round(period_s * rate), 1)
+    samples = max(round(period_s * rate_hz), 1)
     fine = samples / period_s
     count = int(np.floor((time[-1] - time[0]) * fine + 0.01)) + 1
     start = float(time[0])
@@ -138,12 +137,10 @@ def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
     return best
 
 
-def read_periods(
-    log: JointLog, joint: str, estimator: Estimator, rate_hz: float | None = None
-) -> Spectra:
+def read_periods(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> Spectra:
     """Spectra of the steady periods of one multisine (`JointLog.cut`) at its excited lines.
 
-    `rate_hz` is about that of the analysis grid; that of the timestamps if not given.
+    `rate_hz` is about that of the analysis grid.
 
     Raises:
         LogError: The segment gives no period, or fewer than three equal periods.
@@ -167,14 +164,9 @@ def read_periods(
 
 
 def multisine_operator(
-    time: Array,
-    command: Array,
-    period_s: float,
-    estimator: Estimator,
-    *,
-    rate_hz: float | None = None,
+    time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
 ) -> H1Operator:
-    """`estimate_multisine` of one excitation as a matrix, for a fixed command.
+    """`estimate_periodic` of one multisine as a matrix, for a fixed command.
 
     Raises:
         LogError: Fewer than three equal periods.
@@ -300,14 +292,25 @@ def _h1(command: ComplexArray, position: ComplexArray) -> ComplexArray:
     return np.asarray(cross / (np.abs(command) ** 2).sum(axis=0))
 
 
-def _combined(
-    parts: Sequence[JointLog], joint: str, read: Sequence[Spectra], window: str, segment_s: float
+def estimate_periodic(
+    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
 ) -> FrequencyResponse:
-    """Response averaged over the periods of every excitation.
+    """Response to multisines or sine steps, averaged over the periods of every excitation.
 
     `repeats` holds one row per excitation if there are three or more (other random phases are then
-    part of the scatter), one per period otherwise.
+    part of the scatter), one per period (of steps, per block of periods) otherwise.
+
+    Raises:
+        LogError: As `read_periods` or `read_steps`, or repeats with different frequencies.
     """
+    if parts[0].segments[0].kind == "multisine":
+        read = [read_periods(part, joint, estimator, rate_hz) for part in parts]
+        length = float(parts[0].segments[0].period_s or 0.0)
+        window = f"whole periods of {length:g} s, ramps and the first steady period dropped"
+    else:
+        read = [read_steps(part, joint, estimator, rate_hz) for part in parts]
+        length = float(2.0 * np.pi / read[0].omega[0])
+        window = f"whole periods of each step, the first and at least {_SETTLE_S:g} s dropped"
     omega, factor = read[0].omega, read[0].factor
     for other in read[1:]:
         if other.omega.shape != omega.shape or not np.allclose(other.omega, omega):
@@ -333,34 +336,7 @@ def _combined(
         repeats=repeats / factor,
         estimator="periodic",
         window=window,
-        segment_s=segment_s,
+        segment_s=length,
         virtual=parts[0].virtual,
         source=parts[0].source,
     )
-
-
-def estimate_multisine(
-    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
-) -> FrequencyResponse:
-    """Response at the lines of a multisine, averaged over periods and repeats.
-
-    Raises:
-        LogError: Too few periods, or repeats with different lines.
-    """
-    read = [read_periods(part, joint, estimator, rate_hz) for part in parts]
-    period = float(parts[0].segments[0].period_s or 0.0)
-    words = f"whole periods of {period:g} s, ramps and the first steady period dropped"
-    return _combined(parts, joint, read, words, period)
-
-
-def estimate_steps(
-    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
-) -> FrequencyResponse:
-    """Response at the frequencies of sine steps, averaged over blocks of periods and repeats.
-
-    Raises:
-        LogError: As `read_steps`, or repeats with different frequencies.
-    """
-    read = [read_steps(part, joint, estimator, rate_hz) for part in parts]
-    words = f"whole periods of each step, the first and at least {_SETTLE_S:g} s dropped"
-    return _combined(parts, joint, read, words, float(2.0 * np.pi / read[0].omega[0]))

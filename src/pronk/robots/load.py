@@ -30,6 +30,8 @@ from pronk.robots.robot import Drive, Joint, RobotSpec
 SCHEMA = "pronk/robot/1"
 _MIRROR_TOLERANCE = 1e-9
 """Largest relative difference of inertia and bias forces of joints that mirror each other."""
+_ROUNDING = 1e-3
+"""How far a pose may be outside of a range by its rounding to four digits [rad]."""
 _TORQUE_FACTOR, _EMF_FACTOR = {1: 1.0, 3: 1.5}, {1: 1.0, 3: 2.0}
 _Positive = Annotated[float, Meta(gt=0.0)]
 _Least = Annotated[float, Meta(ge=0.0)]
@@ -215,7 +217,8 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
             "command for `decimation` steps of the simulator."
         )
     model = build().compile()
-    base = file.base_body or default_base(model)
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    base = file.base_body or (model.body(model.jnt_bodyid[free[0]]).name if len(free) else "world")
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base) < 0:
         raise RobotError(f"{source}: base_body {base!r} is not a body of the model.")
     hinges = {
@@ -224,14 +227,8 @@ def make_robot(file: RobotFile, build: Model, source: str) -> RobotSpec:
         if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
     }
     groups = _groups(file, hinges, source)
-    copied = (
-        "legs",
-        "policy_rate_hz",
-        "timestep_s",
-        "decimation",
-        "grid_stiffness",
-        "grid_damping",
-    )
+    timing = ("policy_rate_hz", "timestep_s", "decimation")
+    copied = ("legs", *timing, "grid_stiffness", "grid_damping")
     robot = RobotSpec(
         name=file.name,
         joints=tuple(_joint(file, model, name, hinges, groups[name], source) for name in hinges),
@@ -295,7 +292,12 @@ def _joint(
         values = file.poses.get(pose, {})
         if name not in values and group not in values:
             raise RobotError(f"{source}: poses.{pose} has no entry for {name} or {group}.")
-        position[pose] = float(values[name] if name in values else values[group])
+        position[pose] = angle = float(values[name] if name in values else values[group])
+        if limited and not low - _ROUNDING <= angle <= high + _ROUNDING:
+            raise RobotError(
+                f"{source}: poses.{pose} puts {name} at {angle:g} rad, outside its range of "
+                f"{low:g} to {high:g} rad."
+            )
     return Joint(
         name=name,
         group=group,
@@ -308,14 +310,6 @@ def _joint(
         mirror=mirror,
         **entry,
     )
-
-
-def default_base(model: mujoco.MjModel) -> str:
-    """Name the body with the free joint, or the world where nothing is free."""
-    for i in range(model.njnt):
-        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE:
-            return str(model.body(model.jnt_bodyid[i]).name)
-    return "world"
 
 
 def _limb(model: mujoco.MjModel, body: int, base: int) -> int:

@@ -28,7 +28,7 @@ import numpy as np
 
 from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
-from pronk.robots.robot import Drive, RobotSpec
+from pronk.robots.robot import Drive, Joint, RobotSpec
 
 _POSITION_INPUT = 1  # dcmotor input_mode: control is a position command
 _KP, _KD = 4, 6  # where MuJoCo 3.11 packs controller[0] and controller[2] in actuator_gainprm
@@ -36,20 +36,17 @@ _KP, _KD = 4, 6  # where MuJoCo 3.11 packs controller[0] and controller[2] in ac
 Values = Mapping[str, float]
 
 
-def free_spec(
-    robot: RobotSpec, *, armature: Values | None = None, frictionloss: Values | None = None
-) -> mujoco.MjSpec:
+def free_spec(robot: RobotSpec) -> mujoco.MjSpec:
     """The robot as it stands, without floor and without actuators.
 
     Joints have their armature, dry friction and viscous damping; the timestep is the training
     simulator's, the integrator implicitfast; keyframe `default` is the default pose.
-
-    Values by joint name replace the drive's.
     """
     spec = robot.build_spec()
     spec.option.timestep = robot.timestep_s
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    _set_passive(spec, robot, robot.joint_names, armature, frictionloss)
+    for joint in robot.joints:
+        _set_passive(spec, joint)
     _add_default_key(spec, robot, with_command=False)
     return spec
 
@@ -60,8 +57,6 @@ def bench_spec(
     *,
     stiffness: Values | None = None,
     damping: Values | None = None,
-    armature: Values | None = None,
-    frictionloss: Values | None = None,
 ) -> mujoco.MjSpec:
     """One joint on the bench: what moves when it is excited, and nothing else.
 
@@ -70,8 +65,8 @@ def bench_spec(
     by their own drives. Contacts are off, gravity is on. Geoms are left out (the bench is
     computed, not drawn). Keyframe `default` is the default pose with the commands that hold it.
 
-    Values by joint name replace those of the robot's drives. A RobotError names a joint outside
-    the chain that could move with it.
+    Gains by joint name [N m/rad, N m s/rad] replace those of the robot's drives. A RobotError names
+    a joint outside the chain that could move with it.
     """
     joint = robot.joint(joint_name)
     spec = robot.build_spec()
@@ -85,8 +80,9 @@ def bench_spec(
     _remove_other_branches(spec, base, {*joint.chain, *joint.clamped}, joint_name)
     for name in joint.clamped:
         _weld(spec, name, robot.joint(name).default_position)
-    passive = {"armature": armature, "frictionloss": frictionloss}
-    add_drives(spec, robot, joint.chain, stiffness=stiffness, damping=damping, **passive)
+    for name in joint.chain:
+        _set_passive(spec, robot.joint(name))
+    add_drives(spec, robot, joint.chain, stiffness=stiffness, damping=damping)
     _add_default_key(spec, robot, with_command=True)
     return spec
 
@@ -126,19 +122,15 @@ def add_drives(
     *,
     stiffness: Values | None = None,
     damping: Values | None = None,
-    armature: Values | None = None,
-    frictionloss: Values | None = None,
 ) -> None:
-    """Give joints of a spec their drives: armature, friction, and a native dcmotor each.
+    """Give joints of a spec a native dcmotor each.
 
-    Actuators have the names of their joints and take position commands [rad].
-
-    Values by joint name [N m/rad, N m s/rad, kg m^2, N m] replace those of the robot's drives.
+    Actuators have the names of their joints and take position commands [rad]. Gains by joint name
+    [N m/rad, N m s/rad] replace those of the robot's drives.
     """
-    names = tuple(joint_names)
-    _check_names(robot, stiffness, damping)
-    _set_passive(spec, robot, names, armature, frictionloss)
-    for name in names:
+    for name in (*(stiffness or {}), *(damping or {})):
+        robot.joint(name)
+    for name in joint_names:
         joint = robot.joint(name)
         drive = joint.drive
         constant, resistance = _constants(drive)
@@ -208,26 +200,11 @@ def _voltage_gains(drive: Drive, stiffness: float, damping: float) -> tuple[floa
     return resistance * stiffness / constant, resistance * damping / constant - constant
 
 
-def _set_passive(
-    spec: mujoco.MjSpec,
-    robot: RobotSpec,
-    names: Iterable[str],
-    armature: Values | None,
-    frictionloss: Values | None,
-) -> None:
-    _check_names(robot, armature, frictionloss)
-    for name in names:
-        drive = robot.joint(name).drive
-        joint = spec.joint(name)
-        joint.armature = (armature or {}).get(name, drive.armature)
-        joint.frictionloss = (frictionloss or {}).get(name, drive.frictionloss)
-        joint.damping = [drive.viscous_damping, 0.0, 0.0]
-
-
-def _check_names(robot: RobotSpec, *overrides: Values | None) -> None:
-    for values in overrides:
-        for name in values or ():
-            robot.joint(name)
+def _set_passive(spec: mujoco.MjSpec, joint: Joint) -> None:
+    """Give a joint of a spec the armature and friction of its drive."""
+    hinge, drive = spec.joint(joint.name), joint.drive
+    hinge.armature, hinge.frictionloss = drive.armature, drive.frictionloss
+    hinge.damping = [drive.viscous_damping, 0.0, 0.0]
 
 
 def _remove_other_branches(

@@ -22,7 +22,7 @@ import orjson
 from numpy.typing import NDArray
 
 from pronk.links.machine import State
-from pronk.policy.layout import JOINTS, MEASURED_SIZE
+from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.runtime.safety import FilterAction, Reason
 
 Record = np.ndarray[Any, Any] | np.void

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
+from pronk.logs.columns import in_force
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import RobotSpec
 
@@ -110,12 +111,6 @@ def policy_clock(time: Array, command: Array, tick: float) -> tuple[float, float
     return float(time[0] + phase), float(np.median(np.abs(distance)))
 
 
-def held(time: Array, command: Array, instants: Array) -> Array:
-    """Command in force at given instants (the last one logged at or before each)."""
-    index = np.searchsorted(time, instants, side="right") - 1
-    return np.asarray(command[np.clip(index, 0, len(time) - 1)])
-
-
 def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec) -> CommandTrace:
     """Command to one joint in one segment of a log at every physics step of the robot.
 
@@ -139,22 +134,17 @@ def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec)
     tick = robot.timestep_s * robot.decimation
     clock, distance = policy_clock(part.time, command, tick)
     on_clock = distance <= _OFF_CLOCK * 0.6
-    # Begin with the tick in which the log begins, so that ticks and steps stay aligned.
-    start = (
-        clock + np.floor((part.time[0] - clock) / tick + 0.5) * tick if on_clock else part.time[0]
-    )
-    end = part.time[-1]
+    start, period = part.time[0], robot.timestep_s
     if on_clock:
-        ticks = int(np.ceil((end - start) / tick))
-        middle = start + (np.arange(ticks) + 0.5) * tick
-        values = held(part.time, command, middle)
-        early = _early_ticks(values)
+        # Begin with the tick in which the log begins, so that ticks and steps stay aligned.
+        start, period = clock + np.floor((start - clock) / tick + 0.5) * tick, tick
+    count = int(np.ceil((part.time[-1] - start) / period))
+    middle = start + (np.arange(count) + 0.5) * period
+    steps = command[np.maximum(in_force(part.time, middle), 0)]
+    if on_clock:
+        early = _early_ticks(steps)
         start -= early * tick
-        steps = np.repeat(np.concatenate([np.full(early, values[0]), values]), robot.decimation)
-    else:
-        count = int(np.ceil((end - start) / robot.timestep_s))
-        middle = start + (np.arange(count) + 0.5) * robot.timestep_s
-        steps = held(part.time, command, middle)
+        steps = np.repeat(np.pad(steps, (early, 0), mode="edge"), robot.decimation)
     return CommandTrace(
         joint=joint,
         start=float(start),

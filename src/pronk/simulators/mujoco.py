@@ -14,7 +14,7 @@ from functools import partial
 import mujoco
 import mujoco.rollout
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pronk.errors import PronkError, RobotError
 from pronk.response.grid import held_mean
@@ -72,6 +72,17 @@ class Chain(Closing):
         """Stop the threads."""
         self._pool.close()
 
+    def _set(self, model: mujoco.MjModel, name: str, values: Mapping[str, float]) -> None:
+        """Give a model parameters of a joint; the robot's own where one is missing."""
+        joint, dof = self.robot.joint(name), self.joints.index(name)
+        gains = {"stiffness": joint.stiffness, "damping": joint.damping} | dict(values)
+        set_drive_gains(model, name, joint.drive, gains["stiffness"], gains["damping"])
+        for parameter in ("armature", "frictionloss"):
+            array, own = (getattr(m, f"dof_{parameter}") for m in (model, self.model))
+            value = values.get(parameter, float(own[dof]))
+            if array[dof] != value:
+                set_passive(model, name, **{parameter: value})
+
     def rest_position(self, target: Array, stiffness: Array) -> Array:
         """Positions at rest with the drives at a target: what gravity leaves [rad], (chain,)."""
         model, data = self.model, self._data[0]
@@ -104,14 +115,9 @@ class Chain(Closing):
         for run, (own, drives) in enumerate(zip(models, sets, strict=True)):
             stiffness = self._stiffness.copy()
             for row, name in enumerate(self.joints):
-                if not (values := drives.get(name)):
-                    continue
-                joint = self.robot.joint(name)
-                stiffness[row] = values.get("stiffness", joint.stiffness)
-                damping = values.get("damping", joint.damping)
-                set_drive_gains(own, name, joint.drive, stiffness[row], damping)
-                passive = {n: values[n] for n in ("armature", "frictionloss") if n in values}
-                set_passive(own, name, **passive)
+                if values := drives.get(name):
+                    stiffness[row] = values.get("stiffness", stiffness[row])
+                    self._set(own, name, values)
             first[run] = (
                 self.rest_position(command[run, 0], stiffness) if start is None else start[run]
             )
@@ -211,7 +217,8 @@ class JointTestRig(Chain):
             n = part.stop - part.start
             for row, i in enumerate(range(part.start, part.stop)):
                 kp = float(values["stiffness"][i])
-                self._set(self._models[row], {name: float(v[i]) for name, v in values.items()})
+                own = {name: float(v[i]) for name, v in values.items()}
+                self._set(self._models[row], self.joint.name, own)
                 if not shared or begin == 0:
                     pose, command = traces[0 if shared else i].excitation(self.robot, steps)
                     centre[row] = pose[self.index]
@@ -232,18 +239,6 @@ class JointTestRig(Chain):
             )
             self.steps += n * steps
             yield part, sensor[:n, :, self._sensor] - centre[:n, None]
-
-    def _set(self, model: mujoco.MjModel, values: Mapping[str, float]) -> None:
-        """Give a model parameters of the excited joint; the robot's own where one is missing."""
-        name, drive, dof = self.joint.name, self.joint.drive, self.index
-        set_drive_gains(model, name, drive, values["stiffness"], values["damping"])
-        for parameter, array, own in (
-            ("armature", model.dof_armature, self.model.dof_armature),
-            ("frictionloss", model.dof_frictionloss, self.model.dof_frictionloss),
-        ):
-            value = values.get(parameter, float(own[dof]))
-            if array[dof] != value:
-                set_passive(model, name, **{parameter: value})
 
 
 def rig_on(device: str) -> Callable[..., JointTestRig]:
@@ -330,27 +325,3 @@ class MujocoSimulator(JointRigs):
                 out[..., columns] = chain.rollout(held[..., columns], sets)[:, :-1]
             left = [name for name in left if name not in chain.joints]
         return out
-
-
-def simulate(
-    robot: RobotSpec,
-    trace: CommandTrace,
-    stiffness: ArrayLike,
-    damping: ArrayLike,
-    *,
-    armature: float | None = None,
-    frictionloss: float | None = None,
-    threads: int = 2,
-) -> Array:
-    """Simulate one command in the training simulator with many gain pairs; see `JointRigs.play`.
-
-    It begins at rest where gravity leaves the joint with its first command. Gains [N m/rad,
-    N m s/rad] are scalars or of shape (b,); the drive's armature and friction if None.
-    """
-    gains = np.broadcast_arrays(np.atleast_1d(stiffness), np.atleast_1d(damping))
-    values = dict(zip(("stiffness", "damping"), (np.asarray(g, float) for g in gains), strict=True))
-    for name, value in (("armature", armature), ("frictionloss", frictionloss)):
-        if value is not None:
-            values[name] = np.full(len(values["stiffness"]), value)
-    with MujocoSimulator(robot, threads=threads) as simulator:
-        return simulator.play(trace, values)

@@ -25,7 +25,7 @@ from pronk.errors import ArtefactError
 from pronk.evaluation.training_sim.evaluation import Evaluation, Plan, evaluate_policy
 from pronk.files import sha256
 from pronk.policy.contract import check
-from pronk.policy.layout import JOINTS, MEASURED_SIZE
+from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.policy.runtime import Inference, load_policy
 from pronk.policy.runtime import Policy as ExportedPolicy
 from pronk.robots import load_robot

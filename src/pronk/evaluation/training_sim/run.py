@@ -19,7 +19,7 @@ from torch import Tensor
 from pronk.errors import PronkError
 from pronk.evaluation.training_sim.adapter import TERM, StepListener, motion_command
 from pronk.evaluation.training_sim.evaluation import NEVER, Plan
-from pronk.policy.layout import ESTIMATE, JOINTS
+from pronk.policy.observation import ESTIMATE, JOINTS
 from pronk.virtual.capture import Capture
 
 Policy = Callable[[TensorDict], Tensor]

@@ -1,7 +1,7 @@
 """Observations: the measured vector, the jump input, and the state that only training has.
 
-The measured vector is laid out in `pronk.policy.layout`, with noise D7 to D10. The critic reads the
-simulator's state without noise and the randomized parameters of each robot.
+The measured vector is laid out in `pronk.policy.observation`, with noise D7 to D10. The critic
+reads the simulator's state without noise and the randomized parameters of each robot.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 import pronk
 from pronk.files import written_whole
 from pronk.policy.contract import COMMANDS, METADATA_KEY, Contract, measured_layout, to_json
-from pronk.policy.layout import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
+from pronk.policy.observation import ESTIMATE, ESTIMATE_SIZE, MEASURED_SIZE
 from pronk.policy.runtime import load_policy
 from pronk.robots.robot import RobotSpec
 from pronk.train.gains import TrainingGains

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from pronk.errors import PronkError
-from pronk.policy.layout import (
+from pronk.policy.observation import (
     ACTOR_INDICES,
     ACTOR_SIZE,
     ESTIMATE,
@@ -253,7 +253,7 @@ class EstimatorActor(JumpModel):
         if size - self.jump_size != MEASURED_SIZE:
             raise PronkError(
                 f"the measured vector has {size - self.jump_size} numbers; expected"
-                f" {MEASURED_SIZE}, as in pronk.policy.layout."
+                f" {MEASURED_SIZE}, as in pronk.policy.observation."
             )
         return groups, size
 

@@ -21,13 +21,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from pronk.errors import PronkError
-from pronk.policy.layout import ESTIMATE, MEASURED
+from pronk.policy.observation import ESTIMATE, MEASURED
 from pronk.robots.legged import Legged
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.observations import CRITIC, CRITIC_JUMP
 
 GROUPS: Mapping[str, Mapping[str, int]] = {
-    "measured": {name: part.size for name, part in MEASURED.items()},
+    "measured": {name: len(part) for name, part in MEASURED.items()},
     "jump": {"jump": 1},
     "critic": CRITIC,
     "critic_jump": CRITIC_JUMP,

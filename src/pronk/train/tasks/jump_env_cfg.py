@@ -30,7 +30,7 @@ from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
 from mjlab.viewer import ViewerConfig
 
-from pronk.policy.layout import ACTIONS, HISTORY
+from pronk.policy.observation import ACTIONS, HISTORY
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
 from pronk.train import phases

@@ -1,9 +1,10 @@
-"""CSV with one column per joint and quantity."""
+"""CSV with one column per joint and quantity; NPZ with arrays by name, no pickle."""
 
 from __future__ import annotations
 
 import csv
 import math
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 
 QUANTITIES = ("command", "position", "velocity", "torque")
 MOST_BYTES = 2**30
-"""Largest file that is read [bytes]."""
+"""Largest CSV file, and largest size that the arrays of an NPZ may unpack to [bytes]."""
 
 
 def read_text(path: Path) -> str:
@@ -60,19 +61,11 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 def read_csv(
     path: Path, *, robot: RobotSpec | None = None, columns: Mapping[str, str] | None = None
 ) -> Columns:
-    """Read a CSV file.
+    """Read a CSV file; a LogError names the column and row where something is missing.
 
     Columns are called `time`, `command.JOINT`, `position.JOINT`, and optionally `velocity.JOINT`
-    [angle/s] and `torque.JOINT` [N m].
-
-    Args:
-        path: The file.
-        robot: Not needed: the columns have names.
-        columns: The file's name for each of ours, for instance `{"time": "t",
-            "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`.
-
-    Raises:
-        LogError: Something is missing; the message names column and row.
+    [angle/s] and `torque.JOINT` [N m]. `columns` gives the file's own name for each of them, for
+    instance `{"time": "t", "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`.
     """
     header, rows = read_rows(path)
     given, listed = dict(columns or {}), ", ".join(header)
@@ -116,6 +109,53 @@ def read_csv(
         joints=joints,
         time=numbers("time"),
         row=lambda i: f"row {i + 2}",
+        sha256=sha256(path),
+        **found,  # type: ignore[arg-type]
+    )
+
+
+def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
+    """Read the arrays `time` (n,), `command` and `position` (n, joints).
+
+    `velocity`, `torque` and `joints` (the names) are read where they are there.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > MOST_BYTES:
+                raise LogError(f"{path}: it unpacks to more than {MOST_BYTES >> 20} MiB.")
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except LogError:
+        raise
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise LogError(f"{path}: cannot be read ({reason}).") from None
+    except Exception as error:
+        # zipfile, zlib and the npy parser fail in many ways on a damaged file.
+        reason = f"{type(error).__name__}: {error}"[:120]
+        raise LogError(f"{path}: not a readable NPZ file ({reason}).") from error
+    if missing := [n for n in ("time", *QUANTITIES[:2]) if n not in arrays]:
+        raise LogError(
+            f"{path}: no array {', '.join(missing)}; it holds {', '.join(arrays) or 'none'}."
+        )
+    try:
+        found = {
+            n: np.asarray(arrays[n], dtype=np.float64) for n in ("time", *QUANTITIES) if n in arrays
+        }
+    except (TypeError, ValueError):
+        raise LogError(f"{path}: its arrays are not numbers.") from None
+    time = found.pop("time")
+    for name, values in found.items():
+        if time.ndim != 1 or values.shape[:1] != time.shape:
+            raise LogError(
+                f"{path}: time has shape {time.shape} and {name} {values.shape}; expected (n,) and "
+                "(n, joints)."
+            )
+        found[name] = values.reshape(len(time), -1) if len(time) else values
+    return Columns(
+        where=str(path),
+        joints=tuple(str(name) for name in arrays.get("joints", np.empty(0)).reshape(-1)),
+        time=time,
         sha256=sha256(path),
         **found,  # type: ignore[arg-type]
     )
