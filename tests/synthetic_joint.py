@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import chirp
+from scipy.signal import chirp, cont2discrete, lfilter
 
-from analytic import simulate_second_order
 from pronk.logs.joint_log import JointLog, Segment
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 KNEE = {"stiffness": 21.9, "damping": 0.54, "inertia": 0.0068}
 HIP = {"stiffness": 20.6, "damping": 0.49, "inertia": 0.02}
@@ -22,15 +22,43 @@ AMPLITUDE = 0.25
 TICK_HZ = 50.0
 
 
+def second_order(
+    omega: Array, *, stiffness: float, damping: float, inertia: float, delay_s: float = 0.0
+) -> ComplexArray:
+    """Response of an ideal joint to its position command.
+
+    `stiffness exp(-s delay) / (inertia s^2 + damping s + stiffness)` at s = j omega: paper M2 with
+    zero target velocity (reading A9), where `damping` is the drive's and the joint's own together.
+
+    Units: rad/s, N m/rad, N m s/rad, kg m^2 (link and armature), s.
+    """
+    s = 1j * np.asarray(omega, dtype=np.float64)
+    joint = stiffness / (inertia * s**2 + damping * s + stiffness)
+    return np.asarray(joint * np.exp(-s * delay_s))
+
+
+def simulate_second_order(
+    command: Array, rate_hz: float, *, stiffness: float, damping: float, inertia: float
+) -> Array:
+    """Exact response [rad] of the same joint, at rest at first, to a held command [rad].
+
+    The command is constant within each step of `1 / rate_hz`, for which the zero-order-hold
+    equivalent is exact.
+    """
+    joint = (np.array([stiffness]), np.array([inertia, damping, stiffness]))
+    numerator, denominator, _ = cont2discrete(joint, 1.0 / rate_hz, method="zoh")
+    rest = float(command[0])
+    return np.asarray(lfilter(np.ravel(numerator), denominator, command - rest) + rest)
+
+
 def held(time: Array) -> Array:
     """The policy tick in force at each instant."""
     return np.floor(time * TICK_HZ + 1e-9) / TICK_HZ
 
 
-def chirp_command(
-    kind: str, rate: float, *, duration: float = 20.0, settle: float = 1.0
-) -> tuple[Array, Array, Array]:
-    """Time, command held at 50 Hz, instantaneous frequency of a chirp of 0.1 to 25 Hz."""
+def chirp_command(kind: str, rate: float) -> tuple[Array, Array, Array]:
+    """Time, command held at 50 Hz, instantaneous frequency of a chirp of 0.1 to 25 Hz in 20 s."""
+    duration, settle = 20.0, 1.0
     time = np.arange(round((duration + settle) * rate)) / rate
     tick = held(time)
     method = "linear" if kind == "chirp" else "logarithmic"
@@ -41,10 +69,9 @@ def chirp_command(
     return time, np.where(excited, AMPLITUDE * wave, 0.0), np.where(excited, hz, np.nan)
 
 
-def multisine_command(
-    rate: float, *, period: float = 4.0, periods: int = 5, settle: float = 0.5, seed: int = 0
-) -> tuple[Array, Array]:
-    """Random-phase multisine on odd lines, every fourth odd line left silent."""
+def multisine_command(rate: float, *, periods: int = 5, seed: int = 0) -> tuple[Array, Array]:
+    """Random-phase multisine of period 4 s on odd lines, every fourth odd line left silent."""
+    period, settle = 4.0, 0.5
     time = np.arange(round((periods * period + settle) * rate)) / rate
     tick = held(time)
     lines = np.arange(1, 96, 2)
@@ -99,7 +126,6 @@ def make_log(
     *,
     kind: str,
     noise: float = 0.0,
-    amplitude: float = AMPLITUDE,
     period: float | None = None,
     jitter: float = 0.0,
     seed: int = 0,
@@ -128,7 +154,7 @@ def make_log(
                 joints=("knee",),
                 start=float(moved[0]),
                 stop=float(moved[-1]),
-                amplitude=amplitude,
+                amplitude=AMPLITUDE,
                 repeat=repeat,
                 period_s=period,
             )

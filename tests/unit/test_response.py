@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from analytic import second_order, simulate_second_order
 from pronk.errors import ArtefactError, LogError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import read_log
@@ -38,6 +37,8 @@ from synthetic_joint import (
     linear_joint,
     make_log,
     multisine_command,
+    second_order,
+    simulate_second_order,
     steps_command,
 )
 

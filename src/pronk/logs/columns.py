@@ -62,20 +62,12 @@ def import_columns(
     drop_duplicates: bool = False,
     scale: Mapping[str, float] | None = None,
 ) -> JointLog:
-    """Check columns and make a log of them.
+    """Check columns and make a log of them; a LogError names what is implausible and the way out.
 
-    Args:
-        columns: What was read.
-        robot: The robot; it names columns that have no names.
-        unit: Unit of angles in the file, `rad` or `deg`; required where the format has none.
-        time_unit: Unit of the timestamps, one of `TIME_UNITS`; the format's if None.
-        joint_names: Names of the joints.
-        drop_duplicates: Drop rows that repeat the one before in full.
-        scale: Radians per unit of joints whose unit is unknown, by (new) joint name; for command
-            and position, the velocity is left as it is.
-
-    Raises:
-        LogError: Something is implausible; the message names it and the way out.
+    Columns that have no names get those of the robot. `unit` of the angles is `rad` or `deg`, and
+    required where the format has none; `time_unit` is one of `TIME_UNITS`. Duplicates are rows that
+    repeat the one before in full. `scale` gives radians per unit of joints whose unit is unknown,
+    by (new) joint name, for command and position; the velocity is left as it is.
     """
     where = columns.where
     unit, time_unit = unit or columns.unit, time_unit or columns.time_unit

@@ -189,15 +189,10 @@ def load_simulator(
 ) -> Simulator:
     """Make a simulator of a robot.
 
-    Args:
-        choice: `mujoco`, `FILE.py:NAME`, or the name of an entry point in `pronk.simulators`. What
-            it names is called with the robot and returns a `Simulator`.
-        robot: The robot.
-        threads: Threads of MuJoCo.
-        device: Where MuJoCo simulates large runs; see `pronk.simulators.mujoco.DEVICES`.
-
-    Raises:
-        PronkError: There is no such simulator, or it lacks what the protocol needs.
+    The choice is `mujoco`, `FILE.py:NAME`, or an entry point in `pronk.simulators`; what it names
+    is called with the robot and returns a `Simulator`. Threads are those of MuJoCo; its large runs
+    are simulated on `device`, one of `pronk.simulators.mujoco.DEVICES`. A PronkError says that
+    there is no such simulator, or that it lacks what the protocol needs.
     """
     if choice == "mujoco":
         from pronk.simulators.mujoco import MujocoSimulator
