@@ -220,13 +220,13 @@ def correlation_note(time: Array, command: Array, joints: Sequence[str]) -> str:
     index = np.clip(np.searchsorted(time, grid + 0.5 / rate_hz) - 1, 0, len(time) - 1)
     centred = command[index] - command[index].mean(axis=0)
     size = np.linalg.norm(centred, axis=0)
-    moving = np.flatnonzero(size > 1e-9 * np.sqrt(len(time)))
+    moving = [i for i in range(len(joints)) if size[i] > 1e-9 * np.sqrt(len(time))]
     middle = len(time) - 1
     reach = min(round(_REACH_S * rate_hz), middle)
     largest, alike = CORRELATION_LIMIT, ""
     for one, other in combinations(moving, 2):
-        pair = (centred[:, i] / size[i] for i in (other, one))
-        lags = correlate(*pair, method="fft")
+        first, second = (centred[:, i] / size[i] for i in (other, one))
+        lags = correlate(first, second, method="fft")
         peak = float(np.abs(lags[middle - reach : middle + reach + 1]).max())
         if peak > largest:
             largest, alike = peak, f"{joints[other]} and {joints[one]}"

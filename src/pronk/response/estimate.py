@@ -43,8 +43,9 @@ def excitations(log: JointLog, joint: str) -> list[list[JointLog]]:
     where = log.source or "log"
     segments = [segment for segment in log.segments if joint in segment.joints]
     if not log.segments:
-        ends = {"start": float(log.time[0]), "stop": float(log.time[-1])}
-        segments = [Segment(kind="unknown", joints=log.joints, amplitude=math.nan, **ends)]
+        start, stop, nan = float(log.time[0]), float(log.time[-1]), math.nan
+        whole = Segment(kind="unknown", joints=log.joints, start=start, stop=stop, amplitude=nan)
+        segments = [whole]
     if not segments:
         excited = sorted({name for segment in log.segments for name in segment.joints})
         raise LogError(f"{where}: {joint} was not excited; {', '.join(excited)} were.")
