@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pronk.links.machine import State
+from pronk.virtual.faults import flip_bit
 
 
 def some_state(**changes: Any) -> State:
@@ -30,10 +31,9 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     """A broken copy of a message: one flipped bit, a burst, cut, longer, shifted, or noise."""
     kind = rng.integers(6)
     changed = bytearray(data)
-    if kind == 0:  # a bit
-        at = int(rng.integers(8 * len(data)))
-        changed[at // 8] ^= 1 << at % 8
-    elif kind == 1:  # a burst
+    if kind == 0:
+        return flip_bit(data, int(rng.integers(8 * len(data))))
+    if kind == 1:  # a burst
         at, size = int(rng.integers(len(data))), int(rng.integers(1, 64))
         changed[at : at + size] = rng.bytes(len(changed[at : at + size]))
     elif kind == 2:  # cut off

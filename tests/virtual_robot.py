@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pronk.robots import load_robot
+from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import AttitudeParams, SimParams, load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
@@ -32,6 +33,12 @@ def quiet(**machine: Any) -> SimParams:
     nothing |= dict.fromkeys(("gyro_bias", "accelerometer_bias"), (0.0, 0.0, 0.0))
     changed = replace(SIM_PARAMS.machine, **nothing | machine)
     return replace(SIM_PARAMS, machine=changed, attitude=AttitudeParams())
+
+
+def connected(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
+    machine = VirtualRobot(ROBOT, sim_params, **options)
+    machine.connect()
+    return machine
 
 
 def gains(stiffness: float = 17.0, damping: float = 0.4) -> dict[str, Any]:

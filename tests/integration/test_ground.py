@@ -20,7 +20,7 @@ from pronk.links.machine import Command, State
 from pronk.robots import load_robot
 from pronk.virtual.ground import Box, Ground, Start
 from pronk.virtual.physics import Transport
-from pronk.virtual.plant import build_plant, legs_of
+from pronk.virtual.plant import Plant, legs_of
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sensors import about_z, moving_force, of_vector, product, turned_back
 from pronk.virtual.sim_params import (
@@ -30,10 +30,11 @@ from pronk.virtual.sim_params import (
     load_sim_params,
     with_changes,
 )
-from virtual_robot import POSE, ROBOT, SIM_PARAMS, gains, quiet
+from virtual_robot import POSE, ROBOT, SIM_PARAMS, connected, gains, quiet
 
 Array = NDArray[np.float64]
 
+ARM = load_robot("so101")
 GRAVITY = 9.81
 STEP = 0.25e-3
 
@@ -53,9 +54,7 @@ def aligned(sim_params: SimParams) -> SimParams:
 
 
 def standing(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
-    machine = VirtualRobot(ROBOT, sim_params, base="ground", **options)
-    machine.connect()
-    return machine
+    return connected(sim_params, base="ground", **options)
 
 
 def hold(position: Array = POSE, **options: Any) -> Command:
@@ -139,7 +138,7 @@ def test_a_sliding_foot_slows_down_by_friction_and_a_sticking_one_stays() -> Non
 def test_feet_sink_in_by_the_weight_over_their_stiffness() -> None:
     machine = standing(quiet())
     machine.wait(1.0)
-    plant = build_plant(ROBOT, SIM_PARAMS, legs_of(ROBOT), STEP, Ground()).model
+    plant = Plant(ROBOT, SIM_PARAMS, legs_of(ROBOT), STEP, Ground()).model
     weight = plant.body_mass.sum() * GRAVITY
     sunk = 0.0175 - machine.snapshot().foot_position[0, :, 2]
     assert sunk.sum() * SIM_PARAMS.ground.stiffness == pytest.approx(weight, rel=0.06)
@@ -410,7 +409,7 @@ def test_a_trunk_with_other_mass_centre_and_inertia() -> None:
         mass_offset=1.5, com_offset=(0.01, 0.02, -0.03), inertia_scale=(1.1, 0.9, 1.0)
     )
     sim_params = replace(SIM_PARAMS, trunk=trunk)
-    model = build_plant(ROBOT, sim_params, legs_of(ROBOT), STEP, Ground()).model
+    model = Plant(ROBOT, sim_params, legs_of(ROBOT), STEP, Ground()).model
     nominal = ROBOT.build_spec().compile()
     was, now = nominal.body("trunk"), model.body("trunk")
     mass = float(was.mass[0])
@@ -452,6 +451,7 @@ def over(sim_params: SimParams = SIM_PARAMS, **options: Any) -> VirtualRobot:
         (lambda: Box(center=(0.0, 0.0, 0.0), half_size=(1.0, 0.0, 1.0)), "half_size"),
         (lambda: Box(center=(0.0, math.nan, 0.0), half_size=(1.0, 1.0, 1.0)), "center"),
         (lambda: Ground(friction=0.0), "friction"),
+        (lambda: VirtualRobot(ARM, load_sim_params(None, ARM), base="ground"), "so101"),
     ],
 )
 def test_impossible_bodies_and_scenes_are_refused(make: Callable[[], object], words: str) -> None:
@@ -467,9 +467,3 @@ def test_impossible_requests_are_refused() -> None:
     for wrong in ({"made": math.nan}, {"valid_for": 0.0}):
         with pytest.raises(HardwareError, match=next(iter(wrong))):
             machine.send(hold(**wrong))
-
-
-def test_an_arm_is_refused_on_the_ground() -> None:
-    arm = load_robot("so101")
-    with pytest.raises(RobotError, match="so101"):
-        VirtualRobot(arm, load_sim_params(None, arm), base="ground")

@@ -31,7 +31,7 @@ from pronk.links.dds.link import (
     Participant,
     take,
 )
-from pronk.links.link import Freshness
+from pronk.links.link import Freshness, wait_for
 from pronk.links.machine import Command
 from pronk.robots import load_robot
 from pronk.virtual.dds_server import DdsServerTransport
@@ -90,11 +90,8 @@ def double() -> Iterator[Robot]:
     made.process.kill()
 
 
-def eventually(done: Callable[[], bool], seconds: float = 120.0) -> bool:
-    end = time.monotonic() + seconds
-    while not (is_done := done()) and time.monotonic() < end:
-        time.sleep(0.005)
-    return is_done
+def eventually(done: Callable[[], bool]) -> bool:
+    return wait_for(done, 120.0)
 
 
 def turned(angle: float) -> Command:
@@ -264,10 +261,7 @@ def test_two_robots_on_one_domain_are_refused() -> None:
             wire.publish(next(states))
         time.sleep(0.002)
 
-    with (
-        meanwhile(speak),
-        pytest.raises(HardwareError, match="2 robots"),
-    ):
+    with meanwhile(speak), pytest.raises(HardwareError, match="2 robots"):
         DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.0, fresh=FRESH).connect()
 
 

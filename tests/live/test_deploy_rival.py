@@ -121,8 +121,7 @@ class Wire:
 def over_lcm(port: int) -> Wire:
     import lcm
 
-    from pronk.links.lcm.codec import decode_command, encode_command
-    from pronk.links.lcm.layout import CHEETAH
+    from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
     from pronk.links.lcm.link import url_of
 
     sender, listener = (lcm.LCM(url_of(port=port)) for _ in range(2))

@@ -18,8 +18,13 @@ import numpy as np
 import pytest
 
 from pronk.errors import HardwareError
-from pronk.links.lcm.codec import decode_command, encode_command, mode_request
-from pronk.links.lcm.layout import CHEETAH, CONTROL_PARAMETER
+from pronk.links.lcm.codec import (
+    CHEETAH,
+    CONTROL_PARAMETER,
+    decode_command,
+    encode_command,
+    mode_request,
+)
 from pronk.links.lcm.link import LcmMachine, url_of
 from pronk.links.link import Freshness
 from pronk.links.machine import Command, State
@@ -150,9 +155,7 @@ def test_expired_commands_are_followed_by_damping(servers: dict[str, Process]) -
     machine.close()
 
 
-def test_commands_of_other_programs_are_refused(
-    servers: dict[str, Process],
-) -> None:
+def test_commands_of_other_programs_are_refused(servers: dict[str, Process]) -> None:
     process = servers["cheetah"]
     machine = process.machine()
     other = lcm.LCM(url_of(port=process.port))

@@ -30,8 +30,7 @@ from pronk.errors import HardwareError, LogError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp
 from pronk.links.address import Address
-from pronk.links.lcm.codec import decode_command, encode_command
-from pronk.links.lcm.layout import CHEETAH
+from pronk.links.lcm.codec import CHEETAH, decode_command, encode_command
 from pronk.links.lcm.link import url_of
 from pronk.links.link import Freshness
 from pronk.links.machine import Command

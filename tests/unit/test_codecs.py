@@ -26,8 +26,7 @@ from broken_message import mutated, some_state
 from pronk.errors import HardwareError
 from pronk.links.dds import codec as dds
 from pronk.links.lcm import codec as lcm
-from pronk.links.lcm import layout as layouts
-from pronk.links.lcm.layout import CHEETAH, MESSAGES, WTW, Layout, Message
+from pronk.links.lcm.codec import CHEETAH, MESSAGES, WTW, Layout, Message
 from pronk.links.machine import Command, RefusedError, State
 from pronk.robots import load_robot
 
@@ -71,7 +70,7 @@ def lcm_wire(layout: Layout) -> Wire:
         lambda data: lcm.decode_command(layout, data),
         lambda state: lcm.encode_state(layout, state),
         decoder,
-        (12.5, 500.0 / layouts.KNEE_RATIO**2, 5.0 / layouts.KNEE_RATIO**2),
+        (12.5, 500.0 / lcm.KNEE_RATIO**2, 5.0 / lcm.KNEE_RATIO**2),
     )
 
 
@@ -281,29 +280,29 @@ def stiff(position: np.ndarray | float = 0.0) -> Command:
 
 def test_knee_gains_orders_and_signs_on_lcm() -> None:
     # rt_spi.cpp does not convert the knee's gains: a wire gain acts as gain / .6429^2.
-    fields = layouts.LEG_CONTROL_COMMAND.decode(lcm.encode_command(CHEETAH, stiff(POSE)))
+    fields = lcm.LEG_CONTROL_COMMAND.decode(lcm.encode_command(CHEETAH, stiff(POSE)))
     np.testing.assert_allclose(fields["kp_joint"], np.tile([17, 17, 17 * 0.41332], 4), rtol=1e-5)
     np.testing.assert_allclose(fields["kd_joint"], np.tile([0.4, 0.4, 0.4 * 0.41332], 4), rtol=1e-5)
     np.testing.assert_allclose(fields["q_des"], np.tile([0, -0.8, 1.6], 4), rtol=1e-6)
     # leg + joint / 8, so that every number identifies its place.
     marks = np.array([leg + joint / 8 for leg in range(4) for joint in range(3)])
     _, data = lcm.encode_state(CHEETAH, some_state(position=marks, velocity=-marks))
-    fields = layouts.SPI_DATA.decode(data)
+    fields = lcm.SPI_DATA.decode(data)
     np.testing.assert_array_equal(fields["q_abad"], [0, 1, 2, 3])
     np.testing.assert_array_equal(fields["q_hip"], [0.125, 1.125, 2.125, 3.125])
     np.testing.assert_array_equal(fields["qd_knee"], [-0.25, -1.25, -2.25, -3.25])
     # The same stance in Unitree's signs: thigh +0.8, calf -1.6; the hips as they are.
     stance, unitree = np.tile([0.1, -0.8, 1.6], 4), np.tile([0.1, 0.8, -1.6], 4)
-    sent = layouts.WTW_PD_TAU_TARGETS.decode(lcm.encode_command(WTW, stiff(stance)))
+    sent = lcm.WTW_PD_TAU_TARGETS.decode(lcm.encode_command(WTW, stiff(stance)))
     np.testing.assert_array_equal(sent["q_des"], unitree)
     np.testing.assert_array_equal(sent["kp"], np.full(12, 17.0))
     turned = np.array([math.cos(0.2), 0, math.sin(0.2), 0])
     attitude, data = lcm.encode_state(WTW, some_state(position=stance, orientation=turned))
-    fields = layouts.WTW_LEG_CONTROL_DATA.decode(data)
+    fields = lcm.WTW_LEG_CONTROL_DATA.decode(data)
     np.testing.assert_allclose(fields["q"], unitree, rtol=1e-6)
     np.testing.assert_array_equal(fields["tau_est"][:3], [0.0, -0.25, -0.5])
     assert (fields["id"], fields["timestamp_us"]) == (7, 12_500_000)
-    rpy = layouts.WTW_STATE_ESTIMATOR.decode(attitude)["rpy"]
+    rpy = lcm.WTW_STATE_ESTIMATOR.decode(attitude)["rpy"]
     np.testing.assert_allclose(rpy, [0.0, 0.4, 0.0], atol=1e-6)
 
 
@@ -343,7 +342,7 @@ def test_states_need_a_recent_attitude_and_no_stamps() -> None:
     assert decoder.joints(joints, 1.01) is not None
     decoder = lcm.StateDecoder(WTW, Counter())
     decoder.attitude(lcm.encode_state(WTW, some_state())[0], 0.0)
-    states = [decoder.joints(layouts.WTW_LEG_CONTROL_DATA.encode(q=k), 0.0) for k in (1.0, 1.5)]
+    states = [decoder.joints(lcm.WTW_LEG_CONTROL_DATA.encode(q=k), 0.0) for k in (1.0, 1.5)]
     assert [s and (s.sequence, s.robot_time) for s in states] == [(0, None), (1, None)]
 
 
@@ -352,7 +351,7 @@ def test_control_mode_round_trip() -> None:
     assert lcm.read_mode_request(lcm.mode_request(4, 6)) == "locomotion"
     with pytest.raises(RefusedError, match="control_mode"):
         lcm.read_mode_request(lcm.mode_request(7, 6))
-    data = layouts.CONTROL_PARAMETER.decode(lcm.mode_request(4, 6))
+    data = lcm.CONTROL_PARAMETER.decode(lcm.mode_request(4, 6))
     # The robot copies the value from memory: a little-endian double.
     assert data["value"].tobytes()[:8] == bytes.fromhex("0000000000001040")
     assert data["name"].tobytes().rstrip(b"\0") == b"control_mode"
@@ -480,6 +479,6 @@ def test_impossible_dds_commands_are_refused(data: bytes, reason: str) -> None:
 
 def test_layouts_and_robots_that_do_not_exist_are_refused() -> None:
     with pytest.raises(HardwareError, match="go2"):
-        layouts.layout_of("go2")
+        lcm.layout_of("go2")
     with pytest.raises(HardwareError, match="so101"):
         dds.joint_map(load_robot("so101"))

@@ -12,7 +12,7 @@ import yaml
 
 from pronk.errors import RobotError
 from pronk.robots import load_robot
-from pronk.virtual.plant import build_plant
+from pronk.virtual.plant import Plant
 from pronk.virtual.sim_params import SHIPPED, load_sim_params, parse_sim_params, with_changes
 
 BODY: dict[str, Any] = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
@@ -89,12 +89,12 @@ def test_other_joints_and_too_stiff_belts_are_refused() -> None:
     knee = joints.pop("HR_knee")
     for wrong, name in ((joints, "HR_knee"), (joints | {"HR_knee": knee, "tail": knee}, "tail")):
         with pytest.raises(RobotError, match=rf"joints\.{name}"):
-            build_plant(ROBOT, replace(sim_params, joints=wrong), ("FR",), 0.25e-3)
+            Plant(ROBOT, replace(sim_params, joints=wrong), ("FR",), 0.25e-3)
     stiff = replace(sim_params.joints["FR_hip_roll"], belt_stiffness=9e4)
     broken = replace(sim_params, joints={**sim_params.joints, "FR_hip_roll": stiff})
     with pytest.raises(RobotError, match="belt_stiffness"):
-        build_plant(ROBOT, broken, ("FR",), 0.25e-3)
-    build_plant(ROBOT, broken, ("FR",), 0.025e-3)
+        Plant(ROBOT, broken, ("FR",), 0.25e-3)
+    Plant(ROBOT, broken, ("FR",), 0.025e-3)
 
 
 def test_files_are_read_or_refused(tmp_path: Path) -> None:

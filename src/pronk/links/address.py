@@ -33,18 +33,14 @@ GROUP = "pronk.links"
 _COMMON = ("robot", "interface", "clamp_operator", "release", "exclusive_s", "fresh")
 
 
-def link_names() -> tuple[str, ...]:
-    """Names of all links, those of installed packages included."""
-    return (*BUILT_IN, *sorted(entry_points(group=GROUP).names))
-
-
 def find_link(name: str) -> Callable[..., Machine]:
     """Import a link; HardwareError for an unknown name or a library that is not installed."""
     if target := BUILT_IN.get(name):
         return EntryPoint(name, target, GROUP).load()  # type: ignore[no-any-return]
     known = entry_points(group=GROUP)
     if name not in known.names:
-        raise HardwareError(f"no link {name!r}; the links are {', '.join(link_names())}.")
+        names = ", ".join((*BUILT_IN, *sorted(known.names)))
+        raise HardwareError(f"no link {name!r}; the links are {names}.")
     return plugins.load(known[name])  # type: ignore[no-any-return]
 
 
@@ -72,8 +68,6 @@ class Address:
             kind, found, query = parts.scheme, parts.netloc, parts.query
         if found and interface not in (None, found):
             raise HardwareError(f"{text} names the interface {found}; leave out {interface}.")
-        if kind == "twin":
-            raise HardwareError("link 'twin' is now called 'sim'.")
         link = find_link(kind)
         hints = get_type_hints(link.__init__ if inspect.isclass(link) else link)
         known = {

@@ -31,6 +31,8 @@ from pronk.errors import HardwareError
 from pronk.links.machine import Array, Command, RefusedError, State, TorqueKind, damping_command
 from pronk.robots.robot import RobotSpec
 
+Encode = Callable[[Command], bytes]
+Publish = Callable[[bytes], None]
 ClampOperator = Callable[[tuple[str, ...]], None]
 """A person at the bench: receives the joints to fix and returns when they are fixed."""
 
@@ -95,6 +97,25 @@ def unit_quaternion(name: str, values: Array) -> Array:
     return values / length
 
 
+def port_or_domain(
+    what: str, number: int | None, interface: str | None, real: int, virtual: int, allowed: range
+) -> int:
+    """Number on a wire, by default the `real` robots' with an interface and else `virtual`.
+
+    HardwareError for one that is not allowed, or the real robots' without an interface.
+    """
+    if number is None:
+        return virtual if interface is None else real
+    if number not in allowed:
+        raise HardwareError(f"{what} {number}; expected {allowed[0]} to {allowed[-1]}.")
+    if interface is None and number == real:
+        raise HardwareError(
+            f"{what} {number} is the real robots'; take another, such as {virtual}, or name the "
+            "network interface to the robot as well (for instance eth0)."
+        )
+    return number
+
+
 class StateNumbering:
     """Numbers the states of a live robot by the robot's own count, where it has one.
 
@@ -142,25 +163,23 @@ class CommandWriter:
 
     def __init__(
         self,
-        encode: Callable[[Command], bytes],
-        publish: Callable[[bytes], None],
+        encode: Encode,
+        publish: Publish,
         *,
-        joints: int = 12,
-        damping: float = 1.0,
-        repeat_s: float | None = None,
-        counts: Counter[str] | None = None,
+        damping: Command,
+        repeat_s: float | None,
+        counts: Counter[str],
     ) -> None:
         """Start the thread that watches the expiry; nothing is written yet.
 
         `encode` refuses impossible commands, and `publish` is called by one thread at a time. The
-        command in force is written again after `repeat_s` [s]; `damping` [N m s/rad] follows the
-        expiry. `counts` gets `commands`, `repeats`, `expired` and `not written`.
+        command in force is written again after `repeat_s` [s]; `damping` follows the expiry.
+        `counts` gets `commands`, `repeats`, `expired` and `not written`.
         """
-        self.counts: Counter[str] = Counter() if counts is None else counts
-        self.wrote = False
-        """Whether anything was written at all."""
+        self.counts, self.wrote = counts, False
+        """`wrote`: whether anything was written at all."""
         self._encode, self._publish, self._repeat_s = encode, publish, repeat_s
-        self._damping = encode(damping_command(joints, damping))
+        self._damping = encode(damping)
         self._data = b""
         self._expires = self._due = self._wake = math.inf
         self._open = True
@@ -171,9 +190,8 @@ class CommandWriter:
     def send(self, command: Command) -> None:
         """Put a command into force; damping if it has already expired.
 
-        Raises:
-            HardwareError: It is impossible, and was not sent; or writing failed, and damping
-                follows when it expires.
+        HardwareError: it is impossible, and was not sent; or writing failed, and damping follows
+        when it expires.
         """
         data = self._encode(command)
         expires = command.made + command.valid_for
@@ -247,14 +265,16 @@ class NetworkLink(ABC):
     A thread receives, timestamps and keeps states, so that their times do not depend on the caller.
     """
 
-    wire: str
-    """Its name in error messages."""
     torque_kind: TorqueKind
     state_rate_hz: float
     _writer: CommandWriter | None = None
     """None while the link is closed."""
     _command_topic = _address = ""
     """Where commands are written and states are expected, in error messages."""
+    _damping = 1.0
+    """With which the joints sink softly [N m s/rad]."""
+    _repeat_s: float | None = None
+    """Silence after which the command in force is written again [s]."""
 
     def __init__(
         self,
@@ -289,7 +309,12 @@ class NetworkLink(ABC):
         self.virtual, self._latest, self._last_error = False, None, ""
         self.counts.clear()
         self._states.clear()
-        self._writer = self._open()
+        self._writer = CommandWriter(
+            *self._open(),
+            damping=damping_command(len(self._robot.joints), self._damping),
+            repeat_s=self._repeat_s,
+            counts=self.counts,
+        )
         self._reading = True
         self._thread = threading.Thread(target=self._read, name="pronk reader", daemon=True)
         self._thread.start()
@@ -362,8 +387,7 @@ class NetworkLink(ABC):
     def fresh_states(self, rate_hz: float, *, until: float) -> list[State]:
         """Watch windows of states until one is as fresh as required, and return that.
 
-        Raises:
-            HardwareError: A window that ended after `until` [s] was not.
+        HardwareError: a window that ended after `until` [s] was not.
         """
         expected, fresh = rate_hz * _WINDOW_S, self._fresh
         while True:
@@ -397,9 +421,7 @@ class NetworkLink(ABC):
 
     def _opened(self) -> CommandWriter:
         if self._writer is None:
-            raise HardwareError(
-                f"the {self.wire} link to {self.robot} is not open; call connect() first."
-            )
+            raise HardwareError(f"the link to {self.robot} is not open; call connect() first.")
         return self._writer
 
     def _preflight(self) -> None:
@@ -439,8 +461,8 @@ class NetworkLink(ABC):
     # --- the wire -------------------------------------------------------------------------------
 
     @abstractmethod
-    def _open(self) -> CommandWriter:
-        """Open the wire and make the writer."""
+    def _open(self) -> tuple[Encode, Publish]:
+        """Open the wire; return what encodes a command and what puts its bytes on the wire."""
 
     @abstractmethod
     def _receive(self) -> None:
@@ -507,30 +529,21 @@ class StreamLink(NetworkLink):
         repeat_s: float | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link; `transport` opens the wire.
-
-        `repeat_s` is as of `CommandWriter`, `common` as of `NetworkLink`.
-        """
+        """Describe the link; `transport` opens the wire, `common` is as of `NetworkLink`."""
         super().__init__(robot, **common)
         self.torque_kind, self.state_rate_hz = codec.torque_kind, codec.state_rate_hz
         self._codec, self._make, self._repeat_s = codec, transport, repeat_s
-        self._command_topic = self._address = self.wire = codec.name
+        self._command_topic = self._address = codec.name
 
     @property
     def foreign_commands(self) -> int:
         """Commands of others since the link was opened."""
         return self._transport.foreign_commands()
 
-    def _open(self) -> CommandWriter:
+    def _open(self) -> tuple[Encode, Publish]:
         self._sequence = -1
         self._transport = self._make()
-        return CommandWriter(
-            self._codec.encode,
-            self._transport.send,
-            joints=len(self._robot.joints),
-            repeat_s=self._repeat_s,
-            counts=self.counts,
-        )
+        return self._codec.encode, self._transport.send
 
     def _receive(self) -> None:
         for data in self._transport.receive(0.05):

@@ -13,13 +13,6 @@ import numpy as np
 from pronk.errors import RobotError
 
 T = TypeVar("T", bound="Bounded")
-_WORDS = {
-    "float": "a number",
-    "int": "a whole number",
-    "array": "a list",
-    "str": "a text",
-    "object": "a mapping",
-}
 
 
 class Bounded:
@@ -31,10 +24,9 @@ class Bounded:
         for name, hint in _hints(kind).items():
             value = getattr(self, name)
             try:
-                converted = msgspec.convert(_builtin(value), hint)
+                object.__setattr__(self, name, msgspec.convert(_builtin(value), hint))
             except msgspec.ValidationError as error:
-                raise RobotError(f"{name} is {value!r}; {plain(error)}.") from None
-            object.__setattr__(self, name, converted)
+                raise RobotError(f"{name} is {value!r}: {error}.") from None
 
 
 @cache
@@ -49,19 +41,10 @@ def _builtin(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def plain(error: msgspec.ValidationError) -> str:
-    """Put msgspec's message into plain words."""
-    text = str(error)[0].lower() + str(error)[1:]
-    for kind, words in _WORDS.items():
-        text = text.replace(f"`{kind}`", words)
-    return text
-
-
 def read(kind: type[T], where: str, entry: Any, without: tuple[str, ...] = ()) -> T:
     """Build a parameter class from a mapping of its fields, except those in `without`.
 
-    RobotErrors name `where` and the field that is missing, unknown, of a wrong type or out of its
-    bounds.
+    A RobotError names `where` and the wrong field.
     """
     if not isinstance(entry, Mapping):
         raise RobotError(f"{where} is {entry!r}; expected a mapping of its fields.")

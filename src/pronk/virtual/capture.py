@@ -7,7 +7,6 @@ sphere overlaps the ground, as in training. SI units; the world is z up; feet ar
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, get_type_hints
@@ -96,30 +95,26 @@ class Recorder:
         """Begin empty, for a plant on the ground; the first sample is due at the clock's zero."""
         self._plant, self._period = plant, period_s
         self._step_s = float(plant.model.opt.timestep)
-        self._blocks: list[Array] = []
-        self._begins = [0]
-        """Number of the first sample of each block, and of the next one."""
+        self._blocks = [np.empty((0, plant.state_size))]
+        self._taken = 0
+        """Number of samples."""
 
     def due(self, last: int) -> list[int]:
         """Physics steps of the samples that are still to be taken, up to and with one step."""
-        first = self._begins[-1]
         # One more than there can be, for the rounding of steps.
         most = math.floor((last + 0.5) * self._step_s / self._period) + 2
-        return [step for step in self._steps(first, max(first, most)).tolist() if step <= last]
+        steps = self._steps(self._taken, max(self._taken, most))
+        return [step for step in steps.tolist() if step <= last]
 
     def keep(self, rows: Array) -> None:
         """Keep the raw states (n, state_size) of the due steps."""
-        if len(rows):
-            self._blocks.append(rows)
-            self._begins.append(self._begins[-1] + len(rows))
+        self._blocks.append(rows)
+        self._taken += len(rows)
 
-    def capture(self, since: float = -math.inf) -> Capture:
-        """Samples at and after a time [s]."""
-        times = self._step_s * self._steps(0, self._begins[-1]).astype(np.float64)
-        first = int(np.searchsorted(times, since - 0.5 * self._step_s))
-        block = max(bisect_right(self._begins, first) - 1, 0)
-        rows = np.concatenate([np.empty((0, self._plant.state_size)), *self._blocks[block:]])
-        return capture_of(self._plant, times[first:], rows[first - self._begins[block] :])
+    def capture(self) -> Capture:
+        """All samples."""
+        times = self._step_s * self._steps(0, self._taken).astype(np.float64)
+        return capture_of(self._plant, times, np.concatenate(self._blocks))
 
     def _steps(self, first: int, end: int) -> NDArray[np.intp]:
         """Physics steps of samples `first` to `end` - 1."""
@@ -133,6 +128,8 @@ def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
     place, speed = raw.position, raw.velocity
     orientation = place[:, 3:7]
     feet, contact, other = _contacts(plant, place)
+    current = raw.torque / plant.constant
+    heat = current * current * plant.resistance
     return Capture(
         time=time,
         position=place[:, :3].copy(),
@@ -145,7 +142,7 @@ def capture_of(plant: Plant, time: Array, rows: Array) -> Capture:
         joint_position=place[:, plant.link_qpos],
         joint_velocity=speed[:, plant.link],
         torque=raw.torque,
-        electrical_power=plant.electrical_power(raw.torque, speed[:, plant.rotor]),
+        electrical_power=(raw.torque * speed[:, plant.rotor] + heat).sum(axis=-1),
         bus_voltage=raw.voltage.copy(),
     )
 

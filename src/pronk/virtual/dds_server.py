@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
 from pronk.links.dds import codec
@@ -26,7 +24,7 @@ from pronk.links.dds.link import (
     take,
     write,
 )
-from pronk.links.machine import Command, RefusedError, State
+from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.server import ServerTransport
 
@@ -34,40 +32,6 @@ MODES = ("", "normal", "ai", "advanced", "mcf")
 """Controllers of a Go2 that can hold its joints; the first is none."""
 _SERVICE_POLLS = 20
 """Looks for commands to one for requests: 10 ms at the virtual robot's rate."""
-
-
-Handler = Callable[[int, Any], tuple[int, Any]]
-"""From a function's number and its parameter to the code and the data of the response."""
-
-
-class Server:
-    """A Unitree service of the virtual robot. One thread, never blocks, never raises."""
-
-    def __init__(
-        self, participant: Participant, service: str, handler: Handler, counts: Counter[str]
-    ) -> None:
-        """Begin to listen; refused requests are counted in `counts`."""
-        self._requests = participant.reader(f"rt/api/{service}/request", codec.Request)
-        self._responses = participant.writer(f"rt/api/{service}/response", codec.Response)
-        self._handler = handler
-        self._counts = counts
-
-    def poll(self) -> None:
-        """Respond to what has come."""
-        for request in take(self._requests, self._counts):
-            identity = request.header.identity
-            try:
-                parameter = json.loads(request.parameter or "null")
-            except (ValueError, RecursionError):
-                code, data = BAD_PARAMETER, None
-            else:
-                code, data = self._handler(identity.api_id, parameter)
-            if code != DONE:
-                self._counts["refused: request"] += 1
-            status = codec.ResponseStatus(code=code)
-            header = codec.ResponseHeader(identity=identity, status=status)
-            text = "" if data is None else json.dumps(data)
-            self._responses.write(codec.Response(header=header, data=text, binary=[]))
 
 
 class DdsServerTransport(ServerTransport):
@@ -81,9 +45,14 @@ class DdsServerTransport(ServerTransport):
         own = Participant(network)
         self._commands = own.reader(COMMANDS, codec.LowCmd)
         self._states = own.writer(STATES, codec.LowState)
-        self._servers = [
-            Server(own, SWITCHER, self._switch, self.counts),
-            Server(own, BENCH, self._bench, self.counts),
+        # A handler takes a function's number and its parameter, and returns code and data.
+        self._services = [
+            (
+                own.reader(f"rt/api/{name}/request", codec.Request),
+                own.writer(f"rt/api/{name}/response", codec.Response),
+                handler,
+            )
+            for name, handler in ((SWITCHER, self._switch), (BENCH, self._bench))
         ]
         # Another writer is another participant.
         self._other = Participant(network).writer(COMMANDS, codec.LowCmd)
@@ -93,20 +62,13 @@ class DdsServerTransport(ServerTransport):
         """Commands that arrived since the last poll, oldest first."""
         self._polls += 1
         if self._polls % _SERVICE_POLLS == 1:
-            for server in self._servers:
-                server.poll()
-        met = (self.receive(message.data) for message in take(self._commands, self.counts))
-        return [command for command in met if command is not None]
-
-    def receive(self, data: bytes) -> Command | None:
-        """Decode a command; None where it is refused. Never raises."""
-        try:
-            command = decode_command(self._joints, self.corrupt_in(data))
-        except RefusedError as error:
-            self._refuse(error)
-            return None
-        self.counts["commands"] += 1
-        return command
+            self._respond()
+        arrived = []
+        for message in take(self._commands, self.counts):
+            with self.refusing():
+                arrived.append(decode_command(self._joints, self.corrupt_in(message.data)))
+                self.counts["commands"] += 1
+        return arrived
 
     def publish(self, state: State) -> None:
         """Put a state on the wire."""
@@ -119,7 +81,25 @@ class DdsServerTransport(ServerTransport):
 
     def close(self) -> None:
         """Leave the wire."""
-        del self._commands, self._states, self._servers, self._other
+        del self._commands, self._states, self._services, self._other
+
+    def _respond(self) -> None:
+        """Respond to the requests that have come."""
+        for requests, responses, handler in self._services:
+            for request in take(requests, self.counts):
+                identity = request.header.identity
+                try:
+                    parameter = json.loads(request.parameter or "null")
+                except (ValueError, RecursionError):
+                    code, data = BAD_PARAMETER, None
+                else:
+                    code, data = handler(identity.api_id, parameter)
+                if code != DONE:
+                    self.counts["refused: request"] += 1
+                status = codec.ResponseStatus(code=code)
+                header = codec.ResponseHeader(identity=identity, status=status)
+                text = "" if data is None else json.dumps(data)
+                responses.write(codec.Response(header=header, data=text, binary=[]))
 
     def _switch(self, api_id: int, parameter: Any) -> tuple[int, Any]:
         """The service that reports and changes which controller holds the joints."""

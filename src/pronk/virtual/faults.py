@@ -114,14 +114,13 @@ class FaultChannel(Generic[T]):
         """How many messages met each fault."""
         self._faults, self._after = faults, after
         self._rng, self._corrupting = (np.random.default_rng([seed, k]) for k in range(2))
-        self._idle = faults == ChannelFaults()
         self._queue: list[tuple[float, int, T]] = []
         self._put = 0
         self._held: T | None = None
 
     def put(self, item: T, now: float) -> None:
         """Put a message in at a time [s]."""
-        if self._idle or now < self._after:
+        if now < self._after:
             self._push(item, now)
             return
         faults = self._faults

@@ -55,11 +55,6 @@ class Box(Bounded):
     half_size: tuple[_Size, _Size, _Size]
     """[m]"""
 
-    @property
-    def top(self) -> float:
-        """Height of its upper face [m]."""
-        return self.center[2] + self.half_size[2]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Ground(Bounded):
@@ -78,7 +73,7 @@ class Ground(Bounded):
     def height(self, x: float, y: float) -> float:
         """Height of the ground at a place [m]."""
         under = (
-            box.top
+            box.center[2] + box.half_size[2]
             for box in self.terrain
             if abs(x - box.center[0]) <= box.half_size[0]
             and abs(y - box.center[1]) <= box.half_size[1]
@@ -158,7 +153,7 @@ class Start(Bounded):
     """Time before the clock starts [s]."""
 
     def offset(self, joints: int) -> Array:
-        """The joint offset as an array [rad], (joints,); refuse another number of joints."""
+        """The joint offset as an array [rad]; refuse another number of joints."""
         offset = np.zeros(joints) if self.joint_offset is None else np.array(self.joint_offset)
         if offset.shape != (joints,):
             raise RobotError(

@@ -7,23 +7,21 @@ Cheetah-Software would pass it to the motors.
 from __future__ import annotations
 
 from pronk.links.lcm.codec import (
+    BEACON_CHANNEL,
+    CONTROL_PARAMETER,
     MODES,
+    RESPONSE_CHANNEL,
+    VIRTUAL_ROBOT,
     clamp_message,
     decode_command,
     encode_command,
     encode_state,
+    layout_of,
     read_clamp_message,
     read_mode_request,
 )
-from pronk.links.lcm.layout import (
-    BEACON_CHANNEL,
-    CONTROL_PARAMETER,
-    RESPONSE_CHANNEL,
-    VIRTUAL_ROBOT,
-    layout_of,
-)
 from pronk.links.lcm.link import open_lcm, url_of
-from pronk.links.machine import Command, RefusedError, State
+from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.server import ServerTransport
 
@@ -68,7 +66,7 @@ class LcmServerTransport(ServerTransport):
 
     def receive(self, channel: str, data: bytes) -> None:
         """Take one message, whatever it is. Never raises."""
-        try:
+        with self.refusing():
             if channel == self._layout.command.channel:
                 self._arrived.append(decode_command(self._layout, self.corrupt_in(data)))
                 self.counts["commands"] += 1
@@ -79,8 +77,6 @@ class LcmServerTransport(ServerTransport):
             elif channel == VIRTUAL_ROBOT.channel:
                 self._bench_request, self.clamps = read_clamp_message(self._names, data)
                 self._requested = True
-        except RefusedError as error:
-            self._refuse(error)
 
     def publish(self, state: State) -> None:
         """Put a state on the wire, and at 10 Hz the beacon of the virtual robot."""

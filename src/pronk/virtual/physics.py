@@ -82,7 +82,7 @@ class Physics:
         self._voltage = machine.bus_voltage
         self._gains = b""
         self._qvel, self._act = self.data.qvel, self.data.act  # views
-        plant.set_bus_voltage(self._voltage)
+        plant.inverters[:] = self._voltage
         self.data.qpos[plant.rotor_qpos] = self.data.qpos[plant.link_qpos] = pose[plant.columns]
         plant.set_clamps((), self.data.qpos, 0.0, 0.0)
 
@@ -156,4 +156,4 @@ class Physics:
         sagged = machine.bus_voltage / (1.0 + max(share, _LEAST_SHARE))
         # A battery's power is largest at half its voltage.
         self._voltage = max(sagged, 0.5 * machine.bus_voltage)
-        plant.set_bus_voltage(self._voltage)
+        plant.inverters[:] = self._voltage

@@ -29,8 +29,6 @@ at 5 ms, is what makes gains matched in the training simulator differ from those
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import mujoco
@@ -41,7 +39,7 @@ from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, RobotSpec
 from pronk.virtual.ground import Ground
-from pronk.virtual.sim_params import JointParams, SimParams
+from pronk.virtual.sim_params import JointParams, SimParams, TrunkParams
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -69,38 +67,109 @@ class RawStates(NamedTuple):
     voltage: Array  # of the bus [V], (n,)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Plant:
     """A compiled plant and indices of its parts. Arrays are in the order of `joints`."""
 
-    model: Any  # mujoco.MjModel
-    joints: tuple[str, ...]  # joints in the plant, in file order
-    columns: Indices  # of these joints among all joints of the robot
-    rotor: Indices  # in qvel
-    rotor_qpos: Indices
-    link: Indices  # in qvel
-    link_qpos: Indices
-    actuator: Indices  # in ctrl
-    current: Indices  # of each motor's current in act
-    stand: Indices  # roll, pitch, yaw in qpos and qvel; empty if it is rigid, and on the ground
-    feet: Indices  # geoms; empty on the bench
-    constant: Array  # motor constants K [V s/rad]
-    believed: Array  # motor constants K0 that the drives assume [V s/rad]
-    resistance: Array  # [ohm]
-    effort_limit: Array  # largest torque of the motors [N m]
-    rotor_inertia: Array  # reflected through the gear [kg m^2]
-    viscous: Array  # [N m s/rad]
-    encoder_offset: Array  # reading minus true angle [rad]
+    def __init__(
+        self,
+        robot: RobotSpec,
+        sim_params: SimParams,
+        legs: tuple[str, ...],
+        timestep_s: float,
+        ground: Ground | None = None,
+    ) -> None:
+        """Build it: on the bench, base on the stand and feet in the air, or on `ground`.
 
-    @cached_property
-    def state_size(self) -> int:
-        """Numbers in a raw state: positions, velocities, activations, bus voltage."""
-        return int(self.model.nq + self.model.nv + self.model.na + 1)
+        `legs` of `legs_of(robot)` remain in the plant.
+        """
+        if sim_params.robot != robot.name:
+            raise RobotError(
+                f"the parameters are of {sim_params.robot!r}, the robot is {robot.name!r}; give a "
+                "file written for that robot."
+            )
+        sim_params.check_joints(robot.joint_names)
+        joints = [joint for joint in robot.joints if leg_of(robot, joint.name) in legs]
+        names, drives = [joint.name for joint in joints], [joint.drive for joint in joints]
+        true = [sim_params.joints[name] for name in names]
+        spec = robot.build_spec()
+        spec.option.timestep = timestep_s
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        for key in list(spec.keys):
+            spec.delete(key)
+        if ground is None:
+            _fix_base(spec, robot, sim_params)
+        else:
+            _free_base(spec, robot, ground)
+        _drop_legs(spec, robot, set(names))
+        for name, drive, params in zip(names, drives, true, strict=True):
+            _add_rotor(spec, name, drive, params, sim_params.machine.drive_lag_s)
+        self.model: Any = spec.compile()  # mujoco.MjModel
+        model = self.model
+        if model.nq != model.nv + (ground is not None):
+            raise RobotError(f"{robot.name}: the virtual robot has hinge joints only.")
+        rotors, links = ([model.joint(f"{name}{end}") for name in names] for end in ("/rotor", ""))
+        # Mass and inertia by the same factor: a body that was possible stays possible.
+        for link, params in zip(links, true, strict=True):
+            body = int(model.jnt_bodyid[link.id])
+            model.body_mass[body] *= params.link_inertia_scale
+            model.body_inertia[body] *= params.link_inertia_scale
+        self.feet = _ids([])  # geoms; none on the bench
+        if ground is not None:
+            _change_trunk(model, model.body(robot.base_body).id, sim_params.trunk)
+            self.feet = _ids([model.geom(f"{leg}_foot_collision").id for leg in legs])
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        if ground is not None:
+            ground.set_contact(model, self.feet)
+        self.aside = mujoco.MjData(model)  # to compute in, beside the run's
+        self.joints = tuple(names)  # in the plant, in file order
+        self.columns = _ids([robot.joint_names.index(name) for name in names])  # among the robot's
+        self.rotor = _ids([joint.dofadr[0] for joint in rotors])  # in qvel
+        self.rotor_qpos = _ids([joint.qposadr[0] for joint in rotors])
+        self.link = _ids([joint.dofadr[0] for joint in links])  # in qvel
+        self.link_qpos = _ids([joint.qposadr[0] for joint in links])
+        self.actuator = _ids([model.actuator(f"{name}/motor").id for name in names])  # in ctrl
+        # Currents in act. LuGre's bristle comes first among a motor's states, its current last.
+        states = model.actuator_actadr + model.actuator_actnum
+        self._current = _ids(states[self.actuator] - 1)
+        rigid = ground is not None or not math.isfinite(sim_params.machine.stand_stiffness)
+        # Roll, pitch, yaw in qpos and qvel; none of a rigid stand, and on the ground.
+        self.stand = _ids([] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES])
+        scale = np.array([params.torque_scale for params in true])
+        # Motor constants K0 that the drives assume and K [V s/rad], resistance [ohm].
+        self._believed, self.resistance = np.array([motor_of(drive) for drive in drives]).T.copy()
+        self.constant = scale * self._believed
+        self._effort_limit = scale * np.array([drive.effort_limit for drive in drives])  # [N m]
+        self._least_torque = -self._effort_limit
+        gears = np.array([drive.gear_ratio for drive in drives])
+        # Reflected through the gear [kg m^2], and viscous friction [N m s/rad].
+        self._rotor_inertia = np.array([params.rotor_inertia for params in true]) * gears**2
+        self._viscous = np.array([params.viscous for params in true])
+        # Reading minus true angle [rad].
+        self.encoder_offset = np.array([params.encoder_offset for params in true])
+        # Voltages at which the inverters clip, a view; every actuator of the plant is a motor [V].
+        self.inverters = model.actuator_gainprm[:, _VMAX]
+        # Numbers in a raw state: positions, velocities, activations, bus voltage.
+        self.state_size = int(model.nq + model.nv + model.na + 1)
+        self._check_springs(true)
 
-    @cached_property
-    def aside(self) -> Any:
-        """A mujoco.MjData to compute in, beside the run's."""
-        return mujoco.MjData(self.model)
+    def _check_springs(self, joints: list[JointParams]) -> None:
+        """Refuse springs that the physics step cannot follow; name field and largest value."""
+        model, data = self.model, mujoco.MjData(self.model)
+        inertia = np.zeros((model.nv, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        mobility = np.diag(np.linalg.inv(inertia))
+        for name, joint, rotor, link in zip(
+            self.joints, joints, mobility[self.rotor], mobility[self.link], strict=True
+        ):
+            springs = {"belt_stiffness": rotor + link, "presliding_stiffness": rotor}
+            for field, mobile in springs.items():
+                most = (_STABLE / model.opt.timestep) ** 2 / mobile
+                if (value := getattr(joint, field)) > most:
+                    raise RobotError(
+                        f"joints.{name}.{field} is {value:g}; at a physics step of "
+                        f"{model.opt.timestep:g} s at most {most:.3g} N m/rad can be simulated."
+                    )
 
     def read(self, data: Any, voltage: float, row: Array) -> None:
         """Copy the raw state of a mujoco.MjData into a row, shape (state_size,)."""
@@ -115,46 +184,23 @@ class Plant:
 
     def set_gains(self, stiffness: Array, damping: Array) -> None:
         """Set the drives' gains [N m/rad, N m s/rad] from the next physics step."""
-        volts = self.resistance / self.believed
+        volts = self.resistance / self._believed
         self.model.actuator_gainprm[self.actuator, _KP] = volts * stiffness
         self.model.actuator_gainprm[self.actuator, _KD] = volts * damping - self.constant
         # Second-order time stepping; see the module's docstring.
-        explicit = self.constant / self.believed * damping - self.viscous
+        explicit = self.constant / self._believed * damping - self._viscous
         half_step = 0.5 * self.model.opt.timestep
-        inertia = self.rotor_inertia + half_step * explicit
+        inertia = self._rotor_inertia + half_step * explicit
         self.model.dof_armature[self.rotor] = inertia
         # MuJoCo reads this in its place for a rotor whose parent cannot move.
         self.model.dof_M0[self.rotor] = inertia + _ROTOR_MASS
 
-    def set_bus_voltage(self, voltage: float) -> None:
-        """Set the voltage at which the inverters clip [V]."""
-        self._inverters[:] = voltage
-
-    @cached_property
-    def _inverters(self) -> Array:
-        """View of the clip voltages; every actuator of the plant is a motor."""
-        view: Array = self.model.actuator_gainprm[:, _VMAX]
-        return view
-
     def motor_torque(self, act: Array) -> Array:
         """Motor torque without friction [N m], (..., joints), from activations (..., na)."""
-        torque = self.constant * act.take(self.current, axis=-1)
+        torque = self.constant * act.take(self._current, axis=-1)
         np.maximum(torque, self._least_torque, out=torque)
-        limited: Array = np.minimum(torque, self.effort_limit, out=torque)
+        limited: Array = np.minimum(torque, self._effort_limit, out=torque)
         return limited
-
-    @cached_property
-    def _least_torque(self) -> Array:
-        return -self.effort_limit
-
-    def electrical_power(self, torque: Array, speed: Array) -> Array:
-        """Power from the bus, mechanical and heat, summed over joints [W], shape (...).
-
-        Of motor torques [N m] and rotor speeds [rad/s], shape (..., joints).
-        """
-        current = torque / self.constant
-        power: Array = (torque * speed + current * current * self.resistance).sum(axis=-1)
-        return power
 
     def set_clamps(
         self, joints: tuple[str, ...], q: Array, stiffness: float, damping: float
@@ -263,28 +309,6 @@ def _drop_legs(spec: Any, robot: RobotSpec, kept: set[str]) -> None:
             spec.delete(child)
 
 
-def _check_springs(plant: Plant, sim_params: SimParams) -> None:
-    """Refuse springs that the physics step cannot follow; name the field and the largest value."""
-    model = plant.model
-    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, inertia)
-    mobility = np.diag(np.linalg.inv(inertia))
-    for k, name in enumerate(plant.joints):
-        joint = sim_params.joints[name]
-        rotor, link = mobility[plant.rotor[k]], mobility[plant.link[k]]
-        for field, value, mobile in (
-            ("belt_stiffness", joint.belt_stiffness, rotor + link),
-            ("presliding_stiffness", joint.presliding_stiffness, rotor),
-        ):
-            most = (_STABLE / model.opt.timestep) ** 2 / mobile
-            if value > most:
-                raise RobotError(
-                    f"joints.{name}.{field} is {value:g}; at a physics step of "
-                    f"{model.opt.timestep:g} s at most {most:.3g} N m/rad can be simulated."
-                )
-
-
 def _free_base(spec: Any, robot: RobotSpec, ground: Ground) -> None:
     """Put a model's free trunk over the ground; refuse an arm."""
     base = spec.body(robot.base_body)
@@ -316,9 +340,8 @@ def _fix_base(spec: Any, robot: RobotSpec, sim_params: SimParams) -> None:
             )
 
 
-def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
+def _change_trunk(model: Any, body: int, trunk: TrunkParams) -> None:
     """Apply the trunk's parameters; refuse an impossible body."""
-    trunk = sim_params.trunk
     mass = float(model.body_mass[body])
     if not mass + trunk.mass_offset > 0.0:
         raise RobotError(
@@ -339,84 +362,6 @@ def _change_trunk(model: Any, body: int, sim_params: SimParams) -> None:
     model.body_inertia[body] = moments * (1.0 + trunk.mass_offset / mass)
     model.body_mass[body] = mass + trunk.mass_offset
     model.body_ipos[body] += trunk.com_offset
-
-
-def build_plant(
-    robot: RobotSpec,
-    sim_params: SimParams,
-    legs: tuple[str, ...],
-    timestep_s: float,
-    ground: Ground | None = None,
-) -> Plant:
-    """Build the plant: on the bench, base on the stand and feet in the air, or on `ground`.
-
-    `legs` of `legs_of(robot)` remain in the plant.
-    """
-    if sim_params.robot != robot.name:
-        raise RobotError(
-            f"the parameters are of {sim_params.robot!r}, the robot is {robot.name!r}; give a file "
-            "written for that robot."
-        )
-    sim_params.check_joints(robot.joint_names)
-    joints = tuple(joint for joint in robot.joints if leg_of(robot, joint.name) in legs)
-    names = tuple(joint.name for joint in joints)
-    true = [sim_params.joints[name] for name in names]
-    spec = robot.build_spec()
-    spec.option.timestep = timestep_s
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    for key in list(spec.keys):
-        spec.delete(key)
-    if ground is None:
-        _fix_base(spec, robot, sim_params)
-    else:
-        _free_base(spec, robot, ground)
-    _drop_legs(spec, robot, set(names))
-    for joint, params in zip(joints, true, strict=True):
-        _add_rotor(spec, joint.name, joint.drive, params, sim_params.machine.drive_lag_s)
-    model = spec.compile()
-    if model.nq != model.nv + (ground is not None):
-        raise RobotError(f"{robot.name}: the virtual robot has hinge joints only.")
-    rotors, links = ([model.joint(f"{name}{end}") for name in names] for end in ("/rotor", ""))
-    # Mass and inertia by the same factor: a body that was possible stays possible.
-    for link, params in zip(links, true, strict=True):
-        body = int(model.jnt_bodyid[link.id])
-        model.body_mass[body] *= params.link_inertia_scale
-        model.body_inertia[body] *= params.link_inertia_scale
-    feet = _ids([])
-    if ground is not None:
-        _change_trunk(model, model.body(robot.base_body).id, sim_params)
-        feet = _ids([model.geom(f"{leg}_foot_collision").id for leg in legs])
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    if ground is not None:
-        ground.set_contact(model, feet)
-    scale = np.array([params.torque_scale for params in true])
-    believed, resistance = np.array([motor_of(joint.drive) for joint in joints]).T.copy()
-    rigid = ground is not None or not math.isfinite(sim_params.machine.stand_stiffness)
-    motors = _ids([model.actuator(f"{name}/motor").id for name in names])
-    gears = np.array([joint.drive.gear_ratio for joint in joints])
-    plant = Plant(
-        model=model,
-        joints=names,
-        columns=_ids([robot.joint_names.index(name) for name in names]),
-        rotor=_ids([joint.dofadr[0] for joint in rotors]),
-        rotor_qpos=_ids([joint.qposadr[0] for joint in rotors]),
-        link=_ids([joint.dofadr[0] for joint in links]),
-        link_qpos=_ids([joint.qposadr[0] for joint in links]),
-        actuator=motors,
-        # LuGre's bristle comes first among a motor's states, its current last.
-        current=_ids(model.actuator_actadr[motors] + model.actuator_actnum[motors] - 1),
-        stand=_ids([] if rigid else [model.joint(name).dofadr[0] for name in _STAND_AXES]),
-        feet=feet,
-        constant=scale * believed,
-        believed=believed,
-        resistance=resistance,
-        effort_limit=scale * np.array([joint.drive.effort_limit for joint in joints]),
-        rotor_inertia=np.array([params.rotor_inertia for params in true]) * gears**2,
-        viscous=np.array([params.viscous for params in true]),
-        encoder_offset=np.array([params.encoder_offset for params in true]),
-    )
-    _check_springs(plant, sim_params)
-    return plant
 
 
 def _ids(values: Any) -> Indices:

@@ -5,18 +5,12 @@ Physics runs in blocks (`physics.py`), and `sensors.py` makes measured states of
 The physics step is 0.25 ms, and that has converged. On the bench the Bode gains of hip_roll,
 hip_pitch and knee differ by 0.004, 0.003 and 0.002 dB at most from those at 25 us (40 kHz, the rate
 of the robot's own drives, S4) over 0.1 to 15 Hz, thanks to the second-order corrections that
-`plant.py` explains (without them, 0.13 dB). A test holds it under 0.05 dB. On the ground, with a
-policy that walks and jumps (means; n jumps with the same seeds at every step):
+`plant.py` explains. On the ground, with a policy and the same seeds at every step (means of n):
 
-    step [ms]                          0.0625   0.125   0.25    0.5
-    jump from standing, height [m]     .3238    .3235   .3233   .3228   n = 5, +- .0008
-    running at 1 m/s, height [m]       .339     .340    .340    .339    n = 5, +- .005
-                      distance [m]     .408     .409    .409    .410          +- .003
-                      speed [m/s]      1.187    1.188   1.188   1.186         +- .002
-                      feet on ground   47.8 %   47.8 %  47.8 %  47.8 %
-    running at 2 m/s, height [m]                .340    .331            n = 20, +- .007
-                      distance [m]              .781    .771                    +- .021
-                      speed [m/s]               2.225   2.232                   +- .004
+    step [ms]                                  0.0625   0.125   0.25    0.5
+    jump from standing, height [m]             .3238    .3235   .3233   .3228   n = 5, +- .0008
+    jump while running at 1 m/s, distance [m]  .408     .409    .409    .410    n = 5, +- .003
+    jump while running at 2 m/s, distance [m]           .781    .771            n = 20, +- .021
 """
 
 from __future__ import annotations
@@ -33,7 +27,7 @@ from pronk.robots.robot import RobotSpec
 from pronk.virtual.capture import Capture, Recorder
 from pronk.virtual.ground import Ground, Start
 from pronk.virtual.physics import Physics, Transport
-from pronk.virtual.plant import build_plant, legs_of
+from pronk.virtual.plant import Plant, legs_of
 from pronk.virtual.sensors import Sensors
 from pronk.virtual.sim_params import SimParams, load_sim_params
 
@@ -116,14 +110,9 @@ class VirtualRobot:
         self._ground = (ground or sim_params.ground) if base == "ground" else None
         self._start = start or Start()
         self._rate, self._capture_rate, self._dt = log_rate_hz, capture_rate_hz, timestep_s
-        self._plant = build_plant(robot, sim_params, legs or known, timestep_s, self._ground)
+        self._plant = Plant(robot, sim_params, legs or known, timestep_s, self._ground)
         self._recorder: Recorder | None = None
         self._open = False
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Joints that are simulated, in file order."""
-        return self._plant.joints
 
     def connect(self) -> None:
         """Set the robot down, let it settle, start the clock; the drives hold its pose."""
@@ -137,12 +126,12 @@ class VirtualRobot:
         # Steps are counted from the clock's zero; settling happens before it.
         first_step = -round(settle / self._dt)
         self._physics = Physics(plant, machine, pose=pose, first_step=first_step)
-        self._recorder = None
+        self._recorder = self._physics.recorder = None
         if self._ground is not None:
             self._ground.set_down(plant.model, self._physics.data, plant.feet, self._start)
             if self._capture_rate is not None:
                 self._recorder = Recorder(plant, 1.0 / self._capture_rate)
-        self._physics.recorder = self._recorder
+                self._physics.recorder = self._recorder
         self._physics.apply(replace(hold_of(robot), position=pose))
         self._now = 0.0
         self._open = True
@@ -188,23 +177,17 @@ class VirtualRobot:
                 "virtual robot on the bench, base='bench'."
             )
         for name in joints:
-            if name not in self._robot.joint_names:
-                raise HardwareError(
-                    f"{self.robot} has no joint {name!r} to clamp; "
-                    f"it has {', '.join(self._robot.joint_names)}."
-                )
-        machine = self._sim_params.machine
-        self._plant.set_clamps(
-            joints, self._physics.data.qpos, machine.clamp_stiffness, machine.clamp_damping
-        )
+            self._robot.joint(name)
+        fixture = self._sim_params.machine.clamp_stiffness, self._sim_params.machine.clamp_damping
+        self._plant.set_clamps(joints, self._physics.data.qpos, *fixture)
 
     def damp(self) -> None:
         """Damp the joints without stiffness."""
         self._check_open()
         self._transport.put(damping_command(len(self._robot.joints)), self._now)
 
-    def capture(self, since: float = 0.0) -> Capture:
-        """Motion capture from `since` [s] to the physics step reached; also after `close`.
+    def capture(self) -> Capture:
+        """Motion capture up to the physics step reached; also after `close`.
 
         The step reached is behind `now` by the measurement delay.
         """
@@ -213,7 +196,7 @@ class VirtualRobot:
                 "nothing was captured; connect a virtual robot with base='ground' and a "
                 "capture_rate_hz."
             )
-        return self._recorder.capture(since)
+        return self._recorder.capture()
 
     def snapshot(self) -> Capture:
         """One sample of the capture, at the physics step reached."""

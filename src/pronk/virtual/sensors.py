@@ -14,7 +14,7 @@ the few rows of a block.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,21 +72,11 @@ def _cross(a: Array, b: Array) -> Array:
     return across
 
 
-def resting_force(tilt: Array) -> Array:
-    """Reading of an accelerometer at rest at small tilts (roll, pitch, yaw) (n, 3) [rad, m/s^2]."""
-    roll, pitch = tilt[:, 0], tilt[:, 1]
-    return _GRAVITY * np.stack([-pitch, roll, np.ones_like(roll)], axis=1)
-
-
 def moving_force(velocity: Array, orientation: Array, period_s: float) -> Array:
     """Mean reading of an accelerometer between instants, in the body's frame (n, 3) [m/s^2].
 
-    The change of velocity less that by gravity, turned into the frame halfway.
-
-    Args:
-        velocity: World frame [m/s], shape (n + 1, 3).
-        orientation: Body to world, unit quaternions, shape (n + 1, 4).
-        period_s: Between instants [s].
+    The change of `velocity` (world frame, (n + 1, 3) [m/s]) less that by gravity, turned into the
+    frame halfway; `orientation` is body to world, (n + 1, 4).
     """
     force = (velocity[1:] - velocity[:-1]) / period_s
     force[:, 2] += _GRAVITY
@@ -190,12 +180,9 @@ class Sensors:
         """Number of the next state."""
 
     def read(self, tick: Array, instant: Array, raw: RawStates) -> list[State]:
-        """Make the states of a block of ticks; absent joints rest in the default pose.
+        """Make the states of n ticks [s] on the machine's clock; absent joints rest in their pose.
 
-        Args:
-            tick: Nominal instants of the states on the machine's clock [s], shape (n,).
-            instant: Of the physics steps nearest to the measurements [s], shape (n,).
-            raw: The plant at those steps.
+        `instant` and `raw` are of the physics steps nearest to the measurements [s].
         """
         plant, noise = self._plant, self._noise.take(len(tick))
         stamp = tick + noise.jitter + noise.stamp
@@ -214,39 +201,28 @@ class Sensors:
         velocity += noise.velocity[:, plant.columns]
         torque = raw.torque / self._scale + noise.torque[:, plant.columns]
         true_orientation, rate, force = self._motion(raw)
-        orientation = product(noise.heading, product(true_orientation, noise.tilt))
-        rows = (
-            self._spread(position, self._default),
-            self._spread(velocity, 0.0),
-            self._spread(torque, 0.0),
-            rate + noise.gyro,
-            force + noise.force,
-            orientation,
-        )
-        states = [
-            State(
-                time=time,
-                sequence=sequence,
-                position=q,
-                velocity=v,
-                torque=t,
-                gyro=gyro,
-                accelerometer=acceleration,
-                bus_voltage=voltage,
-                orientation=quaternion,
-            )
-            for sequence, (time, voltage, q, v, t, gyro, acceleration, quaternion) in enumerate(
-                zip(stamp.tolist(), raw.voltage.tolist(), *rows, strict=True), self.sequence
-            )
+        columns: dict[str, Any] = {
+            "time": stamp.tolist(),
+            "position": self._spread(position, self._default),
+            "velocity": self._spread(velocity, 0.0),
+            "torque": self._spread(torque, 0.0),
+            "gyro": rate + noise.gyro,
+            "accelerometer": force + noise.force,
+            "bus_voltage": raw.voltage.tolist(),
+            "orientation": product(noise.heading, product(true_orientation, noise.tilt)),
+        }
+        rows = zip(*columns.values(), strict=True)
+        first, self.sequence = self.sequence, self.sequence + len(tick)
+        return [
+            State(sequence=first + k, **dict(zip(columns, row, strict=True)))
+            for k, row in enumerate(rows)
         ]
-        self.sequence += len(states)
-        return states
 
     def _motion(self, raw: RawStates) -> tuple[Array, Array, Array]:
         """Orientation (n, 4), rate (n, 3) and specific force (n, 3) of the trunk."""
         if self._free:
-            orientation, velocity = raw.position[:, 3:7], raw.velocity[:, :3]
-            now = np.concatenate([orientation, velocity], axis=1)
+            orientation = raw.position[:, 3:7]
+            now = np.concatenate([orientation, raw.velocity[:, :3]], axis=1)
             path = np.concatenate([now[:1] if self._trunk is None else self._trunk, now])
             self._trunk = now[-1:]
             force = moving_force(path[:, 4:], path[:, :4], self._period)
@@ -254,7 +230,9 @@ class Sensors:
         stand = self._plant.stand
         tilt = raw.position[:, stand] if len(stand) else np.zeros((len(raw.position), 3))
         rate = raw.velocity[:, stand] if len(stand) else tilt
-        return of_vector(tilt), rate, resting_force(tilt)
+        roll, pitch, _ = tilt.T  # small
+        force = _GRAVITY * np.stack([-pitch, roll, np.ones_like(roll)], axis=1)
+        return of_vector(tilt), rate, force
 
     def _spread(self, values: Array, absent: Array | float) -> Array:
         """Columns of all joints, those that are absent with a value of their own."""

@@ -11,8 +11,10 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -77,8 +79,13 @@ class ServerTransport(ABC):
     def close(self) -> None:
         """Leave the wire."""
 
-    def _refuse(self, error: RefusedError) -> None:
-        self.counts[f"refused: {error.reason}"] += 1
+    @contextmanager
+    def refusing(self) -> Iterator[None]:
+        """Count a message that is refused in the block."""
+        try:
+            yield
+        except RefusedError as error:
+            self.counts[f"refused: {error.reason}"] += 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,11 +130,8 @@ class RobotServer:
         self._frozen: State | None = None
         self._slipped, self._worked = 0.0, time.process_time()
         self._late = Histogram()
-        # Without bit flips the bytes are not even looked at.
-        if self._faults.command.flip:
-            wire.corrupt_in = lambda data: self._flip(self._commands, data)
-        if self._faults.state.flip:
-            wire.corrupt_out = lambda data: self._flip(self._states, data)
+        wire.corrupt_in = partial(self._flip, self._commands)
+        wire.corrupt_out = partial(self._flip, self._states)
 
     def step(self, until: float) -> None:
         """Advance to `until` on the machine's clock [s]. Takes no wall time."""

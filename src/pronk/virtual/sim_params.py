@@ -25,7 +25,7 @@ from msgspec import Meta
 from pronk.errors import RobotError
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Joint, RobotSpec
-from pronk.virtual.bounds import Bounded, plain, read
+from pronk.virtual.bounds import Bounded, read
 from pronk.virtual.ground import Ground
 
 SCHEMA = "pronk/sim_params/1"
@@ -204,7 +204,7 @@ def with_changes(sim_params: SimParams, **changes: float) -> SimParams:
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    schema: str
+    schema: Annotated[str, Meta(pattern=f"^{SCHEMA}$")]
     robot: str
     machine: Any
     joints: Annotated[dict[str, Any], Meta(min_length=1)]
@@ -215,15 +215,11 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 def parse_sim_params(body: Any, source: str) -> SimParams:
     """Read parameters from the content of a YAML file, which errors call `source`."""
-    if not isinstance(body, dict) or body.get("schema") != SCHEMA:
-        got = body.get("schema") if isinstance(body, dict) else type(body).__name__
-        hint = " The fields of pronk/truth/1 are the same." if got == "pronk/truth/1" else ""
-        raise RobotError(f"{source}: schema {got!r}; this pronk reads {SCHEMA!r}.{hint}")
     try:
         file = msgspec.convert(body, _File)
     except msgspec.ValidationError as error:
         known = ", ".join(_File.__struct_fields__)
-        raise RobotError(f"{source}: {plain(error)}; the entries are {known}.") from None
+        raise RobotError(f"{source}: {error}; the entries are {known}.") from None
     return SimParams(
         robot=file.robot,
         machine=read(MachineParams, f"{source}: machine", file.machine),

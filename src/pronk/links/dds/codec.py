@@ -172,10 +172,9 @@ def pack(message: Any, values: NDArray[Any]) -> bytes:
 
 
 def unpack(message: Any, data: bytes) -> NDArray[Any]:
-    """Read a serialized message as one read-only record (1,) of its C image.
+    """Read a message as one read-only record (1,) of its C image.
 
-    Raises:
-        RefusedError: `header`, `length` or `checksum`.
+    RefusedError: `header`, `length` or `checksum`.
     """
     name, size = message.__name__, len(HEADER) + record(message).itemsize - 4
     if data[:2] not in _READABLE:
@@ -263,10 +262,8 @@ def encode_command(joints: JointMap, command: Command) -> bytes:
 def decode_command(joints: JointMap, data: bytes) -> Command:
     """Decode a `LowCmd`. A position that is not controlled reads as 0.
 
-    Raises:
-        RefusedError: `header`, `length`, `checksum`, `head`, `level`, `mode`, `not finite`,
-            `out of range`, or `feed-forward` (a target speed or torque, which a `Command` does
-            not have).
+    RefusedError as of `unpack`, or `head`, `level`, `mode`, `not finite`, `out of range`,
+    `feed-forward` (a target speed or torque, which a `Command` does not have).
     """
     message = unpack(LowCmd, data)
     if tuple(message["head"][0]) != HEAD:
@@ -329,9 +326,7 @@ class StateDecoder(StateNumbering):
     def take(self, data: bytes, arrived: float) -> State | None:
         """Decode a message that arrived at a time [s]; temperatures that are all zero are none.
 
-        Raises:
-            RefusedError: `header`, `length`, `checksum`, `not finite`, or `quaternion` (not of
-                length 1).
+        RefusedError as of `unpack`, or `not finite`, `quaternion` (not of length 1).
         """
         message, sign = unpack(LowState, data), self._joints.sign
         motors = message["motor_state"]

@@ -17,6 +17,7 @@ import json
 import time
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -30,7 +31,7 @@ from cyclonedds.topic import Topic
 from pronk.errors import HardwareError
 from pronk.links.dds import codec
 from pronk.links.dds.codec import STATE_RATE_HZ, StateDecoder, encode_command, joint_map
-from pronk.links.link import RESPONSE_S, CommandWriter, NetworkLink
+from pronk.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_domain
 from pronk.robots.robot import RobotSpec
 
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
@@ -38,7 +39,7 @@ COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
 LOOPBACK_DOMAIN = 77
 """pronk's own; Unitree's robots use 0, unitree_mujoco 1."""
 ROBOT_DOMAIN = 0
-_MOST_DOMAIN = 232  # the ports of higher ones would exceed 65535
+_DOMAINS = range(233)  # the ports of higher ones would exceed 65535
 _QUEUE = 64  # messages kept between two reads; at 500 Hz an eighth of a second
 _WRITE_NS = 1_000_000  # longest time that a slow reader may hold a writer up
 
@@ -67,9 +68,6 @@ _RELEASE_TRIES, _RELEASE_PAUSE_S = 10, 0.2
 
 _LONGEST_BURST_S = 0.1
 _LONGEST_PAUSE_S = 0.05
-_REPEAT_S = 0.004
-"""Silence after which the command in force is written again; Unitree's examples write every 1 to
-10 ms."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,16 +80,10 @@ class DdsNetwork:
     """DDS domain; None for 0 where an interface is named, else pronk's own, 77."""
 
     def __post_init__(self) -> None:
-        if self.domain is None:
-            own = LOOPBACK_DOMAIN if self.interface is None else ROBOT_DOMAIN
-            object.__setattr__(self, "domain", own)
-        elif not 0 <= self.domain <= _MOST_DOMAIN:
-            raise HardwareError(f"DDS domain {self.domain}; expected 0 to {_MOST_DOMAIN}.")
-        elif self.interface is None and self.domain == ROBOT_DOMAIN:
-            raise HardwareError(
-                "DDS domain 0 is the real robots'; name the network interface to the robot as well "
-                f"(for instance eth0), or take another domain, such as {LOOPBACK_DOMAIN}."
-            )
+        domain = port_or_domain(
+            "DDS domain", self.domain, self.interface, ROBOT_DOMAIN, LOOPBACK_DOMAIN, _DOMAINS
+        )
+        object.__setattr__(self, "domain", domain)
 
     def __str__(self) -> str:
         return f"DDS domain {self.domain} on {self.interface or 'loopback'}"
@@ -114,10 +106,7 @@ class Message:
 
 
 class Participant:
-    """One member of a domain, with readers and writers of its own.
-
-    Samples of `LowCmd` and `LowState` stay bytes (`Message`).
-    """
+    """One member of a domain. Samples of `LowCmd` and `LowState` stay bytes (`Message`)."""
 
     def __init__(self, network: DdsNetwork) -> None:
         """Join; HardwareError for a missing interface, or a domain in use with another."""
@@ -188,11 +177,7 @@ class Client:
     def call(self, api_id: int, parameter: Any) -> dict[str, Any] | None:
         """Call a function by its number, repeatedly while there is no response.
 
-        Returns:
-            The response's data; None without a response within `RESPONSE_S`.
-
-        Raises:
-            HardwareError: The response has another code than 0, or is no JSON object.
+        None without one within `RESPONSE_S`; HardwareError for a code other than 0, or no object.
         """
         identity = codec.RequestIdentity(id=time.monotonic_ns(), api_id=api_id)
         header = codec.RequestHeader(
@@ -230,9 +215,7 @@ class Client:
 def check_own_controller(participant: Participant, *, release: bool) -> None:
     """Check that none of the robot's own controllers holds the joints; `release` one that does.
 
-    Raises:
-        HardwareError: One holds them and may not be, or could not be, released; or the robot does
-            not respond.
+    HardwareError: one may not be, or could not be, released; or the robot does not respond.
     """
     switcher = Client(participant, SWITCHER)
     response = switcher.call(CHECK_MODE, {})
@@ -264,9 +247,10 @@ def check_own_controller(participant: Participant, *, release: bool) -> None:
 class DdsMachine(NetworkLink):
     """A robot with twelve joints behind Unitree's codec. Implements `Machine`."""
 
-    wire = "DDS"
     torque_kind = "measured"  # tau_est, by the drives from their currents
     state_rate_hz = STATE_RATE_HZ
+    # Unitree's examples write every 1 to 10 ms.
+    _repeat_s = 0.004
 
     def __init__(
         self,
@@ -279,10 +263,11 @@ class DdsMachine(NetworkLink):
         """Describe the link on a `DdsNetwork`; `common` is as of `NetworkLink`."""
         super().__init__(robot, **common)
         self._joints = joint_map(robot)
+        self._damping = self._joints.sink_damping
         self._network = DdsNetwork(interface=interface, domain=domain)
         self._command_topic, self._address = COMMANDS, f"{STATES} in {self._network}"
 
-    def _open(self) -> CommandWriter:
+    def _open(self) -> tuple[Encode, Publish]:
         self._decoder = StateDecoder(self._joints, self.counts)
         self._senders: set[int] = set()
         self._participant = own = Participant(self._network)
@@ -294,13 +279,8 @@ class DdsMachine(NetworkLink):
         self._wake = core.WaitSet(own.entity)
         for reader in (self._states_in, self._others):
             self._wake.attach(core.ReadCondition(reader, anything))
-        return CommandWriter(
-            lambda command: encode_command(self._joints, command),
-            lambda data: write(out, data, self.counts),
-            damping=self._joints.sink_damping,
-            repeat_s=_REPEAT_S,
-            counts=self.counts,
-        )
+        encode = partial(encode_command, self._joints)
+        return encode, lambda data: write(out, data, self.counts)
 
     def _shut(self) -> None:
         del self._wake, self._states_in, self._others, self._bench, self._participant
@@ -322,8 +302,7 @@ class DdsMachine(NetworkLink):
             )
 
     def _hold(self, joints: tuple[str, ...]) -> bool:
-        request = {"joints": list(joints)}
-        return self._bench.call(CLAMP, request) is not None
+        return self._bench.call(CLAMP, {"joints": list(joints)}) is not None
 
     def _receive(self) -> None:
         self._wake.wait(int(_LONGEST_PAUSE_S * 1e9))

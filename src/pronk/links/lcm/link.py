@@ -15,25 +15,24 @@ import ipaddress
 import threading
 import time
 from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pronk.errors import HardwareError
 from pronk.links.lcm.codec import (
-    StateDecoder,
-    clamp_message,
-    encode_command,
-    mode_request,
-    read_clamp_message,
-)
-from pronk.links.lcm.layout import (
     BEACON_CHANNEL,
     CONTROL_PARAMETER,
     RESPONSE_CHANNEL,
     VIRTUAL_ROBOT,
+    StateDecoder,
+    clamp_message,
+    encode_command,
     layout_of,
+    mode_request,
+    read_clamp_message,
 )
-from pronk.links.link import RESPONSE_S, CommandWriter, NetworkLink, wait_for
+from pronk.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_domain, wait_for
 from pronk.robots.robot import RobotSpec
 
 # LCM's multicast group and port, those of every robot too.
@@ -41,31 +40,18 @@ GROUP, ROBOT_PORT = "239.255.76.67", 7667
 VIRTUAL_PORT = 7768
 """The virtual robot's, so that nothing here ever reaches a real one."""
 _ROUTES = Path("/proc/net/route")
+_PORTS = range(1024, 65536)
 _QUEUE = 100
 _REMEMBERED = 512
 """Commands kept to recognize one's own."""
 
 
 def url_of(*, port: int | None = None, interface: str | None = None) -> str:
-    """The address of a link.
+    """Make LCM's address of an `interface` (`lo` on the robot itself), None for this computer only.
 
-    Args:
-        port: UDP port; `VIRTUAL_PORT` on loopback and `ROBOT_PORT` on an interface if None.
-        interface: To the real robot; `lo` on the robot itself, None stays on this computer.
-
-    Raises:
-        HardwareError: The port is impossible, or multicast does not leave by that interface.
+    HardwareError: the UDP port is impossible, or multicast does not leave by that interface.
     """
-    number = port if port is not None else (ROBOT_PORT if interface else VIRTUAL_PORT)
-    if not 1024 <= number <= 65535:
-        raise HardwareError(
-            f"LCM port {number}; expected 1024 to 65535, for instance {VIRTUAL_PORT}."
-        )
-    if interface is None and number == ROBOT_PORT:
-        raise HardwareError(
-            f"LCM port {ROBOT_PORT} is the real robots'; take another, as {VIRTUAL_PORT}, "
-            "or name the robot's network interface (lo on the robot itself)."
-        )
+    number = port_or_domain("LCM port", port, interface, ROBOT_PORT, VIRTUAL_PORT, _PORTS)
     if interface in (None, "lo"):
         return f"udpm://{GROUP}:{number}?ttl=0"
     way = multicast_interface(_ROUTES.read_text(encoding="ascii")) if _ROUTES.exists() else None
@@ -112,8 +98,6 @@ def open_lcm(url: str) -> Any:
 class LcmMachine(NetworkLink):
     """A robot with twelve joints behind LCM. Implements `Machine`."""
 
-    wire = "LCM"
-
     def __init__(
         self,
         robot: RobotSpec,
@@ -123,10 +107,7 @@ class LcmMachine(NetworkLink):
         interface: str | None = None,
         **common: Any,
     ) -> None:
-        """Describe the link in a layout (`LAYOUTS`) at an address (`url_of`).
-
-        `common` is as of `NetworkLink`.
-        """
+        """Describe the link; see `LAYOUTS`, `url_of` and, for `common`, `NetworkLink`."""
         super().__init__(robot, **common)
         self._layout = known = layout_of(layout)
         if len(robot.joints) != 12:
@@ -140,7 +121,7 @@ class LcmMachine(NetworkLink):
         self._url = url_of(port=port, interface=interface)
         self._address = f"{known.joints.channel} and {known.attitude.channel} at {self._url}"
 
-    def _open(self) -> CommandWriter:
+    def _open(self) -> tuple[Encode, Publish]:
         layout = self._layout
         decoder = StateDecoder(layout, self.counts)
         # Last request for clamps that the virtual robot received, and the joints it holds.
@@ -161,9 +142,7 @@ class LcmMachine(NetworkLink):
                 channel, lambda _, data, handler=handler: self._take(handler, data)
             )
             subscription.set_queue_capacity(_QUEUE)
-        return CommandWriter(
-            lambda command: encode_command(layout, command), self._command, counts=self.counts
-        )
+        return partial(encode_command, layout), self._command
 
     def _shut(self) -> None:
         del self._in, self._out
