@@ -30,14 +30,7 @@ from pronk.links.link import (
     await_rest,
     wait_for,
 )
-from pronk.links.machine import (
-    Command,
-    RefusedError,
-    State,
-    TorqueKind,
-    check_command,
-    damping_command,
-)
+from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.testing import check_link
@@ -203,7 +196,7 @@ def writing(publish: Publish) -> CommandWriter:
     return CommandWriter(
         lambda command: bytes([bool(command.stiffness.any())]),
         publish,
-        damping=damping_command(12),
+        damping=replace(HOLD, stiffness=np.zeros(12)),
         repeat_s=None,
         counts=Counter(),
     )
