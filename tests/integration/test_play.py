@@ -12,6 +12,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -178,7 +179,8 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
     import msgspec
 
     joystick, sim_params = Joystick(ranges=RANGES), load_sim_params()
-    with WebPage(ROBOT, sim_params.ground, joystick, title="# virtual", port=18765) as page:
+    server = WebPage(ROBOT, sim_params.ground, joystick, title="# virtual", port=18765)
+    with closing(server) as page:
         assert page.server.get_host() == "127.0.0.1"
         with urllib.request.urlopen(page.address) as reply:
             assert b"<html" in reply.read()[:2000].lower()

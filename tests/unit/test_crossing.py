@@ -30,11 +30,12 @@ from pronk.evaluation.crossing import (
 )
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.protocol import Case
-from pronk.evaluation.results import Results, Row, Subject
+from pronk.evaluation.results import Results, Row
 from pronk.runtime.script import STILL, Script
 from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Ground
 from pronk.virtual.sim_params import load_sim_params
+from report_cases import of_kind, subject
 from seen_jump import DELAY, SCRIPT, changed, seen_jump
 
 RULES = JumpRules.of(ROBOT)
@@ -164,7 +165,6 @@ def test_what_happens_elsewhere_does_not_count() -> None:
 # --- The search ---------------------------------------------------------------------------------
 
 SIM_PARAMS = load_sim_params()
-SUBJECT = Subject(name="matched", path="policy.onnx", sha256="0" * 64, contract={})
 CASE = Case(name="forward 2", command=FORWARD)
 LADDER = Ladder(first=0.1, step=0.1, leads=(0.0, 0.1))
 PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, practice=2, most=0.45)
@@ -188,21 +188,12 @@ def climb(
         why = "" if good else crossing.NON_FOOT_CONTACT
         return CrossingFigures(obstacle=kind, size=size, lead=task.lead, why=why)
 
-    return search([SUBJECT], plan, robot=ROBOT, sim_params=SIM_PARAMS, run=run), done
+    return search([subject("matched")], plan, robot=ROBOT, sim_params=SIM_PARAMS, run=run), done
 
 
 def result(rows: list[Row]) -> Results:
-    return Results(
-        kind=CROSSING,
-        robot="mini_cheetah",
-        subjects=(SUBJECT,),
-        cases=PLAN.cases,
-        rows=tuple(rows),
-        seed=0,
-        sim_params={},
-        script=PLAN.script,
-        settings={"kinds": ["gap"], "runs": PLAN.runs, "enough": PLAN.enough},
-    )
+    settings = {"kinds": ["gap"], "runs": PLAN.runs, "enough": PLAN.enough}
+    return of_kind(CROSSING, ("matched",), cases=(CASE,), rows=tuple(rows), settings=settings)
 
 
 def test_sizes_grow_until_no_lead_does() -> None:

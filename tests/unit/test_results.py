@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 from dataclasses import asdict, replace
@@ -18,12 +19,9 @@ from pronk.evaluation import results, tables
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.jumps import FIGURES, JumpFigures, JumpRules
 from pronk.evaluation.protocol import PAPER_COMMANDS, PAPER_RATIOS, TABLE_III, Case
-from pronk.evaluation.results import Results, Row, Subject, ratio_of_scatter
-from pronk.robots import load_robot
-from pronk.runtime.script import Script
+from pronk.evaluation.results import Results, ratio_of_scatter
+from report_cases import ROBOT, of_kind, row, subject
 
-ROBOT = load_robot("mini_cheetah")
-SCRIPT = Script(command=(0.0, 0.0, 0.0))
 HEIGHTS = (0.40, 0.44, 0.48)
 MISSED = JumpFigures(standing=True, fell=True, height=0.05, energy=1.0)
 
@@ -40,48 +38,23 @@ def figures(height: float) -> JumpFigures:
     return JumpFigures(**kept)
 
 
-def rows(policy: str, case: Case, heights: tuple[float, ...]) -> list[Row]:
-    """One jump of each height, and one that failed."""
-    made = [*(figures(height) for height in heights), MISSED]
-    return [
-        Row(
-            policy=policy,
-            case=case.name,
-            number=i,
-            seed=100 + i,
-            figures=each,
-            script=replace(SCRIPT, command=case.command, run_s=2.5 + i / 50),
-            capture="captures/a.npz" if i == 0 else "",
-            began=0.125,
-        )
-        for i, each in enumerate(made)
-    ]
-
-
 def trial(
     heights: dict[str, tuple[float, ...]] | None = None, cases: tuple[Case, ...] = PAPER_COMMANDS
 ) -> Results:
+    """One jump of each height, and one that failed, of every policy with every command."""
     heights = heights or {"matched": HEIGHTS, "naive": (0.36, 0.44, 0.52)}
-    return Results(
-        robot=ROBOT.name,
-        subjects=tuple(
-            Subject(name=name, path=f"{name}.onnx", sha256=name, contract={"gains": name})
-            for name in heights
-        ),
-        cases=cases,
-        rows=tuple(
-            r for name, each in heights.items() for case in cases for r in rows(name, case, each)
-        ),
-        joint_names=ROBOT.joint_names,
-        seed=3,
-        sim_params={"file": "shipped with pronk", "sha256": "ab" * 32},
-        script=SCRIPT,
-        spread_s=0.5,
-        rules=asdict(JumpRules.of(ROBOT)),
-        mass=12.0,
-        versions={"pronk": "0.1.0"},
-        timing={"seconds": 1.0},
+    made = []
+    for name, case in itertools.product(heights, cases):
+        for i, each in enumerate([*map(figures, heights[name]), MISSED]):
+            kept: Any = {"capture": "captures/a.npz" if i == 0 else "", "began": 0.125}
+            one = row(name, case, i, each, **kept)
+            made.append(replace(one, script=replace(one.script, run_s=2.5 + i / 50)))
+    rest: Any = {"rules": asdict(JumpRules.of(ROBOT)), "timing": {"seconds": 1.0}}
+    rest |= {"spread_s": 0.5, "mass": 12.0, "rows": tuple(made)}
+    rest["subjects"] = tuple(
+        subject(name, joint_names=[], stiffness=[], damping=[]) for name in heights
     )
+    return of_kind(results.JUMPS, tuple(heights), cases=cases, **rest)
 
 
 # --- Sums ---------------------------------------------------------------------------------------
@@ -137,7 +110,7 @@ def test_the_interval_covers_a_known_ratio() -> None:
 def test_the_paper_s_ratios_follow_from_its_table() -> None:
     for figure, ratio in PAPER_RATIOS.items():
         naive, matched = (
-            sum(getattr(cell, figure)[gains][1] for cell in TABLE_III.values())
+            sum(std for _, std in TABLE_III[figure, gains].values())
             for gains in ("naive", "matched")
         )
         assert naive / matched == pytest.approx(ratio, abs=5e-3)

@@ -140,7 +140,8 @@ def jump_and_film(
     setup = setup_of(policies[0], out)
     trial = run_trial(policies, Plan(jumps=jumps, seed=seed), overwrite=True, **setup)
     first = replace(trial, subjects=trial.subjects[:1])
-    films = record_all(first, out, out / VIDEOS, warn=console.warn, cases=(FILMED,), slow=2.0)
+    how: Any = {"robot": setup["robot"], "warn": console.warn}
+    films = record_all(first, out, out / VIDEOS, cases=(FILMED,), slow=2.0, **how)
     return trial, films
 
 

@@ -65,9 +65,8 @@ def play(
     with ExitStack() as stack:
         pad = stack.enter_context(closing(Gamepad(devices[0], ranges))) if devices else None
         joystick = Joystick(ranges=ranges, jumps=loaded.contract.jump, gamepad=pad)
-        page = stack.enter_context(
-            WebPage(machine, params.ground, joystick, title=title, host=host, port=port)
-        )
+        server = WebPage(machine, params.ground, joystick, title=title, host=host, port=port)
+        page = stack.enter_context(closing(server))
         console.say(f"the virtual robot stands at {page.address}; Ctrl-C ends it")
         if host != "127.0.0.1":
             console.warn(f"bound to {host}: every computer that reaches this one can play")

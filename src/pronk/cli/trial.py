@@ -110,8 +110,9 @@ def trial(
                 found,
                 out,
                 out / VIDEOS,
-                warn=console.warn,
+                robot=setup["robot"],
                 cases=[case.name for case in plan.cases],
+                warn=console.warn,
                 at_once=setup["processes"],
                 progress=report.bar("rendering videos"),
             )
@@ -170,7 +171,4 @@ def _extra_sheets(
         yield variation.table(variation.add_variation(policies, plan_5, progress=bar, **setup))
     if "bodies" in names:
         plan_n = Plan(jumps=jumps, seed=seed)
-        trained = [[path] for path in own]
-        yield bodies.table(
-            bodies.add_bodies(policies, plan_n, own=trained, seed=seed, stages=report, **setup)
-        )
+        yield bodies.table(bodies.add_bodies(policies, plan_n, own=own, stages=report, **setup))

@@ -64,8 +64,12 @@ NAIVE = "drive's own"
 MATCHED = "matched anew"
 TRAINABLE = "matched anew, by group"
 """Names of gains beside those of the policies."""
+COUNT = 3
+"""Of robots."""
 AMPLITUDE = 0.25
 """Of the paper's chirp (F3) [rad]."""
+REPEATS = 3
+"""Of each joint's sweep."""
 SETTINGS = MatchSettings(method="quick", zero_armature=False)
 """The quick search; it ends within a hundredth of a cell of the whole grid's optimum."""
 
@@ -109,49 +113,37 @@ class Bodies:
 
 def add_bodies(
     policies: Sequence[Path],
-    plan: Plan | None = None,
+    plan: Plan,
     *,
-    count: int = 3,
-    own: Sequence[Sequence[Path]] = (),
-    repeats: int = 3,
-    seed: int = 0,
-    stages: Callable[[str, float], None] = lambda stage, share: None,
+    own: Sequence[Path] = (),
+    stages: Callable[[str, float], None],
     **setup: Unpack[Setup],
 ) -> Bodies:
     """Draw robots, match each, try policies on each, and write `bodies.json`.
 
     A robot whose folder has its parameters and gains already is not excited again: a policy trained
     with those gains finds them unchanged. Robots are drawn from `1000 seed + 1` and on around the
-    parameters of `setup`; `own` has for each, in order, policies that were trained with its gains.
-    `repeats` is of each joint's sweep; `stages` is called with a stage and its share done. Without
-    a plan, 20 jumps with each of the paper's commands are tried.
+    parameters of `setup`; `own` has for each, in order, a policy that was trained with its gains.
+    `stages` is called with a stage and its share done.
     """
     begun, robot, out = time.perf_counter(), setup["robot"], setup["out"]
-    processes = setup.get("processes", 1)
-    if len(own) > count:
-        raise PronkError(f"own policies for {len(own)} bodies; there are {count}.")
+    processes, bodies = setup.get("processes", 1), []
+    if len(own) > COUNT:
+        raise PronkError(f"own policies for {len(own)} bodies; there are {COUNT}.")
     subjects = load_subjects(policies, robot)
-    given = [[*policies, *(own[i] if i < len(own) else ())] for i in range(count)]
+    given = [[*policies, *own[i : i + 1]] for i in range(COUNT)]
     for paths in given:
         load_subjects(paths, robot)
-    seeds = [1000 * seed + number for number in range(1, count + 1)]
-    drawn = [draw_robot(setup["sim_params"], robot, seed=one) for one in seeds]
-    bodies = []
-    for i, (params, paths) in enumerate(zip(drawn, given, strict=True), start=1):
-        name, folder = f"body {i}", out / FOLDER / f"body_{i}"
-        matched, logs = match_body(
-            robot,
-            params,
-            folder,
-            seed=seeds[i - 1],
-            repeats=repeats,
-            processes=processes,
-            progress=lambda what, share, name=name: stages(f"{name}: {what}", share),  # type: ignore[misc]
-        )
+    for number, paths in enumerate(given, start=1):
+        name, folder = f"body {number}", out / FOLDER / f"body_{number}"
+        seed = 1000 * plan.seed + number
+        params = draw_robot(setup["sim_params"], robot, seed=seed)
+        how: Any = {"name": name, "processes": processes, "stages": stages}
+        matched, logs = match_body(robot, params, folder, seed=seed, **how)
         digest = sha256(folder / SIM_PARAMS)
         trial = run_trial(
             paths,
-            plan or Plan(),
+            plan,
             robot=robot,
             sim_params=params,
             out=folder / TRIAL,
@@ -160,20 +152,14 @@ def add_bodies(
             processes=processes,
             progress=partial(stages, f"{name}: jump"),
         )
-        body = Body(
-            name=name,
-            folder=str(folder.relative_to(out)),
-            seed=seeds[i - 1],
-            sha256=digest,
-            errors=_errors(robot, logs, matched, trial.subjects),
-            trial=trial,
-        )
-        bodies.append(body)
+        head: Any = {"name": name, "folder": str(folder.relative_to(out)), "seed": seed}
+        errors = _errors(robot, logs, matched, trial.subjects)
+        bodies.append(Body(**head, sha256=digest, errors=errors, trial=trial))
     found = Bodies(
         robot=robot.name,
         subjects=subjects,
         sim_params=dict(setup.get("about") or {}),
-        seed=seed,
+        seed=plan.seed,
         seconds=time.perf_counter() - begun,
         bodies=tuple(bodies),
     )
@@ -303,15 +289,15 @@ def match_body(
     sim_params: SimParams,
     folder: Path,
     *,
+    name: str,
     seed: int,
-    repeats: int = 3,
-    processes: int = 1,
-    progress: Callable[[str, float], None] = lambda stage, share: None,
+    processes: int,
+    stages: Callable[[str, float], None],
 ) -> tuple[MatchedGains, list[JointLog]]:
     """Excite all joints of a virtual robot with the paper's chirp, and match them.
 
     The match reads the logs and nothing else. A folder that has the robot's gains is read. `seed`
-    is of all noise; `repeats` of the sweep of each joint; `processes` sweep legs at once.
+    is of all noise; `processes` sweep legs at once; `stages` are named after `name`.
     """
     files = [folder / LOGS / f"{joint}.mcap" for joint in robot.joint_names]
     same = False
@@ -322,23 +308,16 @@ def match_body(
         (folder / GAINS).unlink(missing_ok=True)
         says = f"A randomized virtual robot, drawn by `{WRITER}`, seed {seed}."
         save_sim_params(folder / SIM_PARAMS, sim_params, says=says)
-        plan = make_plan(robot, amplitudes=(AMPLITUDE,), repeats=repeats)
+        plan = make_plan(robot, amplitudes=(AMPLITUDE,), repeats=REPEATS)
         plan.check()
-        sweep_virtual(
-            plan,
-            sim_params,
-            folder / LOGS,
-            seed=seed,
-            processes=processes,
-            overwrite=True,
-            progress=partial(progress, "sweep"),
-        )
-        progress("match", 0.0)
+        how: Any = {"processes": processes, "progress": partial(stages, f"{name}: sweep")}
+        sweep_virtual(plan, sim_params, folder / LOGS, seed=seed, overwrite=True, **how)
+        stages(f"{name}: match", 0.0)
         logs = read_logs(files, processes=processes, robot=robot)
         found = match_logs(logs, robot, settings=SETTINGS)
         result_file.save(folder / MATCH, found)
         gains_file.save(folder / GAINS, found.gains)
-        progress("match", 1.0)
+        stages(f"{name}: match", 1.0)
     return gains_file.load(folder / GAINS), read_logs(files, processes=processes, robot=robot)
 
 

@@ -34,7 +34,7 @@ COST = 1.10
 """Largest growth of the speed error by the jump phases."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Check:
     """A number beside its limit."""
 
@@ -54,30 +54,22 @@ class Check:
         return {**asdict(self), "passed": self.passed}
 
 
-def _least(what: str, value: float, limit: float, unit: str = "") -> Check:
-    return Check(what=what, value=value, sense=">=", limit=limit, unit=unit)
-
-
-def _most(what: str, value: float, limit: float, unit: str = "") -> Check:
-    return Check(what=what, value=value, sense="<=", limit=limit, unit=unit)
-
-
 def trial_checks(trial: Results) -> list[Check]:
     """Check the first policy of a trial: the paper's matched column, and more."""
-    first, found = trial.subjects[0].name, []
+    first, found, paper = trial.subjects[0].name, [], TABLE_III["height", "matched"]
     cells = [cell for cell in trial.cells if cell.policy == first]
     for cell in cells:
         name = cell.case
-        for figure in ("height", "distance") if name in TABLE_III else ():
-            own, (mean, std) = cell.figures[figure], getattr(TABLE_III[name], figure)["matched"]
-            found.append(_least(f"{name}: {figure}", own.mean, mean, "m"))
-            found.append(_most(f"{name}: {figure}, std", own.std, std, "m"))
+        for figure in ("height", "distance") if name in paper else ():
+            own, (mean, std) = cell.figures[figure], TABLE_III[figure, "matched"][name]
+            found.append(Check(f"{name}: {figure}", own.mean, ">=", mean, "m"))
+            found.append(Check(f"{name}: {figure}, std", own.std, "<=", std, "m"))
         if name in GAPS:
-            found.append(_least(f"{name}: gap", cell.figures["gap"].mean, GAPS[name], "m"))
-        found.append(_least(f"{name}: success", cell.success, SUCCESS))
-    if any(cell.case in TABLE_III for cell in cells):
+            found.append(Check(f"{name}: gap", cell.figures["gap"].mean, ">=", GAPS[name], "m"))
+        found.append(Check(f"{name}: success", cell.success, ">=", SUCCESS))
+    if any(cell.case in paper for cell in cells):
         best = max((c.figures["height"].mean for c in cells if c.found), default=math.nan)
-        found.append(_least("best: height", best, HEIGHT, "m"))
+        found.append(Check("best: height", best, ">=", HEIGHT, "m"))
     return found
 
 
@@ -93,41 +85,39 @@ def cost_of_jumping(before: Mapping[str, float], after: Mapping[str, float]) -> 
 
 def evaluation_checks(evaluation: Evaluation) -> list[Check]:
     """Check every criterion that belongs to the commands of an evaluation."""
-    found: list[Check] = []
+    rows: list[tuple[Any, ...]] = []
     for walk in evaluation.walks:
         name, still = walk.name, walk["speed_error_averaged"].mean
         if name in WALKS:
-            found.append(_most(f"{name}: speed error", walk["speed_error"].mean, 0.15, "m/s"))
-            found.append(_most(f"{name}: falls", walk["fell"].mean, 0.005))
+            rows.append((f"{name}: speed error", walk["speed_error"].mean, "<=", 0.15, "m/s"))
+            rows.append((f"{name}: falls", walk["fell"].mean, "<=", 0.005))
         elif name in ("yaw 2", "yaw -2"):
-            found.append(_most(f"{name}: yaw rate error", walk["yaw_error"].mean, 0.2, "rad/s"))
+            rows.append((f"{name}: yaw rate error", walk["yaw_error"].mean, "<=", 0.2, "rad/s"))
         elif name == "stand":
-            found.append(_most(f"{name}: speed", still, 0.05, "m/s"))
+            rows.append((f"{name}: speed", still, "<=", 0.05, "m/s"))
     for jump in evaluation.jumps:
-        head, off = f"jump {jump.name}: ", jump["lift_off_velocity"].mean - LIFT_OFF_VELOCITY
-        height, words = jump["height"], f"{head}lift-off velocity off {LIFT_OFF_VELOCITY:g}"
-        found.append(_least(f"{head}height", height.mean, HEIGHT, "m"))
-        found.append(_most(f"{head}std of height", height.std, 0.03, "m"))
-        if jump.name in DISTANCE:
-            far = jump["distance"].mean
-            found.append(_least(f"{head}distance", far, DISTANCE[jump.name], "m"))
-        found.append(_least(f"{head}upright", jump["upright"].mean, 0.99))
-        # Flights of the gait before and after do not count.
-        found.append(_least(f"{head}one high flight", jump["single"].mean, 0.95))
-        found.append(_most(words, abs(off), 0.3, "m/s"))
-        late = jump["delay"].p95
-        found.append(_most(f"{head}lift-off after, 95th percentile", late, 0.3, "s"))
+        off = abs(jump["lift_off_velocity"].mean - LIFT_OFF_VELOCITY)
+        own = [
+            ("height", jump["height"].mean, ">=", HEIGHT, "m"),
+            ("std of height", jump["height"].std, "<=", 0.03, "m"),
+            ("distance", jump["distance"].mean, ">=", DISTANCE.get(jump.name), "m"),
+            ("upright", jump["upright"].mean, ">=", 0.99),
+            # Flights of the gait before and after do not count.
+            ("one high flight", jump["single"].mean, ">=", 0.95),
+            (f"lift-off velocity off {LIFT_OFF_VELOCITY:g}", off, "<=", 0.3, "m/s"),
+            ("lift-off after, 95th percentile", jump["delay"].p95, "<=", 0.3, "s"),
+        ]
+        rows += [(f"jump {jump.name}: {row[0]}", *row[1:]) for row in own if row[3] is not None]
     for when, results in (("walking", evaluation.walks), ("around jumps", evaluation.jumps)):
         if results:
             # No flight has height 0.
             highest = (result["uncommanded"].most for result in results)
             value = max((one for one in highest if not math.isnan(one)), default=0.0)
-            found.append(_most(f"flight without a jump input, {when}", value, RISE, "m"))
-    if evaluation.estimator:
-        right = evaluation.estimator["contacts_right"]
-        found.append(_most("velocity RMSE", evaluation.estimator["velocity"], 0.15, "m/s"))
-        found.append(_least("contacts right", right, 0.95))
+            rows.append((f"flight without a jump input, {when}", value, "<=", RISE, "m"))
+    if estimator := evaluation.estimator:
+        rows.append(("velocity RMSE", estimator["velocity"], "<=", 0.15, "m/s"))
+        rows.append(("contacts right", estimator["contacts_right"], ">=", 0.95))
     if evaluation.before:
         cost = cost_of_jumping(evaluation.before, evaluation.speed_errors())
-        found.append(_most("speed error over that before jumping", cost, COST))
-    return found
+        rows.append(("speed error over that before jumping", cost, "<=", COST))
+    return [Check(*row) for row in rows]

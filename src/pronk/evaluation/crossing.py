@@ -9,12 +9,11 @@ Coordinates: s along the commanded direction, which the robot faces at the start
 s = `edge`. The jump input rises when the trunk is `lead` before it (the operator's choice), stays
 for `jump_s`, the velocity for `keep_s` longer; then the command is zero.
 
-For each command, first practice on flat ground: how far in front of the trunk, at the jump input,
-do the front-most feet stand for the last time (`reach`)? A robot that lifts off right at the edge
-is one whose jump input rises that far before it. Then, size by size, `runs` runs for each of a few
-leads about that distance; every run starts at its own place, so that it meets the edge in another
-phase of its gait, which the operator does not use. A size counts as crossed with the lead that did
-best, if it did so in `enough` of its runs; the sizes grow until no lead does.
+For each command, first practice on flat ground: `reach` is how far in front of the trunk, at the
+jump input, the front-most feet stand for the last time. Then, size by size, `runs` runs for each of
+a few leads about that distance; every run starts at its own place and meets the edge in another
+phase of its gait. A size counts as crossed with the lead that did best, if it did so in `enough` of
+its runs; the sizes grow until no lead does.
 
 Crossed means all of this, from the jump input to 2 s after the landing:
 
@@ -30,10 +29,10 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Unpack
+from typing import Any, Literal, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +81,7 @@ PHASE_S = 0.5
 LATE = 3.0
 """A run ends if the robot has not reached the edge after this many times the run-up."""
 STEERED = 0.02
-"""Half-width of the headings at the start: the robot is aimed at the edge [rad]."""
+"""Half-width of the headings at the start [rad]."""
 
 NOT_TRIGGERED = "never came to the place of the jump"
 STEPPED_IN = "a foot went below the floor between the edges"
@@ -143,21 +142,24 @@ def direction(command: Velocity) -> Array:
 # ---- one run ----
 
 
+@dataclass
 class Operator:
     """The command over time: run, and jump when the trunk is at `trigger_at`."""
 
-    def __init__(self, script: Script, *, trigger_at: float, where: Callable[[], float]) -> None:
-        """Begin before the first tick; `where` returns the trunk's place along the course [m]."""
-        self._script, self._where, self._trigger_at = script, where, trigger_at
-        self.triggered: float | None = None
-        """When the jump input rose, since the policy took over [s]."""
+    script: Script
+    trigger_at: float
+    """Along the course [m]."""
+    where: Callable[[], float]
+    """Returns the trunk's place along the course [m]."""
+    triggered: float | None = None
+    """When the jump input rose, since the policy took over [s]."""
 
     def __call__(self, t: float) -> Commanded:
         """Return the command at a time since the policy took over [s]."""
-        script = self._script
+        script = self.script
         if t < script.stand_s:
             return STILL, False
-        if self.triggered is None and self._where() >= self._trigger_at:
+        if self.triggered is None and self.where() >= self.trigger_at:
             self.triggered = t
         if self.triggered is None:
             return script.command, False
@@ -205,7 +207,7 @@ def lost(seen: Capture, obstacle: Obstacle) -> bool:
 def measure_crossing(
     seen: Capture, obstacle: Obstacle, *, triggered: float | None, rules: JumpRules
 ) -> CrossingFigures:
-    """Decide whether an obstacle was crossed, and measure it.
+    """Measure one run at an obstacle.
 
     `triggered` is when the jump input rose, on the capture's clock [s]; None for never.
     """
@@ -216,9 +218,8 @@ def measure_crossing(
     feet, trunk = seen.foot_position[:, :, :2] @ along, seen.position[:, :2] @ along
     behind = seen.contact & (feet >= far)
     first = np.where(behind[on:].any(axis=0), on + behind[on:].argmax(axis=0), count)
-    landed = int(first.max())
+    landed, legs = int(first.max()), np.arange(feet.shape[1])
     settled = landed + round(rules.upright_s / seen.dt)
-    legs = np.arange(feet.shape[1])
     figures: dict[str, Any] = {"speed": float(seen.velocity[on, :2] @ along)}
     main = jump_flights(seen, on, rules, count).main
     if main is not None:
@@ -264,8 +265,8 @@ class Attempt(Job):
 
 def attempt(task: Attempt) -> Row:
     """Run once at an obstacle and measure it."""
-    script, rules, obstacle = task.row.script, task.rules, task.obstacle
-    along, machine = direction(script.command), task.set_down()
+    script, obstacle, robot = task.row.script, task.obstacle, load_robot(task.robot)
+    along, machine, rules = direction(script.command), task.set_down(), JumpRules.of(robot)
     operator = Operator(
         script,
         trigger_at=obstacle.edge - task.lead,
@@ -274,7 +275,7 @@ def attempt(task: Attempt) -> Row:
     # Time to lift off, to fly and land on all feet, and to stand.
     after = rules.search_s + 1.0 + rules.upright_s
     late, began = script.stand_s + LATE * (RUN_UP_S + PHASE_S), machine.now()
-    for tick in ticks(machine, task.policy(), load_robot(task.robot), operator):
+    for tick in ticks(machine, task.policy(), robot, operator):
         if operator.triggered is None:
             if tick.since > late:
                 break
@@ -336,41 +337,6 @@ class CrossingPlan:
     """Times `stand_s`, `jump_s` and `keep_s`."""
 
 
-def attempts(
-    subject: Subject,
-    case: Case,
-    kind: Shape,
-    size: float,
-    *,
-    lead: float,
-    runs: int,
-    plan: CrossingPlan,
-    robot: RobotSpec,
-    sim_params: SimParams,
-) -> list[Attempt]:
-    """Return runs at one obstacle; their starts are alike for all obstacles and leads."""
-    speed, found = math.hypot(*case.command[:2]), []
-    obstacle = Obstacle(kind=kind, size=size, command=case.command, edge=RUN_UP_S * speed)
-    script = replace(plan.script, command=case.command)
-    for count in range(runs):
-        rng = case_rng(plan.seed, case, count)
-        x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
-        offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
-        yaw, seed = float(rng.uniform(-STEERED, STEERED)), int(rng.integers(2**31))
-        task = Attempt(
-            row=Row(policy=subject.name, case=case.name, number=count, seed=seed, script=script),
-            subject=subject,
-            robot=robot.source,
-            sim_params=replace(sim_params, ground=obstacle.on(sim_params.ground)),
-            start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
-            rules=JumpRules.of(robot),
-            obstacle=obstacle,
-            lead=lead,
-        )
-        found.append(task)
-    return found
-
-
 def search(
     subjects: Sequence[Subject],
     plan: CrossingPlan,
@@ -380,26 +346,47 @@ def search(
     run: Callable[[list[Attempt]], list[Row]],
 ) -> list[Row]:
     """Practise, then climb all ladders at once, a rung of each in every round; `run` runs one."""
-    common: Any = {"plan": plan, "robot": robot, "sim_params": sim_params}
+
+    def attempts(
+        subject: Subject, case: Case, kind: Shape, size: float, lead: float, runs: int
+    ) -> Iterator[Attempt]:
+        """Plan runs at one obstacle; their starts are alike for all obstacles and leads."""
+        speed = math.hypot(*case.command[:2])
+        obstacle = Obstacle(kind=kind, size=size, command=case.command, edge=RUN_UP_S * speed)
+        script = replace(plan.script, command=case.command)
+        for count in range(runs):
+            rng = case_rng(plan.seed, case, count)
+            x, y = (-PHASE_S * speed * rng.uniform() * direction(case.command)).tolist()
+            offset = rng.uniform(-OFFSET, OFFSET, len(robot.joints))
+            yaw, seed = float(rng.uniform(-STEERED, STEERED)), int(rng.integers(2**31))
+            named: Any = {"policy": subject.name, "case": case.name}
+            yield Attempt(
+                row=Row(**named, number=count, seed=seed, script=script),
+                subject=subject,
+                robot=robot.source,
+                sim_params=replace(sim_params, ground=obstacle.on(sim_params.ground)),
+                start=Start(position=(x, y), yaw=yaw, joint_offset=tuple(offset.tolist())),
+                obstacle=obstacle,
+                lead=lead,
+            )
+
     pairs = [(subject, case) for subject in subjects for case in plan.cases]
-    practice: Any = {"lead": 0.0, "runs": plan.practice, **common}
-    rows = run([task for s, c in pairs for task in attempts(s, c, "flat", 0.0, **practice)])
+    flat = (attempts(*pair, "flat", 0.0, 0.0, plan.practice) for pair in pairs)
+    rows = run([task for tasks in flat for task in tasks])
     climbing: dict[tuple[str, str, Shape], tuple[Subject, Case, int, float]] = {}
     for subject, case in pairs:
-        own = [
-            row.figures.reach for row in rows if (row.policy, row.case) == (subject.name, case.name)
-        ]
+        names = (subject.name, case.name)
+        own = [row.figures.reach for row in rows if (row.policy, row.case) == names]
         if known := list(filter(math.isfinite, own)):  # without a jump there is nothing to cross
-            for kind in plan.ladders:
-                climbing[subject.name, case.name, kind] = subject, case, 0, float(np.mean(known))
+            reach = float(np.mean(known))
+            climbing |= {(*names, kind): (subject, case, 0, reach) for kind in plan.ladders}
     while climbing:
-        tasks = []
+        steps: list[Attempt] = []
         for (_, _, kind), (subject, case, rung, reach) in climbing.items():
             ladder = plan.ladders[kind]
             for lead in (round(reach + beyond, 4) for beyond in ladder.leads):
-                size = ladder.size(rung)
-                tasks += attempts(subject, case, kind, size, lead=lead, runs=plan.runs, **common)
-        found = run(tasks)
+                steps += attempts(subject, case, kind, ladder.size(rung), lead, plan.runs)
+        found = run(steps)
         rows += found
         for key, (subject, case, rung, reach) in list(climbing.items()):
             tried = [r for r in found if (r.policy, r.case, r.figures.obstacle) == key]
@@ -411,14 +398,12 @@ def search(
     return rows
 
 
-def add_crossings(
-    policies: Sequence[Path], plan: CrossingPlan | None = None, **setup: Unpack[Setup]
-) -> Results:
+def add_crossings(policies: Sequence[Path], plan: CrossingPlan, **setup: Unpack[Setup]) -> Results:
     """Let policies cross gaps and steps; write `crossing.csv` and `crossing.json`.
 
     Arguments and errors as of `run_trial`; the progress is an estimate.
     """
-    begun, plan, robot, rounds = time.perf_counter(), plan or CrossingPlan(), setup["robot"], 0
+    begun, robot, rounds = time.perf_counter(), setup["robot"], 0
     subjects = load_subjects(policies, robot)
     progress = setup.get("progress") or (lambda share: None)
 
@@ -454,8 +439,7 @@ def add_crossings(
 # ---- sums ----
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rung:
+class Rung(NamedTuple):
     """One size, with the lead that did best."""
 
     size: float
@@ -467,8 +451,7 @@ class Rung:
     """Why the others were not crossed, with all leads."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Climb:
+class Climb(NamedTuple):
     """All sizes that one policy tried with one command."""
 
     policy: str
@@ -510,6 +493,5 @@ def climbs(results: Results) -> tuple[Climb, ...]:
                 whole = enough.index(False) if False in enough else len(enough)
                 largest = sizes[whole - 1] if whole else 0.0
                 ever = max((r.figures.size for r in own if r.figures.success), default=0.0)
-                names = {"policy": policy, "case": case, "kind": kind}
-                found.append(Climb(**names, rungs=tuple(rungs), largest=largest, ever=ever))
+                found.append(Climb(policy, case, kind, tuple(rungs), largest, ever))
     return tuple(found)

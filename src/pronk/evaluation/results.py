@@ -165,7 +165,7 @@ class Cell:
     """By figure, then by joint."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Ratio:
     """Scatter of another policy over that of the first."""
 
@@ -226,9 +226,8 @@ class Results:
     def values(self, policy: str, case: str, figure: str) -> Array:
         """Return the known values of one figure, of the jumps that were found."""
         rows = [row.figures for row in self.of(policy, case) if getattr(row.figures, "found", True)]
-        known = np.array([getattr(figures, figure) for figures in rows], dtype=float)
-        finite: Array = known[np.isfinite(known)]
-        return finite
+        known: Array = np.array([getattr(figures, figure) for figures in rows], dtype=float)
+        return known[np.isfinite(known)]
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
@@ -256,12 +255,12 @@ class Results:
                 joints[name] = dict(zip(self.joint_names, map(Spread.of, columns), strict=True))
             else:
                 figures[name] = Spread.of(values)
+        head = {name: getattr(rows[0], name) for name in ("policy", "case", "parameter", "value")}
+        flags = ("standing", "fell", "non_foot_contact")
+        counts = {k: sum(getattr(each, k, k == "standing") for each in every) for k in flags}
         return Cell(
-            **{name: getattr(rows[0], name) for name in ("policy", "case", "parameter", "value")},
-            **{
-                name: sum(getattr(each, name, name == "standing") for each in every)
-                for name in ("standing", "fell", "non_foot_contact")
-            },
+            **head,
+            **counts,
             n=len(rows),
             found=len(found),
             succeeded=succeeded,
@@ -281,10 +280,9 @@ class Results:
                     cases = self.pooled if case is None else (case,)
                     own = [self.values(first, each, figure) for each in cases]
                     others = [self.values(other, each, figure) for each in cases]
-                    value, low, high = ratio_of_scatter(own, others, seed=self.seed)
+                    scatter = ratio_of_scatter(own, others, seed=self.seed)
                     n = (sum(map(len, own)), sum(map(len, others)))
-                    names: Any = {"figure": figure, "case": case, "policy": first, "other": other}
-                    found.append(Ratio(**names, value=value, low=low, high=high, n=n))
+                    found.append(Ratio(figure, case, first, other, *scatter, n))
         return tuple(found)
 
 
@@ -292,8 +290,8 @@ def share_interval(count: int, n: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share."""
     from scipy.stats import binomtest
 
-    interval = binomtest(count, n).proportion_ci(0.95, method="wilson")
-    return float(interval.low), float(interval.high)
+    low, high = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    return float(low), float(high)
 
 
 def ratio_of_scatter(
@@ -301,7 +299,7 @@ def ratio_of_scatter(
 ) -> tuple[float, float, float]:
     """Sum of the standard deviations of `others` over that of `own`, and its 95 % interval.
 
-    One sample of a figure for each command. The interval is that of the percentile bootstrap, every
+    One sample of a figure for each command. The interval is of the percentile bootstrap, every
     sample resampled by itself. All NaN where a sample has fewer than two values or `own` does not
     scatter; with fewer than `FEWEST` values in a sample the interval alone is NaN.
     """
@@ -321,19 +319,12 @@ def ratio_of_scatter(
     value = float(ratio(*samples)) if min(map(len, samples)) > 1 else math.nan
     if not math.isfinite(value) or min(map(len, samples)) < FEWEST:
         return value, math.nan, math.nan
+    how: Any = {"n_resamples": resamples, "method": "percentile", "vectorized": True, "batch": 1000}
     with warnings.catch_warnings():
         # Of resamples without scatter, which the quantiles below leave out.
         warnings.simplefilter("ignore", DegenerateDataWarning)
-        drawn = bootstrap(
-            samples,
-            ratio,
-            n_resamples=resamples,
-            vectorized=True,
-            method="percentile",
-            rng=np.random.default_rng(seed),
-            batch=1000,
-        ).bootstrap_distribution
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
+        drawn = bootstrap(samples, ratio, rng=np.random.default_rng(seed), **how)
+    low, high = np.nanquantile(drawn.bootstrap_distribution, [0.025, 0.975])
     return value, float(low), float(high)
 
 

@@ -117,7 +117,7 @@ def table_iii(trial: Results, figure: str) -> Sheet:
     """The paper's Table III beside ours, for `height` or `distance`."""
     columns: dict[str, tuple[dict[str, str], list[float]]] = {}
     for gains in ("naive", "matched"):
-        paper = {case: getattr(cell, figure)[gains] for case, cell in TABLE_III.items()}
+        paper = TABLE_III[figure, gains]
         cells = {case: f"{mean:.3f} +- {std:.3f}" for case, (mean, std) in paper.items()}
         columns[f"paper, {gains}"] = cells, [std for _, std in paper.values()]
     for name in in_paper_order(subject.name for subject in trial.subjects):

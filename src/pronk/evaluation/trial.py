@@ -4,8 +4,7 @@
 
 Each jump has a new virtual robot with its own heading, joint offsets and noise, and a jump input
 that rises up to `spread_s` later, so that it meets every phase of the gait. All of it is drawn from
-seed, command and number of the jump alone: every policy meets the same starts, and another command
-changes nothing. Walks, crossings and varied robots run the same way.
+seed, command and number of the jump alone. Walks, crossings and varied robots run the same way.
 
     trials.csv, summary.json    one row a jump; what was run, and the sums
     captures/, videos/          recorded runs, and films of them
@@ -146,9 +145,8 @@ class Job:
     """Name or path."""
     sim_params: SimParams
     start: Start
-    rules: JumpRules
-    keep: Path | None = None
-    """File for the capture; None for none."""
+    out: Path = Path()
+    """Folder of the row's capture."""
     measure: Callable[..., Any] = measure
     """From capture to figures; a function of a module."""
 
@@ -200,9 +198,9 @@ def run_job(job: Job) -> Row:
     if not taken:
         raise HardwareError("the policy made no step; let it run for one tick or more.")
     recorded, began = machine.capture(), taken[0].time
-    figures = job.measure(recorded, script, robot, began=began, rules=job.rules)
-    if job.keep is not None:
-        captures.save(job.keep, recorded)
+    figures = job.measure(recorded, script, robot, began=began)
+    if job.row.capture:
+        captures.save(job.out / job.row.capture, recorded)
     return replace(job.row, figures=figures, began=began)
 
 
@@ -228,10 +226,7 @@ def in_processes(
     processes: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> list[R]:
-    """Do every job, in this process or in several, and return the results in the order of the jobs.
-
-    `work` is a function of a module; jobs are pickled.
-    """
+    """Do every job, in this process or in several; `work` is a function of a module."""
     if processes < 1:
         raise PronkError(f"{processes} processes; expected 1 or more.")
     done: list[R] = []
@@ -266,37 +261,21 @@ def plan_jobs(
     measure: Callable[..., Any] = measure,
 ) -> list[Job]:
     """Return every run of a plan; captures are kept in `out`."""
-    rules, found = JumpRules.of(robot), []
-    runs = [
+    found: list[Job] = []
+    common: Any = {"robot": robot.source, "sim_params": sim_params, "out": out, "measure": measure}
+    runs = (
         (subject, case, number)
         for subject in subjects
         for case in plan.tried
         for number in range(plan.jumps if case in plan.cases else plan.rates)
-    ]
+    )
     for subject, case, number in runs:
         script, start, seed = draw(plan, case, number, robot)
-        some = number == 0 or case not in plan.cases
-        kept = keep == "all" or (keep == "some" and some)
+        kept = keep == "all" or (keep == "some" and (number == 0 or case not in plan.cases))
         stem = f"{subject.name}_{case.name}_{number:03d}".replace(" ", "_")
-        capture = f"{CAPTURES}/{stem}.npz" if kept else ""
-        job = Job(
-            row=Row(
-                policy=subject.name,
-                case=case.name,
-                number=number,
-                seed=seed,
-                script=script,
-                capture=capture,
-            ),
-            subject=subject,
-            robot=robot.source,
-            sim_params=sim_params,
-            start=start,
-            rules=rules,
-            keep=out / capture if kept else None,
-            measure=measure,
-        )
-        found.append(job)
+        named: Any = {"policy": subject.name, "case": case.name, "number": number, "seed": seed}
+        row = Row(**named, script=script, capture=f"{CAPTURES}/{stem}.npz" if kept else "")
+        found.append(Job(row=row, subject=subject, start=start, **common))
     return found
 
 
@@ -317,7 +296,7 @@ def run_trial(
     Of jumps `keep_captures` keeps every capture, not the first with each command alone, and
     `overwrite` replaces a trial in the folder; other kinds are added to it. `varied` has parameter,
     value and body of every body, if there are more than that of `setup`; `measure` is as in `Job`.
-    A `PronkError` of policies, parameters or folder comes before the first step.
+    Impossible policies, parameters and folders are refused before the first step.
     """
     robot, out, processes = setup["robot"], setup["out"], setup.get("processes", 1)
     subjects, jobs = load_subjects(policies, robot, jump=kind.jump), []
@@ -352,7 +331,7 @@ def run_trial(
         seed=plan.seed,
         script=plan.script,
         spread_s=plan.spread_s,
-        rules=asdict(jobs[0].rules),
+        rules=asdict(JumpRules.of(robot)),
         mass=legged(robot.source).total_mass,
         settings=dict(settings or {}),
         timing=timing,
@@ -411,15 +390,13 @@ def load_subjects(
     A policy is named after the gains of its training; two of a kind, after their files. With `jump`
     it needs the jump input. The same policy twice is refused.
     """
-    policies = []
-    for path in paths:
-        policies.append(load_policy(path))
-        contract = policies[-1].contract
+    policies = [load_policy(path) for path in paths]
+    for path, policy in zip(paths, policies, strict=True):
         try:
-            check(contract, robot)
+            check(policy.contract, robot)
         except ArtefactError as error:
             raise ArtefactError(f"{path}: {error}") from None
-        if jump and not contract.jump:
+        if jump and not policy.contract.jump:
             raise ArtefactError(
                 f"{path}: this policy was trained to walk only and has no jump input; "
                 "`pronk train jump` adds it."
@@ -435,10 +412,9 @@ def load_subjects(
     names, found = next(distinct, numbered), []
     for name, path, policy in zip(names, paths, policies, strict=True):
         contract = msgspec.to_builtins(policy.contract)
-        kept = {
-            k: v for k, v in contract.items() if k not in ("schema", "observation", "provenance")
-        }
-        found.append(Subject(name=name, path=str(path), sha256=policy.sha256, contract=kept))
+        for unused in ("schema", "observation", "provenance"):
+            contract.pop(unused, None)
+        found.append(Subject(name=name, path=str(path), sha256=policy.sha256, contract=contract))
     return tuple(found)
 
 
@@ -449,7 +425,6 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
     """
     if out.exists() and not out.is_dir():
         raise PronkError(f"--out {out}: a file; expected the name of a folder.")
-    old = [out / SUMMARY, out / TABLE]
     try:
         if out.is_dir() and any(out.iterdir()):
             if not overwrite:
@@ -458,7 +433,7 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
                     "trial in it."
                 )
             # An interrupted trial leaves captures alone.
-            if not any(path.exists() for path in (*old, out / CAPTURES)):
+            if not any((out / name).exists() for name in (SUMMARY, TABLE, CAPTURES)):
                 raise PronkError(
                     f"--out {out}: holds no trial to overwrite; give a new or an empty folder."
                 )
@@ -466,11 +441,10 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
         # Fails now, not after an hour, if the folder cannot be written to.
         with tempfile.NamedTemporaryFile(dir=out):
             pass
-        films = (
-            path for kind in ("mp4", "gif", "png") for path in (out / VIDEOS).glob(f"*.{kind}")
-        )
-        for path in (*old, *(out / CAPTURES).glob("*.npz"), *films):
-            path.unlink(missing_ok=True)
+        films = [f"{VIDEOS}/*.{kind}" for kind in ("mp4", "gif", "png")]
+        for pattern in (SUMMARY, TABLE, f"{CAPTURES}/*.npz", *films):
+            for path in out.glob(pattern):
+                path.unlink()
     except OSError as error:
         raise PronkError(
             f"--out {out}: cannot be written to ({error.strerror}); give another folder."

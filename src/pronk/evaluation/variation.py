@@ -114,15 +114,14 @@ def line(results: Results, parameter: str, policy: str, case: str) -> tuple[Cell
 
 def add_variation(
     policies: Sequence[Path],
-    plan: Plan | None = None,
+    plan: Plan,
     *,
     parameters: tuple[Parameter, ...] = PARAMETERS,
     **setup: Unpack[Setup],
 ) -> Results:
     """Let policies jump on varied virtual robots; write `variation.csv` and `variation.json`.
 
-    Arguments and errors as of `run_trial`; five jumps with each of the paper's commands if `plan`
-    is None.
+    Arguments and errors as of `run_trial`.
     """
     base = setup["sim_params"]
     varied = [
@@ -132,7 +131,7 @@ def add_variation(
     ]
     return run_trial(
         policies,
-        plan or Plan(jumps=5),
+        plan,
         kind=VARIATION,
         varied=[(NOMINAL, 0.0, base), *varied],
         settings={

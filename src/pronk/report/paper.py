@@ -52,7 +52,4 @@ def published_jumps(figure: str) -> dict[str, dict[str, tuple[float, float]]]:
     """Return mean and deviation of `height`, `distance` or `gap` [m] by policy and command."""
     if figure == "gap":
         return {"matched": {case: (gap, math.nan) for case, gap in GAPS.items()}}
-    return {
-        gains: {case: getattr(cell, figure)[gains] for case, cell in TABLE_III.items()}
-        for gains in ("naive", "matched")
-    }
+    return {gains: dict(TABLE_III[figure, gains]) for gains in ("naive", "matched")}

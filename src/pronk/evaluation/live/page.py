@@ -9,7 +9,7 @@ import socket
 import time
 from contextlib import redirect_stdout
 from types import ModuleType
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -106,11 +106,7 @@ class WebPage:
         """Where a browser finds it."""
         self._build(title)
 
-    def __enter__(self) -> Self:
-        """Begin."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Stop the server."""
         with redirect_stdout(io.StringIO()):
             self.server.stop()

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from threading import Lock
 from typing import Protocol
 
 import numpy as np
 
-from pronk.evaluation.jumps import FALLEN_COSINE, FALLEN_HEIGHT, JumpRules, cosine_of_tilt
+from pronk.evaluation.jumps import JumpRules, fallen_at, jump_flights
 from pronk.links.machine import State
 from pronk.policy.contract import COMMANDS
 from pronk.policy.runtime import Policy
@@ -122,36 +122,38 @@ class Gauge:
     speed: float = math.nan
     """Horizontal [m/s]."""
     fallen: bool = False
-    _flight: Capture | None = None
-    _apex: float = -math.inf
+    _seen: list[Capture] = field(default_factory=list)
+    """The samples of a flight under way."""
 
     def add(self, sample: Capture) -> None:
         """Take in a capture of one sample, of the present moment."""
         self.height = float(sample.position[0, 2])
         self.speed = float(np.hypot(*sample.velocity[0, :2]))
-        upright = cosine_of_tilt(sample.orientation[0]) >= FALLEN_COSINE
-        self.fallen = not upright or self.height < FALLEN_HEIGHT
-        airborne = not sample.contact.any() and not bool(sample.other_contact[0])
-        if airborne:
-            if self._flight is None:
-                self._flight, self._apex = sample, -math.inf
-            self._apex = max(self._apex, self.height)
-        elif self._flight is not None:
-            up, self._flight = self._flight, None
-            duration = float(sample.time[0] - up.time[0])
-            if duration >= self.rules.long_s and self._apex > self.rules.high:
-                way = sample.position[0, :2] - up.position[0, :2]
-                hop = Hop(
-                    vertical=float(up.velocity[0, 2]),
-                    apex=self._apex,
-                    duration=duration,
-                    distance=float(np.hypot(*way)),
-                )
-                self.hops.append(hop)
+        self.fallen = fallen_at(sample) == 0
+        self._seen.append(sample)
+        if sample.contact.any() and len(self._seen) > 1:
+            self._land()
+        if self.fallen or sample.contact.any():
+            self.reset()
+
+    def _land(self) -> None:
+        """Keep the flight that the last sample has ended, if it was a jump."""
+        names = (entry.name for entry in fields(Capture))
+        joined = {k: np.concatenate([getattr(one, k) for one in self._seen]) for k in names}
+        seen = Capture(**joined)
+        if flight := jump_flights(seen, 0, self.rules, fallen_at(seen)).main:
+            up, down = flight
+            hop = Hop(
+                vertical=float(seen.velocity[up, 2]),
+                apex=float(seen.position[up:down, 2].max()),
+                duration=float(seen.time[down] - seen.time[up]),
+                distance=float(np.hypot(*(seen.position[down, :2] - seen.position[up, :2]))),
+            )
+            self.hops.append(hop)
 
     def reset(self) -> None:
         """Forget a flight under way."""
-        self._flight = None
+        self._seen.clear()
 
 
 class Page(Protocol):

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpEvents, heading
 from pronk.virtual.capture import Capture
 
@@ -20,8 +19,6 @@ FPS = 25.0
 """Frames per second of a film; half of it in a GIF, whose clock ticks every 10 ms."""
 SCHEMA = "pronk/film/2"
 
-_BEFORE_S, _AFTER_S = 1.0, 1.2
-"""Before lift-off and after touchdown."""
 _AROUND_S = 0.06
 """Time before lift-off and after touchdown that is slowed down with the flight."""
 _FOLLOW_S = 0.25
@@ -82,29 +79,18 @@ def plan(
     title: str,
     note: str = "",
     virtual: bool = True,
-    events: JumpEvents | None = None,
-    span: tuple[float, float] | None = None,
+    events: JumpEvents | None,
+    span: tuple[float, float],
     slow: float = 1.0,
 ) -> Film:
-    """Plan a film of a capture in which the flight is `slow` times slower than real time.
+    """Plan a film of a capture from the first to the last moment of `span` [s].
 
-    Without `span`, the first and the last moment [s], it is from 1 s before lift-off to 1.2 s after
-    touchdown; without `events` either, those of the jump, it is the whole capture.
+    The flight, if there are `events` of a jump, is `slow` times slower than real time.
     """
-    if not 1.0 <= slow < math.inf:
-        raise PronkError(f"slow is {slow:g}; expected 1 (real time) or more, as in 4.")
-    first, last = (float(capture.time[0]), float(capture.time[-1])) if len(capture.time) else (0, 0)
-    jump = (events.liftoff - _BEFORE_S, events.touchdown + _AFTER_S) if events else (first, last)
-    begin, end = span or jump
-    begin, end = max(first, begin), min(last, end)
-    if not begin < end:
-        raise PronkError(
-            f"a film from {begin:g} to {end:g} s of a capture from {first:g} to {last:g} s; "
-            "expected an end after the start."
-        )
+    begin, end = max(float(capture.time[0]), span[0]), min(float(capture.time[-1]), span[1])
+    since, until = (events.liftoff, events.touchdown) if events else (math.inf, math.inf)
     now, times, rates = begin, [], []
     while now <= end + 1e-9:
-        since, until = (events.liftoff, events.touchdown) if events else (math.inf, math.inf)
         times.append(now)
         rates.append(1.0 / slow if since - _AROUND_S <= now < until + _AROUND_S else 1.0)
         now += rates[-1] / FPS

@@ -25,12 +25,15 @@ from pronk.evaluation.jumps import JumpRules, jump_events
 from pronk.evaluation.pictures.film import SCHEMA, Film, plan
 from pronk.evaluation.results import Results, Row
 from pronk.files import save_artefact
+from pronk.robots.robot import RobotSpec
 from pronk.virtual import capture as captures
 
 SLOW = 4.0
 """How many times slower than real time a flight is."""
 _BEFORE_S, _AFTER_S = 0.8, 2.5
 """Around the jump input, of a robot that did not jump."""
+_BEFORE_JUMP_S, _AFTER_JUMP_S = 1.0, 1.2
+"""Before lift-off and after touchdown."""
 _PROBE_S = 60.0
 
 
@@ -72,7 +75,7 @@ def find_gl() -> str:
 
 
 def _run(backend: str, *files: Path, timeout: float | None = None) -> Any:
-    """Run `render` with a GL backend."""
+    """Run `render` with a GL backend, a value of MUJOCO_GL."""
     return subprocess.run(
         [sys.executable, "-m", "pronk.evaluation.pictures.render", *files],
         env=environment(backend),
@@ -96,19 +99,16 @@ def environment(backend: str) -> dict[str, str]:
 def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path, ...]:
     """Write `stem`.mp4, `stem`.gif and, of a jump, `stem`.png, each whole, and return them.
 
-    `warn` is called with one sentence about what this machine lacks.
+    `warn` is called with one sentence about what this machine lacks; without OpenGL a `VideoError`
+    is raised.
     """
+    backend = find_gl()
     endings = [".gif", ".png"] if film.labels else [".gif"]
     if lack := no_encoder():
         warn(lack)
     else:
         endings.insert(0, ".mp4")
     files = tuple(stem.with_name(f"{stem.name}{ending}") for ending in endings)
-    try:
-        backend = find_gl()
-    except VideoError as error:
-        warn(str(error))
-        return ()
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "film.npz"
         save_artefact(source, film, SCHEMA)
@@ -125,31 +125,35 @@ def record(film: Film, stem: Path, *, warn: Callable[[str], None]) -> tuple[Path
 
 
 def films_of(
-    found: Results, folder: Path, *, cases: Container[str] | None = None, slow: float = SLOW
+    found: Results, folder: Path, *, robot: RobotSpec, cases: Container[str], slow: float = SLOW
 ) -> dict[str, Film]:
-    """Plan a film of each policy with each command, or those of `cases`, by the name of its files.
+    """Plan a film of each policy with each command of `cases`, by the name of its files.
 
-    A robot that did not jump is filmed as well. `folder` has the captures.
+    A robot that did not jump is filmed as well. `folder` has the captures; `robot` is that of the
+    trial, of which the results have only the name.
     """
     first: dict[tuple[str, str], Row] = {}
     policies = {subject.name for subject in found.subjects}
     for row in found.rows:
-        if row.capture and row.policy in policies and (cases is None or row.case in cases):
+        if row.capture and row.policy in policies and row.case in cases:
             first.setdefault((row.policy, row.case), row)
     films = {}
     for row in first.values():
         capture = captures.load(folder / row.capture)
         rules, on = JumpRules(**found.rules), row.began + row.script.on
         events = jump_events(capture, row.script, rules, began=row.began)
+        span = (on - _BEFORE_S, on + _AFTER_S)
+        if events:
+            span = (events.liftoff - _BEFORE_JUMP_S, events.touchdown + _AFTER_JUMP_S)
         # The name is without what a shell or a link would trip over.
         films[re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{row.policy}_{row.case}")] = plan(
             capture,
-            robot=found.robot,
+            robot=robot.source,
             title=row.case if "," in row.case else f"{row.case} m/s",
             note=f"policy: {row.policy}" + ("" if events else ", no jump"),
             virtual=found.virtual,
             events=events,
-            span=None if events else (on - _BEFORE_S, on + _AFTER_S),
+            span=span,
             slow=slow,
         )
     return films
@@ -160,8 +164,9 @@ def record_all(
     folder: Path,
     out: Path,
     *,
+    robot: RobotSpec,
+    cases: Container[str],
     warn: Callable[[str], None],
-    cases: Container[str] | None = None,
     slow: float = SLOW,
     at_once: int = 1,
     progress: Callable[[float], None] = lambda share: None,
@@ -176,7 +181,7 @@ def record_all(
     except VideoError as error:
         warn(str(error))
         return ()
-    planned = films_of(found, folder, cases=cases, slow=slow)
+    planned = films_of(found, folder, robot=robot, cases=cases, slow=slow)
     warnings: dict[str, None] = {}
     files: list[Path] = []
     with ThreadPoolExecutor(max(1, at_once)) as threads:
