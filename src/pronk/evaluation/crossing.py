@@ -275,11 +275,11 @@ def attempt(task: Attempt) -> Row:
     # Time to lift off, to fly and land on all feet, and to stand.
     after = rules.search_s + 1.0 + rules.upright_s
     late, began = script.stand_s + LATE * (RUN_UP_S + PHASE_S), machine.now()
-    for tick in ticks(machine, task.policy(), robot, operator):
+    for since in ticks(machine, task.policy(), robot, operator):
         if operator.triggered is None:
-            if tick.since > late:
+            if since > late:
                 break
-        elif tick.since > operator.triggered + after or lost(machine.snapshot(), obstacle):
+        elif since > operator.triggered + after or lost(machine.snapshot(), obstacle):
             break
     triggered = None if operator.triggered is None else began + operator.triggered
     figures = measure_crossing(machine.capture(), obstacle, triggered=triggered, rules=rules)

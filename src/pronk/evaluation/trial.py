@@ -194,10 +194,10 @@ def _opened(path: str, sha256: str) -> Policy:
 def run_job(job: Job) -> Row:
     """Run one job and measure it."""
     machine, robot, script = job.set_down(), load_robot(job.robot), job.row.script
-    taken = list(ticks(machine, job.policy(), robot, script.commanded, seconds=script.seconds))
-    if not taken:
+    began = machine.now()
+    if not list(ticks(machine, job.policy(), robot, script.commanded, seconds=script.seconds)):
         raise HardwareError("the policy made no step; let it run for one tick or more.")
-    recorded, began = machine.capture(), taken[0].time
+    recorded = machine.capture()
     figures = job.measure(recorded, script, robot, began=began)
     if job.row.capture:
         captures.save(job.out / job.row.capture, recorded)

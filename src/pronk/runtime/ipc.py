@@ -11,7 +11,7 @@ from __future__ import annotations
 import signal
 import zlib
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from multiprocessing import shared_memory
 from multiprocessing.connection import Connection
@@ -106,7 +106,7 @@ class Ring(_Slots):
             self._counts[2] += np.uint64(1)
         return fits
 
-    def take(self, most: int = 1000) -> list[np.void]:
+    def take(self, most: int = 4096) -> list[np.void]:
         """Remove and return the oldest records, `most` at a time."""
         taken = int(self._counts[1])
         found: list[np.void] = []
@@ -280,29 +280,24 @@ def event(
     return record
 
 
-_SENSORS: tuple[str, ...] = ("sequence", "position", "velocity", "torque", "gyro")
-_SENSORS += ("accelerometer", "orientation", "bus_voltage")
+_STATE = tuple(field.name for field in fields(State))
 
 
 def put_state(record: NDArray[Any], state: State) -> None:
-    """Write a state on CLOCK_MONOTONIC into a record that begins with one."""
-    for name in _SENSORS:
-        record[name] = getattr(state, name)
-    record["time"] = state.time
-    record["robot_time"] = np.nan if state.robot_time is None else state.robot_time
-    record["temperature"] = np.nan if state.temperature is None else state.temperature
+    """Write a state on CLOCK_MONOTONIC into a record that begins with one; NaN for None."""
+    for name in _STATE:
+        value = getattr(state, name)
+        record[name] = np.nan if value is None else value
 
 
 def get_state(record: np.void) -> State:
     """Read the state in a record, on CLOCK_MONOTONIC."""
-    values = {name: record[name] for name in _SENSORS}
-    robot_time, temperature = float(record["robot_time"]), record["temperature"]
-    return State(
-        **values | {"sequence": int(record["sequence"])},
-        time=float(record["time"]),
-        robot_time=None if np.isnan(robot_time) else robot_time,
-        temperature=None if np.isnan(temperature).all() else temperature,
-    )
+    values: dict[str, Any] = {name: record[name] for name in _STATE}
+    values |= {name: record[name].item() for name in ("time", "sequence", "robot_time")}
+    for name in ("robot_time", "temperature"):
+        if np.isnan(values[name]).all():
+            values[name] = None
+    return State(**values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,23 +342,18 @@ class Shared:
     """The shared memory of a run, made by its first process and attached by the others."""
 
     state: Mailbox
-    """Servo to all: `state_dtype`."""
     actions: Mailbox
-    """Policy to servo: `ACTIONS`."""
     operator: Mailbox
-    """Operator to servo and policy: `OPERATOR`."""
     ticks: Ring
-    """Servo to logger: `TICK`. Four seconds of them fit."""
+    """Four seconds of them fit."""
     samples: Ring
-    """Servo to logger, during a sweep: `sample_dtype`."""
     steps: Ring
-    """Policy to logger: `STEP`."""
     events: Ring
-    """Servo to logger: `EVENT`."""
+    """Servo to logger."""
     policy_events: Ring
-    """Policy to logger: `EVENT`."""
+    """Policy to logger."""
     events_seen: Ring
-    """Servo to operator: `EVENT`."""
+    """Servo to operator."""
 
     def __init__(self, name: str | None = None, joints: int = JOINTS) -> None:
         """Make it, or attach to the one of this name; `joints` of the robot."""
@@ -389,6 +379,12 @@ class Shared:
             setattr(self, each, Mailbox(memory[each]))
         for each in rings:
             setattr(self, each, Ring(memory[each]))
+
+    @property
+    def mode(self) -> Mode | None:
+        """The servo's newest; None before the first."""
+        record = self.state.read()
+        return None if record is None else Mode(int(record["mode"]))
 
     def dropped(self) -> dict[str, int]:
         """Records that did not fit into the queues to the logger."""

@@ -92,22 +92,34 @@ class DeployLogWriter:
             raise LogError(f"{path}: cannot be written ({error.strerror}).") from None
         self._wall = time.time() - time.monotonic()
         facts = {"schema": SCHEMA, "robot": header.get("robot"), "link": header.get("link")}
-        facts["policy_sha256"] = (header.get("policy") or {}).get("sha256")
+        facts["policy_sha256"] = header.get("policy", {}).get("sha256")
         self._file.metadata({name: str(value) for name, value in facts.items()})
         self._put(_HEADER, time.monotonic(), {"schema": SCHEMA, **header})
         self.flush = self._file.flush
         self.flush()
 
+    def drain(self, shared: Shared) -> None:
+        """Write everything that waits, events first: they explain the rest."""
+        for ring, write in (
+            (shared.events, self.event),
+            (shared.policy_events, self.event),
+            (shared.ticks, self.tick),
+            (shared.steps, self.step),
+        ):
+            for record in ring.take():
+                write(record)
+
     def tick(self, record: np.void) -> None:
         """Write one tick of the servo, a record of `TICK`."""
-        row = _values(record)
-        row |= {"mode_name": Mode(row["mode"]).name, "reason_name": Reason(row["reason"]).name}
-        self._put(_TICK, row["begun"], row)
+        names = {
+            "mode_name": Mode(record["mode"]).name,
+            "reason_name": Reason(record["reason"]).name,
+        }
+        self._put_record(_TICK, record, names)
 
     def step(self, record: np.void) -> None:
         """Write one step of the policy, a record of `STEP`."""
-        row = _values(record)
-        self._put(_STEP, row["begun"], row)
+        self._put_record(_STEP, record, {})
 
     def event(self, record: np.void) -> None:
         """Write a record of `EVENT`."""
@@ -119,13 +131,13 @@ class DeployLogWriter:
         self._put(_END, time.monotonic(), {"complete": complete, "figures": figures})
         self._file.close()
 
+    def _put_record(self, topic: str, record: np.void, names: dict[str, str]) -> None:
+        """Write a record as plain numbers and lists, at the time at which it was begun."""
+        row = {name: record[name].tolist() for name in record.dtype.names or ()}
+        self._put(topic, row["begun"], row | names)
+
     def _put(self, topic: str, t: float, body: dict[str, Any]) -> None:
         self._file.put(topic, t + self._wall, body)
-
-
-def _values(record: np.void) -> dict[str, Any]:
-    """A record as plain numbers and lists."""
-    return {name: record[name].tolist() for name in record.dtype.names or ()}
 
 
 READY = b"ready"
@@ -170,7 +182,7 @@ def _write(
 
     def keep() -> None:
         nonlocal flushed
-        _drain(writer, shared)
+        writer.drain(shared)
         if time.monotonic() - flushed >= FLUSH_S:
             writer.flush()
             flushed = time.monotonic()
@@ -184,36 +196,14 @@ def _write(
         # The parent has ended. The servo damps now; that is logged too.
         figures = {}
         until = time.monotonic() + _LAST_S
-        while _moving(shared) and time.monotonic() < until:
+        while shared.mode not in (None, Mode.ENDED) and time.monotonic() < until:
             keep()
-    _drain(writer, shared)
+    writer.drain(shared)
     if isinstance(writer, SweepLogs):
         # The servo has ended its log, unless it was killed.
-        writer.end(complete=False, reason=figures.get("reason", "the servo's process was killed"))
+        writer.end(figures.get("reason", "the servo's process was killed"))
     else:
         writer.end(complete=bool(figures) and not any(shared.dropped().values()), figures=figures)
-
-
-def _moving(shared: Shared) -> bool:
-    """Whether the servo has begun and not ended."""
-    record = shared.state.read()
-    return record is not None and Mode(int(record["mode"])) is not Mode.ENDED
-
-
-def _drain(writer: DeployLogWriter | SweepLogs, shared: Shared) -> None:
-    """Write everything that waits, events first: they explain the rest."""
-    if isinstance(writer, SweepLogs):
-        for record in shared.samples.take(4096):
-            writer.replay(record)
-        shared.events.take()
-        return
-    for ring in (shared.events, shared.policy_events):
-        for record in ring.take():
-            writer.event(record)
-    for record in shared.ticks.take(4096):
-        writer.tick(record)
-    for record in shared.steps.take(4096):
-        writer.step(record)
 
 
 _TICK_NAMES = {"time": "begun", "state_time": "time", "state_sequence": "sequence"} | {

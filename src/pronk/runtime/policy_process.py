@@ -4,11 +4,9 @@ It steps from the moment the robot is damped, whether its actions are used or no
 warm, and the latency is known, before the policy starts. Every change of mode resets the policy's
 history, except from `POLICY` to `HALT`.
 
-Just before each step the process runs a second instance of the policy for warm-up. A policy's
-network reads 2.8 MB of weights, more than a core's second cache holds. Between two steps, 20 ms
-apart, they leave the caches, and a step takes five times as long as it does back to back. One
-warm-up step recovers half of that, 2 ms of them all but a few hundredths of a millisecond.
-`python -m benchmarks tick` measures it.
+Just before each step a second instance of the policy runs for warm-up: between two steps, 20 ms
+apart, the network's weights (2.8 MB) leave the caches, and a step takes five times as long as it
+does back to back. `python -m benchmarks tick` measures it.
 """
 
 from __future__ import annotations
@@ -51,9 +49,8 @@ def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
     """Wait for a deadline, and repeat something in the last 2 ms before it.
 
     Nothing is begun in less than half of the time that it took before, because each repeat is
-    quicker than the one before. Returns at once if the deadline has passed.
-
-    `deadline` is a time of CLOCK_MONOTONIC [s]; returns the number of repeats.
+    quicker than the one before. `deadline` is a time of CLOCK_MONOTONIC [s]; returns the number of
+    repeats.
     """
     sleep_until(deadline - LEAD_S)
     count, needed, now = 0, _FIRST_S, time.monotonic()
@@ -168,9 +165,8 @@ class PolicyProcess:
 
     def step(self, pace: Pace) -> None:
         """Compute an action from the newest state."""
-        begun = time.monotonic()
-        self.lateness.add(begun - pace.deadline)
-        deadline = pace.deadline
+        begun, deadline = time.monotonic(), pace.deadline
+        self.lateness.add(begun - deadline)
         record = self.shared.state.read()
         if record is not None and Mode(int(record["mode"])) not in (Mode.IDLE, Mode.PREFLIGHT):
             mode, entry = Mode(int(record["mode"])), int(record["entry"])
@@ -183,17 +179,22 @@ class PolicyProcess:
                 self._act(record, deadline, begun)
             except PronkError as error:
                 # Without an action the last one expires in the servo's filter.
-                self._report_error(str(error))
+                if str(error) != self._last_error:
+                    self._last_error = str(error)
+                    notice = event(time.monotonic(), "policy", self._last_error)
+                    self.shared.policy_events.put(notice)
         pace.advance(time.monotonic())
 
     def _act(self, record: np.void, deadline: float, begun: float) -> None:
         state = get_state(record)
         velocity, jump = self._commanded()
         now = time.monotonic()
-        command, tick = self.runner.decide(state, (velocity, jump), now)
+        command = self.runner.decide(state, (velocity, jump), now)
         inferred = time.monotonic()
         self.decision.add(inferred - now)
         self.network.add(self.runner.policy.network_s)
+        outputs = self.runner.policy.inference
+        assert outputs is not None
         action, of = self._action, {"state_sequence": state.sequence, "state_time": state.time}
         fill(action, **of, sequence=self._count, entry=self._entry, position=command.position)
         fill(action, made=begun, valid_for=self.plan.action_valid_s)
@@ -202,12 +203,13 @@ class PolicyProcess:
         self._count += 1
         # The observation for the log, built again after the action is out.
         observation = self._history.observe(measurement(state), velocity)
-        self._history.acted(tick.action.astype(np.float32))
+        self._history.acted(outputs.action[0])
         step = self._step
         fill(step, **of, sequence=action["sequence"], observation=observation)
         fill(step, deadline=deadline, begun=begun, observed=now, inferred=inferred, done=done)
-        fill(step, live=self._mode in _LIVE, command=velocity, jump=jump, action=tick.action)
-        fill(step, target=tick.target, contact=tick.contact, linear_velocity=tick.linear_velocity)
+        fill(step, live=self._mode in _LIVE, command=velocity, jump=jump, target=command.position)
+        for name in ("action", "contact", "linear_velocity"):
+            step[name] = getattr(outputs, name)[0]
         self.shared.steps.put(step)
         self._last_error = ""
 
@@ -218,9 +220,3 @@ class PolicyProcess:
             return STILL, False
         forward, left, yaw = np.clip(record["command"], self._least, self._most).tolist()
         return (forward, left, yaw), bool(record["jump"]) and self._jumps
-
-    def _report_error(self, text: str) -> None:
-        """Send an event, unless the last error was the same."""
-        if text != self._last_error:
-            self._last_error = text
-            self.shared.policy_events.put(event(time.monotonic(), "policy", text))

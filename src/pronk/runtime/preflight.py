@@ -7,6 +7,7 @@ The link checks when it connects that no other program writes to the robot;
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -26,8 +27,8 @@ ATTITUDE_SLACK = 0.2
 """Between "up" by the accelerometer and by the attitude filter [rad]."""
 NORM_SLACK = 0.02
 """Of the attitude's quaternion."""
-OVERRUN = 0.15
-"""Farthest that a joint may rest beyond its range: a Go2's calves do when it lies folded [rad]."""
+OVERRUN = Limits.overrun
+"""Farthest that a joint may rest beyond its range; also of a sweep, whose own limit is tighter."""
 REST_SPEED = 1.0
 """Fastest that a joint of a robot at rest may turn [rad/s]."""
 BATTERY_SHARE = 0.85
@@ -47,8 +48,7 @@ def refusals(
             "that the robot's program runs.",
         )
     checks = (_stream(states, limits, now, seconds), _attitude(states, limits))
-    joints = (_joints(states[-1], robot, limits), _supply(states, robot, limits))
-    return tuple(sentence for check in (*checks, *joints) for sentence in check)
+    return tuple(chain(*checks, _joints_and_battery(states, robot, limits)))
 
 
 def _stream(states: Sequence[State], limits: Limits, now: float, seconds: float) -> Iterator[str]:
@@ -107,7 +107,8 @@ def _attitude(states: Sequence[State], limits: Limits) -> Iterator[str]:
         )
 
 
-def _joints(last: State, robot: RobotSpec, limits: Limits) -> Iterator[str]:
+def _joints_and_battery(states: Sequence[State], robot: RobotSpec, limits: Limits) -> Iterator[str]:
+    last = states[-1]
     for i, joint in enumerate(robot.joints):
         q, v = float(last.position[i]), float(last.velocity[i])
         if not limits.low[i] - OVERRUN <= q <= limits.high[i] + OVERRUN:
@@ -117,15 +118,12 @@ def _joints(last: State, robot: RobotSpec, limits: Limits) -> Iterator[str]:
             )
         if not abs(v) <= REST_SPEED:
             yield f"{joint.name} turns at {v:.1f} rad/s; let the robot come to rest first."
-
-
-def _supply(states: Sequence[State], robot: RobotSpec, limits: Limits) -> Iterator[str]:
     least = BATTERY_SHARE * max(joint.drive.bus_voltage for joint in robot.joints)
     volts = float(np.mean([state.bus_voltage for state in states]))
     # A link that does not carry the voltage gives 0 or NaN.
     if 0.0 < volts < least:
         yield f"the battery gives {volts:.1f} V, expected {least:.1f} V at least; charge it."
-    hot = states[-1].temperature
+    hot = last.temperature
     for joint, degrees in zip(robot.joints, () if hot is None else hot, strict=hot is not None):
         if degrees > limits.temperature:
             yield (

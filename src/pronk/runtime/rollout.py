@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from pronk.policy.contract import check
 from pronk.policy.observation import Measurement
 from pronk.policy.runtime import Policy
 from pronk.robots.robot import RobotSpec
-from pronk.runtime.script import Commanded, Velocity
+from pronk.runtime.script import Commanded
 
 Array = NDArray[np.float64]
 Source = Callable[[float], Commanded]
@@ -76,29 +75,6 @@ def check_standing(robot: RobotSpec, state: State) -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tick:
-    """One step of the policy."""
-
-    time: float
-    """On the machine's clock [s]."""
-    since: float
-    """The same, since the policy started [s]."""
-    command: Velocity
-    """Commanded: forward, left [m/s], yaw rate [rad/s]."""
-    jump: bool
-    state: State
-    """From which the action was computed."""
-    action: Array
-    """Output of the network. (12,)"""
-    target: Array
-    """Joint position targets sent [rad]. (12,)"""
-    contact: Array
-    """Estimated probability that each foot touches the ground. (4,)"""
-    linear_velocity: Array
-    """Estimated, of the trunk in its frame [m/s]. (3,)"""
-
-
 class PolicyRunner:
     """A policy on one robot: a state in, a command out."""
 
@@ -118,24 +94,17 @@ class PolicyRunner:
         """Forget the history: the next state fills it."""
         self.policy.reset()
         self._sequence = 0
-        self._began: float | None = None
 
-    def decide(self, state: State, commanded: Commanded, now: float) -> tuple[Command, Tick]:
+    def decide(self, state: State, commanded: Commanded, now: float) -> Command:
         """Run one policy step; call it at `policy.contract.policy_rate_hz`.
 
-        `now` is the machine's clock [s]; returns the command to send and the record of the step.
+        `now` is the machine's clock [s]; `policy.inference` has the outputs of the network.
 
         Raises:
             ArtefactError: Something is not finite, or a policy without jump is commanded to jump.
         """
-        if self._began is None:
-            self._began = now
-        velocity, jump = commanded
-        target = self.policy.step(measurement(state), velocity, jump)
-        inference = self.policy.inference
-        assert inference is not None
         command = Command(
-            position=target,
+            position=self.policy.step(measurement(state), *commanded),
             stiffness=self._stiffness,
             damping=self._damping,
             sequence=self._sequence,
@@ -143,35 +112,18 @@ class PolicyRunner:
             made=now,
         )
         self._sequence += 1
-        tick = Tick(
-            time=now,
-            since=now - self._began,
-            command=velocity,
-            jump=jump,
-            state=state,
-            action=inference.action[0].astype(float),
-            target=target,
-            contact=inference.contact[0].astype(float),
-            linear_velocity=inference.linear_velocity[0].astype(float),
-        )
-        return command, tick
+        return command
 
 
 def ticks(
     machine: Machine, policy: Policy, robot: RobotSpec, source: Source, *, seconds: float = math.inf
-) -> Iterator[Tick]:
-    """Run a policy on a connected, standing machine; yields each tick after its command is sent.
+) -> Iterator[float]:
+    """Run a policy on a connected machine that stands in its default pose.
 
-    The machine's clock waits between ticks until the caller takes the next one. A caller that stops
-    leaves the last targets in force and must damp or close the machine. Ticks that a real machine's
-    clock has already passed are left out.
-
-    Args:
-        machine: Connected, in its default pose.
-        policy: Its contract fits the robot.
-        robot: Of the machine.
-        source: The command, by the time since the first tick [s].
-        seconds: Time to run [s].
+    After each command is sent, yields the time since the first tick [s]. The machine's clock waits
+    between ticks until the caller takes the next one. A caller that stops leaves the last targets
+    in force and must damp or close the machine. Ticks that a real machine's clock has already
+    passed are left out. The policy runs for `seconds`, with the commands of `source`.
 
     Raises:
         ArtefactError: The contract does not fit, before anything is sent; or a number is not
@@ -184,8 +136,7 @@ def ticks(
     began, count = machine.now(), 0
     while count < seconds * rate - 1e-9:
         now = machine.now()
-        command, tick = runner.decide(machine.latest(), source(count / rate), now)
-        machine.send(command)
-        yield tick
+        machine.send(runner.decide(machine.latest(), source(count / rate), now))
+        yield now - began
         count = max(count + 1, math.ceil((machine.now() - began) * rate - 1e-6))
         machine.wait(began + count / rate)

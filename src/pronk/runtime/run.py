@@ -9,7 +9,6 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -54,19 +53,15 @@ class RunSummary:
     trained_delay_s: tuple[float, float] = (0.0, 0.0)
     """Command delays that the policy was trained for [s]."""
 
-    def texts(self, kind: str) -> list[str]:
-        """The texts of the events of one kind."""
-        return [event.text for event in self.events_seen if event.kind == kind]
-
     @property
     def faults(self) -> list[str]:
         """Faults that damped the robot."""
-        return self.texts("fault")
+        return [event.text for event in self.events_seen if event.kind == "fault"]
 
     @property
     def refusals(self) -> list[str]:
         """Results of the pre-flight checks and of opening the link."""
-        return self.texts("refused")
+        return [event.text for event in self.events_seen if event.kind == "refused"]
 
     def delay_words(self) -> str:
         """The measured delay and the range that the policy was trained for, in one line."""
@@ -165,21 +160,13 @@ class Deployment:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
     def mode(self) -> Mode:
         """Mode of the servo; `ENDED` too if its process is gone."""
-        if not self.servo.is_alive():
-            return Mode.ENDED
-        record = self.shared.state.read()
-        return Mode.IDLE if record is None else Mode(int(record["mode"]))
+        return (self.shared.mode or Mode.IDLE) if self.servo.is_alive() else Mode.ENDED
 
     def events_seen(self) -> list[Event]:
         """Events of the servo since the last call; the summary keeps them too."""

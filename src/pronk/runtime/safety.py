@@ -372,8 +372,7 @@ def fit(
         for name, bottom, top in intervals:
             why = np.where(((target < bottom) | (target > top)).any(axis=-1), name, why)
 
-    given = _given(q, v, fitted, kp, kd, limits)
-    work, loss = _work_and_loss(v, given, limits)
+    given, work, loss = _torque_and_power(q, v, fitted, kp, kd, limits)
     much = work + loss > limits.power_w
     if not much.any():
         return fitted, why, possible
@@ -384,22 +383,24 @@ def fit(
     scaled = np.minimum(np.maximum(scaled, low), high)
     fitted = np.where(much[..., None] & stiff, scaled, fitted)
     why = np.where(much, _POWER, why)
-    work, loss = _work_and_loss(v, _given(q, v, fitted, kp, kd, limits), limits)
+    _, work, loss = _torque_and_power(q, v, fitted, kp, kd, limits)
     possible &= work + loss <= limits.power_w * (1.0 + _SLACK)
     return fitted, why, possible
 
 
-def _given(q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limits) -> Array:
-    """The commanded torque, as far as back-EMF leaves voltage for it [N m]. (..., n)."""
+def _torque_and_power(
+    q: Array, v: Array, target: Array, kp: Array, kd: Array, limits: Limits
+) -> tuple[Array, Array, Array]:
+    """The commanded torque, as far as back-EMF leaves voltage for it [N m] (..., n), and its power.
+
+    That is the power done on the joints, nothing recovered from braking ones, and winding losses
+    [W]. (...,) each.
+    """
     low, high = voltage_limits(v, limits.stall, limits.no_load)
-    return np.minimum(np.maximum(kp * (target - q) - kd * v, low), high)
-
-
-def _work_and_loss(v: Array, torque: Array, limits: Limits) -> tuple[Array, Array]:
-    """Power done on the joints, nothing recovered from braking ones, and winding losses [W]."""
+    torque = np.minimum(np.maximum(kp * (target - q) - kd * v, low), high)
     work: Array = np.maximum(torque * v, 0.0).sum(axis=-1)
     loss: Array = (torque * torque * limits.loss).sum(axis=-1)
-    return work, loss
+    return torque, work, loss
 
 
 LEAST_DAMPING_S = 1.0

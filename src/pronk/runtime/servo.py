@@ -137,14 +137,6 @@ class Servo:
         gone = now - float(record["time"]) > timeout
         return bool(record["held"]) and not gone, gone
 
-    def _new_action(self) -> bool:
-        """Take the policy's newest action; whether there is a new one."""
-        record, before = self.shared.actions.read(), self.action
-        if record is None or (before is not None and record["sequence"] == before["sequence"]):
-            return False
-        self.action = record
-        return True
-
     def _report(self, kind: str, text: str, *, reason: int = 0, level: int = 0) -> None:
         """Send an event to logger and operator."""
         record = ipc.event(time.monotonic(), kind, text, reason=reason, level=level)
@@ -258,12 +250,17 @@ class Servo:
         self.age.add(max(0.0, begun - state.time))
         mode, level = self.modes.mode, self.safety.level
         held, gone = self._operator(begun)
-        fresh = self._new_action()
+        action, before = self.shared.actions.read(), self.action
+        fresh = action is not None and (before is None or action["sequence"] != before["sequence"])
+        self.action = action if fresh else before
         if link_error:
             self.safety.fault(FilterAction.LATCH, Reason.LINK, begun)
         if gone and mode not in (Mode.IDLE, Mode.PREFLIGHT):
             self.safety.fault(FilterAction.DAMP, Reason.ENDED, begun)
-        objection = "" if self.plan.ignore_latency or mode is not Mode.STAND else self._objection()
+        objection = ""
+        if mode is Mode.STAND and not self.plan.ignore_latency:
+            measured = self.latency.quantile(0.95), self.latency.count
+            objection = delay_objection(*measured, self.trained)
         desired = self.modes.step(begun, state.position, self.safety, self.action, objection)
         if self.modes.notice:
             self._report("notice", self.modes.notice)
@@ -303,9 +300,6 @@ class Servo:
                 self.faults.append(why or safety.reason.text)
                 self._report("fault", self.faults[-1], reason=safety.reason, level=safety.level)
             self.modes.faulted(begun)
-
-    def _objection(self) -> str:
-        return delay_objection(self.latency.quantile(0.95), self.latency.count, self.trained)
 
     def _send(self, machine: Machine, sent: Command | None) -> str:
         """Write to the machine; returns the link's error, or ""."""

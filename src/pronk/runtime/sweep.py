@@ -26,7 +26,7 @@ from pronk.links.machine import Command, Machine, State, TorqueKind
 from pronk.logs.joint_log import Segment
 from pronk.logs.mcap_log import LogHeader, McapLogWriter, reason_of
 from pronk.robots.robot import RobotSpec
-from pronk.runtime.ipc import TEXT, Record, SampleKind, sample_dtype
+from pronk.runtime.ipc import TEXT, Record, SampleKind, Shared, sample_dtype
 from pronk.runtime.safety import Limits, SafetyFilter
 from pronk.runtime.state_machine import VALID_S
 
@@ -128,12 +128,17 @@ class SweepLogs:
     """Writes the logs of a task from its records (`sample_dtype`)."""
 
     def __init__(self, task: SweepTask) -> None:
-        """Open nothing yet."""
         self.task = task
         self._writer: McapLogWriter | None = None
         self._joint = ""
         self._columns: list[int] = []
         self._torque = True
+
+    def drain(self, shared: Shared) -> None:
+        """Write everything that waits; events are not logged."""
+        for record in shared.samples.take():
+            self.replay(record)
+        shared.events.take()
 
     def replay(self, record: Record) -> None:
         """Write one record."""
@@ -146,8 +151,7 @@ class SweepLogs:
         elif kind == SampleKind.SEGMENT:
             writer.segment(self._segment(number, time))
         elif kind == SampleKind.END:
-            reason = bytes(record["text"]).decode("ascii")
-            self.end(complete=not reason, reason=reason)
+            self.end(bytes(record["text"]).decode("ascii"))
         else:
             command, position, velocity = (
                 record[name][columns] for name in ("command", "position", "velocity")
@@ -191,10 +195,10 @@ class SweepLogs:
             clamped=excitation.clamped,
         )
 
-    def end(self, *, complete: bool, reason: str = "") -> None:
-        """End the log; ending twice has no effect."""
+    def end(self, reason: str) -> None:
+        """End the log, complete if there is no reason; ending twice has no effect."""
         if self._writer is not None:
-            self._writer.end(complete=complete, reason=reason)
+            self._writer.end(complete=not reason, reason=reason)
             self._writer = None
 
     def flush(self) -> None:

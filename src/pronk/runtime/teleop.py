@@ -129,7 +129,6 @@ class BenchOperator(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """The dead-man button is held; a request once joints are clamped, or cannot be."""
-        del now, mode
         request, self._next = self._next, OperatorRequest.NONE
         return OperatorCommand(held=True, request=request)
 
@@ -177,10 +176,8 @@ HELP = """\
   w s forward and back   a d left and right   j l turn   x stand still   ENTER jump"""
 """Keys of the keyboard."""
 
-_STEPS = {"w": (0, 0.25), "s": (0, -0.25), "a": (1, 0.1), "d": (1, -0.1)} | {
-    "j": (2, 0.2),
-    "l": (2, -0.2),
-}
+_STEPS = {"w": (0, 0.25), "s": (0, -0.25), "a": (1, 0.1), "d": (1, -0.1)}
+_STEPS |= {"j": (2, 0.2), "l": (2, -0.2)}
 _REQUESTS = {
     "1": OperatorRequest.STAND,
     "2": OperatorRequest.WALK,
@@ -233,9 +230,7 @@ class Keyboard(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """The keys' input."""
-        del mode
-        request = OperatorRequest.NONE
-        keys = self._keys()
+        request, keys = OperatorRequest.NONE, self._keys()
         if not self._connected:
             return OperatorCommand(request=OperatorRequest.QUIT)
         for key in keys:
@@ -327,7 +322,6 @@ class Gamepad(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """The input of sticks and buttons."""
-        del mode
         request = self._read()
         if not self._connected:
             return OperatorCommand(request=request)

@@ -211,15 +211,15 @@ def play(
             machine.sampled = gauge.add
             gauge.reset()
             before, start, late = simulated, time.perf_counter(), 0.0
-            for tick in ticks(machine, policy, robot, joystick.commanded):
-                simulated = before + tick.since
+            for since in ticks(machine, policy, robot, joystick.commanded):
+                simulated = before + since
                 wall = time.perf_counter() - start
-                page.show(machine.snapshot(), gauge, tick.since / wall if tick.since else 1.0)
+                page.show(machine.snapshot(), gauge, since / wall if since else 1.0)
                 over, again = until(simulated), joystick.take_reset()
                 if over or again:
                     resets += again
                     break
-                ahead = start + late + tick.since - time.perf_counter()
+                ahead = start + late + since - time.perf_counter()
                 time.sleep(max(0.0, ahead))
                 late -= ahead if ahead < -_LATE_S else 0.0
     except KeyboardInterrupt:
