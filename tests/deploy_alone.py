@@ -9,17 +9,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from deploy_runs import PATIENT, QUICK
 from pronk.links.address import Address
 from pronk.runtime.ipc import Event
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import run
 from pronk.runtime.script import Script
-from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import ScriptedOperator
-
-QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
-PATIENT = {"damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}
-"""A busy computer must not look like a fault."""
 
 
 def tell(notice: Event) -> None:

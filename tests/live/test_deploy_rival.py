@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -21,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deploy_runs import DAMPED_S, PATIENT, QUICK, free_port, hold, simulated
 from hopper import write_hopper
 from pronk.errors import HardwareError
 from pronk.links.address import Address
@@ -31,11 +29,7 @@ from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.log import read_deploy_log
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import Deployment
-from pronk.runtime.state_machine import Timing
-from pronk.runtime.teleop import OperatorCommand
 from pronk.virtual.robot import hold_of
-
-pytestmark = pytest.mark.live
 
 pytest.importorskip("onnxruntime")
 pytest.importorskip("lcm")
@@ -44,10 +38,6 @@ pytest.importorskip("cyclonedds")
 ROBOT = load_robot("mini_cheetah")
 OTHER = replace(hold_of(ROBOT), position=hold_of(ROBOT).position + 0.01)
 """What the other program commands; like the virtual robot's own rival, every 10 ms."""
-QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
-PATIENT = {"hold_s": 1.0, "damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000}
-DAMPED_S = 0.060
-"""The bar: from the other's first message to damping on the wire."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,48 +162,13 @@ def over_dds(domain: int) -> Wire:
 @pytest.fixture(scope="module", params=["lcm", "dds"])
 def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
     """A virtual robot of its own, and another program's listener and sender at its wire."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        port = int(probe.getsockname()[1])
-    domain = 150 + os.getpid() % 50
     lcm = request.param == "lcm"
-    address = Address.parse(f"lcm://?port={port}" if lcm else f"dds://?domain={domain}")
-    where = ("--port", str(port)) if lcm else ("--domain", str(domain))
-    running = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "pronk.cli.main",
-            "simulate",
-            "--realtime",
-            "--link",
-            request.param,
-            *where,
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    assert running.stdout is not None
-    try:
-        assert any(line.startswith("ready: the virtual") for line in running.stdout)
-        with over_lcm(port) if lcm else over_dds(domain) as wire:
-            yield address, wire
-    finally:
-        running.kill()
-        running.communicate()
-
-
-def hold(
-    deployment: Deployment, mode: Mode, request: OperatorRequest = OperatorRequest.NONE
-) -> None:
-    """Hold the dead-man button until a mode comes."""
-    until = time.monotonic() + 20.0
-    while deployment.mode is not mode:
-        assert time.monotonic() < until, f"{mode.name} did not come: {deployment.events_seen()}"
-        deployment.write(OperatorCommand(request=request, held=True))
-        request = OperatorRequest.NONE
-        time.sleep(0.01)
+    word, number = ("port", free_port()) if lcm else ("domain", 150 + os.getpid() % 50)
+    with (
+        simulated("--realtime", "--link", request.param, f"--{word}", str(number)),
+        over_lcm(number) if lcm else over_dds(number) as wire,
+    ):
+        yield Address.parse(f"{request.param}://?{word}={number}"), wire
 
 
 def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
@@ -225,7 +180,7 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
         policy=write_hopper(tmp_path / "policy.onnx", strength=0.2),
         log=tmp_path / "run.mcap",
         timing=QUICK,
-        limits=PATIENT,
+        limits=PATIENT | {"hold_s": 1.0},
         action_valid_s=2.0,
         operator_timeout_s=2.0,
         ignore_latency=True,
@@ -241,19 +196,13 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
 
     # It comes up while the policy runs.
     with Deployment(plan) as deployment:
-        hold(deployment, Mode.STAND, OperatorRequest.STAND)
-        hold(deployment, Mode.POLICY, OperatorRequest.WALK)
-        until = time.monotonic() + 0.3
-        while time.monotonic() < until:
-            deployment.write(OperatorCommand(held=True))
-            time.sleep(0.01)
+        hold(deployment, 20.0, Mode.STAND, OperatorRequest.STAND)
+        hold(deployment, 20.0, Mode.POLICY, OperatorRequest.WALK)
+        hold(deployment, 0.3)
         wire.speak()
-        hold(deployment, Mode.FAULT)
-        until = time.monotonic() + 0.3
-        while time.monotonic() < until:
-            # It does not come back by itself, nor by a request to stand.
-            deployment.write(OperatorCommand(request=OperatorRequest.STAND, held=True))
-            time.sleep(0.01)
+        hold(deployment, 20.0, Mode.FAULT)
+        # It does not come back by itself, nor by a request to stand.
+        hold(deployment, 0.3, None, *[OperatorRequest.STAND] * 30)
         assert deployment.mode is Mode.FAULT
     wire.hush()
     when, damps = wire.received()

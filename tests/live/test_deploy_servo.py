@@ -24,8 +24,6 @@ from pronk.runtime.plan import Link, Plan
 from pronk.runtime.servo import Servo
 from pronk.runtime.state_machine import Timing
 
-pytestmark = pytest.mark.live
-
 QUICK = Timing(damp_s=0.05, fold_s=0.1, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
 NOWHERE = Path("policy.onnx")
 """The servo knows nothing of the policy but its actions."""

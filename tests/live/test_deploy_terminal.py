@@ -19,8 +19,6 @@ from hopper import write_hopper
 from pronk.runtime.ipc import Mode
 from pronk.runtime.log import DeployLog, read_deploy_log
 
-pytestmark = pytest.mark.live
-
 pytest.importorskip("onnxruntime")
 
 PROGRAM = Path(__file__).parent.parent / "deploy_alone.py"

@@ -8,8 +8,6 @@ from __future__ import annotations
 import io
 import os
 import signal
-import socket
-import subprocess
 import sys
 import threading
 import time
@@ -23,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deploy_runs import DAMPED_S, free_port, simulated
 from pronk.cli import main as cli
 from pronk.cli.console import Person
 from pronk.cli.sweep import record_wire
@@ -42,15 +41,11 @@ from pronk.runtime.run import Recorded, run_sweep
 from pronk.runtime.sweep import SweepTask
 from pronk.virtual.robot import hold_of
 
-pytestmark = pytest.mark.live
-
 lcm = pytest.importorskip("lcm")
 
 ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
-PATIENT = {"hold_s": 10.0, "damp_s": 10.0, "latch_s": 10.0, "expiry_s": 10.0, "lag": 10000.0}
-DAMPED_S = 0.060
-"""Longest time from a fault to damping."""
+PATIENT = dict.fromkeys(("hold_s", "damp_s", "latch_s", "expiry_s"), 10.0) | {"lag": 10000.0}
 FRESH = Freshness(share=0.02, longest_gap_s=10.0)
 
 
@@ -66,19 +61,9 @@ def plan_of(joint: str, name: str = ROBOT.name, amplitude: float = 0.2) -> Sweep
 @pytest.fixture(scope="module")
 def port() -> Iterator[int]:
     """Address of a virtual robot of its own."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        number = int(probe.getsockname()[1])
-    words = [sys.executable, "-m", "pronk.cli.main", "simulate", "--port", str(number)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    running = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment)
-    assert running.stdout is not None
-    try:
-        assert running.stdout.readline().startswith("ready: the virtual mini_cheetah")
+    number = free_port()
+    with simulated("--port", str(number)):
         yield number
-    finally:
-        running.kill()
-        running.communicate()
 
 
 class Listener:

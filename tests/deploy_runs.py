@@ -1,0 +1,83 @@
+"""What the live tests of processes share: quick times, patience, an operator, `pronk simulate`."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pronk.runtime.ipc import Mode, OperatorRequest
+from pronk.runtime.run import Deployment
+from pronk.runtime.state_machine import Timing
+from pronk.runtime.teleop import OperatorCommand
+
+QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
+PATIENT = {"damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}
+"""A busy computer must not look like a fault."""
+DAMPED_S = 0.060
+"""Longest time from a fault to damping on the wire."""
+
+
+def met(
+    deployment: Deployment,
+    seconds: float,
+    modes: tuple[Mode, ...],
+    *requests: OperatorRequest,
+    **more: Any,
+) -> bool:
+    """Hold the dead-man button until one of some modes comes, or for a time; whether it came."""
+    left = list(requests)
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        request = left.pop(0) if left else OperatorRequest.NONE
+        deployment.write(OperatorCommand(request=request, held=True, **more))
+        if deployment.mode in modes:
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def hold(
+    deployment: Deployment,
+    seconds: float,
+    mode: Mode | None = None,
+    *requests: OperatorRequest,
+    **more: Any,
+) -> None:
+    """Hold the dead-man button until a mode comes, or for a time."""
+    found = met(deployment, seconds, () if mode is None else (mode,), *requests, **more)
+    assert mode is None or found, f"{mode.name} did not come: {notified(deployment)}"
+
+
+def notified(deployment: Deployment) -> str:
+    deployment.events_seen()
+    return f"{deployment.mode.name}, {[notice.text for notice in deployment.summary.events_seen]}"
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def simulated(*words: str) -> Iterator[None]:
+    """A `pronk simulate` process that is ready."""
+    running = subprocess.Popen(
+        [sys.executable, "-m", "pronk.cli.main", "simulate", *words],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert running.stdout is not None
+    try:
+        assert any(line.startswith("ready: the virtual mini_cheetah") for line in running.stdout)
+        yield
+    finally:
+        running.kill()
+        running.communicate()
