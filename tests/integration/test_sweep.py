@@ -31,7 +31,6 @@ class Watched(VirtualRobot):
     def __init__(self, **options: object) -> None:
         super().__init__(ROBOT, SIM_PARAMS, legs=("FR",), **options)  # type: ignore[arg-type]
         self.calls: list[str] = []
-        self.silent_after = np.inf
 
     def damp(self) -> None:
         self.calls.append("damp")
@@ -44,10 +43,6 @@ class Watched(VirtualRobot):
     def clamp(self, joints: tuple[str, ...]) -> None:
         self.calls.append(f"clamp {' '.join(joints)}".rstrip())
         super().clamp(joints)
-
-    def wait(self, until: float) -> list[State]:
-        states = super().wait(until)
-        return states if until < self.silent_after else []
 
 
 def plan_of(*joints: str, **options: object) -> SweepPlan:
@@ -131,6 +126,22 @@ def test_frequency_and_motion_of_other_joints_are_logged(recorded: Recorded) -> 
     assert first.stop < second.start
 
 
+class Silent(Watched):
+    """No state comes any more in the middle of a sweep."""
+
+    def wait(self, until: float) -> list[State]:
+        return super().wait(until) if until < 5.0 else []
+
+
+class Interrupted(Watched):
+    """The interrupt key is pressed in the middle of a sweep."""
+
+    def wait(self, until: float) -> list[State]:
+        if until > 5.0:
+            raise KeyboardInterrupt
+        return super().wait(until)
+
+
 class Slipping(Watched):
     """A knee's encoder slips in the middle of a sweep."""
 
@@ -146,25 +157,29 @@ def weak(**drive: float) -> SweepPlan:
 
 
 @pytest.mark.parametrize(
-    ("machine", "plan", "why"),
+    ("machine", "drive", "why"),
     [
-        (Slipping, plan_of("FR_knee"), "mechanical limits"),
-        (Watched, weak(no_load_speed=1.0), "rad/s"),
-        (Watched, weak(effort_limit=0.5), "torque"),
+        (Slipping, {}, "mechanical limits"),
+        (Watched, {"no_load_speed": 1.0}, "rad/s"),
+        (Watched, {"effort_limit": 0.5}, "torque"),
+        (Silent, {}, "sent no state between"),
+        (Interrupted, {}, "KeyboardInterrupt"),
     ],
-    ids=["position", "speed", "torque"],
+    ids=["position", "speed", "torque", "silence", "interrupt"],
 )
-def test_a_measured_state_beyond_a_limit_damps_and_keeps_the_log(
-    tmp_path: Path, machine: type[Watched], plan: SweepPlan, why: str
+def test_whatever_ends_a_sweep_damps_and_keeps_the_log(
+    tmp_path: Path, machine: type[Watched], drive: dict[str, float], why: str
 ) -> None:
     watched = machine()
-    with pytest.raises(HardwareError, match=why):
-        sweep(watched, plan, tmp_path)
+    with pytest.raises((HardwareError, KeyboardInterrupt)) as caught:
+        sweep(watched, weak(**drive), tmp_path)
+    assert why in str(caught.value) or machine is Interrupted
     # At once where it happened, and again on the way out (closing damps too).
     assert watched.calls[-4:] == ["damp", "damp", "close", "damp"]
     log = read_mcap(tmp_path / "FR_knee.mcap")
     assert not log.complete
     assert why in log.notes[0]
+    assert log.time[-1] > 4.9 or drive
 
 
 def test_a_command_beyond_a_limit_is_clamped_by_the_filter(tmp_path: Path) -> None:
@@ -196,31 +211,6 @@ def test_every_command_of_a_sweep_passes_the_filter(
     sweep(Counted(), plan_of("FR_knee"), tmp_path)
     assert sent
     assert all(one is other for one, other in zip(sent, passed, strict=True))
-
-
-def test_the_interrupt_key_damps_the_joints_and_keeps_the_log(tmp_path: Path) -> None:
-    machine = Watched()
-
-    def impatient(share: float) -> None:
-        if share > 0.3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        sweep(machine, plan_of("FR_knee"), tmp_path, progress=impatient)
-    assert "damp" in machine.calls
-    assert "close" in machine.calls
-    log = read_mcap(tmp_path / "FR_knee.mcap")
-    assert not log.complete
-    assert "KeyboardInterrupt" in log.notes[0]
-    assert log.time[-1] > log.segments[0].start + 1.0
-
-
-def test_a_silent_machine_is_an_error(tmp_path: Path) -> None:
-    machine = Watched()
-    machine.silent_after = 4.0
-    with pytest.raises(HardwareError, match="sent no state between"):
-        sweep(machine, plan_of("FR_knee"), tmp_path)
-    assert not read_mcap(tmp_path / "FR_knee.mcap").complete
 
 
 def test_several_processes_can_share_a_plan(tmp_path: Path) -> None:

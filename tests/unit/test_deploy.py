@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import pty
@@ -27,6 +28,7 @@ from pronk.runtime.ipc import (
     ACTIONS,
     EVENT,
     STEP,
+    TEXT,
     TICK,
     Event,
     Mailbox,
@@ -36,11 +38,13 @@ from pronk.runtime.ipc import (
     Shared,
     block,
     event,
+    fill,
     get_state,
     put_state,
 )
 from pronk.runtime.log import SCHEMA, TOPICS, DeployLogWriter, is_deploy_log, read_deploy_log
 from pronk.runtime.preflight import delay_objection, refusals
+from pronk.runtime.run import RunSummary
 from pronk.runtime.safety import FilterAction, Limits, Reason, SafetyFilter
 from pronk.runtime.script import Script
 from pronk.runtime.state_machine import (
@@ -165,6 +169,17 @@ def test_a_state_survives_the_way_through_memory(measured: dict[str, Any]) -> No
         np.testing.assert_array_equal(getattr(back, name), value)
 
 
+def test_an_event_survives_the_ring() -> None:
+    [record] = np.frombuffer(
+        event(2.5, "fault", "the robot is tilted", level=FilterAction.DAMP).tobytes(), dtype=EVENT
+    )
+    assert Event.of(record) == Event(
+        time=2.5, kind="fault", text="the robot is tilted", level="DAMP"
+    )
+    [long] = np.frombuffer(event(0.0, "notice", "ä" * 2 * TEXT).tobytes(), dtype=EVENT)
+    assert Event.of(long).text == "?" * TEXT
+
+
 # --- Pacing -------------------------------------------------------------------------------------
 
 
@@ -265,11 +280,10 @@ class Run:
 
     def give(self, target: np.ndarray, entry: int | None = None) -> None:
         made, self.action = self.action, np.zeros((), dtype=ACTIONS)
-        self.action["sequence"] = 0 if made is None else made["sequence"] + 1
-        self.action["state_sequence"], self.action["valid_for"] = 3, 0.05
-        self.action["state_time"] = self.action["made"] = self.t
-        self.action["entry"] = self.machine.entry if entry is None else entry
-        self.action["position"] = target
+        sequence = 0 if made is None else made["sequence"] + 1
+        entry = self.machine.entry if entry is None else entry
+        fill(self.action, sequence=sequence, state_sequence=3, entry=entry, position=target)
+        fill(self.action, state_time=self.t, made=self.t, valid_for=0.05)
 
     def standing(self) -> Run:
         self.machine.preflighted((), self.t)
@@ -427,6 +441,9 @@ def test_a_robot_at_rest_may_move() -> None:
     assert found(stream(temperature=np.full(12, 40.0), bus_voltage=0.0)) == ()
 
 
+LEANING = {"orientation": turned(1.0), "accelerometer": 9.81 * np.array([0, 0.84147, 0.54030])}
+
+
 @pytest.mark.parametrize(
     ("states", "now", "word"),
     [
@@ -441,11 +458,7 @@ def test_a_robot_at_rest_may_move() -> None:
         (stream(accelerometer=np.array([0.0, 0.0, 1.0])), 0.5, "accelerometer"),
         (stream(accelerometer=np.array([0.0, 0.0, -9.81])), 0.5, "disagree"),
         (stream(orientation=turned(0.5)), 0.5, "disagree"),
-        (
-            stream(orientation=turned(1.0), accelerometer=9.81 * np.array([0, 0.84147, 0.54030])),
-            0.5,
-            "tilted by 1.00",
-        ),
+        (stream(**LEANING), 0.5, "tilted by 1.00"),
         (stream(position=at(2, 2.8)), 0.5, "FR_knee"),
         (stream(velocity=at(3, 2.0, np.zeros(12))), 0.5, "FL_hip_roll"),
         (stream(bus_voltage=18.0), 0.5, "18.0"),
@@ -586,21 +599,28 @@ HEADER = {"robot": "mini_cheetah", "joints": list(ROBOT.joint_names)}
 
 
 def record(number: int, **changes: Any) -> np.void:
-    one = np.zeros((), dtype=TICK)
-    put_state(one, state(time=number / 500, sequence=number))
-    one["tick"], one["begun"], one["deadline"] = number, number / 500 + 1e-4, number / 500
-    one["done"], one["latency"] = number / 500 + 4e-4, np.nan
-    one["desired"] = one["sent"] = POSE
-    for name, value in changes.items():
-        one[name] = value
-    return np.frombuffer(one.tobytes(), dtype=TICK)[0]
+    one, t = np.zeros(1, dtype=TICK), number / 500
+    put_state(one[0], state(time=t, sequence=number))
+    times = {"begun": t + 1e-4, "deadline": t, "done": t + 4e-4, "latency": np.nan}
+    fill(one[0], tick=number, desired=POSE, sent=POSE, **times)
+    fill(one[0], **changes)
+    return one[0]
 
 
 def step(**values: Any) -> np.void:
-    one = np.zeros((), dtype=STEP)
-    for name, value in values.items():
-        one[name] = value
-    return np.frombuffer(one.tobytes(), dtype=STEP)[0]
+    one = np.zeros(1, dtype=STEP)
+    fill(one[0], **values)
+    return one[0]
+
+
+def written(path: Path, ticks: int, every: int = 1000) -> None:
+    """A log of some ticks, flushed now and then."""
+    writer = DeployLogWriter(path, HEADER)
+    for k in range(ticks):
+        writer.tick(record(k))
+        if k % every == every - 1:
+            writer.flush()
+    writer.end(complete=True, figures={})
 
 
 def test_a_log_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -647,12 +667,7 @@ def test_a_log_cut_anywhere_is_read_up_to_there_or_refused(
     folder.mkdir(exist_ok=True)
     whole = folder / "whole.mcap"
     if not whole.exists():
-        writer = DeployLogWriter(whole, HEADER)
-        for k in range(60):
-            writer.tick(record(k))
-            if k % 10 == 9:
-                writer.flush()
-        writer.end(complete=True, figures={})
+        written(whole, 60, every=10)
     data = whole.read_bytes()
     cut = folder / "cut.mcap"
     cut.write_bytes(data[: int(share * len(data))])
@@ -668,30 +683,21 @@ def test_a_log_cut_anywhere_is_read_up_to_there_or_refused(
 
 def test_a_file_that_unpacks_to_too_much_is_damaged(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = DeployLogWriter(path, HEADER)
-    for k in range(100):
-        writer.tick(record(k))
-    writer.end(complete=True, figures={})
+    written(path, 100)
     with path.open("rb") as file, pytest.raises(DamagedError, match="more than 0 MiB"):
         list(records(file, path.stat().st_size, 50_000))
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"position": [0.0] * 11},
-        {"sequence": 2**63},
-        {"sequence": None},
-        {"velocity": "fast"},
-        {"time": {}},
-    ],
-)
-def test_messages_of_another_kind_are_refused(changes: dict[str, Any], tmp_path: Path) -> None:
+WRONG = (("position", [0.0] * 11), ("sequence", 2**63), ("sequence", None), ("velocity", "fast"))
+
+
+@pytest.mark.parametrize(("name", "value"), [*WRONG, ("time", {})])
+def test_messages_of_another_kind_are_refused(name: str, value: Any, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     writer = McapWriter(path, TOPICS)
     writer.put("/deploy/header", 0.0, {"schema": SCHEMA, **HEADER})
-    body = {name: record(0)[name].tolist() for name in TICK.names or ()}
-    writer.put("/deploy/tick", 0.0, body | changes)
+    body = {each: record(0)[each].tolist() for each in TICK.names or ()}
+    writer.put("/deploy/tick", 0.0, body | {name: value})
     writer.close()
     with pytest.raises(LogError, match="messages"):
         read_deploy_log(path)
@@ -706,3 +712,27 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
             read_deploy_log(path)
     with pytest.raises(LogError, match="cannot be written"):
         DeployLogWriter(tmp_path, HEADER)
+
+
+# --- The summary --------------------------------------------------------------------------------
+
+
+def test_faults_and_refusals_are_kept_apart() -> None:
+    texts = (("mode", "DAMP"), ("refused", "lying"), ("fault", "tilted"))
+    seen = [Event(time=1.0, kind=k, text=t) for k, t in texts]
+    figures = json.loads(json.dumps(RunSummary(events_seen=seen).figures()))
+    assert (figures["faults"], figures["refusals"]) == (["tilted"], ["lying"])
+
+
+@pytest.mark.parametrize(
+    ("delay", "word"),
+    [
+        ({}, "no delay"),
+        ({"n": 0}, "no delay"),
+        ({"n": 50, "p50_ms": 3.0, "p95_ms": 10.0}, "within"),
+        ({"n": 50, "p50_ms": 3.0, "p95_ms": 10.1}, "BEYOND"),
+    ],
+)
+def test_the_delay_stands_beside_that_of_training(delay: dict[str, Any], word: str) -> None:
+    summary = RunSummary(servo={"state_to_command": delay}, trained_delay_s=(0.0, 0.01))
+    assert word in summary.delay_words()

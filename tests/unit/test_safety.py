@@ -48,15 +48,8 @@ def state(**changes: Any) -> State:
 
 
 def command(**changes: Any) -> Command:
-    whole: dict[str, Any] = {
-        "position": POSE,
-        "stiffness": KP,
-        "damping": KD,
-        "state_sequence": 100,
-        "made": 0.0,
-        "valid_for": 0.05,
-    }
-    return Command(**(whole | changes))
+    whole = {"position": POSE, "stiffness": KP, "damping": KD, "state_sequence": 100}
+    return Command(**(whole | {"valid_for": 0.05} | changes))
 
 
 def judged(

@@ -11,6 +11,7 @@ import tyro
 from pronk.cli import console
 from pronk.cli.options import Base, LinkOptions
 from pronk.errors import HardwareError, PronkError
+from pronk.runtime import BLEND_S, TILT
 
 if TYPE_CHECKING:
     from pronk.policy.contract import Contract
@@ -31,8 +32,8 @@ def deploy(
     log: Path | None = None,
     capture: Path | None = None,
     seconds: float | None = None,
-    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = 0.4,
-    tilt: float = 0.8,
+    blend: Annotated[float, tyro.conf.arg(name="blend-time-s")] = BLEND_S,
+    tilt: float = TILT,
     ignore_latency: Annotated[bool, tyro.conf.arg(name="ignore-latency-check")] = False,
 ) -> console.Outcome:
     """Stand up, let the policy walk and jump, sit down; every command through the safety filter.

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -277,13 +279,9 @@ class DeployLog:
 
 def is_deploy_log(path: Path) -> bool:
     """Whether the first message of a file is the header of a deployment's log."""
-    try:
-        with path.open("rb") as file:
-            for batch in records(file, path.stat().st_size):
-                for record in batch:
-                    return record.topic == _HEADER
-    except (OSError, DamagedError):
-        pass
+    with suppress(OSError, DamagedError, StopIteration), path.open("rb") as file:
+        first = next(chain.from_iterable(records(file, path.stat().st_size)))
+        return first.topic == _HEADER
     return False
 
 

@@ -17,7 +17,7 @@ import orjson
 from pronk import __version__
 from pronk.errors import HardwareError, LogError, PronkError
 from pronk.links.link import ClampOperator
-from pronk.links.realtime import Interrupts, terminal_blocked
+from pronk.links.realtime import Interrupts, sleep_until, terminal_blocked
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared, fill
@@ -201,7 +201,13 @@ class Deployment:
         `progress` is called with the share of a sweep that is done, 0 to 1.
         """
         wake = time.monotonic()
-        while (mode := self._noted(operator, notify)) is not Mode.ENDED:
+        while True:
+            mode = self.mode
+            for event in self.events_seen():
+                operator.notified(event.kind, event.text)
+                notify(event)
+            if mode is Mode.ENDED:
+                return self.summary
             record = self.shared.state.read()
             progress(0.0 if record is None else float(record["progress"]))
             try:
@@ -213,16 +219,7 @@ class Deployment:
                 self.write(_QUIT)
                 operator.leave()
             wake = max(wake + 1.0 / _RATE_HZ, time.monotonic())
-            time.sleep(max(0.0, wake - time.monotonic()))
-        self._noted(operator, notify)
-        return self.summary
-
-    def _noted(self, operator: Operator, notify: Callable[[Event], None]) -> Mode:
-        """Pass on the new events; the mode after them."""
-        for event in self.events_seen():
-            operator.notified(event.kind, event.text)
-            notify(event)
-        return self.mode
+            sleep_until(wake)
 
     def close(self) -> None:
         """Damp, end all processes, finish the log; closing twice has no effect."""

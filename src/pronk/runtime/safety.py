@@ -25,6 +25,7 @@ from pronk.actuator.model import voltage_limits, winding_loss
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
+from pronk.runtime import TILT
 
 
 class FilterAction(IntEnum):
@@ -124,7 +125,7 @@ class Limits:
     """Largest bus power of a command, computed from the torques that the drives can give at their
     speeds, with winding losses and without recovery [W]. Twelve standing drives at their effort
     limits would take 4.4 kW."""
-    tilt: float = 0.8
+    tilt: float = TILT
     """Largest angle of the trunk's z axis from the vertical [rad]; infinite for a hung robot."""
     temperature: float = 80.0
     """Of any motor, where it is measured [deg C]."""
@@ -481,14 +482,14 @@ class SafetyFilter:
         self, states: Sequence[State], command: Command, t: float, held: bool
     ) -> SafetyInput:
         n, newest = len(self.limits.joints), states[-1]
-        position = _rows([each.position for each in states], n)
+        sizes = dict.fromkeys(("position", "velocity", "torque", "temperature"), n)
+        sizes |= {"orientation": 4, "gyro": 3}
+        measured = {
+            name: _rows([getattr(each, name) for each in states], size)
+            for name, size in sizes.items()
+        }
         return SafetyInput(
-            position=position,
-            velocity=_rows([each.velocity for each in states], n),
-            torque=_rows([each.torque for each in states], n),
-            orientation=_rows([each.orientation for each in states], 4),
-            gyro=_rows([each.gyro for each in states], 3),
-            temperature=_rows([each.temperature for each in states], n),
+            **measured,
             state_age=t - newest.time,
             target=_rows([command.position], n),
             stiffness=_rows([command.stiffness], n),
@@ -496,7 +497,7 @@ class SafetyFilter:
             command_age=t - command.made,
             valid_for=float(command.valid_for),
             lag=newest.sequence - command.state_sequence if command.state_sequence >= 0 else 0,
-            last=position[-1:] if self.last is None else self.last[None],
+            last=measured["position"][-1:] if self.last is None else self.last[None],
             held=held,
         )
 

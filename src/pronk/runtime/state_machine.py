@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pronk.errors import RobotError
 from pronk.links.machine import Command
 from pronk.robots.robot import RobotSpec
+from pronk.runtime import BLEND_S
 from pronk.runtime.ipc import Mode, OperatorRequest, Record
 from pronk.runtime.safety import FilterAction, Reason, SafetyFilter
 
@@ -49,7 +50,7 @@ class Timing:
     """From there to the default pose."""
     ramp_s: float = 0.5
     """In which the stiffness grows from none to that of the robot's drives."""
-    blend_s: float = 0.4
+    blend_s: float = BLEND_S
     """In which the policy's targets replace the pose; 0 as in training."""
     halt_s: float = 1.0
     """With a zero command before the robot sits down."""
@@ -234,6 +235,7 @@ class StateMachine:
         """Carry out the request as far as the mode allows."""
         request, mode = self._request, self.mode
         stand, reset = OperatorRequest.STAND, OperatorRequest.RESET
+        risen = self._path is not None and self._path.done(t)
         self.notice = ""
         if request in (OperatorRequest.DAMP, OperatorRequest.QUIT):
             if mode not in (*SILENT, Mode.FAULT, Mode.DAMP):
@@ -254,7 +256,7 @@ class StateMachine:
                 self._path = stand_up(self.robot, position, t, self.timing)
                 self._request = OperatorRequest.NONE
                 self.enter(Mode.STAND, t)
-        elif request is OperatorRequest.WALK and mode is Mode.STAND and self._stands(t):
+        elif request is OperatorRequest.WALK and mode is Mode.STAND and risen:
             self.notice, self._request = objection, OperatorRequest.NONE
             if not objection:
                 self._blending = None
@@ -262,9 +264,6 @@ class StateMachine:
                 self._first_entry = self.entry
         if self.mode is not mode and request not in (OperatorRequest.QUIT, stand):
             self._request = OperatorRequest.NONE
-
-    def _stands(self, t: float) -> bool:
-        return self._path is not None and self._path.done(t)
 
     def _sit(self, t: float, position: Array) -> None:
         self._path = sit_down(self.robot, position, t, self.timing)

@@ -192,7 +192,31 @@ _REPEAT_S = 0.8
 """A key counts as held for this long; keyboards repeat a key after 0.66 s at most [s]."""
 
 
-class Keyboard(Operator):
+class Device(Operator):
+    """A device that is read by its file descriptor."""
+
+    def __init__(self, fd: int, ranges: Ranges) -> None:
+        self._fd, self._ranges = fd, tuple(ranges.values())
+        self._jump = -1e9
+        """When the jump was pressed last [s]."""
+        self._connected = True
+
+    def _read(self) -> bytes:
+        """What has come since the last call; notes the end of the device."""
+        data = b""
+        while select.select([self._fd], [], [], 0.0)[0]:
+            try:
+                part = os.read(self._fd, 4096)
+            except OSError:
+                part = b""
+            if not part:
+                self._connected = False
+                break
+            data += part
+        return data
+
+
+class Keyboard(Device):
     """Keys of a terminal.
 
     A terminal does not report the release of a key, only its repetition, so the dead-man button is
@@ -205,8 +229,7 @@ class Keyboard(Operator):
         Raises:
             HardwareError: It is no terminal.
         """
-        self._fd = sys.stdin.fileno() if stream is None else stream
-        self._ranges = tuple(ranges.values())
+        super().__init__(sys.stdin.fileno() if stream is None else stream, ranges)
         if not os.isatty(self._fd):
             raise HardwareError(
                 "there is no keyboard (standard input is no terminal); run it in a terminal, use "
@@ -215,8 +238,7 @@ class Keyboard(Operator):
         self._before = termios.tcgetattr(self._fd)
         tty.setcbreak(self._fd)
         self._command = [0.0, 0.0, 0.0]
-        self._held = self._jump = -1e9
-        self._connected = True
+        self._held = -1e9
 
     def close(self) -> None:
         """Restore the terminal."""
@@ -230,7 +252,7 @@ class Keyboard(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """The keys' input."""
-        request, keys = OperatorRequest.NONE, self._keys()
+        request, keys = OperatorRequest.NONE, self._read().decode("ascii", "ignore")
         if not self._connected:
             return OperatorCommand(request=OperatorRequest.QUIT)
         for key in keys:
@@ -253,19 +275,6 @@ class Keyboard(Operator):
             held=now - self._held < _REPEAT_S,
             request=request,
         )
-
-    def _keys(self) -> str:
-        keys = b""
-        while select.select([self._fd], [], [], 0.0)[0]:
-            try:
-                part = os.read(self._fd, 256)
-            except OSError:
-                part = b""
-            if not part:
-                self._connected = False
-                break
-            keys += part
-        return keys.decode("ascii", "ignore")
 
 
 _EVENT = struct.Struct("<IhBB")
@@ -293,7 +302,7 @@ PAD_HELP = """\
 """Buttons of the gamepad."""
 
 
-class Gamepad(Operator):
+class Gamepad(Device):
     """A gamepad through the kernel's joystick interface; unplugged counts as released."""
 
     def __init__(self, path: Path, ranges: Ranges) -> None:
@@ -303,18 +312,16 @@ class Gamepad(Operator):
             HardwareError: It cannot be opened.
         """
         try:
-            self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+            fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
             raise HardwareError(
                 f"gamepad {path}: {error.strerror}; plug it in, or name another "
                 "one (ls /dev/input/js*)."
             ) from None
-        self._ranges = tuple(ranges.values())
+        super().__init__(fd, ranges)
         self._axes: dict[int, float] = {}
         self._buttons: dict[int, bool] = {}
         self._pressed = False
-        self._jump = -1e9
-        self._connected = True
 
     def close(self) -> None:
         """Close the device."""
@@ -322,7 +329,14 @@ class Gamepad(Operator):
 
     def command(self, now: float, mode: Mode) -> OperatorCommand:
         """The input of sticks and buttons."""
-        request = self._read()
+        request = OperatorRequest.NONE
+        for _, value, kind, number in _EVENT.iter_unpack(self._read()):
+            if kind & ~_INITIAL == _AXIS:
+                self._axes[number] = value / _FULL
+            elif kind & ~_INITIAL == _BUTTON:
+                self._buttons[number] = bool(value)
+                if value and not kind & _INITIAL:
+                    request = _PAD_REQUESTS.get(number, request)
         if not self._connected:
             return OperatorCommand(request=request)
         pushed = (-self._axes.get(number, 0.0) for number in _AXES)
@@ -340,23 +354,3 @@ class Gamepad(Operator):
             held=self._buttons.get(_LEFT_BUMPER, False),
             request=request,
         )
-
-    def _read(self) -> OperatorRequest:
-        request = OperatorRequest.NONE
-        while True:
-            try:
-                data = os.read(self._fd, _EVENT.size)
-            except BlockingIOError:
-                return request
-            except OSError:
-                data = b""
-            if len(data) < _EVENT.size:
-                self._connected = False
-                return request
-            _, value, kind, number = _EVENT.unpack(data)
-            if kind & ~_INITIAL == _AXIS:
-                self._axes[number] = value / _FULL
-            elif kind & ~_INITIAL == _BUTTON:
-                self._buttons[number] = bool(value)
-                if value and not kind & _INITIAL:
-                    request = _PAD_REQUESTS.get(number, request)
