@@ -83,11 +83,7 @@ class DeployLogWriter:
     """Writes a log as the run goes on."""
 
     def __init__(self, path: Path, header: dict[str, Any]) -> None:
-        """Open `path`, which is replaced, and write the header.
-
-        Raises:
-            LogError: The file cannot be made.
-        """
+        """Open `path`, which is replaced, and write the header; LogError if it cannot be made."""
         try:
             self._file = McapWriter(path, TOPICS)
         except OSError as error:
@@ -342,13 +338,7 @@ def _take(messages: dict[str, list[Any]], batch: list[Record]) -> None:
 
 
 def _table(rows: list[dict[str, Any]], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Messages as records; null becomes NaN.
-
-    Raises:
-        KeyError: A message lacks a field.
-        TypeError: A field is not a number.
-        ValueError: A field has another shape.
-    """
+    """Messages as records; null becomes NaN. Raises one of `_WRONG` for other messages."""
     table = np.zeros(len(rows), dtype=kind)
     for name in kind.names or ():
         of = kind[name]

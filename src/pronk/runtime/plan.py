@@ -37,10 +37,7 @@ class Link:
     def __call__(self, clamp_operator: ClampOperator | None = None) -> Machine:
         """Make the machine, not yet connected; the virtual robot in real time.
 
-        `clamp_operator` clamps joints on a real bench.
-
-        Raises:
-            HardwareError: The link's library is not installed.
+        HardwareError if the link's library is not installed.
         """
         machine = self.address.machine(
             load_robot(self.robot),
@@ -57,8 +54,8 @@ class Link:
 class Paced:
     """The virtual robot in real time, on CLOCK_MONOTONIC. Implements `Machine`.
 
-    `wait` first runs the physics to the given time and then sleeps until that time comes; nothing
-    can be sent in between. So the time that the physics takes does not delay the loop.
+    `wait` runs the physics to the given time and then sleeps until it comes: nothing can be sent in
+    between, and the physics does not delay the loop.
     """
 
     virtual = True

@@ -1,12 +1,8 @@
 """Run a policy on a machine, real or virtual, under given commands.
 
-On every tick of the policy's clock: read the machine's newest state, compute the policy's joint
-targets from it and the command, and send them with the gains of the robot's own drives, whatever
-gains the policy was trained with, as on the paper's robot.
-
-The policy starts on a machine that stands in its default pose, held by its drives (as after
-`Machine.connect`). Its history is filled with the first sample and its past actions are zero, as at
-the begin of every episode of training.
+Targets are sent with the gains of the robot's own drives, whatever gains the policy was trained
+with, as on the paper's robot. The policy starts on a machine that stands in its default pose; its
+history is filled with the first sample and its past actions are zero, as in training.
 """
 
 from __future__ import annotations

@@ -117,11 +117,7 @@ class Deployment:
         self._interrupts = Interrupts()
 
     def __enter__(self) -> Self:
-        """Start everything.
-
-        Raises:
-            HardwareError: The link could not be opened.
-        """
+        """Start everything; HardwareError if the link could not be opened."""
         plan, context = self.plan, get_context("spawn")
         with terminal_blocked():
             self.shared = Shared(joints=len(plan.robot.joints))
@@ -305,11 +301,7 @@ def _received(end: Connection) -> dict[str, Any]:
 
 
 def run(plan: Plan, operator: Operator, notify: Callable[[Event], None]) -> RunSummary:
-    """Run a policy from beginning to end.
-
-    Raises:
-        PronkError: It could not start.
-    """
+    """Run a policy from beginning to end; PronkError if it could not start."""
     with Deployment(plan) as deployment:
         summary = deployment.run(operator, notify)
     if not summary.servo:
@@ -354,8 +346,7 @@ def run_sweep(
 ) -> Recorded:
     """Carry out a sweep on a machine in real time.
 
-    `clamp_operator` clamps joints on a real bench, in a thread of its own; `progress` is called
-    with the share done, 0 to 1.
+    `clamp_operator` runs in a thread of its own; `progress` gets the share done, 0 to 1.
 
     Raises:
         PronkError: The robot may not be moved, the filter stopped the sweep, or a process was

@@ -532,10 +532,9 @@ def _detail(reason: Reason, state: State, command: Command, limits: Limits, t: f
         return f"{limits.joints[i]} {state.temperature[i]:.0f} of {limits.temperature:.0f} deg C"
     if reason is Reason.TILT:
         return f"{tilt(state.orientation):.2f} of {limits.tilt:.2f} rad"
-    if reason is Reason.EXPIRED:
-        return f"{1e3 * (t - command.made):.0f} ms old"
-    if reason in (Reason.NO_STATE, Reason.STATE_LOST):
-        return f"{1e3 * (t - state.time):.0f} ms old"
+    if reason in (Reason.EXPIRED, Reason.NO_STATE, Reason.STATE_LOST):
+        since = command.made if reason is Reason.EXPIRED else state.time
+        return f"{1e3 * (t - since):.0f} ms old"
     if reason is Reason.LAG:
         return f"{state.sequence - command.state_sequence} states"
     return ""

@@ -28,11 +28,7 @@ _SLACK = 1e-9
 
 
 def check_velocity(command: Velocity, of: str) -> None:
-    """Refuse a command that is not three finite numbers.
-
-    Raises:
-        PronkError: The command and what was expected.
-    """
+    """Raise PronkError for a command that is not three finite numbers."""
     if len(command) != 3 or not all(map(math.isfinite, command)):
         raise PronkError(
             f"command {command} of {of}; expected three finite numbers: {', '.join(COMMANDS)}."

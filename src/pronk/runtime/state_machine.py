@@ -104,11 +104,7 @@ class Path:
 
 
 def folded_pose(robot: RobotSpec) -> Array:
-    """[rad], (joints,).
-
-    Raises:
-        RobotError: The robot file gives none.
-    """
+    """[rad], (joints,); RobotError if the robot file gives none."""
     pose = [joint.folded_position for joint in robot.joints]
     if any(position is None for position in pose):
         raise RobotError(

@@ -1,10 +1,9 @@
 """Sweeps: excite each joint with its signals and log the response, under the safety filter.
 
 Commands change at the policy's rate on the machine's own clock; every measured state is logged with
-the command in force. `SweepController` gives the commands and the log's records, which `SweepLogs`
-writes. `record` runs it on a machine whose clock waits (the virtual robot in this process); on a
-machine in real time the servo runs it (`pronk.runtime.servo`). In both, every command passes the
-safety filter, and whatever happens, the joints are left damped and the log stays readable.
+the command in force. `record` runs a sweep on a machine whose clock waits (the virtual robot in
+this process), the servo on a machine in real time. In both, every command passes the safety filter,
+and whatever happens, the joints are left damped and the log stays readable.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ class SweepTask:
 
     @property
     def excited(self) -> list[str]:
-        """Excited joints, one log each."""
+        """Joints, one log each."""
         return [name for name in self.plan.joints if self.joints is None or name in self.joints]
 
     @property
@@ -78,9 +77,8 @@ class SweepTask:
         """Refuse a task that cannot be carried out, before anything moves.
 
         Raises:
-            PlanError: The plan could exceed a limit.
-            RobotError: A joint is unknown.
-            HardwareError: The plan does not excite a joint, or a log exists.
+            PronkError: The plan could exceed a limit, a joint is unknown or not excited, or a log
+                exists.
         """
         for name in self.joints or ():
             self.plan.robot.joint(name)
@@ -243,10 +241,10 @@ class SweepController:
     ) -> None:
         """Begin on a connected machine at `start` on its clock [s], from a measured `state`.
 
-        Until the joints are at the pose, the limits of `safety` are as wide as the joints are at
+        Until the joints are at the pose, the limits of `safety` are widened to where they are at
         first. In `real_time` the joints are stiffened first, and held while the operator clamps
-        others. `sink` takes the log's records (`sample_dtype`), `progress` the share done, 0 to 1,
-        and `written` the name of each log that is complete.
+        others. `sink` takes records of `sample_dtype`, `progress` the share done, 0 to 1, and
+        `written` the name of each complete log.
         """
         self.task, self.plan, self.machine, self.safety = task, task.plan, machine, safety
         self._sink, self._progress, self._written = sink, progress, written
@@ -448,10 +446,8 @@ def record(
     `progress` is called about twice a second of machine time. Returns the logs, in order.
 
     Raises:
-        PlanError: The plan could exceed a limit.
-        RobotError: A joint is unknown.
-        HardwareError: A log exists, the machine sends no states, or the filter stopped the sweep.
-            The joints are then damped, and the log up to then is readable and has the reason.
+        PronkError: As of `SweepTask.check`; or no states come, or the filter stopped the sweep. The
+            joints are then damped, and the log up to then is readable and has the reason.
     """
     if machine.robot != task.plan.robot.name:
         raise HardwareError(

@@ -224,11 +224,7 @@ class Keyboard(Device):
     """
 
     def __init__(self, ranges: Ranges, stream: int | None = None) -> None:
-        """Read a terminal key by key: standard input, or another file descriptor.
-
-        Raises:
-            HardwareError: It is no terminal.
-        """
+        """Read standard input key by key, or another file; HardwareError if it is no terminal."""
         super().__init__(sys.stdin.fileno() if stream is None else stream, ranges)
         if not os.isatty(self._fd):
             raise HardwareError(
@@ -306,11 +302,7 @@ class Gamepad(Device):
     """A gamepad through the kernel's joystick interface; unplugged counts as released."""
 
     def __init__(self, path: Path, ranges: Ranges) -> None:
-        """Open a device such as /dev/input/js0.
-
-        Raises:
-            HardwareError: It cannot be opened.
-        """
+        """Open a device such as /dev/input/js0; HardwareError if it cannot be opened."""
         try:
             fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
