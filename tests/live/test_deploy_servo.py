@@ -52,7 +52,7 @@ class Run:
         self.servo = Servo(plan, shared, (0.0, 1.0))
         self.shared = shared
         self.said: list[tuple[str, str]] = []
-        self._stick = np.zeros((), dtype=OPERATOR)
+        self._record = np.zeros((), dtype=OPERATOR)
         self._thread = threading.Thread(target=self.servo.run)
         self.begun = time.monotonic()
         self._thread.start()
@@ -68,13 +68,13 @@ class Run:
         seconds: float = 20.0,
     ) -> None:
         """Hold the dead-man button until something is so."""
-        stick, end = self._stick, time.monotonic() + seconds
-        stick["request"] = request
-        stick["requests"] += request is not OperatorRequest.NONE
+        record, end = self._record, time.monotonic() + seconds
+        record["request"] = request
+        record["requests"] += request is not OperatorRequest.NONE
         while not there():
             assert time.monotonic() < end, (self.servo.modes.mode, self.said)
-            stick["time"], stick["held"] = time.monotonic(), 1
-            self.shared.operator.write(stick)
+            record["time"], record["held"] = time.monotonic(), 1
+            self.shared.operator.write(record)
             self.receive()
             time.sleep(0.005)
         self.receive()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pronk
 from pronk.links.machine import State
 from pronk.links.realtime import Pace
 from pronk.policy.runtime import load_policy
-from pronk.runtime.ipc import OPERATOR, Mode, Shared, put_state, state_dtype
+from pronk.runtime.ipc import OPERATOR, Mode, Shared, fill, put_state, state_dtype
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.policy_process import LEAD_S, PolicyProcess, standing, warm_up_until
 
@@ -41,14 +42,12 @@ def states(count: int) -> list[State]:
     still = standing(load_policy(POLICY).contract)
     rng = np.random.default_rng(3)
     return [
-        State(
-            **vars(still)
-            | {
-                "sequence": k,
-                "position": still.position + 0.1 * rng.standard_normal(12),
-                "velocity": rng.standard_normal(12),
-                "gyro": rng.standard_normal(3),
-            }
+        replace(
+            still,
+            sequence=k,
+            position=still.position + 0.1 * rng.standard_normal(12),
+            velocity=rng.standard_normal(12),
+            gyro=rng.standard_normal(3),
         )
         for k in range(count)
     ]
@@ -58,9 +57,9 @@ def publish(process: PolicyProcess, state: State, mode: Mode, entry: int) -> Non
     """What servo and operator write before a step."""
     record, operator = np.zeros((), dtype=state_dtype(12)), np.zeros((), dtype=OPERATOR)
     put_state(record, state)
-    record["mode"], record["entry"] = mode, entry
+    fill(record, mode=mode, entry=entry)
     process.shared.state.write(record)
-    operator["command"], operator["jump"] = (1.0, -0.3, 99.0), state.sequence % 3 == 0
+    fill(operator, command=(1.0, -0.3, 99.0), jump=state.sequence % 3 == 0)
     process.shared.operator.write(operator)
 
 
@@ -114,7 +113,7 @@ def test_the_policy_is_never_commanded_beyond_what_it_was_trained_for() -> None:
 
 
 def test_a_state_that_is_not_finite_gives_no_action_and_one_event() -> None:
-    spoilt = State(**vars(states(1)[0]) | {"velocity": np.full(12, np.nan)})
+    spoilt = replace(states(1)[0], velocity=np.full(12, np.nan))
     with running() as process:
         for _ in range(3):
             publish(process, spoilt, Mode.POLICY, 1)
