@@ -66,7 +66,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def test_a_run_writes_policies_checkpoints_and_provenance(whole: RunFolder) -> None:
-    walk, jump = load_policy(whole.walk).contract, load_policy(whole.policy).contract
+    walk, jump = (load_policy(whole.path / f"{name}.onnx").contract for name in ("walk", "policy"))
     assert (walk.jump, jump.jump) == (False, True)
     assert walk.provenance["phases"] == {"walk": 2}
     assert jump.provenance["phases"] == {"walk": 2, "jump_a": 1, "jump_b": 2}
@@ -122,7 +122,7 @@ def test_a_stopped_run_is_resumed_from_its_checkpoint(tmp_path: Path, kind: sign
     state = checkpoint.read(folder.path / "walk.pt")
     assert state["iter"] == 5
     assert state["infos"]["env_state"]["common_step_counter"] == 6 * 24
-    assert not load_policy(folder.policy).contract.jump
+    assert not load_policy(folder.path / "policy.onnx").contract.jump
 
 
 def test_a_jump_begins_with_a_walking_policy(whole: RunFolder, tmp_path: Path) -> None:

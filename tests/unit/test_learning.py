@@ -50,7 +50,7 @@ def test_losses_by_hand() -> None:
     # Probabilities 1/2, 1/2, 1/2 and 3/4 where there is no contact.
     assert float(cross_entropy) == pytest.approx((3 * math.log(2) + math.log(4)) / 4)
     assert float(squared) == pytest.approx((1 + 0 + 4) / 3)
-    contact, _ = estimator.estimate(x)
+    contact, _ = estimator(x)
     torch.testing.assert_close(contact, torch.tensor([[0.5, 0.5, 0.5, 0.75]]))
 
 

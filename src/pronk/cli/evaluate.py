@@ -51,7 +51,7 @@ def evaluate(
     require_extra()
     if out.suffix != ".json":
         raise PronkError(f"--out {out}: expected a name that ends in .json, as in evaluation.json.")
-    where = "cuda:0" if find_devices(device).device == "cuda" else "cpu"
+    where = "cuda:0" if find_devices(device) else "cpu"
 
     from pronk.evaluation.training_sim import adapter
     from pronk.evaluation.training_sim.evaluation import load_speed_errors, save, sheets

@@ -7,30 +7,24 @@ from __future__ import annotations
 
 import contextlib
 import os
-from dataclasses import dataclass
+import platform
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any
 
 from pronk.errors import PronkError
 
-_NEEDED = ("torch", "mjlab", "rsl_rl")
 _MODULES = (
-    "smooth",
-    "sensor",
-    "passive",
-    "derivative",
-    "solver",
-    "forward",
-    "support",
-    "constraint",
+    *("smooth", "sensor", "passive", "derivative"),
+    *("solver", "forward", "support", "constraint"),
 )
 """Of MuJoCo Warp, launched in every step of every model, the longest to compile first."""
 
 
 def require_extra() -> None:
     """Refuse to train where the extra is not installed, with a PronkError."""
-    missing = [name for name in _NEEDED if find_spec(name) is None]
+    missing = [name for name in ("torch", "mjlab", "rsl_rl") if find_spec(name) is None]
     if missing:
         raise PronkError(
             f"training needs {', '.join(missing)}, which this installation lacks; "
@@ -38,67 +32,43 @@ def require_extra() -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Devices:
-    """Devices to compute on."""
-
-    device: Literal["cpu", "cuda"]
-    visible: tuple[str, ...] = ()
-    """Entries of `CUDA_VISIBLE_DEVICES`, one a process; empty on the CPU."""
-
-    @property
-    def count(self) -> int:
-        """Number of processes."""
-        return max(len(self.visible), 1)
-
-    def claim(self) -> None:
-        """Hide all other GPUs from this process and its children, before any uses CUDA."""
-        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(self.visible)
-
-
-def parse_gpu_ids(text: str) -> list[int] | Literal["all"]:
-    """Read `0,1` or `all`; PronkError if it is neither or names a GPU twice."""
-    if text == "all":
-        return "all"
-    words = [word.strip() for word in text.split(",")]
-    if not all(word.isdigit() for word in words) or len(set(words)) < len(words):
-        raise PronkError(f"--gpu-ids {text!r}: expected different numbers, as in 0,1, or all.")
-    return [int(word) for word in words]
-
-
-def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> Devices:
-    """The GPUs or the CPU to compute on.
+def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[str, ...]:
+    """The GPUs to compute on, one a process, as `CUDA_VISIBLE_DEVICES` names them; () is the CPU.
 
     Args:
         requested: `auto`, `cpu` or `cuda`.
         gpu_ids: Numbers of the visible GPUs, as in `0,1`, or `all`; the first alone if None.
 
     Raises:
-        PronkError: There is no such GPU.
+        PronkError: There is no such GPU, or `gpu_ids` is malformed or names one twice.
     """
-    if requested not in ("auto", "cpu", "cuda"):
-        raise PronkError(f"device {requested!r}; expected one of auto, cpu, cuda.")
-    ids = None if gpu_ids is None else parse_gpu_ids(gpu_ids)
+    words = [] if gpu_ids is None else [word.strip() for word in gpu_ids.split(",")]
+    if words != ["all"] and not (
+        all(word.isdigit() for word in words) and len(set(words)) == len(words)
+    ):
+        raise PronkError(f"--gpu-ids {gpu_ids!r}: expected different numbers, as in 0,1, or all.")
     if requested == "cpu":
-        if ids is not None:
+        if words:
             raise PronkError(f"--gpu-ids {gpu_ids} goes with a GPU; leave it or --device cpu out.")
-        return Devices(device="cpu")
+        return ()
     found = visible_gpus()
     if not found:
-        if requested == "cuda" or ids is not None:
+        if requested == "cuda" or words:
             raise PronkError(
                 "no GPU was found (PyTorch sees none; CUDA_VISIBLE_DEVICES is "
                 f"{os.environ.get('CUDA_VISIBLE_DEVICES', 'not set')}); expected one with a CUDA "
                 "driver, or --device cpu for a test."
             )
-        return Devices(device="cpu")
-    numbers = range(len(found)) if ids == "all" else [0] if ids is None else ids
+        return ()
+    if words == ["all"]:
+        return found
+    numbers = [int(word) for word in words] or [0]
     if max(numbers) >= len(found):
         raise PronkError(
             f"--gpu-ids {gpu_ids}: this host has {len(found)} visible GPU(s), numbered 0 to "
             f"{len(found) - 1}."
         )
-    return Devices(device="cuda", visible=tuple(found[i] for i in numbers))
+    return tuple(found[i] for i in numbers)
 
 
 def visible_gpus() -> tuple[str, ...]:
@@ -114,32 +84,19 @@ def visible_gpus() -> tuple[str, ...]:
 
 
 def device_facts(device: str, count: int = 1) -> dict[str, Any]:
-    """Name of the device, and of a GPU its driver.
+    """Name of a device, `cpu` or `cuda`; of GPUs their number and CUDA's version."""
+    if device == "cuda":
+        import torch
 
-    Args:
-        device: `cpu` or `cuda`.
-        count: Number of GPUs.
-    """
-    if device == "cpu":
-        return {"device": "cpu", "name": _processor(), "cores": os.cpu_count()}
-    import torch
-
-    return {
-        "device": "cuda",
-        "name": torch.cuda.get_device_name(0),
-        "count": count,
-        "cuda": torch.version.cuda,
-    }
-
-
-def _processor() -> str:
-    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # noqa: PTH123
-        for line in file:
+        name = torch.cuda.get_device_name(0)
+        return {"device": "cuda", "name": name, "count": count, "cuda": torch.version.cuda}
+    name = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    import platform
-
-    return platform.processor() or platform.machine()
+                name = line.partition(":")[2].strip()
+                break
+    return {"device": "cpu", "name": name, "cores": os.cpu_count()}
 
 
 def compile_kernels(device: str) -> None:

@@ -82,32 +82,26 @@ def training_gains(
             simulator than the one that trains.
         PronkError: `like` was given with a file of gains, or a range reaches zero.
     """
-    if str(choice) != NAIVE:
-        if like is not None:
-            raise PronkError(
-                f"ranges like {like} were requested with the gains of {choice}; "
-                "they go with the choice 'naive' only, a gains.yaml has its own."
-            )
-        path = Path(choice)
-        matched = _matched(path, robot)
-        return TrainingGains(
-            name="matched",
-            robot=robot.name,
-            groups={group: matched.groups[group] for group in robot.groups},
-            delay_s=_mean_delay(matched, path),
-            sha256=sha256(path),
-            virtual=matched.virtual,
+    naive = str(choice) == NAIVE
+    if like is not None and not naive:
+        raise PronkError(
+            f"ranges like {like} were requested with the gains of {choice}; "
+            "they go with the choice 'naive' only, a gains.yaml has its own."
         )
-    naive = {group: _naive(robot, group) for group in robot.groups}
-    if like is None:
-        return TrainingGains(name="naive", robot=robot.name, groups=naive)
-    matched = _matched(like, robot)
+    groups = {group: _naive(robot, group) for group in robot.groups} if naive else {}
+    if naive and like is None:
+        return TrainingGains(name="naive", robot=robot.name, groups=groups)
+    path = like or Path(choice)
+    matched = _matched(path, robot)
+    for group in robot.groups:
+        own = matched.groups[group]
+        groups[group] = _about(groups[group], own) if naive else own
     return TrainingGains(
-        name="naive",
+        name="naive" if naive else "matched",
         robot=robot.name,
-        groups={group: _about(naive[group], matched.groups[group]) for group in robot.groups},
-        delay_s=_mean_delay(matched, like),
-        sha256=sha256(like),
+        groups=groups,
+        delay_s=math.fsum(joint.delay_s for joint in matched.joints.values()) / len(matched.joints),
+        sha256=sha256(path),
         virtual=matched.virtual,
     )
 
@@ -150,40 +144,28 @@ def _matched(path: Path, robot: RobotSpec) -> MatchedGains:
             f"{path}: gains of {gains.robot}; training {robot.name} needs gains of {robot.name}, "
             "or the choice 'naive'."
         )
-    _check_simulator(gains.simulator, robot, path)
+    # Gains hold for the simulator that they were matched in, and for no other; patches of MuJoCo
+    # keep its physics.
+    timing = {"timestep_s": robot.timestep_s, "decimation": robot.decimation}
+    used, got = (
+        vars(info) | {"version": ".".join(info.version.split(".")[:2])}
+        for info in (SimulatorInfo(version=mujoco.__version__, **timing), gains.simulator)
+    )
+    differing = [name for name in used if got[name] != used[name]]
+    if differing:
+        has, needs = (
+            ", ".join(f"{name} {info[name]}" for name in differing) for info in (got, used)
+        )
+        raise ArtefactError(
+            f"{path}: gains matched in a simulator with {has}; training uses {needs}, where they "
+            "mean another joint: match the logs again with this pronk."
+        )
     missing = [group for group in robot.groups if group not in gains.groups]
     if missing:
         raise ArtefactError(
             f"{path}: no training gains for {', '.join(missing)}; match logs of every joint group "
             f"({', '.join(robot.groups)}) in one run of `pronk match`."
         )
-    return gains
-
-
-def _check_simulator(simulator: SimulatorInfo, robot: RobotSpec, path: Path) -> None:
-    """Gains hold for the simulator that they were matched in, and for no other."""
-    used = SimulatorInfo(
-        version=_minor(mujoco.__version__),
-        timestep_s=robot.timestep_s,
-        decimation=robot.decimation,
-    )
-    got = {**vars(simulator), "version": _minor(simulator.version)}
-    differing = [name for name, value in vars(used).items() if got[name] != value]
-    if differing:
-        has = ", ".join(f"{name} {got[name]}" for name in differing)
-        needs = ", ".join(f"{name} {getattr(used, name)}" for name in differing)
-        raise ArtefactError(
-            f"{path}: gains matched in a simulator with {has}; training uses {needs}, where they "
-            "mean another joint: match the logs again with this pronk."
-        )
-
-
-def _minor(version: str) -> str:
-    """`3.11` of `3.11.0`: patches of MuJoCo keep its physics."""
-    return ".".join(str(version).split(".")[:2])
-
-
-def _mean_delay(gains: MatchedGains, path: Path) -> float:
     if not gains.joints:
         raise ArtefactError(f"{path}: no joints, so no command delay; `pronk match` writes them.")
-    return math.fsum(joint.delay_s for joint in gains.joints.values()) / len(gains.joints)
+    return gains

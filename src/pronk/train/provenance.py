@@ -41,28 +41,13 @@ class RunFolder:
 
     @property
     def provenance(self) -> Path:
-        """Where it comes from."""
+        """The file that `read` reads."""
         return self.path / "provenance.json"
 
     @property
     def gains(self) -> Path:
-        """Copy of the file of gains."""
+        """The copy of the file of gains."""
         return self.path / "gains.yaml"
-
-    @property
-    def log(self) -> Path:
-        """What the libraries print."""
-        return self.path / "train.log"
-
-    @property
-    def walk(self) -> Path:
-        """The policy after phase 1 of a run that goes on to jump."""
-        return self.path / "walk.onnx"
-
-    @property
-    def policy(self) -> Path:
-        """The policy at the end."""
-        return self.path / "policy.onnx"
 
     def checkpoint(self) -> Path:
         """The last checkpoint; ArtefactError if there is none."""
@@ -151,7 +136,7 @@ def new_session() -> dict[str, Any]:
 
 
 def changed_versions(provenance: dict[str, Any]) -> list[str]:
-    """Packages in another version than when the run was last started, as text."""
+    """Packages in other versions than when the run was last started, as text."""
     last = provenance["sessions"][-1]["versions"]
     return [
         f"{name} was {last.get(name)} and is {version}"
@@ -165,23 +150,18 @@ def git_state() -> dict[str, Any] | None:
 
     An installed pronk may lie inside another repository; then that is not its commit.
     """
-    package = Path(pronk.__file__).parent
-    if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
-        return None
-    commit = _git(package, "rev-parse", "HEAD")
-    changed = _git(package, "status", "--porcelain", "--", ".")
-    return None if commit is None else {"commit": commit, "changed": bool(changed)}
 
+    def git(*words: str) -> str:
+        folder = str(Path(pronk.__file__).parent)
+        return subprocess.run(
+            ["git", "-C", folder, *words], capture_output=True, text=True, timeout=20, check=True
+        ).stdout.strip()
 
-def _git(folder: Path, *words: str) -> str | None:
     try:
-        done = subprocess.run(
-            ["git", "-C", str(folder), *words],
-            capture_output=True,
-            text=True,
-            timeout=20,
-            check=True,
-        )
+        git("ls-files", "--error-unmatch", "__init__.py")
+        return {
+            "commit": git("rev-parse", "HEAD"),
+            "changed": bool(git("status", "--porcelain", "--", ".")),
+        }
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()

@@ -19,15 +19,7 @@ import torch
 
 from pronk.errors import ArtefactError
 from pronk.files import sha256, written_whole
-from pronk.train import provenance
-from pronk.train.devices import (
-    Devices,
-    check_cuda_graphs,
-    compile_kernels,
-    device_facts,
-    find_devices,
-    require_extra,
-)
+from pronk.train import devices, provenance
 from pronk.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.train.phases import STEPS_PER_ITERATION
 from pronk.train.provenance import RunFolder
@@ -41,14 +33,11 @@ _COPIED = ("MUJOCO*", "MJLAB*", "WARP*", "WANDB*")
 def train(
     settings: TrainSettings, report: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Begin or resume a run, and train until it is finished or stopped.
+    """Begin or resume a run, train until it is finished or stopped, and return its provenance.
 
     Args:
         settings: As given.
         report: Called with one line of text before training begins.
-
-    Returns:
-        The run's provenance.
 
     Raises:
         PronkError: The settings are impossible, then nothing is written; or learning has diverged.
@@ -64,13 +53,14 @@ def train(
     else:
         folder.check_fresh()
         settings = settings.completed()
-    require_extra()
-    devices = find_devices(settings.device, settings.gpu_ids)
-    devices.claim()
+    devices.require_extra()
+    gpus = devices.find_devices(settings.device, settings.gpu_ids)
+    # Hide all other GPUs from this process and its children, before any uses CUDA.
+    os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(gpus)
     if not settings.resume:
         found = _begin(folder, settings)
-    report(_summary(settings, found, devices))
-    return found if found["finished"] else _launch(folder, settings, devices)
+    report(_summary(settings, found, gpus))
+    return found if found["finished"] else _launch(folder, settings, max(len(gpus), 1))
 
 
 def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
@@ -79,9 +69,8 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
 
     task = load_task(str(settings.robot))
     gains = training_gains(settings.gains or NAIVE, task.robot, like=settings.ranges_from)
-    start = None
-    if settings.init_checkpoint is not None:
-        start = initial_state(settings.init_checkpoint, settings.iterations["walk"])
+    first = settings.init_checkpoint
+    start = None if first is None else initial_state(first, settings.iterations["walk"])
     task.env_cfg(task.robot, gains, **_options(settings))  # refuses impossible gains
     folder.path.mkdir(parents=True, exist_ok=True)
     if settings.gains_file is not None:
@@ -94,7 +83,7 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
         "settings": settings.stored_values(),
         "gains": {
             "name": gains.name,
-            "file": None if settings.gains_file is None else settings.gains_file.name,
+            "file": settings.gains_file and settings.gains_file.name,
             "sha256": gains.sha256,
             "virtual": gains.virtual,
         },
@@ -117,13 +106,10 @@ def initial_state(path: Path, iterations: int) -> dict[str, Any]:
     Raises:
         ArtefactError: There is none, or its policy already jumps.
     """
-    source = path
-    if path.is_dir():
-        # The run of the task walk ends with that phase, others name its checkpoint.
-        source = path / "walk.pt"
+    source = path / "walk.pt" if path.is_dir() else path
     if not source.is_file():
         raise ArtefactError(
-            f"--init-checkpoint {path}: no {source.name if path.is_dir() else 'such file'}; "
+            f"--init-checkpoint {path}: no {'such file' if source == path else 'walk.pt'}; "
             "expected the folder of a run whose phase walk is over, or one of its checkpoints."
         )
     state = checkpoint.widen_checkpoint(checkpoint.read(source))
@@ -168,28 +154,28 @@ def run_gains(folder: RunFolder, robot: Any) -> TrainingGains:
     return training_gains(folder.gains, robot)
 
 
-def _summary(settings: TrainSettings, found: dict[str, Any], devices: Devices) -> str:
+def _summary(settings: TrainSettings, found: dict[str, Any], gpus: tuple[str, ...]) -> str:
     phases = ", ".join(f"{n} {c}" for n, c in settings.iterations.items() if c > 0)
     gains = found["gains"]
     words = f"{gains['name']} gains"
     if gains["file"]:
         words += f" {'with the ranges ' if gains['name'] == NAIVE else ''}of {gains['file']}"
         words += " (of the virtual robot)" if gains["virtual"] else ""
-    on = devices.device if devices.count == 1 else f"each of {devices.count} GPUs"
+    on = f"each of {len(gpus)} GPUs" if len(gpus) > 1 else "cuda" if gpus else "cpu"
     return (
         f"training {settings.task} of {settings.robot}: {phases} iterations, {settings.envs} "
         f"robots on {on}, {words}, seed {settings.seed}; run folder {settings.out}"
     )
 
 
-def _launch(folder: RunFolder, settings: TrainSettings, devices: Devices) -> dict[str, Any]:
+def _launch(folder: RunFolder, settings: TrainSettings, processes: int) -> dict[str, Any]:
     """Train in this process, or in one for each GPU."""
     begin = time.monotonic()
     with folder.locked():
         with folder.changed() as found:
             found["sessions"].append(provenance.new_session())
         try:
-            if devices.count == 1:
+            if processes == 1:
                 train_run(folder, settings)
             else:
                 import torchrunx
@@ -197,7 +183,7 @@ def _launch(folder: RunFolder, settings: TrainSettings, devices: Devices) -> dic
                 os.environ.setdefault("TORCHRUNX_LOG_DIR", str(folder.path / "torchrunx"))
                 torchrunx.Launcher(
                     hostnames=["localhost"],
-                    workers_per_host=devices.count,
+                    workers_per_host=processes,
                     backend=None,  # rsl_rl makes the process group itself
                     copy_env_vars=(*torchrunx.DEFAULT_ENV_VARS_FOR_COPY, *_COPIED),
                 ).run(train_run, folder, settings)
@@ -210,7 +196,7 @@ def _launch(folder: RunFolder, settings: TrainSettings, devices: Devices) -> dic
 def train_run(folder: RunFolder, settings: TrainSettings) -> None:
     """Do what one process does: all of a run, or the rest of it."""
     rank = int(os.environ.get("RANK", "0"))
-    log = folder.log if rank == 0 else folder.log.with_suffix(f".{rank}.log")
+    log = folder.path / ("train.log" if rank == 0 else f"train.{rank}.log")
     with log.open("a", encoding="utf-8", buffering=1) as file, contextlib.redirect_stdout(file):
         _train_run(folder, settings, rank)
 
@@ -221,7 +207,7 @@ def _train_run(folder: RunFolder, settings: TrainSettings, rank: int) -> None:
     from mjlab.utils.os import dump_yaml
     from mjlab.utils.torch import configure_torch_backends
 
-    from pronk.train.rl.runner import Progress, PronkRunner
+    from pronk.train.rl.runner import PronkRunner, note
     from pronk.train.tasks import load_task
 
     begin = time.monotonic()
@@ -230,8 +216,7 @@ def _train_run(folder: RunFolder, settings: TrainSettings, rank: int) -> None:
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
         torch.cuda.set_device(device)
     configure_torch_backends()
-    progress = Progress()
-    progress.note(rank, f"building {settings.envs} robots on {device} and compiling kernels")
+    note(rank, f"building {settings.envs} robots on {device} and compiling kernels")
     task = load_task(str(settings.robot))
     gains = run_gains(folder, task.robot)
     seed = int(settings.seed or 0) + rank
@@ -245,19 +230,18 @@ def _train_run(folder: RunFolder, settings: TrainSettings, rank: int) -> None:
     if rank == 0:
         dump_yaml(folder.path / "params" / "env.yaml", asdict(env_cfg))
         dump_yaml(folder.path / "params" / "agent.yaml", asdict(agent))
-    compile_kernels(device)
+    devices.compile_kernels(device)
     env = RslRlVecEnvWrapper(ManagerBasedRlEnv(env_cfg, device=device), agent.clip_actions)
     runner = PronkRunner(env, asdict(agent), str(folder.path), device)
-    found = folder.read()
-    runner.provenance = {"start_sha256": found["start_sha256"]}
-    runner.progress = progress
+    runner.provenance = {"start_sha256": folder.read()["start_sha256"]}
+    runner.show_progress = True
     last = checkpoint.latest(folder.path)
     if last is not None:
         runner.load(str(last))
     built = time.monotonic() - begin
-    progress.note(rank, f"built in {built:.0f} s")
-    if device != "cpu" and (warning := check_cuda_graphs(env.unwrapped.sim)) is not None:
-        progress.note(rank, f"warning: {warning}")
+    note(rank, f"built in {built:.0f} s")
+    if device != "cpu" and (warning := devices.check_cuda_graphs(env.unwrapped.sim)) is not None:
+        note(rank, f"warning: {warning}")
     if settings.minutes is not None:
         runner.deadline = begin + 60.0 * settings.minutes
     with stop_signals(runner):
@@ -270,7 +254,7 @@ def _train_run(folder: RunFolder, settings: TrainSettings, rank: int) -> None:
             found["sessions"][-1] |= {
                 "stopped": runner.stop_reason,
                 "build_s": built,
-                "device": device_facts(device.partition(":")[0], runner.gpu_world_size),
+                "device": devices.device_facts(device.partition(":")[0], runner.gpu_world_size),
             }
 
 
@@ -281,10 +265,8 @@ def stop_signals(runner: Any) -> Iterator[None]:
     The next one has its usual effect. Python delivers signals to the main thread alone; in another
     thread the block changes nothing.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    main = threading.current_thread() is threading.main_thread()
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM) if main}
 
     def stop(number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number)

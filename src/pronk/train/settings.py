@@ -90,20 +90,19 @@ class TrainSettings:
         """
         found = dict(TASKS[self.task])
         known = [n for n in PHASES if found[n] > 0 and (n, self.task) != ("walk", "jump")]
-        given = set()
-        for entry in self.phase:
-            name, _, count = entry.partition("=")
+        names = [entry.partition("=")[0] for entry in self.phase]
+        for entry, name in zip(self.phase, names, strict=True):
+            count = entry.removeprefix(f"{name}=")
             if not (name and count.isdigit()):
                 raise PronkError(f"--phase {entry!r}: expected PHASE=ITERATIONS, as in walk=300.")
             if name not in known:
                 raise PronkError(
                     f"{self.task} has no phase {name!r}; its phases are {', '.join(known)}."
                 )
-            if name in given:
+            if names.count(name) > 1:
                 raise PronkError(f"--phase {name} is given twice; once is enough.")
             if int(count) < 1:
                 raise PronkError(f"phase {name} has {count} iterations; expected 1 or more.")
-            given.add(name)
             found[name] = int(count)
         return found
 
@@ -128,36 +127,27 @@ class TrainSettings:
                 "jump needs --init-checkpoint: the folder of a walking run, or one of its "
                 "checkpoints; `pronk train all` does both."
             )
-        defaults: dict[str, Any] = {
-            "robot": "mini_cheetah",
-            "envs": 4096,
-            "seed": 1,
-            "ellipsoid": False,
-        }
+        defaults: dict[str, Any]
+        defaults = {"robot": "mini_cheetah", "envs": 4096, "seed": 1, "ellipsoid": False}
         return replace(self, **{n: v for n, v in defaults.items() if getattr(self, n) is None})
 
     def resumed(self, stored: Mapping[str, Any]) -> Self:
-        """With the values of the run that is resumed.
-
-        Args:
-            stored: From `stored_values`.
+        """With the values of the run that is resumed, as of `stored_values`.
 
         Raises:
             PronkError: An option is given with another value than the run has.
         """
-        given = self.stored_values()
-        for name, value in given.items():
+        for name, value in self.stored_values().items():
             if value and value != stored[name]:
                 raise PronkError(
                     f"--resume: --{name.replace('_', '-')} is {value}, but the run in {self.out} "
                     f"has {'none' if stored[name] is None else stored[name]}; leave it out to "
                     "continue that run, or give a new --out."
                 )
-        values: dict[str, Any] = {
-            n: Path(v) if n in ("ranges_from", "init_checkpoint") and v else v
-            for n, v in stored.items()
-        }
-        return replace(self, **{**values, "phase": tuple(values["phase"])})
+        values: dict[str, Any] = {**stored, "phase": tuple(stored["phase"])}
+        for name in ("ranges_from", "init_checkpoint"):
+            values[name] = values[name] and Path(values[name])
+        return replace(self, **values)
 
     def stored_values(self) -> dict[str, Any]:
         """What decides the result of a run, as JSON holds it."""

@@ -9,7 +9,6 @@ All float32. The normalization is part of the graph: the input is as measured.
 from __future__ import annotations
 
 import copy
-import importlib.util
 import platform
 import warnings
 from collections.abc import Mapping
@@ -34,26 +33,13 @@ OPSET = 18
 TOLERANCE = 1e-5
 """Largest difference between ONNX Runtime and PyTorch that `verify` should give."""
 
-_DISTRIBUTIONS = {
-    "mjlab": "mjlab",
-    "mujoco": "mujoco",
-    "mujoco_warp": "mujoco-warp",
-    "warp": "warp-lang",
-    "torch": "torch",
-    "rsl_rl": "rsl-rl-lib",
-    "numpy": "numpy",
-}
-
 
 def versions() -> dict[str, str]:
     """Versions of the packages that a run is computed with."""
+    modules = ("mjlab", "mujoco", "mujoco_warp", "warp", "torch", "rsl_rl", "numpy")
+    packages = {"warp": "warp-lang", "rsl_rl": "rsl-rl-lib"}
     found = {"python": platform.python_version(), "pronk": pronk.__version__}
-    for name, distribution in _DISTRIBUTIONS.items():
-        try:
-            found[name] = metadata.version(distribution)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+    return found | {name: metadata.version(packages.get(name, name)) for name in modules}
 
 
 def contract_for(
@@ -108,10 +94,7 @@ def contract_for(
 
 
 def export_policy(actor: EstimatorActor, contract: Contract, path: Path) -> None:
-    """Write `policy.onnx`, whole or not at all; the actor stays unchanged.
-
-    With a contract without jump input the graph has none: the actor's is zero.
-    """
+    """Write `policy.onnx`, whole or not at all; without jump input the actor's is zero."""
     import onnx
 
     inputs = {"measured": MEASURED_SIZE} | ({"jump": 1} if contract.jump else {})
@@ -141,24 +124,15 @@ def export_policy(actor: EstimatorActor, contract: Contract, path: Path) -> None
         onnx.save(model, aside)
 
 
-def verify(path: Path, actor: EstimatorActor, observations: Mapping[str, Tensor]) -> float | None:
+def verify(path: Path, actor: EstimatorActor, observations: Mapping[str, Tensor]) -> float:
     """Largest absolute difference of all outputs between an exported policy and its actor.
 
-    Both compute on the CPU: a GPU may round matrix products to TF32.
-
-    Args:
-        path: From `export_policy`.
-        actor: The actor that was exported.
-        observations: "measured" (N, 105) and, for a policy that jumps, "jump" (N, 1).
-
-    Returns:
-        The difference; None if ONNX Runtime is not installed.
+    Both compute on the CPU: a GPU may round matrix products to TF32. `observations` has "measured"
+    (N, 105) and, for a policy that jumps, "jump" (N, 1).
 
     Raises:
         ArtefactError: The file cannot be run, or an input or output is not finite.
     """
-    if importlib.util.find_spec("onnxruntime") is None:
-        return None
     policy = load_policy(path)
     names = ("measured", "jump") if policy.contract.jump else ("measured",)
     inputs = [observations[name].detach().to("cpu", torch.float32) for name in names]

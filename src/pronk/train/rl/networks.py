@@ -75,7 +75,6 @@ class JumpLinear(nn.Linear):
     """
 
     def __init__(self, layer: nn.Linear, jump_size: int) -> None:
-        """Split the last `jump_size` inputs off a layer."""
         super().__init__(layer.in_features - jump_size, layer.out_features)
         with torch.no_grad():
             self.weight.copy_(layer.weight[:, : self.in_features])
@@ -131,16 +130,8 @@ class JumpModel(MLPModel):
     jump_size: int
     """Number of jump inputs."""
 
-    def __init__(
-        self,
-        obs: TensorDict,
-        obs_groups: dict[str, list[str]],
-        obs_set: str,
-        output_dim: int,
-        **cfg: Any,
-    ) -> None:
-        """Called by rsl_rl with an observation (for its sizes) and the groups of each set."""
-        super().__init__(obs, obs_groups, obs_set, output_dim, **cfg)
+    def __init__(self, *args: Any, **cfg: Any) -> None:
+        super().__init__(*args, **cfg)
         if self.obs_normalization:
             self.obs_normalizer = RolloutNormalization(self.obs_dim - self.jump_size)
         self.mlp[0] = JumpLinear(self.mlp[0], self.jump_size)
@@ -176,45 +167,29 @@ class Estimator(nn.Module):
     """Foot contacts and trunk velocity from the normalized measurement and the jump input.
 
     A small network beside the actor, trained on the simulator's state while PPO trains the actor
-    that reads its estimate (paper N1; Ji et al. 2022).
+    that reads its estimate (paper N1; Ji et al. 2022). Its input is `ESTIMATOR_INDICES` of the
+    normalized measurement, then the jump input, (..., 102 + jump_size).
     """
 
-    def __init__(
-        self,
-        *,
-        jump_size: int = 1,
-        hidden_dims: Sequence[int] = (256, 128),
-        activation: str = "elu",
-    ) -> None:
-        """Begin with random weights; `activation` by rsl_rl's name."""
+    def __init__(self, jump_size: int = 1, hidden_dims: Sequence[int] = (256, 128)) -> None:
         super().__init__()
-        self.mlp = MLP(ESTIMATOR_SIZE + jump_size, ESTIMATE_SIZE, list(hidden_dims), activation)
+        self.mlp = MLP(ESTIMATOR_SIZE + jump_size, ESTIMATE_SIZE, list(hidden_dims), "elu")
         self.mlp[0] = JumpLinear(self.mlp[0], jump_size)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of the contacts (..., 4) and trunk velocity in the trunk's frame [m/s] (..., 3).
-
-        Args:
-            x: Normalized `ESTIMATOR_INDICES` of the measurement, then the jump input,
-                (..., 102 + jump_size).
-        """
+        """Contact probabilities (..., 4), velocity in the trunk's frame [m/s] (..., 3)."""
         contact, velocity = self.mlp(x).split(list(ESTIMATE.values()), dim=-1)
-        return contact, velocity
-
-    def estimate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """As `forward`, with probabilities instead of logits."""
-        contact, velocity = self(x)
         return torch.sigmoid(contact), velocity
 
     def losses(self, x: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Mean cross entropy of the contacts [nat], mean squared velocity error [m^2/s^2].
 
-        Args:
-            x: As for `forward`.
-            target: Contacts (0 or 1), then velocity, (N, 7).
+        `target` has contacts (0 or 1), then velocity, (N, 7).
         """
-        contact, velocity = self(x)
-        true_contact, true_velocity = target.split(list(ESTIMATE.values()), dim=-1)
+        sizes = list(ESTIMATE.values())
+        (contact, velocity), (true_contact, true_velocity) = (
+            each.split(sizes, dim=-1) for each in (self.mlp(x), target)
+        )
         return (
             nn.functional.binary_cross_entropy_with_logits(contact, true_contact),
             nn.functional.mse_loss(velocity, true_velocity),
@@ -232,30 +207,17 @@ class EstimatorActor(JumpModel):
     jump_group = "jump"
 
     def __init__(
-        self,
-        obs: TensorDict,
-        obs_groups: dict[str, list[str]],
-        obs_set: str,
-        output_dim: int,
-        estimator_hidden_dims: Sequence[int] = (256, 128),
-        **cfg: Any,
+        self, *args: Any, estimator_hidden_dims: Sequence[int] = (256, 128), **cfg: Any
     ) -> None:
-        """Called by rsl_rl; see `JumpModel`."""
-        super().__init__(obs, obs_groups, obs_set, output_dim, **cfg)
-        self.estimator = Estimator(jump_size=self.jump_size, hidden_dims=estimator_hidden_dims)
-        for name, indices in (("actor", ACTOR_INDICES), ("estimator", ESTIMATOR_INDICES)):
-            self.register_buffer(f"_{name}_indices", torch.tensor(indices), persistent=False)
-
-    def _get_obs_dim(
-        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str
-    ) -> tuple[list[str], int]:
-        groups, size = super()._get_obs_dim(obs, obs_groups, obs_set)
-        if size - self.jump_size != MEASURED_SIZE:
+        super().__init__(*args, **cfg)
+        if self.obs_dim - self.jump_size != MEASURED_SIZE:
             raise PronkError(
-                f"the measured vector has {size - self.jump_size} numbers; expected"
+                f"the measured vector has {self.obs_dim - self.jump_size} numbers; expected"
                 f" {MEASURED_SIZE}, as in pronk.policy.observation."
             )
-        return groups, size
+        self.estimator = Estimator(self.jump_size, estimator_hidden_dims)
+        for name, indices in (("actor", ACTOR_INDICES), ("estimator", ESTIMATOR_INDICES)):
+            self.register_buffer(f"_{name}_indices", torch.tensor(indices), persistent=False)
 
     def _get_latent_dim(self) -> int:
         return ACTOR_SIZE + self.jump_size
@@ -266,7 +228,7 @@ class EstimatorActor(JumpModel):
         """The acting network's input, (..., 52 + jump)."""
         measured = self.obs_normalizer(obs[self.group])
         with torch.no_grad():
-            estimate = self.estimator.estimate(self._estimator_input(measured, obs))
+            estimate = self.estimator(self._estimator_input(measured, obs))
         return torch.cat([*estimate, measured[..., self._actor_indices], obs[self.jump_group]], -1)
 
     def limit_noise(self, largest: float) -> None:
@@ -279,8 +241,8 @@ class EstimatorActor(JumpModel):
         return self._estimator_input(self.obs_normalizer(obs[self.group]), obs)
 
     def estimate(self, obs: Observations) -> tuple[Tensor, Tensor]:
-        """Contact probabilities (..., 4), trunk velocity in the trunk's frame [m/s] (..., 3)."""
-        return self.estimator.estimate(self.estimator_input(obs))
+        """The estimator's output for observations."""
+        return self.estimator(self.estimator_input(obs))
 
     def _estimator_input(self, measured: Tensor, obs: Observations) -> Tensor:
         return torch.cat([measured[..., self._estimator_indices], obs[self.jump_group]], dim=-1)
@@ -291,13 +253,3 @@ class JumpCritic(JumpModel):
 
     group = "critic"
     jump_group = "critic_jump"
-
-
-def jump_parameters(*models: nn.Module) -> list[nn.Parameter]:
-    """The weights of the jump inputs of some networks."""
-    return [
-        parameter
-        for model in models
-        for name, parameter in model.named_parameters()
-        if name.endswith(JUMP_WEIGHT)
-    ]

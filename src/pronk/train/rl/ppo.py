@@ -19,7 +19,7 @@ from rsl_rl.storage import RolloutStorage
 from torch import Tensor, nn
 
 from pronk.errors import PronkError
-from pronk.train.rl.networks import EstimatorActor, JumpCritic, average, jump_parameters
+from pronk.train.rl.networks import JUMP_WEIGHT, EstimatorActor, JumpCritic, average
 
 TARGET_GROUP = "estimator_target"
 """The group of observations that the estimator is trained on."""
@@ -68,11 +68,11 @@ class EstimatorPPO(PPO):
         critic: JumpCritic,
         storage: RolloutStorage,
         *,
-        estimator_learning_rate: float = 1e-3,
-        estimator_epochs: int = 1,
-        estimator_mini_batches: int = 8,
-        estimator_contact_coef: float = 1.0,
-        estimator_velocity_coef: float = 1.0,
+        estimator_learning_rate: float,
+        estimator_epochs: int,
+        estimator_mini_batches: int,
+        estimator_contact_coef: float,
+        estimator_velocity_coef: float,
         **cfg: Any,
     ) -> None:
         """Called by rsl_rl with the fields of `EstimatorPpoCfg`.
@@ -92,14 +92,13 @@ class EstimatorPPO(PPO):
                 f"{estimator_learning_rate:g}; expected more than 0."
             )
         super().__init__(actor, critic, storage, **cfg)
-        symmetry: Mapping[str, Any] = cfg.get("symmetry_cfg") or {}
-        self._augments = bool(symmetry) and not symmetry.get("use_mirror_loss")
-        if self._augments:
-            self.symmetry = _Augmentation(**symmetry)
+        if self.symmetry is not None:
+            self.symmetry = _Augmentation(**cfg["symmetry_cfg"])
         self.estimator_epochs = estimator_epochs
         self.estimator_mini_batches = estimator_mini_batches
-        self.estimator_contact_coef = estimator_contact_coef
-        self.estimator_velocity_coef = estimator_velocity_coef
+        self._coefficients = torch.tensor(
+            [estimator_contact_coef, estimator_velocity_coef], device=self.device
+        ).unbind()
         # PPO has put the whole actor under its optimizer; the estimator is part of the actor.
         estimator = list(actor.estimator.parameters())
         own = {id(parameter) for parameter in estimator}
@@ -118,13 +117,11 @@ class EstimatorPPO(PPO):
             Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2].
         """
         losses: dict[str, float] = super().update()
-        if self._augments:
-            del losses["symmetry"]
+        losses.pop("symmetry", None)
         # The storage is cleared by now, but only its cursor: the rollout is still there.
         losses.update(self._update_estimator())
-        observations = self.storage.observations
-        self._raw_actor.learn_normalization(observations, self.gpu_world_size)
-        self._raw_critic.learn_normalization(observations, self.gpu_world_size)
+        for model in (self._raw_actor, self._raw_critic):
+            model.learn_normalization(self.storage.observations, self.gpu_world_size)
         return losses
 
     def _update_estimator(self) -> dict[str, float]:
@@ -134,9 +131,6 @@ class EstimatorPPO(PPO):
         with torch.no_grad():
             inputs = actor.estimator_input(observations).flatten(0, 1)
         targets = observations[TARGET_GROUP].flatten(0, 1)
-        weights = inputs.new_tensor(
-            [self.estimator_contact_coef, self.estimator_velocity_coef]
-        ).unbind()
         history: list[Tensor] = []
         for _ in range(self.estimator_epochs):
             order = torch.randperm(len(inputs), device=inputs.device)
@@ -147,9 +141,12 @@ class EstimatorPPO(PPO):
             for batch, target in zip(*batches, strict=True):
                 losses = actor.estimator.losses(batch, target)
                 optimizer.zero_grad()
-                torch.autograd.backward(losses, weights)
+                torch.autograd.backward(losses, self._coefficients)
                 if self.gpu_world_size > 1:
-                    self._average_gradients(parameters)
+                    gradients = [p.grad for p in parameters if p.grad is not None]
+                    together = nn.utils.parameters_to_vector(gradients)
+                    average(together, self.gpu_world_size)
+                    nn.utils.vector_to_parameters(together, gradients)
                 nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
                 optimizer.step()
                 history += [loss.detach() for loss in losses]
@@ -157,12 +154,6 @@ class EstimatorPPO(PPO):
         optimizer.zero_grad()
         contact, velocity = torch.stack(history).view(-1, 2).mean(dim=0).tolist()
         return {"estimator_contact": contact, "estimator_velocity": velocity}
-
-    def _average_gradients(self, parameters: list[nn.Parameter]) -> None:
-        """Over the processes, in one piece."""
-        gradients = [p.grad for p in parameters if p.grad is not None]
-        together = average(nn.utils.parameters_to_vector(gradients), self.gpu_world_size)
-        nn.utils.vector_to_parameters(together, gradients)
 
     def set_estimator_rate(self, rate: float) -> None:
         """Set the learning rate of the estimator."""
@@ -175,9 +166,11 @@ class EstimatorPPO(PPO):
         With the step count of the other weights, zero moments would count as a long average, and
         the first step would be (1 - 0.9) / sqrt(1 - 0.999) = 3.2 learning rates long.
         """
-        for optimizer in (self.optimizer, self.estimator_optimizer):
-            for parameter in jump_parameters(self._raw_actor, self._raw_critic):
-                optimizer.state.pop(parameter, None)
+        for model in (self._raw_actor, self._raw_critic):
+            for name, parameter in model.named_parameters():
+                if name.endswith(JUMP_WEIGHT):
+                    self.optimizer.state.pop(parameter, None)
+                    self.estimator_optimizer.state.pop(parameter, None)
 
     def save(self) -> dict[str, Any]:
         """State of the networks and both optimizers."""

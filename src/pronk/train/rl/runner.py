@@ -10,6 +10,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -123,12 +124,6 @@ class PronkRunner(MjlabOnPolicyRunner):
     ) -> None:
         """As mjlab makes its runners.
 
-        Args:
-            env: mjlab's `RslRlVecEnvWrapper`, on `device`.
-            train_cfg: The configuration of `rsl_rl.runners.OnPolicyRunner`, as a mapping.
-            log_dir: Folder for figures, checkpoints and policies; None for none.
-            device: Device to compute on.
-
         Raises:
             PronkError: The curriculum's iterations are not as long as the runner's.
         """
@@ -150,13 +145,14 @@ class PronkRunner(MjlabOnPolicyRunner):
         """Further entries for the provenance in the contract of exported policies."""
         self.phases: dict[str, dict[str, Any]] = {}
         """Figures of the phases that were finished: iterations, seconds, and so on."""
-        self.progress: Progress | None = None
-        """Prints a line after each iteration."""
+        self.show_progress = False
+        """Print a line after an iteration, at most one in ten seconds."""
         self.stop_reason = ""
         """If not empty, training ends with a checkpoint after the present iteration."""
         self.deadline = math.inf
         """Training stops after the iteration in which `time.monotonic` passes this [s]."""
         self._seconds = 0.0
+        self._shown = -math.inf
         self._jumping = False
 
     @property
@@ -207,19 +203,30 @@ class PronkRunner(MjlabOnPolicyRunner):
         if after != before or done == 1.0:
             self._finish_phase(before)
         self._begin_iteration()
-        if self.progress is not None:
-            self.progress.show(self, seconds)
+        if self.show_progress:
+            self._show_progress(before, seconds)
         if time.monotonic() > self.deadline and not self.stop_reason:
             self.stop_reason = "the time given by --minutes is over"
-        if self._in_any_process(bool(self.stop_reason)):
+        stops = torch.tensor(float(bool(self.stop_reason)), device=self.device)
+        if self.is_distributed:  # if any process stops, all do
+            torch.distributed.all_reduce(stops, op=torch.distributed.ReduceOp.MAX)
+        if stops:
             raise Stopped
 
-    def _in_any_process(self, flag: bool) -> bool:
-        if not self.is_distributed:
-            return flag
-        raised = torch.tensor(float(flag), device=self.device)
-        torch.distributed.all_reduce(raised, op=torch.distributed.ReduceOp.MAX)
-        return bool(raised.item())
+    def _show_progress(self, phase: str, seconds: float) -> None:
+        done, total, now = self.iteration, self.curriculum.total, time.monotonic()
+        if now - self._shown < 10.0 and done < total:
+            return
+        self._shown = now
+        steps = self.curriculum.steps_per_iteration * self.env.num_envs * self.gpu_world_size
+        words = [f"{phase} {done}/{total}", f"{steps / seconds:,.0f} steps/s"]
+        if self.logger.rewbuffer:
+            words.append(f"reward {self.logger.rewbuffer[0]:.2f}")
+            words.append(f"episode {self.logger.lenbuffer[0]:.0f} steps")
+        fraction = float(motion_command(self.env.unwrapped).ranges.fraction)
+        words.append(f"speed range {fraction:.2f}")
+        words.append(f"{timedelta(seconds=round(seconds * (total - done)))} left")
+        note(self.gpu_global_rank, "  ".join(words))
 
     # --- Phases ----------------------------------------------------------------------------------
 
@@ -243,7 +250,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             path = self.folder / ("policy.onnx" if last else "walk.onnx")
             self.phases[name]["onnx_difference"] = self._export(path, name)
 
-    def _export(self, path: Path, phase: str) -> float | None:
+    def _export(self, path: Path, phase: str) -> float:
         """Write a policy; largest difference of its outputs from PyTorch's on the last rollout."""
         env = self.env.unwrapped
         command, action = motion_command(env), joint_position_action(env)
@@ -270,11 +277,10 @@ class PronkRunner(MjlabOnPolicyRunner):
         export_policy(actor, contract, path)
         observations = self.alg.storage.observations.flatten(0, 1)[:_COMPARED]
         difference = verify(path, actor, {n: observations[n] for n in ("measured", "jump")})
-        if difference is not None and not difference <= TOLERANCE:
-            print(  # noqa: T201
-                f"warning: {path} differs from PyTorch by {difference:.1e}, more than "
-                f"{TOLERANCE:g}",
-                file=sys.stderr,
+        if not difference <= TOLERANCE:
+            note(
+                self.gpu_global_rank,
+                f"warning: {path} differs from PyTorch by {difference:.1e}, over {TOLERANCE:g}",
             )
         return difference
 
@@ -353,42 +359,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         return f"learning diverged in iteration {self.iteration}: {reason}; {way_out}."
 
 
-class Progress:
-    """A line on standard error after an iteration, at most one in ten seconds."""
-
-    def __init__(self, least_s: float = 10.0) -> None:
-        self._least_s = least_s
-        self._last = -math.inf
-
-    def note(self, rank: int, text: str) -> None:
-        """Print one line of the first process."""
-        if rank == 0:
-            print(text, file=sys.stderr, flush=True)  # noqa: T201
-
-    def show(self, runner: PronkRunner, seconds: float) -> None:
-        """Print the progress of a runner whose last iteration took `seconds`."""
-        done, total = runner.iteration, runner.curriculum.total
-        now = time.monotonic()
-        if now - self._last < self._least_s and done < total:
-            return
-        self._last = now
-        phase, _ = phase_at(runner.curriculum.iterations, done - 1)
-        steps = runner.curriculum.steps_per_iteration * runner.env.num_envs * runner.gpu_world_size
-        words = [f"{phase} {done}/{total}", f"{steps / seconds:,.0f} steps/s"]
-        if runner.logger.rewbuffer:
-            words.append(f"reward {runner.logger.rewbuffer[0]:.2f}")
-            words.append(f"episode {runner.logger.lenbuffer[0]:.0f} steps")
-        fraction = float(motion_command(runner.env.unwrapped).ranges.fraction)
-        words.append(f"speed range {fraction:.2f}")
-        words.append(f"{duration(seconds * (total - done))} left")
-        self.note(runner.gpu_global_rank, "  ".join(words))
-
-
-def duration(seconds: float) -> str:
-    """A duration for people: 48 s, 3 min 20 s, 1 h 05 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+def note(rank: int, text: str) -> None:
+    """Print a line of the first process on standard error."""
+    if rank == 0:
+        print(text, file=sys.stderr, flush=True)  # noqa: T201

@@ -14,6 +14,7 @@ extension trains on both sides (Mittal et al. 2024):
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -56,53 +57,44 @@ _FEET = (
 """Quantities by leg; stiffness and damping are those of one joint group after the other."""
 
 
-class Mirror:
-    """Mirror image of a vector of named parts: mirrored[i] = sign[i] * original[source[i]].
+def mirrored(group: str, x: Tensor, body: Legged) -> Tensor:
+    """The mirror image of (..., size) in a group of `GROUPS`; applied twice it is the identity.
 
-    Applied twice it is the identity. A part longer than its quantity is a history of it.
+    Raises:
+        PronkError: There is no such group.
     """
-
-    def __init__(
-        self, parts: Mapping[str, int], body: Legged, device: torch.device | str = "cpu"
-    ) -> None:
-        """Prepare for parts given by name and size, in order.
-
-        Raises:
-            PronkError: A part has no whole number of samples.
-        """
-        source: list[int] = []
-        signs: list[float] = []
-        for name, size in parts.items():
-            indices, factors = _mirrored(name, body)
-            if size % len(indices):
-                raise PronkError(
-                    f"{name} has {size} numbers; expected a multiple of {len(indices)}."
-                )
-            for _ in range(size // len(indices)):
-                start = len(source)
-                source += [start + i for i in indices]
-                signs += factors
-        self._source = torch.tensor(source, device=device)
-        self._sign = torch.tensor(signs, device=device)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """The mirror image of (..., size)."""
-        return x[..., self._source] * self._sign
+    if group not in GROUPS:
+        raise PronkError(
+            f"the observation group {group!r} has no known layout; expected one of "
+            f"{', '.join(GROUPS)}."
+        )
+    source, sign = _mirror(group, body.legs, body.leg_joints, x.device)
+    return x[..., source] * sign
 
 
-def _mirrored(name: str, body: Legged) -> tuple[list[int], list[float]]:
-    """Source and sign of one sample of a quantity; unchanged unless it is listed above."""
-    other_leg = [body.legs.index(leg[0] + {"R": "L", "L": "R"}[leg[1]]) for leg in body.legs]
-    if name in _SIGNS:
-        return [0, 1, 2], list(_SIGNS[name])
-    if name in _FEET:
-        return other_leg, [1.0] * len(other_leg)
-    if name in _JOINTS:
-        joints = body.leg_joints
-        indices = [leg * len(joints) + i for leg in other_leg for i in range(len(joints))]
-        signs = [-1.0 if joint == "hip_roll" else 1.0 for _ in body.legs for joint in joints]
-        return indices, signs
-    return [0], [1.0]
+@lru_cache
+def _mirror(
+    group: str, legs: tuple[str, ...], joints: tuple[str, ...], device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Index and sign of the number of the original that each number of the image is."""
+    other_leg = [legs.index(leg[0] + {"R": "L", "L": "R"}[leg[1]]) for leg in legs]
+    source: list[int] = []
+    signs: list[float] = []
+    for name, size in GROUPS[group].items():
+        indices, factors = [0], [1.0]
+        if name in _SIGNS:
+            indices, factors = [0, 1, 2], list(_SIGNS[name])
+        elif name in _FEET:
+            indices, factors = other_leg, [1.0] * len(legs)
+        elif name in _JOINTS:
+            indices = [leg * len(joints) + i for leg in other_leg for i in range(len(joints))]
+            factors = [-1.0 if joint == "hip_roll" else 1.0 for _ in legs for joint in joints]
+        # A part longer than its quantity is a history of it, or one for each joint group.
+        for _ in range(size // len(indices)):
+            start = len(source)
+            source += [start + i for i in indices]
+            signs += factors
+    return torch.tensor(source, device=device), torch.tensor(signs, device=device)
 
 
 def with_mirror_image(
@@ -117,34 +109,13 @@ def with_mirror_image(
 
     Returns:
         The same with 2 N rows; None stays None.
-
-    Raises:
-        PronkError: There is a group without a layout in `GROUPS`.
     """
     body = motion_command(env.unwrapped).body
-    both = None
+
+    def both(group: str, x: Tensor) -> Tensor:
+        return torch.cat([x, mirrored(group, x, body)])
+
     if obs is not None:
-        groups = {
-            name: torch.cat([group, _mirror(name, body, group.device)(group)])
-            for name, group in obs.to_dict().items()
-        }
-        both = TensorDict(groups, batch_size=[2 * obs.batch_size[0]], device=obs.device)
-    if actions is not None:
-        mirror = _mirror("action", body, actions.device)
-        actions = torch.cat([actions, mirror(actions)])
-    return both, actions
-
-
-_MIRRORS: dict[tuple[str, tuple[str, ...], torch.device], Mirror] = {}
-
-
-def _mirror(group: str, body: Legged, device: torch.device) -> Mirror:
-    if group not in GROUPS:
-        raise PronkError(
-            f"the observation group {group!r} has no known layout; expected one of "
-            f"{', '.join(GROUPS)}."
-        )
-    key = (group, body.legs, device)
-    if key not in _MIRRORS:
-        _MIRRORS[key] = Mirror(GROUPS[group], body, device)
-    return _MIRRORS[key]
+        groups = {name: both(name, x) for name, x in obs.to_dict().items()}
+        obs = TensorDict(groups, batch_size=[2 * obs.batch_size[0]], device=obs.device)
+    return obs, None if actions is None else both("action", actions)
