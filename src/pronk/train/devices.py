@@ -16,8 +16,14 @@ from typing import Any
 from pronk.errors import PronkError
 
 _MODULES = (
-    *("smooth", "sensor", "passive", "derivative"),
-    *("solver", "forward", "support", "constraint"),
+    "smooth",
+    "sensor",
+    "passive",
+    "derivative",
+    "solver",
+    "forward",
+    "support",
+    "constraint",
 )
 """Of MuJoCo Warp, launched in every step of every model, the longest to compile first."""
 

@@ -114,11 +114,9 @@ TASKS: Mapping[str, Mapping[str, int]] = {
 
 
 def phase_at(iterations: Mapping[str, int], iteration: int) -> tuple[str, float]:
-    """The phase of an iteration, and the fraction of it that is over before.
+    """The phase of an iteration, counted from 0, and the fraction of it that is over before.
 
-    Args:
-        iterations: Of each phase by name.
-        iteration: Counted from 0; beyond the last, the last phase is over.
+    Beyond the last iteration the last phase is over.
 
     Raises:
         PronkError: There is no phase.
@@ -142,8 +140,7 @@ class Curriculum:
     """
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
-        iterations = {name: cfg.params[name] for name in PHASES}
-        self.iterations = iterations
+        self.iterations = {name: cfg.params[name] for name in PHASES}
         """Of each phase."""
         self.steps_per_iteration: int = cfg.params["steps_per_iteration"]
         self._set = -1

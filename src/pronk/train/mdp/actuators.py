@@ -140,10 +140,8 @@ class Battery:
     def set(self, voltage: Tensor, resistance: Tensor, rated: float) -> None:
         """Give every robot its battery.
 
-        Args:
-            voltage: At no load [V]. (N, 1)
-            resistance: Of battery and wires [ohm]. (N, 1)
-            rated: Voltage of the drives' stall torque [V].
+        `voltage` at no load [V] and `resistance` with the wires [ohm] are (N, 1); `rated` is the
+        voltage of the drives' stall torque [V].
         """
         self.no_load.copy_(voltage / rated)
         self.drop.copy_(4.0 * resistance / rated**2)

@@ -84,10 +84,10 @@ class MotionCommand(CommandTerm):
         """Forward, left [m/s], yaw rate [rad/s], in the trunk's frame. (N, 3)"""
         self.jump = torch.zeros(count, dtype=torch.bool, device=device)
         """Jump input. (N,)"""
-        data = env.scene["robot"].data
-        self.default_position: Tensor = data.default_joint_pos
+        entity = env.scene["robot"]
+        self.default_position: Tensor = entity.data.default_joint_pos
         """[rad]. (N, 12)"""
-        self.position_limits: Tensor = data.joint_pos_limits
+        self.position_limits: Tensor = entity.data.joint_pos_limits
         """[rad]. (N, 12, 2)"""
         nominal = [cfg.gains.groups[joint.group] for joint in self.robot.joints]
         self.stiffness = torch.tensor([gains.stiffness for gains in nominal], device=device)
@@ -120,7 +120,6 @@ class MotionCommand(CommandTerm):
         self._least, self._most = spans.to(device).T[:, :, None]
         # The golden ratio spreads any fraction evenly over the robots.
         self._rank = (torch.arange(count, device=device) * 0.6180339887) % 1.0
-        entity = env.scene["robot"]
         sites = [f"{leg}_foot" for leg in self.body.legs]
         feet, _ = entity.find_sites(sites, preserve_order=True)
         self.feet: Tensor = entity.indexing.site_ids[feet].long()
@@ -233,22 +232,20 @@ class MotionCommand(CommandTerm):
         if env_ids is not None:
             return
         if not self.scripted:
-            self._redraw(dt)
+            self.time_left -= dt
+            due = self.time_left <= 0.0
+            velocity, time, on, off = self._draw(self.num_envs)
+            self.velocity = torch.where(due[:, None], velocity, self.velocity)
+            self.time_left = torch.where(due, time, self.time_left)
+            if self.cfg.jump_fraction <= 0.0:
+                self.jump.zero_()
+            else:
+                self._jump_left -= dt
+                turn = (self._jump_left <= 0.0) & self.jumper
+                self.jump = self.jump ^ turn
+                change = torch.where(self.jump, on, off)
+                self._jump_left = torch.where(turn, change, self._jump_left)
         self._set_guidance()
-
-    def _redraw(self, dt: float | Tensor) -> None:
-        self.time_left -= dt
-        due = self.time_left <= 0.0
-        velocity, time, on, off = self._draw(self.num_envs)
-        self.velocity = torch.where(due[:, None], velocity, self.velocity)
-        self.time_left = torch.where(due, time, self.time_left)
-        if self.cfg.jump_fraction <= 0.0:
-            self.jump.zero_()
-            return
-        self._jump_left -= dt
-        turn = (self._jump_left <= 0.0) & self.jumper
-        self.jump = self.jump ^ turn
-        self._jump_left = torch.where(turn, torch.where(self.jump, on, off), self._jump_left)
 
     def _set_guidance(self) -> None:
         """Set what the action term adds to the targets of the coming step."""

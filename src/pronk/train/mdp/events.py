@@ -80,11 +80,7 @@ def sample_gains(gains: GroupGains, shape: Shape, n: int, device: str) -> Tensor
 
 
 def check_ellipsoid(gains: GroupGains) -> None:
-    """Refuse gains without an ellipsoid, or whose ellipsoid reaches gains that are not positive.
-
-    Raises:
-        PronkError: The message names the gains.
-    """
+    """PronkError for gains without an ellipsoid, or whose ellipsoid reaches gains of 0 or less."""
     (a, b), (c, d) = gains.ellipsoid
     least = (
         gains.ellipsoid_center[0] - max(a, 0.0) ** 0.5,
@@ -105,14 +101,8 @@ def randomize_shank_length(
     """Draw the length of every shank, knee axis to foot centre (D5).
 
     The foot moves along the shank, and the shank's capsule ends as far from the foot as before.
-    Mass and inertia of the shank stay: a tube cut by 7 % changes them no more.
-
-    Args:
-        env: The environment.
-        env_ids: Not used; all robots draw.
-        span: Of the length [m].
-        feet: The feet's geoms and sites.
-        shanks: Capsules of the shanks, along z, as many as feet and in the same order.
+    Mass and inertia of the shank stay: a tube cut by 7 % changes them no more. `span` is of the
+    length [m]; `shanks` are capsules along z, as many as `feet` and in the same order.
     """
     robot, model = env.scene["robot"], env.sim.model
     foot, shank = (robot.indexing.geom_ids[cfg.geom_ids] for cfg in (feet, shanks))
@@ -184,15 +174,9 @@ def reset_state(
     """Draw the state in which an episode begins, about the initial state, which stands upright.
 
     mjlab's events for this draw all six axes of pose and twist, in four times the operations: a
-    seventh of a training step with thousands of robots.
-
-    Args:
-        env: The environment.
-        env_ids: Robots that start a new episode. (n,)
-        place: Half-width of the position along world x and y [m].
-        speed: Half-width of the velocity along world x and y [m/s].
-        heading: Half-width of the yaw angle [rad].
-        joints: Half-width of joint positions about the default pose [rad].
+    seventh of a training step with thousands of robots. Arguments are half-widths: `place` of the
+    position [m] and `speed` of the velocity [m/s] along world x and y, `heading` of the yaw angle
+    [rad], `joints` of the joint positions about the default pose [rad].
     """
     robot = env.scene["robot"]
     root = robot.data.default_root_state[env_ids]

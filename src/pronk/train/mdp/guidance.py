@@ -22,13 +22,9 @@ _DIFFERENCE = 1e-4
 
 
 def leg_angles(body: Legged, length: Tensor) -> tuple[Tensor, Tensor]:
-    """Hip pitch and knee [rad] of a leg whose foot is below its hip.
+    """Hip pitch and knee [rad] of a leg whose foot is below its hip, bent as in the default pose.
 
-    The knee bends as in the default pose.
-
-    Args:
-        body: Dimensions of the robot.
-        length: From the axis of the hip pitch to the foot [m]; at most that of a straight leg.
+    `length` is from the axis of the hip pitch to the foot [m], at most that of a straight leg.
     """
     thigh, shank = body.thigh_length, body.shank_length
     cosine = (length.square() - thigh**2 - shank**2) / (2.0 * thigh * shank)

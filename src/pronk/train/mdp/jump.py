@@ -82,14 +82,11 @@ class JumpSettings:
         return (self.liftoff_velocity + self.fall * self.fall_s) / (self.prompt_s - self.fall_s)
 
     def countermovement(self, since: Tensor) -> Tensor:
-        """Leg length minus that of the default pose in a jump that falls and then pushes [m].
+        """Leg length minus that of the default pose in a jump, `since` the command [s] [m].
 
         The trunk falls with `fall` for `fall_s`; then its velocity rises evenly, by `push`, to
         `liftoff_velocity` at `prompt_s`. The feet stay in place. This takes about a third of the
         power of a push at once.
-
-        Args:
-            since: Time since the command [s]; any shape.
         """
         falls = since.clamp_max(self.fall_s)
         pushes = (since - self.fall_s).clamp_min(0.0)

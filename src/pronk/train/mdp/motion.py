@@ -73,9 +73,7 @@ class Motion:
 def leg_length(body: Legged, knee: Tensor) -> Tensor:
     """From the axis of the hip pitch to the foot's centre, in the leg's plane [m].
 
-    Args:
-        body: Dimensions of the robot.
-        knee: Angle of the knee [rad], 0 for a straight leg; any shape.
+    `knee` is its angle [rad], 0 for a straight leg; any shape.
     """
     thigh, shank = body.thigh_length, body.shank_length
     return (thigh**2 + shank**2 + 2.0 * thigh * shank * torch.cos(knee)).sqrt()
@@ -89,13 +87,9 @@ def standing_leg(body: Legged) -> float:
 def measure_motion(
     env: ManagerBasedRlEnv, body: Legged, feet: Tensor, before: Motion | None
 ) -> Motion:
-    """Measure the step just simulated.
+    """Measure the step just simulated, of an environment in which nothing but the robot moves.
 
-    Args:
-        env: The environment; the robot is the only thing in it that moves.
-        body: Dimensions of the robot.
-        feet: The foot sites' ids in the model. (L,)
-        before: The step before; None at the very first.
+    `feet` has the foot sites' ids in the model, (L,); `before` is the step before, if any.
     """
     robot, physics = env.scene["robot"].data, env.sim.data
     ground = env.scene["feet"].data

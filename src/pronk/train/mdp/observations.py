@@ -17,46 +17,20 @@ from pronk.train.mdp.commands import motion_command
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-CRITIC = {
-    "angular_velocity": 3,
-    "projected_gravity": 3,
-    "command": 3,
-    "time_left": 1,
-    "joint_position": 12,
-    "joint_velocity": 12,
-    "action": 12,
-    "linear_velocity": 3,
-    "height": 1,
-    "foot_contact": 4,
-    "foot_force": 4,
-    "foot_height": 4,
-    "voltage": 1,
-    "no_load": 1,
-    "drop": 1,
-    "friction": 1,
-    "base_mass": 1,
-    "delay": 1,
-    "shank_length": 4,
-    "stiffness": 12,
-    "damping": 12,
-}
+_TRUNK = {"angular_velocity": 3, "projected_gravity": 3, "command": 3, "time_left": 1}
+_MOTION = {"joint_position": 12, "joint_velocity": 12, "action": 12, "linear_velocity": 3}
+_GROUND = {"height": 1, "foot_contact": 4, "foot_force": 4, "foot_height": 4}
+_BATTERY = {"voltage": 1, "no_load": 1, "drop": 1}
+_BODY = {"friction": 1, "base_mass": 1, "delay": 1, "shank_length": 4}
+RANDOMIZED = {**_BATTERY, **_BODY, "stiffness": 12, "damping": 12}
+"""Parameters that are drawn for each robot, see `randomized_parameters`."""
+CRITIC = {**_TRUNK, **_MOTION, **_GROUND, **RANDOMIZED}
 """Parts of the critic's vector, in order, and their sizes. With the randomized parameters of the
 robot and the time that its velocity command lasts, they explain differences between returns."""
 
-CRITIC_JUMP = {
-    "jump": 1,
-    "mode": 1,
-    "since": 1,
-    "airborne": 1,
-    "best_score": 1,
-    "travel": 1,
-    "reward_scale": 1,
-    "overspeed": 1,
-    "flight": 1,
-    "best_flight": 1,
-    "jumper": 1,
-    "jump_left": 1,
-}
+_LIFTOFF = ("mode", "since", "airborne", "best_score", "travel", "reward_scale", "overspeed")
+_FLIGHT = ("flight", "best_flight")
+CRITIC_JUMP = dict.fromkeys(("jump", *_LIFTOFF, *_FLIGHT, "jumper", "jump_left"), 1)
 """Parts of the critic's jump vector; zeros as long as no robot gets a jump input. Jump commands
 come at random and earn more than seconds of walking: without knowing whether and when one comes,
 most of the difference between two returns would hide the effect of an action."""
@@ -98,7 +72,7 @@ def jump(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def estimator_target(env: ManagerBasedRlEnv) -> Tensor:
-    """Contacts (0 or 1), velocity in the trunk's frame [m/s]. (N, 7)."""
+    """Contacts (0 or 1), then velocity in the trunk's frame [m/s]. (N, 7)."""
     contact = env.scene["feet"].data.found > 0
     return torch.cat([contact.float(), _linear_velocity(env)], dim=-1)
 
@@ -129,7 +103,7 @@ def critic(env: ManagerBasedRlEnv) -> Tensor:
 
 
 def randomized_parameters(env: ManagerBasedRlEnv) -> list[Tensor]:
-    """The parts of `CRITIC` that are drawn for each robot, in order. (N, size) each.
+    """The parts of `RANDOMIZED`, in order. (N, size) each.
 
     Stiffness and damping by joint group and leg; `voltage` is the battery's present one over the
     rated one, `drop` in 1/kW; foot to knee axis in m, mass in kg, delay in physics steps.
@@ -155,24 +129,11 @@ def randomized_parameters(env: ManagerBasedRlEnv) -> list[Tensor]:
 def critic_jump(env: ManagerBasedRlEnv) -> Tensor:
     """The parts of `CRITIC_JUMP`. (N, 12)."""
     command = motion_command(env)
-    state = command.state
-    parts = [
-        command.jump,
-        state.mode,
-        state.since,
-        state.airborne,
-        state.best_score,
-        state.travel,
-        state.reward_scale,
-        state.overspeed,
-        state.flight,
-        state.best_flight,
-        command.jumper,
-        command.jump_left,
-    ]
-    used = command.cfg.jump_fraction > 0.0 or command.scripted
-    parts = [part.float() for part in parts]
-    return torch.stack(parts, dim=-1) if used else env.sim.data.qpos.new_zeros(env.num_envs, 12)
+    inside = [getattr(command.state, name) for name in (*_LIFTOFF, *_FLIGHT)]
+    parts = [command.jump, *inside, command.jumper, command.jump_left]
+    if not (command.cfg.jump_fraction > 0.0 or command.scripted):
+        return env.sim.data.qpos.new_zeros(env.num_envs, len(parts))
+    return torch.stack([part.float() for part in parts], dim=-1)
 
 
 def _linear_velocity(env: ManagerBasedRlEnv) -> Tensor:

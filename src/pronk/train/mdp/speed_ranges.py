@@ -66,9 +66,8 @@ class SpeedRanges:
     def advance(self, error: Tensor, counted: Tensor) -> None:
         """Advance by one policy step.
 
-        Args:
-            error: Of the horizontal velocity [m/s]. (N, 2)
-            counted: Robots that count: those outside jump mode. Bool, (N,)
+        `error` is of the horizontal velocity [m/s], (N, 2); `counted` are the robots outside jump
+        mode, bool, (N,).
         """
         # A robot with a state that is not finite counts as not tracking.
         kernel = torch.exp(error.square().sum(dim=-1) * -4.0).nan_to_num() * counted

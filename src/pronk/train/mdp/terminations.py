@@ -12,27 +12,20 @@ if TYPE_CHECKING:
 
 
 def fell(env: ManagerBasedRlEnv, tilt_cosine: float, height: float) -> Tensor:
-    """The trunk leans too far or lies on the ground. Bool, (N,).
+    """The trunk is below `height` [m], or leans so that the cosine is below `tilt_cosine`. (N,).
 
-    Args:
-        env: The environment.
-        tilt_cosine: Least cosine of the angle between the trunk's z axis and the vertical.
-        height: Least height of the trunk [m].
+    The cosine is that of the angle between the trunk's z axis and the vertical.
     """
     qpos = env.sim.data.qpos
-    # The cosine is 1 - 2 (x^2 + y^2) of the quaternion (w, x, y, z).
+    # It is 1 - 2 (x^2 + y^2) of the quaternion (w, x, y, z).
     leaning = qpos[:, 4:6].square().sum(dim=-1) > (1.0 - tilt_cosine) / 2.0
     return leaning | (qpos[:, 2] < height)
 
 
 def non_finite(env: ManagerBasedRlEnv, speed: float) -> Tensor:
-    """State that is not finite, or faster than the robot can be. Bool, (N,).
+    """State that is not finite, or a joint or trunk faster than `speed` [rad/s, m/s]. (N,).
 
     Ends the episode of this robot alone.
-
-    Args:
-        env: The environment.
-        speed: Largest plausible velocity, joint or trunk [rad/s, m/s].
     """
     # A largest magnitude is NaN if one of them is, and NaN is no less than anything.
     fastest = torch.linalg.vector_norm(env.sim.data.qvel, ord=torch.inf, dim=-1)
@@ -41,10 +34,5 @@ def non_finite(env: ManagerBasedRlEnv, speed: float) -> Tensor:
 
 
 def time_out(env: ManagerBasedRlEnv, steps: int) -> Tensor:
-    """A fixed number of policy steps, however long each takes (D1 varies it). Bool, (N,).
-
-    Args:
-        env: The environment.
-        steps: Policy steps in an episode.
-    """
+    """The episode has `steps` policy steps, however long each took (D1 varies it). (N,)."""
     return env.episode_length_buf >= steps

@@ -10,7 +10,6 @@ A robot outside this package has a task if `env_cfgs.py` (with `env_cfg`) and, o
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,14 +24,24 @@ from mjlab.tasks.registry import register_mjlab_task
 from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.train.gains import NAIVE, training_gains
+from pronk.train.gains import NAIVE, TrainingGains, training_gains
 from pronk.train.phases import TASKS
 from pronk.train.rl.runner import PronkRunner
-from pronk.train.tasks.jump_env_cfg import play_cfg
+from pronk.train.tasks.jump_env_cfg import jump_env_cfg, play_cfg
 from pronk.train.tasks.jump_rl_cfg import jump_rl_cfg
 
-ROBOTS = ("mini_cheetah",)
-"""Robots of this package with a task."""
+
+def mini_cheetah(robot: RobotSpec, gains: TrainingGains, **options: Any) -> ManagerBasedRlEnvCfg:
+    """The shared environment with the paper's randomization; options are those of it."""
+    cfg = jump_env_cfg(robot, gains, **options)
+    cfg.events["shank_length"].params["span"] = (0.18, 0.20)  # D5 [m]
+    cfg.events["base_mass"].params["added"] = (-0.4, 1.6)  # D6 [kg]
+    cfg.events["battery"].params["voltage"] = (22.2, 25.2)  # six cells, 3.7 to 4.2 V
+    return cfg
+
+
+ROBOTS = {"mini_cheetah": mini_cheetah}
+"""Robots of this package with a task, and their environments."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,21 +62,16 @@ def load_task(robot: str) -> Task:
     """
     spec = load_robot(robot)
     if spec.source in ROBOTS:
-        package = f"{__name__}.config.{spec.source}"
-        modules = [importlib.import_module(f"{package}.{n}") for n in ("env_cfgs", "rl_cfg")]
-        return Task(robot=spec, env_cfg=modules[0].env_cfg, rl_cfg=modules[1].rl_cfg)
+        return Task(robot=spec, env_cfg=ROBOTS[spec.source], rl_cfg=jump_rl_cfg)
     folder = Path(spec.source).parent
-    path = folder / "env_cfgs.py"
+    path, own = folder / "env_cfgs.py", folder / "rl_cfg.py"
     if not path.is_file():
         raise PronkError(
             f"{robot} has no training task: expected {path} with a function env_cfg, or one of the "
             f"robots {', '.join(ROBOTS)}."
         )
-    env = _function(path, "env_cfg")
-    own = folder / "rl_cfg.py"
-    return Task(
-        robot=spec, env_cfg=env, rl_cfg=_function(own, "rl_cfg") if own.is_file() else jump_rl_cfg
-    )
+    rl_cfg = _function(own, "rl_cfg") if own.is_file() else jump_rl_cfg
+    return Task(robot=spec, env_cfg=_function(path, "env_cfg"), rl_cfg=rl_cfg)
 
 
 def _function(path: Path, name: str) -> Callable[..., Any]:

@@ -43,6 +43,8 @@ FOOT_CONTACT = (0.0105, 1.0)
 """Time constant [s] and damping ratio of a foot on the ground. With MuJoCo's .02 the feet of a
 landing robot sink in by 19 to 28 mm, so that its shanks touch the floor; MuJoCo takes no less than
 twice the physics step."""
+EPISODE_S = 20.0
+"""Longest episode at the nominal policy rate [s]."""
 DELAY_STEPS = 1
 """Half-width of the command delay about the matched one [physics steps]. Not in the paper."""
 
@@ -55,7 +57,6 @@ def jump_env_cfg(
     gain_shape: events.Shape = "box",
     num_envs: int = 4096,
     seed: int = 0,
-    episode_s: float = 20.0,
 ) -> ManagerBasedRlEnvCfg:
     """The environment of all phases.
 
@@ -66,7 +67,6 @@ def jump_env_cfg(
         gain_shape: Whether gains are drawn from the box or the ellipsoid of each group.
         num_envs: Number of robots.
         seed: Of all draws.
-        episode_s: Longest episode at the nominal policy rate [s].
     """
     delay = round(gains.delay_s / robot.timestep_s)
     return ManagerBasedRlEnvCfg(
@@ -92,7 +92,7 @@ def jump_env_cfg(
             "time_out": TerminationTermCfg(
                 func=terminations.time_out,
                 time_out=True,
-                params={"steps": round(episode_s * robot.policy_rate_hz)},
+                params={"steps": round(EPISODE_S * robot.policy_rate_hz)},
             ),
             # 70 degrees; the trunk's lower face is 5 cm below its centre.
             "fell": TerminationTermCfg(
@@ -106,7 +106,7 @@ def jump_env_cfg(
                 params={**iterations, "steps_per_iteration": phases.STEPS_PER_ITERATION},
             )
         },
-        episode_length_s=episode_s,
+        episode_length_s=EPISODE_S,
         viewer=ViewerConfig(
             origin_type=ViewerConfig.OriginType.ASSET_BODY,
             entity_name="robot",

@@ -1,1 +1,0 @@
-"""MIT Mini Cheetah, the robot of the paper."""
