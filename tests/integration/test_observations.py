@@ -204,34 +204,21 @@ def test_non_foot_contacts_are_counted(env: Any) -> None:
 def test_layout_of_the_measured_vector(env: Any) -> None:
     """Written out once more, since policies depend on it; histories run from old to new."""
     states, actions = [], []
-    for _ in range(3):
-        actions.append(torch.rand(N, 12))
-        env.action_manager.process_action(actions[-1])
-        states.append(put(env))
-        seen = observe(env)["measured"]
-    qpos, qvel = states[-1]
+    for _ in range(4):
+        actions.append(torch.rand(N, 12) - 0.5)
+        found = {name: group.clone() for name, group in env.step(actions[-1])[0].items()}
+        qpos, qvel = (np.float64(q.numpy()) for q in (env.sim.data.qpos, env.sim.data.qvel))
+        states.append((qpos, qvel))
+    seen = found["measured"]
     assert seen.shape == (N, 105)
     close(seen[:, 0:3], qvel[:, 3:6])
     close(seen[:, 3:6], rotations(qpos).inv().apply([0.0, 0.0, -1.0]))
-    close(seen[:, 6:42], np.hstack([q[:, 7:] - DEFAULT for q, _ in states]))
-    close(seen[:, 42:78], np.hstack([v[:, 6:] for _, v in states]))
-    close(seen[:, 78:102], np.hstack(actions[1:]))
+    close(seen[:, 6:42], np.hstack([q[:, 7:] - DEFAULT for q, _ in states[-3:]]))
+    close(seen[:, 42:78], np.hstack([v[:, 6:] for _, v in states[-3:]]))
+    close(seen[:, 78:102], np.hstack(actions[-2:]))
     close(seen[:, 102:105], motion_command(env).velocity)
-
-
-def test_measured_vector_of_steps_and_of_a_new_episode(env: Any) -> None:
-    """The state at the end of the step, the two before, and the actions that led there."""
-    states, actions = [], []
-    for _ in range(4):
-        actions.append(torch.rand(N, 12) - 0.5)
-        seen = {name: group.clone() for name, group in env.step(actions[-1])[0].items()}
-        position = env.sim.data.qpos[:, 7:].numpy() - DEFAULT
-        states.append((position, env.sim.data.qvel[:, 6:].clone()))
-    close(measured(seen, "joint_position"), np.hstack([q for q, _ in states[-3:]]))
-    close(measured(seen, "joint_velocity"), np.hstack([v for _, v in states[-3:]]))
-    close(measured(seen, "action"), np.hstack(actions[-2:]))
-    actor = seen["measured"][:, list(ACTOR_INDICES)]
-    close(actor[:, 9:], np.hstack([*states[-1], actions[-1]]))
+    now = np.hstack([qpos[:, 7:] - DEFAULT, qvel[:, 6:], actions[-1]])
+    close(seen[:, list(ACTOR_INDICES)][:, 9:], now)
     # A new episode begins with the present as its past; the other robots' histories stay.
     anew = env.reset(env_ids=torch.tensor([4]))[0]
     position = env.sim.data.qpos[4, 7:].numpy() - DEFAULT
@@ -239,7 +226,7 @@ def test_measured_vector_of_steps_and_of_a_new_episode(env: Any) -> None:
     close(measured(anew, "action")[4], 0.0)
     others = torch.arange(N) != 4
     for name in ("joint_position", "joint_velocity", "action"):
-        assert torch.equal(measured(anew, name)[others], measured(seen, name)[others])
+        assert torch.equal(measured(anew, name)[others], measured(found, name)[others])
 
 
 def test_noise_is_uniform_and_on_the_measured_vector_alone() -> None:

@@ -19,9 +19,6 @@ from training_env import N
 
 pytestmark = pytest.mark.train
 
-HEIGHT = 16.0, 16.0, 13.0, 10.0
-"""Weight of jump_height: in jump_a, and in jump_b at the beginning, the middle and the end."""
-
 
 @pytest.fixture
 def env() -> Any:
@@ -39,6 +36,7 @@ def env() -> Any:
         ("walk", 300, ("walk", 1.0)),
         ("together", 0, ("jump_a", 0.0)),
         ("together", 520, ("jump_b", 0.0)),
+        ("together", 1079, ("jump_b", 559 / 560)),
     ],
 )
 def test_phase_of_an_iteration(task: str, iteration: int, expected: tuple[str, float]) -> None:

@@ -19,7 +19,7 @@ import yaml
 
 from pronk.cli import main as cli
 from pronk.policy.runtime import load_policy
-from pronk.train.phases import PHASES, TASKS, phase_at
+from pronk.train.phases import PHASES, TASKS
 from pronk.train.provenance import RunFolder
 from pronk.train.rl import checkpoint
 
@@ -201,15 +201,3 @@ def test_the_reward_rises() -> None:
     runner.learn(35)
     assert runner.logger.rewbuffer[0] > first + 1.0
     env.close()
-
-
-def test_the_curriculum_follows_the_step_counter() -> None:
-    iterations = {"walk": 2, "jump_a": 0, "jump_b": 4}
-    assert [phase_at(iterations, i) for i in (0, 1, 2, 5, 6, 9)] == [
-        ("walk", 0.0),
-        ("walk", 0.5),
-        ("jump_b", 0.0),
-        ("jump_b", 0.75),
-        ("jump_b", 1.0),
-        ("jump_b", 1.0),
-    ]

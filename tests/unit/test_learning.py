@@ -28,7 +28,7 @@ from ppo_case import (
 from pronk.errors import ArtefactError, PronkError
 from pronk.policy.observation import ACTOR_INDICES, ESTIMATOR_INDICES
 from pronk.train.rl import checkpoint
-from pronk.train.rl.networks import JUMP_WEIGHT, Estimator, RolloutNormalization
+from pronk.train.rl.networks import JUMP_WEIGHT, Estimator
 from pronk.train.rl.ppo import EstimatorPPO
 
 pytestmark = pytest.mark.train
@@ -118,8 +118,16 @@ def test_impossible_inputs_are_refused(
 
 
 def test_ppo_and_supervision_change_different_weights() -> None:
+    """Every weight has one optimizer."""
     algorithm = build()
-    actor = algorithm.get_policy()
+    actor, critic = algorithm.get_policy(), algorithm.critic
+    mine, others = (
+        [p for group in optimizer.param_groups for p in group["params"]]
+        for optimizer in (algorithm.estimator_optimizer, algorithm.optimizer)
+    )
+    assert {id(p) for p in mine} == {id(p) for p in actor.estimator.parameters()}
+    everything = [*actor.parameters(), *critic.parameters()]
+    assert sorted(map(id, mine + others)) == sorted(map(id, everything))
     for _ in range(2):  # the second time the estimator has had gradients of its own
         roll_out(algorithm)
         estimator, network = weights(actor.estimator), weights(actor.mlp)
@@ -134,16 +142,6 @@ def test_ppo_and_supervision_change_different_weights() -> None:
     still.update()
     after = [weights(m) for m in (actor.mlp, critic.mlp, actor.estimator)]
     assert [same(x, y) for x, y in zip(before, after, strict=True)] == [True, True, False]
-
-
-def test_every_weight_has_one_optimizer() -> None:
-    algorithm = build()
-    actor, critic = algorithm.get_policy(), algorithm.critic
-    mine = [p for g in algorithm.estimator_optimizer.param_groups for p in g["params"]]
-    others = [p for g in algorithm.optimizer.param_groups for p in g["params"]]
-    assert {id(p) for p in mine} == {id(p) for p in actor.estimator.parameters()}
-    everything = [*actor.parameters(), *critic.parameters()]
-    assert sorted(map(id, mine + others)) == sorted(map(id, everything))
 
 
 def test_losses_are_means_over_the_rollout() -> None:
@@ -204,16 +202,6 @@ def test_statistics_are_those_of_all_rollouts_and_the_first_ratio_is_one() -> No
         torch.testing.assert_close(normalizer.std, std, rtol=1e-4, atol=1e-5)
 
 
-def test_a_normalized_rollout_has_mean_zero_and_spread_one() -> None:
-    normalizer = RolloutNormalization(3)
-    x = torch.randn(4, 50, 3) * torch.tensor([1.0, 10.0, 0.1]) + 5.0
-    normalizer.learn(x)
-    y = normalizer(x).flatten(0, 1)
-    torch.testing.assert_close(y.mean(dim=0), torch.zeros(3), rtol=0, atol=1e-5)
-    flat = x.flatten(0, 1).std(dim=0, correction=0)
-    torch.testing.assert_close(y.std(dim=0, correction=0), flat / (flat + 0.01))
-
-
 # --- The jump input ------------------------------------------------------------------------------
 
 
@@ -258,18 +246,13 @@ def test_fed_zeros_the_jump_input_stays_blank() -> None:
             with_jump = outputs(algorithm, obs)
             obs["jump"], obs["critic_jump"] = obs["jump"] * 0.0, obs["critic_jump"] * 0.0
             assert outputs(algorithm, obs) == with_jump, (rows, threads)
+    # By PyTorch's own linear layer, too.
+    first, x = algorithm.get_policy().mlp[0], torch.randn(7, 53)
+    plain = torch.nn.functional.linear(x[:, :52].contiguous(), first.weight, first.bias)
+    assert torch.equal(first(x), plain)
     roll_out(algorithm)
     algorithm.update()
     assert all(value.any() for value in jump_weights(algorithm))
-
-
-def test_a_layer_with_blank_inputs_is_the_layer_without_them() -> None:
-    """Bit for bit, by PyTorch's own linear layer."""
-    actor = trained(2, jump=False, hidden=PAPER).get_policy()
-    first = actor.mlp[0]
-    x = torch.randn(7, 53)
-    plain = torch.nn.functional.linear(x[:, :52].contiguous(), first.weight, first.bias)
-    assert torch.equal(first(x), plain)
 
 
 def test_the_moments_of_the_jump_inputs_begin_anew() -> None:

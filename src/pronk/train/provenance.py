@@ -88,11 +88,7 @@ class RunFolder:
             )
 
     def read(self) -> dict[str, Any]:
-        """The provenance.
-
-        Raises:
-            ArtefactError: There is no run, or the file is damaged or of another schema.
-        """
+        """The provenance; ArtefactError if there is none or it is damaged or of another schema."""
         path = self.provenance
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
@@ -101,9 +97,8 @@ class RunFolder:
                 f"{self.path} holds no run (no {path.name}); leave --resume out to begin one."
             ) from None
         except (OSError, ValueError) as error:
-            raise ArtefactError(
-                f"{path}: cannot be read as JSON ({type(error).__name__})."
-            ) from error
+            text = f"{path}: cannot be read as JSON ({type(error).__name__})."
+            raise ArtefactError(text) from error
         if not isinstance(found, dict) or found.get("schema") != SCHEMA:
             got = found.get("schema") if isinstance(found, dict) else type(found).__name__
             raise ArtefactError(f"{path}: schema {got!r}; this pronk reads {SCHEMA!r}.")

@@ -60,8 +60,6 @@ class MotionCommandCfg(CommandTermCfg):
     """In jump mode the rewarded horizontal speed is this much higher [m/s], for commands below
     1 m/s in proportion: the paper's robot, too, flew further than command times flight time
     (.60 m at 1 m/s). Ground covered faster is not rewarded."""
-    liftoff_std: float = 1.0
-    """Standard deviation of the lift-off kernel [m/s], see `JumpState`; a phase sets it."""
     settings: JumpSettings = field(default_factory=JumpSettings)
 
     def build(self, env: ManagerBasedRlEnv) -> MotionCommand:
@@ -102,11 +100,10 @@ class MotionCommand(CommandTerm):
         """True: `velocity` and `jump` are set by the caller alone."""
         self.guidance_scale = 0.0
         """Fraction of the guidance that is added to the actions, 0 to 1; a phase sets it."""
-        self._guidance = guidance(
-            self.body, cfg.settings, self.stiffness, self.damping, env.step_dt
-        )
+        gains = (self.stiffness, self.damping)
+        self._guidance = guidance(self.body, cfg.settings, *gains, env.step_dt)
         self._standing_leg = standing_leg(self.body)
-        self.state = JumpState(count, device, cfg.settings, cfg.liftoff_std)
+        self.state = JumpState(count, device, cfg.settings)
         self.ranges = SpeedRanges(cfg.growth, device)
         self._jump_left = torch.zeros(count, device=device)
         self._limits = torch.tensor(cfg.limits, device=device)

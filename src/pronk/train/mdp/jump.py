@@ -97,11 +97,9 @@ class JumpSettings:
 class JumpState:
     """State of the jumps of N robots, and what changed in the last policy step."""
 
-    def __init__(
-        self, count: int, device: torch.device | str, settings: JumpSettings, liftoff_std: float
-    ) -> None:
+    def __init__(self, count: int, device: torch.device | str, settings: JumpSettings) -> None:
         self.settings = settings
-        self.liftoff_std = liftoff_std
+        self.liftoff_std = 1.0
         """Standard deviation of the lift-off kernel [m/s]; a phase sets it."""
 
         def zeros(*shape: int) -> Tensor:
@@ -184,7 +182,7 @@ class JumpState:
         """Advance by one policy step.
 
         Args:
-            jump: Jump input, bool, (N,).
+            jump: Jump input, bool.
             contact: Foot contacts, bool, (N, 4).
             height: Trunk over ground [m].
             vertical: Vertical velocity of the trunk [m/s].

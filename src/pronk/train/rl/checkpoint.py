@@ -100,23 +100,20 @@ def widen_checkpoint(state: Mapping[str, Any]) -> dict[str, Any]:
     if any(name.endswith(JUMP_WEIGHT) for network in networks.values() for name in network):
         return dict(state)
     wide = dict(state)
-    # The parameters in the order of each optimizer, by network and name.
+    # The parameters in the order of each optimizer, by name.
     order: dict[str, list[str]] = {key: [] for key in OPTIMIZERS}
     for network, weights in networks.items():
-        added: dict[str, Tensor] = {}
+        added = wide[f"{network}_state_dict"] = {}
         for name, value in weights.items():
             part = "estimator" if name.startswith("estimator.") else network
-            first = name.endswith("mlp.0.weight")
-            optimizer = OPTIMIZERS[part == "estimator"]
             if not name.startswith("obs_normalizer."):
-                order[optimizer].append(f"{network}.{name}")
+                order[OPTIMIZERS[part == "estimator"]].append(name)
             added[name] = value.clone()
-            if first:
+            if name.endswith("mlp.0.weight"):
                 jump = name.removesuffix("weight") + JUMP_WEIGHT
                 added[jump] = value.new_zeros(len(value), _JUMP_SIZES[part])
-        wide[f"{network}_state_dict"] = added
-    for key in OPTIMIZERS:
-        wide[key] = _widen_optimizer(state[key], order[key])
+    for key, names in order.items():
+        wide[key] = _widen_optimizer(state[key], names)
     return wide
 
 

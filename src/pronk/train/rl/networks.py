@@ -30,8 +30,6 @@ from pronk.policy.observation import (
     MEASURED_SIZE,
 )
 
-HIDDEN_DIMS = (1024, 512, 256)
-"""Of actor and critic (paper N2)."""
 JUMP_WEIGHT = "jump_weight"
 """Last part of the name of a jump input's weights in a network's state."""
 
@@ -40,11 +38,18 @@ Observations = TensorDict | Mapping[str, Tensor]
 
 
 @dataclass
-class EstimatorActorCfg(RslRlModelCfg):
-    """Configuration of the actor and the estimator in it."""
+class JumpCriticCfg(RslRlModelCfg):
+    """Configuration of the critic; sizes of the paper (N2)."""
 
-    hidden_dims: tuple[int, ...] = HIDDEN_DIMS
+    hidden_dims: tuple[int, ...] = (1024, 512, 256)
     obs_normalization: bool = True
+    class_name: str = "pronk.train.rl.networks:JumpCritic"
+
+
+@dataclass
+class EstimatorActorCfg(JumpCriticCfg):
+    """Configuration of the actor, which is as large, and the estimator in it."""
+
     distribution_cfg: dict[str, Any] | None = field(
         default_factory=lambda: {
             "class_name": "GaussianDistribution",
@@ -55,15 +60,6 @@ class EstimatorActorCfg(RslRlModelCfg):
     estimator_hidden_dims: tuple[int, ...] = (256, 128)
     """Of the estimator (paper N1)."""
     class_name: str = "pronk.train.rl.networks:EstimatorActor"
-
-
-@dataclass
-class JumpCriticCfg(RslRlModelCfg):
-    """Configuration of the critic."""
-
-    hidden_dims: tuple[int, ...] = HIDDEN_DIMS
-    obs_normalization: bool = True
-    class_name: str = "pronk.train.rl.networks:JumpCritic"
 
 
 class JumpLinear(nn.Linear):
@@ -128,7 +124,6 @@ class JumpModel(MLPModel):
     jump_group: ClassVar[str]
     """The group that is not."""
     jump_size: int
-    """Number of jump inputs."""
 
     def __init__(self, *args: Any, **cfg: Any) -> None:
         super().__init__(*args, **cfg)

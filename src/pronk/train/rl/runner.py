@@ -27,7 +27,7 @@ from pronk.train.phases import PHASES, curriculum, phase_at
 from pronk.train.rl import checkpoint
 from pronk.train.rl.export import TOLERANCE, contract_for, export_policy, verify
 
-KEPT = 3
+_KEPT = 3
 """Numbered checkpoints that are kept."""
 _COMPARED = 4096
 """Observations that an exported policy is compared on."""
@@ -151,6 +151,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         """If not empty, training ends with a checkpoint after the present iteration."""
         self.deadline = math.inf
         """Training stops after the iteration in which `time.monotonic` passes this [s]."""
+        self._steps_per_iteration = steps * env.num_envs * self.gpu_world_size
         self._seconds = 0.0
         self._shown = -math.inf
         self._jumping = False
@@ -218,8 +219,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         if now - self._shown < 10.0 and done < total:
             return
         self._shown = now
-        steps = self.curriculum.steps_per_iteration * self.env.num_envs * self.gpu_world_size
-        words = [f"{phase} {done}/{total}", f"{steps / seconds:,.0f} steps/s"]
+        words = [f"{phase} {done}/{total}", f"{self._steps_per_iteration / seconds:,.0f} steps/s"]
         if self.logger.rewbuffer:
             words.append(f"reward {self.logger.rewbuffer[0]:.2f}")
             words.append(f"episode {self.logger.lenbuffer[0]:.0f} steps")
@@ -236,8 +236,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             return
         iterations = self.curriculum.iterations[name]
         seconds = self._seconds - sum(entry["seconds"] for entry in self.phases.values())
-        envs = self.env.num_envs * self.gpu_world_size
-        steps = iterations * self.curriculum.steps_per_iteration * envs
+        steps = iterations * self._steps_per_iteration
         self.phases[name] = {
             "iterations": iterations,
             "env_steps": steps,
@@ -252,22 +251,19 @@ class PronkRunner(MjlabOnPolicyRunner):
 
     def _export(self, path: Path, phase: str) -> float:
         """Write a policy; largest difference of its outputs from PyTorch's on the last rollout."""
-        env = self.env.unwrapped
-        command, action = motion_command(env), joint_position_action(env)
-        gains = command.cfg.gains
+        command, action = (f(self.env.unwrapped) for f in (motion_command, joint_position_action))
+        gains, lift_off = command.cfg.gains, command.cfg.settings.liftoff_velocity
         contract = contract_for(
             command.robot,
             gains,
             action_scale=float(action.cfg.scale),
             delay_steps=action.cfg.delay_steps,
             command_limits=command.cfg.limits,
-            lift_off_velocity=(
-                command.cfg.settings.liftoff_velocity if PHASES[phase].jump else None
-            ),
+            lift_off_velocity=lift_off if PHASES[phase].jump else None,
             provenance={
                 "run": path.parent.resolve().name,
                 "phases": {n: p["iterations"] for n, p in self.phases.items()},
-                "envs": env.num_envs * self.gpu_world_size,
+                "envs": self.env.num_envs * self.gpu_world_size,
                 "seed": self.cfg["seed"],
                 "ranges_sha256": gains.sha256,
                 **self.provenance,
@@ -304,7 +300,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             "seconds": self._seconds,
         }
         checkpoint.write(Path(path), state)
-        for old in checkpoint.numbered(Path(path).parent)[:-KEPT]:
+        for old in checkpoint.numbered(Path(path).parent)[:-_KEPT]:
             old.unlink(missing_ok=True)
         if self.cfg["upload_model"]:
             self.logger.save_model(path, self.current_learning_iteration)
