@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest, kstest
 
 pytest.importorskip("mjlab")
@@ -23,7 +23,6 @@ from training_env import N
 
 pytestmark = pytest.mark.train
 
-Array = NDArray[np.float64]
 DT = 0.02
 LIMITS = np.array([3.0, 1.0, 2.0])  # C1 to C3
 ALL = torch.arange(N)
@@ -39,43 +38,33 @@ def command(env: Any) -> MotionCommand:
     return motion_command(env)
 
 
-def velocities(command: MotionCommand, rounds: int) -> Array:
-    """Velocity commands at the beginning of many episodes. (rounds * N, 3)"""
+def test_velocities_are_uniform_in_the_given_fractions(
+    command: MotionCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """10 of 100 stand, 40 move along one axis, each as often; the others along all.
+
+    The present ranges are .65 of the whole.
+    """
+    monkeypatch.setattr(command, "ranges", SpeedRanges(Growth(start=0.65), "cpu"))
     found = []
-    for _ in range(rounds):
+    for _ in range(1000):
         command.reset(ALL)
         found.append(command.velocity.clone())
-    return np.float64(torch.cat(found).numpy())
-
-
-def test_velocities_are_uniform_in_the_given_fractions(command: MotionCommand) -> None:
-    """10 of 100 stand, 40 move along one axis, each as often; the others along all."""
-    command.ranges.grown.fill_(1e6)
-    velocity = velocities(command, 1000)
+    velocity = np.float64(torch.cat(found).numpy())
     moves = velocity != 0.0
     axes, total = moves.sum(axis=1), len(moves)
     fractions = [(axes == 0, 0.1), (axes == 1, 0.4), (axes == 3, 0.5)]
     fractions += [(moves[:, axis] & (axes == 1), 0.4 / 3) for axis in range(3)]
-    for found, fraction in fractions:
-        assert binomtest(int(found.sum()), total, fraction).pvalue > 1e-4
+    for rows, fraction in fractions:
+        assert binomtest(int(rows.sum()), total, fraction).pvalue > 1e-4
     assert not (axes == 2).any()
-    for axis, limit in enumerate(LIMITS):
+    for axis, limit in enumerate(0.65 * LIMITS):
         for rows in (axes == 3, (axes == 1) & moves[:, axis]):
             test = kstest(velocity[rows, axis], "uniform", args=(-limit, 2 * limit))
             assert test.pvalue > 1e-3
     whole = velocity[axes == 3]
     correlation = np.corrcoef(whole, rowvar=False)[np.triu_indices(3, 1)]
     assert np.abs(correlation).max() < 4.0 / math.sqrt(len(whole))
-
-
-@pytest.mark.parametrize("fraction", [0.3, 0.65])
-def test_velocities_use_the_present_ranges(
-    command: MotionCommand, monkeypatch: pytest.MonkeyPatch, fraction: float
-) -> None:
-    monkeypatch.setattr(command, "ranges", SpeedRanges(Growth(start=fraction), "cpu"))
-    most = np.abs(velocities(command, 200)).max(axis=0)
-    assert (most <= fraction * LIMITS + 1e-6).all()
-    assert (most > 0.97 * fraction * LIMITS).all()
 
 
 @pytest.mark.parametrize("scripted", [False, True])
@@ -183,11 +172,9 @@ def test_scripted_commands_are_set_by_the_caller_alone() -> None:
     [
         # .35 m/s more, in proportion below 1 m/s, in the same direction.
         ((2.0, 0.0, 1.0), 0.0, (2.35, 0.0)),
-        ((-1.2, 0.9, 0.0), 0.0, (-1.48, 1.11)),
         ((0.0, -0.5, 0.0), 0.0, (0.0, -0.675)),
         ((0.0, 0.0, 1.0), 0.0, (0.0, 0.0)),
         # The overspeed at the command is added.
-        ((2.0, 0.0, 1.0), 0.5, (2.85, 0.0)),
         ((-1.2, 0.9, 0.0), 0.5, (-1.88, 1.41)),
     ],
 )
@@ -215,11 +202,8 @@ def received(
     """What the jump state receives of robots with that attitude [deg] and velocity [m/s]."""
     command, given = motion_command(env), {}
     monkeypatch.setattr(command.state, "advance", given.update)
-    (cy, cp), (sy, sp) = (
-        [f(math.radians(angle) / 2.0) for angle in (yaw, pitch)] for f in (math.cos, math.sin)
-    )
-    # Yaw about z, then pitch about the turned y.
-    env.sim.data.qpos[:, 3:7] = torch.tensor([cy * cp, -sy * sp, cy * sp, sy * cp])
+    attitude = Rotation.from_euler("ZY", (yaw, pitch), degrees=True)
+    env.sim.data.qpos[:, 3:7] = torch.tensor(attitude.as_quat(scalar_first=True))
     env.sim.data.qvel[:, :3] = torch.tensor(velocity)
     env.common_step_counter += 1
     assert command.motion is command.motion

@@ -13,16 +13,12 @@ from pronk.errors import PronkError
 from pronk.train.gains import NAIVE
 from pronk.train.phases import PHASES, TASKS
 
-Task = Literal["walk", "jump", "all", "together"]
-Device = Literal["auto", "cpu", "cuda"]
-Logger = Literal["tensorboard", "wandb"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings:
     """Settings of a run. None: left out, so the default or, with `resume`, that of the run."""
 
-    task: tyro.conf.Positional[Task]
+    task: tyro.conf.Positional[Literal["walk", "jump", "all", "together"]]
     """walk: phase 1. jump: a walking policy, then phases 2a and 2b. all: both. together: walk and
     jump at once from random weights, the paper's ablation."""
     out: Path
@@ -43,7 +39,7 @@ class TrainSettings:
     """PHASE=ITERATIONS, as in walk=300, for walk, jump_a or jump_b; repeat it."""
     ellipsoid: bool | None = None
     """Draw gains from each group's ellipsoid, or its box; box."""
-    device: Device = "auto"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a GPU if there is one; the CPU is for tests."""
     gpu_ids: str | None = None
     """GPUs of this host, as in 0,1, or all; 0."""
@@ -53,7 +49,7 @@ class TrainSettings:
     """Iterations between checkpoints."""
     minutes: float | None = None
     """Stop at a checkpoint after so long; --resume goes on from there."""
-    logger: Logger = "tensorboard"
+    logger: Literal["tensorboard", "wandb"] = "tensorboard"
     """Where the curves go."""
 
     def __post_init__(self) -> None:

@@ -103,7 +103,8 @@ def widen_checkpoint(state: Mapping[str, Any]) -> dict[str, Any]:
     # The parameters in the order of each optimizer, by name.
     order: dict[str, list[str]] = {key: [] for key in OPTIMIZERS}
     for network, weights in networks.items():
-        added = wide[f"{network}_state_dict"] = {}
+        added: dict[str, Tensor] = {}
+        wide[f"{network}_state_dict"] = added
         for name, value in weights.items():
             part = "estimator" if name.startswith("estimator.") else network
             if not name.startswith("obs_normalizer."):
