@@ -18,7 +18,7 @@ from pronk.match.gains import GroupGains
 from pronk.robots import load_robot
 from pronk.train.gains import TrainingGains, training_gains
 from pronk.train.mdp.commands import motion_command
-from pronk.train.mdp.observations import CRITIC, randomized_parameters
+from pronk.train.mdp.observations import RANDOMIZED, randomized_parameters
 from pronk.train.phases import PHASES, STEPS_PER_ITERATION
 from pronk.train.tasks import load_task
 from pronk.train.tasks.jump_env_cfg import without_randomization
@@ -101,8 +101,8 @@ def fresh(env: Any, phase: str = "walk", *, scripted: bool = False) -> Any:
 
 def drawn(env: Any) -> dict[str, Tensor]:
     """The randomized parameters by name, (N, size) each; gains in the robot's order of joints."""
-    parts, names, groups = randomized_parameters(env), list(CRITIC)[-9:], len(ROBOT.groups)
+    parts, groups = randomized_parameters(env), len(ROBOT.groups)
     single, gains = parts[: -2 * groups], parts[-2 * groups :]
     # Each group's gains are one part, leg by leg.
     both = [torch.stack(half, dim=-1).flatten(1) for half in (gains[:groups], gains[groups:])]
-    return {n: part.clone() for n, part in zip(names, [*single, *both], strict=True)}
+    return {n: part.clone() for n, part in zip(RANDOMIZED, [*single, *both], strict=True)}

@@ -18,7 +18,7 @@ from torch import Tensor
 
 import training_env
 from pronk.train.mdp.commands import MotionCommand, motion_command
-from pronk.train.mdp.speed_ranges import Growth, SpeedRanges
+from pronk.train.mdp.speed_ranges import STEPS
 from training_env import N
 
 pytestmark = pytest.mark.train
@@ -38,14 +38,12 @@ def command(env: Any) -> MotionCommand:
     return motion_command(env)
 
 
-def test_velocities_are_uniform_in_the_given_fractions(
-    command: MotionCommand, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_velocities_are_uniform_in_the_given_fractions(command: MotionCommand) -> None:
     """10 of 100 stand, 40 move along one axis, each as often; the others along all.
 
-    The present ranges are .65 of the whole.
+    The present ranges are half way from .35 to the whole.
     """
-    monkeypatch.setattr(command, "ranges", SpeedRanges(Growth(start=0.65), "cpu"))
+    command.ranges.grown.fill_(STEPS / 2)
     found = []
     for _ in range(1000):
         command.reset(ALL)
@@ -58,7 +56,7 @@ def test_velocities_are_uniform_in_the_given_fractions(
     for rows, fraction in fractions:
         assert binomtest(int(rows.sum()), total, fraction).pvalue > 1e-4
     assert not (axes == 2).any()
-    for axis, limit in enumerate(0.65 * LIMITS):
+    for axis, limit in enumerate(0.675 * LIMITS):
         for rows in (axes == 3, (axes == 1) & moves[:, axis]):
             test = kstest(velocity[rows, axis], "uniform", args=(-limit, 2 * limit))
             assert test.pvalue > 1e-3

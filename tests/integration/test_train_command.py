@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import pytest
 
 pytest.importorskip("torch")
 pytest.importorskip("mjlab")
 from pronk.cli import main as cli
 from pronk.errors import PronkError
-from pronk.match.gains import MatchedGains, save
-from pronk.simulators.simulator import SimulatorInfo
 from pronk.train import devices
 from pronk.train.phases import TASKS
 from pronk.train.provenance import RunFolder
@@ -85,19 +82,6 @@ def test_a_folder_that_is_not_empty_stays_as_it_is(
     assert "--resume" in text
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
     assert "is a file" in refused(capsys, "walk", *NAIVE, "--out", tmp_path / "notes.txt")
-
-
-def test_gains_of_another_robot_are_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    simulator = SimulatorInfo(version=mujoco.__version__)
-    gains = MatchedGains(robot="so101", simulator=simulator, joints={}, groups={})
-    save(tmp_path / "arm.yaml", gains)
-    out = tmp_path / "run"
-    text = refused(capsys, "walk", "--gains", tmp_path / "arm.yaml", "--out", out)
-    assert "so101" in text
-    assert "mini_cheetah" in text
-    assert not out.exists()
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"schema": "pronk/run/1"}', "{"])

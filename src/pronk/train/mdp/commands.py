@@ -22,7 +22,7 @@ from pronk.train.mdp.actions import joint_position_action
 from pronk.train.mdp.guidance import guidance
 from pronk.train.mdp.jump import JumpSettings, JumpState
 from pronk.train.mdp.motion import Motion, measure_motion, standing_leg
-from pronk.train.mdp.speed_ranges import Growth, SpeedRanges
+from pronk.train.mdp.speed_ranges import SpeedRanges
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -42,9 +42,9 @@ class MotionCommandCfg(CommandTermCfg):
     resampling_time_range: tuple[float, float] = (2.0, 6.0)
     """Time between draws of the velocity command [s]."""
     limits: tuple[float, float, float] = (3.0, 1.0, 2.0)
-    """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3)."""
-    growth: Growth = field(default_factory=Growth)
-    """Growth of the ranges up to `limits`."""
+    """Half-widths of the uniform draws: forward, left [m/s], yaw rate [rad/s] (C1 to C3).
+
+    They grow up to these, see `pronk.train.mdp.speed_ranges`."""
     standing: float = 0.1
     """Fraction of the draws that are zero."""
     one_axis: float = 0.4
@@ -104,7 +104,7 @@ class MotionCommand(CommandTerm):
         self._guidance = guidance(self.body, cfg.settings, *gains, env.step_dt)
         self._standing_leg = standing_leg(self.body)
         self.state = JumpState(count, device, cfg.settings)
-        self.ranges = SpeedRanges(cfg.growth, device)
+        self.ranges = SpeedRanges(device)
         self._jump_left = torch.zeros(count, device=device)
         self._limits = torch.tensor(cfg.limits, device=device)
         moving = 1.0 - cfg.standing

@@ -92,7 +92,7 @@ class EstimatorPPO(PPO):
                 f"{estimator_learning_rate:g}; expected more than 0."
             )
         super().__init__(actor, critic, storage, **cfg)
-        if self.symmetry is not None:
+        if self.symmetry is not None and not self.symmetry.use_mirror_loss:
             self.symmetry = _Augmentation(**cfg["symmetry_cfg"])
         self.estimator_epochs = estimator_epochs
         self.estimator_mini_batches = estimator_mini_batches
@@ -117,7 +117,8 @@ class EstimatorPPO(PPO):
             Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2].
         """
         losses: dict[str, float] = super().update()
-        losses.pop("symmetry", None)
+        if isinstance(self.symmetry, _Augmentation):
+            del losses["symmetry"]
         # The storage is cleared by now, but only its cursor: the rollout is still there.
         losses.update(self._update_estimator())
         for model in (self._raw_actor, self._raw_critic):
