@@ -146,10 +146,12 @@ def _matched(path: Path, robot: RobotSpec) -> MatchedGains:
         )
     # Gains hold for the simulator that they were matched in, and for no other; patches of MuJoCo
     # keep its physics.
-    timing = {"timestep_s": robot.timestep_s, "decimation": robot.decimation}
+    trains = SimulatorInfo(
+        version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
+    )
     used, got = (
         vars(info) | {"version": ".".join(info.version.split(".")[:2])}
-        for info in (SimulatorInfo(version=mujoco.__version__, **timing), gains.simulator)
+        for info in (trains, gains.simulator)
     )
     differing = [name for name in used if got[name] != used[name]]
     if differing:

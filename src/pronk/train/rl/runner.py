@@ -251,7 +251,8 @@ class PronkRunner(MjlabOnPolicyRunner):
 
     def _export(self, path: Path, phase: str) -> float:
         """Write a policy; largest difference of its outputs from PyTorch's on the last rollout."""
-        command, action = (f(self.env.unwrapped) for f in (motion_command, joint_position_action))
+        env = self.env.unwrapped
+        command, action = motion_command(env), joint_position_action(env)
         gains, lift_off = command.cfg.gains, command.cfg.settings.liftoff_velocity
         contract = contract_for(
             command.robot,
@@ -263,7 +264,7 @@ class PronkRunner(MjlabOnPolicyRunner):
             provenance={
                 "run": path.parent.resolve().name,
                 "phases": {n: p["iterations"] for n, p in self.phases.items()},
-                "envs": self.env.num_envs * self.gpu_world_size,
+                "envs": env.num_envs * self.gpu_world_size,
                 "seed": self.cfg["seed"],
                 "ranges_sha256": gains.sha256,
                 **self.provenance,
