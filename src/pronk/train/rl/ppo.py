@@ -61,6 +61,7 @@ class EstimatorPPO(PPO):
     _raw_actor: EstimatorActor
     _raw_critic: JumpCritic
     optimizer: torch.optim.Optimizer
+    symmetry: Symmetry | None
 
     def __init__(
         self,
