@@ -24,7 +24,7 @@ from pronk.match.parameters import GAINS
 from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
 from pronk.match.uncertainty import gain_interval
-from pronk.report.paper import published
+from pronk.report.paper import TABLE_I
 from pronk.response.estimate import operators
 from pronk.robots import load_robot
 from pronk.simulators.mujoco import MujocoSimulator
@@ -49,14 +49,12 @@ def run(trials: int, seed: int, progress: Progress, *, threads: int = 2) -> dict
     if trials < 1:
         raise PronkError(f"{trials} trials; expected 1 or more.")
     robot, settings = load_robot(ROBOT), MatchSettings(threads=threads)
-    paper = published(ROBOT)
-    assert paper is not None
     chirp = Excitation(offsets=Chirp(length_s=LENGTH_S).samples(), repeats=REPEATS, settle_s=REST_S)
     samples = round((LENGTH_S + 2.0 * REST_S + 1.0) * RATE_HZ)
     noise = partial(coloured_noise, deviation=NOISE_RAD, corner_hz=NOISE_CORNER_HZ, rate_hz=RATE_HZ)
     found = {}
     for index, name in enumerate(JOINTS):
-        rng, known = np.random.default_rng([seed, index]), paper.joints[name]
+        rng, known = np.random.default_rng([seed, index]), TABLE_I[name]
         log = synthetic_log(
             robot, name, [chirp], *known, noise=list(noise(rng, (REPEATS, samples)))
         )

@@ -26,7 +26,7 @@ from pronk.match.grid import GridSearch, alike, axes, quick_search, search
 from pronk.match.measured_joint import MeasuredJoint, measured_joints
 from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
-from pronk.report.paper import published
+from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
 from pronk.simulators.mujoco import JointTestRig, MujocoSimulator
 
@@ -71,9 +71,8 @@ def run(
         the one nearest to the known gains), the wall times, `bare_steps_per_second` weighted as the
         grid's own steps are, `ratio` of the grid's speed to it, and the largest resident memory.
     """
-    robot, paper = load_robot(ROBOT), published(ROBOT)
-    assert paper is not None
-    known = {name: paper.joints[name] for name in joints or robot.joint_names}
+    robot = load_robot(ROBOT)
+    known = {name: TABLE_I[name] for name in joints or robot.joint_names}
     settings = MatchSettings(grid_points=points, threads=threads)
     goals = []
     for k, (name, gains) in enumerate(known.items(), start=1):

@@ -333,7 +333,7 @@ def train(
     begin = time.perf_counter()
 
     def line(text: str) -> None:
-        console.err().print(f"{time.perf_counter() - begin:6.1f} s  {text}", markup=False)
+        console.note(f"{time.perf_counter() - begin:6.1f} s  {text}")
 
     found = run(
         line,

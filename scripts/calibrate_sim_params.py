@@ -23,7 +23,7 @@ from pronk.files import write_text
 from pronk.logs.mcap_log import read_mcap
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
-from pronk.report.paper import published
+from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
 from pronk.runtime.sweep import SweepTask, record
 from pronk.virtual.robot import VirtualRobot
@@ -149,12 +149,6 @@ def designed() -> SimParams:
     )
 
 
-def target(name: str) -> np.ndarray:
-    paper = published("mini_cheetah")
-    assert paper is not None
-    return np.array(paper.joints[name])
-
-
 def matched(
     sim_params: SimParams, name: str, method: str = "quick"
 ) -> tuple[np.ndarray, float, float]:
@@ -174,7 +168,7 @@ def calibrated(sim_params: SimParams, name: str) -> JointParams:
     """Turn the two knobs of a joint until its match lands on Table I."""
     robot = load_robot("mini_cheetah")
     drive_damping = robot.joint(name).damping
-    wanted = target(name)
+    wanted = np.array(TABLE_I[name])
     for turn in range(ROUNDS):
         joint = sim_params.joints[name]
         got, error, naive = matched(sim_params, name)
@@ -233,7 +227,7 @@ def main() -> None:
         sim_params = load_sim_params(arguments.out)
         for name in sim_params.joints:
             got, error, naive = matched(sim_params, name, "grid")
-            cells = (got - target(name)) / CELL
+            cells = (got - TABLE_I[name]) / CELL
             print(
                 f"{name:14s} {got[0]:6.2f} {got[1]:.4f}  {cells[0]:+.2f} {cells[1]:+.2f} cells off"
                 f" Table I, {error:.3f} dB (naive {naive:.3f})",

@@ -41,9 +41,14 @@ def say(text: str) -> None:
     Console(highlight=False, soft_wrap=True).print(text, markup=False)
 
 
-def warn(text: str) -> None:
+def note(text: str, **look: Any) -> None:
     """Print one line to standard error."""
-    err().print(f"warning: {text}", markup=False, style="yellow")
+    err().print(text, markup=False, **look)
+
+
+def warn(text: str) -> None:
+    """Print a warning to standard error."""
+    note(f"warning: {text}", style="yellow")
 
 
 def following(*commands: str) -> None:

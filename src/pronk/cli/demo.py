@@ -74,8 +74,7 @@ def demo(
         hero = style.save(figures.hero(result), out / "hero.svg")
         page, _ = write_report(out, report)
     seconds = time.perf_counter() - begun
-    cells = cells_apart(result)
-    show_match(result, replays, cells)
+    cells = show_match(result, replays)
     if trial is not None:
         sheets = (tables.table_iii(trial, figure) for figure in ("height", "distance"))
         for sheet in (*sheets, tables.landings(trial)):
@@ -164,22 +163,14 @@ def sweep_and_match(
 
     params, cpus = load_sim_params(), os.cpu_count() or 1
 
-    def record(folder: str, signal: Any, amplitudes: Any, counts: Any, seed: int) -> list[Path]:
-        plan = make(robot, None, signal, amplitudes, counts)
+    def record(folder: str, seed: int, *excitation: Any) -> list[Path]:
+        plan = make(robot, None, *excitation)
         plan.check()
-        bar = report.bar(f"sweep ({folder})")
-        return sweep_virtual(
-            plan,
-            params,
-            out / folder,
-            seed=seed,
-            processes=cpus,
-            overwrite=True,
-            progress=bar,
-        )
+        how: Any = {"progress": report.bar(f"sweep ({folder})"), "overwrite": True}
+        return sweep_virtual(plan, params, out / folder, seed=seed, processes=cpus, **how)
 
-    paths = record("logs", "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])), seed)
-    fresh = record("fresh", "log-chirp", AMPLITUDES[:1], 1, seed + 1)
+    paths = record("logs", seed, "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])))
+    fresh = record("fresh", seed + 1, "log-chirp", AMPLITUDES[:1], 1)
     logs = read_logs(paths, processes=cpus, robot=robot)
     settings = MatchSettings(method="quick" if quick else "grid")
     result = match_logs(logs, robot, settings=settings, progress=report)
@@ -187,57 +178,35 @@ def sweep_and_match(
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():
         save_responses(out / "logs" / f"{name}.response.npz", joint.responses)
-    replays = [
-        one
-        for log in read_logs(fresh, robot=robot)
-        for one in predict(log, robot, result.gains).joints
-    ]
-    save_prediction(
-        out / "fresh.prediction.npz",
-        Prediction(joints=tuple(replays), source="fresh", virtual=True),
-    )
+    read = read_logs(fresh, robot=robot)
+    replays = [one for log in read for one in predict(log, robot, result.gains).joints]
+    prediction = Prediction(joints=tuple(replays), source="fresh", virtual=True)
+    save_prediction(out / "fresh.prediction.npz", prediction)
     return result, replays
 
 
-def cells_apart(result: MatchResult) -> dict[str, list[float]]:
-    """Distance of each joint's gains from the paper's Table I, in cells of the grid."""
-    from pronk.report.paper import published
-
-    paper = published(ROBOT)
-    assert paper is not None
-    found = {}
-    for name, joint in result.joints.items():
-        grids = (joint.grid_stiffness, joint.grid_damping)
-        pairs = zip((joint.stiffness, joint.damping), paper.joints[name], grids, strict=True)
-        found[name] = [float(abs(own - its) / (grid[1] - grid[0])) for own, its, grid in pairs]
-    return found
-
-
 def show_match(
-    result: MatchResult, replays: Sequence[JointPrediction], cells: dict[str, list[float]]
-) -> None:
-    """Print matched gains beside the paper's, and the errors with nominal and matched gains."""
-    from pronk.evaluation.tables import table
-    from pronk.report.paper import published
+    result: MatchResult, replays: Sequence[JointPrediction]
+) -> dict[str, tuple[float, float]]:
+    """Print matched gains beside the paper's Table I, and the errors with both sets of gains.
 
-    paper = published(ROBOT)
-    assert paper is not None
-    by_joint = {one.joint: one for one in replays}
+    Returns:
+        Distance of each joint's stiffness and damping from Table I, in cells of the grid.
+    """
+    from pronk.evaluation.tables import table
+    from pronk.report.paper import TABLE_I
+
+    by_joint, cells, rows = {one.joint: one for one in replays}, {}, []
+    for name, one in result.joints.items():
+        (k, d), fresh = TABLE_I[name], by_joint[name]
+        k_cell, d_cell = (axis[1] - axis[0] for axis in (one.grid_stiffness, one.grid_damping))
+        cells[name] = abs(one.stiffness - k) / k_cell, abs(one.damping - d) / d_cell
+        gains = (f"{one.stiffness:.2f} / {one.damping:.3f}", f"{k:g} / {d:g}")
+        errors = (one.naive_error_db, one.error_db, fresh.rmse_naive, fresh.rmse_matched)
+        apart = "{:.1f} / {:.1f}".format(*cells[name])
+        rows.append((name, *gains, apart, *errors, one.zero_armature_error_db))
     columns = "joint | matched | Table I | grid cells apart | gain error nominal [dB];2"
     columns += " | matched [dB];2 | fresh RMSE nominal [rad];4 | matched [rad];4"
-    rows = [
-        (
-            name,
-            f"{gains.stiffness:.2f} / {gains.damping:.3f}",
-            "{:g} / {:g}".format(*paper.joints[name]),
-            "{:.1f} / {:.1f}".format(*cells[name]),
-            gains.naive_error_db,
-            gains.error_db,
-            by_joint[name].rmse_naive,
-            by_joint[name].rmse_matched,
-            result.joints[name].zero_armature_error_db,
-        )
-        for name, gains in result.gains.joints.items()
-    ]
     title = "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)"
     console.show_sheet(table(f"{columns} | no rotor inertia [dB];2", rows, title=title))
+    return cells

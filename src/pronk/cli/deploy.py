@@ -58,6 +58,7 @@ def deploy(
     from pronk.runtime.plan import Link, Plan
     from pronk.runtime.run import run
     from pronk.runtime.state_machine import Timing
+    from pronk.runtime.teleop import HELP, PAD_HELP, Gamepad, Keyboard, ScriptedOperator, TimeLimit
 
     contract = load_policy(policy).contract
     address = machine.address(base)
@@ -76,10 +77,17 @@ def deploy(
     scripts = None if script is None else _scripts(script, contract, walk_only)
     if not (address.local or machine.yes):
         console.confirm(contract.robot, str(address))
-    operator, words = _operator(contract, scripts, gamepad, seconds)
-    with closing(operator):
+    operator: Operator
+    if scripts is not None:
+        operator = scripted = ScriptedOperator(scripts)
+        words = f"unattended: {len(scripts)} scripts, {scripted.seconds:.0f} s."
+    elif gamepad is not None:
+        operator, words = Gamepad(gamepad, contract.command_ranges), PAD_HELP
+    else:
+        operator, words = Keyboard(contract.command_ranges), HELP
+    with closing(operator if seconds is None else TimeLimit(operator, seconds)) as limited:
         console.say(words)
-        summary = run(plan, operator, _notify)
+        summary = run(plan, limited, _notify)
     _report(summary)
     lost = any(event.kind == "lost" for event in summary.events_seen)
     again = f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
@@ -90,26 +98,6 @@ def deploy(
         following=[again if log is None else f"pronk report {log}"],
         status=1 if failed else 130 if summary.interrupted else 0,
     )
-
-
-def _operator(
-    contract: Contract,
-    scripts: list[Script] | None,
-    gamepad: Path | None,
-    seconds: float | None,
-) -> tuple[Operator, str]:
-    """The operator of the run, and its help."""
-    from pronk.runtime.teleop import HELP, PAD_HELP, Gamepad, Keyboard, ScriptedOperator, TimeLimit
-
-    operator: Operator
-    if scripts is not None:
-        operator = scripted = ScriptedOperator(scripts)
-        words = f"unattended: {len(scripts)} scripts, {scripted.seconds:.0f} s."
-    elif gamepad is not None:
-        operator, words = Gamepad(gamepad, contract.command_ranges), PAD_HELP
-    else:
-        operator, words = Keyboard(contract.command_ranges), HELP
-    return (operator if seconds is None else TimeLimit(operator, seconds)), words
 
 
 def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
@@ -136,11 +124,8 @@ def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
 
 def _notify(event: Event) -> None:
     """Print one line for an event."""
-    line = f"{event.kind}: {event.text}"
-    if event.kind in ("fault", "refused", "notice", "lost"):
-        console.warn(line)
-    else:
-        console.err().print(line, markup=False)
+    bad = event.kind in ("fault", "refused", "notice", "lost")
+    (console.warn if bad else console.note)(f"{event.kind}: {event.text}")
 
 
 def _report(summary: RunSummary) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -38,9 +38,8 @@ def evaluate(
         like: With naive gains: the gains.yaml whose ranges and delay are used.
         what: walk: velocities. jump: the paper's jumps. all: both.
         robots: Robots for each command.
-        randomization: full: as in training. noise: one nominal robot many times, with
-            noise, timing and delay as in training. none: the nominal robot,
-            undisturbed.
+        randomization: full: as in training. noise: one nominal robot many times, with noise, timing
+            and delay as in training. none: the nominal robot, undisturbed.
         before: Evaluation of the policy before the jump phases, to compare the walk.
         seed: Of all draws.
         device: auto: a GPU if there is one. On the CPU take a few robots.
@@ -61,17 +60,10 @@ def evaluate(
     errors = {} if before is None else load_speed_errors(before)
     subject = adapter.load_subject(policy, where)
     robot = load_task(subject.robot).robot
-    plan = Plan(
-        robot=robot,
-        robots=robots,
-        seed=seed,
-        walks=() if what == "jump" else WALKS,
-        jumps=() if what == "walk" else JUMPS,
-    )
+    walks, jumps = () if what == "jump" else WALKS, () if what == "walk" else JUMPS
+    plan = Plan(robot=robot, robots=robots, seed=seed, walks=walks, jumps=jumps)
     if plan.jumps and not subject.jump:
-        raise PronkError(
-            f"{policy}: a policy without the jump input; evaluate it with --what walk."
-        )
+        raise PronkError(f"{policy}: no jump input; evaluate it with --what walk.")
     drives = training_gains(gains, robot, like=like)
     if not subject.knows(drives):
         console.warn(
@@ -79,15 +71,8 @@ def evaluate(
         )
     # mjlab and Warp print to standard output.
     with console.progress() as report, redirect_stdout(io.StringIO()):
-        found = adapter.evaluate(
-            subject,
-            drives,
-            plan,
-            device=where,
-            randomization=randomization,
-            before=errors,
-            progress=report,
-        )
+        how: Any = {"device": where, "randomization": randomization, "before": errors}
+        found = adapter.evaluate(subject, drives, plan, progress=report, **how)
     save(out, found)
     for sheet in sheets(found):
         console.show_sheet(sheet)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -50,10 +50,7 @@ class LinkOptions:
     """No confirmation before real hardware moves."""
 
     def address(self, base: Base | None = None) -> Address:
-        """The machine's address, with what belongs to its link.
-
-        Args:
-            base: Of the virtual robot; None for the link's own.
+        """The machine's address, with what belongs to its link; None as base for the link's own.
 
         Raises:
             HardwareError: An option is not of the link.
@@ -61,15 +58,16 @@ class LinkOptions:
         from pronk.links.address import SIM, Address
 
         options: dict[str, Any] = {"layout": self.layout, "port": self.port, "domain": self.domain}
+        where = self.interface
         if self.link.partition(":")[0] == SIM:
             params = None if self.sim_params is None else str(self.sim_params)
             options |= {"seed": self.seed or None, "params": params}
-            return Address.parse(self.link, base or self.interface, **options)
-        if self.sim_params is not None:
+            where = base or self.interface
+        elif self.sim_params is not None:
             raise HardwareError(
                 "--sim-params is of --link sim; give it to `pronk simulate` instead."
             )
-        return Address.parse(self.link, self.interface, **options)
+        return Address.parse(self.link, where, **options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,28 +107,25 @@ class Reading:
         from pronk.logs.readers import read_logs
 
         options = vars(self) | {
-            "columns": _pairs(self.columns, "--columns") or None,
-            "joint_names": _pairs(self.joint_names, "--joint-names") or None,
-            "scale": None,
             "format": self.log_format,
-            "log_format": None,
-            "reader_options": None,
-            **_pairs(self.reader_options, "--reader-option"),
+            "columns": _pairs("--columns", self.columns),
+            "joint_names": _pairs("--joint-names", self.joint_names),
+            "scale": _pairs("--scale", self.scale, float),
+            **_pairs("--reader-option", self.reader_options),
         }
-        try:
-            scale = {name: float(text) for name, text in _pairs(self.scale, "--scale").items()}
-        except ValueError as error:
-            raise PronkError(f"--scale: {error}.") from None
-        options["scale"] = scale or None
-        given = {name: value for name, value in options.items() if value is not None}
+        del options["log_format"], options["reader_options"]
+        given = {name: value for name, value in options.items() if value not in (None, {})}
         return read_logs(paths, processes=os.cpu_count() or 1, robot=robot, **given)
 
 
-def _pairs(entries: Sequence[str], option: str) -> dict[str, str]:
+def _pairs(option: str, entries: Sequence[str], kind: Callable[[str], Any] = str) -> dict[str, Any]:
     found = {}
     for entry in entries:
         name, _, value = entry.partition("=")
-        if not (name and value):
-            raise PronkError(f"{option} {entry!r}: expected NAME=VALUE.")
-        found[name] = value
+        try:
+            if not (name and value):
+                raise ValueError("expected NAME=VALUE")
+            found[name] = kind(value)
+        except ValueError as error:
+            raise PronkError(f"{option} {entry!r}: {error}.") from None
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -26,16 +27,12 @@ def play(
     Args:
         policy: policy.onnx.
         robot: A name, or a path to a robot.yaml, MJCF or URDF; the policy's if left out.
-        sim_params: Body of the virtual robot; the one that ships with pronk if left
-            out.
+        sim_params: Body of the virtual robot; the one that ships with pronk if left out.
         port: Of the page; the next one that is free.
         host: Address to bind to. 0.0.0.0 admits every computer on your networks.
-        gamepad: Use a gamepad that is plugged into this machine; if there is one, if
-            left out.
+        gamepad: Use a gamepad that is plugged into this machine; if there is one, if left out.
         seed: Of the virtual robot's noise.
     """
-    from dataclasses import asdict
-
     from pronk.evaluation.live.page import WebPage, modules
     from pronk.evaluation.live.play import Joystick
     from pronk.evaluation.live.play import play as run
@@ -55,8 +52,8 @@ def play(
         f"## The virtual robot\nNot a real one. {machine.name}, policy `{policy.name}` "
         f"({loaded.contract.gains} gains), in real time."
     )
-    devices = sorted(Path("/dev/input").glob("js*"))
-    devices = [path for path in devices if os.access(path, os.R_OK) and gamepad is not False]
+    plugged = [] if gamepad is False else sorted(Path("/dev/input").glob("js*"))
+    devices = [path for path in plugged if os.access(path, os.R_OK)]
     if gamepad and not devices:
         raise PronkError(
             "--gamepad: there is no gamepad that can be read in /dev/input; plug one in, or leave "
@@ -81,4 +78,4 @@ def play(
         f"{played.simulated_s:.0f} s of the virtual robot in {played.wall_s:.0f} s "
         f"({factor:.2f} x real time), {len(played.hops)} jumps"
     )
-    return console.Outcome(figures=asdict(played))
+    return console.Outcome(figures=vars(played))

@@ -58,14 +58,12 @@ def simulate(
         seed: Of all noise and all faults.
         port: UDP port on this computer (LCM); 7768 if left out.
         domain: Domain on this computer (DDS); 77 if left out, never 0.
-        faults: What goes wrong, for instance 'loss=0.3,state.delay=5ms,jitter=2ms,nan=0
-            .01,flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=
-            4s,after=2s'.
+        faults: What goes wrong, for instance 'loss=0.3,state.delay=5ms,jitter=2ms,nan=0.01,
+            flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=4s,after=2s'.
         silence: What the drives do when commands stop.
         silence_after: Time without a command after which they do it, in s.
-        mode: The robot's own controller that holds the joints at first; released if
-            left out. LCM: stand_up, balance_stand, locomotion, recovery_stand; DDS:
-            normal, ai, advanced, mcf.
+        mode: The robot's own controller that holds the joints at first; released if left out. LCM:
+            stand_up, balance_stand, locomotion, recovery_stand; DDS: normal, ai, advanced, mcf.
         duration: End after this time, in s; Ctrl-C ends it too.
         capture: Write what a motion-capture rig would measure to this .npz (--base ground).
         realtime: Request real-time scheduling.
@@ -94,9 +92,8 @@ def simulate(
     wire: ServerTransport = resolve_name(_SERVERS[link])(known, mode=mode, **address.options)
     try:
         machine.connect()
-        server = RobotServer(
-            machine, wire, hold=hold_of(known), faults=wrong, watchdog=watchdog, seed=seed
-        )
+        options: Any = {"faults": wrong, "watchdog": watchdog, "seed": seed}
+        server = RobotServer(machine, wire, hold=hold_of(known), **options)
         console.say(
             f"ready: the virtual {known.name} on the {base}, seed {seed}, at {address}; "
             "Ctrl-C ends it"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from pronk.errors import PronkError
 
 if TYPE_CHECKING:
     from pronk.evaluation.tables import Sheet
+    from pronk.evaluation.trial import Plan
 
 RATES_JUMPS = 3
 """At 2.25 m/s, beside the paper's commands: enough to draw its figure of roll and pitch rates."""
@@ -75,23 +76,14 @@ def trial(
 
     if own and not bodies:
         raise PronkError("--own without --bodies; it names policies that are tried on those.")
-    plan = Plan(
-        cases=parse_cases(commands or ["paper"]),
-        jumps=jumps,
-        rates=0 if commands else RATES_JUMPS,
-        seed=seed,
-    )
+    cases, rates = parse_cases(commands or ["paper"]), 0 if commands else RATES_JUMPS
+    plan = Plan(cases=cases, jumps=jumps, rates=rates, seed=seed)
     policies = [policy, *also]
     setup: Any = setup_of(policy, out, sim_params, robot, processes=processes)
     with console.progress() as report:
-        found = run_trial(
-            policies,
-            plan,
-            keep_captures=keep_captures,
-            overwrite=overwrite,
-            progress=report.bar("jumping"),
-            **setup,
-        )
+        bar = report.bar("jumping")
+        keep: Any = {"keep_captures": keep_captures, "overwrite": overwrite}
+        found = run_trial(policies, plan, progress=bar, **keep, **setup)
     sheets = list(tables.sheets(found))
     for sheet in sheets:
         if definitions or sheet.title != tables.DEFINITIONS:
@@ -102,7 +94,6 @@ def trial(
         f"{timing['seconds']:.0f} s on {timing['processes']:.0f} processes; "
         f"{timing['simulated_s_per_cpu_s']:.1f} simulated seconds per second of a core"
     )
-    wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
     films: tuple[Path, ...] = ()
     with console.progress() as report:
         if video:
@@ -116,17 +107,19 @@ def trial(
                 at_once=setup["processes"],
                 progress=report.bar("rendering videos"),
             )
+        wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
         names = [name for name, on in wanted.items() if on]
-        extra = list(_extra_sheets(names, policies, setup, seed, jumps, own, report))
+        trained = [[path] for path in own]
+        extra = list(_extra_sheets(names, policies, setup, plan, trained, report))
         page, _ = write_report(out, report)
     for sheet in extra:
         console.show_sheet(sheet)
     figures = {
         "virtual": found.virtual,
-        "sheets": [asdict(sheet) for sheet in (*sheets, *extra)],
+        "sheets": [*sheets, *extra],
         "checks": [check.row() for check in trial_checks(found)],
-        "cells": [asdict(cell) for cell in found.cells],
-        "ratios": [asdict(ratio) for ratio in found.ratios],
+        "cells": found.cells,
+        "ratios": found.ratios,
         "timing": dict(timing),
         "page": page,
         "videos": films,
@@ -143,9 +136,8 @@ def _extra_sheets(
     names: Sequence[str],
     policies: Sequence[Path],
     setup: Any,
-    seed: int,
-    jumps: int,
-    own: Sequence[Path],
+    plan: Plan,
+    own: Sequence[Sequence[Path]],
     report: console.Reporter,
 ) -> Iterator[Sheet]:
     """Run what belongs to a trial besides its jumps, and yield the tables."""
@@ -155,20 +147,19 @@ def _extra_sheets(
     from pronk.evaluation.walk import add_walks
     from pronk.report import extra_pages
 
-    def titled(what: str, sheet: Sheet) -> Sheet:
-        return replace(sheet, title=f"Virtual robot, {what}: {sheet.title}")
-
+    seed = plan.seed
     if "walk" in names:
         walks = add_walks(policies, seed=seed, progress=report.bar("walking"), **setup)
-        yield from (titled("walking", sheet) for sheet in extra_pages.walk_tables(walks))
+        for sheet in extra_pages.walk_tables(walks):
+            yield replace(sheet, title=f"Virtual robot, walking: {sheet.title}")
     if "crossing" in names:
-        plan = CrossingPlan(seed=seed)
-        crossed = add_crossings(policies, plan, progress=report.bar("crossing"), **setup)
-        yield titled("crossing", extra_pages.crossing_table(crossed))
+        bar = report.bar("crossing")
+        crossed = add_crossings(policies, CrossingPlan(seed=seed), progress=bar, **setup)
+        sheet = extra_pages.crossing_table(crossed)
+        yield replace(sheet, title=f"Virtual robot, crossing: {sheet.title}")
     if "variation" in names:
-        bar = report.bar("varying the robot")
-        plan_5 = Plan(jumps=5, seed=seed)
-        yield variation.table(variation.add_variation(policies, plan_5, progress=bar, **setup))
+        bar, few = report.bar("varying the robot"), Plan(jumps=5, seed=seed)
+        yield variation.table(variation.add_variation(policies, few, progress=bar, **setup))
     if "bodies" in names:
-        plan_n = Plan(jumps=jumps, seed=seed)
+        plan_n = Plan(jumps=plan.jumps, seed=seed)
         yield bodies.table(bodies.add_bodies(policies, plan_n, own=own, stages=report, **setup))

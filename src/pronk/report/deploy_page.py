@@ -142,8 +142,8 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure:
     with np.errstate(invalid="ignore"):
         filtered = np.where(np.abs(log.desired - log.sent) > _MOVED, log.desired, np.nan)[there]
     sent = run.in_force(log)
-    with style.joint_panels(log.joints, height=1.55, sharey="row") as (figure, panels):
-        style.label(panels, "time [s]", "[rad]")
+    options: dict[str, Any] = {"height": 1.55, "sharey": "row"}
+    with style.joint_panels(log.joints, "time [s]", "[rad]", **options) as (figure, panels):
         for i, axes in enumerate(panels[name] for name in log.joints):
             axes.plot(measured[there], log.position[there, i], **style.MEASURED_LINE)
             axes.step(t[there], filtered[:, i], where="post", **_DESIRED)

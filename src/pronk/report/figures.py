@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,6 @@ def _measured(
     shade = {"color": look["color"], "alpha": 0.35 if look is style.MEASURED_LINE else 0.15}
     axes.fill_between(response.frequency_hz, low, high, linewidth=0, **shade)
     axes.plot(response.frequency_hz, middle, **look)
-    axes.set_ylabel("phase [deg]" if phase else "gain [dB]")
 
 
 def _panel(axes: Axes, fit: JointFit, curves: _Curves, *, phase: bool = False) -> None:
@@ -100,6 +100,8 @@ def bode(fit: JointFit, *, title: str | None = None, coherence: bool = True) -> 
     options: dict[str, Any] = {"sharex": True, "height_ratios": ratios}
     with drawing(len(ratios), height=1.0 + 1.0 * sum(ratios), **options) as (figure, grid):
         gain, phase = grid[:2, 0]
+        gain.set_ylabel("gain [dB]")
+        phase.set_ylabel("phase [deg]")
         _panel(gain, fit, _simulated(fit))
         _panel(phase, fit, _simulated(fit), phase=True)
         gain.set_title(title or style.joint_words(fit.joint))
@@ -133,15 +135,14 @@ def hero(result: MatchResult) -> Figure:
 
 def overview(fits: Mapping[str, JointFit]) -> Figure:
     """Draw the gain of every joint; rows are joint groups, columns are legs."""
-    with style.joint_panels(list(fits), height=2.0, sharey="row") as (figure, panels):
+    labels, options = ("frequency [Hz]", "gain [dB]"), {"height": 2.0, "sharey": "row"}
+    with style.joint_panels(list(fits), *labels, **options) as (figure, panels):
         for name, axes in panels.items():
             fit = fits[name]
             _panel(axes, fit, _simulated(fit))
             axes.margins(y=0.2)
-            axes.set_ylabel("")
             errors = f"{fit.naive_error_db:.2f} → {fit.error_db:.2f} dB"
             axes.text(0.03, 0.05, errors, transform=axes.transAxes, fontsize=8.5, color="#333333")
-        style.label(panels, "frequency [Hz]", "gain [dB]")
         legend(figure, _keys(any(fit.responses[0].virtual for fit in fits.values())), 4)
     return figure
 
@@ -160,7 +161,8 @@ def zero_armature(fit: JointFit) -> Figure:
         _panel(axes, fit, curves)
         # An antiresonance would leave the rest of the curves no room.
         shallow = style.decibel(fit.matched).min() - 20.0
-        axes.set(xlabel="frequency [Hz]", ylim=(max(shallow, axes.get_ylim()[0]), None))
+        axes.set(xlabel="frequency [Hz]", ylabel="gain [dB]")
+        axes.set_ylim(max(shallow, axes.get_ylim()[0]), None)
         axes.set_title(f"{style.joint_words(fit.joint)}: with and without rotor inertia")
         best = f"best without rotor inertia: error {fit.zero_armature_error_db:.2f} dB"
         keys = _keys(fit.responses[0].virtual, f": error {fit.error_db:.2f} dB")
@@ -176,12 +178,10 @@ def responses(found: Sequence[FrequencyResponse]) -> Figure:
     keys = []
     with drawing(3, height=6.2, **options) as (figure, grid):
         gain, phase, coherence = grid[:, 0]
-        for i, response in enumerate(found):
-            look: dict[str, Any] = {
-                "color": colours[i % 4],
-                "linestyle": dashes[i % 4],
-                "linewidth": 1.4,
-            }
+        gain.set_ylabel("gain [dB]")
+        phase.set_ylabel("phase [deg]")
+        for response, color, dash in zip(found, cycle(colours), cycle(dashes), strict=False):
+            look: dict[str, Any] = {"color": color, "linestyle": dash, "linewidth": 1.4}
             _measured(gain, response, look)
             _measured(phase, response, look, phase=True)
             _coherence(coherence, response, **look)
@@ -230,8 +230,8 @@ def error_maps(result: MatchResult, drive: Mapping[str, tuple[float, float]]) ->
     low = max(min(float(np.nanmin(e)) for e in errors.values()), 0.05)
     high = max(float(np.nanmax(e)) for e in errors.values())
     norm, drawn = LogNorm(vmin=low, vmax=max(high, low * 1.01)), set()
-    with style.joint_panels(list(fits), height=2.35) as (figure, panels):
-        style.label(panels, "stiffness [N m/rad]", "damping [N m s/rad]")
+    labels = ("stiffness [N m/rad]", "damping [N m s/rad]")
+    with style.joint_panels(list(fits), *labels, height=2.35) as (figure, panels):
         for name, axes in panels.items():
             fit, k, d = fits[name], fits[name].grid_stiffness, fits[name].grid_damping
             look: dict[str, Any] = {"cmap": "viridis", "shading": "nearest", "rasterized": True}
@@ -326,18 +326,17 @@ def busiest_window(prediction: JointPrediction, seconds: float) -> slice:
     return slice(start, start + width)
 
 
-def prediction(found: JointPrediction, *, virtual: bool, seconds: float = 1.5) -> Figure:
-    """Draw the `busiest_window` of one joint: command, measured, simulated, and the errors."""
-    window = busiest_window(found, seconds)
+def prediction(found: JointPrediction, *, virtual: bool) -> Figure:
+    """Draw the busiest 1.5 s of one joint: command, measured, simulated, and the errors."""
+    window = busiest_window(found, 1.5)
     time, measured = found.time[window], found.measured[window]
-    looks = {"naive": style.NAIVE_LINE, "matched": style.MATCHED_LINE}
     command: dict[str, Any] = {"color": style.COMMAND, "linewidth": 0.7}
     with drawing(2, height=4.8, sharex=True, height_ratios=[3.0, 1.4]) as (figure, grid):
         top, bottom = grid[:, 0]
         top.step(time, found.command[window], where="post", **command)
         top.plot(time, measured, **style.MEASURED_LINE)
         bottom.axhline(0.0, color="#666666", linewidth=0.8)
-        for name, look in looks.items():
+        for name, look in (("naive", style.NAIVE_LINE), ("matched", style.MATCHED_LINE)):
             values = getattr(found, name)[window]
             top.plot(time, values, **look)
             bottom.plot(time, values - measured, **look)
@@ -345,11 +344,8 @@ def prediction(found: JointPrediction, *, virtual: bool, seconds: float = 1.5) -
         signal = "log" if found.signal == "unknown" else found.signal.replace("_", " ")
         top.set_title(f"{style.joint_words(found.joint)}: prediction of a {signal}")
         bottom.set(ylabel=f"error [{found.unit}]", xlabel="time [s]", xlim=(time[0], time[-1]))
-        keys = [
-            key("command", **command),
-            key(measured_words(virtual), **style.MEASURED_LINE),
-            key(f"nominal: RMSE {found.rmse_naive:.4f}", **style.NAIVE_LINE),
-            key(f"matched: RMSE {found.rmse_matched:.4f}", **style.MATCHED_LINE),
-        ]
+        keys = [key("command", **command), key(measured_words(virtual), **style.MEASURED_LINE)]
+        keys.append(key(f"nominal: RMSE {found.rmse_naive:.4f}", **style.NAIVE_LINE))
+        keys.append(key(f"matched: RMSE {found.rmse_matched:.4f}", **style.MATCHED_LINE))
         legend(figure, keys, 4)
     return figure

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from pronk.evaluation.protocol import TABLE_III
 
-_TABLE_I = {
+TABLE_I = {
     "FR_hip_roll": (20.6, 0.492),
     "FL_hip_roll": (18.1, 0.516),
     "HR_hip_roll": (18.5, 0.431),
@@ -22,6 +22,7 @@ _TABLE_I = {
     "HR_knee": (22.2, 0.553),
     "HL_knee": (21.8, 0.553),
 }
+"""Matched stiffness [N m/rad] and damping [N m s/rad] of the paper's robot, `mini_cheetah`."""
 # Last column of Table I.
 _TRAINING = {"hip_roll": (20.0, 0.45), "hip_pitch": (17.5, 0.4), "knee": (21.5, 0.55)}
 GAPS = {"forward 2": 0.55, "back 2": 0.5, "side -1": 0.4, "side +1": 0.4}
@@ -45,7 +46,7 @@ class Published:
 
 def published(robot: str) -> Published | None:
     """Return the paper's gains of `robot`; None for another robot than the paper's."""
-    return Published(joints=_TABLE_I, training=_TRAINING) if robot == "mini_cheetah" else None
+    return Published(joints=TABLE_I, training=_TRAINING) if robot == "mini_cheetah" else None
 
 
 def published_jumps(figure: str) -> dict[str, dict[str, tuple[float, float]]]:

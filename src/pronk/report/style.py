@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -103,9 +103,17 @@ def drawing(
 
 @contextmanager
 def joint_panels(
-    names: Sequence[str], *, height: float, sharey: bool | Literal["row"] = True
+    names: Sequence[str],
+    x_label: str,
+    y_label: str,
+    *,
+    height: float,
+    sharey: bool | Literal["row"] = True,
 ) -> Iterator[tuple[Figure, dict[str, Axes]]]:
-    """Make a figure with one titled panel per joint, `height` inches a row."""
+    """Make a figure with one titled panel per joint, `height` inches a row.
+
+    The lowest panel of each column and the first of each row are labelled.
+    """
     rows = grid_of_joints(names)
     shape, size = (len(rows), max(map(len, rows))), height * len(rows) + 0.7
     with drawing(*shape, height=size, sharex=True, sharey=sharey) as (figure, grid):
@@ -114,17 +122,12 @@ def joint_panels(
             axes.set_visible(False)
         for name, axes in panels.items():
             axes.set_title(joint_words(name))
+        for row in rows:
+            panels[row[0]].set_ylabel(y_label)
+        for name in {c: name for row in rows for c, name in enumerate(row)}.values():
+            panels[name].set_xlabel(x_label)
+            panels[name].tick_params(labelbottom=True)
         yield figure, panels
-
-
-def label(panels: Mapping[str, Axes], x_label: str, y_label: str) -> None:
-    """Label the lowest panel of each column and the first of each row."""
-    rows = grid_of_joints(list(panels))
-    for row in rows:
-        panels[row[0]].set_ylabel(y_label)
-    for name in {c: name for row in rows for c, name in enumerate(row)}.values():
-        panels[name].set_xlabel(x_label)
-        panels[name].tick_params(labelbottom=True)
 
 
 def grid_of_joints(names: Sequence[str]) -> list[list[str]]:
@@ -146,9 +149,8 @@ def key(label: str, **look: Any) -> Line2D:
 
 def legend(figure: Figure, keys: Sequence[Any], columns: int | None = None, **look: Any) -> None:
     """Put a legend below all axes of a figure."""
-    figure.legend(
-        handles=keys, loc="outside lower center", ncols=columns or min(len(keys), 6), **look
-    )
+    columns = columns or min(len(keys), 6)
+    figure.legend(handles=keys, loc="outside lower center", ncols=columns, **look)
 
 
 def frequency_axis(axes: Axes, low_hz: float, high_hz: float) -> None:
@@ -173,15 +175,13 @@ def render(figure: Figure, kind: str = "svg", *, dpi: float = 130.0) -> bytes:
 
 
 def data_uri(data: bytes, kind: str) -> str:
-    """Return an image file as a `data:` address; `kind` is `svg`, `png` or `gif`."""
-    mime = "svg+xml" if kind == "svg" else kind
-    return f"data:image/{mime};base64,{base64.b64encode(data).decode('ascii')}"
+    """Return an image file as a `data:` address; `kind` is `svg+xml`, `png` or `gif`."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def picture(figure: Figure, *, dense: bool = False) -> str:
     """Return a figure as a `data:` address; as PNG if `dense`: many marks make a large SVG."""
-    kind = "png" if dense else "svg"
-    return data_uri(render(figure, kind), kind)
+    return data_uri(render(figure, "png"), "png") if dense else data_uri(render(figure), "svg+xml")
 
 
 def save(figure: Figure, path: Path) -> Path:
