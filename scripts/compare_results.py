@@ -3,13 +3,16 @@
     python scripts/compare_results.py OLD NEW [--tolerance 1e-6]
 
 OLD and NEW are two files of the same kind. Prints the largest relative difference of each field
-that differs, and exits with 1 if one exceeds the tolerance. Times and speeds are left out.
+that differs, and exits with 1 if one exceeds the tolerance. A field, row or number that only one
+file has differs by `inf`. Texts, times and speeds are left out.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,32 +32,60 @@ def load(path: Path) -> Any:
 
 
 def differences(old: Any, new: Any, field: str = "") -> Iterator[tuple[str, float]]:
-    """Yield each field that both have and its relative difference; texts are skipped."""
+    """Yield each field that differs and its relative difference."""
     if isinstance(old, dict) and isinstance(new, dict):
+        for name in old.keys() ^ new.keys():
+            yield str(name), math.inf
         for name in old.keys() & new.keys():
             yield from differences(old[name], new[name], str(name))
     elif isinstance(old, list) and isinstance(new, list):
-        for one, other in zip(old, new, strict=True):
+        if len(old) != len(new):
+            yield field, math.inf
+        for one, other in zip(old, new, strict=False):
             yield from differences(one, other, field)
     elif old != new:
-        try:
-            a, b = float(old), float(new)
-        except (TypeError, ValueError):
-            return
-        yield field, abs(a - b) / max(abs(a), 1e-9)
+        size = relative(old, new)
+        if size > 0.0:
+            yield field, size
+
+
+def relative(old: Any, new: Any) -> float:
+    """Return the relative difference of two values; 0 for two texts or two missing numbers."""
+    a, b = number(old), number(new)
+    if a is None and b is None:
+        return 0.0
+    if a is None or b is None:
+        return math.inf
+    if math.isnan(a) and math.isnan(b):
+        return 0.0
+    size = abs(a - b) / max(abs(a), 1e-9)
+    return math.inf if math.isnan(size) else size
+
+
+def number(value: Any) -> float | None:
+    """Return a number, NaN where it is missing in the file, None for anything else."""
+    if value is None or value == "":
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return None
 
 
 def main() -> None:
     """Compare two files."""
-    old, new = (load(Path(path)) for path in sys.argv[1:3])
-    tolerance = float(sys.argv[4]) if "--tolerance" in sys.argv else 1e-6
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("old", type=Path)
+    parser.add_argument("new", type=Path)
+    parser.add_argument("--tolerance", type=float, default=1e-6)
+    given = parser.parse_args()
     worst: dict[str, float] = {}
-    for field, size in differences(old, new):
+    for field, size in differences(load(given.old), load(given.new)):
         if not field.endswith(TIMES):
             worst[field] = max(worst.get(field, 0.0), size)
     for field, size in sorted(worst.items()):
         print(f"{field:50} {size:.1e}")
-    sys.exit(any(size > tolerance for size in worst.values()))
+    sys.exit(any(size > given.tolerance for size in worst.values()))
 
 
 if __name__ == "__main__":

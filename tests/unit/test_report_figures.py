@@ -198,12 +198,12 @@ def test_crossings_become_shares_with_wilsons_interval() -> None:
 
 
 def test_variation_gives_means_over_commands_and_shares_of_landings() -> None:
-    together = extra_pages.by_value(varied(), "trunk_mass_offset", "naive")
-    value, height, low, high = extra_pages.varied_line(together, "height")
+    of_mass = (varied(), "trunk_mass_offset", "naive")
+    value, height, low, high = extra_pages.varied_line(*of_mass, "height")
     assert value.tolist() == [0.0, 1.0]
     assert height == pytest.approx([0.4, 0.3])
     assert high - low == pytest.approx([0.02, 0.02])
-    assert extra_pages.varied_line(together, "landed")[1].tolist() == [1.0, 0.0]
+    assert extra_pages.varied_line(*of_mass, "landed")[1].tolist() == [1.0, 0.0]
     assert [panel.marks for panel in extra_pages.variation_panels(varied())] == [(0.0,)] * 3
     assert extra_pages.mean([0.4, math.nan, 0.2]) == pytest.approx(0.3)
     assert math.isnan(extra_pages.mean([math.nan]))

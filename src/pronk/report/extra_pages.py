@@ -16,7 +16,7 @@ from pronk.evaluation.bodies import Bodies, Body
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.crossing import CROSSING, Climb, climbs
 from pronk.evaluation.jumps import FIGURES
-from pronk.evaluation.results import Cell, Results, share_interval
+from pronk.evaluation.results import Results, share_interval
 from pronk.evaluation.tables import Sheet, figure_row, number, place, table, verdict
 from pronk.evaluation.variation import VARIATION, parameters_of
 from pronk.evaluation.walk import SETTLE_S, WALK, WALK_FIGURES
@@ -36,8 +36,7 @@ _OF_POLICY = "training gains of "
 
 
 def _part(origin: Results | Bodies, content: dict[str, Any], **fields: Any) -> Part:
-    where = "virtual robot" if origin.virtual else "robot"
-    content |= {"results": origin, "where": where}
+    content |= {"results": origin, "where": "virtual robot" if origin.virtual else "robot"}
     return Part(virtual=origin.virtual, content=content, **fields)
 
 
@@ -52,11 +51,10 @@ def walk_tables(walks: Results) -> tuple[Sheet, ...]:
         f"{SETTLE_S:g} s after the command are left out."
     )
     sheets = []
+    counts = {"walks": "n", "fell": "fell", "non-foot contact": "non_foot_contact"}
     for subject in walks.subjects:
         own = [cell for cell in walks.cells if cell.policy == subject.name]
-        rows = [("walks", *(str(cell.n) for cell in own))]
-        rows.append(("fell", *(str(cell.fell) for cell in own)))
-        rows.append(("non-foot contact", *(str(cell.non_foot_contact) for cell in own)))
+        rows = [(name, *(str(getattr(c, field)) for c in own)) for name, field in counts.items()]
         rows += [figure_row(name, WALK_FIGURES[name].unit, own, 2) for name in _WALK_TABLE]
         title = f"{subject.name}: mean +- standard deviation"
         columns = ("figure", *(cell.case for cell in own))
@@ -85,12 +83,8 @@ def walk_part(path: Path) -> Part:
 
 def climb_line(climb: Climb) -> Array:
     """Return size [m], share of crossed runs with the best lead, and its interval; (4, n)."""
-    return np.array(
-        [
-            (rung.size, rung.crossed / rung.runs, *share_interval(rung.crossed, rung.runs))
-            for rung in climb.rungs
-        ]
-    ).T
+    counts = [(rung.size, rung.crossed, rung.runs) for rung in climb.rungs]
+    return np.array([(size, k / n, *share_interval(k, n)) for size, k, n in counts]).T
 
 
 def crossing_table(crossings: Results) -> Sheet:
@@ -141,15 +135,8 @@ def crossing_part(path: Path) -> Part:
     figure = draw.lines(panels, columns=len(crossings.cases), mark=mark, bar="95 % interval")
     content = {"curves": picture(figure), "sheet": crossing_table(crossings)}
     summary = f"{first}, {place(crossings)}: gaps crossed {crossed or 'none'}."
-    return _part(
-        crossings, content, kind="crossing", title="Crossing gaps and steps", summary=summary
-    )
-
-
-def by_value(variation: Results, parameter: str, policy: str) -> list[tuple[Cell, ...]]:
-    """Return the cells of a policy, all commands of a value together, by value."""
-    cases = [varied.line(variation, parameter, policy, case.name) for case in variation.cases]
-    return list(zip(*cases, strict=True))
+    fields = {"kind": "crossing", "title": "Crossing gaps and steps"}
+    return _part(crossings, content, summary=summary, **fields)
 
 
 def mean(values: Sequence[float]) -> float:
@@ -158,47 +145,42 @@ def mean(values: Sequence[float]) -> float:
     return float(np.mean(kept)) if kept else float("nan")
 
 
-def varied_line(cells: Sequence[Sequence[Cell]], figure: str) -> Array:
-    """Return value, result and the ends of its bar; (4, n).
+def varied_line(variation: Results, parameter: str, policy: str, figure: str) -> Array:
+    """Return value, result and the ends of its bar, over the values of a parameter; (4, n).
 
     The result is the mean of the commands' means, with the mean of their standard deviations; of
     `landed` the share of all jumps, with Wilson's interval.
     """
+    cases = [varied.line(variation, parameter, policy, case.name) for case in variation.cases]
     points = []
-    for together in cells:
+    for cells in zip(*cases, strict=True):
         if figure == "landed":
-            landed, n = sum(c.succeeded for c in together), sum(c.n for c in together)
+            landed, n = sum(c.succeeded for c in cells), sum(c.n for c in cells)
             bar = (landed / n, *share_interval(landed, n))
         else:
-            y, d = (
-                mean([getattr(c.figures[figure], of) for c in together]) for of in ("mean", "std")
-            )
+            spreads = [cell.figures[figure] for cell in cells]
+            y, d = mean([one.mean for one in spreads]), mean([one.std for one in spreads])
             bar = (y, y - d, y + d)
-        points.append((together[0].value, *bar))
+        points.append((cells[0].value, *bar))
     return np.array(points).T
 
 
 def variation_panels(variation: Results) -> list[Panel]:
     """Return a column for each parameter, rows of height, distance and landed."""
     found = []
-    for figure in ("height", "distance", "landed"):
+    for figure, unit in (("height", "m"), ("distance", "m"), ("landed", "1")):
         for each in parameters_of(variation):
             name = each.name.removesuffix("_s").replace("_", " ")
-            lines = {
-                policy: varied_line(by_value(variation, each.name, policy), figure)
-                for policy in trial_page.policies(variation)
-            }
-            share = figure == "landed"
-            found.append(
-                Panel(
-                    title=name if figure == "height" else "",
-                    x_label=f"{name} [{each.unit}]" if share else "",
-                    y_label=f"{figure} [{'1' if share else 'm'}]",
-                    lines=lines,
-                    marks=(variation.settings["nominal"][each.name],),
-                    share=share,
-                )
+            policies = trial_page.policies(variation)
+            panel = Panel(
+                title=name if figure == "height" else "",
+                x_label=f"{name} [{each.unit}]" if figure == "landed" else "",
+                y_label=f"{figure} [{unit}]",
+                lines={one: varied_line(variation, each.name, one, figure) for one in policies},
+                marks=(variation.settings["nominal"][each.name],),
+                share=figure == "landed",
             )
+            found.append(panel)
     return found
 
 

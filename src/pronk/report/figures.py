@@ -135,8 +135,8 @@ def hero(result: MatchResult) -> Figure:
 
 def overview(fits: Mapping[str, JointFit]) -> Figure:
     """Draw the gain of every joint; rows are joint groups, columns are legs."""
-    labels, options = ("frequency [Hz]", "gain [dB]"), {"height": 2.0, "sharey": "row"}
-    with style.joint_panels(list(fits), *labels, **options) as (figure, panels):
+    labels = ("frequency [Hz]", "gain [dB]")
+    with style.joint_panels(list(fits), *labels, height=2.0, sharey="row") as (figure, panels):
         for name, axes in panels.items():
             fit = fits[name]
             _panel(axes, fit, _simulated(fit))
@@ -306,13 +306,12 @@ def _draw_gains(axes: Axes, gains: MatchedGains, joint: str) -> None:
     one, leg = gains.joints[joint], style.leg_of(joint)
     point = (one.stiffness, one.damping)
     ends = np.array([one.stiffness_ci95, one.damping_ci95])
-    lengths = np.nan_to_num(np.abs(ends.T - point).T, posinf=0.0)[..., None]
+    x_bar, y_bar = np.nan_to_num(np.abs(ends.T - point).T, posinf=0.0)[..., None]
     look: dict[str, Any] = {"color": style.MEASURED, "markersize": 5, "elinewidth": 1.0}
-    marker = style.LEG_MARKERS.get(leg, "o")
-    axes.errorbar(one.stiffness, one.damping, lengths[1], lengths[0], fmt=marker, **look)
+    axes.errorbar(*point, y_bar, x_bar, fmt=style.LEG_MARKERS.get(leg, "o"), **look)
     if not leg:
-        words = style.joint_words(joint)
-        axes.annotate(words, point, textcoords="offset points", xytext=(7, 7))
+        place: dict[str, Any] = {"textcoords": "offset points", "xytext": (7, 7)}
+        axes.annotate(style.joint_words(joint), point, **place)
 
 
 def busiest_window(prediction: JointPrediction, seconds: float) -> slice:

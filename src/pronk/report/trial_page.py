@@ -67,17 +67,16 @@ def traces(trial: Results, folder: Path) -> tuple[Traces, int] | None:
     present = [(row, path) for row, path in kept if path.exists()]
     if not present:
         return None
-    found: Traces = {
-        what: {name: {} for name in policies(trial)} for what in ("height", "roll", "pitch")
-    }
+    axes = {"roll": 0, "pitch": 1}
+    found: Traces = {what: {name: {} for name in policies(trial)} for what in ("height", *axes)}
     for row, path in present:
         capture = capture_file.load(path)
-        time, turn = capture.time - row.began, capture.angular_velocity
-        since, run = time - row.script.on, time - row.script.start
+        since = capture.time - row.began - row.script.on
         own = {"height": _cut(since, capture.position[:, 2], -BEFORE_S, AFTER_S)}
         if row.case == RATES.name:
-            own["roll"] = _cut(run, turn[:, 0], 0.0, row.script.run_s)
-            own["pitch"] = _cut(run, turn[:, 1], 0.0, row.script.run_s)
+            run = capture.time - row.began - row.script.start
+            for what, axis in axes.items():
+                own[what] = _cut(run, capture.angular_velocity[:, axis], 0.0, row.script.run_s)
         for what, trace in own.items():
             found[what][row.policy].setdefault(row.case, []).append(trace)
     return found, len(kept) - len(present)
@@ -104,8 +103,7 @@ def _image(path: Path) -> str:
 
     data = path.read_bytes()
     try:
-        with Image.open(io.BytesIO(data)) as opened:
-            opened.load()
+        Image.open(io.BytesIO(data)).load()
     except Exception as error:
         raise ArtefactError(
             f"{path}: not a readable picture ({type(error).__name__}); delete it, or run `pronk "
@@ -126,10 +124,8 @@ def part(path: Path) -> Part:
     checks, first = trial_checks(trial), trial.subjects[0].name
     passed = sum(check.passed for check in checks)
     pictures, names = films(folder)
-    panels = [
-        (f"{name} [m]", values(trial, name), published_jumps(name))
-        for name in ("height", "distance", "gap")
-    ]
+    drawn = ("height", "distance", "gap")
+    panels = [(f"{name} [m]", values(trial, name), published_jumps(name)) for name in drawn]
     content = {
         "trial": trial,
         "where": where,
@@ -161,11 +157,11 @@ def part(path: Path) -> Part:
 def _total(trial: Results, name: str) -> dict[str, float]:
     """Counts over all commands, and the share of landings [%] with its interval."""
     own = [cell for cell in trial.cells if cell.policy == name]
-    fields = {"n": "n", "jumped": "found", "landed": "succeeded", "fell": "fell"}
-    counts = {key: sum(getattr(cell, field) for cell in own) for key, field in fields.items()}
-    low, high = share_interval(counts["landed"], counts["n"])
-    share = counts["landed"] / counts["n"]
-    return counts | {"share": 100 * share, "low": 100 * low, "high": 100 * high}
+    counts = {of: sum(getattr(cell, of) for cell in own) for of in ("n", "found", "fell")}
+    landed, n = sum(cell.succeeded for cell in own), counts["n"]
+    low, high = share_interval(landed, n)
+    share = {"share": 100 * landed / n, "low": 100 * low, "high": 100 * high}
+    return counts | {"landed": landed} | share
 
 
 def _trace_figures(trial: Results, folder: Path) -> dict[str, Any]:
