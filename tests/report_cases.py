@@ -51,9 +51,12 @@ def second_order(omega, stiffness, damping, inertia, viscous=0.01):
     return stiffness / (inertia * s**2 + (damping + viscous) * s + stiffness)
 
 
+def gap_db(measured, simulated):
+    return 20.0 * np.log10(np.abs(measured) / np.abs(simulated))
+
+
 def error_db(measured, simulated, band):
-    gap = 20.0 * np.log10(np.abs(measured) / np.abs(simulated))
-    return float(np.sqrt(np.mean(gap[band] ** 2)))
+    return float(np.sqrt(np.mean(gap_db(measured, simulated)[band] ** 2)))
 
 
 def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
@@ -65,41 +68,28 @@ def joint_fit(name: str, leg: int = 0, *, virtual: bool = True) -> JointFit:
     matched = second_order(omega, stiffness, damping, inertia)
     naive = second_order(omega, *NOMINAL_GAINS, inertia)
     responses = []
+    known: dict[str, Any] = {"joint": f"{LEGS[leg]}_{name}", "omega": omega, "virtual": virtual}
+    known |= {"estimator": "H1", "window": "hann 4 s, 75 % overlap", "segment_s": 4.0}
+    known |= {"coherence": 1.0 - 0.3 * (omega / omega[-1]) ** 3, "delay_s": 0.002}
+    known |= {"averages": np.full(omega.size, 12.0), "third_harmonic": 0.02}
     for amplitude in (0.25, 0.125):
         noise = 0.01 * (rng.normal(size=(3, omega.size)) + 1j * rng.normal(size=(3, omega.size)))
         repeats = matched * np.exp(-1j * omega * 0.002) + noise * 0.25 / amplitude
-        responses.append(
-            FrequencyResponse(
-                joint=f"{LEGS[leg]}_{name}",
-                amplitude=amplitude,
-                omega=omega,
-                response=repeats.mean(axis=0),
-                coherence=1.0 - 0.3 * (omega / omega[-1]) ** 3,
-                averages=np.full(omega.size, 12.0),
-                repeats=repeats,
-                estimator="H1",
-                window="hann 4 s, 75 % overlap",
-                segment_s=4.0,
-                delay_s=0.002,
-                third_harmonic=0.02,
-                virtual=virtual,
-                source="synthetic",
-            )
-        )
+        mean = repeats.mean(axis=0)
+        one = FrequencyResponse(amplitude=amplitude, response=mean, repeats=repeats, **known)
+        responses.append(one)
     first = responses[0]
     band = first.band(*band_hz)
     k, d = np.linspace(13, 27, 21), np.linspace(0.1, 0.7, 21)
-    surface = [
-        [error_db(first.response, second_order(omega, a, b, inertia), band) ** 2 for b in d]
-        for a in k
-    ]
+    grid = second_order(omega, k[:, None, None], d[None, :, None], inertia)
+    surface = np.mean(gap_db(first.response, grid)[..., band] ** 2, axis=-1)
     is_knee = name == "knee"
     return JointFit(
         joint=first.joint,
         responses=tuple(responses),
         grid_stiffness=k,
         grid_damping=d,
-        grid_error=np.array(surface),
+        grid_error=surface,
         stiffness=stiffness,
         damping=damping,
         ci95={
@@ -130,17 +120,12 @@ def match(*, virtual: bool = True, robot: str = "mini_cheetah", legs: int = 4) -
     """Return a match of the three joints of some legs."""
     fits = [joint_fit(name, leg, virtual=virtual) for leg in range(legs) for name in GROUPS]
     joints = {fit.joint: fit for fit in fits}
-    groups = {
-        name: GroupGains(
-            stiffness=round(k * 2) / 2,
-            damping=round(d * 20) / 20,
-            stiffness_range=2.0,
-            damping_range=0.05,
-            ellipsoid=((1.2, 0.0), (0.0, 0.001)),
-            ellipsoid_center=(k, d),
-        )
-        for name, (_, k, d, _) in GROUPS.items()
-    }
+    box: dict[str, Any] = {"stiffness_range": 2.0, "damping_range": 0.05}
+    box["ellipsoid"] = ((1.2, 0.0), (0.0, 0.001))
+    groups = {}
+    for name, (_, k, d, _) in GROUPS.items():
+        centre = {"stiffness": round(k * 2) / 2, "damping": round(d * 20) / 20}
+        groups[name] = GroupGains(ellipsoid_center=(k, d), **centre, **box)
     gains = MatchedGains(
         robot=robot,
         simulator=SimulatorInfo(version="3.11.0"),
@@ -275,10 +260,8 @@ def varied() -> Results:
                 for number in range(3):
                     good = name == "matched" or parameter != mass.name
                     known = dict.fromkeys(variation.VARIED_FIGURES, 0.5 + 0.1 * number)
-                    known["height"] = height + 0.01 * (number - 1)
-                    figures = JumpFigures(
-                        standing=True, found=True, upright=good, fell=not good, **known
-                    )
+                    known |= {"height": height + 0.01 * (number - 1), "found": True}
+                    figures = JumpFigures(standing=True, upright=good, fell=not good, **known)
                     rows.append(row(name, case, number, figures, parameter=parameter, value=value))
     settings = {"parameters": [asdict(mass)], "nominal": {mass.name: 0.0}}
     names = ("matched", "naive")
@@ -293,16 +276,9 @@ def write_bodies(folder: Path) -> Bodies:
         gains_file.save(folder / where / "gains.yaml", gains)
         errors = {"training gains of matched": 0.1 * i, "training gains of naive": 0.6 * i}
         errors[bodies.MATCHED] = 0.02 * i
-        found.append(
-            Body(
-                name=f"body {i}",
-                folder=where,
-                seed=i,
-                sha256="ef" * 32,
-                errors=errors,
-                trial=write_trial(folder / where / "trial", cases=CASES[:2]),
-            )
-        )
+        trial = write_trial(folder / where / "trial", cases=CASES[:2])
+        one: dict[str, Any] = {"name": f"body {i}", "folder": where, "seed": i, "trial": trial}
+        found.append(Body(sha256="ef" * 32, errors=errors, **one))
     head = of_kind(results.JUMPS, ("matched", "naive"), cases=(), rows=())
     fields = {n: getattr(head, n) for n in ("robot", "subjects", "sim_params", "seed", "versions")}
     made = Bodies(**fields, bodies=tuple(found))

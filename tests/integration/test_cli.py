@@ -1,4 +1,4 @@
-"""The command line: from a sweep to gains, predictions and exports; help, exit statuses."""
+"""The command line: from a sweep to gains, predictions, exports; help, exit statuses, the demo."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from command_line import accepted, invoke, refused
+from hopper import ROBOT, write_hopper
 from pronk import __version__
 from pronk.cli import main as cli
-from pronk.errors import PronkError
+from pronk.cli.demo import find_policies
+from pronk.errors import ArtefactError, PronkError
 from pronk.logs.readers import find_logs
 
 KNEE = ("--joints", "FR_knee")
@@ -175,3 +177,18 @@ def test_drive_mode_fits_what_it_can_and_refuses_the_rest(matched, tmp_path):
     assert not out.exists()
     printed = accepted(*common, "--mode", "drive", "--fit", "damping", "--fit", "delay")
     assert "held" in printed
+
+
+def test_the_demo_takes_the_matched_policy_first_and_refuses_another_robots(tmp_path):
+    pytest.importorskip("onnxruntime")
+    assert find_policies(None, ROBOT)[0].parts[-3:] == ("policies", "matched", "policy.onnx")
+    own = {"stiffness": (17.0,) * 12, "damping": (0.4,) * 12, "gains_sha256": ""}
+    for name, changes in (("naive", {"gains": "naive", **own}), ("matched", {})):
+        (tmp_path / name).mkdir()
+        write_hopper(tmp_path / name / "policy.onnx", 0.5, **changes)
+    found = find_policies(tmp_path, ROBOT)
+    assert [path.parent.name for path in found] == ["matched", "naive"]
+    (tmp_path / "a").mkdir()
+    write_hopper(tmp_path / "a" / "policy.onnx", robot="go2")
+    with pytest.raises(ArtefactError, match="go2"):
+        find_policies(tmp_path, ROBOT)

@@ -13,8 +13,8 @@ from command_line import invoke
 from pronk.errors import LogError
 from pronk.links.machine import State
 from pronk.report import build, deploy_page, deploy_run
+from pronk.report.deploy_page import part
 from pronk.report.deploy_run import delay, drive_delay, quantiles
-from pronk.report.page import Part
 from pronk.robots import load_robot
 from pronk.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
 from pronk.runtime.log import DeployLogWriter, read_deploy_log
@@ -63,21 +63,16 @@ def say(writer: DeployLogWriter, at: float, kind: str, text: str, **more: int) -
     writer.event(np.frombuffer(event(at, kind, text, **more).tobytes(), dtype=EVENT)[0])
 
 
-def targets(count: int) -> np.ndarray:
-    """Small steps every 20 ms, as a policy gives them. (count, joints)."""
-    steps = np.random.default_rng(1).uniform(-0.2, 0.2, (count // 10 + 1, 12))
-    return POSE + np.repeat(steps, 10, axis=0)[:count]
-
-
 def flown(path: Path, count: int = 400, lag: int = 2, **changes: Any) -> Path:
-    """A run whose torques obey the drives' law with targets sent `lag` ticks earlier."""
-    desired = targets(count)
+    """A run with a step every 20 ms; torques obey the law of drives, `lag` ticks late."""
+    steps = np.random.default_rng(1).uniform(-0.2, 0.2, (count // 10 + 1, 12))
+    desired = POSE + np.repeat(steps, 10, axis=0)[:count]
     writer = DeployLogWriter(path, HEADER)
     say(writer, 0.0, "robot", VIRTUAL)
     for k in range(count):
-        torque = KP * (desired[max(k - lag, 0)] - POSE)
-        answered = {"latency": 0.003} if k % 10 == 0 else {}
-        writer.tick(record(k, desired[k], torque=torque, **answered, **changes))
+        known = {"torque": KP * (desired[max(k - lag, 0)] - POSE)}
+        known |= {"latency": 0.003} if k % 10 == 0 else {}
+        writer.tick(record(k, desired[k], **(known | changes)))
         if k % 10 == 0:
             step = np.zeros((), dtype=STEP)
             step["sequence"], step["begun"], step["live"] = k // 10, k * TICK_S, 1
@@ -128,30 +123,20 @@ def test_quantiles_are_those_of_the_sorted_values() -> None:
 
 @pytest.mark.parametrize("lag", [1, 2, 4])
 def test_the_drives_delay_is_found(tmp_path: Path, lag: int) -> None:
-    log = read_deploy_log(flown(tmp_path / "run.mcap", lag=lag))
+    path = flown(tmp_path / "run.mcap", lag=lag)
+    log, made = read_deploy_log(path), part(path)
     # A state at tick k sees the target sent at tick k - lag, on the wire 0.4 ms after the tick:
     # right for every shift between (lag - 1) ticks and lag ticks, less 0.4 ms.
     latest = lag * TICK_S - 4e-4
     found = drive_delay(log, ROBOT)
     np.testing.assert_allclose(found, (max(latest - TICK_S, 0.0), latest), atol=2.6e-4)
-    whole_delay = delay(log, ROBOT)
-    assert whole_delay.within is (lag < 4)
-    assert whole_delay.longest == pytest.approx(0.003 + found[1])
-
-
-def test_a_delay_beyond_training_is_a_warning(tmp_path: Path) -> None:
-    made = page(flown(tmp_path / "run.mcap", lag=5))
-    assert made.figures["delay"]["within"] is False
-    assert made.warning
+    assert delay(log, ROBOT).longest == pytest.approx(0.003 + found[1])
+    # A delay beyond that of training is a warning.
+    assert (made.figures["delay"]["within"], made.warning) == (lag < 4, lag >= 4)
 
 
 def test_torques_that_are_not_measured_leave_the_drives_out(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    writer = DeployLogWriter(path, HEADER)
-    for k, target in enumerate(targets(400)):
-        answered = {"latency": 0.003} if k % 10 == 0 else {}
-        writer.tick(record(k, target, torque=np.full(12, np.nan), **answered))
-    writer.end(complete=True, figures={})
+    path = flown(tmp_path / "run.mcap", torque=np.full(12, np.nan))
     found = delay(read_deploy_log(path), ROBOT)
     assert np.isnan(found.drives).all()
     assert found.longest == pytest.approx(0.003)
@@ -174,7 +159,7 @@ def test_measures_of_a_fault(tmp_path: Path) -> None:
     assert math.isnan(joints["torque"][0])  # all zeros: this robot reports none
     assert len(deploy_run.times(log)["age of the state"][0]) == 201  # until the fault
     assert "0.40 s, after 0.2 s of the policy: tilted" in deploy_page.verdict(log)
-    content = page(tmp_path / "run.mcap").content
+    content = part(tmp_path / "run.mcap").content
     assert (content["moved"], content["given"], list(content["damped"])) == (100, 200, [True] * 100)
 
 
@@ -194,14 +179,10 @@ def test_motor_temperatures_are_drawn_where_they_are_measured(tmp_path: Path) ->
     np.testing.assert_array_equal(hot.temperature[4], np.arange(12.0) + 30.0)
 
 
-def page(path: Path) -> Part:
-    return deploy_page.part(path)
-
-
 def test_a_cut_log_is_a_warning(tmp_path: Path) -> None:
     path = faulted(tmp_path / "run.mcap", end=False)
     path.write_bytes(path.read_bytes()[:-20])
-    made = page(path)
+    made = part(path)
     assert made.figures["complete"] is False
     assert made.warning
     assert "The log was cut" in build.page("cut", [made])
@@ -215,7 +196,7 @@ def test_the_page_of_a_refusal(tmp_path: Path) -> None:
         writer.tick(record(k, POSE, mode=Mode.PREFLIGHT, **nothing))
     say(writer, 0.01, "refused", "the battery gives 12.0 V; charge it.")
     writer.end(complete=True, figures={})
-    made = page(path)
+    made = part(path)
     assert made.summary.endswith("the battery gives 12.0 V; charge it.")
     assert made.figures["delay"]["within"] is None
 
@@ -234,9 +215,5 @@ def test_a_log_and_a_folder_of_logs_become_pages(tmp_path: Path) -> None:
     assert [one.source for one in found] == ["a.mcap", "deep/b.mcap"]
     assert [one.virtual for one in found] == [False, True]
     assert found[1].figures["delay"]["within"] is True
-
-
-def test_a_file_that_is_not_a_log_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "other.mcap").write_bytes(b"no log of anything")
     with pytest.raises(LogError, match="not a log of a deployment"):
         build.write_report(tmp_path / "other.mcap")

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("torch")
 pytest.importorskip("mjlab")
-from pronk.cli import main as cli
+from command_line import refused
 from pronk.errors import PronkError
 from pronk.train import devices
 from pronk.train.phases import TASKS
@@ -20,13 +20,6 @@ from pronk.train.tasks import load_task
 
 pytestmark = pytest.mark.train
 NAIVE = ("--gains", "naive")
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    assert cli.run(["train", *map(str, arguments)]) == 2
-    text = capsys.readouterr().err
-    assert text.count("\n") == 1
-    return text
 
 
 @pytest.mark.parametrize(
@@ -63,25 +56,21 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
         (("walk", "--resume"), "holds no run|--resume"),
     ],
 )
-def test_bad_input(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: tuple[str, ...], words: str
-) -> None:
+def test_bad_input(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
     out = tmp_path / "run"
-    text = refused(capsys, *arguments, "--out", out)
+    text = refused("train", *arguments, "--out", out)
     for word in words.split("|"):
         assert word in text, (word, text)
     assert not out.exists()
 
 
-def test_a_folder_that_is_not_empty_stays_as_it_is(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_folder_that_is_not_empty_stays_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("kept")
-    text = refused(capsys, "walk", *NAIVE, "--out", tmp_path)
+    text = refused("train", "walk", *NAIVE, "--out", tmp_path)
     assert "notes.txt" in text
     assert "--resume" in text
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
-    assert "is a file" in refused(capsys, "walk", *NAIVE, "--out", tmp_path / "notes.txt")
+    assert "is a file" in refused("train", "walk", *NAIVE, "--out", tmp_path / "notes.txt")
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"schema": "pronk/run/1"}', "{"])
@@ -92,12 +81,8 @@ def test_damaged_provenance_is_refused(tmp_path: Path, content: str) -> None:
 
 
 def test_a_folder_is_trained_in_by_one_process(tmp_path: Path) -> None:
-    with (
-        RunFolder(tmp_path).locked(),
-        pytest.raises(PronkError, match="another process"),
-        RunFolder(tmp_path).locked(),
-    ):
-        pass
+    with RunFolder(tmp_path).locked(), pytest.raises(PronkError, match="another process"):
+        RunFolder(tmp_path).locked().__enter__()
 
 
 def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:
