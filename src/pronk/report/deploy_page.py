@@ -81,10 +81,19 @@ def overview(log: DeployLog) -> Figure:
     ]
     tracks = tracks[:4] + [one for one in tracks[4:] if np.isfinite(one[2]).any()]
     limit = log.header.get("limits", {}).get("tilt") or np.nan
+    whole = sum(length for _, _, length in run.stretches(log))
+    centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8.5}
     rows, ratios = len(tracks) + 1, [0.42, *[1.0] * len(tracks)]
     with drawing(rows, height=1.3 * rows + 0.5, sharex=True, height_ratios=ratios) as drawn:
         figure, panels = drawn[0], drawn[1][:, 0]
-        _draw_modes(panels[0], log)
+        axes = panels[0]
+        for mode, begin, length in run.stretches(log):
+            colour = _MODE_COLOURS.get(mode, "#ececec")
+            axes.axvspan(begin, begin + length, facecolor=colour, edgecolor="white")
+            if length >= 0.0075 * len(mode.name) * whole:  # the name fits
+                axes.text(begin + 0.5 * length, 0.5, mode.name.lower(), **centred)
+        axes.set(ylim=(0.0, 1.0), yticks=[], ylabel="mode")
+        axes.grid(visible=False)
         for i, (label, time, values, look) in enumerate(tracks):
             axes = panels[i + 1]
             axes.plot(time, values, **look)
@@ -105,20 +114,6 @@ def overview(log: DeployLog) -> Figure:
         keys = [key("command", **_COMMAND), key("policy's estimate; turning: gyro", **_ESTIMATE)]
         legend(figure, [*keys, key("tilt limit", **_LIMIT), *_mark_keys(log)])
     return figure
-
-
-def _draw_modes(axes: Axes, log: DeployLog) -> None:
-    """Draw a bar for each mode, with its name where it fits."""
-    found = run.stretches(log)
-    whole = sum(length for _, _, length in found)
-    for mode, begin, length in found:
-        colour = _MODE_COLOURS.get(mode, "#ececec")
-        axes.axvspan(begin, begin + length, facecolor=colour, edgecolor="white")
-        if length >= 0.0075 * len(mode.name) * whole:
-            look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8.5}
-            axes.text(begin + 0.5 * length, 0.5, mode.name.lower(), **look)
-    axes.set(ylim=(0.0, 1.0), yticks=[], ylabel="mode")
-    axes.grid(visible=False)
 
 
 def window(log: DeployLog) -> tuple[float, float, str]:
@@ -157,11 +152,12 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure:
 
 def verdict(log: DeployLog) -> str:
     """Return the outcome in one sentence."""
-    kinds = {event.text for event in log.events if event.kind == "robot"}
-    robot = log.header["robot"]
-    robot = f"Virtual {robot}" if VIRTUAL in kinds else f"Real {robot}" if REAL in kinds else robot
-    if not {REAL, VIRTUAL} & kinds:
-        robot += " (real or virtual unknown)"
+    kinds, robot = (
+        {event.text for event in log.events if event.kind == "robot"},
+        log.header["robot"],
+    )
+    known = f"Virtual {robot}" if VIRTUAL in kinds else f"Real {robot}" if REAL in kinds else ""
+    robot = known or f"{robot} (real or virtual unknown)"
     active = sum(length for mode, _, length in run.stretches(log) if mode in run.POLICY_MODES)
     first = {event.kind: event for event in reversed(log.events)}
     if fault := first.get("fault"):
@@ -170,10 +166,8 @@ def verdict(log: DeployLog) -> str:
         return f"{robot}: a fault at {at:.2f} s, {after}: {fault.text}."
     if refusal := first.get("refused"):
         return f"{robot} was not moved: {refusal.text}"
-    if not active:
-        return f"{robot}: no fault; the policy was never active."
-    inputs = f"jump inputs: {len(jumps(log))}"
-    return f"{robot}: no fault; the policy was active for {active:.1f} s, {inputs}."
+    for_s = f"active for {active:.1f} s, jump inputs: {len(jumps(log))}"
+    return f"{robot}: no fault; the policy was {for_s if active else 'never active'}."
 
 
 def part(path: Path) -> Part:
@@ -208,6 +202,7 @@ def part(path: Path) -> Part:
         "tracking_rms_rad": dict(zip(log.joints, tracking["error"], strict=True)),
     }
     events = sorted(log.events, key=lambda event: event.time)
+    shown = ("ticks", "first", "largest", "joint", "why")
     content = {
         "log": log,
         "file": path.name,
@@ -240,10 +235,7 @@ def part(path: Path) -> Part:
         "interventions": table(
             "action | ticks | first at [s];2 | largest change [rad] | joint | reason",
             [
-                (
-                    one["level"].lower(),
-                    *(one[n] for n in ("ticks", "first", "largest", "joint", "why")),
-                )
+                (one["level"].lower(), *(one[name] for name in shown))
                 for one in figures["interventions"]
             ],
             "joint: the one whose target was changed most often for this reason.",

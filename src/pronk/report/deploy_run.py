@@ -39,13 +39,10 @@ _UNKNOWN = (float("nan"), float("nan"))
 def quantiles(values: Array) -> dict[str, float]:
     """Return `n`, `QUANTILES` and `max` of the finite values; NaN if fewer than one lies beyond."""
     found = np.sort(values[np.isfinite(values)])
-    n = len(found)
-    of = {
-        name: found[int(np.ceil(share * n - 1e-9)) - 1]
-        if n * (1.0 - share) > 1.0 - 1e-9
-        else np.nan
-        for name, share in QUANTILES.items()
-    }
+    n, of = len(found), {}
+    for name, share in QUANTILES.items():
+        beyond = n * (1.0 - share) > 1.0 - 1e-9
+        of[name] = found[int(np.ceil(share * n - 1e-9)) - 1] if beyond else np.nan
     return {"n": n} | of | {"max": found[-1] if n else np.nan}
 
 
@@ -110,17 +107,11 @@ def interventions(log: DeployLog) -> list[dict[str, Any]]:
         if there.any():
             often = (change[there] > _MOVED).sum(axis=0)
             moved = level < FilterAction.DAMP and bool(often.any())
-            found.append(
-                {
-                    "level": level.name,
-                    "reason": reason.name,
-                    "why": reason.text,
-                    "ticks": int(there.sum()),
-                    "first": float(seconds(log, log.time[there][0])),
-                    "largest": float(change[there].max()) if moved else float("nan"),
-                    "joint": log.joints[int(often.argmax())] if moved else "",
-                }
-            )
+            one = {"level": level.name, "reason": reason.name, "why": reason.text}
+            one |= {"ticks": int(there.sum()), "first": float(seconds(log, log.time[there][0]))}
+            one["largest"] = float(change[there].max()) if moved else float("nan")
+            one["joint"] = log.joints[int(often.argmax())] if moved else ""
+            found.append(one)
     return found
 
 

@@ -37,15 +37,12 @@ def find_gains(folder: Path) -> Path:
         raise ArtefactError(
             f"{folder}: no such folder; give the one that `pronk match --out` wrote to."
         )
-    schema = f"schema: {gains_file.SCHEMA}"
-    found = [
-        path
-        for path in folder.glob("*.yaml")
-        if path.name == "gains.yaml" or schema in path.read_text("utf-8", "replace")[:200]
-    ]
-    for path in found:
-        if path.name == "gains.yaml" or len(found) == 1:
-            return path
+    if (usual := folder / "gains.yaml").exists():
+        return usual
+    schema, files = f"schema: {gains_file.SCHEMA}", folder.glob("*.yaml")
+    found = [path for path in files if schema in path.read_text("utf-8", "replace")[:200]]
+    if len(found) == 1:
+        return found[0]
     what = "several gains files and none is called" if found else "no"
     raise ArtefactError(f"{folder}: {what} gains.yaml; `pronk match LOG... --out` writes one.")
 
@@ -61,16 +58,12 @@ def robot_joints(gains: MatchedGains) -> dict[str, Joint]:
 
 def group_members(gains: MatchedGains) -> dict[str, list[str]]:
     """Return the matched joints of each group, by the robot or, if unknown, by their names."""
-    known = robot_joints(gains)
-    found = {
-        group: [
-            name
-            for name in gains.joints
-            if (known[name].group == group if name in known else name.endswith(group))
-        ]
-        for group in gains.groups
-    }
-    return {group: names for group, names in found.items() if names}
+    known, found = robot_joints(gains), {}
+    for group in gains.groups:
+        for name in gains.joints:
+            if known[name].group == group if name in known else name.endswith(group):
+                found.setdefault(group, []).append(name)
+    return found
 
 
 def verdict(result: MatchResult) -> dict[str, Any]:
@@ -208,12 +201,10 @@ def ranges_table(gains: MatchedGains, members: Mapping[str, list[str]]) -> Sheet
 def _zero_armature_table(fits: Mapping[str, JointFit]) -> Sheet:
     rows = []
     for name, fit in fits.items():
-        error = fit.zero_armature_error_db
-        if np.isfinite(error):
+        if np.isfinite(error := fit.zero_armature_error_db):
             lost = any(flag.startswith(f"{ZERO_ARMATURE}no match") for flag in fit.flags)
-            ratio = error / max(fit.error_db, 1e-6)
-            outcome = "no match" if lost else "not excluded"
-            rows.append((joint_words(name), error, fit.error_db, ratio, outcome))
+            errors = (error, fit.error_db, error / max(fit.error_db, 1e-6))
+            rows.append((joint_words(name), *errors, "no match" if lost else "not excluded"))
     columns = "joint | best error without rotor inertia [dB];2 | matched error [dB];2 | ratio;1"
     return table(f"{columns} | without rotor inertia", rows)
 
@@ -225,14 +216,13 @@ def _prediction_section(found: Prediction) -> dict[str, Any]:
     for one in found.joints:
         errors = (one.rmse_naive, one.rmse_naive_delayed, one.rmse_matched)
         ratio = one.rmse_matched / one.rmse_naive if one.rmse_naive > 0.0 else None
-        rows.append(
-            (joint_words(one.joint), one.unit, *errors, ratio, one.r2_naive, one.r2_matched)
-        )
+        fits = (one.r2_naive, one.r2_matched)
+        rows.append((joint_words(one.joint), one.unit, *errors, ratio, *fits))
     columns = "joint | unit | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4"
     columns += " | matched / nominal;2 | R² nominal | R² matched"
-    figure = figures.prediction(by_joint[first], virtual=found.virtual)
-    made = {"figure": picture(figure), "table": table(columns, rows)}
-    return {"source": found.source, "joint": first} | made
+    figure = picture(figures.prediction(by_joint[first], virtual=found.virtual))
+    shown = {"figure": figure, "table": table(columns, rows)}
+    return {"source": found.source, "joint": first} | shown
 
 
 def _scale_table(
@@ -243,11 +233,10 @@ def _scale_table(
     """Mean ratio of matched gains and those of the real drive, by joint group."""
     rows = []
     for group, names in members.items():
-        pairs = [(gains.joints[n].stiffness, gains.joints[n].damping, *drive[n])
-                 for n in names if min(drive.get(n, (0.0,))) > 0.0]  # fmt: skip
-        if pairs:
-            k, d, drive_k, drive_d = np.array(pairs).T
-            rows.append((joint_words(group), np.mean(k / drive_k), np.mean(d / drive_d)))
+        if known := [name for name in names if min(drive.get(name, (0.0,))) > 0.0]:
+            own = [(gains.joints[name].stiffness, gains.joints[name].damping) for name in known]
+            ratios = np.array(own) / np.array([drive[name] for name in known])
+            rows.append((joint_words(group), *ratios.mean(axis=0)))
     return table(
         "group | stiffness, matched / real drive;2 | damping, matched / real drive;2",
         rows,
