@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from pronk.cli.main import run_commands
+from pronk.cli.main import run
 
 SUMMARIES = {
     "match": "pronk, mujoco.sysid and CMA-ES on the same logs.",
@@ -18,4 +18,4 @@ SUMMARIES = {
 
 if __name__ == "__main__":
     commands = {name: (f"benchmarks.{name}:{name}", summary) for name, summary in SUMMARIES.items()}
-    sys.exit(run_commands(commands, sys.argv[1:], "python -m benchmarks"))
+    sys.exit(run(sys.argv[1:], commands, "python -m benchmarks"))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pronk
 from pronk.cli import console
 from pronk.cli.match import prediction_rows, summary
-from pronk.cli.sweep import AMPLITUDES, make
+from pronk.cli.sweep import AMPLITUDES
 from pronk.errors import PronkError
 
 if TYPE_CHECKING:
@@ -152,6 +152,8 @@ def sweep_and_match(
     The smaller amplitude only shows whether the gains hold there too; it has one repeat.
     """
     from pronk.evaluation.virtual_sweep import sweep_virtual
+    from pronk.excitation.plan import make_plan
+    from pronk.excitation.signals import Chirp, LogChirp, Signal
     from pronk.logs.readers import read_logs
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
@@ -163,14 +165,15 @@ def sweep_and_match(
 
     params, cpus = load_sim_params(), os.cpu_count() or 1
 
-    def record(folder: str, seed: int, *excitation: Any) -> list[Path]:
-        plan = make(robot, None, *excitation)
+    def record(folder: str, seed: int, signal: Signal, **counts: Any) -> list[Path]:
+        plan = make_plan(robot, signal=signal, **counts)
         plan.check()
         how: Any = {"progress": report.bar(f"sweep ({folder})"), "overwrite": True}
         return sweep_virtual(plan, params, out / folder, seed=seed, processes=cpus, **how)
 
-    paths = record("logs", seed, "chirp", AMPLITUDES, (repeats, *[1] * len(AMPLITUDES[1:])))
-    fresh = record("fresh", seed + 1, "log-chirp", AMPLITUDES[:1], 1)
+    counts = (repeats, *[1] * len(AMPLITUDES[1:]))
+    paths = record("logs", seed, Chirp(), amplitudes=AMPLITUDES, repeats=counts)
+    fresh = record("fresh", seed + 1, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
     logs = read_logs(paths, processes=cpus, robot=robot)
     settings = MatchSettings(method="quick" if quick else "grid")
     result = match_logs(logs, robot, settings=settings, progress=report)

@@ -56,37 +56,37 @@ RENAMED = {
 _JSON = "json_file"
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Run the command line of the words after `pronk`; return its exit status."""
-    return run_commands(COMMANDS, arguments, "pronk")
-
-
-def run_commands(
-    commands: Mapping[str, tuple[str, str]], arguments: Sequence[str], program: str
+def run(
+    arguments: Sequence[str],
+    commands: Mapping[str, tuple[str, str]] = COMMANDS,
+    program: str = "pronk",
 ) -> int:
-    """Run one of `commands`, of the program of that name; return its exit status."""
+    """Run one of `commands` with the words after the program's name; return its exit status."""
     try:
         return _dispatch(commands, list(arguments), program)
-    except PronkError as error:
-        _print_error(str(error))
-        return 2
-    except KeyboardInterrupt:
-        _print_error("interrupted.")
-        return 130
+    except SystemExit as stop:  # The help of a command was printed.
+        return int(stop.code or 0)
     except BrokenPipeError:
         sys.stderr.close()  # The reader of a pipe has closed it.
         return 0
+    except PronkError as error:
+        status, text = 2, str(error)
+    except KeyboardInterrupt:
+        status, text = 130, "interrupted."
     except MemoryError:
-        _print_error("out of memory; give fewer logs or joints at a time.")
-        return 1
+        status, text = 1, "out of memory; give fewer logs or joints at a time."
     except Exception as error:
         if os.environ.get("PRONK_DEBUG"):
             traceback.print_exc()
-        _print_error(
-            f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
-            "PRONK_DEBUG=1 shows where it happened."
+        status, text = (
+            1,
+            (
+                f"{type(error).__name__}: {error}. This is a defect of pronk, not of your input; "
+                "PRONK_DEBUG=1 shows where it happened."
+            ),
         )
-        return 1
+    print(f"pronk: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
+    return status
 
 
 def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], program: str) -> int:
@@ -108,20 +108,17 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
         raise PronkError(f"there is no command {name!r}; {hint}")
     command = pkgutil.resolve_name(commands[name][0])
     values = _parse(command, arguments[1:], f"{program} {name}")
-    if values is None:  # The help was printed.
-        return 0
     json_file = values.pop(_JSON, None)
     outcome = command(**values)
     return 0 if outcome is None else int(outcome.end(json_file))
 
 
-def _parse(
-    command: Callable[..., Any], arguments: list[str], program: str
-) -> dict[str, Any] | None:
-    """Return the arguments that a command line means for a command; None where it means its help.
+def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> dict[str, Any]:
+    """Return the values of a command's parameters.
 
     Raises:
         PronkError: The options do not fit; one sentence.
+        SystemExit: The help was printed.
     """
     import tyro
 
@@ -156,7 +153,7 @@ def _parse(
             return tyro.cli(call, prog=program, args=arguments, config=config)
     except SystemExit as stop:
         if not stop.code:
-            return None
+            raise
         raise PronkError(_sentence(messages.getvalue(), arguments, program)) from None
 
 
@@ -169,14 +166,8 @@ def _sentence(box: str, arguments: list[str], program: str) -> str:
     lines = [re.sub(r"[│╭╮╰╯─]", " ", line).strip() for line in box.splitlines()]
     text = " ".join(line for line in lines if line)
     text = text.split("For full helptext")[0].strip().rstrip(".")
-    text = re.sub(
-        r"^(Parsing error|Required options|Unrecognized options|Value error)\s+", "", text
-    )
-    return f"{text}; `{program} --help` lists the options."
-
-
-def _print_error(text: str) -> None:
-    print(f"pronk: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
+    title = r"^(Parsing error|Required options|Unrecognized options|Value error)\s+"
+    return f"{re.sub(title, '', text)}; `{program} --help` lists the options."
 
 
 def main() -> None:

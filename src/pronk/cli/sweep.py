@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,13 +15,12 @@ from pronk.errors import HardwareError
 
 if TYPE_CHECKING:
     from pronk.excitation.plan import SweepPlan
-    from pronk.robots.robot import RobotSpec
     from pronk.runtime.ipc import Event
     from pronk.runtime.plan import Link
     from pronk.runtime.run import Recorded
 
 SignalName = Literal["chirp", "log-chirp", "multisine", "sine-steps"]
-"""Excitation signals."""
+"""Excitation signals: classes of `pronk.excitation.signals`, `log-chirp` for `LogChirp`."""
 AMPLITUDES = (0.25, 0.125)
 """The paper's amplitude (F3) and half of it, so that friction shows [rad]."""
 COLUMNS = {
@@ -66,6 +65,8 @@ def sweep(
         overwrite: Replace logs that exist.
     """
     from pronk.evaluation.virtual_sweep import sweep_virtual
+    from pronk.excitation import signals
+    from pronk.excitation.plan import make_plan
     from pronk.links.address import SIM
     from pronk.robots import load_robot
     from pronk.runtime.plan import Link
@@ -81,7 +82,9 @@ def sweep(
     names = [part for entry in joints for part in entry.split(",") if part]
     with console.progress() as report:
         report("forecast", 0.0)
-        plan = make(known, names or None, signal, amplitude or AMPLITUDES, repeats)
+        kind = getattr(signals, signal.title().replace("-", ""))
+        sizes = amplitude or AMPLITUDES
+        plan = make_plan(known, names or None, kind(), amplitudes=sizes, repeats=repeats)
         report("forecast", 1.0)
     title = f"Plan: {plan.duration_s:.0f} s of the robot's time; worst case over what is uncertain"
     console.show_rows(title, COLUMNS, plan.rows())
@@ -121,26 +124,6 @@ def sweep(
         )
     match = f"pronk match {out} --robot {robot} --out {out}/gains.yaml"
     return console.Outcome(figures=figures, following=[f"pronk response {out}", match])
-
-
-def make(
-    robot: RobotSpec,
-    joints: Sequence[str] | None,
-    signal: SignalName,
-    amplitudes: Sequence[float],
-    repeats: int | Sequence[int],
-) -> SweepPlan:
-    """Plan a sweep with the usual settings of a signal, one joint after another."""
-    from pronk.excitation import signals
-    from pronk.excitation.plan import make_plan
-
-    kinds: dict[str, type[signals.Signal]] = {
-        "chirp": signals.Chirp,
-        "log-chirp": signals.LogChirp,
-        "multisine": signals.Multisine,
-        "sine-steps": signals.SineSteps,
-    }
-    return make_plan(robot, joints, kinds[signal](), amplitudes=amplitudes, repeats=repeats)
 
 
 def record_wire(
