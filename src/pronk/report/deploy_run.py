@@ -107,7 +107,7 @@ def interventions(log: DeployLog) -> list[dict[str, Any]]:
         if there.any():
             often = (change[there] > _MOVED).sum(axis=0)
             moved = level < FilterAction.DAMP and bool(often.any())
-            one = {"level": level.name, "reason": reason.name, "why": reason.text}
+            one: dict[str, Any] = {"level": level.name, "reason": reason.name, "why": reason.text}
             one |= {"ticks": int(there.sum()), "first": float(seconds(log, log.time[there][0]))}
             one["largest"] = float(change[there].max()) if moved else float("nan")
             one["joint"] = log.joints[int(often.argmax())] if moved else ""

@@ -20,7 +20,7 @@ from pronk.match.gains import MatchedGains
 from pronk.match.predict import JointPrediction
 from pronk.match.result import JointFit, MatchResult
 from pronk.report import style
-from pronk.report.paper import published
+from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
 from pronk.report.style import drawing, key, legend
 from pronk.response.response import FrequencyResponse
 
@@ -148,13 +148,8 @@ def overview(fits: Mapping[str, JointFit]) -> Figure:
 
 
 def zero_armature(fit: JointFit) -> Figure:
-    """Draw the gain of one joint with the best match without rotor inertia (paper Fig. 3).
-
-    Raises:
-        ValueError: The match did not search with zero armature on this joint.
-    """
-    if fit.zero_armature is None:
-        raise ValueError(f"{fit.joint} was not matched with zero armature")
+    """Draw the gain of one joint with the best match without rotor inertia (paper Fig. 3)."""
+    assert fit.zero_armature is not None
     curves = [(fit.zero_armature, style.ZERO_LINE), (fit.matched, style.MATCHED_LINE)]
     with drawing(height=3.9) as (figure, grid):
         axes = grid[0, 0]
@@ -225,7 +220,7 @@ def error_maps(result: MatchResult, drive: Mapping[str, tuple[float, float]]) ->
     `drive` has stiffness [N m/rad] and damping [N m s/rad] of the real drive by joint.
     """
     fits = {name: joint for name, joint in result.joints.items() if joint.grid_error.size}
-    paper = published(result.gains.robot)
+    paper = TABLE_I if result.gains.robot == ROBOT else {}
     errors = {name: np.sqrt(fit.grid_error) for name, fit in fits.items()}
     low = max(min(float(np.nanmin(e)) for e in errors.values()), 0.05)
     high = max(float(np.nanmax(e)) for e in errors.values())
@@ -239,10 +234,10 @@ def error_maps(result: MatchResult, drive: Mapping[str, tuple[float, float]]) ->
             axes.grid(False)
             axes.set(xlim=(k[0], k[-1]), ylim=(d[0], d[-1]))
             i, j = np.unravel_index(int(np.nanargmin(fit.grid_error)), fit.grid_error.shape)
-            refined, known = (fit.stiffness, fit.damping), paper.joints.get(name) if paper else None
+            refined = (fit.stiffness, fit.damping)
             if np.isfinite(fit.covariance).all():
                 axes.add_patch(ellipse(refined, fit.covariance, edgecolor="white", zorder=4))
-            points = ((k[i], d[j]), refined, drive.get(name), known)
+            points = ((k[i], d[j]), refined, drive.get(name), paper.get(name))
             for (words, mark), point in zip(_MARKS.items(), points, strict=True):
                 if point is not None:
                     axes.plot(*point, **mark)
@@ -259,7 +254,7 @@ def error_maps(result: MatchResult, drive: Mapping[str, tuple[float, float]]) ->
 
 def ranges(gains: MatchedGains, groups: Mapping[str, Sequence[str]]) -> Figure:
     """Draw the gains of the joints of each group, the training range and the ellipse."""
-    paper, columns = published(gains.robot), min(3, len(groups))
+    paper, columns = TRAINING if gains.robot == ROBOT else {}, min(3, len(groups))
     rows = -(-len(groups) // columns)
     box: dict[str, Any] = {"facecolor": "#dbeaf4", "edgecolor": style.MATCHED}
     outline: dict[str, Any] = {"edgecolor": style.MATCHED, "linestyle": ":", "linewidth": 1.4}
@@ -274,9 +269,8 @@ def ranges(gains: MatchedGains, groups: Mapping[str, Sequence[str]]) -> Figure:
             axes.plot(group.stiffness, group.damping, **_mark("+", style.MATCHED, 9))
             if np.isfinite(shape).all() and shape.any():
                 axes.add_patch(ellipse(group.ellipsoid_center, shape, squared=1.0, **outline))
-            if paper is not None and name in paper.training:
-                half = (paper.stiffness_range, paper.damping_range)
-                axes.add_patch(_box(paper.training[name], half, **dashed))
+            if name in paper:
+                axes.add_patch(_box(paper[name], RANGES, **dashed))
             for joint in joints:
                 _draw_gains(axes, gains, joint)
             axes.autoscale_view()

@@ -19,7 +19,7 @@ from pronk.match.predict import Prediction, load_prediction
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult
 from pronk.report import figures
 from pronk.report.page import Part, page
-from pronk.report.paper import published
+from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
 from pronk.report.style import joint_words, picture, rms
 from pronk.robots import load_robot
 from pronk.robots.robot import Joint
@@ -58,7 +58,8 @@ def robot_joints(gains: MatchedGains) -> dict[str, Joint]:
 
 def group_members(gains: MatchedGains) -> dict[str, list[str]]:
     """Return the matched joints of each group, by the robot or, if unknown, by their names."""
-    known, found = robot_joints(gains), {}
+    known = robot_joints(gains)
+    found: dict[str, list[str]] = {}
     for group in gains.groups:
         for name in gains.joints:
             if known[name].group == group if name in known else name.endswith(group):
@@ -155,17 +156,17 @@ def part(path: Path, gains: str | None = None) -> Part:
 
 def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     """Return the matched gains of each joint, beside the paper's for its robot."""
-    paper = published(gains.robot)
+    paper = gains.robot == ROBOT
     delays = any(joint.delay_s > 0.0 for joint in gains.joints.values())
     columns = "joint | stiffness [N m/rad];2 | 95 %;2 | damping [N m s/rad] | 95 %"
-    columns += " | paper, Table I" * bool(paper) + " | friction [N m]" * in_time
+    columns += " | paper, Table I" * paper + " | friction [N m]" * in_time
     columns += " | delay [ms];1" * delays
     columns += " | nominal error [dB];2 | error [dB];2 | lowest coherence"
     rows = []
     for name, one in gains.joints.items():
         row: list[Any] = [joint_words(name) + " (flagged)" * bool(one.flags)]
         row += [one.stiffness, one.stiffness_ci95, one.damping, one.damping_ci95]
-        row += [" / ".join(map(str, paper.joints.get(name, ("-",))))] if paper else []
+        row += [" / ".join(map(str, TABLE_I.get(name, ("-",))))] * paper
         row += [one.frictionloss] * in_time + [1000.0 * one.delay_s] * delays
         rows.append([*row, one.naive_error_db, one.error_db, one.coherence_min])
     notes = [f"95 % intervals over {'blocks of the recordings' if in_time else 'repeats'}."]
@@ -181,21 +182,21 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
 
 def ranges_table(gains: MatchedGains, members: Mapping[str, list[str]]) -> Sheet:
     """Return the range that training draws from for each joint group."""
-    paper, rows = published(gains.robot), []
+    paper, rows = gains.robot == ROBOT, []
     for name, one in gains.groups.items():
         row = [joint_words(name), f"{one.stiffness:.2f} ± {one.stiffness_range:.2f}"]
         row.append(f"{one.damping:.3f} ± {one.damping_range:.3f}")
         if paper:
-            k, d = paper.training.get(name, ("-", "-"))
-            row.append(f"{k} ± {paper.stiffness_range}, {d} ± {paper.damping_range}")
+            k, d = TRAINING.get(name, ("-", "-"))
+            row.append(f"{k} ± {RANGES[0]}, {d} ± {RANGES[1]}")
         rows.append([*row, ", ".join(map(joint_words, members.get(name, [])))])
     columns = "group | stiffness [N m/rad] | damping [N m s/rad]"
-    columns += " | paper's training gains" * bool(paper) + " | joints"
+    columns += " | paper's training gains" * paper + " | joints"
     note = (
         "The paper's hip roll damping of FL, 0.516, is outside its own range 0.45 ± 0.05 "
         "(reading A13)."
     )
-    return table(columns, rows, *[note] * bool(paper))
+    return table(columns, rows, *[note] * paper)
 
 
 def _zero_armature_table(fits: Mapping[str, JointFit]) -> Sheet:

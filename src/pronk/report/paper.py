@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 
 from pronk.evaluation.protocol import TABLE_III
 
+ROBOT = "mini_cheetah"
+"""The paper's robot."""
 TABLE_I = {
     "FR_hip_roll": (20.6, 0.492),
     "FL_hip_roll": (18.1, 0.516),
@@ -22,31 +22,15 @@ TABLE_I = {
     "HR_knee": (22.2, 0.553),
     "HL_knee": (21.8, 0.553),
 }
-"""Matched stiffness [N m/rad] and damping [N m s/rad] of the paper's robot, `mini_cheetah`."""
-# Last column of Table I.
-_TRAINING = {"hip_roll": (20.0, 0.45), "hip_pitch": (17.5, 0.4), "knee": (21.5, 0.55)}
+"""Matched stiffness [N m/rad] and damping [N m s/rad] of each joint of `ROBOT`."""
+TRAINING = {"hip_roll": (20.0, 0.45), "hip_pitch": (17.5, 0.4), "knee": (21.5, 0.55)}
+"""Last column of Table I: those of each joint group, as used in training."""
+RANGES = (2.0, 0.05)
+"""Half-widths of their randomization [N m/rad], [N m s/rad] (D3, D4)."""
 GAPS = {"forward 2": 0.55, "back 2": 0.5, "side -1": 0.4, "side +1": 0.4}
 """Widest gaps by command, read off video (R3) [m]; of which policy is not stated."""
 WALKS = ("forward 2", "back 2", "side -1", "side +1")
 """Velocities of R4."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Published:
-    """Gains that the paper gives for its robot: stiffness [N m/rad] and damping [N m s/rad]."""
-
-    joints: Mapping[str, tuple[float, float]]
-    training: Mapping[str, tuple[float, float]]
-    """Of each joint group, as used in training."""
-    stiffness_range: float = 2.0
-    """Half-width of the randomization [N m/rad] (D3)."""
-    damping_range: float = 0.05
-    """Half-width of the randomization [N m s/rad] (D4)."""
-
-
-def published(robot: str) -> Published | None:
-    """Return the paper's gains of `robot`; None for another robot than the paper's."""
-    return Published(joints=TABLE_I, training=_TRAINING) if robot == "mini_cheetah" else None
 
 
 def published_jumps(figure: str) -> dict[str, dict[str, tuple[float, float]]]:
