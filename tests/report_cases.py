@@ -158,9 +158,8 @@ def write_match(folder: Path, result: MatchResult, *, prediction: bool = False) 
     gains_file.save(folder / "gains.yaml", result.gains)
     match_file.save(folder / "match.npz", result)
     if prediction:
-        one = Prediction(
-            joints=(joint_prediction(),), virtual=result.gains.virtual, source="fresh.mcap"
-        )
+        joints, virtual = (joint_prediction(),), result.gains.virtual
+        one = Prediction(joints=joints, virtual=virtual, source="fresh.mcap")
         save_prediction(folder / "fresh.prediction.npz", one)
     return folder
 

@@ -45,14 +45,12 @@ def csv(path: Path, *rows: str, header: str = HEADER) -> Path:
 # --- Commands -----------------------------------------------------------------------------------
 
 SWEEP = ("sweep", "mini_cheetah", "--out", "x")
+ROBOT_OF = ("--robot", "go2")
 MATCH = ("match", "a.csv", "--robot", "mini_cheetah", "--out", "x/gains.yaml")
 COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "no such command": (("mach",), "mach"),
     "no such option": (("match", ".", "--robot", "mini_cheetah", "--grids", "3"), "--grids"),
-    "a former command as a value": (
-        ("match", "bench", "--robot", "go2", "--grids", "3"),
-        "--grids",
-    ),
+    "a former command as a value": (("match", "bench", *ROBOT_OF, "--grids", "3"), "--grids"),
     "sweep: robot": (("sweep", "mini_cheeta", "--out", "x"), "mini_cheetah"),
     "sweep: joint": ((*SWEEP, "--joints", "FR_ankle"), "FR_knee"),
     "sweep: amplitude": ((*SWEEP, "--joints", "FR_knee", "--amplitude", "1.4"), "amplitude"),
@@ -75,10 +73,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "match: format": (("match", "notes.txt", *MATCH[2:]), "notes.txt"),
     "match: pickle": (("match", "bomb.pt", *MATCH[2:]), "bomb.pt"),
     "match: simulator": ((*MATCH, "--unit", "rad", "--simulator", "gazebo"), "gazebo"),
-    "predict: gains": (
-        ("predict", "a.csv", "--robot", "go2", "--gains", "no.yaml", "--unit", "rad"),
-        "pronk match",
-    ),
+    "predict: gains": (("predict", "a.csv", *ROBOT_OF, "--gains", "no.yaml"), "pronk match"),
     "export: gains": (("export", "no.yaml", "--to", "mjlab", "--out", "x.py"), "pronk match"),
     "export: target": (("export", "no.yaml", "--to", "gazebo", "--out", "x.py"), "mjlab"),
     "train: task": (("train", "run", "--out", "x"), "walk"),
@@ -343,10 +338,8 @@ def test_programs_that_are_no_tensors(tmp_path: Path, program: bytes, named: str
 def test_files_that_promise_more_than_they_hold(tmp_path: Path) -> None:
     program, storages = pace()
     (tmp_path / "a.pt").write_bytes(archive(program, (storages[0][:40], *storages[1:])))
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
-    )
+    header, huge = io.BytesIO(), {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
+    np.lib.format.write_array_header_1_0(header, huge)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
         file.writestr("time.npy", header.getvalue() + bytes(80))
     chunk = bytes(16 + 8 + 4 + 4) + (2**64 - 16).to_bytes(8, "little")

@@ -38,18 +38,9 @@ def result():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("trial")
-
-
-@pytest.fixture(scope="module")
-def trial(folder):
-    return write_trial(folder, keep=True)
-
-
-@pytest.fixture(scope="module")
-def captured(trial, folder):
-    traces, missing = trial_page.traces(trial, folder)
+def captured(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trial")
+    traces, missing = trial_page.traces(write_trial(folder, keep=True), folder)
     assert missing == 0
     return traces
 
@@ -58,10 +49,10 @@ def curve(axes, colour):
     return next(line for line in axes.lines if line.get_color() == colour)
 
 
-def drawn_figures(result):
+def test_axes_have_units_and_legends_fit(result) -> None:
     groups = {name: [j for j in result.joints if j.endswith(name)] for name in GROUPS}
     knee = result.joints["FR_knee"]
-    return [
+    for figure in (
         figures.bode(knee),
         figures.hero(result),
         figures.overview(result.joints),
@@ -70,11 +61,7 @@ def drawn_figures(result):
         figures.zero_armature(knee),
         figures.prediction(joint_prediction(), virtual=True),
         figures.responses(knee.responses),
-    ]
-
-
-def test_axes_have_units_and_legends_fit(result) -> None:
-    for figure in drawn_figures(result):
+    ):
         labels = [text for a in figure.axes for text in (a.get_xlabel(), a.get_ylabel())]
         named = [label for label in labels if label and label != "coherence"]
         assert named
@@ -97,9 +84,8 @@ def test_bode_has_gain_in_decibel_and_phase_in_degrees(result) -> None:
 
 
 def test_overview_has_a_row_per_group_and_a_column_per_leg(result) -> None:
-    assert style.grid_of_joints(list(result.joints)) == [
-        [f"{leg}_{name}" for leg in LEGS] for name in GROUPS
-    ]
+    rows = [[f"{leg}_{name}" for leg in LEGS] for name in GROUPS]
+    assert style.grid_of_joints(list(result.joints)) == rows
     arm = ["Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll"]
     assert style.grid_of_joints(arm) == [arm[:3], arm[3:]]
 
@@ -140,7 +126,8 @@ def test_prediction_shows_where_the_nominal_simulation_is_worst() -> None:
     assert figures.busiest_window(one, 100.0) == slice(0, len(one.time))
 
 
-def test_cells_draw_mean_spread_and_the_paper(trial) -> None:
+def test_cells_draw_mean_spread_and_the_paper(tmp_path) -> None:
+    trial = write_trial(tmp_path)
     distance, paper = trial_page.values(trial, "distance"), published_jumps("distance")
     assert list(distance) == ["naive", "matched"]  # as in the paper
     axes = trial_figures.cells([("distance [m]", distance, paper)]).axes[0]
@@ -181,9 +168,8 @@ def test_rates_are_of_the_acceleration_at_the_papers_speed(captured) -> None:
     assert time[[0, -1]] == pytest.approx([0.0, SCRIPT.run_s])
     assert np.allclose(rate, 2.0 * RATE * np.sin(OMEGA * time), atol=1e-6)
     # A sine over nearly whole periods.
-    assert trial_page.rate_rms({CASES[2].name: runs}) == pytest.approx(
-        2.0 * RATE / math.sqrt(2.0), rel=0.02
-    )
+    expected = 2.0 * RATE / math.sqrt(2.0)
+    assert trial_page.rate_rms({CASES[2].name: runs}) == pytest.approx(expected, rel=0.02)
 
 
 def test_crossings_become_shares_with_wilsons_interval() -> None:
@@ -223,6 +209,6 @@ def test_scatter_over_gain_error_of_randomized_robots(tmp_path) -> None:
     figure = trial_figures.scatter_over_error(errors, {"distance [m]": distance})
     axes, texts = figure.axes[0], figure.legends[0].get_texts()
     assert len(texts) == 3  # the robots of a policy share a look
-    means = {line.get_xdata()[0]: line.get_ydata()[0] for line in axes.lines
-             if line.get_marker() == "_"}  # fmt: skip
+    lines = [line for line in axes.lines if line.get_marker() == "_"]
+    means = {line.get_xdata()[0]: line.get_ydata()[0] for line in lines}
     assert means[1.2] == pytest.approx(trial_figures.std(np.array([0.38, 0.40, 0.42])), rel=0.6)
