@@ -152,10 +152,8 @@ def joints(log: DeployLog, begin: float, end: float) -> Figure:
 
 def verdict(log: DeployLog) -> str:
     """Return the outcome in one sentence."""
-    kinds, robot = (
-        {event.text for event in log.events if event.kind == "robot"},
-        log.header["robot"],
-    )
+    kinds = {event.text for event in log.events if event.kind == "robot"}
+    robot = log.header["robot"]
     known = f"Virtual {robot}" if VIRTUAL in kinds else f"Real {robot}" if REAL in kinds else ""
     robot = known or f"{robot} (real or virtual unknown)"
     active = sum(length for mode, _, length in run.stretches(log) if mode in run.POLICY_MODES)
@@ -201,8 +199,15 @@ def part(path: Path) -> Part:
         "interventions": run.interventions(log),
         "tracking_rms_rad": dict(zip(log.joints, tracking["error"], strict=True)),
     }
-    events = sorted(log.events, key=lambda event: event.time)
+    events = [(float(seconds(log, one.time)), one.kind, one.text) for one in log.events]
+    timing = [
+        (name, one["n"], *(1e3 * one[of] for of in (*run.QUANTILES, "max")))
+        for name, one in figures["times"].items()
+    ]
     shown = ("ticks", "first", "largest", "joint", "why")
+    filtered = [
+        (one["level"].lower(), *(one[name] for name in shown)) for one in figures["interventions"]
+    ]
     content = {
         "log": log,
         "file": path.name,
@@ -215,10 +220,7 @@ def part(path: Path) -> Part:
         "dropped": sum(log.figures.get("servo", {}).get("dropped", {}).values()),
         "policy": log.header.get("policy", {}),
         "overview": picture(overview(log), dense=True),
-        "events": table(
-            "time [s] | kind | text",
-            [(float(seconds(log, one.time)), one.kind, one.text) for one in events],
-        ),
+        "events": table("time [s] | kind | text", sorted(events, key=lambda event: event[0])),
         "close_up": f"{end - begin:.1f} s {about}",
         "joints": picture(joints(log, begin, end)),
         "joint_table": _joint_table(log, tracking, robot),
@@ -226,18 +228,12 @@ def part(path: Path) -> Part:
         "delay_table": _delay_table(found),
         "timing": table(
             "[ms] | n | 50 % | 95 % | 99 % | 99.9 % | max",
-            [
-                (name, one["n"], *(1e3 * value for value in list(one.values())[1:]))
-                for name, one in figures["times"].items()
-            ],
+            timing,
             *(f"{name}: {meaning}." for name, (_, meaning) in times.items()),
         ),
         "interventions": table(
             "action | ticks | first at [s];2 | largest change [rad] | joint | reason",
-            [
-                (one["level"].lower(), *(one[name] for name in shown))
-                for one in figures["interventions"]
-            ],
+            filtered,
             "joint: the one whose target was changed most often for this reason.",
         ),
     }
