@@ -139,8 +139,15 @@ def jump_and_film(
     setup = setup_of(policies[0], out)
     trial = run_trial(policies, Plan(jumps=jumps, seed=seed), overwrite=True, **setup)
     first = replace(trial, subjects=trial.subjects[:1])
-    how: Any = {"robot": setup["robot"], "warn": console.warn}
-    films = record_all(first, out, out / VIDEOS, cases=(FILMED,), slow=2.0, **how)
+    films = record_all(
+        first,
+        out,
+        out / VIDEOS,
+        robot=setup["robot"],
+        cases=(FILMED,),
+        slow=2.0,
+        warn=console.warn,
+    )
     return trial, films
 
 
@@ -168,8 +175,15 @@ def sweep_and_match(
     def record(folder: str, seed: int, signal: Signal, **counts: Any) -> list[Path]:
         plan = make_plan(robot, signal=signal, **counts)
         plan.check()
-        how: Any = {"progress": report.bar(f"sweep ({folder})"), "overwrite": True}
-        return sweep_virtual(plan, params, out / folder, seed=seed, processes=cpus, **how)
+        return sweep_virtual(
+            plan,
+            params,
+            out / folder,
+            seed=seed,
+            processes=cpus,
+            overwrite=True,
+            progress=report.bar(f"sweep ({folder})"),
+        )
 
     counts = (repeats, *[1] * len(AMPLITUDES[1:]))
     paths = record("logs", seed, Chirp(), amplitudes=AMPLITUDES, repeats=counts)

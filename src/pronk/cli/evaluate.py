@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -71,8 +71,15 @@ def evaluate(
         )
     # mjlab and Warp print to standard output.
     with console.progress() as report, redirect_stdout(io.StringIO()):
-        how: Any = {"device": where, "randomization": randomization, "before": errors}
-        found = adapter.evaluate(subject, drives, plan, progress=report, **how)
+        found = adapter.evaluate(
+            subject,
+            drives,
+            plan,
+            device=where,
+            randomization=randomization,
+            before=errors,
+            progress=report,
+        )
     save(out, found)
     for sheet in sheets(found):
         console.show_sheet(sheet)

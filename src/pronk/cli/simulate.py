@@ -92,8 +92,9 @@ def simulate(
     wire: ServerTransport = resolve_name(_SERVERS[link])(known, mode=mode, **address.options)
     try:
         machine.connect()
-        options: Any = {"faults": wrong, "watchdog": watchdog, "seed": seed}
-        server = RobotServer(machine, wire, hold=hold_of(known), **options)
+        server = RobotServer(
+            machine, wire, hold=hold_of(known), faults=wrong, watchdog=watchdog, seed=seed
+        )
         console.say(
             f"ready: the virtual {known.name} on the {base}, seed {seed}, at {address}; "
             "Ctrl-C ends it"

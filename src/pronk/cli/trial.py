@@ -82,8 +82,14 @@ def trial(
     setup: Any = setup_of(policy, out, sim_params, robot, processes=processes)
     with console.progress() as report:
         bar = report.bar("jumping")
-        keep: Any = {"keep_captures": keep_captures, "overwrite": overwrite}
-        found = run_trial(policies, plan, progress=bar, **keep, **setup)
+        found = run_trial(
+            policies,
+            plan,
+            keep_captures=keep_captures,
+            overwrite=overwrite,
+            progress=bar,
+            **setup,
+        )
     sheets = list(tables.sheets(found))
     for sheet in sheets:
         if definitions or sheet.title != tables.DEFINITIONS:
@@ -109,8 +115,7 @@ def trial(
             )
         wanted = {"walk": walk, "crossing": crossing, "variation": variation, "bodies": bodies}
         names = [name for name, on in wanted.items() if on]
-        trained = [[path] for path in own]
-        extra = list(_extra_sheets(names, policies, setup, plan, trained, report))
+        extra = list(_extra_sheets(names, policies, setup, plan, own, report))
         page, _ = write_report(out, report)
     for sheet in extra:
         console.show_sheet(sheet)
@@ -137,7 +142,7 @@ def _extra_sheets(
     policies: Sequence[Path],
     setup: Any,
     plan: Plan,
-    own: Sequence[Sequence[Path]],
+    own: Sequence[Path],
     report: console.Reporter,
 ) -> Iterator[Sheet]:
     """Run what belongs to a trial besides its jumps, and yield the tables."""
