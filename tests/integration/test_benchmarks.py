@@ -201,7 +201,7 @@ def job(tmp_path: Path) -> Job:
     subjects = load_subjects([write_hopper(tmp_path / "policy.onnx")], HOPPER)
     plan = Plan(cases=(Case(name="spot", command=STILL),), jumps=1, script=script, spread_s=0.0)
     [job] = plan_jobs(subjects, plan, robot=HOPPER, sim_params=load_sim_params())
-    return replace(job, keep=None)
+    return replace(job, row=replace(job.row, capture=""))
 
 
 def test_the_bare_loop_repeats_the_trial_to_the_last_bit(job: Job) -> None:
