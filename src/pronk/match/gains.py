@@ -34,7 +34,11 @@ class JointGains:
     grid_damping: float = NAN
     """The paper's grid optimum [N m s/rad]; NaN without a grid."""
     stiffness_ci95: tuple[float, float] = (NAN, NAN)
+    """95 % interval by the repeats alone."""
     damping_ci95: tuple[float, float] = (NAN, NAN)
+    stiffness_total95: tuple[float, float] = (NAN, NAN)
+    """95 % interval with the change between amplitudes and parts of the log; NaN if not known."""
+    damping_total95: tuple[float, float] = (NAN, NAN)
     covariance: tuple[tuple[float, float], tuple[float, float]] = ((NAN, NAN), (NAN, NAN))
     """Of (stiffness, damping), repeats as the unit."""
     band_hz: tuple[float, float] = (NAN, NAN)
@@ -109,8 +113,8 @@ def _omitted(name: str, value: Any) -> bool:
     """True for empty text and tuples, and for optional parameters that are not used."""
     if value in ((), ""):
         return True
-    if name == "frictionloss":
-        return bool(np.isnan(value))
+    if name in ("frictionloss", "stiffness_total95", "damping_total95"):
+        return bool(np.isnan(value).any())
     return bool(name == "delay_s" and value == 0.0)
 
 

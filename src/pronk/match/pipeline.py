@@ -21,7 +21,7 @@ from pronk.match.measured_joint import (
     measured_joints,
     merged,
 )
-from pronk.match.parameters import DRIVE_MODE, FREE, GAINS_MODE, checked_names
+from pronk.match.parameters import DRIVE_MODE, FREE, GAINS, GAINS_MODE, PARAMETERS, checked_names
 from pronk.match.ranges import matched_gains
 from pronk.match.response_fit import (
     Fit,
@@ -34,11 +34,13 @@ from pronk.match.response_fit import (
 from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult, amplitude_spread
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
+from pronk.match.time_fit import TIME_FIT, TimeFit, fit_joint, recorded
 from pronk.match.uncertainty import gain_interval
+from pronk.response.estimate import excited_joints
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import moves_together
-from pronk.simulators.mujoco import mujoco_info
+from pronk.simulators.chain import moves_together, published
+from pronk.simulators.mujoco import MujocoSimulator, mujoco_info
 from pronk.simulators.simulator import JointRigs, joint_rigs
 
 Array = NDArray[np.float64]
@@ -52,6 +54,16 @@ NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
 NO_ARMATURE_RATIO = 5.0
 """Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
+NOT_BETTER = "not better: "
+"""Beginning of the flag on a joint whose match is no better than less fitting, on what was kept
+aside."""
+_NOT_BETTER = 1.02
+"""Error kept aside over that of the best of the others from which on a match is not better: where
+the model's friction is right all fits are equal but for noise."""
+_FRICTION_RATIO = 1.5
+"""Fitted dry friction over the model's, or under it, that is worth a flag."""
+_START_S = 0.005
+"""Delay from which the fit in time begins [s]: one physics step of the training simulator."""
 SPREAD_MAX = 0.05
 """Relative change of stiffness between amplitudes that is worth a flag; the paper's own
 randomization is 2 N m/rad on 20 (D3), twice that."""
@@ -115,7 +127,7 @@ def match_logs(
             if mode == "drive":
                 joints = _match_drives(rigs, found, on_drive, fitted, clock)
             else:
-                joints, rate = _match_gains(rigs, found, on_drive, chosen, clock)
+                joints, rate = _match_gains(rigs, logs, found, on_drive, chosen, clock)
     gains = {name: joint.gains() for name, joint in joints.items()}
     return MatchResult(
         gains=matched_gains(robot, gains, logs, info),
@@ -186,15 +198,19 @@ def _match_drives(
 
 def _match_gains(
     rigs: JointRigs,
+    logs: Sequence[JointLog],
     found: Found,
     on_drive: Mapping[str, Pair],
     settings: MatchSettings,
     clock: _Clock,
 ) -> tuple[dict[str, JointFit], float]:
-    """The paper's search and its refinement; physics steps per second of the grid."""
+    """Search by the paper's magnitude and, with method `time`, fit in time from there.
+
+    Also returns physics steps per second of the grid; NaN where it was not searched whole.
+    """
     main = [goals[0] for goals in found.values()]
     grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
-    if settings.method == "quick":
+    if isinstance(rigs, MujocoSimulator) and not settings.exhaustive:
         with clock.stage("quick search"):
             grids, fits = quick_search(rigs, main, *grid)
     else:
@@ -206,26 +222,138 @@ def _match_gains(
         with clock.stage("refine"):
             fits = refine(rigs, main, [one.gains for one in grids])
     best = {fit.target.joint: fit for fit in fits}
+    fitted: dict[str, TimeFit] = {}
     by_amplitude = {name: [fit] for name, fit in best.items()}
-    with clock.stage("amplitudes"):
-        others = [goal for goals in found.values() for goal in goals[1:]]
-        for fit in refine(rigs, others, [best[goal.joint].gains for goal in others]):
-            by_amplitude[fit.target.joint].append(fit)
+    if settings.method == "time":
+        with clock.stage("time fit"):
+            for name, fit in best.items():
+                nominal = published(rigs.robot, name) | dict(
+                    zip(GAINS, on_drive[name], strict=True)
+                )
+                start = nominal | dict(zip(GAINS, fit.gains, strict=True)) | {"delay": _START_S}
+                sources = [log for log in logs if name in excited_joints(log)]
+                records = recorded(sources, name, rigs.robot)
+                fitted[name] = fit_joint(rigs, records, TIME_FIT, start, nominal)
+                clock.report(len(fitted) / len(best))
+    else:
+        with clock.stage("amplitudes"):
+            others = [goal for goals in found.values() for goal in goals[1:]]
+            for fit in refine(rigs, others, [best[goal.joint].gains for goal in others]):
+                by_amplitude[fit.target.joint].append(fit)
     with clock.stage("responses"):
-        requests = [SimRequest(goal, *best[goal.joint].gains) for goal in main]
-        requests += [SimRequest(goal, *on_drive[goal.joint]) for goal in main]
-        simulated = responses(rigs, requests, whole=True)
+        requests = [
+            SimRequest(goal, **_drive(rigs, fitted[goal.joint].estimate.values))
+            if goal.joint in fitted
+            else SimRequest(goal, *best[goal.joint].gains)
+            for goal in main
+        ]
+        matched = responses(rigs, requests, whole=True)
+        naive = responses(
+            rigs, [SimRequest(goal, *on_drive[goal.joint]) for goal in main], whole=True
+        )
     zero: dict[str, tuple[float, ComplexArray]] = {}
-    if settings.zero_armature and "armature" in rigs.parameters:
+    wanted = settings.zero_armature and settings.method == "paper"
+    if wanted and "armature" in rigs.parameters:
         with clock.stage("zero armature"):
             zero = _without_armature(rigs, main, *grid, clock)
     joints = {}
     for k, (name, goals) in enumerate(found.items()):
-        matched, naive = simulated[k], simulated[len(main) + k]
-        joints[name] = _joint_fit(
-            rigs.robot, goals, by_amplitude[name], grids[k], matched, naive, zero.get(name)
-        )
+        both = matched[k], naive[k]
+        cells = {
+            "grid_stiffness": grids[k].stiffness,
+            "grid_damping": grids[k].damping,
+            "grid_error": grids[k].error,
+        }
+        if name in fitted:
+            joints[name] = _time_joint_fit(rigs.robot, goals, fitted[name], *both, **cells)
+        else:
+            joints[name] = _joint_fit(
+                rigs.robot,
+                goals,
+                by_amplitude[name],
+                grids[k],
+                matched[k],
+                naive[k],
+                zero.get(name),
+            )
     return joints, rate
+
+
+def _drive(rigs: JointRigs, values: Mapping[str, float]) -> dict[str, float]:
+    """Parameters of a fitted drive that a simulation takes."""
+    settable = {*rigs.parameters, "delay"} - {"offset"}
+    return {name: value for name, value in values.items() if name in settable}
+
+
+def _time_joint_fit(
+    robot: RobotSpec,
+    goals: Sequence[MeasuredJoint],
+    fit: TimeFit,
+    matched: ComplexArray,
+    naive: ComplexArray,
+    **grid: Array,
+) -> JointFit:
+    """Put the findings of one joint together that was fitted in time."""
+    goal, joint = goals[0], robot.joint(goals[0].joint)
+    error_db = goal.rms_db(matched[goal.fit_mask])
+    return response_fit(
+        robot,
+        goals,
+        fit.estimate,
+        matched,
+        naive,
+        error_db=error_db,
+        total95=fit.total95,
+        held_out=fit.held_out,
+        amplitude_gains=fit.amplitude_gains,
+        flags=(
+            *_held_out_flags(fit.held_out),
+            *_no_match(error_db, goal),
+            *_time_flags(fit, joint.drive.frictionloss),
+            *fit.estimate.flags,
+            *_left_out(goal, joint.band_hz),
+            *goal.warnings,
+        ),
+        **grid,
+    )
+
+
+def _held_out_flags(errors: Mapping[str, float]) -> Iterator[str]:
+    """A match that is no better on what was kept aside than with less or no fitting."""
+    words = {
+        "nominal": "the nominal gains",
+        "nominal_delayed": "the nominal gains with the best delay",
+        "plain": "a plain fit of stiffness, damping and delay",
+    }
+    best = min(words, key=errors.__getitem__)
+    if errors["matched"] > _NOT_BETTER * errors[best]:
+        yield (
+            f"{NOT_BETTER}on what was kept aside it misses by {1e3 * errors['matched']:.2f} mrad, "
+            f"{words[best]} by {1e3 * errors[best]:.2f} mrad; use those, or record more amplitudes"
+        )
+
+
+def _time_flags(fit: TimeFit, frictionloss: float) -> Iterator[str]:
+    """Parameters at a bound, not identified, or far from the model's; gains by the amplitude."""
+    values = fit.estimate.values
+    for name in fit.at_bound:
+        if name not in ("delay", "frictionloss"):  # none is a possible result
+            yield (f"{name} at the bound of the search, {values[name]:.3g} {PARAMETERS[name].unit}")
+    for name in fit.estimate.unidentified:
+        if name not in fit.at_bound:
+            yield (
+                f"{name} is not identified (deviation {fit.estimate.sd[name]:.2g}); "
+                f"{PARAMETERS[name].remedy}"
+            )
+    if not fit.settled:
+        yield "the fit in time did not settle"
+    dry = values["frictionloss"]
+    if not frictionloss / _FRICTION_RATIO <= dry <= frictionloss * _FRICTION_RATIO:
+        yield (
+            f"friction: {dry:.3g} N m of dry friction fitted where the model of the robot has "
+            f"{frictionloss:.3g}; the gains hold with the fitted one"
+        )
+    yield from amplitude_flags(fit.amplitude_gains)
 
 
 def _without_armature(
@@ -292,19 +420,24 @@ def _joint_fit(
     )
 
 
-def _no_match_db(fit: Fit) -> float:
+def _no_match_db(goal: MeasuredJoint) -> float:
     """Error in the band above which gains are no match [dB]."""
-    return max(NO_MATCH_DB, NO_MATCH_INTERVALS * fit.target.measurement_error_db())
+    return max(NO_MATCH_DB, NO_MATCH_INTERVALS * goal.measurement_error_db())
+
+
+def _no_match(error_db: float, goal: MeasuredJoint) -> Iterator[str]:
+    """Flag gains whose response is not the measured one."""
+    limit = _no_match_db(goal)
+    if not error_db <= limit:
+        yield (
+            f"no match: the best gains miss the measured response by {error_db:.2g} dB RMS, "
+            f"more than {limit:.2g} dB; the model lacks something that the robot has"
+        )
 
 
 def _warnings(fit: Fit, grid: GridSearch) -> Iterator[str]:
-    """Flags of the optimum."""
-    limit = _no_match_db(fit)
-    if not fit.error_db <= limit:
-        yield (
-            f"no match: the best gains miss the measured response by {fit.error_db:.2g} dB RMS, "
-            f"more than {limit:.2g} dB; the model lacks something that the robot has"
-        )
+    """Flags of the optimum of the paper's search."""
+    yield from _no_match(fit.error_db, fit.target)
     if grid.at_edge:
         yield (
             f"at the edge of the grid ({grid.gains[0]:.3g} N m/rad, {grid.gains[1]:.3g} N m s/rad)"
@@ -327,7 +460,7 @@ def _armature_flags(fit: Fit, zero_db: float) -> Iterator[str]:
     if not np.isfinite(zero_db):
         return
     ratio = zero_db / max(fit.error_db, 1e-6)
-    if ratio >= NO_ARMATURE_RATIO and zero_db > _no_match_db(fit):
+    if ratio >= NO_ARMATURE_RATIO and zero_db > _no_match_db(fit.target):
         verdict = "no match, the best node misses"
     else:
         # A light rotor on a heavy link: other gains make up for it.

@@ -94,13 +94,16 @@ def characteristic_frequency(robot: RobotSpec, joint_name: str, damping: float) 
 
 
 def _bounds(gains: JointGains) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Interval of each gain, the gain included; the bare gain where there is no interval."""
+    """Widest interval of each gain, the gain included; the bare gain where there is none."""
 
-    def about(value: float, interval: tuple[float, float]) -> tuple[float, float]:
-        ends = [*interval, value] if np.isfinite(interval).all() else [value]
+    def about(value: float, *intervals: tuple[float, float]) -> tuple[float, float]:
+        ends = [value, *(end for one in intervals if np.isfinite(one).all() for end in one)]
         return min(ends), max(ends)
 
-    return about(gains.stiffness, gains.stiffness_ci95), about(gains.damping, gains.damping_ci95)
+    return (
+        about(gains.stiffness, gains.stiffness_ci95, gains.stiffness_total95),
+        about(gains.damping, gains.damping_ci95, gains.damping_total95),
+    )
 
 
 def _centre(robot: RobotSpec, group: Mapping[str, JointGains]) -> tuple[float, float]:

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.files import load_artefact, save_artefact
-from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.gains import NAN, JointGains, MatchedGains
 from pronk.match.uncertainty import Estimate
 from pronk.response.response import FrequencyResponse
 
-SCHEMA = "pronk/match/2"
+SCHEMA = "pronk/match/3"
 ZERO_ARMATURE = "zero armature: "
 """Beginning of the flag on the search without rotor inertia; it is no flag on the gains."""
 
@@ -45,7 +45,13 @@ class JointFit:
     delay_s: float = 0.0
     """Command delay [s]."""
     ci95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """95 % interval of each fitted parameter."""
+    """95 % interval of each fitted parameter by the repeats alone."""
+    total95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """The same with what the model does not explain: the change between amplitudes and between
+    parts of the log."""
+    held_out: Mapping[str, float] = field(default_factory=dict)
+    """RMSE [rad] on what was kept aside, each octave counting alike, with the drive `nominal`,
+    `nominal_delayed`, `plain` (stiffness, damping and delay fitted) and `matched`."""
     covariance: Array
     """Of (stiffness, damping), shape (2, 2)."""
     held: tuple[str, ...] = ()
@@ -109,6 +115,8 @@ class JointFit:
             "grid_damping": best[1],
             "stiffness_ci95": self.ci95.get("stiffness", (self.stiffness, self.stiffness)),
             "damping_ci95": self.ci95.get("damping", (self.damping, self.damping)),
+            "stiffness_total95": self.total95.get("stiffness", (NAN, NAN)),
+            "damping_total95": self.total95.get("damping", (NAN, NAN)),
             "covariance": ((a, b), (c, d)),
             "amplitude_spread": amplitude_spread(self.amplitude_gains),
             "flags": tuple(f for f in self.flags if not f.startswith(ZERO_ARMATURE)),

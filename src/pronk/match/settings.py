@@ -1,4 +1,4 @@
-"""Settings of a match; the defaults are the paper's choices."""
+"""Settings of a match."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from pronk.simulators.mujoco import DEVICES
 class MatchSettings:
     """How to match."""
 
-    method: Literal["grid", "quick"] = "grid"
-    """`grid` simulates every pair (paper F7); `quick` searches the linearized model and verifies
-    by simulation at the optimum."""
+    method: Literal["time", "paper"] = "time"
+    """`time` fits gains, dry friction and delay in the time domain, all amplitudes together;
+    `paper` compares the magnitude of the largest amplitude (F7 to F11)."""
+    exhaustive: bool = False
+    """Simulate every pair of the paper's grid (F7), instead of searching the linearized model and
+    verifying by simulation at the optimum."""
     grid_points: int = 50
     """Points of each axis of the grid (paper F7)."""
     zero_armature: bool = True
-    """Repeat the search without rotor inertia (paper F13)."""
+    """Repeat the paper's search without rotor inertia (paper F13); method `paper` only."""
     coherence_min: float = 0.8
     """Frequencies below are left out of the fit; a joint with most of its band below is refused."""
     threads: int = 2
@@ -40,7 +43,7 @@ class MatchSettings:
             PronkError: A value is outside its range; the message gives the range.
         """
         for name, good, expected in (
-            ("method", self.method in ("grid", "quick"), "grid or quick"),
+            ("method", self.method in ("time", "paper"), "time or paper"),
             ("grid_points", self.grid_points >= 3, "3 or more"),
             ("coherence_min", 0.0 <= self.coherence_min < 1.0, "0 to below 1"),
             ("device", self.device in DEVICES, f"one of {', '.join(DEVICES)}"),
