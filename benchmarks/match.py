@@ -102,9 +102,9 @@ def known_log(
 
 
 def fit_pronk(log: JointLog, *, robot: RobotSpec, threads: int = 2) -> Estimate:
-    """Match a log the way `pronk match --quick` does."""
+    """Match a log the way `pronk match --method paper` does."""
     before = time.perf_counter()
-    settings = MatchSettings(method="quick", zero_armature=False, threads=threads)
+    settings = MatchSettings(method="paper", zero_armature=False, threads=threads)
     found = match_logs([log], robot, settings=settings).gains.joints[JOINT]
     return Estimate(
         stiffness=found.stiffness,

@@ -150,7 +150,7 @@ def designed() -> SimParams:
 
 
 def matched(
-    sim_params: SimParams, name: str, method: str = "quick"
+    sim_params: SimParams, name: str, exhaustive: bool = False
 ) -> tuple[np.ndarray, float, float]:
     """Matched (stiffness, damping) of one joint, its error and the naive error [dB RMS]."""
     robot = load_robot("mini_cheetah")
@@ -159,7 +159,7 @@ def matched(
     with tempfile.TemporaryDirectory() as folder:
         task = SweepTask(plan=plan, out_dir=Path(folder))
         logs = [read_mcap(path) for path in record(machine, task)]
-    settings = MatchSettings(method=method, zero_armature=False)  # type: ignore[arg-type]
+    settings = MatchSettings(method="paper", exhaustive=exhaustive, zero_armature=False)
     found = match_logs(logs, robot, settings=settings).joints[name]
     return np.array([found.stiffness, found.damping]), found.error_db, found.naive_error_db
 
@@ -226,7 +226,7 @@ def main() -> None:
     if arguments.check:
         sim_params = load_sim_params(arguments.out)
         for name in sim_params.joints:
-            got, error, naive = matched(sim_params, name, "grid")
+            got, error, naive = matched(sim_params, name, exhaustive=True)
             cells = (got - TABLE_I[name]) / CELL
             print(
                 f"{name:14s} {got[0]:6.2f} {got[1]:.4f}  {cells[0]:+.2f} {cells[1]:+.2f} cells off"

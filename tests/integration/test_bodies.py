@@ -35,7 +35,7 @@ from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params
 
 SIM_PARAMS = load_sim_params()
-QUICK = MatchSettings(method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False)
+QUICK = MatchSettings(method="paper", estimator=Estimator(segment_s=4.0), zero_armature=False)
 
 
 # --- Draws --------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.logs.readers import find_logs
 
 KNEE = ("--joints", "FR_knee")
-MATCH = ("--robot", "mini_cheetah", "--quick")
+MATCH = ("--robot", "mini_cheetah", "--method", "paper")
 
 
 def test_help_names_every_command_and_loads_no_heavy_library():

@@ -77,7 +77,7 @@ def test_sweep_match_predict_export(
         ["robot", "new", str(model)],
         ["robot", "check", str(robot)],
         ["sweep", str(robot), "--out", str(logs), "--joints", joint, "--amplitude", "0.15"],
-        ["match", str(logs), "--robot", str(robot), "--out", str(gains), "--quick"],
+        ["match", str(logs), "--robot", str(robot), "--out", str(gains), "--method", "paper"],
         ["predict", str(logs), "--robot", str(robot), "--gains", str(gains)],
         ["export", str(gains), "--robot", str(robot), "--to", "mjcf", "--out", str(written)],
     ):

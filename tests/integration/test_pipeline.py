@@ -23,7 +23,7 @@ from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
 QUICK = MatchSettings(
-    method="quick", estimator=Estimator(segment_s=4.0), zero_armature=False, grid_points=25
+    method="paper", estimator=Estimator(segment_s=4.0), zero_armature=False, grid_points=25
 )
 KNOWN = {"FR_hip_roll": (20.6, 0.492), "FL_hip_roll": (18.1, 0.516), "FR_knee": (21.8, 0.541)}
 
@@ -126,7 +126,7 @@ def test_the_artefacts_survive_a_round_trip(matched: MatchResult, tmp_path: Path
 
 def test_the_grid_way_agrees_with_the_quick_way(matched: MatchResult) -> None:
     log = log_of("FR_knee", KNOWN["FR_knee"], seed=2)
-    whole = match_logs([log], ROBOT, settings=replace(QUICK, method="grid", grid_points=25))
+    whole = match_logs([log], ROBOT, settings=replace(QUICK, exhaustive=True, grid_points=25))
     found, quick = whole.gains.joints["FR_knee"], matched.gains.joints["FR_knee"]
     assert (found.grid_stiffness, found.grid_damping) == (
         quick.grid_stiffness,

@@ -35,7 +35,6 @@ def demo(
     jumps: int = 2,
     repeats: int = 3,
     seed: int = 0,
-    quick: bool = False,
 ) -> console.Outcome:
     """Sweep and match all joints of the virtual robot, let trained policies jump on it, report.
 
@@ -45,7 +44,6 @@ def demo(
         jumps: Jumps with each of the paper's commands.
         repeats: Repeats of the matched amplitude.
         seed: Of the virtual robot's noise.
-        quick: Search the linearized model instead of the grid.
     """
     from pronk.evaluation import tables
     from pronk.report import figures, style
@@ -67,7 +65,7 @@ def demo(
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
     ):
         jumping = pool.submit(jump_and_film, tried, out / "trial", jumps, seed)
-        result, replays = sweep_and_match(robot, out, repeats, seed, quick, report)
+        result, replays = sweep_and_match(robot, out, repeats, seed, report)
         report("jumps and film", 0.0)
         trial, films = jumping.result()
         report("jumps and film", 1.0)
@@ -152,7 +150,7 @@ def jump_and_film(
 
 
 def sweep_and_match(
-    robot: RobotSpec, out: Path, repeats: int, seed: int, quick: bool, report: console.Reporter
+    robot: RobotSpec, out: Path, repeats: int, seed: int, report: console.Reporter
 ) -> tuple[MatchResult, list[JointPrediction]]:
     """Sweep all joints, match them, and predict a sweep that was not matched.
 
@@ -166,7 +164,6 @@ def sweep_and_match(
     from pronk.match import result as result_file
     from pronk.match.pipeline import match_logs
     from pronk.match.predict import Prediction, predict, save_prediction
-    from pronk.match.settings import MatchSettings
     from pronk.response import save as save_responses
     from pronk.virtual.sim_params import load_sim_params
 
@@ -189,8 +186,7 @@ def sweep_and_match(
     paths = record("logs", seed, Chirp(), amplitudes=AMPLITUDES, repeats=counts)
     fresh = record("fresh", seed + 1, LogChirp(), amplitudes=AMPLITUDES[:1], repeats=1)
     logs = read_logs(paths, processes=cpus, robot=robot)
-    settings = MatchSettings(method="quick" if quick else "grid")
-    result = match_logs(logs, robot, settings=settings, progress=report)
+    result = match_logs(logs, robot, progress=report)
     gains_file.save(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from pronk.cli import console
+from pronk.cli import console, options
 from pronk.cli.options import Reading
 from pronk.errors import PronkError
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from pronk.match.result import MatchResult
 
 Mode = Literal["gains", "drive"]
+Method = Literal["time", "paper"]
+WARNING_STATUS = 3
+"""Exit status of a match that is no better than less fitting, on what was kept aside."""
 Target = Literal["mjlab", "mjcf", "isaaclab"]
 
 
@@ -27,7 +30,9 @@ def match(
     robot: str,
     out: Path = Path("gains.yaml"),
     mode: Mode = "gains",
-    quick: bool = False,
+    method: Method = "time",
+    exhaustive: bool = False,
+    drive_gains: tuple[str, ...] = (),
     zero_armature: bool = True,
     free: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
     simulator: str = "mujoco",
@@ -42,8 +47,12 @@ def match(
         out: The gains file.
         mode: gains: stiffness and damping (the paper's). drive: damping, armature, friction and
             delay at known stiffness.
-        quick: Search the linearized model, verify by simulation.
-        zero_armature: Repeat the search without rotor inertia.
+        method: time: gains, dry friction and delay in the time domain, all amplitudes together.
+            paper: gains by the magnitude of the largest amplitude.
+        exhaustive: Simulate every pair of the paper's grid.
+        drive_gains: Gains on the real drives if the logs do not have them: JOINT=STIFFNESS,DAMPING
+            or GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
+        zero_armature: Repeat the paper's search without rotor inertia (--method paper).
         free: drive: fit this instead; repeat it. What the sweeps cannot separate is refused.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
@@ -53,7 +62,7 @@ def match(
     from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
-    from pronk.match.pipeline import match_logs
+    from pronk.match.pipeline import NOT_BETTER, match_logs
     from pronk.match.settings import MatchSettings
     from pronk.report.match_page import write_page
     from pronk.robots import load_robot
@@ -63,15 +72,24 @@ def match(
         raise PronkError(f"--out {out}: expected a name that ends in .yaml, as in gains.yaml.")
     if free and mode != "drive":
         raise PronkError("--fit names what --mode drive fits; give --mode drive as well.")
-    logs = reading.read(paths, known)
+    given, logs = options.drive_gains(drive_gains), reading.read(paths, known)
     settings = MatchSettings(
-        method="quick" if quick else "grid",
+        method=method,
+        exhaustive=exhaustive,
         zero_armature=zero_armature,
         device=device,
         simulator=simulator,
     )
     with console.progress() as report:
-        result = match_logs(logs, known, mode=mode, free=free, settings=settings, progress=report)
+        result = match_logs(
+            logs,
+            known,
+            mode=mode,
+            free=free,
+            drive_gains=given,
+            settings=settings,
+            progress=report,
+        )
         gains_file.save(out, result.gains)
         result_file.save(out.parent / "match.npz", result)
         report("page", 0.0)
@@ -105,7 +123,9 @@ def match(
         f"pronk export {out} --to mjlab --out actuators.py",
     ]
     wrote = [out, out.parent / "match.npz", page]
-    return console.Outcome(figures=figures, wrote=wrote, following=following)
+    worse = any(f.startswith(NOT_BETTER) for joint in result.joints.values() for f in joint.flags)
+    status = WARNING_STATUS if worse else 0
+    return console.Outcome(figures=figures, wrote=wrote, following=following, status=status)
 
 
 def summary(result: MatchResult) -> dict[str, Any]:
@@ -131,6 +151,7 @@ def predict(
     robot: str,
     gains: Path,
     out: Path | None = None,
+    drive_gains: tuple[str, ...] = (),
     simulator: str = "mujoco",
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
@@ -141,6 +162,7 @@ def predict(
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         gains: gains.yaml of `pronk match`.
         out: Folder for replays and figures; beside the gains.
+        drive_gains: As of `pronk match`.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         reading: How logs are read.
     """
@@ -152,7 +174,7 @@ def predict(
     from pronk.robots import load_robot
 
     known, matched = load_robot(robot), gains_file.load(gains)
-    logs = reading.read(paths, known)
+    given, logs = options.drive_gains(drive_gains), reading.read(paths, known)
     fitted = [log.source for log in logs if log.sha256 and log.sha256 in matched.logs.values()]
     folder = out if out is not None else gains.parent
     rows: list[dict[str, Any]] = []
@@ -161,7 +183,7 @@ def predict(
     with console.progress() as report:
         done = report.bar("predict")
         for i, log in enumerate(logs):
-            found = predict_log(log, known, matched, simulator=simulator)
+            found = predict_log(log, known, matched, drive_gains=given, simulator=simulator)
             excluded |= found.excluded
             stem = Path(log.source or "log").stem
             path = folder / f"{stem}.prediction.npz"

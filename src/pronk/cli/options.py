@@ -129,3 +129,32 @@ def _pairs(option: str, entries: Sequence[str], kind: Callable[[str], Any] = str
         except ValueError as error:
             raise PronkError(f"{option} {entry!r}: {error}.") from None
     return found
+
+
+def drive_gains(
+    entries: Sequence[str],
+) -> dict[str, tuple[float, float]] | Literal["default"] | None:
+    """Gains on the real drives from `--drive-gains`; None where it was not given.
+
+    Raises:
+        PronkError: An entry is neither `default` nor NAME=STIFFNESS,DAMPING.
+    """
+    if not entries:
+        return None
+    if tuple(entries) == ("default",):
+        return "default"
+    found = {}
+    for name, text in _pairs(entries, "--drive-gains").items():
+        try:
+            stiffness, damping = (float(word) for word in text.split(","))
+        except ValueError:
+            raise PronkError(
+                f"--drive-gains {name}={text}: expected NAME=STIFFNESS,DAMPING, as in knee=25,.5."
+            ) from None
+        if not (0.0 < stiffness < 1e6 and 0.0 <= damping < 1e6):
+            raise PronkError(
+                f"--drive-gains {name}={text}: expected a positive stiffness and a damping of 0 or "
+                "more."
+            )
+        found[name] = stiffness, damping
+    return found

@@ -70,7 +70,7 @@ AMPLITUDE = 0.25
 """Of the paper's chirp (F3) [rad]."""
 REPEATS = 3
 """Of each joint's sweep."""
-SETTINGS = MatchSettings(method="quick", zero_armature=False)
+SETTINGS = MatchSettings(method="paper", zero_armature=False)
 """The quick search; it ends within a hundredth of a cell of the whole grid's optimum."""
 
 Pairs = Mapping[str, tuple[float, float]]

@@ -7,13 +7,14 @@ windows and segments that the log went through.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import IdentifiabilityError, LogError
+from pronk.errors import IdentifiabilityError, LogError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
 from pronk.response.estimate import (
@@ -30,6 +31,8 @@ from pronk.simulators.command_trace import CommandTrace, command_trace
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+_SAME_GAINS = 0.01
+"""Relative difference of gains by the log and by the user that is rounding."""
 DB = 20.0 / np.log(10.0)
 """Decibels per neper: `20 log10(gain) = DB * log(gain)`."""
 FLOOR_DB = 0.1
@@ -144,6 +147,64 @@ def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[
             f"{len(logs)} logs excite no joint; expected some of {', '.join(robot.joint_names)}."
         )
     return {name: where[name] for name in robot.joint_names if name in where}
+
+
+Pair = tuple[float, float]
+DriveGains = Mapping[str, Pair] | Literal["default"]
+"""Stiffness [N m/rad] and damping [N m s/rad] on the real drives, by joint or joint group, or
+`default`: those of the robot's file."""
+
+
+def with_drive_gains(
+    logs: Sequence[JointLog], robot: RobotSpec, given: DriveGains | None = None
+) -> list[JointLog]:
+    """Logs with the gains that were on the real drives: their own, or else the given ones.
+
+    Raises:
+        LogError: A log has no gains and none are given for a joint of it, or they contradict it.
+        PronkError: A given name is no joint and no joint group of the robot.
+    """
+    by_joint: dict[str, Pair] = {}
+    for name, pair in ({} if given is None or given == "default" else given).items():
+        if name not in (*robot.joint_names, *robot.groups):
+            raise PronkError(
+                f"drive gains of {name!r}; expected a joint ({', '.join(robot.joint_names)}) or a "
+                f"joint group ({', '.join(robot.groups)})."
+            )
+        members = robot.group(name) if name in robot.groups else (robot.joint(name),)
+        by_joint |= {joint.name: pair for joint in members}
+    out = []
+    for log in logs:
+        where, moved, pairs = log.source or "log", excited_joints(log), []
+        for column, name in enumerate(log.joints):
+            own: Pair | None = None
+            if log.stiffness is not None and log.damping is not None:
+                own = float(log.stiffness[column]), float(log.damping[column])
+            pair: Pair | None = by_joint.get(name, own)
+            if own and pair and not np.allclose(own, pair, rtol=_SAME_GAINS):
+                raise LogError(
+                    f"{where}: {name} was recorded at {own[0]:g} N m/rad and {own[1]:g} N m s/rad "
+                    f"by the log, at {pair[0]:g} and {pair[1]:g} by --drive-gains; leave the "
+                    "option out, or correct the log."
+                )
+            if pair is None and name in moved and given != "default":
+                raise LogError(
+                    f"{where}: the gains that were on the drive of {name} are not in the log; give "
+                    "--drive-gains JOINT_OR_GROUP=STIFFNESS,DAMPING, or --drive-gains default if "
+                    "they were those of the robot's file."
+                )
+            known = name in robot.joint_names
+            pairs.append(
+                pair
+                or (
+                    (robot.joint(name).stiffness, robot.joint(name).damping)
+                    if known
+                    else (0.0, 0.0)
+                )
+            )
+        stiffness, damping = np.array(pairs).T
+        out.append(replace(log, stiffness=stiffness, damping=damping))
+    return out
 
 
 def gains_on_drive(log: JointLog, joint: str, robot: RobotSpec) -> tuple[float, float]:

@@ -15,11 +15,13 @@ from pronk.logs.joint_log import JointLog
 from pronk.match.arm import fit_whole_arm
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
+    DriveGains,
     MeasuredJoint,
     gains_on_drive,
     logs_by_joint,
     measured_joints,
     merged,
+    with_drive_gains,
 )
 from pronk.match.parameters import DRIVE_MODE, FREE, GAINS, GAINS_MODE, PARAMETERS, checked_names
 from pronk.match.ranges import matched_gains
@@ -75,6 +77,7 @@ def match_logs(
     *,
     mode: Literal["gains", "drive"] = "gains",
     free: Sequence[str] = (),
+    drive_gains: DriveGains | None = None,
     settings: MatchSettings | None = None,
     progress: Progress | None = None,
 ) -> MatchResult:
@@ -89,7 +92,8 @@ def match_logs(
         mode: `gains` finds stiffness and damping (the paper's); `drive` takes the stiffness for
             known and fits damping, armature, dry friction and delay.
         free: Parameters to fit in mode `drive` instead, out of `FREE`.
-        settings: How to match; the paper's search if not given.
+        drive_gains: Gains that were on the real drives, where the logs do not have them.
+        settings: How to match; the fit in time if not given.
         progress: Called with the stage and the share of it that is done, 0 to 1.
 
     Raises:
@@ -99,6 +103,7 @@ def match_logs(
         PronkError: The device or simulator of the settings cannot be used here.
     """
     chosen, clock = settings or MatchSettings(), _Clock(progress)
+    logs = with_drive_gains(logs, robot, drive_gains)
     if mode not in ("gains", "drive"):
         raise PronkError(f"mode {mode!r}; expected gains or drive.")
     if free and mode != "drive":
@@ -259,13 +264,8 @@ def _match_gains(
     joints = {}
     for k, (name, goals) in enumerate(found.items()):
         both = matched[k], naive[k]
-        cells = {
-            "grid_stiffness": grids[k].stiffness,
-            "grid_damping": grids[k].damping,
-            "grid_error": grids[k].error,
-        }
         if name in fitted:
-            joints[name] = _time_joint_fit(rigs.robot, goals, fitted[name], *both, **cells)
+            joints[name] = _time_joint_fit(rigs.robot, goals, fitted[name], *both, grids[k])
         else:
             joints[name] = _joint_fit(
                 rigs.robot,
@@ -291,7 +291,7 @@ def _time_joint_fit(
     fit: TimeFit,
     matched: ComplexArray,
     naive: ComplexArray,
-    **grid: Array,
+    grid: GridSearch,
 ) -> JointFit:
     """Put the findings of one joint together that was fitted in time."""
     goal, joint = goals[0], robot.joint(goals[0].joint)
@@ -314,7 +314,9 @@ def _time_joint_fit(
             *_left_out(goal, joint.band_hz),
             *goal.warnings,
         ),
-        **grid,
+        grid_stiffness=grid.stiffness,
+        grid_damping=grid.damping,
+        grid_error=grid.error,
     )
 
 

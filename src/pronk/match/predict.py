@@ -21,7 +21,7 @@ from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import MatchedGains
-from pronk.match.measured_joint import gains_on_drive
+from pronk.match.measured_joint import DriveGains, gains_on_drive, with_drive_gains
 from pronk.match.parameters import GAINS
 from pronk.response.estimate import excited_joints
 from pronk.response.grid import held_mean
@@ -107,6 +107,7 @@ def predict(
     robot: RobotSpec,
     gains: MatchedGains,
     *,
+    drive_gains: DriveGains | None = None,
     threads: int = 2,
     simulator: str = "mujoco",
 ) -> Prediction:
@@ -121,6 +122,7 @@ def predict(
     """
     if gains.robot != robot.name:
         raise LogError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    (log,) = with_drive_gains([log], robot, drive_gains)
     if moves_together(log):
         if simulator != "mujoco":
             raise PronkError(
