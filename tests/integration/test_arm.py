@@ -13,7 +13,7 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.readers import read_log
 from pronk.match import gains as gains_file
 from pronk.match import match_logs
-from pronk.match.arm import fit_whole_arm, trusted_frequency, trusted_samples
+from pronk.match.arm import fit_together, trusted_frequency, trusted_samples
 from pronk.match.parameters import DRIVE_MODE
 from pronk.match.predict import drives_of, predict
 from pronk.match.result import MatchResult
@@ -69,7 +69,7 @@ def recorded_with_known_drives(log: JointLog) -> JointLog:
 
 def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
     log = recorded_with_known_drives(commands(65.0, (0.15, 8.0), 0.35))
-    joints, _ = fit_whole_arm([log], ARM, DRIVE_MODE, most_held=0)
+    joints, _ = fit_together([log], ARM, DRIVE_MODE, most_held=0)
     for name, known in KNOWN.items():
         joint = joints[name]
         assert joint.stiffness == known["stiffness"]
@@ -83,7 +83,7 @@ def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
 def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
     log = recorded_with_known_drives(commands(65.0, (0.05, 0.4), 0.1))
     with pytest.raises(IdentifiabilityError, match=r"armature.*a sweep to higher frequencies"):
-        fit_whole_arm([log], ARM, DRIVE_MODE, most_held=0)
+        fit_together([log], ARM, DRIVE_MODE, most_held=0)
 
 
 def test_too_short_and_misspelled_are_refused() -> None:
@@ -91,9 +91,9 @@ def test_too_short_and_misspelled_are_refused() -> None:
     with pytest.raises(LogError, match="at least 3"):
         match_logs([log], ARM)
     with pytest.raises(PronkError, match="stiffness, damping"):
-        fit_whole_arm([log], ARM, ("kd",))
+        fit_together([log], ARM, ("kd",))
     with pytest.raises(LogError, match="at least one"):
-        fit_whole_arm([], ARM, DRIVE_MODE)
+        fit_together([], ARM, DRIVE_MODE)
 
 
 def test_still_arm_is_refused() -> None:

@@ -62,7 +62,8 @@ def match(
     from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
-    from pronk.match.pipeline import NOT_BETTER, match_logs
+    from pronk.match.pipeline import match_logs
+    from pronk.match.result import NOT_BETTER
     from pronk.match.settings import MatchSettings
     from pronk.report.match_page import write_page
     from pronk.robots import load_robot

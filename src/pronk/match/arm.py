@@ -7,7 +7,9 @@ own position far more than its neighbours', so the Jacobian is taken block-diago
 per parameter, in which that of every joint is changed at once.
 
 What the recordings identify is fitted; what they do not is held at the published value, and a flag
-names it. Blocks of the jackknife are pieces of 20 s.
+names it. Blocks of the jackknife are pieces of 2.5 to 20 s, an eighth of all recordings; every
+fourth is kept aside first, where the fit is compared with less fitting. With a fixed base chains
+(legs) do not affect each other, and are fitted one after the other.
 """
 
 from __future__ import annotations
@@ -23,24 +25,28 @@ from scipy import signal
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.fit import Problem, Solution, solve
-from pronk.match.measured_joint import DB
-from pronk.match.parameters import PARAMETERS, checked_names
-from pronk.match.result import JointFit
+from pronk.match.measured_joint import DB, gains_on_drive
+from pronk.match.parameters import GAINS, PARAMETERS, checked_names
+from pronk.match.result import HELD_OUT, JointFit, held_out_flags
 from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
 from pronk.response.estimate import estimate as estimate_response
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import ChainSimulation, published
+from pronk.simulators.chain import ChainSimulation, branches, published
 from pronk.simulators.mujoco import Drives
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-BLOCK_S = 20.0
-"""Length of a block of the jackknife [s]: many times the joints' memory of half a second."""
+BLOCKS_S = (2.5, 20.0)
+"""Shortest and longest block of the jackknife [s]: five times the joints' memory of half a second,
+and many times."""
+_BLOCKS = 8
+"""Blocks that recordings are divided into, as far as the lengths allow."""
 MIN_BLOCKS = 3
 COHERENCE_MIN = 0.8
 """Frequencies whose coherence is lower do not count towards an error in dB."""
+_PLAIN = ("stiffness", "damping", "delay")
 _ROUNDS = 15
 _SETTLED = 1e-3
 """Relative change of cost or parameters that ends the search: far below the intervals."""
@@ -58,7 +64,7 @@ _AT_LIMIT = 0.25
 """Share of its power that a sine at the limit keeps, filtered forwards and backwards."""
 
 
-class TimeProblem(Problem):
+class ArmProblem(Problem):
     """Residuals of the drives of one arm in time."""
 
     def __init__(
@@ -66,20 +72,20 @@ class TimeProblem(Problem):
         arm: ChainSimulation,
         masks: Sequence[Mask],
         fitted: Mapping[str, Sequence[str]],
+        nominal: Drives,
         found: Drives,
         progress: Callable[[int], None],
     ) -> None:
         """Take the recordings and the samples of them to use, shape (n, joints) each.
 
-        `found` holds drives from an earlier fit, the published ones where a joint is missing;
-        `progress` is called with the number of simulations so far.
+        `found` holds drives from an earlier fit, the `nominal` ones where a joint is missing;
+        `progress` is called with the number of simulations done.
         """
-        start = {joint: published(arm.robot, joint) for joint in arm.joints}
-        super().__init__(start | dict(found), fitted, refitted=found)
-        self.arm, self.fitted, self.masks = arm, fitted, masks
+        super().__init__({**nominal, **found}, fitted, refitted=found)
+        self.arm, self.fitted, self.masks, self.nominal = arm, fitted, masks, nominal
         self.measured = arm.measured()
         self._kinds = [name for name in PARAMETERS if name in {name for _, name in self.slots}]
-        self._evaluations, self._progress = 0, progress
+        self._progress = progress
         self._last: tuple[Array, Array] | None = None
 
     def residual(self, x: Array) -> Array:
@@ -122,12 +128,11 @@ class TimeProblem(Problem):
 
     def _simulated(self, sets: Sequence[Drives]) -> list[Array]:
         out = [self.residuals(positions) for positions in self.arm.run(sets)]
-        self._evaluations += len(sets)
-        self._progress(self._evaluations)
+        self._progress(len(sets))
         return out
 
 
-def fit_whole_arm(
+def fit_together(
     logs: Sequence[JointLog],
     robot: RobotSpec,
     names: Sequence[str],
@@ -136,10 +141,10 @@ def fit_whole_arm(
     threads: int = 2,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[dict[str, JointFit], dict[str, str]]:
-    """Fit drive parameters of every joint that moves in some recordings.
+    """Fit drive parameters of every joint that moves in some recordings, chain by chain.
 
     Args:
-        logs: Recordings of one arm; several joints may move at once.
+        logs: Recordings of one robot whose base is fixed; several joints may move at once.
         robot: The robot.
         names: Parameters to fit, out of `PARAMETERS`.
         most_held: How many parameters of a joint may be held at the published value, one after
@@ -159,35 +164,99 @@ def fit_whole_arm(
     if not logs:
         raise LogError("no recordings; the fit of an arm needs at least one.")
     names = checked_names(names, tuple(PARAMETERS))
-    most = _ROUNDS * (1 + len(names))
-    with ChainSimulation(robot, logs, threads=threads) as arm:
-        masks, limit_hz = _trusted(arm)
-        blocks = _blocks(logs)
-        if (count := len(np.unique(blocks))) < MIN_BLOCKS:
-            raise LogError(
-                f"the recordings make {count} blocks of {BLOCK_S:g} s; intervals need at least "
-                f"{MIN_BLOCKS}."
+    fits: dict[str, JointFit] = {}
+    excluded: dict[str, str] = {}
+    chains = branches(logs, robot)
+    for k, joints in enumerate(chains):
+        with ChainSimulation(robot, logs, joints=joints, threads=threads) as arm:
+
+            def report(share: float, k: int = k) -> None:
+                progress((k + share) / len(chains))
+
+            fits |= _fit_chain(arm, names, most_held, report)
+            excluded |= arm.excluded
+    return fits, excluded
+
+
+def _fit_chain(
+    arm: ChainSimulation,
+    names: Sequence[str],
+    most_held: int,
+    progress: Callable[[float], None],
+) -> dict[str, JointFit]:
+    """Fit the joints of one chain: first without every fourth block, then to everything."""
+    masks, limit_hz = _trusted(arm)
+    blocks = _blocks(arm.logs)
+    if (count := len(np.unique(blocks))) < MIN_BLOCKS:
+        raise LogError(
+            f"the recordings make {count} blocks of {BLOCKS_S[0]:g} s or more; intervals need at "
+            f"least {MIN_BLOCKS}."
+        )
+    nominal = {
+        joint: published(arm.robot, joint)
+        | dict(zip(GAINS, gains_on_drive(log, joint, arm.robot), strict=True))
+        for log, excited in zip(arm.logs, arm.excited, strict=True)
+        for joint in excited
+    }
+    most, counted = 2 * _ROUNDS * (1 + len(names)), [0]
+
+    def count_runs(more: int) -> None:
+        counted[0] += more
+        progress(min(counted[0] / most, 0.99))
+
+    aside = blocks % 4 == 3
+    if not aside.any():
+        aside = blocks == blocks.max()
+    edges = np.cumsum([len(mask) for mask in masks])[:-1]
+    out_of_fit = np.split(aside, edges)
+    kept = [mask & ~out[:, None] for mask, out in zip(masks, out_of_fit, strict=True)]
+
+    def fit(
+        names: Mapping[str, Sequence[str]], begin: Drives, used: Sequence[Mask]
+    ) -> tuple[ArmProblem, Solution]:
+        problem = ArmProblem(arm, used, names, nominal, begin, count_runs)
+        return problem, solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
+
+    held: dict[str, tuple[str, ...]] = dict.fromkeys(arm.joints, ())
+    found: dict[str, dict[str, float]] = {}
+    while True:
+        fitted = {j: tuple(n for n in names if n not in held[j]) for j in arm.joints}
+        problem, solution = fit(fitted, found, masks)
+        estimates = _estimates(problem, solution, blocks)
+        unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
+        found = problem.values(solution.x)
+        if not unknown:
+            break
+        for joint, lost in unknown.items():
+            if len(held[joint]) == most_held or len(fitted[joint]) == 1:
+                _refuse(unknown)
+            worst = min(lost, key=_HOLD_FIRST.index)
+            held[joint] = (*held[joint], worst)
+            found[joint][worst] = nominal[joint][worst]
+    drives: list[Drives] = [nominal]
+    for few in (("delay",), _PLAIN, names):
+        free = {j: [n for n in few if n not in held[j]] for j in arm.joints}
+        begin = {j: nominal[j] | {n: found[j][n] for n in free[j]} for j in arm.joints}
+        if few == names:
+            begin = found
+        trial, best = fit(free, begin, kept)
+        drives.append(trial.values(best.x))
+    left = [mask & out[:, None] for mask, out in zip(masks, out_of_fit, strict=True)]
+    judge = ArmProblem(arm, left, fitted, nominal, found, count_runs)
+    used = np.concatenate(left)
+    errors = [judge.residuals(positions) for positions in arm.run(drives)]
+    held_out = {
+        joint: dict(
+            zip(
+                HELD_OUT,
+                (_rms(error[judge.block(joint)][used[:, i]]) for error in errors),
+                strict=True,
             )
-        held: dict[str, tuple[str, ...]] = dict.fromkeys(arm.joints, ())
-        found: dict[str, dict[str, float]] = {}
-        while True:
-            fitted = {j: tuple(n for n in names if n not in held[j]) for j in arm.joints}
-            problem = TimeProblem(
-                arm, masks, fitted, found, lambda count: progress(min(count / most, 0.99))
-            )
-            solution = solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
-            estimates = _estimates(problem, solution, blocks)
-            unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
-            if not unknown:
-                fits = _joint_fits(problem, solution, estimates, held, limit_hz)
-                return fits, arm.excluded
-            found = problem.values(solution.x)
-            for joint, few in unknown.items():
-                if len(held[joint]) == most_held or len(fitted[joint]) == 1:
-                    _refuse(unknown)
-                worst = min(few, key=_HOLD_FIRST.index)
-                held[joint] = (*held[joint], worst)
-                found[joint][worst] = published(robot, joint)[worst]
+        )
+        for i, joint in enumerate(arm.joints)
+        if used[:, i].any()
+    }
+    return _joint_fits(problem, solution, estimates, held, limit_hz, held_out)
 
 
 def trusted_frequency(time: Array, command: Array, position: Array) -> float:
@@ -253,9 +322,10 @@ def _trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
 def _blocks(logs: Sequence[JointLog]) -> NDArray[np.int64]:
     """Number of the block of every sample of all recordings, shape (rows,)."""
     out, first = [], 0
-    for log in logs:
-        span = log.time[-1] - log.time[0]
-        count = max(round(span / BLOCK_S), 1)
+    spans = [float(log.time[-1] - log.time[0]) for log in logs]
+    length = float(np.clip(sum(spans) / _BLOCKS, *BLOCKS_S))
+    for log, span in zip(logs, spans, strict=True):
+        count = max(round(span / length), 1)
         share = ((log.time - log.time[0]) / span * count).astype(np.int64)
         out.append(first + np.minimum(share, count - 1))
         first += count
@@ -263,7 +333,7 @@ def _blocks(logs: Sequence[JointLog]) -> NDArray[np.int64]:
 
 
 def _estimates(
-    problem: TimeProblem, solution: Solution, blocks: NDArray[np.int64]
+    problem: ArmProblem, solution: Solution, blocks: NDArray[np.int64]
 ) -> dict[str, Estimate]:
     """Values and intervals of every joint; those at a bound are flagged."""
     out, values = {}, problem.values(solution.x)
@@ -296,15 +366,16 @@ def _refuse(unknown: Mapping[str, tuple[str, ...]]) -> None:
 
 
 def _joint_fits(
-    problem: TimeProblem,
+    problem: ArmProblem,
     solution: Solution,
     estimates: Mapping[str, Estimate],
     held: Mapping[str, tuple[str, ...]],
     limit_hz: Mapping[str, float],
+    held_out: Mapping[str, Mapping[str, float]],
 ) -> dict[str, JointFit]:
     """Every joint with the response of the recording that shows most of its band."""
     arm, out = problem.arm, {}
-    matched, naive = arm.run([problem.values(solution.x), {}])
+    matched, naive = arm.run([problem.values(solution.x), problem.nominal])
     naive_residual = problem.residuals(naive)
     for i, (name, found) in enumerate(estimates.items()):
         rows = problem.block(name)
@@ -327,7 +398,9 @@ def _joint_fits(
             held=held[name],
             rmse=_rms(solution.residual[rows][mask]),
             published_rmse=_rms(naive_residual[rows][mask]),
-            flags=(*flags, *found.flags),
+            total95=found.ci95,
+            held_out=held_out.get(name, {}),
+            flags=(*held_out_flags(held_out.get(name, {})), *flags, *found.flags),
             **_compared(arm, name, simulated, limit_hz[name]),
         )
     return out

@@ -69,6 +69,8 @@ class GroupGains:
     """Half-width of the uniform randomization about `stiffness` [N m/rad]."""
     damping_range: float
     """Half-width of the uniform randomization about `damping` [N m s/rad]."""
+    frictionloss: float = NAN
+    """Mean dry friction that goes with the gains [N m]; NaN: that of the robot's drives."""
     ellipsoid: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
     """Shape matrix E of the joint ellipsoid: {x : (x - c)^T E^-1 (x - c) <= 1} covers the data."""
     ellipsoid_center: tuple[float, float] = (0.0, 0.0)

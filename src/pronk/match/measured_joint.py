@@ -180,28 +180,22 @@ def with_drive_gains(
             own: Pair | None = None
             if log.stiffness is not None and log.damping is not None:
                 own = float(log.stiffness[column]), float(log.damping[column])
-            pair: Pair | None = by_joint.get(name, own)
-            if own and pair and not np.allclose(own, pair, rtol=_SAME_GAINS):
+            stated = by_joint.get(name, own)
+            if own and stated and not np.allclose(own, stated, rtol=_SAME_GAINS):
                 raise LogError(
                     f"{where}: {name} was recorded at {own[0]:g} N m/rad and {own[1]:g} N m s/rad "
-                    f"by the log, at {pair[0]:g} and {pair[1]:g} by --drive-gains; leave the "
+                    f"by the log, at {stated[0]:g} and {stated[1]:g} by --drive-gains; leave the "
                     "option out, or correct the log."
                 )
-            if pair is None and name in moved and given != "default":
+            if stated is None and name in moved and given != "default":
                 raise LogError(
                     f"{where}: the gains that were on the drive of {name} are not in the log; give "
                     "--drive-gains JOINT_OR_GROUP=STIFFNESS,DAMPING, or --drive-gains default if "
                     "they were those of the robot's file."
                 )
-            known = name in robot.joint_names
-            pairs.append(
-                pair
-                or (
-                    (robot.joint(name).stiffness, robot.joint(name).damping)
-                    if known
-                    else (0.0, 0.0)
-                )
-            )
+            if stated is None and name in robot.joint_names:
+                stated = robot.joint(name).stiffness, robot.joint(name).damping
+            pairs.append(stated or (0.0, 0.0))
         stiffness, damping = np.array(pairs).T
         out.append(replace(log, stiffness=stiffness, damping=damping))
     return out

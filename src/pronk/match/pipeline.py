@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import PronkError
 from pronk.logs.joint_log import JointLog
-from pronk.match.arm import fit_whole_arm
+from pronk.match.arm import fit_together
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
     DriveGains,
@@ -33,7 +33,13 @@ from pronk.match.response_fit import (
     require_sweeps,
     response_fit,
 )
-from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult, amplitude_spread
+from pronk.match.result import (
+    ZERO_ARMATURE,
+    JointFit,
+    MatchResult,
+    amplitude_spread,
+    held_out_flags,
+)
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.match.time_fit import TIME_FIT, TimeFit, fit_joint, recorded
@@ -56,12 +62,6 @@ NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
 NO_ARMATURE_RATIO = 5.0
 """Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
-NOT_BETTER = "not better: "
-"""Beginning of the flag on a joint whose match is no better than less fitting, on what was kept
-aside."""
-_NOT_BETTER = 1.02
-"""Error kept aside over that of the best of the others from which on a match is not better: where
-the model's friction is right all fits are equal but for noise."""
 _FRICTION_RATIO = 1.5
 """Fitted dry friction over the model's, or under it, that is worth a flag."""
 _START_S = 0.005
@@ -118,7 +118,7 @@ def match_logs(
             )
         info, names = mujoco_info(robot), GAINS_MODE if mode == "gains" else DRIVE_MODE
         with clock.stage("fit"):
-            joints, excluded = fit_whole_arm(
+            joints, excluded = fit_together(
                 logs, robot, names, threads=chosen.threads, progress=clock.report
             )
     else:
@@ -307,7 +307,7 @@ def _time_joint_fit(
         held_out=fit.held_out,
         amplitude_gains=fit.amplitude_gains,
         flags=(
-            *_held_out_flags(fit.held_out),
+            *held_out_flags(fit.held_out),
             *_no_match(error_db, goal),
             *_time_flags(fit, joint.drive.frictionloss),
             *fit.estimate.flags,
@@ -318,21 +318,6 @@ def _time_joint_fit(
         grid_damping=grid.damping,
         grid_error=grid.error,
     )
-
-
-def _held_out_flags(errors: Mapping[str, float]) -> Iterator[str]:
-    """A match that is no better on what was kept aside than with less or no fitting."""
-    words = {
-        "nominal": "the nominal gains",
-        "nominal_delayed": "the nominal gains with the best delay",
-        "plain": "a plain fit of stiffness, damping and delay",
-    }
-    best = min(words, key=errors.__getitem__)
-    if errors["matched"] > _NOT_BETTER * errors[best]:
-        yield (
-            f"{NOT_BETTER}on what was kept aside it misses by {1e3 * errors['matched']:.2f} mrad, "
-            f"{words[best]} by {1e3 * errors[best]:.2f} mrad; use those, or record more amplitudes"
-        )
 
 
 def _time_flags(fit: TimeFit, frictionloss: float) -> Iterator[str]:

@@ -64,6 +64,7 @@ def group_gains(robot: RobotSpec, joints: Mapping[str, JointGains]) -> dict[str,
             damping=centre[1],
             stiffness_range=_up(float(needed[0]), STIFFNESS_STEP),
             damping_range=_up(float(needed[1]), DAMPING_STEP),
+            frictionloss=float(np.mean([gains.frictionloss for gains in group.values()])),
             ellipsoid=((a, b), (c, d)),
             ellipsoid_center=(float(middle[0]), float(middle[1])),
         )

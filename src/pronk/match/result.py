@@ -21,6 +21,13 @@ from pronk.response.response import FrequencyResponse
 SCHEMA = "pronk/match/3"
 ZERO_ARMATURE = "zero armature: "
 """Beginning of the flag on the search without rotor inertia; it is no flag on the gains."""
+HELD_OUT = ("nominal", "nominal_delayed", "plain", "matched")
+"""Drives whose errors on what was kept aside are compared."""
+NOT_BETTER = "not better: "
+"""Beginning of the flag on a match that is no better there than less fitting."""
+_NOT_BETTER = 1.02
+"""Error kept aside over that of the best of the others from which on a match is not better: where
+the model's friction is right all fits are equal but for noise."""
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -164,3 +171,21 @@ def amplitude_spread(gains: Array) -> float:
     if len(gains) < 2:
         return float("nan")
     return float(np.abs(gains[1:, 1] / gains[0, 1] - 1.0).max())
+
+
+def held_out_flags(errors: Mapping[str, float]) -> tuple[str, ...]:
+    """Flag a match that is no better on what was kept aside than with less or no fitting."""
+    words = {
+        "nominal": "the nominal gains",
+        "nominal_delayed": "the nominal gains with the best delay",
+        "plain": "a plain fit of stiffness, damping and delay",
+    }
+    if not errors:
+        return ()
+    best = min(words, key=errors.__getitem__)
+    if errors["matched"] <= _NOT_BETTER * errors[best]:
+        return ()
+    return (
+        f"{NOT_BETTER}on what was kept aside it misses by {1e3 * errors['matched']:.2f} mrad, "
+        f"{words[best]} by {1e3 * errors[best]:.2f} mrad; use those, or record more amplitudes",
+    )

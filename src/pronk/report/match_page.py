@@ -16,7 +16,7 @@ from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
 from pronk.match.predict import Prediction, load_prediction
-from pronk.match.result import ZERO_ARMATURE, JointFit, MatchResult
+from pronk.match.result import HELD_OUT, ZERO_ARMATURE, JointFit, MatchResult
 from pronk.report import figures
 from pronk.report.page import Part, page
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
@@ -122,6 +122,7 @@ def part(path: Path, gains: str | None = None) -> Part:
         "where": "the virtual robot" if own.virtual else "the robot",
         "in_time": in_time,
         "gains_table": gains_table(own, in_time),
+        "held_out": _held_out_table(result),
         "overview": picture(figures.overview(fits)) if fits else None,
         "bode": {name: picture(figures.bode(fits[name])) for name in order},
         "maps": None if in_time else picture(figures.error_maps(result, drive)),
@@ -156,28 +157,62 @@ def part(path: Path, gains: str | None = None) -> Part:
 
 def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     """Return the matched gains of each joint, beside the paper's for its robot."""
-    paper = gains.robot == ROBOT
-    delays = any(joint.delay_s > 0.0 for joint in gains.joints.values())
-    columns = "joint | stiffness [N m/rad];2 | 95 %;2 | damping [N m s/rad] | 95 %"
-    columns += " | paper, Table I" * paper + " | friction [N m]" * in_time
+    paper, joints = gains.robot == ROBOT, gains.joints.values()
+    delays = any(one.delay_s > 0.0 for one in joints)
+    friction = any(np.isfinite(one.frictionloss) for one in joints)
+    total = any(np.isfinite(one.stiffness_total95).all() for one in joints)
+    interval = "repeat 95 %;2 | total 95 %;2" if total else "95 %;2"
+    columns = f"joint | stiffness [N m/rad];2 | {interval} | damping [N m s/rad] | "
+    columns += interval.replace(";2", "")
+    columns += " | by magnitude alone" * total
+    columns += " | paper, Table I" * paper + " | friction [N m]" * friction
     columns += " | delay [ms];1" * delays
     columns += " | nominal error [dB];2 | error [dB];2 | lowest coherence"
     rows = []
     for name, one in gains.joints.items():
         row: list[Any] = [joint_words(name) + " (flagged)" * bool(one.flags)]
-        row += [one.stiffness, one.stiffness_ci95, one.damping, one.damping_ci95]
+        row += [one.stiffness, one.stiffness_ci95] + [one.stiffness_total95] * total
+        row += [one.damping, one.damping_ci95] + [one.damping_total95] * total
+        row += [f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}"] * total
         row += [" / ".join(map(str, TABLE_I.get(name, ("-",))))] * paper
-        row += [one.frictionloss] * in_time + [1000.0 * one.delay_s] * delays
+        row += [one.frictionloss] * friction + [1000.0 * one.delay_s] * delays
         rows.append([*row, one.naive_error_db, one.error_db, one.coherence_min])
-    notes = [f"95 % intervals over {'blocks of the recordings' if in_time else 'repeats'}."]
-    if delays and not in_time:
+    simulator = gains.simulator
+    notes = [
+        f"Equivalent gains of {simulator.engine} at a step of {1000.0 * simulator.timestep_s:g} ms "
+        "and with the inertia of this model, not the gains of the drive itself."
+    ]
+    if total:
+        notes.append(
+            "repeat: spread of the repeats. total: also the change between amplitudes and between "
+            "parts of the excitation. by magnitude alone: the paper's grid."
+        )
+    else:
+        notes.append(f"95 % intervals over {'blocks of the recordings' if in_time else 'repeats'}.")
+    if delays and not (in_time or total):
         notes.append("delay: lag of the measured phase behind the matched simulation.")
     if paper and gains.virtual:
         notes.append(
             "Table I was measured on the paper's robot; the virtual robot's hidden parameters were "
-            "set so that a match lands near it."
+            "set so that a match by magnitude lands near it."
         )
     return table(columns, rows, *notes)
+
+
+def _held_out_table(result: MatchResult) -> Sheet:
+    """Errors on what the fits did not use."""
+    rows = [
+        (joint_words(name), *(1e3 * fit.held_out[key] for key in HELD_OUT))
+        for name, fit in result.joints.items()
+        if fit.held_out
+    ]
+    return table(
+        "joint | nominal;2 | nominal with the best delay;2 | plain fit;2 | matched;2",
+        rows,
+        "RMSE [mrad] on the last repeat of each amplitude (every fourth part where there is one), "
+        "which these fits did not use; each octave counts alike. plain fit: stiffness, damping "
+        "and delay, with the model's friction.",
+    )
 
 
 def ranges_table(gains: MatchedGains, members: Mapping[str, list[str]]) -> Sheet:

@@ -42,6 +42,22 @@ def published(robot: RobotSpec, joint: str) -> dict[str, float]:
     }
 
 
+def branches(logs: Sequence[JointLog], robot: RobotSpec) -> list[tuple[str, ...]]:
+    """Joints that move in some logs, by the chain that holds them.
+
+    With the base fixed, chains do not affect each other. LogError if nothing moves in radians.
+    """
+    moved = {name for log in logs for name in excited_joints(log, robot)[0]}
+    out: list[tuple[str, ...]] = []
+    left = [name for name in robot.joint_names if name in moved]
+    while left:
+        roots = (joint.chain for joint in robot.joints if left[0] in joint.chain)
+        chain = max(roots, key=lambda names: (len(set(names) & set(left)), -len(names)))
+        out.append(tuple(name for name in left if name in chain))
+        left = [name for name in left if name not in chain]
+    return out
+
+
 def excited_joints(log: JointLog, robot: RobotSpec) -> tuple[tuple[str, ...], dict[str, str]]:
     """Which joints of a log can be simulated, and why the others cannot.
 
@@ -87,14 +103,30 @@ def moves_together(log: JointLog) -> bool:
 class ChainSimulation(Closing):
     """The chain with the commands of one or more logs, for many sets of drives."""
 
-    def __init__(self, robot: RobotSpec, logs: Sequence[JointLog], *, threads: int = 2) -> None:
-        """Compile the model of the chain that holds all joints that move.
+    def __init__(
+        self,
+        robot: RobotSpec,
+        logs: Sequence[JointLog],
+        *,
+        joints: Sequence[str] | None = None,
+        threads: int = 2,
+    ) -> None:
+        """Compile the model of the chain that holds all joints that move, or the given ones.
+
+        `joints` are one of `branches`; logs in which none of them moves are left out.
 
         Raises:
             LogError: Nothing moves in radians, or joints of different chains move together.
         """
-        self.robot, self.logs = robot, tuple(logs)
-        found = [excited_joints(log, robot) for log in self.logs]
+        self.robot = robot
+        pairs = [(log, excited_joints(log, robot)) for log in logs]
+        found, kept = [], []
+        for log, (excited, reasons) in pairs:
+            mine = tuple(name for name in excited if joints is None or name in joints)
+            if mine:
+                kept.append(log)
+                found.append((mine, reasons))
+        self.logs = tuple(kept)
         names = {name for excited, _ in found for name in excited}
         self.joints = tuple(name for name in robot.joint_names if name in names)
         self.excited = tuple(excited for excited, _ in found)

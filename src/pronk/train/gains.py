@@ -130,6 +130,7 @@ def _about(nominal: GroupGains, ranges: GroupGains) -> GroupGains:
         ranges,
         stiffness=nominal.stiffness,
         damping=nominal.damping,
+        frictionloss=nominal.frictionloss,
         ellipsoid_center=(
             center[0] + (nominal.stiffness - ranges.stiffness),
             center[1] + (nominal.damping - ranges.damping),

@@ -22,6 +22,7 @@ proportion to V. V follows over a few steps, since power and voltage depend on e
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -92,7 +93,7 @@ def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg,
     cfgs = []
     for group in robot.groups:
         joints = robot.group(group)
-        drive = joints[0].drive
+        drive, fitted = joints[0].drive, gains.groups[group].frictionloss
         if any(joint.drive != drive for joint in joints):
             raise RobotError(
                 f"the joints of {robot.name}'s group {group} have different drives; expected one "
@@ -104,7 +105,7 @@ def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg,
                 stiffness=gains.groups[group].stiffness,
                 damping=gains.groups[group].damping,
                 armature=drive.armature,
-                frictionloss=drive.frictionloss,
+                frictionloss=drive.frictionloss if math.isnan(fitted) else fitted,
                 viscous_damping=drive.viscous_damping,
                 effort_limit=drive.effort_limit,
                 saturation_effort=drive.stall_torque,
