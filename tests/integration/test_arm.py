@@ -87,9 +87,9 @@ def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
 
 
 def test_too_short_and_misspelled_are_refused() -> None:
-    log = commands(30.0, (0.2, 3.0), 0.2)
+    log = commands(5.0, (0.2, 3.0), 0.2)
     with pytest.raises(LogError, match="at least 3"):
-        match_logs([log], ARM)
+        match_logs([log], ARM, drive_gains="default")
     with pytest.raises(PronkError, match="stiffness, damping"):
         fit_together([log], ARM, ("kd",))
     with pytest.raises(LogError, match="at least one"):
@@ -138,7 +138,7 @@ def test_sweep_is_used_up_to_where_it_breaks() -> None:
 
 @pytest.fixture(scope="module")
 def matched() -> MatchResult:
-    return match_logs([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM)
+    return match_logs([read_log(SO101 / "chirp_sweep", robot=ARM)], ARM, drive_gains="default")
 
 
 @recorded
@@ -150,7 +150,7 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
     assert drives_of(ARM, gains)["elbow_flex"]["frictionloss"] == pytest.approx(
         matched.joints["elbow_flex"].frictionloss, rel=1e-5
     )
-    found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains)
+    found = predict(read_log(SO101 / "step_response", robot=ARM), ARM, gains, drive_gains="default")
     assert tuple(one.joint for one in found.joints) == JOINTS
     for one in found.joints:
         assert one.rmse_matched < 0.7 * one.rmse_naive

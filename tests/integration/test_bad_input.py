@@ -69,10 +69,22 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "match: columns": ((*MATCH, "--unit", "rad", "--columns", "nonsense"), "NAME=VALUE"),
     "match: scale": ((*MATCH, "--unit", "rad", "--scale", "FR_knee=big"), "big"),
     "match: joint": (("match", "b.csv", *MATCH[2:], "--unit", "rad"), "FR_elbow"),
+    "match: drive gains": ((*MATCH, "--unit", "rad"), "--drive-gains"),
+    "match: drive gains of no joint": (
+        (*MATCH, "--unit", "rad", "--drive-gains", "elbow=17,.4"),
+        "hip_roll",
+    ),
+    "match: drive gains without damping": (
+        (*MATCH, "--unit", "rad", "--drive-gains", "knee=17"),
+        "knee=25,.5",
+    ),
     "match: not a log": (("match", "noise.mcap", *MATCH[2:]), "noise.mcap"),
     "match: format": (("match", "notes.txt", *MATCH[2:]), "notes.txt"),
     "match: pickle": (("match", "bomb.pt", *MATCH[2:]), "bomb.pt"),
-    "match: simulator": ((*MATCH, "--unit", "rad", "--simulator", "gazebo"), "gazebo"),
+    "match: simulator": (
+        (*MATCH, "--unit", "rad", "--drive-gains", "default", "--simulator", "gazebo"),
+        "gazebo",
+    ),
     "predict: gains": (("predict", "a.csv", *ROBOT_OF, "--gains", "no.yaml"), "pronk match"),
     "export: gains": (("export", "no.yaml", "--to", "mjlab", "--out", "x.py"), "pronk match"),
     "export: target": (("export", "no.yaml", "--to", "gazebo", "--out", "x.py"), "mjlab"),

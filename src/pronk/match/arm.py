@@ -239,8 +239,10 @@ def _fit_chain(
         begin = {j: nominal[j] | {n: found[j][n] for n in free[j]} for j in arm.joints}
         if few == names:
             begin = found
-        trial, best = fit(free, begin, kept)
-        drives.append(trial.values(best.x))
+        if any(free.values()):
+            trial, best = fit(free, begin, kept)
+            begin = trial.values(best.x)
+        drives.append(begin)
     left = [mask & out[:, None] for mask, out in zip(masks, out_of_fit, strict=True)]
     judge = ArmProblem(arm, left, fitted, nominal, found, count_runs)
     used = np.concatenate(left)

@@ -101,10 +101,6 @@ class MeasuredJoint:
         """Standard deviation of the measured gain from its coherence [dB], shape (inside,)."""
         return np.asarray(np.hypot(DB * self.measured.deviation()[self.fit_mask], FLOOR_DB))
 
-    def weights(self, phase: bool) -> Array:
-        """Weight of each gain, and then of each phase if used [1/dB]."""
-        return np.tile(1.0 / self.deviation_db(), 1 + phase)
-
     def error_db(self, simulated: ComplexArray) -> Array:
         """Gain over the measured one [dB] of a simulated response, both of shape (..., inside)."""
         measured = np.abs(self.measured.response[self.fit_mask])
@@ -119,19 +115,6 @@ class MeasuredJoint:
         """Root mean square half-width of the measured gain's own 95 % interval in the band [dB]."""
         relative = self.measured.relative_error(0.95)[self.fit_mask]
         return float(DB * np.sqrt(np.mean(relative**2)))
-
-
-def residual_db(simulated: ComplexArray, measured: ComplexArray, phase: bool) -> Array:
-    """Simulated over measured response in dB, gain and then (if used) phase, shape (..., m).
-
-    A radian of phase counts as a neper of gain, 8.69 dB: noise turns a response as much as it
-    stretches it.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.log(np.asarray(simulated / measured, dtype=np.complex128))
-    if not phase:
-        return np.asarray(DB * ratio.real)
-    return np.concatenate([DB * ratio.real, DB * np.unwrap(ratio.imag, axis=-1)], axis=-1)
 
 
 def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[JointLog]]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import PronkError
+from pronk.errors import IdentifiabilityError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.match.arm import fit_together
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
@@ -28,7 +29,6 @@ from pronk.match.ranges import matched_gains
 from pronk.match.response_fit import (
     Fit,
     Pair,
-    fit_drive,
     refine,
     require_sweeps,
     response_fit,
@@ -130,7 +130,7 @@ def match_logs(
             robot, info = rigs.robot, rigs.info
             found, on_drive = _measured(logs, robot, chosen, clock)
             if mode == "drive":
-                joints = _match_drives(rigs, found, on_drive, fitted, clock)
+                joints = _match_drives(rigs, logs, found, on_drive, fitted, clock)
             else:
                 joints, rate = _match_gains(rigs, logs, found, on_drive, chosen, clock)
     gains = {name: joint.gains() for name, joint in joints.items()}
@@ -185,6 +185,7 @@ def _measured(
 
 def _match_drives(
     rigs: JointRigs,
+    logs: Sequence[JointLog],
     found: Found,
     on_drive: Mapping[str, Pair],
     fitted: tuple[str, ...],
@@ -194,11 +195,43 @@ def _match_drives(
     for name, goals in found.items():
         require_sweeps(rigs.robot, name, goals, fitted)
     joints = {}
-    with clock.stage("fit"):
+    with clock.stage("time fit"):
         for name, goals in found.items():
-            joints[name] = fit_drive(rigs, goals, on_drive[name], fitted)
+            fit = _fit_in_time(rigs, logs, name, fitted, on_drive[name])
+            if unknown := fit.estimate.unidentified:
+                raise IdentifiabilityError(
+                    f"{name}: these logs do not identify the {unknown[0]} (deviation "
+                    f"{fit.estimate.sd[unknown[0]]:.2g}); {PARAMETERS[unknown[0]].remedy}; or hold "
+                    "it at a known value."
+                )
+            requests = [
+                SimRequest(goals[0], **_drive(rigs, fit.estimate.values)),
+                SimRequest(goals[0], **_drive(rigs, _nominal(rigs.robot, name, on_drive[name]))),
+            ]
+            matched, naive = responses(rigs, requests, whole=True)
+            joints[name] = _time_joint_fit(rigs.robot, goals, fit, matched, naive)
             clock.report(len(joints) / len(found))
     return joints
+
+
+def _nominal(robot: RobotSpec, name: str, on_drive: Pair) -> dict[str, float]:
+    """The published drive with the gains that were on it."""
+    return published(robot, name) | dict(zip(GAINS, on_drive, strict=True))
+
+
+def _fit_in_time(
+    rigs: JointRigs,
+    logs: Sequence[JointLog],
+    name: str,
+    fitted: Sequence[str],
+    on_drive: Pair,
+    start: Pair | None = None,
+) -> TimeFit:
+    """Fit one joint in time, from some gains or those that were on the drive."""
+    nominal = _nominal(rigs.robot, name, on_drive)
+    begin = nominal | dict(zip(GAINS, start or on_drive, strict=True)) | {"delay": _START_S}
+    sources = [log for log in logs if name in excited_joints(log)]
+    return fit_joint(rigs, recorded(sources, name, rigs.robot), fitted, begin, nominal)
 
 
 def _match_gains(
@@ -232,13 +265,8 @@ def _match_gains(
     if settings.method == "time":
         with clock.stage("time fit"):
             for name, fit in best.items():
-                nominal = published(rigs.robot, name) | dict(
-                    zip(GAINS, on_drive[name], strict=True)
-                )
-                start = nominal | dict(zip(GAINS, fit.gains, strict=True)) | {"delay": _START_S}
-                sources = [log for log in logs if name in excited_joints(log)]
-                records = recorded(sources, name, rigs.robot)
-                fitted[name] = fit_joint(rigs, records, TIME_FIT, start, nominal)
+                pair = on_drive[name]
+                fitted[name] = _fit_in_time(rigs, logs, name, TIME_FIT, pair, fit.gains)
                 clock.report(len(fitted) / len(best))
     else:
         with clock.stage("amplitudes"):
@@ -291,12 +319,12 @@ def _time_joint_fit(
     fit: TimeFit,
     matched: ComplexArray,
     naive: ComplexArray,
-    grid: GridSearch,
+    grid: GridSearch | None = None,
 ) -> JointFit:
     """Put the findings of one joint together that was fitted in time."""
     goal, joint = goals[0], robot.joint(goals[0].joint)
     error_db = goal.rms_db(matched[goal.fit_mask])
-    return response_fit(
+    found = response_fit(
         robot,
         goals,
         fit.estimate,
@@ -314,6 +342,11 @@ def _time_joint_fit(
             *_left_out(goal, joint.band_hz),
             *goal.warnings,
         ),
+    )
+    if grid is None:
+        return found
+    return replace(
+        found,
         grid_stiffness=grid.stiffness,
         grid_damping=grid.damping,
         grid_error=grid.error,

@@ -26,7 +26,7 @@ from pronk.match.parameters import GAINS
 from pronk.response.estimate import excited_joints
 from pronk.response.grid import held_mean
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import ChainSimulation, moves_together, published
+from pronk.simulators.chain import ChainSimulation, branches, moves_together, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.simulator import JointRigs, joint_rigs
 
@@ -113,8 +113,8 @@ def predict(
 ) -> Prediction:
     """Simulate a log with naive and with matched gains.
 
-    Where several joints move at once the whole arm is simulated; otherwise each segment of each
-    joint by itself, the rest held as on the rig.
+    Where several joints move at once each chain of them is simulated; otherwise each segment
+    of each joint by itself, the rest held as on the rig.
 
     Raises:
         LogError: The log excites no joint that has matched gains, or the robots differ.
@@ -129,7 +129,7 @@ def predict(
                 f"{log.source or 'log'}: several joints move at once, which only simulator mujoco "
                 f"replays, not {simulator}."
             )
-        joints, excluded = _arm(log, robot, gains, threads)
+        joints, excluded = _together(log, robot, gains, threads)
     else:
         with joint_rigs(simulator, robot, threads=threads) as rigs:
             joints, excluded = _joint_by_joint(log, rigs, gains)
@@ -169,35 +169,38 @@ def _without_gains(name: str) -> str:
     )
 
 
-def _arm(
+def _together(
     log: JointLog, robot: RobotSpec, gains: MatchedGains, threads: int
 ) -> tuple[list[JointPrediction], dict[str, str]]:
-    """The whole arm at once; joints and the reasons why others are left out."""
-    matched = drives_of(robot, gains)
+    """Chain by chain; joints and the reasons why others are left out."""
+    matched, joints = drives_of(robot, gains), []
+    left_out: dict[str, str] = {}
     kinds = {name: s.kind for s in log.segments for name in s.joints}
-    with ChainSimulation(robot, [log], threads=threads) as arm:
-        naive = {name: _on_drive(log, robot, name) for name in arm.joints}
-        late = {
-            name: drive | {"delay": matched[name]["delay"]} if name in matched else drive
-            for name, drive in naive.items()
-        }
-        simulated = [positions for (positions,) in arm.run([naive, late, matched])]
-    missing = {name: _without_gains(name) for name in arm.joints if name not in matched}
-    joints = [
-        JointPrediction(
-            joint=name,
-            time=log.time,
-            command=log.command[:, log.column(name)],
-            measured=log.position[:, log.column(name)],
-            naive=simulated[0][:, i],
-            naive_delayed=simulated[1][:, i],
-            matched=simulated[2][:, i],
-            signal=kinds.get(name, "unknown"),
-        )
-        for i, name in enumerate(arm.joints)
-        if name in matched
-    ]
-    return joints, arm.excluded | missing
+    for branch in branches([log], robot):
+        with ChainSimulation(robot, [log], joints=branch, threads=threads) as arm:
+            naive = {name: _on_drive(log, robot, name) for name in arm.joints}
+            late = {
+                name: drive | {"delay": matched[name]["delay"]} if name in matched else drive
+                for name, drive in naive.items()
+            }
+            simulated = [positions for (positions,) in arm.run([naive, late, matched])]
+        left_out |= arm.excluded
+        left_out |= {name: _without_gains(name) for name in arm.joints if name not in matched}
+        joints += [
+            JointPrediction(
+                joint=name,
+                time=log.time,
+                command=log.command[:, log.column(name)],
+                measured=log.position[:, log.column(name)],
+                naive=simulated[0][:, i],
+                naive_delayed=simulated[1][:, i],
+                matched=simulated[2][:, i],
+                signal=kinds.get(name, "unknown"),
+            )
+            for i, name in enumerate(arm.joints)
+            if name in matched
+        ]
+    return joints, left_out
 
 
 def _joint_by_joint(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pronk.match.fit import Solution
-from pronk.match.measured_joint import FLOOR_DB, MeasuredJoint, residual_db
+from pronk.match.measured_joint import FLOOR_DB, MeasuredJoint
 from pronk.match.parameters import GAINS, PARAMETERS
 
 Array = NDArray[np.float64]
@@ -124,34 +124,15 @@ def estimate(
     )
 
 
-def repeat_moves(goals: Sequence[MeasuredJoint], solution: Solution, phase: bool) -> list[Array]:
-    """Where each repeat of each amplitude would move the optimum, shapes (repeats, p).
+def repeat_moves(goal: MeasuredJoint, solution: Solution) -> Array:
+    """Where each repeat would move the optimum of a fit by magnitude, shape (repeats, p).
 
     By one Gauss-Newton step with the simulator's own derivatives at the common optimum,
     `(J^T J)^-1 J^T` times what the repeat differs from the mean: repeats differ by little.
     """
-    influence = np.linalg.pinv(solution.jacobian)
-    out, first = [], 0
-    for goal in goals:
-        weight = goal.weights(phase)
-        part = influence[:, first : first + len(weight)]
-        first += len(weight)
-        repeats = goal.measured.repeats[:, goal.fit_mask]
-        change = residual_db(repeats, goal.measured.response[goal.fit_mask], phase)
-        # Residuals are simulated less measured: a larger response needs larger gains there.
-        out.append((change * weight) @ part.T)
-    return out
-
-
-def repeat_covariance(
-    goals: Sequence[MeasuredJoint], solution: Solution, phase: bool
-) -> tuple[Array, int]:
-    """Covariance, shape (p, p), and degrees of freedom of a fit to several amplitudes."""
-    freedom, covariance = 0, np.zeros((len(solution.x), len(solution.x)))
-    for moves in repeat_moves(goals, solution, phase):
-        if (more := len(moves) - 1) > 0:
-            freedom, covariance = freedom + more, covariance + jackknife(moves / more)
-    return covariance, freedom
+    # Residuals are simulated less measured: a larger response needs larger gains there.
+    change = goal.error_db(goal.measured.repeats[:, goal.fit_mask]) / goal.deviation_db()
+    return np.asarray(change @ np.linalg.pinv(solution.jacobian).T)
 
 
 def gain_interval(
@@ -177,7 +158,7 @@ def gain_interval(
         gains, freedom = optimum[None, :], np.inf
         flags = ("one repeat: the interval assumes white noise",)
     else:
-        gains = optimum * np.exp(repeat_moves([goal], solution, phase=False)[0])
+        gains = optimum * np.exp(repeat_moves(goal, solution))
         covariance = jackknife(gains / (count - 1))
         if count == 2:
             flags = ("two repeats: the interval is wide, three or more narrow it",)
