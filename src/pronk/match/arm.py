@@ -42,7 +42,7 @@ BLOCKS_S = (2.5, 20.0)
 """Shortest and longest block of the jackknife [s]: five times the joints' memory of half a second,
 and many times."""
 _BLOCKS = 8
-"""Blocks that recordings are divided into, as far as the lengths allow."""
+"""Blocks of recordings that are too short for three of the longest."""
 MIN_BLOCKS = 3
 COHERENCE_MIN = 0.8
 """Frequencies whose coherence is lower do not count towards an error in dB."""
@@ -325,7 +325,9 @@ def _blocks(logs: Sequence[JointLog]) -> NDArray[np.int64]:
     """Number of the block of every sample of all recordings, shape (rows,)."""
     out, first = [], 0
     spans = [float(log.time[-1] - log.time[0]) for log in logs]
-    length = float(np.clip(sum(spans) / _BLOCKS, *BLOCKS_S))
+    short, length = BLOCKS_S
+    if sum(spans) < MIN_BLOCKS * length:
+        length = max(short, sum(spans) / _BLOCKS)
     for log, span in zip(logs, spans, strict=True):
         count = max(round(span / length), 1)
         share = ((log.time - log.time[0]) / span * count).astype(np.int64)
