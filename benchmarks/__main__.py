@@ -7,7 +7,8 @@ import sys
 from pronk.cli.main import run
 
 SUMMARIES = {
-    "match": "pronk, mujoco.sysid and CMA-ES on the same logs.",
+    "match": "pronk and its peers on virtual robots drawn at random.",
+    "known": "pronk, mujoco.sysid and CMA-ES on logs with known gains.",
     "grid": "The paper's grid beside a bare mujoco.rollout loop.",
     "engine": "The same drive at 0.25 ms and at 5 ms.",
     "coverage": "How often the 95 % intervals hold.",

@@ -1,252 +1,288 @@
-"""`python -m benchmarks match`: pronk and its peers on the same logs with known gains.
+"""`python -m benchmarks match`: pronk and its peers on virtual robots drawn at random.
 
-The logs come from the training simulator itself with gains that the tools must find, at the
-physics steps (200 Hz), with coloured noise and one disturbance a scenario. Every tool gets the
-same logs, bench model (armature and friction in it), two free parameters and start; the bounds of
-the peers are the edges of pronk's grid. Rows marked `+ delay` give a peer its own delay parameter
-in the scenario where commands act late: whole steps for CMA-ES in PACE's manner, a continuous one
-for mujoco.sysid, realized by linear interpolation between its 5 ms steps.
+Each robot is swept on the virtual bench as `pronk sweep` does, one leg of it. Every method gets the
+same logs and the same model of the joint, whose armature and dry friction are not those of the
+robot, and gives drive parameters of the training simulator. These are judged twice:
 
-Read a bias against its standard error, `sd / sqrt(n)`, and a coverage against its own small number:
-95 % of 10 intervals are 9.5.
+- Held-out error: a falling chirp, a multisine and random steps are simulated with them. RMSE
+  against the recorded position, at the physics steps, over that of the nominal gains with the
+  delay that fits the sweep best.
+- Equivalent gains: the same method is given a chirp of a third amplitude, recorded without noise.
+  Bias is the mean of the gains of the sweep over these, less 1, and coverage how many of the
+  sweep's 95 % intervals of stiffness and damping contain them.
+
+Robots are taken one after the other; an interrupt ends with the table of those that are done.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
 
-from benchmarks.peers import POPULATION, Estimate, fit_cma, fit_sysid, import_peers
+from benchmarks.random_robots import HELD_OUT, ROBOT, Recorded, recorded
 from benchmarks.runner import Progress, finish, machine
-from benchmarks.synthetic_log import Excitation, coloured_noise, synthetic_log
+from benchmarks.time_fit import (
+    fit_mujoco_sysid,
+    fit_plain,
+    recordings,
+    search_cma,
+    simulated,
+    start_values,
+)
 from pronk.cli import console
 from pronk.errors import PronkError
-from pronk.excitation.signals import Chirp
 from pronk.logs.joint_log import JointLog
 from pronk.match.pipeline import match_logs
+from pronk.match.predict import drives_of
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
-from pronk.robots.robot import RobotSpec
+from pronk.simulators.simulator import JointRigs, joint_rigs
 
-ROBOT = "mini_cheetah"
-JOINT = "FR_knee"
-"""The excited joint: thigh clamped, hip_roll held by its drive."""
-KNOWN = (21.8, 0.541)
-"""Stiffness [N m/rad] and damping [N m s/rad] to find: FR knee in Table I of the paper."""
-MAX_DELAY_S = 0.04
-"""Largest delay a tool with such a parameter may find [s]."""
+Kind = Literal["hip_roll", "hip_pitch", "knee"]
+JOINTS: tuple[Kind, ...] = ("hip_roll", "hip_pitch", "knee")
+GAINS = ("stiffness", "damping")
+NOMINAL = "nominal with delay"
+PLAIN = "plain fit"
+PRONK = "pronk"
+PAPER = "pronk, paper's method"
+Intervals = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenario:
-    """Noise and one disturbance."""
+class Found:
+    """Result of one method for one log."""
 
-    name: str
-    words: str
-    """One line for the table."""
-    noise_rad: float = 3e-3
-    """Standard deviation of the measurement noise, with a corner at 2 Hz [rad]."""
-    delay_s: float = 0.0
-    """From a command to its effect [s]; in no tool's model."""
-    friction_factor: float = 1.0
-    """Dry friction over that of the model which every tool is given."""
-    gain_spread: float = 0.0
-    """Relative standard deviation of stiffness and damping, each, from one repeat to the next."""
+    values: Mapping[str, float]
+    """stiffness, damping, armature, frictionloss, delay."""
+    repeat: Intervals = field(default_factory=dict)
+    """95 % intervals from repeats, or of the tool's own kind."""
+    total: Intervals = field(default_factory=dict)
+    """95 % intervals with everything that the tool takes for uncertain."""
+    flags: tuple[str, ...] = ()
 
 
-SCENARIOS = (
-    Scenario(name="noise", words="coloured noise: 3 mrad, 2 Hz corner"),
-    # 7 ms is between one and two physics steps, so that whole steps cannot express it.
-    Scenario(name="delay", words="noise, and commands act 7 ms late", delay_s=0.007),
-    Scenario(name="friction", words="noise, and twice the modelled friction", friction_factor=2.0),
-    # A warming drive. Repeat runs of one Go2 gave parameters that vary by 3 to 14 % (issue 8 of
-    # iit-DLSLab/sim2real-robot-identification); the mildest of these.
-    Scenario(name="repeats", words="noise, and gains 3 % apart between repeats", gain_spread=0.03),
-)
+Fit = Callable[[JointRigs, JointLog, str], Found]
 
 
-def known_log(
-    robot: RobotSpec,
-    scenario: Scenario,
-    rng: np.random.Generator,
-    *,
-    repeats: int = 5,
-    length_s: float = 20.0,
-    threads: int = 2,
-) -> JointLog:
-    """Return a log of `JOINT` with the gains `KNOWN`: the same chirp `repeats` times."""
-    signal, rate = Chirp(length_s=length_s), 1.0 / robot.timestep_s
-    chirp = Excitation(
-        offsets=signal.samples(robot.policy_rate_hz), band_hz=signal.band_hz, repeats=repeats
-    )
-    factors = 1.0 + scenario.gain_spread * rng.standard_normal((repeats, 2))
-    shape = (repeats, round((length_s + 2.0) * rate))
-    noise = coloured_noise(rng, shape, deviation=scenario.noise_rad, corner_hz=2.0, rate_hz=rate)
-    return synthetic_log(
-        robot,
-        JOINT,
-        [chirp],
-        *(np.array(KNOWN) * factors).T,
-        rate_hz=rate,
-        noise=list(noise),
-        delay_s=scenario.delay_s,
-        frictionloss=scenario.friction_factor * robot.joint(JOINT).drive.frictionloss,
-        threads=threads,
-    )
+def _pronk(settings: MatchSettings, rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    result = match_logs([log], rigs.robot, settings=settings)
+    fit = result.joints[joint]
+    values = drives_of(rigs.robot, result.gains)[joint]
+    return Found(values=values, repeat=fit.ci95, total=fit.total95, flags=fit.flags)
 
 
-def fit_pronk(log: JointLog, *, robot: RobotSpec, threads: int = 2) -> Estimate:
-    """Match a log the way `pronk match --method paper` does."""
-    before = time.perf_counter()
-    settings = MatchSettings(method="paper", zero_armature=False, threads=threads)
-    found = match_logs([log], robot, settings=settings).gains.joints[JOINT]
-    return Estimate(
-        stiffness=found.stiffness,
-        damping=found.damping,
-        interval=(found.stiffness_ci95, found.damping_ci95),
-        seconds=time.perf_counter() - before,
-    )
+def _sysid(rigs: JointRigs, log: JointLog, joint: str) -> Found:
+    found = fit_mujoco_sysid(log, joint, rigs.robot)
+    fitted = {"stiffness": found.stiffness, "damping": found.damping, "delay": found.delay_s or 0.0}
+    own = dict(zip(GAINS, found.interval or (), strict=False))
+    return Found(values=start_values(rigs.robot, joint) | fitted, repeat=own)
 
 
-def tools(
-    robot: RobotSpec, scenario: Scenario, *, seed: int, threads: int
-) -> dict[str, Callable[[JointLog], Estimate]]:
-    """Return the tools of a scenario by name."""
-    joint = robot.joint(JOINT)
-    shared: dict[str, Any] = {"joint": JOINT, "robot": robot, "threads": threads}
-    shared["bounds"] = robot.grid_stiffness, robot.grid_damping
-    shared["start"] = joint.stiffness, joint.damping
-    sysid, cma = partial(fit_sysid, **shared), partial(fit_cma, seed=seed + 1, **shared)
-    chosen: dict[str, Callable[[JointLog], Estimate]] = {
-        "pronk": partial(fit_pronk, robot=robot, threads=threads),
-        "mujoco.sysid": sysid,
-        "CMA-ES as PACE": cma,
+def methods() -> dict[str, Fit]:
+    """Methods by name; that of the nominal gains first, for the others are related to it."""
+    paper = MatchSettings(method="paper", zero_armature=False, threads=1)
+    return {
+        NOMINAL: lambda rigs, log, joint: Found(values=fit_plain(rigs, log, joint, ("delay",))),
+        PLAIN: lambda rigs, log, joint: Found(values=fit_plain(rigs, log, joint)),
+        PRONK: partial(_pronk, MatchSettings(threads=1)),
+        PAPER: partial(_pronk, paper),
+        "mujoco.sysid": _sysid,
+        "CMA-ES": lambda rigs, log, joint: Found(values=search_cma(rigs, log, joint, seed=0)),
     }
-    if scenario.delay_s:
-        steps = round(MAX_DELAY_S / robot.timestep_s)
-        chosen["mujoco.sysid + delay"] = partial(sysid, delay_bounds_s=(0.0, MAX_DELAY_S))
-        chosen["CMA-ES as PACE + delay"] = partial(cma, delay_steps=steps)
-    return chosen
+
+
+def compare(rigs: JointRigs, logs: Recorded, chosen: Mapping[str, Fit]) -> Iterator[dict[str, Any]]:
+    """Yield a row for each method on one joint; `refused` has the reason where it gave none."""
+    held_out = recordings(logs.held_out, logs.joint, rigs.robot)
+    for name, fit in chosen.items():
+        row: dict[str, Any] = {"joint": logs.joint, "method": name}
+        begin = time.perf_counter()
+        try:
+            found = fit(rigs, logs.sweep, logs.joint)
+        except PronkError as error:
+            yield row | {"refused": str(error)}
+            continue
+        row |= {"seconds": time.perf_counter() - begin, **vars(found)}
+        errors = [simulated(rigs, one, [found.values])[0] - one.positions[0] for one in held_out]
+        rmse = [float(np.sqrt(np.mean(error**2))) for error in errors]
+        row["rmse"] = dict(zip(HELD_OUT, rmse, strict=True))
+        if name != NOMINAL:
+            try:
+                row["exact"] = dict(fit(rigs, logs.exact, logs.joint).values)
+            except PronkError as error:
+                row["exact_refused"] = str(error)
+        yield row
 
 
 def run(
-    trials: int,
+    robots: int,
     seed: int,
     progress: Progress,
     *,
-    scenarios: Sequence[Scenario] = SCENARIOS,
-    repeats: int = 5,
-    length_s: float = 20.0,
-    threads: int = 2,
-) -> list[dict[str, Any]]:
-    """Run every tool on `trials` logs of each scenario, of `repeats` chirps of `length_s` [s].
+    joints: Sequence[str] = JOINTS,
+    chosen: Mapping[str, Fit] | None = None,
+    folder: Path | None = None,
+) -> Iterator[list[dict[str, Any]]]:
+    """Yield the rows of one robot after the other.
 
     Raises:
-        PronkError: A peer is not installed, or a number is impossible.
+        PronkError: The number of robots or a joint is impossible.
     """
-    if trials < 1 or repeats < 1:
-        raise PronkError(f"{trials} trials of {repeats} repeats; expected 1 or more of each.")
-    import_peers()
-    robot = load_robot(ROBOT)
-    found: dict[tuple[str, str], list[Estimate]] = {}
-    for index, scenario in enumerate(scenarios):
-        for trial in range(trials):
-            rng = np.random.default_rng([seed, index, trial])
-            log = known_log(
-                robot, scenario, rng, repeats=repeats, length_s=length_s, threads=threads
-            )
-            for name, fit in tools(robot, scenario, seed=seed, threads=threads).items():
-                found.setdefault((scenario.name, name), []).append(fit(log))
-            progress("match", (index * trials + trial + 1) / (trials * len(scenarios)))
-    return [summary(*key, estimates) for key, estimates in found.items()]
+    if robots < 1 or not joints or not set(joints) <= set(JOINTS):
+        raise PronkError(
+            f"{robots} robots, joints {', '.join(joints)}; expected 1 or more of each, joints out "
+            f"of {', '.join(JOINTS)}."
+        )
+    chosen = chosen or methods()
+    with joint_rigs("mujoco", load_robot(ROBOT), threads=1) as rigs:
+        for number in range(robots):
+            rows = []
+            for logs in recorded(seed, number, joints, folder):
+                rows += [{"robot": number} | row for row in compare(rigs, logs, chosen)]
+                progress("match", (number + len(rows) / (len(joints) * len(chosen))) / robots)
+            yield rows
 
 
-def summary(scenario: str, tool: str, estimates: Sequence[Estimate]) -> dict[str, Any]:
-    """Return errors and coverage of one tool in one scenario; NaN where there is no average.
+def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Summarize each method over its joints; NaN where there is no number.
 
-    Pairs are for stiffness and damping, relative to the known gains [%]: `bias`, `sd` over the
-    trials, `half_width` of the 95 % intervals. `intervals` were given, `covered` of them hold the
-    known gain. Means of `seconds` and `delay_ms`; `estimates` in N m/rad, N m s/rad.
+    `ratio` of a joint is the geometric mean over the held-out signals of its RMSE over that of the
+    nominal gains with delay.
     """
-    gains, known = np.array([(one.stiffness, one.damping) for one in estimates]), np.array(KNOWN)
-    error = 100.0 * (gains / known - 1.0)
-    nan = np.full(2, np.nan)
-    bounds = np.array([one.interval for one in estimates if one.interval]).reshape(-1, 2, 2)
-    half = 50.0 * np.diff(bounds, axis=-1)[..., 0] / known
-    delays = [one.delay_s for one in estimates if one.delay_s is not None]
-    return {
-        "scenario": scenario,
-        "tool": tool,
-        "trials": len(estimates),
-        "bias": error.mean(axis=0),
-        "sd": error.std(axis=0, ddof=1) if len(estimates) > 1 else nan,
-        "intervals": 2 * len(bounds),
-        "covered": int(((bounds[..., 0] <= known) & (known <= bounds[..., 1])).sum()),
-        "half_width": half.mean(axis=0) if len(bounds) else nan,
-        "seconds": float(np.mean([one.seconds for one in estimates])),
-        "delay_ms": 1e3 * float(np.mean(delays)) if delays else float("nan"),
-        "estimates": gains,
-    }
+    by: dict[str, dict[tuple[int, str], Mapping[str, Any]]] = {}
+    for row in rows:
+        by.setdefault(row["method"], {})[row["robot"], row["joint"]] = row
+    out = []
+    for name, mine in by.items():
+        good = {key: row for key, row in mine.items() if "rmse" in row}
+        ratios = _ratios(good, by.get(NOMINAL, {}))
+        plain = _ratios(good, by.get(PLAIN, {}))
+        joint = np.exp(np.log(ratios).mean(axis=1)) if len(ratios) else np.array([np.nan])
+        both = [row for row in good.values() if "exact" in row]
+        bias = [[100.0 * (r["values"][g] / r["exact"][g] - 1.0) for g in GAINS] for r in both]
+        one: dict[str, Any] = {
+            "method": name,
+            "joints": len(good),
+            "refused": len(mine) - len(good),
+            "below": int((joint < 1.0).sum()),
+            "cells_below": int((ratios < 1.0).sum()),
+            "median": float(np.median(joint)),
+            "signals": dict(zip(HELD_OUT, np.median(ratios, axis=0).tolist(), strict=True))
+            if len(ratios)
+            else {},
+            "over_plain": float(np.exp(np.log(plain).mean())) if len(plain) else float("nan"),
+            "bias": np.mean(bias, axis=0).tolist() if bias else [float("nan")] * 2,
+            "absolute": np.median(np.abs(bias), axis=0).tolist() if bias else [float("nan")] * 2,
+            "seconds": float(np.mean([r["seconds"] for r in good.values()] or [float("nan")])),
+        }
+        for kind in ("repeat", "total"):
+            pairs = [
+                (r[kind][g], r["exact"][g], r["values"][g])
+                for r in both
+                for g in GAINS
+                if g in r[kind]
+            ]
+            one[kind] = {
+                "intervals": len(pairs),
+                "covered": sum(low <= exact <= high for (low, high), exact, _ in pairs),
+                "half_width": float(
+                    np.median([50.0 * (high - low) / value for (low, high), _, value in pairs])
+                )
+                if pairs
+                else float("nan"),
+            }
+        out.append(one)
+    return out
 
 
-def show(rows: Sequence[dict[str, Any]], title: str, caption: str) -> Table:
-    """Make a table with a section for each scenario."""
-    columns = ["tool", "logs", "stiffness [%]", "damping [%]", "coverage", "half-widths [%]"]
-    made = console.table(title, [*columns, "fit [s]", "delay [ms]"], caption=caption)
-    scenario = None
-    for one in rows:
-        if one["scenario"] != scenario:
-            scenario = one["scenario"]
-            made.add_section()
-            made.add_row(f"[bold]{scenario}[/]")
-        errors = [
-            f"{bias:+.2f}" if np.isnan(sd) else f"{bias:+.2f} +/- {sd:.2f}"
-            for bias, sd in zip(one["bias"], one["sd"], strict=True)
-        ]
-        given = one["intervals"] > 0
+def _ratios(mine: Mapping[Any, Mapping[str, Any]], other: Mapping[Any, Mapping[str, Any]]) -> Any:
+    """RMSE over that of another method, shape (joints that both have, signals)."""
+    both = [key for key in mine if "rmse" in other.get(key, {})]
+    ratios = [[mine[k]["rmse"][s] / other[k]["rmse"][s] for s in HELD_OUT] for k in both]
+    return np.array(ratios).reshape(-1, len(HELD_OUT))
+
+
+def show(summaries: Sequence[Mapping[str, Any]], title: str, caption: str) -> Table:
+    """Make the table of `summary`."""
+    columns = ["method", "joints", "below", "median", *HELD_OUT, "over plain", "bias [%]"]
+    columns += ["|bias| [%]", "repeat 95 %", "total 95 %", "fit [s]"]
+    made = console.table(title, columns, caption=caption)
+
+    def coverage(one: Mapping[str, Any]) -> str:
+        if not one["intervals"]:
+            return "none"
+        return f"{one['covered']} of {one['intervals']} (+-{one['half_width']:.2f} %)"
+
+    for one in summaries:
+        refused = f", {one['refused']} refused" if one["refused"] else ""
         made.add_row(
-            one["tool"],
-            str(one["trials"]),
-            *errors,
-            f"{one['covered']} of {one['intervals']}" if given else "no intervals",
-            "{:.2f} / {:.2f}".format(*one["half_width"]) if given else "",
-            f"{one['seconds']:.2f}",
-            "" if np.isnan(one["delay_ms"]) else f"{one['delay_ms']:.1f}",
+            one["method"],
+            f"{one['joints']}{refused}",
+            f"{one['below']}",
+            f"{one['median']:.2f}",
+            *(f"{one['signals'].get(name, float('nan')):.2f}" for name in HELD_OUT),
+            f"{one['over_plain']:.3f}",
+            "{:+.1f} / {:+.1f}".format(*one["bias"]),
+            "{:.1f} / {:.1f}".format(*one["absolute"]),
+            coverage(one["repeat"]),
+            coverage(one["total"]),
+            f"{one['seconds']:.1f}",
         )
     return made
 
 
-def match(trials: int = 5, seed: int = 0) -> console.Outcome:
-    """Match logs with known gains by pronk, mujoco.sysid and CMA-ES; bias, coverage, time.
+def match(
+    robots: int = 20,
+    seed: int = 27,
+    joints: tuple[Kind, ...] = JOINTS,
+    method: tuple[str, ...] = (),
+    cache: Path | None = None,
+) -> console.Outcome:
+    """Match virtual robots drawn at random by pronk and its peers; held-out error, coverage.
 
     Args:
-        trials: Logs of each scenario, about 20 s each on two cores.
-        seed: Of the noise.
+        robots: Number of robots.
+        seed: Of the parameters of the robots and of the noise.
+        joints: Joints of one leg.
+        method: Methods beside the nominal gains and the plain fit; repeat it. All if left out.
+        cache: Folder of the recorded logs; in the system's temporary folder if left out.
     """
-    begin = time.perf_counter()
+    begin, known = time.perf_counter(), methods()
+    if unknown := set(method) - set(known):
+        raise PronkError(f"methods {', '.join(unknown)}; expected some of {', '.join(known)}.")
+    wanted = {NOMINAL, PLAIN, *(method or known)}
+    chosen = {name: fit for name, fit in known.items() if name in wanted}
+    rows: list[dict[str, Any]] = []
     with console.progress() as report:
-        rows = run(trials, seed, report)
-    seconds, computer = time.perf_counter() - begin, machine("mujoco")
-    words = "; ".join(f"{one.name}: {one.words}" for one in SCENARIOS)
-    title = (
-        f"{JOINT}, known gains {KNOWN[0]:g} N m/rad and {KNOWN[1]:g} N m s/rad; {trials} logs of 5 "
-        f"chirps a scenario, seed {seed}"
-    )
+        try:
+            for more in run(robots, seed, report, joints=joints, chosen=chosen, folder=cache):
+                rows += more
+        except KeyboardInterrupt:
+            console.warn("interrupted")
+    found = {
+        "schema": "pronk/bench-match/4",
+        "seed": seed,
+        "robots": len({row["robot"] for row in rows}),
+        "summary": (summaries := summary(rows)),
+        "rows": rows,
+        "machine": (computer := machine("mujoco")),
+        "seconds": time.perf_counter() - begin,
+    }
+    title = f"{found['robots']} virtual robots, seed {seed}, {', '.join(joints)} of one leg each"
     caption = (
-        f"{words}.\nFree: stiffness and damping, and a delay where the name has it. Errors: "
-        "estimate over known gain, mean +/- sd over the logs. Coverage: 95 % intervals, of "
-        "stiffness and of damping, that hold the known gain. Half-widths: of stiffness / damping.\n"
-        f"CMA-ES in PACE's manner: {POPULATION} simulations a generation on this CPU; PACE runs "
-        f"4,096 on a GPU. {computer['cores']} cores ({computer['processor']}), MuJoCo "
-        f"{computer['mujoco']}, Python {computer['python']}; {seconds:.0f} s in all."
+        "joints: with a result. below: joints whose held-out RMSE (geometric mean over the "
+        "signals) is below that of the nominal gains with delay; median and medians of each "
+        "signal: of that ratio. over plain: geometric mean of the RMSE over the plain fit's. "
+        "bias, |bias|: mean, median of the absolute value, of stiffness / damping, against the "
+        "same method on a noise-free chirp of a third amplitude. repeat, total: intervals of both "
+        "gains that contain those; in brackets the median half-width. One thread; "
+        f"{computer['processor']}, MuJoCo {computer['mujoco']}; {found['seconds']:.0f} s in all."
     )
-    known = {"joint": JOINT, "known": KNOWN, "scenarios": [asdict(one) for one in SCENARIOS]}
-    about = {"trials": trials, "seed": seed, "machine": computer, "seconds": seconds}
-    figures = {"schema": "pronk/bench-match/3", "rows": rows} | known | about
-    return finish(figures, show(rows, title, caption))
+    return finish(found, show(summaries, title, caption))

@@ -74,7 +74,7 @@ def import_peers() -> tuple[Any, Any]:
         from mujoco import sysid
     except ImportError as error:
         raise PronkError(
-            "`python -m benchmarks match` compares with mujoco.sysid and with CMA-ES from the "
+            "`python -m benchmarks known` compares with mujoco.sysid and with CMA-ES from the "
             f"package cma, but {error.name} is not installed; `pip install pronk[bench]` brings it."
         ) from None
     return sysid, cma

@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 import pronk
-from benchmarks import grid, latency, match, runner, train, trial
+from benchmarks import grid, known, latency, runner, train, trial
 from benchmarks.peers import Estimate, Replay, fit_cma, fit_sysid
 from benchmarks.synthetic_log import coloured_noise
 from hopper import ROBOT as HOPPER
@@ -30,7 +30,7 @@ from pronk.runtime.script import STILL, Script
 from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
-QUIET = match.Scenario(name="quiet", words="no noise", noise_rad=0.0)
+QUIET = known.Scenario(name="quiet", words="no noise", noise_rad=0.0)
 PEER: dict[str, Any] = {"bounds": ((13.0, 27.0), (0.1, 0.7)), "start": (17.0, 0.4)}
 SHORT: dict[str, Any] = {"repeats": 2, "length_s": 8.0}
 POLICY = Path(pronk.__file__).parents[2] / "policies" / "matched" / "policy.onnx"
@@ -68,7 +68,7 @@ def test_blocks_take_turns_and_ratios_are_of_neighbours() -> None:
 
 @pytest.fixture(scope="module")
 def quiet() -> JointLog:
-    return match.known_log(ROBOT, QUIET, np.random.default_rng(0), **SHORT)
+    return known.known_log(ROBOT, QUIET, np.random.default_rng(0), **SHORT)
 
 
 def test_noise_has_its_variance_and_corner_from_the_first_sample_on() -> None:
@@ -82,10 +82,10 @@ def test_noise_has_its_variance_and_corner_from_the_first_sample_on() -> None:
 
 
 def test_logs_are_reproducible_and_have_the_disturbance_of_their_scenario(quiet: JointLog) -> None:
-    def log(scenario: match.Scenario) -> JointLog:
-        return match.known_log(ROBOT, scenario, np.random.default_rng(5), **SHORT)
+    def log(scenario: known.Scenario) -> JointLog:
+        return known.known_log(ROBOT, scenario, np.random.default_rng(5), **SHORT)
 
-    noisy = match.SCENARIOS[0]
+    noisy = known.SCENARIOS[0]
     assert np.array_equal(log(noisy).position, log(noisy).position)
     for scenario, same in ((QUIET, True), (replace(QUIET, gain_spread=0.03), False)):
         one, two = (log(scenario).cut(segment).position for segment in log(scenario).segments)
@@ -98,27 +98,27 @@ def test_logs_are_reproducible_and_have_the_disturbance_of_their_scenario(quiet:
 @pytest.mark.parametrize(
     ("fit", "tolerance"),
     [
-        (lambda log: fit_sysid(log, match.JOINT, ROBOT, **PEER), 1e-3),
-        (lambda log: fit_cma(log, match.JOINT, ROBOT, population=12, **PEER), 1e-3),
-        (lambda log: match.fit_pronk(log, robot=ROBOT), 1e-2),
+        (lambda log: fit_sysid(log, known.JOINT, ROBOT, **PEER), 1e-3),
+        (lambda log: fit_cma(log, known.JOINT, ROBOT, population=12, **PEER), 1e-3),
+        (lambda log: known.fit_pronk(log, robot=ROBOT), 1e-2),
     ],
 )
 def test_every_tool_finds_the_known_gains_without_noise(
     fit: Callable[[JointLog], Estimate], tolerance: float, quiet: JointLog
 ) -> None:
     found = fit(quiet)
-    assert (found.stiffness, found.damping) == pytest.approx(match.KNOWN, rel=tolerance)
+    assert (found.stiffness, found.damping) == pytest.approx(known.KNOWN, rel=tolerance)
 
 
 def test_peers_find_a_delay_of_whole_steps() -> None:
     late = replace(QUIET, delay_s=0.010)
-    log = match.known_log(ROBOT, late, np.random.default_rng(0), **SHORT)
-    found = fit_sysid(log, match.JOINT, ROBOT, delay_bounds_s=(0.0, 0.04), **PEER)
+    log = known.known_log(ROBOT, late, np.random.default_rng(0), **SHORT)
+    found = fit_sysid(log, known.JOINT, ROBOT, delay_bounds_s=(0.0, 0.04), **PEER)
     assert found.delay_s == pytest.approx(0.010, abs=3e-4)
-    assert found.stiffness == pytest.approx(match.KNOWN[0], rel=0.01)
-    stepped = fit_cma(log, match.JOINT, ROBOT, delay_steps=8, population=16, **PEER)
+    assert found.stiffness == pytest.approx(known.KNOWN[0], rel=0.01)
+    stepped = fit_cma(log, known.JOINT, ROBOT, delay_steps=8, population=16, **PEER)
     assert stepped.delay_s == pytest.approx(0.010)
-    assert stepped.stiffness == pytest.approx(match.KNOWN[0], rel=0.01)
+    assert stepped.stiffness == pytest.approx(known.KNOWN[0], rel=0.01)
 
 
 def test_a_replay_needs_equal_repeats_at_the_physics_step(quiet: JointLog) -> None:
@@ -126,18 +126,18 @@ def test_a_replay_needs_equal_repeats_at_the_physics_step(quiet: JointLog) -> No
     other[len(other) // 2 :] += 0.1
     for changes in ({"time": quiet.time * 1.001}, {"command": other}, {"segments": ()}):
         with pytest.raises(LogError):
-            Replay(replace(quiet, **changes), match.JOINT, ROBOT)
+            Replay(replace(quiet, **changes), known.JOINT, ROBOT)
 
 
 def test_a_row_is_the_mean_and_the_coverage_of_its_estimates() -> None:
-    kp, kd = match.KNOWN
+    kp, kd = known.KNOWN
     around = ((kp - 0.5, kp + 0.5), (kd * 0.9, kd * 1.1))
     beside = ((kp + 1.0, kp + 2.0), (kd * 0.9, kd * 1.1))
     estimates = [
         Estimate(stiffness=1.05 * kp, damping=kd, interval=around, seconds=1.0),
         Estimate(stiffness=kp, damping=0.9 * kd, interval=beside, seconds=3.0),
     ]
-    row = match.summary("s", "t", estimates)
+    row = known.summary("s", "t", estimates)
     assert row["bias"] == pytest.approx((2.5, -5.0))
     assert row["sd"][0] == pytest.approx(5.0 / math.sqrt(2.0))
     assert (row["covered"], row["intervals"], row["seconds"]) == (3, 4, 2.0)
@@ -153,20 +153,20 @@ def test_a_missing_peer_is_named(package: str, monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.delattr(sys.modules["mujoco"], "sysid")
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(PronkError, match=package):
-        match.run(1, 0, ignore)
+        known.run(1, 0, ignore)
 
 
 def test_a_delay_softens_only_fits_in_the_time_domain() -> None:
-    scenarios = (replace(match.SCENARIOS[1], noise_rad=1e-3),)
-    rows = match.run(1, 4, ignore, scenarios=scenarios, **SHORT)
+    scenarios = (replace(known.SCENARIOS[1], noise_rad=1e-3),)
+    rows = known.run(1, 4, ignore, scenarios=scenarios, **SHORT)
     bias = {one["tool"]: one["bias"][0] for one in rows}
     assert abs(bias["pronk"]) < 2.0
     assert bias["mujoco.sysid"] < -10.0
     assert bias["CMA-ES as PACE"] == pytest.approx(bias["mujoco.sysid"], abs=0.5)
-    shown = text(match.show(rows, "", ""))
+    shown = text(known.show(rows, "", ""))
     assert all(name in shown for name in bias)
     with pytest.raises(PronkError, match="0 trials"):
-        match.run(0, 0, ignore)
+        known.run(0, 0, ignore)
 
 
 def test_the_grid_search_is_refined_to_the_known_gains() -> None:

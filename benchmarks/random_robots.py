@@ -1,0 +1,217 @@
+"""Virtual Mini Cheetahs drawn at random, and their logs on the bench, cached on disk.
+
+Ranges are those of issue 27. Every factor is relative to the shipped parameters of the virtual
+robot, apart from the torque constant, which is relative to the model's. Uniform draws, but the
+belts', whose logarithm is uniform.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.cli.sweep import AMPLITUDES
+from pronk.excitation.plan import Excitation, SweepPlan, make_plan
+from pronk.excitation.signals import Chirp, Multisine, Signal
+from pronk.logs.joint_log import JointLog
+from pronk.logs.readers import read_log
+from pronk.robots import load_robot
+from pronk.runtime.sweep import SweepTask, record
+from pronk.virtual.plant import legs_of
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import JointParams, SimParams, load_sim_params
+
+Array = NDArray[np.float64]
+
+ROBOT = "mini_cheetah"
+FRICTION = (0.0, 3.0)
+BREAKAWAY = (1.0, 1.5)
+"""Stribeck peak over Coulomb friction; shipped: 1.15 to 1.45."""
+STRIBECK_SPEED = (0.05, 0.5)
+"""Speed at which the peak has fallen to 1/e [rad/s]; shipped: 0.11 to 0.18."""
+BELT = (0.25, 2.0)
+DELAY_S = (0.0, 0.015)
+TORQUE = (0.75, 1.25)
+ROTOR = (0.7, 1.3)
+ENCODER_BITS = (12, 16)
+
+REPEATS = 3
+"""Of each amplitude, as `pronk sweep`."""
+THIRD_AMPLITUDE = 0.18
+"""Of the sweep without noise: about the geometric mean of the two of `pronk sweep` [rad]."""
+HELD_OUT = ("chirp", "multisine", "steps")
+"""Signals that no method sees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FallingChirp(Chirp):
+    """A linear chirp from the highest frequency to the lowest."""
+
+    def _samples(self, rate_hz: float) -> Array:
+        return super()._samples(rate_hz)[::-1]
+
+    def frequency(self, rate_hz: float = 50.0) -> Array:
+        """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
+        return super().frequency(rate_hz)[::-1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps(Signal):
+    """Steps to random positions within the amplitude, each held for `hold_s`."""
+
+    kind = "unknown"
+
+    amplitude: float = 0.1
+    hold_s: float = 0.5
+    steps: int = 20
+    seed: int = 0
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """From one step in the whole signal to one each `hold_s` [Hz]."""
+        return 1.0 / (self.hold_s * self.steps), 1.0 / self.hold_s
+
+    def _samples(self, rate_hz: float) -> Array:
+        levels = np.random.default_rng(self.seed).uniform(-1.0, 1.0, self.steps)
+        out = np.repeat(
+            self.amplitude * levels / np.abs(levels).max(), round(self.hold_s * rate_hz)
+        )
+        return np.concatenate([[0.0], out, [0.0]])
+
+    def frequency(self, rate_hz: float = 50.0) -> Array:
+        """NaN at the ticks, shape (ticks,)."""
+        return np.full(self.steps * round(self.hold_s * rate_hz) + 2, np.nan)
+
+
+def held_out_signals() -> dict[str, Signal]:
+    """Signals of `HELD_OUT`; amplitudes and directions differ from those of the sweep."""
+    signals = (FallingChirp(amplitude=0.15), Multisine(amplitude=0.2, periods=1), Steps())
+    return dict(zip(HELD_OUT, signals, strict=True))
+
+
+def draw(seed: int, number: int) -> SimParams:
+    """Draw robot `number` of a seed; the same numbers for the same arguments."""
+    rng, shipped = np.random.default_rng([seed, number]), load_sim_params()
+    machine = replace(
+        shipped.machine,
+        command_delay_s=rng.uniform(*DELAY_S),
+        encoder_bits=int(rng.integers(*ENCODER_BITS, endpoint=True)),
+    )
+    joints = {name: _draw_joint(rng, joint) for name, joint in shipped.joints.items()}
+    return replace(shipped, machine=machine, joints=joints)
+
+
+def _draw_joint(rng: np.random.Generator, joint: JointParams) -> JointParams:
+    friction, belt = rng.uniform(*FRICTION), np.exp(rng.uniform(*np.log(BELT)))
+    coulomb, rotor = friction * joint.coulomb, rng.uniform(*ROTOR)
+    # Bristles break away at the same deflection, and rotor and link stay as damped as they were.
+    return replace(
+        joint,
+        coulomb=coulomb,
+        breakaway=coulomb * rng.uniform(*BREAKAWAY),
+        stribeck_speed=rng.uniform(*STRIBECK_SPEED),
+        presliding_stiffness=friction * joint.presliding_stiffness,
+        presliding_damping=np.sqrt(friction) * joint.presliding_damping,
+        belt_stiffness=belt * joint.belt_stiffness,
+        belt_damping=np.sqrt(belt) * joint.belt_damping,
+        torque_scale=rng.uniform(*TORQUE),
+        rotor_inertia=rotor * joint.rotor_inertia,
+    )
+
+
+def without_noise(params: SimParams) -> SimParams:
+    """The same robot with exact sensors and clocks: what its gains are without noise."""
+    machine = replace(
+        params.machine,
+        sampling_jitter_s=0.0,
+        timestamp_error_s=0.0,
+        position_noise=0.0,
+        encoder_bits=30,
+    )
+    return replace(params, machine=machine)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """Logs of one joint."""
+
+    joint: str
+    sweep: JointLog
+    """The paper's chirp at `AMPLITUDES`, `REPEATS` times each."""
+    held_out: JointLog
+    """A segment for each of `HELD_OUT`, in that order."""
+    exact: JointLog
+    """The sweep's chirp at `THIRD_AMPLITUDE` without noise, once."""
+
+
+@cache
+def _plans(leg: str, kinds: tuple[str, ...]) -> tuple[SweepPlan, SweepPlan]:
+    """Sweep and held-out signals; sweep at the third amplitude."""
+    robot = load_robot(ROBOT)
+    joints = [f"{leg}_{kind}" for kind in kinds]
+    sweep = make_plan(robot, joints, amplitudes=AMPLITUDES, repeats=REPEATS)
+    extra = [
+        Excitation(
+            joint=name,
+            signal=signal,
+            clamped=robot.joint(name).clamped,
+            sign=robot.joint(name).original[1],
+        )
+        for name in joints
+        for signal in held_out_signals().values()
+    ]
+    third = [
+        replace(one, signal=replace(one.signal, amplitude=THIRD_AMPLITUDE))
+        for one in sweep.excitations
+        if one.repeat == 0 and one.signal.amplitude == max(AMPLITUDES)
+    ]
+    return (
+        replace(sweep, excitations=(*sweep.excitations, *extra)),
+        replace(sweep, excitations=tuple(third)),
+    )
+
+
+def recorded(
+    seed: int, number: int, kinds: Sequence[str], folder: Path | None = None
+) -> list[Recorded]:
+    """Record robot `number` of a seed on the bench, or read its logs from the cache.
+
+    One leg is excited: FR, FL, HR, HL in turn. Logs lie in `folder`, by default in the system's
+    temporary folder, under a hash of parameters, signals and seed.
+    """
+    robot, params = load_robot(ROBOT), draw(seed, number)
+    legs = legs_of(robot)
+    leg = legs[number % len(legs)]
+    noise = 1000 * seed + number
+    logs = []
+    for plan, drawn in zip(_plans(leg, tuple(kinds)), (params, without_noise(params)), strict=True):
+        key = repr((drawn, plan.excitations, plan.settle_s, noise)).encode()
+        name = f"{seed}-{number}-{leg}-{hashlib.sha256(key).hexdigest()[:12]}"
+        out = (folder or Path(tempfile.gettempdir()) / "pronk-bench-match") / name
+        if not out.exists():
+            out.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=out.parent) as partial:
+                task = SweepTask(plan=plan, out_dir=Path(partial) / "logs")
+                record(VirtualRobot(robot, drawn, seed=noise, legs=(leg,)), task)
+                (Path(partial) / "logs").rename(out)
+        logs.append([read_log(out / f"{joint}.mcap", robot=robot) for joint in plan.joints])
+    found = []
+    for joint, noisy, exact in zip(_plans(leg, tuple(kinds))[0].joints, *logs, strict=True):
+        swept = len(AMPLITUDES) * REPEATS
+        sweep, held_out = noisy.segments[:swept], noisy.segments[swept:]
+        found.append(
+            Recorded(
+                joint=joint,
+                sweep=replace(noisy, segments=sweep),
+                held_out=replace(noisy, segments=held_out),
+                exact=exact,
+            )
+        )
+    return found
