@@ -1,0 +1,115 @@
+"""The fit in time: known drives found again, what is kept aside, gains that were on the drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic_log import Excitation, synthetic_log
+from pronk.errors import LogError, PronkError
+from pronk.excitation.signals import Chirp, Multisine
+from pronk.logs.joint_log import JointLog
+from pronk.match.gains import load, save
+from pronk.match.pipeline import match_logs
+from pronk.match.result import HELD_OUT, NOT_BETTER, MatchResult, held_out_flags
+from pronk.robots import load_robot
+
+ROBOT = load_robot("mini_cheetah")
+MODEL = ROBOT.joint("FR_knee").drive
+KNOWN = {"stiffness": 21.8, "damping": 0.541, "frictionloss": 3.0 * MODEL.frictionloss}
+LATE_S = 0.008
+
+
+def sweep(signal: Chirp | Multisine, amplitudes: tuple[float, ...], repeats: int) -> JointLog:
+    """A knee with known gains, three times the model's friction, 8 ms late, 0.2 mrad of noise."""
+    rng = np.random.default_rng(5)
+    excitations = [
+        Excitation(offsets=replace(signal, amplitude=a).samples(), repeats=repeats)
+        for a in amplitudes
+    ]
+    noise = [2e-4 * rng.standard_normal(40000) for _ in range(repeats * len(excitations))]
+    gains = KNOWN["stiffness"], KNOWN["damping"]
+    log = synthetic_log(
+        ROBOT, "FR_knee", excitations, *gains, frictionloss=KNOWN["frictionloss"], noise=noise
+    )
+    late = round(LATE_S * 500.0)
+    position = np.concatenate([np.repeat(log.position[:1], late, axis=0), log.position[:-late]])
+    return replace(log, position=position, source="a.csv")
+
+
+@pytest.fixture(scope="module")
+def log() -> JointLog:
+    return sweep(Chirp(length_s=10.0), (0.25, 0.125), 2)
+
+
+@pytest.fixture(scope="module")
+def matched(log: JointLog) -> MatchResult:
+    return match_logs([log], ROBOT)
+
+
+def test_gains_friction_and_delay_are_found_together(matched: MatchResult) -> None:
+    found = matched.gains.joints["FR_knee"]
+    assert found.stiffness == pytest.approx(KNOWN["stiffness"], rel=0.01)
+    assert found.damping == pytest.approx(KNOWN["damping"], rel=0.02)
+    assert found.frictionloss == pytest.approx(KNOWN["frictionloss"], rel=0.03)
+    assert found.delay_s == pytest.approx(LATE_S, abs=5e-4)
+    assert matched.gains.groups["knee"].frictionloss == found.frictionloss
+    assert any(flag.startswith("friction: ") for flag in found.flags)
+
+
+def test_magnitude_alone_takes_the_friction_for_gains(matched: MatchResult) -> None:
+    found = matched.gains.joints["FR_knee"]
+    wrong = abs(found.grid_damping / KNOWN["damping"] - 1.0)
+    assert wrong > 5.0 * abs(found.damping / KNOWN["damping"] - 1.0)
+
+
+def test_total_intervals_hold_the_gains_of_each_amplitude(matched: MatchResult) -> None:
+    fit = matched.joints["FR_knee"]
+    for column, name in enumerate(("stiffness", "damping"), 1):
+        low, high = fit.total95[name]
+        assert (low <= fit.amplitude_gains[:, column]).all()
+        assert (fit.amplitude_gains[:, column] <= high).all()
+        assert low <= fit.ci95[name][0] < fit.ci95[name][1] <= high
+
+
+def test_the_repeat_that_was_kept_aside_is_met_better_than_with_less_fitting(
+    matched: MatchResult,
+) -> None:
+    errors = matched.joints["FR_knee"].held_out
+    assert errors["matched"] < 0.5 * min(errors[name] for name in HELD_OUT[:-1])
+    assert errors["matched"] < 5e-4
+
+
+def test_a_match_that_is_not_better_says_so_first() -> None:
+    errors = dict.fromkeys(HELD_OUT, 1e-3)
+    assert held_out_flags(errors) == ()
+    (flag,) = held_out_flags(errors | {"plain": 0.9e-3})
+    assert flag.startswith(NOT_BETTER)
+
+
+def test_one_multisine_without_repeats_has_intervals_and_a_part_kept_aside() -> None:
+    log = sweep(Multisine(), (0.25,), 1)
+    fit = match_logs([log], ROBOT).joints["FR_knee"]
+    assert fit.stiffness == pytest.approx(KNOWN["stiffness"], rel=0.02)
+    assert fit.ci95["stiffness"][0] < fit.stiffness < fit.ci95["stiffness"][1]
+    assert fit.held_out["matched"] < 0.5 * fit.held_out["nominal_delayed"]
+
+
+def test_friction_and_total_intervals_are_in_the_file(matched: MatchResult, tmp_path: Path) -> None:
+    save(tmp_path / "gains.yaml", matched.gains)
+    again, found = load(tmp_path / "gains.yaml").joints["FR_knee"], matched.gains.joints["FR_knee"]
+    assert again.frictionloss == pytest.approx(found.frictionloss, rel=1e-5)
+    assert again.stiffness_total95 == pytest.approx(found.stiffness_total95, rel=1e-5)
+
+
+def test_gains_of_the_drive_are_required_and_checked(log: JointLog) -> None:
+    bare = replace(log, stiffness=None, damping=None)
+    with pytest.raises(LogError, match=r"FR_knee.*--drive-gains"):
+        match_logs([bare], ROBOT)
+    with pytest.raises(LogError, match=r"17 N m/rad.*25"):
+        match_logs([log], ROBOT, drive_gains={"knee": (25.0, 0.5)})
+    with pytest.raises(PronkError, match="hip_roll"):
+        match_logs([bare], ROBOT, drive_gains={"elbow": (25.0, 0.5)})
