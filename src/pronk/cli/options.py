@@ -139,22 +139,13 @@ def drive_gains(
     Raises:
         PronkError: An entry is neither `default` nor NAME=STIFFNESS,DAMPING.
     """
-    if not entries:
-        return None
     if tuple(entries) == ("default",):
         return "default"
-    found = {}
-    for name, text in _pairs(entries, "--drive-gains").items():
-        try:
-            stiffness, damping = (float(word) for word in text.split(","))
-        except ValueError:
-            raise PronkError(
-                f"--drive-gains {name}={text}: expected NAME=STIFFNESS,DAMPING, as in knee=25,.5."
-            ) from None
-        if not (0.0 < stiffness < 1e6 and 0.0 <= damping < 1e6):
-            raise PronkError(
-                f"--drive-gains {name}={text}: expected a positive stiffness and a damping of 0 or "
-                "more."
-            )
-        found[name] = stiffness, damping
-    return found
+    return _pairs("--drive-gains", entries, _gains) or None
+
+
+def _gains(text: str) -> tuple[float, float]:
+    words = text.split(",")
+    if len(words) != 2 or not (0.0 < float(words[0]) < 1e6 and 0.0 <= float(words[1]) < 1e6):
+        raise ValueError("expected NAME=STIFFNESS,DAMPING, the stiffness above 0, as in knee=25,.5")
+    return float(words[0]), float(words[1])
