@@ -268,14 +268,16 @@ def fit_joint(
     simulations = Simulations(rigs, records)
 
     def fit(names: Sequence[str], begin: Mapping[str, float]) -> dict[str, float]:
+        if not names:
+            return dict(begin)
         problem = TimeProblem(simulations, names, begin, kept)
         return problem.drive(solve(problem, tolerance=_ROUGH, rounds=_ROUNDS).x)
 
-    trained = fit(fitted, start)
+    trained, plain = fit(fitted, start), [name for name in _PLAIN if name in fitted]
     drives = {
         "nominal": nominal,
         "nominal_delayed": fit(("delay",), {**nominal, "delay": trained["delay"]}),
-        "plain": fit(_PLAIN, {**nominal, **{name: trained[name] for name in _PLAIN}}),
+        "plain": fit(plain, {**nominal, **{name: trained[name] for name in plain}}),
         "matched": trained,
     }
     errors = {name: simulations.rmse(drive, aside) for name, drive in drives.items()}
