@@ -13,11 +13,15 @@ SUMMARIES = {
     "grid": "The paper's grid beside a bare mujoco.rollout loop.",
     "engine": "The same drive at 0.25 ms and at 5 ms.",
     "coverage": "How often the 95 % intervals hold.",
+    "wrong-inputs": "How often wrong inputs are named, and right ones flagged.",
     "latency": "Lateness of the control loop, and policy latency.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",
 }
 
 if __name__ == "__main__":
-    commands = {name: (f"benchmarks.{name}:{name}", summary) for name, summary in SUMMARIES.items()}
+    commands = {}
+    for name, summary in SUMMARIES.items():
+        module = name.replace("-", "_")
+        commands[name] = (f"benchmarks.{module}:{module}", summary)
     sys.exit(run(sys.argv[1:], commands, "python -m benchmarks"))

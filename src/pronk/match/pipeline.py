@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.logs.joint_log import JointLog
+from pronk.match import plausibility
 from pronk.match.arm import fit_together
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
@@ -62,8 +63,6 @@ NO_MATCH_INTERVALS = 3.0
 """A noisy log may miss by more: so many half-widths of the measured gain's own interval."""
 NO_ARMATURE_RATIO = 5.0
 """Error without rotor inertia, over the matched one, from which on it is no match (F13)."""
-_FRICTION_RATIO = 1.5
-"""Fitted dry friction over the model's, or under it, that is worth a flag."""
 _START_S = 0.005
 """Delay from which the fit in time begins [s]: one physics step of the training simulator."""
 SPREAD_MAX = 0.05
@@ -108,6 +107,7 @@ def match_logs(
         raise PronkError(f"mode {mode!r}; expected gains or drive.")
     if free and mode != "drive":
         raise PronkError("parameters to fit can be named in mode drive only.")
+    plausibility.require_plausible(logs_by_joint(logs, robot), robot)
     excluded: Mapping[str, str] = {}
     rate = float("nan")
     if any(moves_together(log) for log in logs):
@@ -121,6 +121,9 @@ def match_logs(
             joints, excluded = fit_together(
                 logs, robot, names, threads=chosen.threads, progress=clock.report
             )
+        for name, fit in joints.items():
+            wrong = plausibility.flags(logs, fit, robot)
+            joints[name] = replace(fit, flags=(*fit.flags, *wrong))
     else:
         fitted = checked_names(free or DRIVE_MODE, FREE)
         # The simulator first: a device that is missing must not cost the user an estimate.
@@ -133,6 +136,10 @@ def match_logs(
                 joints = _match_drives(rigs, logs, found, on_drive, fitted, clock)
             else:
                 joints, rate = _match_gains(rigs, logs, found, on_drive, chosen, clock)
+            with clock.stage("plausibility"):
+                for name, fit in joints.items():
+                    wrong = plausibility.flags(logs, fit, robot, rigs=rigs, goals=found[name])
+                    joints[name] = replace(fit, flags=(*fit.flags, *wrong))
     gains = {name: joint.gains() for name, joint in joints.items()}
     return MatchResult(
         gains=matched_gains(robot, gains, logs, info),
@@ -337,7 +344,7 @@ def _time_joint_fit(
         flags=(
             *held_out_flags(fit.held_out),
             *_no_match(error_db, goal),
-            *_time_flags(fit, joint.drive.frictionloss),
+            *_time_flags(fit),
             *fit.estimate.flags,
             *_left_out(goal, joint.band_hz),
             *goal.warnings,
@@ -353,8 +360,8 @@ def _time_joint_fit(
     )
 
 
-def _time_flags(fit: TimeFit, frictionloss: float) -> Iterator[str]:
-    """Parameters at a bound, not identified, or far from the model's; gains by the amplitude."""
+def _time_flags(fit: TimeFit) -> Iterator[str]:
+    """Parameters at a bound or not identified; gains by the amplitude."""
     values = fit.estimate.values
     for name in fit.at_bound:
         if name not in ("delay", "frictionloss"):  # none is a possible result
@@ -367,12 +374,6 @@ def _time_flags(fit: TimeFit, frictionloss: float) -> Iterator[str]:
             )
     if not fit.settled:
         yield "the fit in time did not settle"
-    dry = values["frictionloss"]
-    if not frictionloss / _FRICTION_RATIO <= dry <= frictionloss * _FRICTION_RATIO:
-        yield (
-            f"friction: {dry:.3g} N m of dry friction fitted where the model of the robot has "
-            f"{frictionloss:.3g}; the gains hold with the fitted one"
-        )
     yield from amplitude_flags(fit.amplitude_gains)
 
 

@@ -1,0 +1,68 @@
+"""Wrong inputs are named: every corruption of one log of the virtual robot, and none of the log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.wrong_inputs import CORRUPTIONS, Case, bare, judged
+from pronk.evaluation.virtual_sweep import sweep_virtual
+from pronk.excitation.plan import make_plan
+from pronk.logs.readers import read_logs
+from pronk.match.plausibility import findings, require_plausible
+from pronk.robots import load_robot
+from pronk.virtual.sim_params import SimParams
+from tests.virtual_robot import ROBOT, SIM_PARAMS
+
+JOINT = "FL_hip_roll"
+SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
+
+
+def sweep(params: SimParams, out: Path) -> Case:
+    plan = make_plan(ROBOT, [JOINT], repeats=(2, 1))
+    (path,) = sweep_virtual(plan, params, out)
+    return Case(log=read_logs([path], robot=ROBOT)[0], joint=JOINT, robot=ROBOT)
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return sweep(SIM_PARAMS, tmp_path_factory.mktemp("sweep"))
+
+
+@pytest.mark.parametrize("name", [name for name, (change, _) in CORRUPTIONS.items() if change])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_named_or_refused(case: Case, name: str, seed: int) -> None:
+    change, causes = CORRUPTIONS[name]
+    assert change is not None
+    wrong = change(case, np.random.default_rng(seed))
+    found, words = judged(wrong)
+    assert found == {"refused"} or found & causes, words
+
+
+@pytest.mark.parametrize("kind", ["sweep", "bare"])
+def test_right_inputs_pass(case: Case, kind: str) -> None:
+    right = case if kind == "sweep" else replace(case, log=bare(case.log))
+    assert judged(right)[0] == set()
+
+
+@pytest.mark.parametrize("factor", [3.0, 1.0 / 3.0])
+def test_wrong_friction_is_named(tmp_path: Path, factor: float) -> None:
+    own = SIM_PARAMS.joints[JOINT]
+    coulomb = factor * ROBOT.joint(JOINT).drive.frictionloss
+    changed = replace(own, coulomb=coulomb, breakaway=1.3 * coulomb)
+    params = replace(SIM_PARAMS, joints={**SIM_PARAMS.joints, JOINT: changed})
+    assert judged(sweep(params, tmp_path))[0] == {"friction"}
+
+
+@pytest.mark.skipif(not SO101.is_dir(), reason="the recordings of the SO-101 are not here")
+def test_recordings_of_an_arm_pass() -> None:
+    robot = load_robot("so101")
+    for log in read_logs(sorted(path for path in SO101.glob("*") if path.is_dir()), robot=robot):
+        moving = np.ptp(log.command, axis=0) > 1e-3
+        for name, moves in zip(log.joints, moving, strict=True):
+            if moves and log.unit(name) == "rad":
+                require_plausible({name: [log]}, robot)
+                assert findings([log], name, robot) == [], (log.source, name)
