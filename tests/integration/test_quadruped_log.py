@@ -23,7 +23,7 @@ RATE_HZ, LENGTH_S, AMPLITUDE = 200.0, 25.0, 0.2
 
 
 def record(path: Path) -> None:
-    """Chirps from .2 to 6 to 10 Hz on all joints of the virtual robot, base fixed, as PACE saves."""
+    """Chirps up to 6 to 10 Hz on all joints of the virtual robot, base fixed, as PACE saves."""
     random = np.random.default_rng(0)
     last_hz, phase = random.uniform(6.0, 10.0, 12), random.uniform(0.0, 2.0 * np.pi, 12)
     machine = VirtualRobot(
