@@ -217,9 +217,12 @@ def show_match(
         gains = (f"{one.stiffness:.2f} / {one.damping:.3f}", f"{k:g} / {d:g}")
         errors = (one.naive_error_db, one.error_db, fresh.rmse_naive, fresh.rmse_matched)
         apart = "{:.1f} / {:.1f}".format(*cells[name])
-        rows.append((name, *gains, apart, *errors, one.zero_armature_error_db))
-    columns = "joint | matched | Table I | grid cells apart | gain error nominal [dB];2"
+        node = result.gains.joints[name]
+        magnitude = f"{node.grid_stiffness:.2f} / {node.grid_damping:.3f}"
+        rows.append((name, *gains, apart, magnitude, *errors))
+    columns = "joint | matched | Table I | grid cells apart | best of the grid by magnitude"
+    columns += " | gain error nominal [dB];2"
     columns += " | matched [dB];2 | fresh RMSE nominal [rad];4 | matched [rad];4"
     title = "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)"
-    console.show_sheet(table(f"{columns} | no rotor inertia [dB];2", rows, title=title))
+    console.show_sheet(table(columns, rows, title=title))
     return cells
