@@ -164,18 +164,17 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     interval = "repeat 95 %;2 | total 95 %;2" if total else "95 %;2"
     columns = f"joint | stiffness [N m/rad];2 | {interval} | damping [N m s/rad] | "
     columns += interval.replace(";2", "")
-    columns += " | by magnitude alone" * total
-    columns += " | paper, Table I" * paper + " | friction [N m]" * friction
-    columns += " | delay [ms];1" * delays
+    columns += " | friction [N m]" * friction + " | delay [ms];1" * delays
+    columns += " | by magnitude alone" * total + " | paper, Table I" * paper
     columns += " | nominal error [dB];2 | error [dB];2 | lowest coherence"
     rows = []
     for name, one in gains.joints.items():
         row: list[Any] = [joint_words(name) + " (flagged)" * bool(one.flags)]
         row += [one.stiffness, one.stiffness_ci95] + [one.stiffness_total95] * total
         row += [one.damping, one.damping_ci95] + [one.damping_total95] * total
+        row += [one.frictionloss] * friction + [1000.0 * one.delay_s] * delays
         row += [f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}"] * total
         row += [" / ".join(map(str, TABLE_I.get(name, ("-",))))] * paper
-        row += [one.frictionloss] * friction + [1000.0 * one.delay_s] * delays
         rows.append([*row, one.naive_error_db, one.error_db, one.coherence_min])
     simulator = gains.simulator
     notes = [
