@@ -193,8 +193,8 @@ def test_so101_gravity_sag_agrees_with_the_recorded_offsets() -> None:
         ("  default:", "  home:", "default"),
         ("hip_pitch: -0.8", "hip_pitch: -4.0", "FR_hip_pitch at -4 rad"),
         ("model: mini_cheetah.xml", "model: other.xml", "other.xml"),
-        ("base_body: trunk", "base_body: trunk\npolicy_rate_hz: 100.0", "policy_rate_hz"),
-        ("base_body: trunk", "base_body: trunk\ndecimation: 7", "decimation"),
+        ("policy_rate_hz: 50.0", "policy_rate_hz: 100.0", "policy_rate_hz"),
+        ("decimation: 4", "decimation: 7", "decimation"),
     ],
 )
 def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_path: Path) -> None:

@@ -19,11 +19,11 @@ from pronk import plugins
 from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_radians, check_rate, check_unit, examine, saturation_note
 from pronk.logs.columns import Columns, import_columns
+from pronk.logs.csv_npz_reader import read_csv, read_npz
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_log import read_mcap
 from pronk.logs.pace_reader import read_pace
 from pronk.logs.sage_reader import is_sage, read_sage
-from pronk.logs.tables import read_csv, read_npz
 from pronk.robots.robot import RobotSpec
 
 GROUP = "pronk.readers"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import Columns, in_force
-from pronk.logs.tables import read_rows, read_text
+from pronk.logs.csv_npz_reader import read_rows, read_text
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
