@@ -194,7 +194,7 @@ def test_so101_gravity_sag_agrees_with_the_recorded_offsets() -> None:
         ("hip_pitch: -0.8", "hip_pitch: -4.0", "FR_hip_pitch at -4 rad"),
         ("model: mini_cheetah.xml", "model: other.xml", "other.xml"),
         ("policy_rate_hz: 50.0", "policy_rate_hz: 100.0", "policy_rate_hz"),
-        ("decimation: 4", "decimation: 7", "decimation"),
+        ("decimation: 4 ", "decimation: 7 ", "decimation"),
     ],
 )
 def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_path: Path) -> None:

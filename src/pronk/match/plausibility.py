@@ -456,6 +456,8 @@ def velocity_ratio(position: FrequencyResponse, velocity: FrequencyResponse) -> 
         return float("nan"), float("nan")
     omega = position.omega[use]
     ratio = velocity.response[use] / (1j * omega * position.response[use])
+    if not np.abs(ratio).all():
+        return float("nan"), float("nan")
     sign = float(np.sign(np.median(ratio[: 2 * _SLOW].real)))
     phase = np.unwrap(np.angle(ratio * sign))
     # A difference quotient and a filter act as 1 - a omega^2 on the gain, from 1 at standstill.
@@ -684,7 +686,11 @@ def response_test(
     drive, kinds = robot.joint(name).drive, [PARAMETERS[one] for one in FREE]
     armature = max(drive.armature, PARAMETERS["armature"].low)
     known = dict(zip(FREE, (*on_drive, armature, drive.frictionloss, _DELAY_S), strict=True))
-    given = {k: v for k, v in (fitted or {}).items() if k in FREE and np.isfinite(v)}
+    given = {
+        k: max(v, PARAMETERS[k].low)
+        for k, v in (fitted or {}).items()
+        if k in FREE and np.isfinite(v)
+    }
     start = {k: max(v, PARAMETERS[k].start) for k, v in known.items()} | given
     low = np.array([kind.scaled(kind.low) for kind in kinds])
     high = np.array([kind.scaled(kind.high) for kind in kinds])
@@ -715,10 +721,12 @@ def response_test(
         tracks = responses(rigs, requests)
         found = []
         for k in range(0, len(requests), len(goals)):
-            parts = [
-                np.log(one / goal.measured.response[goal.fit_mask])
-                for one, goal in zip(tracks[k : k + len(goals)], goals, strict=True)
-            ]
+            # What diverged or stands still is not finite and ends the test.
+            with np.errstate(divide="ignore", invalid="ignore"):
+                parts = [
+                    np.log(one / goal.measured.response[goal.fit_mask])
+                    for one, goal in zip(tracks[k : k + len(goals)], goals, strict=True)
+                ]
             whole = np.concatenate([part.real + 1j * np.unwrap(part.imag) for part in parts])
             found.append(rows(whole))
         return found
@@ -752,7 +760,7 @@ def response_test(
         extra = np.concatenate([rows(unit * signature), np.zeros(size + 1)])
         both = np.column_stack([whole, extra])
         found = np.linalg.lstsq(both, -right, rcond=None)[0]
-        deviation = np.sqrt(np.linalg.inv(both.T @ both)[-1, -1])
+        deviation = np.sqrt(np.linalg.pinv(both.T @ both)[-1, -1])
         wrong[cause] = float(unit * found[-1]), float(unit * deviation)
     return ResponseTest(values=values_at(x), wrong=wrong)
 
