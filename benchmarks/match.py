@@ -113,6 +113,7 @@ def compare(rigs: JointRigs, logs: Recorded, chosen: Mapping[str, Fit]) -> Itera
         errors = [simulated(rigs, one, [found.values])[0] - one.positions[0] for one in held_out]
         rmse = [float(np.sqrt(np.mean(error**2))) for error in errors]
         row["rmse"] = dict(zip(HELD_OUT, rmse, strict=True))
+        row["moving"] = dict(zip(HELD_OUT, [float(e.std()) for e in errors], strict=True))
         if name != NOMINAL:
             try:
                 row["exact"] = dict(fit(rigs, logs.exact, logs.joint).values)
@@ -163,7 +164,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     for name, mine in by.items():
         good = {key: row for key, row in mine.items() if "rmse" in row}
         ratios = _ratios(good, by.get(NOMINAL, {}))
-        plain = _ratios(good, by.get(PLAIN, {}))
+        plain, moving = (_ratios(good, by.get(PLAIN, {}), kind) for kind in ("rmse", "moving"))
         joint = np.exp(np.log(ratios).mean(axis=1)) if len(ratios) else np.array([np.nan])
         both = [row for row in good.values() if "exact" in row]
         bias = [[100.0 * (r["values"][g] / r["exact"][g] - 1.0) for g in GAINS] for r in both]
@@ -178,6 +179,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             if len(ratios)
             else {},
             "over_plain": float(np.exp(np.log(plain).mean())) if len(plain) else float("nan"),
+            "moving": float(np.exp(np.log(moving).mean())) if len(moving) else float("nan"),
             "bias": np.mean(bias, axis=0).tolist() if bias else [float("nan")] * 2,
             "absolute": np.median(np.abs(bias), axis=0).tolist() if bias else [float("nan")] * 2,
             "seconds": float(np.mean([r["seconds"] for r in good.values()] or [float("nan")])),
@@ -202,16 +204,20 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-def _ratios(mine: Mapping[Any, Mapping[str, Any]], other: Mapping[Any, Mapping[str, Any]]) -> Any:
+def _ratios(
+    mine: Mapping[Any, Mapping[str, Any]],
+    other: Mapping[Any, Mapping[str, Any]],
+    kind: str = "rmse",
+) -> Any:
     """RMSE over that of another method, shape (joints that both have, signals)."""
-    both = [key for key in mine if "rmse" in other.get(key, {})]
-    ratios = [[mine[k]["rmse"][s] / other[k]["rmse"][s] for s in HELD_OUT] for k in both]
+    both = [key for key in mine if kind in other.get(key, {})]
+    ratios = [[mine[k][kind][s] / other[k][kind][s] for s in HELD_OUT] for k in both]
     return np.array(ratios).reshape(-1, len(HELD_OUT))
 
 
 def show(summaries: Sequence[Mapping[str, Any]], title: str, caption: str) -> Table:
     """Make the table of `summary`."""
-    columns = ["method", "joints", "below", "median", *HELD_OUT, "over plain", "bias [%]"]
+    columns = ["method", "joints", "below", "median", *HELD_OUT, "over plain", "moving", "bias [%]"]
     columns += ["|bias| [%]", "repeat 95 %", "total 95 %", "fit [s]"]
     made = console.table(title, columns, caption=caption)
 
@@ -229,6 +235,7 @@ def show(summaries: Sequence[Mapping[str, Any]], title: str, caption: str) -> Ta
             f"{one['median']:.2f}",
             *(f"{one['signals'].get(name, float('nan')):.2f}" for name in HELD_OUT),
             f"{one['over_plain']:.3f}",
+            f"{one['moving']:.3f}",
             "{:+.1f} / {:+.1f}".format(*one["bias"]),
             "{:.1f} / {:.1f}".format(*one["absolute"]),
             coverage(one["repeat"]),
@@ -279,7 +286,8 @@ def match(
     caption = (
         "joints: with a result. below: joints whose held-out RMSE (geometric mean over the "
         "signals) is below that of the nominal gains with delay; median and medians of each "
-        "signal: of that ratio. over plain: geometric mean of the RMSE over the plain fit's. "
+        "signal: of that ratio. over plain: geometric mean of the RMSE over the plain fit's; "
+        "moving: the same without the mean error of each signal, which is sag under gravity. "
         "bias, |bias|: mean, median of the absolute value, of stiffness / damping, against the "
         "same method on a noise-free chirp of a third amplitude. repeat, total: intervals of both "
         "gains that contain those; in brackets the median half-width. One thread; "

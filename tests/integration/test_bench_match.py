@@ -108,6 +108,9 @@ def test_a_method_is_judged_on_signals_that_it_did_not_see() -> None:
     # What is left of the error is that of the interpolation between 5 ms steps.
     assert plain["below"] == plain["joints"] == 1
     assert plain["median"] < 0.1
+    assert plain["moving"] == plain["over_plain"] == pytest.approx(1.0)
+    assert nominal["moving"] > 10.0
+    assert all(row["moving"][s] <= row["rmse"][s] for row in rows[:2] for s in HELD_OUT)
     assert np.abs(plain["bias"]).max() < 0.3
     assert (none["joints"], none["refused"]) == (0, 1)
     assert math.isnan(none["median"])
@@ -117,6 +120,7 @@ def test_a_method_is_judged_on_signals_that_it_did_not_see() -> None:
 def test_coverage_counts_the_gains_of_the_noise_free_sweep() -> None:
     rmse = dict.fromkeys(HELD_OUT, 1.0)
     base: dict[str, Any] = {"robot": 0, "joint": JOINT, "seconds": 1.0, "rmse": rmse}
+    base["moving"] = rmse
     values = {"stiffness": 20.0, "damping": 0.5}
     near = {"stiffness": (19.0, 21.0), "damping": (0.49, 0.51)}
     wide = {"stiffness": (19.0, 21.0), "damping": (0.40, 0.60)}
