@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from benchmarks.peers import SIGMA, Estimate, fit_sysid, import_peers
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import RobotSpec
+from pronk.simulators.chain import published
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.simulator import JointRigs
 
@@ -116,14 +117,9 @@ class Residual:
 
 def start_values(robot: RobotSpec, joint: str) -> dict[str, float]:
     """Nominal gains with a delay to begin with, and the model's armature and dry friction."""
-    known = robot.joint(joint)
-    return {
-        "stiffness": known.stiffness,
-        "damping": known.damping,
-        "armature": known.drive.armature,
-        "frictionloss": known.drive.frictionloss,
-        "delay": START_DELAY_S,
-    }
+    known = published(robot, joint) | {"delay": START_DELAY_S}
+    del known["offset"]
+    return known
 
 
 def fit_plain(

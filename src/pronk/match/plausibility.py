@@ -64,7 +64,7 @@ CAUSES: Mapping[str, tuple[str, str]] = {
     ),
     "torque constant": (
         "the motor's torque constant is not the drive's",
-        "log the drive's torque, which tells the two apart",
+        "log the drive's torque, which distinguishes the two",
     ),
     "torque column": ("the torque column has another scale", "give its unit and side of the gear"),
     "other leg": ("the columns are another joint's", "give the order of the file's joints"),

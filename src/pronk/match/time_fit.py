@@ -120,7 +120,7 @@ def _repeat(part: JointLog, trace: CommandTrace) -> Repeat:
     inside = np.flatnonzero((part.time >= trace.time[0]) & (part.time <= trace.time[-1]))[::every]
     weight = np.full(len(inside), 1.0 / part.segments[0].amplitude)
     if part.frequency is not None:
-        # Between excitations the joint is at rest, which tells nothing of its dynamics.
+        # Between excitations the joint is at rest, which holds nothing of its dynamics.
         hz = np.nan_to_num(part.frequency[inside], nan=np.inf)
         weight = weight / np.sqrt(np.maximum(hz, _LOWEST_HZ))
     return Repeat(
@@ -339,8 +339,7 @@ def _estimate(problem: TimeProblem, solution: Solution) -> Estimate:
     if not freedom:
         moves = block_moves(solution.jacobian, solution.residual, part)
         covariance, freedom = jackknife(moves), len(moves) - 1
-    found = estimate(problem.fitted, solution.x, covariance, freedom, problem.drive(solution.x))
-    return found
+    return estimate(problem.fitted, solution.x, covariance, freedom, problem.drive(solution.x))
 
 
 def _by_amplitude(problem: TimeProblem, solution: Solution) -> Array:
@@ -351,13 +350,13 @@ def _by_amplitude(problem: TimeProblem, solution: Solution) -> Array:
     excitation = _numbers(problem.records)[0]
     amplitudes = np.array([one.amplitude for one in problem.records])
     columns = [problem.fitted.index(name) for name in GAINS if name in problem.fitted]
-    drive, out = problem.drive(solution.x), []
+    out = []
     for amplitude in dict.fromkeys(amplitudes.tolist()):
         mine = np.isin(excitation, np.flatnonzero(amplitudes == amplitude))
         x = solution.x.copy()
         x[columns] -= np.linalg.pinv(solution.jacobian[mine][:, columns]) @ solution.residual[mine]
         own = problem.drive(x)
-        out.append((amplitude, *(own.get(name, drive[name]) for name in GAINS)))
+        out.append((amplitude, *(own[name] for name in GAINS)))
     return np.array(out)
 
 
