@@ -52,8 +52,9 @@ PARAMETERS: Mapping[str, Parameter] = {
         "a second, smaller amplitude gives the dry friction",
     ),
     "delay": Parameter(
-        # Known if known to a physics step of the training simulator.
-        *(0.0, 0.1, "s", 1e-3, 0.01),
+        # Known if known to a physics step of the training simulator. Below zero where the log has
+        # the command later than the drive had it.
+        *(-0.03, 0.1, "s", 1e-3, 0.01),
         "the phase at higher frequencies, or steps logged faster, gives the delay",
         sd_max=0.005,
         log=False,

@@ -102,7 +102,7 @@ class JointFit:
             damping=found.values["damping"],
             armature=found.values["armature"],
             frictionloss=found.values["frictionloss"],
-            delay_s=found.values["delay"],
+            delay_s=max(found.values["delay"], 0.0),
             ci95=found.ci95,
             covariance=found.covariance,
             repeat_gains=found.repeat_gains,

@@ -74,6 +74,11 @@ class Recorded:
     """[rad]"""
     repeats: tuple[Repeat, ...]
 
+    def at(self, time: Array, delay: float) -> Array:
+        """Instants of the simulation that some timestamps show with a delay [s], shape (n,)."""
+        last = (len(self.trace.command) - 1) * self.trace.timestep
+        return np.clip(time - delay, 0.0, last)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TimeFit:
@@ -91,6 +96,10 @@ class TimeFit:
     settled: bool
     at_bound: tuple[str, ...]
     """Fitted parameters that ended at a bound of the search."""
+    problem: TimeProblem
+    """What was fitted."""
+    solution: Solution
+    """Its optimum, with residuals and Jacobian."""
 
 
 def recorded(logs: Sequence[JointLog], joint: str, robot: RobotSpec) -> list[Recorded]:
@@ -174,7 +183,7 @@ class Simulations:
         for one, track, own in zip(self.records, self.tracks([drive])[0], masks, strict=True):
             for repeat, mask in zip(one.repeats, own, strict=True):
                 if mask.any():
-                    at = np.maximum(repeat.time[mask] - drive["delay"], 0.0)
+                    at = one.at(repeat.time[mask], drive["delay"])
                     wrong, weight = track(at) - repeat.position[mask], repeat.weight[mask] ** 2
                     squares += float(weight @ (wrong - wrong.mean()) ** 2)
                     weights += float(weight.sum())
@@ -232,7 +241,7 @@ class TimeProblem(Problem):
                 for repeat, mask in zip(one.repeats, masks, strict=True):
                     if not mask.any():
                         continue
-                    at = np.maximum(repeat.time[mask] - delay, 0.0)
+                    at = one.at(repeat.time[mask], delay)
                     simulated = [track[n](at) for track in tracks]
                     both = np.empty((1 + len(x), len(at)))
                     both[0] = simulated[0] - repeat.position[mask]
@@ -291,6 +300,8 @@ def fit_joint(
         held_out=errors,
         settled=solution.settled,
         at_bound=tuple(n for n, at in zip(fitted, solution.at_bound, strict=True) if at),
+        problem=problem,
+        solution=solution,
     )
 
 
@@ -378,5 +389,5 @@ def _total(
             change = float(np.abs(own).max())
         half = [min(float(np.sqrt(end**2 + blocks**2 + change**2)), 20.0) for end in (low, high)]
         bottom, top = kind.unscaled(at - half[0]), kind.unscaled(at + half[1])
-        out[name] = (max(bottom, 0.0), top)
+        out[name] = (bottom, top)
     return out

@@ -105,7 +105,7 @@ def estimate(
             # e^20 is as good as infinite and does not overflow.
             low, high = (PARAMETERS[name].unscaled(at + s * min(half, 20.0)) for s in (-1, 1))
         if freedom:
-            ci95[name] = (float(low if name == "offset" else max(low, 0.0)), float(high))
+            ci95[name] = (float(max(low, 0.0) if PARAMETERS[name].log else low), float(high))
     scale = np.array([best[name] if PARAMETERS[name].log else 1.0 for name in fitted])
     if symmetric:
         sd = sd / scale
