@@ -25,8 +25,8 @@ ROBOT = load_robot("mini_cheetah")
 OPTIONS: dict[str, dict[str, Any]] = {
     ".csv": {"unit": "rad"},
     ".mcap": {},
-    ".npz": {"unit": "rad", "joint_names": ["FR_knee"]},
-    ".pt": {"joint_names": ["FR_knee"]},
+    ".npz": {"unit": "rad", "joint_order": ["FR_knee"]},
+    ".pt": {"joint_order": ["FR_knee"]},
 }
 GOOD = ("0.00,0.1,0.1", "0.02,0.2,0.2", "0.04,0.1,0.3", "0.06,0.0,0.1")
 HEADER = "time,position.FR_knee,command.FR_knee"
@@ -288,7 +288,7 @@ def test_mutated_pickles_behind_a_sound_archive(tmp_path: Path, data: st.DataObj
     program, storages = pace()
     path = tmp_path / "a.pt"
     path.write_bytes(archive(mutate(data, program), storages))
-    reads_or_refuses(path, joint_names=["FR_knee"])
+    reads_or_refuses(path, joint_order=["FR_knee"])
 
 
 # --- Pickles and sizes --------------------------------------------------------------------------
@@ -397,7 +397,7 @@ def test_mistakes_in_a_csv_are_located(tmp_path: Path, rows: tuple[str, ...], na
         ({"unit": "rad", "columns": {"time": "t"}}, "'t'"),
         ({"unit": "rad", "columns": {"speed.FR_knee": "x"}}, "speed.FR_knee"),
         ({"unit": "rad", "rate_hz": 100.0}, r"50\.00 Hz"),
-        ({"unit": "rad", "joint_names": ["a", "b"]}, "2 joint names"),
+        ({"unit": "rad", "joint_order": ["a", "b"]}, "by the file"),
         ({"unit": "rad", "command_topic": "/x"}, "command_topic"),
         ({"units": "rad"}, "units"),
         ({"format": "hdf5"}, "mcap, csv, sage, pace, npz"),

@@ -51,7 +51,7 @@ def part(log: JointLog, inside: np.ndarray) -> JointLog:
 @pytest.mark.slow
 def test_all_legs_at_once_are_matched_leg_by_leg(tmp_path: Path) -> None:
     record(tmp_path / "all.pt")
-    log = read_log(tmp_path / "all.pt", robot=ROBOT)
+    log = read_log(tmp_path / "all.pt", robot=ROBOT, joint_order="default")
     first = log.time - log.time[0] < LENGTH_S / 2.0
     gains = match_logs([part(log, first)], ROBOT, drive_gains="default").gains
     assert list(gains.joints) == list(ROBOT.joint_names)

@@ -97,8 +97,6 @@ def test_a_folder_of_recordings_is_read_whole() -> None:
 
 @recorded
 def test_sage_joints_can_be_renamed() -> None:
-    log = read_log(SO101 / "multisine", joint_names=list("abcdef"))
-    assert log.joints == tuple("abcdef")
     log = read_log(SO101 / "multisine", joint_names={"Jaw": "claw"})
     assert log.joints[0] == "Rotation"
     assert log.unit("claw") == "unknown"
@@ -176,10 +174,8 @@ def test_npz_of_another_tool(tmp_path: Path) -> None:
     position = np.rad2deg(0.1 * np.sin(time))
     np.savez(tmp_path / "a.npz", time=time, command=position, position=position)
     with pytest.raises(LogError, match="radians or degrees"):
-        read_log(tmp_path / "a.npz", joint_names=["FR_knee"])
-    with pytest.raises(LogError, match="give joint_names"):
-        read_log(tmp_path / "a.npz", unit="deg")
-    log = read_log(tmp_path / "a.npz", unit="deg", joint_names=["FR_knee"])
+        read_log(tmp_path / "a.npz", joint_order=["FR_knee"])
+    log = read_log(tmp_path / "a.npz", unit="deg", joint_order=["FR_knee"])
     np.testing.assert_allclose(log.position[:, 0], 0.1 * np.sin(time), atol=1e-15)
 
 
@@ -192,16 +188,14 @@ def test_pace_recording_without_pytorch_gives_pytorchs_numbers(tmp_path: Path) -
     position = torch.rand(12, 400, generator=generator, dtype=torch.float64).T
     path = tmp_path / "chirp_data.pt"
     torch.save({"time": time, "dof_pos": position, "des_dof_pos": command, "note": "x"}, path)
-    log = read_log(path, robot=load_robot("mini_cheetah"))
+    log = read_log(path, robot=load_robot("mini_cheetah"), joint_order="default")
     np.testing.assert_array_equal(log.position, position.numpy())
     np.testing.assert_array_equal(log.command, command.numpy().astype(float))
     assert log.joints == load_robot("mini_cheetah").joint_names
-    with pytest.raises(LogError, match="give joint_names"):
-        read_log(path)
     names = [f"j{i}" for i in range(12)]
     code = (
         "import sys; from pronk.logs.readers import read_log;"
-        f"log = read_log({str(path)!r}, joint_names={names});"
+        f"log = read_log({str(path)!r}, joint_order={names});"
         "print(log.joints[11], 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -365,6 +359,45 @@ uint32 nanosec
 ARRAY = "float64[] data\n"
 
 
+def test_an_order_of_joints_is_never_assumed(tmp_path: Path) -> None:
+    robot, path = load_robot("mini_cheetah"), tmp_path / "a.npz"
+    values = np.cumsum(np.random.default_rng(0).uniform(-0.01, 0.01, (300, 12)), axis=0)
+    arrays = {"time": np.arange(300) / 200.0, "command": values, "position": values}
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    for known, proposal in ((None, "--robot"), (robot, ",".join(robot.joint_names))):
+        with pytest.raises(LogError, match="--joint-order NAME") as caught:
+            read_log(path, unit="rad", robot=known)
+        assert proposal in str(caught.value)
+    theirs = (*robot.joint_names[3:6], *robot.joint_names[:3], *robot.joint_names[6:])
+    for order in (theirs, ",".join(theirs)):
+        assert read_log(path, unit="rad", robot=robot, joint_order=order).joints == theirs
+    assert read_log(path, unit="rad", robot=robot, joint_order="default").joints == (
+        robot.joint_names
+    )
+    for wrong in (theirs[:3], (*theirs[:11], theirs[0]), (*theirs[:11], "tail")):
+        with pytest.raises((LogError, RobotError), match=r"3 joint names|named twice|no joint"):
+            read_log(path, unit="rad", robot=robot, joint_order=wrong)
+    # Names in the file count; an order that contradicts them is refused.
+    np.savez(path, **arrays, joints=np.array(theirs))  # type: ignore[arg-type]
+    for order in (None, "default", theirs):
+        assert read_log(path, unit="rad", robot=robot, joint_order=order).joints == theirs
+    with pytest.raises(LogError, match="by the file"):
+        read_log(path, unit="rad", robot=robot, joint_order=robot.joint_names)
+
+
+def test_joint_order_is_an_option_of_the_command_line(tmp_path: Path) -> None:
+    log, path = example(10_000), tmp_path / "a.npz"
+    arrays = {name: getattr(log, name) for name in ("time", "command", "position")}
+    np.savez(path, **arrays)
+    words = ["response", path, "--unit", "rad", "--robot", "mini_cheetah", "--no-plots"]
+    refused = invoke(words)
+    assert refused.exit_code == 2
+    assert "--joint-order default" in refused.stderr
+    done = invoke([*words, "--joint-order", "FL_hip_roll,FL_knee,FL_hip_pitch"])
+    assert done.exit_code == 0, done.stderr
+    assert "FL_knee" in done.stdout
+
+
 def bag(path: Path, *, stamped: bool = True, command: str = "/joint_command") -> None:
     """Two joints at 200 Hz, commands at 50 Hz, recorded by rosbag2 into MCAP."""
     with path.open("wb") as stream, RosWriter(stream) as writer:
@@ -406,7 +439,12 @@ def test_a_bag_with_two_joint_state_topics(tmp_path: Path) -> None:
 def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     bag(tmp_path / "bag_0.mcap", stamped=False, command="/array")
-    log = read_log(tmp_path, command_topic="/array", command_field="data")
+    array = {"command_topic": "/array", "command_field": "data"}
+    with pytest.raises(LogError, match="--joint-order NAME"):
+        read_log(tmp_path, **array)  # type: ignore[arg-type]
+    with pytest.raises(LogError, match="lack hip"):
+        read_log(tmp_path, joint_order=["knee", "hop"], **array)  # type: ignore[arg-type]
+    log = read_log(tmp_path, joint_order=["knee", "hip"], **array)  # type: ignore[arg-type]
     k = np.arange(8, 400)
     np.testing.assert_allclose(log.command[:, 0], np.sin(0.1 * (k - k % 4)))
     assert any("times of reception" in note for note in log.notes)
@@ -418,7 +456,7 @@ def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
         ({}, "command_topic is missing"),
         ({"command_topic": "/elsewhere"}, "no commands on /elsewhere"),
         ({"measured_topic": "/imu", "command_topic": "/joint_command"}, "no sensor_msgs.* on /imu"),
-        ({"command_topic": "/joint_command", "command_field": "velocity"}, "holds 0 values"),
+        ({"command_topic": "/joint_command", "command_field": "velocity"}, "the 0 values"),
         ({"command_topic": "/joint_command", "command_field": "points.0"}, "no field 'points.0'"),
         ({"command_topic": "/joint_command", "command_field": "header"}, "not a list of numbers"),
     ],

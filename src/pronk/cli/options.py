@@ -82,6 +82,8 @@ class Reading:
     """CSV: OURS=THEIRS, as in position.FR_knee=q3; repeat it."""
     joint_names: tuple[str, ...] = ()
     """THEIRS=OURS for joints of other names; repeat it."""
+    joint_order: str | None = None
+    """NAME,NAME,... of columns without joint names (PACE); default for the robot's order."""
     scale: tuple[str, ...] = ()
     """JOINT=RADIANS per unit, for a joint that is not in radians; repeat it."""
     rate_hz: float | None = None

@@ -19,8 +19,6 @@ UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
 """Radians in each unit of angle."""
 _EPOCH_S = 1e6
 """Clocks that begin later than this count from an epoch, and are made to begin at zero [s]."""
-Names = Mapping[str, str] | Sequence[str]
-"""Joint names: new ones by the file's own, or all of them in the order of the columns."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +40,7 @@ class Columns:
     """One of `TIME_UNITS`."""
     no_angles: tuple[str, ...] = ()
     """Joints whose position is on another scale than `unit`, by their names in the file."""
-    names: Names | None = None
+    names: Mapping[str, str] | None = None
     """Joint names that the format's own stand for."""
     row: Callable[[int], str] = "sample {}".format
     """Names a sample as the user finds it in the file."""
@@ -58,16 +56,18 @@ def import_columns(
     *,
     unit: str | None = None,
     time_unit: str | None = None,
-    joint_names: Names | None = None,
+    joint_names: Mapping[str, str] | None = None,
+    joint_order: Sequence[str] | None = None,
     drop_duplicates: bool = False,
     scale: Mapping[str, float] | None = None,
 ) -> JointLog:
     """Check columns and make a log of them; a LogError names what is implausible and the way out.
 
-    Columns that have no names get those of the robot. `unit` of the angles is `rad` or `deg`, and
-    required where the format has none; `time_unit` is one of `TIME_UNITS`. Duplicates are rows that
-    repeat the one before in full. `scale` gives radians per unit of joints whose unit is unknown,
-    by (new) joint name, for command and position; the velocity is left as it is.
+    `unit` of the angles is `rad` or `deg`, and required where the format has none; `time_unit` is
+    one of `TIME_UNITS`. `joint_names` gives new names by the file's own; `joint_order` names
+    columns that have no names (see `ordered`). Duplicates are rows that repeat the one before in
+    full. `scale` gives radians per unit of joints whose unit is unknown, by (new) joint name, for
+    command and position; the velocity is left as it is.
     """
     where = columns.where
     unit, time_unit = unit or columns.unit, time_unit or columns.time_unit
@@ -79,7 +79,7 @@ def import_columns(
     for name, value, known in (("unit", unit, UNITS), ("time_unit", time_unit, TIME_UNITS)):
         if value not in known:
             raise LogError(f"{where}: {name} {value!r}; expected one of {', '.join(known)}.")
-    joints = _joint_names(columns, robot, columns.names if joint_names is None else joint_names)
+    joints = _named(columns, robot, joint_names, joint_order)
     keep, notes = np.arange(len(columns.time)), list(columns.notes)
     if drop_duplicates and len(keep) > 1:
         every = (columns.command, columns.position, columns.velocity, columns.torque)
@@ -145,7 +145,12 @@ def import_columns(
     )
 
 
-def _joint_names(columns: Columns, robot: RobotSpec | None, names: Names | None) -> tuple[str, ...]:
+def _named(
+    columns: Columns,
+    robot: RobotSpec | None,
+    names: Mapping[str, str] | None,
+    order: Sequence[str] | None,
+) -> tuple[str, ...]:
     """Names of the joints, as many as there are columns."""
     where, joints = columns.where, columns.joints
     shape = (len(columns.time), columns.position.shape[-1])
@@ -154,28 +159,56 @@ def _joint_names(columns: Columns, robot: RobotSpec | None, names: Names | None)
             f"{where}: time has shape {columns.time.shape}, command {columns.command.shape} and "
             f"position {columns.position.shape}; expected (n,), (n, joints) and (n, joints)."
         )
-    if not joints and names is None and robot is not None and len(robot.joints) == shape[1]:
-        return robot.joint_names
-    if not joints and (names is None or isinstance(names, Mapping)):
+    stated = ordered(f"{where}: its {shape[1]} columns", shape[1], robot, order, joints)
+    names = columns.names if names is None else names
+    if unknown := [name for name in names or {} if name not in stated]:
         raise LogError(
-            f"{where}: its {shape[1]} columns have no names; give joint_names as a list, in the "
-            "file's order."
+            f"{where}: joint_names renames {', '.join(unknown)}; the file has {', '.join(stated)}."
         )
-    if isinstance(names, Mapping):
-        if unknown := [name for name in names if name not in joints]:
-            raise LogError(
-                f"{where}: joint_names renames {', '.join(unknown)}; the file has "
-                f"{', '.join(joints)}."
-            )
-        joints = tuple(names.get(joint, joint) for joint in joints)
-    elif names is not None:
-        joints = tuple(names)
-    if len(joints) != shape[1]:
+    return tuple((names or {}).get(joint, joint) for joint in stated)
+
+
+def ordered(
+    what: str,
+    count: int,
+    robot: RobotSpec | None,
+    order: Sequence[str] | None,
+    joints: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Joint of each of several values: by the file, or in the order that the user states.
+
+    Args:
+        what: The values, for messages.
+        count: How many there are.
+        robot: The robot.
+        order: Joint names, one a value (a list, or text with commas), or `default`: the robot's
+            joints in its own order. An order of joints is never assumed.
+        joints: Names in the file, if it has any.
+
+    Raises:
+        LogError: Neither the file nor the user names the joints, or they differ.
+    """
+    own = () if robot is None else robot.joint_names
+    stated = tuple(order.split(",") if isinstance(order, str) else order or ())
+    if stated == ("default",):
+        stated = tuple(joints) or own
+    if not stated and not joints:
+        default = f"default if that is {','.join(own)}" if own else "default with --robot"
         raise LogError(
-            f"{where}: {len(joints)} joint names for {shape[1]} columns; give one name each, in "
-            "the file's order."
+            f"{what} have no joint names; give --joint-order NAME,NAME,... in the file's order, or "
+            f"--joint-order {default}."
         )
-    return joints
+    if stated and joints and stated != tuple(joints):
+        raise LogError(
+            f"{what} are {', '.join(joints)} by the file and {', '.join(stated)} by --joint-order; "
+            "leave the option out; --joint-names THEIRS=OURS renames joints."
+        )
+    stated = stated or tuple(joints)
+    if len(stated) != count:
+        raise LogError(
+            f"{what} have {len(stated)} joint names ({', '.join(stated)}); expected one each."
+        )
+    return stated
 
 
 def in_force(sent: Array, time: Array) -> NDArray[np.intp]:

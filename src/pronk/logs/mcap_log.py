@@ -135,6 +135,7 @@ def read_mcap(
     measured_topic: str | None = None,
     command_topic: str | None = None,
     command_field: str = "position",
+    joint_order: Sequence[str] | None = None,
 ) -> JointLog:
     """Read a log of pronk, or the JointState messages of a rosbag2 MCAP.
 
@@ -148,6 +149,7 @@ def read_mcap(
             (rosbag2 only).
         command_field: Where in a command message the positions are, dots between names, numbers
             for indices (rosbag2 only), for instance `points.0.positions`.
+        joint_order: Joints of a command without names (rosbag2 only), see `columns.ordered`.
 
     Raises:
         LogError: Not MCAP, nothing usable in it, or a topic that is not there.
@@ -158,14 +160,16 @@ def read_mcap(
             path,
             found,
             damage,
-            robot="unknown" if robot is None else robot.name,
+            robot=robot,
             measured_topic=measured_topic or MEASURED_TOPIC,
             command_topic=command_topic,
             command_field=command_field,
+            joint_order=joint_order,
         )
-    if measured_topic or command_topic:
+    if measured_topic or command_topic or joint_order not in (None, "default"):
         raise LogError(
-            f"{path}: a log of pronk needs no measured_topic or command_topic; leave them out."
+            f"{path}: a log of pronk needs no measured_topic, command_topic or joint_order; leave "
+            "them out."
         )
     try:
         return _read_sweep(path, found, damage)

@@ -120,12 +120,12 @@ def read_log(
 
     Args:
         path: File or folder.
-        robot: The robot, to check the joint names against, or to name columns that have no names.
+        robot: The robot, to check the joint names against.
         format: One of `readers()`; from the name if None.
         rate_hz: Expected rate; an error if the timestamps disagree.
-        options: Of the format: `unit`, `time_unit`, `joint_names`, `drop_duplicates`, `scale`
-            (see `import_columns`), `columns` (CSV), `measured_topic`, `command_topic`,
-            `command_field` (rosbag2).
+        options: Of the format: `unit`, `time_unit`, `joint_names`, `joint_order`,
+            `drop_duplicates`, `scale` (see `import_columns`), `columns` (CSV), `measured_topic`,
+            `command_topic`, `command_field` (rosbag2).
 
     Returns:
         The log; `notes` list what was found.

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.files import sha256
-from pronk.logs.columns import in_force
+from pronk.logs.columns import in_force, ordered
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap import Record
+from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -32,10 +33,11 @@ def read_joint_states(
     found: Sequence[Record],
     damage: str,
     *,
-    robot: str,
+    robot: RobotSpec | None,
     measured_topic: str,
     command_topic: str | None,
     command_field: str,
+    joint_order: Sequence[str] | None,
 ) -> JointLog:
     """Join the measured states of one topic with the commands of another; see `read_mcap`.
 
@@ -76,7 +78,18 @@ def read_joint_states(
         )
 
     def values(messages: Sequence[Any], topic: str, field: str) -> Array:
-        return np.array([_values(path, topic, message, field, joints) for message in messages])
+        rows = []
+        for message in messages:
+            names, numbers = _values(path, topic, message, field)
+            what = f"{path}: the {len(numbers)} values of a message on {topic}"
+            if len(numbers) != 1 or len(joints) != 1 or names:
+                names = ordered(what, len(numbers), robot, joint_order, names)
+            else:
+                names = joints
+            if missing := [joint for joint in joints if joint not in names]:
+                raise LogError(f"{what} lack {', '.join(missing)}; they are {', '.join(names)}.")
+            rows.append([numbers[names.index(joint)] for joint in joints])
+        return np.array(rows)
 
     def measured(field: str) -> Array | None:
         """Velocity or effort; None where a state lacks it."""
@@ -92,7 +105,7 @@ def read_joint_states(
         f"the file is cut short ({damage})": bool(damage),
     }
     return JointLog(
-        robot=robot,
+        robot="unknown" if robot is None else robot.name,
         joints=joints,
         time=time[known] - time[known][0],
         command=values(commands, command_topic, command_field)[order][index[known]],
@@ -135,8 +148,10 @@ def _stamp(message: Any) -> float:
     return 0.0 if stamp is None else float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
-def _values(path: Path, topic: str, message: Any, field: str, joints: Sequence[str]) -> list[float]:
-    """Numbers of a field, one a joint in the order of `joints`."""
+def _values(
+    path: Path, topic: str, message: Any, field: str
+) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Joint names of a message, if it has any, and the numbers of a field."""
     value = message
     for part in field.split("."):
         try:
@@ -149,23 +164,11 @@ def _values(path: Path, topic: str, message: Any, field: str, joints: Sequence[s
                 + "); name it with command_field."
             ) from None
     try:
-        numbers = [math.nan if math.isinf(number) else float(number) for number in value]
+        numbers = tuple(math.nan if math.isinf(number) else float(number) for number in value)
     except TypeError:
         raise LogError(
             f"{path}: field {field!r} of the messages on {topic} is not a list of numbers; name "
             "another with command_field."
         ) from None
-    names = list(getattr(message, "name", None) or getattr(message, "joint_names", None) or ())
-    if names and len(names) == len(numbers):
-        if missing := [joint for joint in joints if joint not in names]:
-            raise LogError(
-                f"{path}: a message on {topic} lacks {', '.join(missing)}; it names "
-                f"{', '.join(names)}."
-            )
-        return [numbers[names.index(joint)] for joint in joints]
-    if len(numbers) != len(joints):
-        raise LogError(
-            f"{path}: a message on {topic} holds {len(numbers)} values; expected {len(joints)} "
-            f"({', '.join(joints)})."
-        )
-    return numbers
+    names = getattr(message, "name", None) or getattr(message, "joint_names", None) or ()
+    return tuple(map(str, names)), numbers
