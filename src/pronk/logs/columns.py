@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.logs.checks import TIME_UNITS, check_unit, correlation_note
-from pronk.logs.joint_log import JointLog, Segment, check_increasing
+from pronk.logs.joint_log import JointLog, check_increasing
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
@@ -113,14 +113,6 @@ def import_columns(
     rates = np.where([joint in scale for joint in joints], 1.0, factors)
     factors = np.array([scale.get(j, factor) for j, factor in zip(joints, factors, strict=True)])
     command = columns.command[keep] * factors
-    # One excitation of unknown kind for every joint whose command moves.
-    travel = dict(zip(joints, np.ptp(command, axis=0), strict=True))
-    start, stop = float(time[0]), float(time[-1])
-    segments = tuple(
-        Segment(kind="unknown", joints=(joint,), start=start, stop=stop, amplitude=float(peak) / 2)
-        for joint, peak in travel.items()
-        if peak > 0.0
-    )
     # A command that is not finite is refused below, by name.
     if np.isfinite(command).all() and (note := correlation_note(time, command, joints)):
         notes.append(note)
@@ -132,8 +124,6 @@ def import_columns(
         position=columns.position[keep] * factors,
         velocity=None if columns.velocity is None else columns.velocity[keep] * rates,
         torque=None if columns.torque is None else columns.torque[keep],
-        segments=segments,
-        pose=np.asarray(0.5 * (command.max(axis=0) + command.min(axis=0))),
         units=tuple(
             "unknown" if off and joint not in scale else "rad"
             for joint, off in zip(joints, other, strict=True)

@@ -20,6 +20,7 @@ from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_radians, check_rate, check_unit, examine, saturation_note
 from pronk.logs.columns import Columns, import_columns
 from pronk.logs.csv_npz_reader import read_csv, read_npz
+from pronk.logs.excitations import with_segments
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_log import read_mcap
 from pronk.logs.pace_reader import read_pace
@@ -155,7 +156,8 @@ def read_log(
         log = chosen.read(path, robot=robot, **given)
         if not isinstance(log, JointLog):
             raise LogError(f"{path}: the reader {kind} returned {type(log).__name__}.")
-        return replace(log, notes=(*log.notes, *_examined(path, log, robot, rate_hz)))
+        notes = _examined(path, log, robot, rate_hz)
+        return with_segments(replace(log, notes=(*log.notes, *notes)))
     except PronkError as error:
         # Names from the file itself may hold line breaks; a message is one sentence.
         raise type(error)(" ".join(str(error).split())) from error.__cause__

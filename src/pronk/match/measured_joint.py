@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, LogError, PronkError
+from pronk.logs.excitations import with_segments
 from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
 from pronk.response.estimate import (
@@ -141,7 +142,7 @@ DriveGains = Mapping[str, Pair] | Literal["default"]
 def with_drive_gains(
     logs: Sequence[JointLog], robot: RobotSpec, given: DriveGains | None = None
 ) -> list[JointLog]:
-    """Logs with the gains that were on the real drives: their own, or else the given ones.
+    """Logs with segments and the gains that were on the real drives: their own, or the given ones.
 
     Raises:
         LogError: A log has no gains and none are given for a joint of it, or they contradict it.
@@ -157,7 +158,7 @@ def with_drive_gains(
         members = robot.group(name) if name in robot.groups else (robot.joint(name),)
         by_joint |= {joint.name: pair for joint in members}
     out = []
-    for log in logs:
+    for log in map(with_segments, logs):
         where, moved, pairs = log.source or "log", excited_joints(log), []
         for column, name in enumerate(log.joints):
             own: Pair | None = None
@@ -205,14 +206,13 @@ def measured_joints(
         IdentifiabilityError: Too little of the band is coherent at the largest amplitude.
     """
     where = log.source or "log"
-    if log.segments:
-        chosen = tuple(segment for segment in log.segments if segment.kind != "sine_steps")
-        if not any(joint in segment.joints for segment in chosen):
-            raise LogError(
-                f"{where}: {joint} was excited by sine steps only; match a chirp or a multisine, "
-                "and keep the steps to check it."
-            )
-        log = replace(log, segments=chosen)
+    chosen = tuple(one for one in with_segments(log).segments if one.kind != "sine_steps")
+    if not any(joint in segment.joints for segment in chosen):
+        raise LogError(
+            f"{where}: {joint} was excited by sine steps only; match a chirp or a multisine, and "
+            "keep the steps to check it."
+        )
+    log = replace(log, segments=chosen)
     known, parts = robot.joint(joint), excitations(log, joint)
     rate_hz = log_rate(parts)
     found: list[MeasuredJoint] = []

@@ -23,7 +23,6 @@ from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.gains import MatchedGains
 from pronk.match.measured_joint import DriveGains, gains_on_drive, with_drive_gains
 from pronk.match.parameters import GAINS
-from pronk.response.estimate import excited_joints
 from pronk.response.grid import held_mean
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, branches, moves_together, published
@@ -207,10 +206,9 @@ def _joint_by_joint(
     log: JointLog, rigs: JointRigs, gains: MatchedGains
 ) -> tuple[list[JointPrediction], dict[str, str]]:
     """One joint after the other, segment by segment."""
-    segments = log.segments or _single(log)
     matched, joints, missing = drives_of(rigs.robot, gains), [], {}
     for name in rigs.robot.joint_names:
-        mine = [segment for segment in segments if name in segment.joints]
+        mine = [segment for segment in log.segments if name in segment.joints]
         if mine and name not in matched:
             missing[name] = _without_gains(name)
         elif mine:
@@ -251,18 +249,3 @@ def _replay(
         "naive_delayed": played(delayed, real, GAINS),
         "matched": played(delayed, best, [*GAINS, *own]),
     }
-
-
-def _single(log: JointLog) -> tuple[Segment, ...]:
-    """The whole log as one segment of those whose command moves."""
-    if not (names := excited_joints(log)):
-        return ()
-    return (
-        Segment(
-            kind="unknown",
-            joints=names,
-            start=float(log.time[0]),
-            stop=float(log.time[-1]),
-            amplitude=float("nan"),
-        ),
-    )

@@ -10,7 +10,8 @@ import numpy as np
 
 from pronk.errors import LogError, PronkError
 from pronk.logs.checks import check_motion
-from pronk.logs.joint_log import JointLog, Segment
+from pronk.logs.excitations import with_segments
+from pronk.logs.joint_log import JointLog
 from pronk.response.diagnostics import fit_delay, third_harmonic
 from pronk.response.grid import analysis_rate
 from pronk.response.h1 import H1Operator, estimate_averaged
@@ -19,19 +20,17 @@ from pronk.response.response import Estimator, FrequencyResponse
 
 
 def excited_joints(log: JointLog) -> tuple[str, ...]:
-    """Joints of the log's segments; without segments, those whose command moves."""
-    named = {name for segment in log.segments for name in segment.joints}
-    moving = np.ptp(log.command, axis=0) > 0.0
-    pairs = zip(log.joints, moving, strict=True)
-    return tuple(name for name, moves in pairs if (name in named if log.segments else moves))
+    """Joints of the log's segments, in the log's order."""
+    named = {name for segment in with_segments(log).segments for name in segment.joints}
+    return tuple(name for name in log.joints if name in named)
 
 
 def excitations(log: JointLog, joint: str) -> list[list[JointLog]]:
     """Split a log into the excitations of one joint, grouped into repeats.
 
     Excitations of the same kind, amplitude, period, band and clamping are repeats of one another.
-    A log without segments is one excitation of unknown kind; an amplitude that is not known is read
-    off the command.
+    Those of a log without segments are found in its command (`with_segments`); an amplitude that is
+    not known is read off the command.
 
     Returns:
         Groups of repeats, largest amplitude first.
@@ -39,16 +38,12 @@ def excitations(log: JointLog, joint: str) -> list[list[JointLog]]:
     Raises:
         LogError: There is no such joint, it was not excited, or its command is constant.
     """
-    column = log.column(joint)
+    column, log = log.column(joint), with_segments(log)
     where = log.source or "log"
     segments = [segment for segment in log.segments if joint in segment.joints]
-    if not log.segments:
-        start, stop, nan = float(log.time[0]), float(log.time[-1]), math.nan
-        whole = Segment(kind="unknown", joints=log.joints, start=start, stop=stop, amplitude=nan)
-        segments = [whole]
     if not segments:
-        excited = sorted({name for segment in log.segments for name in segment.joints})
-        raise LogError(f"{where}: {joint} was not excited; {', '.join(excited)} were.")
+        others = ", ".join(excited_joints(log)) or "no joints"
+        raise LogError(f"{where}: {joint} was not excited; {others} were.")
     groups: dict[tuple[object, ...], list[JointLog]] = {}
     for segment in segments:
         part = log.cut(segment)

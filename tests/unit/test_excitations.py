@@ -1,0 +1,142 @@
+"""Excitations found in the commands of logs that do not name them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from log_files import write_csv, write_mcap, write_npz
+from pronk.logs.excitations import with_segments
+from pronk.logs.joint_log import JointLog
+from pronk.logs.readers import read_log
+from pronk.match.measured_joint import measured_joints
+from pronk.match.settings import MatchSettings
+from pronk.match.time_fit import recorded
+from pronk.response.estimate import estimate, excitations, excited_joints
+from pronk.robots import load_robot
+from pronk.simulators.chain import moves_together
+from synthetic_joint import KNEE, chirp_command, multisine_command, simulate_second_order
+
+ROBOT = load_robot("mini_cheetah")
+LEG = ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
+POSE = np.array([ROBOT.joint(name).default_position for name in LEG])
+RATE = 500.0
+CHIRP = chirp_command("chirp", RATE)[1]  # 20 s at 0.25 rad and 1 s of rest
+JITTER_S = 5e-5
+
+
+def log_of(*parts: tuple[str, np.ndarray], begin: np.ndarray | None = None) -> JointLog:
+    """Commands about the pose one after another, each to one joint or to `all` of them.
+
+    With `begin` the leg stands there at first and moves to the pose within a second.
+    """
+    rows = []
+    if begin is not None:
+        share = np.clip(np.arange(1000.0) / 500.0 - 0.5, 0.0, 1.0)[:, None]
+        rows.append(begin + share * (POSE - begin))
+        rows.append(np.tile(POSE, (400, 1)))
+    for joint, signal in parts:
+        moved = np.array([joint in (name, "all") for name in LEG])
+        rows.append(POSE + signal[:, None] * moved)
+    command = np.concatenate(rows)
+    time = np.arange(len(command)) / RATE
+    time += np.random.default_rng(0).uniform(0.0, JITTER_S, len(time))
+    position = np.stack([simulate_second_order(c, RATE, **KNEE) for c in command.T], axis=1)
+    return JointLog(robot=ROBOT.name, joints=LEG, time=time, command=command, position=position)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".mcap"])
+def test_repeats_and_amplitudes_in_one_file_are_told_apart(tmp_path: Path, suffix: str) -> None:
+    knee = [("FR_knee", size * CHIRP) for size in (1.0, 0.4, 1.0, 1.0)]
+    made = log_of(*knee)
+    path = tmp_path / f"a{suffix}"
+    {".csv": write_csv, ".npz": write_npz, ".mcap": write_mcap}[suffix](path, made)
+    log = read_log(path, robot=ROBOT, **({} if suffix == ".mcap" else {"unit": "rad"}))
+    assert [(one.repeat, round(one.amplitude, 3)) for one in log.segments] == [
+        *((0, 0.25), (0, 0.1)),
+        *((1, 0.25), (2, 0.25)),
+    ]
+    for k, one in enumerate(log.segments):
+        # The chirp, and a part of the rest before and after it.
+        assert 21.0 * k - 0.6 < one.start <= 21.0 * k + 0.03
+        assert 21.0 * k + 20.3 < one.stop < 21.0 * k + 21.03
+    assert [len(parts) for parts in excitations(log, "FR_knee")] == [3, 1]
+    assert [len(one.repeats) for one in recorded([log], "FR_knee", ROBOT)] == [3, 1]
+    loud, quiet = estimate(log, "FR_knee")
+    assert (len(loud.repeats), len(quiet.repeats)) == (3, 1)
+    # The same as of the first chirp alone, which a file of its own would hold.
+    alone = estimate(log_of(knee[0]), "FR_knee")[0]
+    for found in (loud, quiet):
+        np.testing.assert_allclose(found.response, alone.response, atol=0.02)
+    assert len(measured_joints(log, "FR_knee", ROBOT, MatchSettings())) == 2
+
+
+def test_joints_after_one_another_do_not_move_together() -> None:
+    parts = [(name, size * CHIRP) for name in LEG for size in (1.0, 1.0)]
+    log = with_segments(log_of(*parts, begin=POSE + np.array([0.3, -0.4, 0.5])))
+    assert [one.joints[0] for one in log.segments] == [name for name, _ in parts]
+    assert not moves_together(log)
+    assert any("changes of pose of FR_hip_roll, FR_hip_pitch" in note for note in log.notes)
+    assert log.pose is not None
+    np.testing.assert_allclose(log.pose, POSE, atol=1e-9)
+    for name in LEG:
+        (found,) = recorded([log], name, ROBOT)
+        assert len(found.repeats) == 2
+        np.testing.assert_allclose(found.trace.command[0], ROBOT.joint(name).default_position)
+
+
+def test_a_change_of_pose_between_excitations_is_not_left_out() -> None:
+    moved = log_of(("FR_knee", CHIRP), ("FR_knee", CHIRP))
+    command, half = moved.command.copy(), len(moved.time) // 2
+    command[half - 100 :, 1] += np.minimum(np.arange(half + 100) / 500.0, 1.0)
+    log = with_segments(replace(moved, command=command))
+    assert set(excited_joints(log)) == set(LEG[1:])
+    assert moves_together(log)
+
+
+def test_joints_at_once_move_together_and_repeat() -> None:
+    log = with_segments(log_of(("all", CHIRP), ("all", CHIRP)))
+    assert moves_together(log)
+    for name in LEG:
+        assert [len(parts) for parts in excitations(log, name)] == [2]
+
+
+SHORT = CHIRP[: round(4.0 * RATE)].copy()
+SHORT[-round(0.5 * RATE) :] = 0.0
+STEPS = np.repeat([0.0, 0.1, 0.0, -0.1, 0.0], 500)
+
+
+@pytest.mark.parametrize(
+    "signals",
+    [
+        (CHIRP,),
+        (CHIRP, multisine_command(RATE)[1]),
+        (SHORT, SHORT, SHORT),
+        (STEPS, STEPS),
+        (np.repeat([0.0, 0.1, 0.2, 0.3, 0.4], 500),),
+        (CHIRP, STEPS),
+        (CHIRP, -CHIRP),
+    ],
+    ids=["one", "two kinds", "too short", "pulses", "stairs", "with pulses", "negative"],
+)
+def test_what_is_no_repeat_stays_one_excitation(signals: tuple[np.ndarray, ...]) -> None:
+    made = log_of(*(("FR_knee", signal) for signal in signals))
+    log = with_segments(made)
+    (one,) = log.segments
+    assert (one.joints, one.start, one.stop) == (("FR_knee",), made.time[0], made.time[-1])
+
+
+@pytest.mark.parametrize(
+    "other", [np.repeat([0.0, 0.1, 0.2, 0.3, 0.4], 500), CHIRP[: round(7.03 * RATE)]]
+)
+def test_stairs_and_a_chirp_that_is_cut_are_excitations(other: np.ndarray) -> None:
+    log = with_segments(log_of(("FR_knee", CHIRP), ("FR_hip_roll", other)))
+    assert not moves_together(log)
+    assert excited_joints(log) == ("FR_hip_roll", "FR_knee")
+
+
+def test_a_log_that_stands_still_has_no_excitation() -> None:
+    assert with_segments(log_of(("FR_knee", np.zeros(2000)))).segments == ()
