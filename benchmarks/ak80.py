@@ -27,6 +27,7 @@ from benchmarks.runner import finish
 from pronk.cli import console
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
+from pronk.logs.readers import read_log
 from pronk.match.torque import (
     BLOCK_S,
     FIT_HZ,
@@ -64,23 +65,13 @@ def read(name: str, data: Path = DATA) -> JointLog:
     path = data / f"{name}.csv"
     if not path.is_file():
         raise LogError(f"{path} is missing: the AK80-6 recordings are not here.")
-    table = np.genfromtxt(path, delimiter=",", names=True)
-
-    def both(kind: str) -> Array:
-        return np.stack([table[f"{kind}1"], table[f"{kind}2"]], axis=1)
-
-    position = both("pos_meas")
-    names = table.dtype.names or ()
-    return JointLog(
-        robot="ak80_double_pendulum",
-        joints=JOINTS,
-        time=table["time"],
-        command=both("pos_des") if "pos_des1" in names else position,
-        position=position,
-        velocity=both("vel_meas"),
-        torque=both("tau_meas"),
-        source=str(path),
-    )
+    names = {"position": "pos_meas", "torque": "tau_meas"}
+    columns = {
+        f"{ours}.{joint}": f"{theirs}{i + 1}"
+        for ours, theirs in names.items()
+        for i, joint in enumerate(JOINTS)
+    }
+    return read_log(path, robot=rig(), unit="rad", columns=columns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +201,7 @@ def rollout_error(pendulum: Pendulum, moved: Motion) -> Array:
 def run(data: Path = DATA) -> dict[str, Any]:
     """Fit three logs and compare all sets on the two others."""
     fit = fit_torque(
-        [read(name, data) for name in FITTED], rig(), links_known=False, shared=(JOINTS,)
+        [read(name, data) for name in FITTED], rig(), JOINTS[0], links_known=False, shared=(JOINTS,)
     )
     facts = json.loads((data / "facts.json").read_text())["published_parameters"]
     sets = {"fit": fitted(fit), **{name: published(one) for name, one in sorted(facts.items())}}

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.ak80 import DATA, HELD_OUT, JOINTS, fitted, read, rig, run
+from benchmarks.ak80 import DATA, FITTED, HELD_OUT, JOINTS, RIG, fitted, read, rig, run
+from command_line import invoke
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
-from pronk.match.torque import TorqueFit, fit_torque
+from pronk.logs.readers import read_log
+from pronk.match import gains, match_logs
+from pronk.match.torque import TorqueFit, fit_drives, fit_torque
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+from pronk.virtual.sim_params import load_sim_params
 
 recorded = pytest.mark.skipif(not DATA.is_dir(), reason="the AK80-6 recordings are not here")
 
@@ -73,34 +80,130 @@ def logs() -> list[JointLog]:
 
 
 def test_known_drives_and_torque_scale_are_recovered_with_known_links(logs: list[JointLog]) -> None:
-    fit = fit_torque(logs, rig(), links_known=True)
+    fit = fit_torque(logs, rig(), JOINTS[0], links_known=True)
     assert_drives(fit, 1.0)
     for joint in JOINTS:
         assert fit.joints[joint]["scale"].value == pytest.approx(SCALE, rel=0.03)
 
 
 def test_unknown_links_leave_the_scale_open(logs: list[JointLog]) -> None:
-    fit = fit_torque(logs, rig(), links_known=False, shared=(JOINTS,))
+    fit = fit_torque(logs, rig(), JOINTS[0], links_known=False, shared=(JOINTS,))
     assert_drives(fit, SCALE)
     assert not fit.joints["elbow"]["scale"].identified
 
 
 def test_armature_of_the_first_joint_is_not_told_from_its_link(logs: list[JointLog]) -> None:
-    fit = fit_torque(logs, rig(), links_known=False)
+    fit = fit_torque(logs, rig(), JOINTS[0], links_known=False)
     assert not fit.joints["shoulder"]["armature"].identified
     assert np.isnan(fit.joints["shoulder"]["armature"].value)
     assert fit.joints["elbow"]["armature"].identified
 
 
 def test_pendulum_of_a_fit_has_its_torque(logs: list[JointLog]) -> None:
-    fit = fit_torque(logs, rig(), links_known=False, shared=(JOINTS,))
+    fit = fit_torque(logs, rig(), JOINTS[0], links_known=False, shared=(JOINTS,))
     q, v, a = np.random.default_rng(0).normal(size=(3, 40, 2))
     assert fitted(fit).torque(q, v, a) == pytest.approx(fit.torque(q, v, a), abs=1e-6)
 
 
 def test_a_log_without_torque_is_refused(logs: list[JointLog]) -> None:
     with pytest.raises(LogError, match="no torque channel"):
-        fit_torque([replace(logs[0], torque=None)], rig(), links_known=True)
+        fit_torque([replace(logs[0], torque=None)], rig(), JOINTS[0], links_known=True)
+
+
+def heavier(factor: float) -> RobotSpec:
+    """The rig with a wrong mass of its lower link."""
+
+    def build() -> mujoco.MjSpec:
+        spec = rig().build_spec()
+        body = spec.body("lower")
+        body.mass, body.inertia = factor * body.mass, factor * np.array(body.inertia)
+        return spec
+
+    return replace(rig(), build_spec=build)
+
+
+def test_mode_drive_fits_torque_and_keeps_it(logs: list[JointLog], tmp_path: Path) -> None:
+    still = [replace(log, command=0.0 * log.command) for log in logs]
+    with pytest.raises(LogError, match="--mode drive"):
+        match_logs(still, rig())
+    result = match_logs(still, rig(), mode="drive")
+    gains.save(tmp_path / "gains.yaml", result.gains)
+    kept = gains.load(tmp_path / "gains.yaml")
+    for j, joint in enumerate(JOINTS):
+        for found in (result.gains.joints[joint], kept.joints[joint]):
+            low, high = found.torque["scale"].ci95
+            assert low < found.torque["scale"].value < high
+            assert found.torque["scale"].value == pytest.approx(SCALE, rel=0.03)
+            assert found.armature == pytest.approx(ARMATURE, rel=0.1)
+            assert found.frictionloss == pytest.approx(DRY[j], rel=0.1)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.03, 1.1])
+def test_links_that_do_not_hold_are_fitted(logs: list[JointLog], factor: float) -> None:
+    drives, _ = fit_drives(logs, heavier(factor))
+    for joint in JOINTS:
+        assert not drives[joint]["scale"].identified
+    elbow = drives["elbow"]["armature"]
+    assert elbow.value == pytest.approx(SCALE * ARMATURE, rel=0.05)
+    # Both drives are alike in the model but for their friction.
+    assert not drives["shoulder"]["armature"].identified
+
+
+def test_friction_of_a_swept_leg_in_units_of_its_sensor(tmp_path: Path) -> None:
+    """Of one joint that moves, armature, scale and links are one; friction is not."""
+    robot = load_robot("mini_cheetah")
+    words = ["sweep", robot.name, "--joints", "FR_knee", "--repeats", "1", "--amplitude", "0.25"]
+    done = invoke([*words, "--out", tmp_path])
+    assert done.exit_code == 0, done.stderr
+    drives, flags = fit_drives([read_log(tmp_path / "FR_knee.mcap")], robot)
+    assert (list(drives), flags) == (["FR_knee"], {})
+    own, true = drives["FR_knee"], load_sim_params(None, robot).joints["FR_knee"]
+    assert not own["scale"].identified
+    assert not own["armature"].identified
+    assert own["dry"].value == pytest.approx(true.coulomb / true.torque_scale, rel=0.05)
+    low, high = own["viscous"].ci95
+    assert low < true.viscous / true.torque_scale < high
+
+
+COLUMNS = [
+    word
+    for i, joint in enumerate(JOINTS)
+    for pair in (f"position.{joint}=pos_meas{i + 1}", f"torque.{joint}=tau_meas{i + 1}")
+    for word in ("--columns", pair)
+]
+
+
+@recorded
+def test_recordings_of_torque_are_fitted_from_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / RIG.name).write_text(RIG.read_text())
+    assert invoke(["robot", "new", tmp_path / RIG.name]).exit_code == 0
+    robot, out = tmp_path / "robot.yaml", tmp_path / "out" / "gains.yaml"
+    logs = [DATA / f"{name}.csv" for name in FITTED]
+    words = ["match", *logs, "--robot", robot, "--unit", "rad", *COLUMNS, "--out", out]
+    refused = invoke(words)
+    assert (refused.exit_code, out.exists()) == (2, False)
+    assert "--mode drive" in refused.stderr
+    done = invoke([*words, "--mode", "drive"])
+    assert done.exit_code == 0, done.stderr
+    expected = run()["fit"].joints
+    found = gains.load(out).joints
+    assert found["elbow"].armature == pytest.approx(expected["elbow"]["armature"].value, rel=1e-4)
+    assert not found["shoulder"].torque["armature"].identified
+    for joint in JOINTS:
+        assert found[joint].frictionloss == pytest.approx(expected[joint]["dry"].value, rel=1e-4)
+        low, high = found[joint].torque["dry"].ci95
+        assert low < found[joint].frictionloss < high
+        assert "the robot's file" in " ".join(found[joint].flags)
+    for words_of in ("0.00264", "0.002271 to 0.003009", "armature [kg m^2]"):
+        assert words_of in done.stdout
+        assert words_of in (out.parent / "match.html").read_text()
+    # One drive for both actuators, as their builder may state.
+    text = robot.read_text().replace("drive: elbow", "drive: shoulder")
+    robot.write_text(text)
+    done = invoke([*words, "--mode", "drive"])
+    assert done.exit_code == 0, done.stderr
+    found = gains.load(out).joints
+    assert found["shoulder"].armature == found["elbow"].armature
 
 
 @recorded

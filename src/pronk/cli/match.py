@@ -46,7 +46,7 @@ def match(
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         out: The gains file.
         mode: gains: stiffness and damping (the paper's). drive: damping, armature, friction and
-            delay at known stiffness.
+            delay at known stiffness; by a torque channel armature, friction and torque scale.
         method: time: gains, dry friction and delay in the time domain, all amplitudes together.
             paper: gains by the magnitude of the largest amplitude.
         exhaustive: Simulate every pair of the paper's grid.
@@ -97,14 +97,19 @@ def match(
         page, part = write_page(out.parent, gains=out.name)
         report("page", 1.0)
     found = part.figures
-    console.say(
-        f"{part.summary} Gain error in the compared band, RMS over the joints: "
-        f"{found['naive_error_db']:.2f} dB with the nominal gains of the real drive, "
-        f"{found['error_db']:.2f} dB with the matched gains."
+    errors = (
+        f" Gain error in the compared band, RMS over the joints: {found['naive_error_db']:.2f} dB "
+        f"with the nominal gains of the real drive, {found['error_db']:.2f} dB with the matched "
+        "gains."
     )
+    console.say(part.summary + errors * bool(np.isfinite(found["error_db"])))
     for name, flags in found["flags"].items():
         console.say(f"{name}: {'; '.join(flags)}")
-    for name, title in (("gains_table", "Matched gains"), ("ranges_table", "Training ranges")):
+    shown = {"gains_table": "Matched gains", "ranges_table": "Training ranges"}
+    if mode == "drive":
+        # By torque alone no gains are matched.
+        shown = {"drives": "Fitted drives"} | (shown if result.joints else {})
+    for name, title in shown.items():
         console.show_sheet(part.content[name], title)
     figures = summary(result)
     joints = result.joints.items()

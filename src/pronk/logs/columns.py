@@ -30,7 +30,8 @@ class Columns:
     joints: tuple[str, ...] = ()
     """Names of the columns; empty if the file has none."""
     time: Array
-    command: Array
+    command: Array | None
+    """None where the drives were commanded in torque."""
     position: Array
     velocity: Array | None = None
     torque: Array | None = None
@@ -69,7 +70,7 @@ def import_columns(
     full. `scale` gives radians per unit of joints whose unit is unknown, by (new) joint name, for
     command and position; the velocity is left as it is.
     """
-    where = columns.where
+    where, sent = columns.where, columns.command
     unit, time_unit = unit or columns.unit, time_unit or columns.time_unit
     if unit is None:
         raise LogError(
@@ -79,10 +80,16 @@ def import_columns(
     for name, value, known in (("unit", unit, UNITS), ("time_unit", time_unit, TIME_UNITS)):
         if value not in known:
             raise LogError(f"{where}: {name} {value!r}; expected one of {', '.join(known)}.")
+    if sent is None and columns.torque is None:
+        raise LogError(f"{where}: neither a commanded position nor a torque; expected one of them.")
     joints = _named(columns, robot, joint_names, joint_order)
     keep, notes = np.arange(len(columns.time)), list(columns.notes)
+    if sent is None:
+        # A command that stands still excites nothing.
+        sent = np.repeat(columns.position[:1], len(columns.time), axis=0)
+        notes.append("no commanded position, so the drives count as commanded in torque")
     if drop_duplicates and len(keep) > 1:
-        every = (columns.command, columns.position, columns.velocity, columns.torque)
+        every = (sent, columns.position, columns.velocity, columns.torque)
         table = np.column_stack([columns.time, *(v for v in every if v is not None)])
         same = (np.diff(table, axis=0) == 0.0).all(axis=1)
         keep = np.flatnonzero(np.concatenate(([True], ~same)))
@@ -112,7 +119,7 @@ def import_columns(
     factors = np.where(other, 1.0, UNITS[unit])
     rates = np.where([joint in scale for joint in joints], 1.0, factors)
     factors = np.array([scale.get(j, factor) for j, factor in zip(joints, factors, strict=True)])
-    command = columns.command[keep] * factors
+    command = sent[keep] * factors
     # A command that is not finite is refused below, by name.
     if np.isfinite(command).all() and (note := correlation_note(time, command, joints)):
         notes.append(note)
@@ -144,10 +151,11 @@ def _named(
     """Names of the joints, as many as there are columns."""
     where, joints = columns.where, columns.joints
     shape = (len(columns.time), columns.position.shape[-1])
-    if columns.command.shape != shape or columns.position.shape != shape:
+    command = columns.position if columns.command is None else columns.command
+    if command.shape != shape or columns.position.shape != shape:
         raise LogError(
-            f"{where}: time has shape {columns.time.shape}, command {columns.command.shape} and "
-            f"position {columns.position.shape}; expected (n,), (n, joints) and (n, joints)."
+            f"{where}: time has shape {columns.time.shape}, command {command.shape} and position "
+            f"{columns.position.shape}; expected (n,), (n, joints) and (n, joints)."
         )
     stated = ordered(f"{where}: its {shape[1]} columns", shape[1], robot, order, joints)
     names = columns.names if names is None else names

@@ -64,8 +64,9 @@ def read_csv(
     """Read a CSV file; a LogError names the column and row where something is missing.
 
     Columns are called `time`, `command.JOINT`, `position.JOINT`, and optionally `velocity.JOINT`
-    [angle/s] and `torque.JOINT` [N m]. `columns` gives the file's own name for each of them, for
-    instance `{"time": "t", "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`.
+    [angle/s] and `torque.JOINT` [N m]; with torques, commands need not be there. `columns` gives
+    the file's own name for each of them, for instance
+    `{"time": "t", "position.FR_knee": "q3", "command.FR_knee": "q3_des"}`.
     """
     header, rows = read_rows(path)
     given, listed = dict(columns or {}), ", ".join(header)
@@ -77,7 +78,9 @@ def read_csv(
             f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
         )
     joints = tuple(name.partition(".")[2] for name in names if name.startswith("position."))
-    needed = ["time", *(f"command.{joint}" for joint in joints)]
+    by_torque = all(f"torque.{joint}" in names for joint in joints)
+    commanded = [name for name in names if name.startswith("command.")]
+    needed = ["time", *(f"command.{joint}" for joint in joints if commanded or not by_torque)]
     missing = [name for name in needed if name not in names] or ["position.JOINT"] * (not joints)
     if missing:
         raise LogError(
@@ -110,14 +113,15 @@ def read_csv(
         time=numbers("time"),
         row=lambda i: f"row {i + 2}",
         sha256=sha256(path),
-        **found,  # type: ignore[arg-type]
+        **({"command": None} | found),  # type: ignore[arg-type]
     )
 
 
 def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     """Read the arrays `time` (n,), `command` and `position` (n, joints).
 
-    `velocity`, `torque` and `joints` (the names) are read where they are there.
+    `velocity`, `torque` and `joints` (the names) are read where they are there; with `torque`, a
+    `command` need not be.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -134,7 +138,8 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
         # zipfile, zlib and the npy parser fail in many ways on a damaged file.
         reason = f"{type(error).__name__}: {error}"[:120]
         raise LogError(f"{path}: not a readable NPZ file ({reason}).") from error
-    if missing := [n for n in ("time", *QUANTITIES[:2]) if n not in arrays]:
+    needed = ("time", "position", *["command"] * ("torque" not in arrays))
+    if missing := [name for name in needed if name not in arrays]:
         raise LogError(
             f"{path}: no array {', '.join(missing)}; it holds {', '.join(arrays) or 'none'}."
         )
@@ -157,7 +162,7 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
         joints=tuple(str(name) for name in arrays.get("joints", np.empty(0)).reshape(-1)),
         time=time,
         sha256=sha256(path),
-        **found,  # type: ignore[arg-type]
+        **({"command": None} | found),  # type: ignore[arg-type]
     )
 
 

@@ -22,6 +22,23 @@ NAN = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
+class TorqueParameter:
+    """One parameter of a joint's drive, by a torque channel."""
+
+    value: float
+    """NaN if the recordings leave it open."""
+    ci95: tuple[float, float]
+    """95 % interval by blocks of the recordings; NaN where they leave it open."""
+    reason: str = ""
+    """Why it is not identified; empty if it is."""
+
+    @property
+    def identified(self) -> bool:
+        """True if the recordings tell it."""
+        return not self.reason
+
+
+@dataclass(frozen=True, kw_only=True)
 class JointGains:
     """Matched gains of one joint."""
 
@@ -55,6 +72,8 @@ class JointGains:
     """Dry friction that goes with the gains [N m]; NaN: that of the robot's drive."""
     delay_s: float = 0.0
     """Command delay that goes with the gains [s]."""
+    torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
+    """The drive by a torque channel (mode drive): names of `match.torque.UNITS`."""
     flags: tuple[str, ...] = ()
     """Warnings, for instance `at the edge of the grid` or `no match`."""
 
@@ -108,12 +127,14 @@ def _rounded(value: Any) -> Any:
         return float(f"{value:.6g}")
     if isinstance(value, (tuple, list)):
         return [_rounded(v) for v in value]
+    if isinstance(value, Mapping):
+        return {name: _line(one) for name, one in value.items()}
     return value
 
 
 def _omitted(name: str, value: Any) -> bool:
     """True for empty text and tuples, and for optional parameters that are not used."""
-    if value in ((), ""):
+    if value in ((), "", {}):
         return True
     if name in ("frictionloss", "stiffness_total95", "damping_total95"):
         return bool(np.isnan(value).any())

@@ -127,8 +127,11 @@ def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[
     for name in where:
         robot.joint(name)
     if not where:
+        fit = any(log.torque is not None for log in logs)
         raise LogError(
-            f"{len(logs)} logs excite no joint; expected some of {', '.join(robot.joint_names)}."
+            f"{len(logs)} logs excite no joint by a commanded position; expected some of "
+            f"{', '.join(robot.joint_names)}"
+            + ("; --mode drive fits drives to torques." if fit else ".")
         )
     return {name: where[name] for name in robot.joint_names if name in where}
 

@@ -44,6 +44,7 @@ from pronk.match.result import (
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.match.time_fit import TIME_FIT, TimeFit, fit_joint, recorded
+from pronk.match.torque import fit_drives, joint_fits
 from pronk.match.uncertainty import gain_interval
 from pronk.response.estimate import excited_joints
 from pronk.response.response import FrequencyResponse
@@ -89,7 +90,8 @@ def match_logs(
         logs: One or more logs of one robot; a joint may be excited in several.
         robot: The robot.
         mode: `gains` finds stiffness and damping (the paper's); `drive` takes the stiffness for
-            known and fits damping, armature, dry friction and delay.
+            known and fits damping, armature, dry friction and delay, and by a torque channel
+            armature, friction and torque scale.
         free: Parameters to fit in mode `drive` instead, out of `FREE`.
         drive_gains: Gains that were on the real drives, where the logs do not have them.
         settings: How to match; the fit in time if not given.
@@ -107,6 +109,17 @@ def match_logs(
         raise PronkError(f"mode {mode!r}; expected gains or drive.")
     if free and mode != "drive":
         raise PronkError("parameters to fit can be named in mode drive only.")
+    drives, remarks = fit_drives(logs, robot) if mode == "drive" else ({}, {})
+    logs, every = [log for log in logs if excited_joints(log)] or logs, logs
+    if drives and not any(map(excited_joints, logs)):
+        if not (joints := joint_fits(robot, {}, drives, remarks)):
+            raise IdentifiabilityError(
+                f"{len(logs)} logs identify no drive of {', '.join(drives)} by torque; record "
+                "larger or faster motions, at least 10 s of them."
+            )
+        info = mujoco_info(robot)
+        gains = {name: joint.gains() for name, joint in joints.items()}
+        return MatchResult(gains=matched_gains(robot, gains, logs, info), joints={})
     plausibility.require_plausible(logs_by_joint(logs, robot), robot)
     excluded: Mapping[str, str] = {}
     rate = float("nan")
@@ -140,9 +153,10 @@ def match_logs(
                 for name, fit in joints.items():
                     wrong = plausibility.flags(logs, fit, robot, rigs=rigs, goals=found[name])
                     joints[name] = replace(fit, flags=(*fit.flags, *wrong))
+    joints = joint_fits(robot, joints, drives, remarks)
     gains = {name: joint.gains() for name, joint in joints.items()}
     return MatchResult(
-        gains=matched_gains(robot, gains, logs, info),
+        gains=matched_gains(robot, gains, every, info),
         joints={name: joint for name, joint in joints.items() if joint.responses},
         seconds=clock.seconds,
         grid_steps_per_second=rate,

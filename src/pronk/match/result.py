@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.files import load_artefact, save_artefact
-from pronk.match.gains import NAN, JointGains, MatchedGains
+from pronk.match.gains import NAN, JointGains, MatchedGains, TorqueParameter
 from pronk.match.uncertainty import Estimate
 from pronk.response.response import FrequencyResponse
 
@@ -91,6 +91,8 @@ class JointFit:
     """Simulated less recorded position where several joints moved together [rad]."""
     published_rmse: float = float("nan")
     """The same with the robot's published parameters [rad]."""
+    torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
+    """The drive by a torque channel: names of `match.torque.UNITS`."""
     flags: tuple[str, ...] = ()
 
     @classmethod

@@ -24,6 +24,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -32,8 +33,11 @@ from scipy import signal, stats
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
+from pronk.match.gains import TorqueParameter
+from pronk.match.result import JointFit
 from pronk.match.uncertainty import block_moves, jackknife
-from pronk.robots.robot import RobotSpec
+from pronk.robots.model import bench_spec
+from pronk.robots.robot import Drive, RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -63,8 +67,24 @@ _SD_MAX = 0.3
 _PLACES = (0.0, 1.0, -1.0)
 """Point masses that span the inertia of a body: places on the line from its joint through its
 centre of mass, in units of that distance."""
+_LINKS_HOLD = 1.05
+"""Residual with the model's links over that with fitted links up to which the model's hold. On
+simulated logs: 1.002 or less with the right links, 1.14 and more with a link 2 % too heavy, which
+makes the armature of the joint before it 12 % too large."""
+_MOVES_RAD_S = 2.0 * SIGN_RAD_S
+"""Root mean square speed below `FIT_HZ` from which on a joint moves. In sweeps of one joint the
+excited one moves at 0.5 rad/s, its neighbours at 0.01."""
+_MOST_S = 120.0
+"""Recordings of one chain that are used [s]: 48 blocks."""
+_SCALE = (0.5, 2.0)
+"""Torque scale of a sensor on the joint's side of the gear."""
+_AGREE = 0.3
+"""Relative difference of one parameter by torque and by position that is no contradiction."""
+_BOTH = {"armature": ("armature", "kg m^2"), "dry": ("frictionloss", "N m")}
+"""Names by position and units of what is fitted by torque as well."""
 _HELD_FIRST = ("stribeck", "viscous")
 """Terms held at zero where they are not identified, in this order."""
+_STILL = TorqueParameter(value=np.nan, ci95=(np.nan, np.nan), reason="it does not move")
 DRIVE_TERMS = ("armature", "viscous", "dry", "stribeck")
 UNITS = {
     "armature": "kg m^2",
@@ -73,19 +93,6 @@ UNITS = {
     "stribeck": "N m",
     "scale": "1",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class TorqueParameter:
-    """One parameter of a joint's drive."""
-
-    value: float
-    """NaN if the recordings leave it open."""
-    ci95: tuple[float, float]
-    """95 % interval by blocks of the recordings."""
-    identified: bool
-    reason: str = ""
-    """Why it is not identified."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +130,12 @@ class Motion:
     """[rad/s^2], shape (n, joints)."""
     torque: Array
     """[N m], shape (n, joints)."""
+
+    def moves(self) -> NDArray[np.bool_]:
+        """Which joints move enough for their friction to be known, shape (joints,)."""
+        rate_hz = 1.0 / float(self.time[1] - self.time[0])
+        slow = low_passed(self.velocity, rate_hz, FIT_HZ)
+        return np.asarray(np.sqrt(np.mean(slow**2, axis=0)) > _MOVES_RAD_S)
 
 
 def low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> Array:
@@ -162,22 +175,26 @@ def motion(log: JointLog, joints: Sequence[str]) -> Motion:
 
 
 class TorqueModel:
-    """Columns of the equation of motion of a robot with a fixed base."""
+    """Columns of the equation of motion of a chain of joints with a fixed base."""
 
     def __init__(
-        self, robot: RobotSpec, *, links_known: bool, shared: Sequence[Sequence[str]] = ()
+        self,
+        robot: RobotSpec,
+        joint: str,
+        *,
+        links_known: bool,
+        shared: Sequence[Sequence[str]] = (),
     ) -> None:
         """Choose what is fitted.
 
         Args:
             robot: Geometry, and the links' inertia if known.
+            joint: The joint whose chain is meant; the base is fixed.
             links_known: Hold the links as the model has them, and fit the torque scale.
             shared: Groups of joints with the same actuator: one armature for each group.
         """
-        self.model = robot.build_spec().compile()
+        self.model = bench_spec(robot, joint).compile()
         self.joints = tuple(self.model.joint(i).name for i in range(self.model.njnt))
-        if self.model.nv != self.model.njnt:
-            raise LogError("the torque fit is for robots with a fixed base and hinges.")
         self.links_known = links_known
         groups = {name: tuple(group) for group in shared for name in group}
         self.armature_of = {name: groups.get(name, (name,)) for name in self.joints}
@@ -251,9 +268,11 @@ class TorqueModel:
 def fit_torque(
     logs: Sequence[JointLog],
     robot: RobotSpec,
+    joint: str,
     *,
     links_known: bool,
     shared: Sequence[Sequence[str]] = (),
+    most_s: float = np.inf,
 ) -> TorqueFit:
     """Fit armature and friction, and the torque scale or the links.
 
@@ -261,31 +280,33 @@ def fit_torque(
     `BLOCK_S` of a recording.
 
     Args:
-        logs: Recordings with torque, every joint in each.
-        robot: A robot with a fixed base.
+        logs: Recordings with torque, every joint of the chain in each, the base fixed.
+        robot: The robot.
+        joint: The joint whose chain is fitted.
         links_known: Hold the links as the model has them, and fit the torque scale.
         shared: Groups of joints with the same actuator.
+        most_s: Beginning of each log that is used [s].
 
     Raises:
         LogError: A log has no torque or is too slow, or there are fewer than three blocks.
     """
-    model = TorqueModel(robot, links_known=links_known, shared=shared)
+    model = TorqueModel(robot, joint, links_known=links_known, shared=shared)
     columns, torques, numbers, first = [], [], [], 0
     for log in logs:
         moved = motion(log, model.joints)
-        rate = log.rate_hz
-        every = max(1, round(rate / RATE_HZ))
-        thin = [v[::every] for v in (moved.position, moved.velocity, moved.acceleration)]
-        step = rate / every
-        full = low_passed(model.regressor(*thin), step, FIT_HZ)
-        torque = low_passed(moved.torque[::every], step, FIT_HZ)
+        every = max(1, round(log.rate_hz / RATE_HZ))
+        step, used = log.rate_hz / every, slice(0, int(min(most_s, 1e6) * log.rate_hz), every)
+        full = model.regressor(moved.position[used], moved.velocity[used], moved.acceleration[used])
+        full, torque = low_passed(full, step, FIT_HZ), low_passed(moved.torque[used], step, FIT_HZ)
         # Both sides end at FIT_HZ, and the ends hold the transients of the filters.
         keep = slice(round(0.1 * step), -round(0.1 * step), max(1, int(step / (4.0 * FIT_HZ))))
-        time = moved.time[::every][keep] - moved.time[0]
-        count = max(round((moved.time[-1] - moved.time[0]) / BLOCK_S), 1)
-        share = np.minimum((time / (moved.time[-1] - moved.time[0]) * count).astype(int), count - 1)
-        columns.append(full[keep])
-        torques.append(torque[keep])
+        time = moved.time[used] - moved.time[0]
+        count = max(round(time[-1] / BLOCK_S), 1)
+        share = np.minimum((time[keep] / time[-1] * count).astype(int), count - 1)
+        # What friction holds a joint at that stands still is not known.
+        moves = moved.moves()
+        columns.append(np.where(moves[:, None], full[keep], 0.0))
+        torques.append(np.where(moves, torque[keep], 0.0))
         numbers.append(first + share)
         first += count
     if first < 3:
@@ -299,13 +320,115 @@ def fit_torque(
             (joint, term)
             for term in _HELD_FIRST
             for joint in model.joints
-            if (joint, term) not in held and not found.joints[joint][term].identified
+            if (joint, term) not in held
+            and not (one := found.joints[joint][term]).identified
+            and one is not _STILL
         ]
         if not unknown:
             return found
         for joint, term in unknown:
             if term == unknown[0][1]:
                 held[joint, term] = found.joints[joint][term]
+
+
+def fit_drives(
+    logs: Sequence[JointLog], robot: RobotSpec
+) -> tuple[dict[str, dict[str, TorqueParameter]], dict[str, str]]:
+    """Fit the drives of every chain whose joints all have torque in some of the logs.
+
+    The links are the model's if these explain the torque as well as fitted ones, and their torque
+    is not hidden by friction. Else they are fitted, joints with equal drives share one armature,
+    and the torque scale is left open.
+
+    Returns:
+        Parameters by joint, and by joint what is to be known of them.
+    """
+    found: dict[str, dict[str, TorqueParameter]] = {}
+    flags: dict[str, str] = {}
+    roots: dict[tuple[str, ...], str] = {}
+    for name in robot.joint_names:
+        inside = [joint for joint in robot.joints if name in joint.chain]
+        longest = max(inside, key=lambda joint: len(joint.chain))
+        roots.setdefault(longest.chain, longest.name)
+    for chain, root in roots.items():
+        mine = [log for log in logs if set(chain) <= set(log.joints) and _usable(log, chain)]
+        if sum(float(np.ptp(log.time)) for log in mine) < 3.0 * BLOCK_S:
+            continue
+        by_drive: dict[Drive, list[str]] = {}
+        for name in chain:
+            by_drive.setdefault(robot.joint(name).drive, []).append(name)
+        fit = partial(fit_torque, mine, robot, root, most_s=_MOST_S / len(mine))
+        known = fit(links_known=True)
+        fitted = fit(links_known=False, shared=list(by_drive.values()))
+        wrong = bool((known.rms > _LINKS_HOLD * fitted.rms).any())
+        for j, (name, own) in enumerate(known.joints.items()):
+            scale = own["scale"]
+            if scale is _STILL:
+                continue
+            if wrong:
+                reason = (
+                    f"the model's links leave {1e3 * known.rms[j]:.0f} mN m of the torque "
+                    f"unexplained, fitted ones {1e3 * fitted.rms[j]:.0f} mN m"
+                )
+                scale = replace(fitted.joints[name]["scale"], reason=reason)
+            elif scale.identified and not _SCALE[0] < scale.value < _SCALE[1]:
+                flags[name] = f"its torque column is {scale.value:.3g} of the joint's torque"
+            drive = own if scale.identified else fitted.joints[name]
+            found[name] = {**drive, "scale": scale}
+    return found, flags
+
+
+def joint_fits(
+    robot: RobotSpec,
+    fits: Mapping[str, JointFit],
+    drives: Mapping[str, Mapping[str, TorqueParameter]],
+    flags: Mapping[str, str],
+) -> dict[str, JointFit]:
+    """Fits by position with the drives by torque; the arguments are those of `fit_drives`.
+
+    Joints that were not fitted by position have the gains of the robot's file, and the armature and
+    dry friction that torque identifies.
+    """
+    out = dict(fits)
+    for name in (name for name in robot.joint_names if name in drives):
+        known, own = robot.joint(name), drives[name]
+        armature, dry = (own[term].value if own[term].identified else None for term in _BOTH)
+        found = [flags[name]] if name in flags else []
+        if name in fits:
+            for term, (parameter, unit) in _BOTH.items():
+                value, one = getattr(fits[name], parameter), own[term]
+                apart = abs(one.value - value) > _AGREE * value and parameter in fits[name].ci95
+                if one.identified and apart and not one.ci95[0] <= value <= one.ci95[1]:
+                    found.append(
+                        f"{parameter} {value:.3g} {unit} by position, {one.value:.3g} by torque"
+                    )
+        elif any(one.identified for one in own.values()):
+            out[name] = JointFit(
+                joint=name,
+                stiffness=known.stiffness,
+                damping=known.damping,
+                armature=known.drive.armature if armature is None else armature,
+                frictionloss=np.nan if dry is None else dry,
+                covariance=np.zeros((2, 2)),
+            )
+            held = ["stiffness", "damping", *["armature"] * (armature is None)]
+            found.append(f"{', '.join(held)}: not fitted but those of the robot's file")
+        if name in out:
+            out[name] = replace(out[name], torque=own, flags=(*out[name].flags, *found))
+    return {name: out[name] for name in robot.joint_names if name in out}
+
+
+def _usable(log: JointLog, chain: Sequence[str]) -> bool:
+    """True if a log has torque with its sign, fast enough, of joints in radians."""
+    if log.torque is None or log.rate_hz < 4.0 * MOTION_HZ:
+        return False
+    torque = log.torque[:, [log.column(name) for name in chain]]
+    # Torques that are never negative are magnitudes.
+    return (
+        bool(torque.min() < 0.0)
+        and all(log.unit(name) == "rad" for name in chain)
+        and bool(motion(log, chain).moves().any())
+    )
 
 
 def _solve(
@@ -317,7 +440,7 @@ def _solve(
 ) -> TorqueFit:
     """Least squares with some parameters at zero; `held` has them as they were last fitted."""
     design = design * np.array([name not in held for name in model.names])
-    weight = np.ones(goal.shape[1])
+    weight, counts = np.ones(goal.shape[1]), design.any(axis=2).sum(axis=0)
     for _ in range(_PASSES):
         rows = (design * weight[:, None]).reshape(-1, design.shape[2])
         sought = (goal * weight).ravel()
@@ -328,15 +451,22 @@ def _solve(
         reduced = left[:, :rank] * singular[:rank]
         best = (left[:, :rank].T @ sought) / singular[:rank]
         x = right[:rank].T @ best / size
-        rms = np.sqrt(np.mean((design @ x - goal) ** 2, axis=0))
+        rms = np.sqrt(np.sum((design @ x - goal) ** 2, axis=0) / np.maximum(counts, 1))
         weight = 1.0 / np.maximum(rms, 1e-9)
     moves = block_moves(reduced, reduced @ best - sought, blocks)
     spread = right[:rank].T @ jackknife(moves) @ right[:rank] / np.outer(size, size)
     # Share of each (scaled) parameter that moves along combinations without effect.
     open_share = np.sqrt(np.maximum(1.0 - np.sum(right[:rank] ** 2, axis=0), 0.0))
-    joints = {
-        name: _parameters(model, name, x, spread, open_share, len(moves)) for name in model.joints
-    }
+    joints = {}
+    for j, name in enumerate(model.joints):
+        # Known links fill one column a joint, the first ones.
+        own = design[:, j, [c for c in range(len(x)) if c != j]]
+        left = design[:, j, j] - own @ np.linalg.lstsq(own, design[:, j, j], rcond=None)[0]
+        if not counts[j]:
+            joints[name] = dict.fromkeys(UNITS, _STILL)
+            continue
+        apart = float(np.sqrt(np.sum(left**2) / counts[j]))
+        joints[name] = _parameters(model, name, x, spread, open_share, len(moves), apart)
     for (joint, term), last in held.items():
         reason = f"held at 0: {last.reason}"
         joints[joint][term] = replace(last, value=0.0, reason=reason)
@@ -346,18 +476,25 @@ def _solve(
 
 
 def _parameters(
-    model: TorqueModel, joint: str, x: Array, covariance: Array, open_share: Array, blocks: int
+    model: TorqueModel,
+    joint: str,
+    x: Array,
+    covariance: Array,
+    open_share: Array,
+    blocks: int,
+    apart: float,
 ) -> dict[str, TorqueParameter]:
-    """Every parameter of one joint, the scale divided out where it was fitted."""
-    quantile = float(stats.t.ppf(0.975, blocks - 1))
+    """Every parameter of one joint, the scale divided out where it was fitted.
+
+    `apart` is the torque of the links [N m] that no other term of the joint has.
+    """
+    quantile, dry = float(stats.t.ppf(0.975, blocks - 1)), x[model.names.index((joint, "dry"))]
     out = {}
     scale_at = model.names.index((joint, "scale")) if model.links_known else None
     for term in ("scale", *DRIVE_TERMS):
         if term == "scale" and scale_at is None:
             reason = "needs links of known mass: it is one with the unit of all masses"
-            out[term] = TorqueParameter(
-                value=np.nan, ci95=(-np.inf, np.inf), identified=False, reason=reason
-            )
+            out[term] = TorqueParameter(value=np.nan, ci95=(np.nan, np.nan), reason=reason)
             continue
         owner = model.armature_of[joint][0] if term == "armature" else joint
         at = model.names.index((owner, term))
@@ -370,18 +507,17 @@ def _parameters(
         sd = max(float(gradient @ covariance @ gradient), 0.0) ** 0.5
         reason = ""
         if open_share[at] > _NULL:
-            reason = "the motion does not tell it from the links' inertia"
-            value, sd = np.nan, np.inf
+            reason = (
+                "the motion does not tell it from the links' inertia (joints whose drives are "
+                "equal in robot.yaml share one armature)"
+            )
+            value = sd = np.nan
         elif not sd <= _SD_MAX * abs(value):
             reason = f"standard deviation {sd:.2g} {UNITS[term]}"
-        elif value < 0.0 and term in ("armature", "viscous", "dry"):
+        elif value < 0.0 and term != "stribeck":
             reason = "negative: the model does not hold"
-        half = quantile * sd
-        interval = (value - half, value + half) if np.isfinite(half) else (-np.inf, np.inf)
-        out[term] = TorqueParameter(
-            value=float(value),
-            ci95=(float(interval[0]), float(interval[1])),
-            identified=not reason,
-            reason=reason,
-        )
+        elif term == "scale" and value * apart < dry:
+            reason = f"dry friction, {dry:.2g} N m, hides {value * apart:.2g} N m of the links"
+        ends = float(value - quantile * sd), float(value + quantile * sd)
+        out[term] = TorqueParameter(value=float(value), ci95=ends, reason=reason)
     return out

@@ -15,8 +15,10 @@ from pronk.files import write_text
 from pronk.match import gains as gains_file
 from pronk.match import result as result_file
 from pronk.match.gains import MatchedGains
+from pronk.match.parameters import PARAMETERS
 from pronk.match.predict import Prediction, load_prediction
 from pronk.match.result import HELD_OUT, ZERO_ARMATURE, JointFit, MatchResult
+from pronk.match.torque import UNITS
 from pronk.report import figures
 from pronk.report.page import Part, page
 from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
@@ -107,7 +109,7 @@ def part(path: Path, gains: str | None = None) -> Part:
     """
     gains_path = path.parent / gains if gains else find_gains(path.parent)
     result = result_file.load(path, gains_file.load(gains_path))
-    own, found = result.gains, verdict(result)
+    own, found, drives = result.gains, verdict(result), drives_table(result)
     fits = {name: fit for name, fit in result.joints.items() if fit.responses}
     # Without a grid several joints moved at once and were fitted in time.
     in_time = not any(fit.grid_error.size for fit in result.joints.values())
@@ -122,6 +124,7 @@ def part(path: Path, gains: str | None = None) -> Part:
         "where": "the virtual robot" if own.virtual else "the robot",
         "in_time": in_time,
         "gains_table": gains_table(own, in_time),
+        "drives": drives,
         "held_out": _held_out_table(result),
         "overview": picture(figures.overview(fits)) if fits else None,
         "bode": {name: picture(figures.bode(fits[name])) for name in order},
@@ -148,7 +151,9 @@ def part(path: Path, gains: str | None = None) -> Part:
         kind="match",
         title=f"Match of {own.robot}",
         virtual=own.virtual,
-        summary=f"{found['matched']} of {found['joints']} joints matched.",
+        summary=f"{found['matched']} of {found['joints']} joints matched."
+        if result.joints or not drives.rows
+        else f"Drives of {found['joints']} joints fitted by torque.",
         warning=found["matched"] < found["joints"] or bool(found["flags"]),
         content=content,
         figures=found,
@@ -196,6 +201,31 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
             "set so that a match by magnitude lands near it."
         )
     return table(columns, rows, *notes)
+
+
+def drives_table(result: MatchResult) -> Sheet:
+    """Every fitted parameter of each joint with its interval, by position and by torque."""
+    rows = []
+    for name, joint in result.gains.joints.items():
+        found: list[tuple[str, str, float, tuple[float, float], str]] = []
+        if fit := result.joints.get(name):
+            for one in (one for one in PARAMETERS if one in fit.ci95):
+                value = getattr(fit, "delay_s" if one == "delay" else one, np.nan)
+                ends = fit.total95.get(one, fit.ci95[one])
+                found.append((one, PARAMETERS[one].unit, value, ends, "position"))
+        for term, by in joint.torque.items():
+            words = "torque" if by.identified else f"not identified by torque: {by.reason}"
+            found.append((term, UNITS[term], by.value if by.identified else np.nan, by.ci95, words))
+        for term, unit, value, ends, words in found:
+            known = np.isfinite(value)
+            cells = (f"{value:.4g}", "{:.4g} to {:.4g}".format(*ends)) if known else ("-", "-")
+            rows.append((joint_words(name), f"{term} [{unit}]", *cells, words))
+    return table(
+        "joint | parameter | value | 95 % | by",
+        rows,
+        "scale: torque column over the joint's torque. dry and viscous: friction of the joint. "
+        "Where the scale is not identified, values by torque are in the column's unit of torque.",
+    )
 
 
 def _held_out_table(result: MatchResult) -> Sheet:
