@@ -146,12 +146,12 @@ def match_logs(
             robot, info = rigs.robot, rigs.info
             found, on_drive = _measured(logs, robot, chosen, clock)
             if mode == "drive":
-                joints = _match_drives(rigs, logs, found, on_drive, fitted, clock)
+                joints, fits = _match_drives(rigs, logs, found, on_drive, fitted, clock)
             else:
-                joints, rate = _match_gains(rigs, logs, found, on_drive, chosen, clock)
+                joints, fits, rate = _match_gains(rigs, logs, found, on_drive, chosen, clock)
             with clock.stage("plausibility"):
                 for name, fit in joints.items():
-                    wrong = plausibility.flags(logs, fit, robot, rigs=rigs, goals=found[name])
+                    wrong = plausibility.flags(logs, fit, robot, fits.get(name))
                     joints[name] = replace(fit, flags=(*fit.flags, *wrong))
     joints = joint_fits(robot, joints, drives, remarks)
     gains = {name: joint.gains() for name, joint in joints.items()}
@@ -211,14 +211,14 @@ def _match_drives(
     on_drive: Mapping[str, Pair],
     fitted: tuple[str, ...],
     clock: _Clock,
-) -> dict[str, JointFit]:
+) -> tuple[dict[str, JointFit], dict[str, TimeFit]]:
     """Mode drive: fit the drive of every joint, if the sweeps can separate its parameters."""
     for name, goals in found.items():
         require_sweeps(rigs.robot, name, goals, fitted)
-    joints = {}
+    joints, fits = {}, {}
     with clock.stage("time fit"):
         for name, goals in found.items():
-            fit = _fit_in_time(rigs, logs, name, fitted, on_drive[name])
+            fit = fits[name] = _fit_in_time(rigs, logs, name, fitted, on_drive[name])
             if unknown := fit.estimate.unidentified:
                 raise IdentifiabilityError(
                     f"{name}: these logs do not identify the {unknown[0]} (deviation "
@@ -232,7 +232,7 @@ def _match_drives(
             matched, naive = responses(rigs, requests, whole=True)
             joints[name] = _time_joint_fit(rigs.robot, goals, fit, matched, naive)
             clock.report(len(joints) / len(found))
-    return joints
+    return joints, fits
 
 
 def _nominal(robot: RobotSpec, name: str, on_drive: Pair) -> dict[str, float]:
@@ -262,10 +262,11 @@ def _match_gains(
     on_drive: Mapping[str, Pair],
     settings: MatchSettings,
     clock: _Clock,
-) -> tuple[dict[str, JointFit], float]:
+) -> tuple[dict[str, JointFit], dict[str, TimeFit], float]:
     """Search by the paper's magnitude and, with method `time`, fit in time from there.
 
-    Also returns physics steps per second of the grid; NaN where it was not searched whole.
+    Also returns the fits in time by joint, and physics steps per second of the grid; NaN where it
+    was not searched whole.
     """
     main = [goals[0] for goals in found.values()]
     grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
@@ -325,7 +326,7 @@ def _match_gains(
                 naive[k],
                 zero.get(name),
             )
-    return joints, rate
+    return joints, fitted, rate
 
 
 def _drive(rigs: JointRigs, values: Mapping[str, float]) -> dict[str, float]:
