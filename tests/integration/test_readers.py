@@ -256,6 +256,8 @@ def test_exact_duplicates_can_be_dropped_and_are_mentioned(tmp_path: Path) -> No
     path.write_text("\n".join(text))
     with pytest.raises(LogError, match="row 10 repeats the timestamp"):
         read_log(path, unit="rad")
+    done = invoke(["response", path, "--unit", "rad", "--drop-duplicates"])
+    assert "repeats the timestamp" not in done.stderr
     back = read_log(path, unit="rad", drop_duplicates=True)
     np.testing.assert_array_equal(back.time, log.time)
     assert any(note.startswith("3 rows") for note in back.notes)
@@ -453,7 +455,7 @@ def test_a_bag_folder_and_commands_of_another_type(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "command_topic is missing"),
+        ({}, "--command-topic"),
         ({"command_topic": "/elsewhere"}, "no commands on /elsewhere"),
         ({"measured_topic": "/imu", "command_topic": "/joint_command"}, "no sensor_msgs.* on /imu"),
         ({"command_topic": "/joint_command", "command_field": "velocity"}, "the 0 values"),

@@ -84,6 +84,8 @@ class Reading:
     """THEIRS=OURS for joints of other names; repeat it."""
     joint_order: str | None = None
     """NAME,NAME,... of columns without joint names (PACE); default for the robot's order."""
+    drop_duplicates: bool = False
+    """Drop rows that repeat the one before in full."""
     scale: tuple[str, ...] = ()
     """JOINT=RADIANS per unit, for a joint that is not in radians; repeat it."""
     rate_hz: float | None = None
@@ -111,6 +113,7 @@ class Reading:
         options = vars(self) | {
             "format": self.log_format,
             "columns": _pairs("--columns", self.columns),
+            "drop_duplicates": self.drop_duplicates or None,
             "joint_names": _pairs("--joint-names", self.joint_names),
             "scale": _pairs("--scale", self.scale, float),
             **_pairs("--reader-option", self.reader_options),

@@ -122,7 +122,7 @@ def check_unit(time: Array, where: str, unit: str) -> None:
         key=lambda name: abs(np.log(rates[name] / 500.0)),
     )
     hint = (
-        f"the timestamps are probably in {likely[0]} (time_unit={likely[0]!r})"
+        f"the timestamps are probably in {likely[0]} (--time-unit {likely[0]}, or convert them)"
         if likely
         else "no unit of time fits them"
     )
@@ -135,14 +135,14 @@ def check_unit(time: Array, where: str, unit: str) -> None:
 def check_rate(timing: Timing, where: str, expected_hz: float) -> None:
     """Refuse an expected rate that differs from the measured one; the LogError gives both."""
     if not (np.isfinite(expected_hz) and expected_hz > 0.0):
-        raise LogError(f"{where}: rate_hz is {expected_hz}; expected a positive number.")
+        raise LogError(f"{where}: --rate-hz {expected_hz}; expected a positive number.")
     # Lost samples do not make the clock slow.
     measured = (timing.samples + timing.lost - 1) / timing.duration_s
     if abs(measured / expected_hz - 1.0) > RATE_TOLERANCE:
         late = abs(timing.samples / expected_hz - timing.samples / measured)
         raise LogError(
-            f"{where}: rate_hz is {expected_hz:g} and the timestamps come at {measured:.2f} Hz "
-            f"({late:.2f} s apart by the end); leave rate_hz out to use the timestamps."
+            f"{where}: --rate-hz {expected_hz:g}, but the timestamps come at {measured:.2f} Hz "
+            f"({late:.2f} s apart by the end); leave --rate-hz out to use the timestamps."
         )
 
 
@@ -200,7 +200,7 @@ def check_radians(log: JointLog, joint: str) -> None:
     what = f"its command swings by {peak:.3g}" if swings else f"it reaches {farthest:.3g}"
     raise LogError(
         f"{log.source or 'log'}: {joint} is read in radians and {what}, more than a joint "
-        "turns; the file is probably in degrees (unit='deg')."
+        "turns; the file is probably in degrees (--unit deg, or convert it)."
     )
 
 

@@ -75,11 +75,11 @@ def import_columns(
     if unit is None:
         raise LogError(
             f"{where}: the file does not say whether its angles are radians or degrees; give "
-            "unit='rad' or unit='deg'."
+            "--unit rad or --unit deg."
         )
-    for name, value, known in (("unit", unit, UNITS), ("time_unit", time_unit, TIME_UNITS)):
+    for name, value, known in (("--unit", unit, UNITS), ("--time-unit", time_unit, TIME_UNITS)):
         if value not in known:
-            raise LogError(f"{where}: {name} {value!r}; expected one of {', '.join(known)}.")
+            raise LogError(f"{where}: {name} {value}; expected one of {', '.join(known)}.")
     if sent is None and columns.torque is None:
         raise LogError(f"{where}: neither a commanded position nor a torque; expected one of them.")
     joints = _named(columns, robot, joint_names, joint_order)
@@ -108,9 +108,7 @@ def import_columns(
     scale = scale or {}
     for joint, factor in scale.items():
         if joint not in joints:
-            raise LogError(
-                f"{where}: a scale is given for {joint}; the joints are {', '.join(joints)}."
-            )
+            raise LogError(f"{where}: --scale names {joint}; the joints are {', '.join(joints)}.")
         if not (np.isfinite(factor) and factor != 0.0):
             raise LogError(f"{where}: the scale of {joint} is {factor}; expected a number.")
     # A scale defines the unit of position; the velocity beside it may be an angle already.
@@ -161,7 +159,8 @@ def _named(
     names = columns.names if names is None else names
     if unknown := [name for name in names or {} if name not in stated]:
         raise LogError(
-            f"{where}: joint_names renames {', '.join(unknown)}; the file has {', '.join(stated)}."
+            f"{where}: --joint-names renames {', '.join(unknown)}; the joints are "
+            f"{', '.join(stated)}."
         )
     return tuple((names or {}).get(joint, joint) for joint in stated)
 

@@ -74,7 +74,7 @@ def read_csv(
     names |= given
     if wrong := [name for name in given if not _is_ours(name)]:
         raise LogError(
-            f"{path}: columns names {wrong[0]!r}; expected time, or a quantity and a joint, for "
+            f"{path}: --columns names {wrong[0]!r}; expected time, or a quantity and a joint, for "
             f"instance position.FR_knee (quantities: {', '.join(QUANTITIES)})."
         )
     joints = tuple(name.partition(".")[2] for name in names if name.startswith("position."))
@@ -85,7 +85,7 @@ def read_csv(
     if missing:
         raise LogError(
             f"{path}: no column called {', '.join(missing)}; the header is {listed}; "
-            f"say which it is with columns={{{missing[0]!r}: ...}}."
+            f"say which it is with --columns {missing[0]}=NAME."
         )
     for name, theirs in names.items():
         if header.count(theirs) != 1:

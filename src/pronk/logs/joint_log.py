@@ -172,7 +172,7 @@ def check_increasing(time: Array, where: str, row: Callable[[int], str]) -> None
     if steps[i - 1] == 0.0:
         raise LogError(
             f"{where}: {row(i)} repeats the timestamp {time[i]:.9g} of the one before; timestamps "
-            "must increase (drop_duplicates=True drops rows that repeat the one before in full)."
+            "must increase (--drop-duplicates drops rows that repeat the one before in full)."
         )
     raise LogError(
         f"{where}: time goes back in {row(i)}, from {time[i - 1]:.9g} to {time[i]:.9g}; sort or "

@@ -168,8 +168,8 @@ def read_mcap(
         )
     if measured_topic or command_topic or joint_order not in (None, "default"):
         raise LogError(
-            f"{path}: a log of pronk needs no measured_topic, command_topic or joint_order; leave "
-            "them out."
+            f"{path}: a log of pronk needs no --measured-topic, --command-topic or --joint-order; "
+            "leave them out."
         )
     try:
         return _read_sweep(path, found, damage)

@@ -53,12 +53,12 @@ def read_joint_states(
     if topics.get(measured_topic) != JOINT_STATE:
         raise LogError(
             f"{path}: no {JOINT_STATE} on {measured_topic}; it holds {listed}; name the topic "
-            "with measured_topic."
+            "with --measured-topic."
         )
     if command_topic is None:
         raise LogError(
-            f"{path}: command_topic is missing; the file holds {listed}; name the topic of the "
-            "commands (and command_field where the positions are not in `position`)."
+            f"{path}: --command-topic is missing; the file holds {listed}; name the topic of the "
+            "commands (and --command-field where the positions are not in `position`)."
         )
     if command_topic not in topics or command_topic == measured_topic:
         raise LogError(f"{path}: no commands on {command_topic}; it holds {listed}.")
@@ -161,14 +161,14 @@ def _values(
             raise LogError(
                 f"{path}: messages on {topic} have no field {field!r} (at {part!r}"
                 + (f"; there are {', '.join(slots)}" if slots else "")
-                + "); name it with command_field."
+                + "); name it with --command-field."
             ) from None
     try:
         numbers = tuple(math.nan if math.isinf(number) else float(number) for number in value)
     except TypeError:
         raise LogError(
             f"{path}: field {field!r} of the messages on {topic} is not a list of numbers; name "
-            "another with command_field."
+            "another with --command-field."
         ) from None
     names = getattr(message, "name", None) or getattr(message, "joint_names", None) or ()
     return tuple(map(str, names)), numbers

@@ -127,7 +127,7 @@ def command_trace(log: JointLog, segment: Segment, joint: str, robot: RobotSpec)
     if log.unit(joint) != "rad":
         raise LogError(
             f"{where}: {joint} is in unit {log.unit(joint)!r}; the simulator needs radians, so "
-            "give the scale to the reader."
+            "give --scale JOINT=RADIANS."
         )
     part = log.cut(segment)
     command = part.command[:, part.column(joint)]
