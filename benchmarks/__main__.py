@@ -15,6 +15,7 @@ SUMMARIES = {
     "coverage": "How often the 95 % intervals hold.",
     "wrong-inputs": "How often wrong inputs are named, and right ones flagged.",
     "latency": "Lateness of the control loop, and policy latency.",
+    "supervision": "False alarms and detection times of the sensors' supervision.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",
 }

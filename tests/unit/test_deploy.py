@@ -415,9 +415,18 @@ def test_a_latched_fault_needs_a_reset_and_another_its_second() -> None:
 
 def stream(**changes: Any) -> list[State]:
     rng = np.random.default_rng(0)
-    return [
+    states = [
         state(**({"time": k / 500, "sequence": k, "gyro": 0.01 * rng.standard_normal(3)} | changes))
         for k in range(250)
+    ]
+    noise = 1e-6 * rng.standard_normal((250, 7))
+    return [
+        replace(
+            each,
+            accelerometer=each.accelerometer + row[:3],
+            orientation=each.orientation + row[3:],
+        )
+        for each, row in zip(states, noise, strict=True)
     ]
 
 
@@ -433,6 +442,14 @@ def at(index: int, value: float, values: np.ndarray = LYING) -> np.ndarray:
     array = values.copy()
     array[index] = value
     return array
+
+
+@pytest.mark.parametrize("name", ["gyro", "accelerometer", "orientation"])
+def test_a_source_that_has_stopped_keeps_the_robot_from_moving(name: str) -> None:
+    first, *others = stream()
+    value = getattr(first, name)
+    (why,) = found([replace(each, **{name: value}) for each in (first, *others)])
+    assert name in why
 
 
 def test_a_robot_at_rest_may_move() -> None:

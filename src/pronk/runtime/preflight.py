@@ -72,6 +72,11 @@ def _stream(states: Sequence[State], limits: Limits, now: float, seconds: float)
             "no number changed in all states, not even the gyro's noise; the sensors or the "
             "program that reads them have stopped."
         )
+    elif seconds >= 0.1 and len(states) > 10 and np.isfinite(limits.tilt):
+        for name in ("gyro", "accelerometer", "orientation"):
+            values = np.array([getattr(state, name) for state in states])
+            if (values == values[0]).all():
+                yield f"the {name} did not change in all states; it has stopped, restart the robot."
     for name in ("position", "velocity", "gyro", "accelerometer", "orientation"):
         if not np.isfinite([getattr(state, name) for state in states]).all():
             yield f"the states' {name} holds something that is not a number; restart the robot."

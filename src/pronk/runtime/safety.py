@@ -5,15 +5,17 @@ have an order, that of its table of faults: the first that is met gives the reas
 unchanged, or its target is moved into the range that all limits allow, or it is replaced by
 damping. Gains are never changed: a robot with another stiffness is not the one that was matched.
 
-`SafetyFilter` judges the states and the command of a tick by these rules. A fault damps for at
-least one second; a latched fault needs the operator's reset.
+`SafetyFilter` judges the states and the command of a tick by these rules, and the states so far by
+`Supervision`: whether they can all be true. A fault damps for at least one second; a latched fault
+needs the operator's reset.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import NamedTuple
@@ -26,6 +28,7 @@ from pronk.errors import RobotError
 from pronk.links.machine import Command, State
 from pronk.robots.robot import RobotSpec
 from pronk.runtime import TILT
+from pronk.runtime.supervision import Supervision
 
 
 class FilterAction(IntEnum):
@@ -78,6 +81,11 @@ class Reason(IntEnum):
     ENDED = 20, "the operator's program has ended"
     LINK = 21, "the link reports a fault"
     OVERLOAD = 22, "a joint's measured torque is beyond its limit"
+    REPEATED = 23, "a sensor of the trunk repeats its numbers; it or its program has stopped"
+    ATTITUDE = 24, "attitude, gyro and accelerometer contradict each other"
+    ENCODER = 25, "a joint's position and velocity contradict each other or its load"
+    HELD = 26, "states were too old, and the last target held, for too much of a second"
+    CLIPPED = 27, "a joint's target was beyond its torque for too long; the joint may be blocked"
 
 
 Array = NDArray[np.float64]
@@ -104,6 +112,8 @@ class Limits:
     """Speed at which that torque is zero [rad/s]."""
     loss: Array
     """Winding loss per square of the joint's torque [W / (N m)^2]."""
+    felt: Array
+    """Change of the commanded torque that a joint shows by a bit at least [N m]."""
     measured_torque: float = math.inf
     """Largest measured torque of a joint, as a multiple of `torque`; infinite where it is not
     checked: a policy's landings exceed it for some milliseconds."""
@@ -137,6 +147,27 @@ class Limits:
     """Age of the state from which the fault is latched [s]."""
     future_s: float = 0.005
     """A state or command stamped farther ahead than this is of another clock [s]."""
+    held_s: float = 0.1
+    """Longest that targets are held in any second [s]."""
+    clipped_s: float = 0.3
+    """Longest that targets are limited by torque, twice the longest of a jumping policy [s]."""
+    repeat_s: float = 0.04
+    """Longest that attitude, gyro or accelerometer may repeat: an attitude of LCM may be 20 ms old.
+    Also the time from which a constant position or velocity counts [s]."""
+    attitude: float = 0.06
+    """Between attitude and integral of the gyro; twice the largest [rad]."""
+    turned: float = 0.03
+    """Integral of the gyro from which the attitude must have moved too, by a quarter of it; the
+    least is nine tenths [rad]."""
+    upright: float = 0.5
+    """Between the mean specific force and the attitude's vertical; twice the largest of 15 minutes
+    that include falls [rad]."""
+    encoder: float = 0.18
+    """Between position and integral of velocity; the largest is 0.09 with a third of the states
+    lost, 0.01 with all of them [rad]."""
+    moved: float = 0.01
+    """Integral of velocity at a constant position, or the reverse; half of it where all are
+    constant [rad]."""
     expiry_s: float = 0.05
     """Longest that any command is repeated, whatever its own validity [s]."""
     lag: int = 30
@@ -145,13 +176,13 @@ class Limits:
 
     def __post_init__(self) -> None:
         n = len(self.joints)
-        for field in fields(self)[1:]:
-            value = getattr(self, field.name)
-            if field.type == "Array":
+        for entry in fields(self)[1:]:
+            value = getattr(self, entry.name)
+            if entry.type == "Array":
                 if np.shape(value) != (n,) or not np.isfinite(value).all():
-                    raise RobotError(f"Limits.{field.name} is {value}; expected {n} numbers.")
-            elif not value > 0 or (math.isinf(value) and field.name not in _UNLIMITED):
-                raise RobotError(f"Limits.{field.name} is {value}; it must be positive.")
+                    raise RobotError(f"Limits.{entry.name} is {value}; expected {n} numbers.")
+            elif not value > 0 or (math.isinf(value) and entry.name not in _UNLIMITED):
+                raise RobotError(f"Limits.{entry.name} is {value}; it must be positive.")
         if not (self.high - self.low > 2.0 * self.margin).all():
             raise RobotError("Limits.margin leaves nothing between low and high; make it smaller.")
         if not self.hold_s <= self.damp_s <= self.latch_s:
@@ -193,6 +224,9 @@ class Limits:
             stall=np.array([drive.stall_torque for drive in drives]),
             no_load=no_load,
             loss=np.array(loss, dtype=float),
+            # From one direction of slip to the other dry friction takes up twice its size; that
+            # again for a drive whose friction is twice the nominal.
+            felt=np.array([0.05 * d.effort_limit + 4.0 * d.frictionloss for d in drives]),
             **changed,  # type: ignore[arg-type]
         )
 
@@ -404,6 +438,10 @@ def _torque_and_power(
     return torque, work, loss
 
 
+_STUCK = 0.25
+"""Least path of an attitude, as a share of the integral of the gyro."""
+_ALL = 0.5
+"""Share of a joint's limit that holds where all joints are constant."""
 LEAST_DAMPING_S = 1.0
 """Shortest time that a fault damps [s]."""
 
@@ -434,6 +472,18 @@ class SafetyFilter:
     """When it began [s]."""
     last: Array | None = None
     """The target sent a tick ago [rad], (joints,); None after damping."""
+    supervision: Supervision = field(init=False)
+    """Of the states since the last damping."""
+    _ticks: deque[tuple[float, float]] = field(init=False, default_factory=deque)
+    """Time of ticks that held within the last second, and time since the tick before [s]."""
+    _judged: float | None = None
+    """Time of the last tick [s]; None after damping."""
+    _clipped: float = 0.0
+    """Time for which targets have been limited by torque [s]."""
+
+    def __post_init__(self) -> None:
+        """Begin without a state."""
+        self.supervision = Supervision(len(self.limits.joints))
 
     @property
     def faulted(self) -> bool:
@@ -455,6 +505,8 @@ class SafetyFilter:
     def damped(self) -> Decision:
         """Note a tick without a target; the next one is limited to near the measured position."""
         self.last = None
+        self.supervision.begin()
+        self._judged, self._clipped = None, 0.0
         return Decision(self.level, self.reason)
 
     def judge(
@@ -470,13 +522,45 @@ class SafetyFilter:
         faulted = result.level >= _DAMP
         row = int(np.argmax(faulted)) if faulted.any() else -1
         level, reason = FilterAction(int(result.level[row])), Reason(int(result.reason[row]))
+        detail = ""
+        if level >= _DAMP:
+            detail = _detail(reason, states[row], command, self.limits, t)
+        elif not self.faulted:
+            wrong = self._implausible(states) or self._persistent(level, reason, t)
+            if wrong is not None:
+                level, reason, detail = wrong
         if self.faulted or level >= _DAMP:
-            detail = "" if self.faulted else _detail(reason, states[row], command, self.limits, t)
+            detail = "" if self.faulted else detail
             if level >= _DAMP:
                 self.fault(level, reason, t)
             return None, self.damped()._replace(detail=detail)
         self.last = result.target[-1]
+        self.supervision.command(np.asarray(command.stiffness) * self.last)
         return replace(command, position=self.last), Decision(level, reason)
+
+    def _implausible(self, states: Sequence[State]) -> Decision | None:
+        """Supervise the new states; the first fault."""
+        for state in states:
+            self.supervision.observe(state)
+            found = _contradiction(self.supervision, self.limits)
+            if found is not None:
+                return Decision(_LATCH, *found)
+        return None
+
+    def _persistent(self, level: FilterAction, reason: Reason, t: float) -> Decision | None:
+        """Note a tick that holds or limits; a fault if it has been so for too long."""
+        seconds = 0.0 if self._judged is None else t - self._judged
+        self._judged = t
+        while self._ticks and self._ticks[0][0] < t - 1.0:
+            self._ticks.popleft()
+        if level is FilterAction.HOLD:
+            self._ticks.append((t, seconds))
+            if (held := sum(each for _, each in self._ticks)) > self.limits.held_s:
+                return Decision(_DAMP, Reason.HELD, f"{1e3 * held:.0f} ms")
+        self._clipped = self._clipped + seconds if reason is Reason.TORQUE else 0.0
+        if self._clipped > self.limits.clipped_s:
+            return Decision(_LATCH, Reason.CLIPPED, f"{1e3 * self._clipped:.0f} ms")
+        return None
 
     def _input(
         self, states: Sequence[State], command: Command, t: float, held: bool
@@ -513,6 +597,41 @@ def _rows(rows: Sequence[object], count: int) -> Array:
     if len(rows) == 1 or all(row is None for row in rows):
         return np.full((len(rows), count), np.nan)
     return np.concatenate([_rows([row], count) for row in rows])
+
+
+def _contradiction(seen: Supervision, limits: Limits) -> tuple[Reason, str] | None:
+    """What states say against each other, and the numbers; None if nothing."""
+    joints, n = limits.joints, len(limits.joints)
+    if math.isfinite(limits.tilt):  # else the trunk is fixed, and a robot may have no such unit
+        for name, seconds in seen.repeated.items():
+            if seconds > limits.repeat_s:
+                return Reason.REPEATED, f"{name}, for {1e3 * seconds:.0f} ms"
+        if seen.attitude > limits.attitude:
+            return Reason.ATTITUDE, f"the gyro's integral is {seen.attitude:.2f} rad off"
+        path, turned = seen.paths
+        if turned > limits.turned and path < _STUCK * turned:
+            return Reason.ATTITUDE, f"it is stuck while the gyro's integral is {turned:.2f} rad"
+        if (lean := seen.lean) > limits.upright:
+            return Reason.ATTITUDE, f"the mean specific force is {lean:.2f} rad off the vertical"
+    if (seen.encoder > limits.encoder).any():
+        i = int(np.argmax(seen.encoder))
+        return Reason.ENCODER, f"{joints[i]}, by {seen.encoder[i]:.2f} rad"
+    constant = (seen.constant_s > limits.repeat_s).reshape(2, n)
+    if not constant.any():
+        return None
+    share = np.where(constant.all(axis=1), _ALL, 1.0)[:, None]
+    excess = np.where(constant, seen.moved.reshape(2, n) / (limits.moved * share), 0.0)
+    if (excess > 1.0).any():
+        kind, i = divmod(int(np.argmax(excess)), n)
+        which = ("position", "velocity")[kind]
+        return Reason.ENCODER, f"{joints[i]}, whose {which} is constant"
+    unmoved = constant.all(axis=0) & (seen.load > limits.felt * share.max())
+    if math.isinf(limits.tilt):  # a robot on its stand may be simulated without some of its legs
+        unmoved &= seen.live
+    if unmoved.any():
+        i = int(np.argmax(unmoved))
+        return Reason.ENCODER, f"{joints[i]}, constant while {seen.load[i]:.1f} N m were added"
+    return None
 
 
 def _detail(reason: Reason, state: State, command: Command, limits: Limits, t: float) -> str:

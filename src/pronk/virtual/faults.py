@@ -9,13 +9,15 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
 from msgspec import Meta
 
 from pronk.errors import HardwareError
+from pronk.links.machine import State
 from pronk.virtual.bounds import Bounded
 
 T = TypeVar("T")
@@ -46,6 +48,60 @@ class ChannelFaults(Bounded):
     """That one bit of a message is inverted."""
 
 
+_JOINT = 3
+"""Joint of the faults of one encoder: the second leg's first, whose load changes least."""
+_DITHER = 1e-4
+"""Share of the live attitude in one that is stuck, so that it does not repeat."""
+
+
+def _held(*names: str) -> Callable[[State, State], dict[str, Any]]:
+    """Sources that repeat what they measured last."""
+    return lambda last, state: {name: getattr(last, name) for name in names}
+
+
+def _encoder(last: State, state: State, *, position: float, velocity: float) -> dict[str, Any]:
+    q, v = state.position.copy(), state.velocity.copy()
+    q[_JOINT], v[_JOINT] = position, velocity
+    return {"position": q, "velocity": v}
+
+
+def _stuck(last: State, state: State) -> dict[str, Any]:
+    attitude = last.orientation + _DITHER * state.orientation
+    return {"orientation": attitude / np.linalg.norm(attitude)}
+
+
+def _swapped(_last: State, state: State) -> dict[str, Any]:
+    """The first leg's joints and the second's."""
+    order = [3, 4, 5, 0, 1, 2, *range(6, len(state.position))]
+    names = ("position", "velocity", "torque")
+    return {name: getattr(state, name)[order] for name in names}
+
+
+SENSOR_FAULTS: dict[str, Callable[[State, State], dict[str, Any]]] = {
+    "imu-repeats": _held("orientation", "gyro", "accelerometer"),
+    "attitude-repeats": _held("orientation"),
+    "gyro-repeats": _held("gyro"),
+    "accelerometer-repeats": _held("accelerometer"),
+    "positions-repeat": _held("position"),
+    "velocities-repeat": _held("velocity"),
+    "joints-repeat": _held("position", "velocity"),
+    "attitude-stuck": _stuck,
+    "gyro-zero": lambda last, state: {"gyro": np.zeros(3)},
+    "velocities-zero": lambda last, state: {"velocity": np.zeros_like(state.velocity)},
+    "encoder-jumps": lambda last, state: _encoder(
+        last, state, position=state.position[_JOINT] + 1.0, velocity=state.velocity[_JOINT]
+    ),
+    "encoder-zero": lambda last, state: _encoder(
+        last, state, position=0.0, velocity=state.velocity[_JOINT]
+    ),
+    "encoder-constant": lambda last, state: _encoder(
+        last, state, position=last.position[_JOINT], velocity=last.velocity[_JOINT]
+    ),
+    "legs-swapped": _swapped,
+}
+"""What a faulty sensor makes of a state, from the last state before the fault and this one."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Faults:
     """Faults of a machine behind a link. Times on the machine's clock."""
@@ -63,14 +119,21 @@ class Faults:
     """When the robot's own clock jumps, and by how much [s]."""
     rival: float | None = None
     """When another program begins to command the joints [s]."""
+    sensor: tuple[str, float] | None = None
+    """One of `SENSOR_FAULTS`, and when it begins [s]."""
+
+
+def spoiled(fault: str, last: State, state: State) -> State:
+    """A state as a sensor with one of `SENSOR_FAULTS` makes it; `last` is from before the fault."""
+    return replace(state, **SENSOR_FAULTS[fault](last, state))
 
 
 def parse_faults(text: str) -> Faults:
     """Read faults such as `loss=0.3,state.delay=5ms,freeze=3s:0.5s`; refuse unknown words.
 
     Fields of `ChannelFaults` are of both directions unless `command.` or `state.` stands before
-    them; `after=T`, `rival=T`, `freeze=T:LENGTH` and `clock=T:STEP` are of the machine. Numbers
-    without a unit are in seconds.
+    them; `after=T`, `rival=T`, `freeze=T:LENGTH`, `clock=T:STEP` and `sensor=T:FAULT`, a name of
+    `SENSOR_FAULTS`, are of the machine. Numbers without a unit are in seconds.
     """
     channels: dict[str, dict[str, float]] = {"command": {}, "state": {}}
     whole: dict[str, Any] = {}
@@ -85,10 +148,13 @@ def parse_faults(text: str) -> Faults:
             whole[name] = _number(word, value)
         elif name in ("freeze", "clock") and value.count(":") == 1:
             whole[name] = tuple(_number(word, part) for part in value.split(":"))
+        elif name == "sensor" and value.partition(":")[2] in SENSOR_FAULTS:
+            whole[name] = (value.partition(":")[2], _number(word, value.partition(":")[0]))
         else:
             raise HardwareError(
                 f"fault {word!r} is unknown; expected {', '.join(known)} (both directions, or with "
-                "command. or state. before it), after=T, rival=T, freeze=T:LENGTH, clock=T:STEP."
+                "command. or state. before it), after=T, rival=T, freeze=T:LENGTH, clock=T:STEP, "
+                f"sensor=T:FAULT with FAULT one of {', '.join(SENSOR_FAULTS)}."
             )
     command, state = (ChannelFaults(**channels[name]) for name in ("command", "state"))
     return Faults(command=command, state=state, **whole)

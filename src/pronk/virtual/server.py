@@ -24,7 +24,7 @@ from pronk.links.machine import Command, Machine, RefusedError, State, damping_c
 from pronk.links.realtime import Histogram
 from pronk.robots.robot import RobotSpec
 from pronk.virtual.bounds import Bounded
-from pronk.virtual.faults import FaultChannel, Faults, flip_bit
+from pronk.virtual.faults import FaultChannel, Faults, flip_bit, spoiled
 
 Corrupt = Callable[[bytes], bytes]
 
@@ -128,6 +128,8 @@ class RobotServer:
         self._contended = -math.inf
         self._clamps: tuple[str, ...] = ()
         self._frozen: State | None = None
+        self._sound: State | None = None
+        """The last state before a sensor's fault."""
         self._slipped, self._worked = 0.0, time.process_time()
         self._late = Histogram()
         wire.corrupt_in = partial(self._flip, self._commands)
@@ -217,6 +219,10 @@ class RobotServer:
             state = replace(self._frozen, time=state.time, sequence=state.sequence)
         else:
             self._frozen = None
+        if faults.sensor is not None and now < faults.sensor[1]:
+            self._sound = state
+        elif faults.sensor is not None:
+            state = spoiled(faults.sensor[0], self._sound or state, state)
         if self._states.strikes("nan", now):
             name = _BROKEN_FIELDS[self._states.pick(len(_BROKEN_FIELDS))]
             values = getattr(state, name).copy()
