@@ -265,6 +265,30 @@ def test_two_robots_on_one_domain_are_refused() -> None:
         DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.0, fresh=FRESH).connect()
 
 
+def test_a_second_robot_that_begins_later_stops_the_commands() -> None:
+    network = own_network(1)
+    wires = [DdsServerTransport(ROBOT, domain=network.domain) for _ in range(2)]
+    robot, later = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",)), Event()
+    robot.connect()
+    states = iter(robot.wait(120.0))
+
+    def speak() -> None:
+        for wire in wires[: 2 if later.is_set() else 1]:
+            wire.poll()
+            wire.publish(next(states))
+        time.sleep(0.002)
+
+    machine = DdsMachine(ROBOT, domain=network.domain, exclusive_s=0.0, fresh=FRESH)
+    with meanwhile(speak):
+        machine.connect()
+        machine.send(HOLD)
+        later.set()
+        assert eventually(lambda: machine.sources == 2)
+        with pytest.raises(HardwareError, match="2 robots"):
+            machine.send(HOLD)
+        machine.close()
+
+
 def test_networks() -> None:
     assert DdsNetwork().domain == 77
     assert DdsNetwork(interface="eth7").domain == 0

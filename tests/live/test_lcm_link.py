@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -29,7 +30,9 @@ from pronk.links.lcm.link import LcmMachine, url_of
 from pronk.links.link import Freshness
 from pronk.links.machine import Command, State
 from pronk.robots import load_robot
-from pronk.virtual.robot import hold_of
+from pronk.virtual.lcm_server import LcmServerTransport
+from pronk.virtual.robot import VirtualRobot, hold_of
+from pronk.virtual.sim_params import load_sim_params
 
 pytestmark = pytest.mark.live
 
@@ -183,6 +186,35 @@ def test_commands_of_other_programs_are_refused(servers: dict[str, Process]) -> 
         machine.wait(machine.now() + 0.01)
     with pytest.raises(HardwareError, match="another program"):
         machine.send(HOLD)
+    machine.close()
+
+
+def test_a_second_robot_on_the_port_is_refused(servers: dict[str, Process]) -> None:
+    process = servers["cheetah"]
+    wire, done = LcmServerTransport(ROBOT, port=process.port), threading.Event()
+    robot = VirtualRobot(ROBOT, load_sim_params(), legs=("FR",))
+    robot.connect()
+    states = itertools.cycle(robot.wait(1.0))
+
+    def speak() -> None:
+        begun, sent = time.monotonic(), 0
+        while not done.wait(0.002):
+            # At a mean of 400 Hz, however late this thread is.
+            while sent < 400.0 * (time.monotonic() - begun):
+                wire.publish(next(states))
+                sent += 1
+
+    other = threading.Thread(target=speak)
+    other.start()
+    machine = LcmMachine(ROBOT, port=process.port, fresh=Freshness(share=0.02, longest_gap_s=10.0))
+    try:
+        with pytest.raises(HardwareError, match="600 states a second"):
+            machine.connect()
+    finally:
+        done.set()
+        other.join()
+    assert machine.counts["commands"] == 0
+    machine.connect()
     machine.close()
 
 

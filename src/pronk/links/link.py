@@ -47,6 +47,11 @@ _LEAST_DAMP_S, _MOST_DAMP_S = 1.0, 3.0
 _AT_REST = 0.5
 """Joint speed below which a damped robot counts as at rest [rad/s]."""
 _KEPT_STATES = 10_000
+_MOST_RATE, _RATE_S = 1.2, 1.0
+"""Largest share of the robot's rate at which states may come, and the time over which it is
+counted, in which a pause of this computer of 0.2 s with the burst after it passes [s]."""
+_MOST_DROPPED = 0.2
+"""Share of the states that may be out of order before a robot is commanded."""
 _MEASURED = ("position", "velocity", "gyro", "accelerometer")
 """Of a live sensor these never repeat to the last bit."""
 # A robot's count that went back by more than this belongs to a robot that was started again; one
@@ -299,6 +304,7 @@ class NetworkLink(ABC):
         self._exclusive_s, self._fresh = exclusive_s, fresh or Freshness()
         self._latest: State | None = None
         self._states: deque[State] = deque(maxlen=_KEPT_STATES)
+        self._arrivals: deque[float] = deque()
 
     def connect(self) -> None:
         """Open the link and check that states come and no other program commands. 1 or 2 s.
@@ -309,6 +315,8 @@ class NetworkLink(ABC):
         self.virtual, self._latest, self._last_error = False, None, ""
         self.counts.clear()
         self._states.clear()
+        most = 1 + round(_MOST_RATE * _RATE_S * self.state_rate_hz)
+        self._arrivals = deque(maxlen=most)
         self._writer = CommandWriter(
             *self._open(),
             damping=damping_command(len(self._robot.joints), self._damping),
@@ -406,13 +414,33 @@ class NetworkLink(ABC):
                 )
 
     def check_exclusive(self) -> None:
-        """Raise HardwareError if another program has commanded since the link was opened."""
+        """Raise HardwareError if another program commands, or another robot sends states.
+
+        That is judged from when the link was opened.
+        """
         if foreign := self.foreign_commands:
             raise HardwareError(
                 f"another program commands the joints: {foreign} commands on "
                 f"{self._command_topic}; stop that program, or release the robot's own controller, "
                 "and connect again."
             )
+        sources, crowded = self.sources, self.counts["crowded"]
+        if sources > 1 or crowded:
+            found = (
+                f"{sources} robots or programs send states"
+                if sources > 1
+                else f"more than {_MOST_RATE * self.state_rate_hz:.0f} states a second come"
+            )
+            raise HardwareError(
+                f"{found} on {self._address}, expected one that sends "
+                f"{self.state_rate_hz:.0f} a second; switch the others off, or take another port "
+                "or domain, and connect again."
+            )
+
+    @property
+    def sources(self) -> int:
+        """Senders of states since the link was opened; 1 where the wire does not tell."""
+        return 1
 
     @property
     def foreign_commands(self) -> int:
@@ -438,6 +466,12 @@ class NetworkLink(ABC):
         self.fresh_states(self.state_rate_hz, until=begun + 2.0 * RESPONSE_S)
         time.sleep(max(0.0, silent_from + self._exclusive_s - time.monotonic()))
         self.check_exclusive()
+        if self.counts["out of order"] > max(10.0, _MOST_DROPPED * self.counts["states"]):
+            raise HardwareError(
+                f"{self.counts['out of order']} of {self.counts['states']} states on "
+                f"{self._address} are out of order, as of two robots; switch one off, or take "
+                "another port or domain."
+            )
         self._confirm()
         self.wait(0.0)
 
@@ -457,6 +491,10 @@ class NetworkLink(ABC):
             self._latest = state
             self._states.append(state)
             self.counts["states"] += 1
+            arrivals, now = self._arrivals, time.monotonic()
+            arrivals.append(now)
+            if len(arrivals) == arrivals.maxlen and now - arrivals[0] < _RATE_S:
+                self.counts["crowded"] += 1
 
     # --- the wire -------------------------------------------------------------------------------
 
