@@ -138,5 +138,13 @@ def test_stairs_and_a_chirp_that_is_cut_are_excitations(other: np.ndarray) -> No
     assert excited_joints(log) == ("FR_hip_roll", "FR_knee")
 
 
+def test_noise_of_another_command_is_no_excitation() -> None:
+    made = log_of(("FR_knee", CHIRP))
+    command = made.command + 1e-4 * np.random.default_rng(0).random(made.command.shape) * [1, 1, 0]
+    log = with_segments(replace(made, command=command))
+    assert excited_joints(log) == ("FR_knee",)
+    assert not moves_together(log)
+
+
 def test_a_log_that_stands_still_has_no_excitation() -> None:
     assert with_segments(log_of(("FR_knee", np.zeros(2000)))).segments == ()

@@ -20,6 +20,8 @@ from pronk.logs.joint_log import JointLog, Segment
 
 Array = NDArray[np.float64]
 
+MOVED_RAD = 1e-3
+"""Least travel of a command that excites a joint: two counts of a 12-bit encoder."""
 REST_S = 0.4
 """Least rest between two motions [s]: twice what the estimator takes for rest."""
 SHORTEST_S = 8.0
@@ -112,7 +114,7 @@ def _motions(log: JointLog) -> list[_Motion]:
     out = []
     for column, command in enumerate(log.command.T):
         moves = np.flatnonzero(np.abs(np.diff(command)) > _STILL * np.ptp(command))
-        if len(moves):
+        if len(moves) and np.ptp(command) >= MOVED_RAD:
             rests = np.flatnonzero(log.time[moves[1:]] - log.time[moves[:-1] + 1] >= REST_S)
             firsts, lasts = moves[np.append(0, rests + 1)], moves[np.append(rests, -1)] + 1
             pairs = zip(firsts.tolist(), lasts.tolist(), strict=True)
