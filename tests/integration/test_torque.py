@@ -11,8 +11,8 @@ import pytest
 
 from benchmarks.ak80 import DATA, FITTED, HELD_OUT, JOINTS, RIG, fitted, read, rig, run
 from command_line import invoke
-from pronk.errors import LogError
-from pronk.logs.joint_log import JointLog
+from pronk.errors import IdentifiabilityError, LogError
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.readers import read_log
 from pronk.match import gains, match_logs
 from pronk.match.torque import TorqueFit, fit_drives, fit_torque
@@ -108,6 +108,26 @@ def test_pendulum_of_a_fit_has_its_torque(logs: list[JointLog]) -> None:
 def test_a_log_without_torque_is_refused(logs: list[JointLog]) -> None:
     with pytest.raises(LogError, match="no torque channel"):
         fit_torque([replace(logs[0], torque=None)], rig(), JOINTS[0], links_known=True)
+
+
+def shortened(log: JointLog, seconds: float) -> JointLog:
+    whole = Segment(kind="unknown", joints=JOINTS, start=0.0, stop=seconds, amplitude=np.nan)
+    return log.cut(whole)
+
+
+def test_torque_that_cannot_be_used_is_named(logs: list[JointLog]) -> None:
+    for log, reason in (
+        (replace(logs[0], torque=np.abs(logs[0].torque)), "magnitudes"),  # type: ignore[arg-type]
+        (replace(logs[0], time=5.0 * logs[0].time), "Hz, fewer than 160"),
+        (replace(logs[0], position=0.0 * logs[0].position), "no joint moves"),
+        (shortened(logs[0], 7.0), "less than 7.5"),
+    ):
+        drives, flags = fit_drives([log], rig())
+        assert drives == {}
+        assert reason in flags["elbow"]
+    still, size = 0.0 * logs[0].command, np.abs(logs[0].torque)  # type: ignore[arg-type]
+    with pytest.raises(IdentifiabilityError, match="magnitudes"):
+        match_logs([replace(logs[0], command=still, torque=size)], rig(), mode="drive")
 
 
 def heavier(factor: float) -> RobotSpec:

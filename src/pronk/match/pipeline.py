@@ -111,11 +111,12 @@ def match_logs(
         raise PronkError("parameters to fit can be named in mode drive only.")
     drives, remarks = fit_drives(logs, robot) if mode == "drive" else ({}, {})
     logs, every = [log for log in logs if excited_joints(log)] or logs, logs
-    if drives and not any(map(excited_joints, logs)):
+    if (drives or remarks) and not any(map(excited_joints, logs)):
         if not (joints := joint_fits(robot, {}, drives, remarks)):
+            reasons = "; ".join(dict.fromkeys(remarks.values()))
             raise IdentifiabilityError(
-                f"{len(logs)} logs identify no drive of {', '.join(drives)} by torque; record "
-                "larger or faster motions, at least 10 s of them."
+                f"{len(logs)} logs excite no joint by a commanded position and identify no drive "
+                f"by torque: {reasons or 'record larger or faster motions'}."
             )
         info = mujoco_info(robot)
         gains = {name: joint.gains() for name, joint in joints.items()}

@@ -351,8 +351,15 @@ def fit_drives(
         longest = max(inside, key=lambda joint: len(joint.chain))
         roots.setdefault(longest.chain, longest.name)
     for chain, root in roots.items():
-        mine = [log for log in logs if set(chain) <= set(log.joints) and _usable(log, chain)]
-        if sum(float(np.ptp(log.time)) for log in mine) < 3.0 * BLOCK_S:
+        mine = [log for log in logs if log.torque is not None and set(chain) <= set(log.joints)]
+        if not mine:
+            continue
+        reasons = [_unusable(log, chain) for log in mine]
+        mine = [log for log, reason in zip(mine, reasons, strict=True) if not reason]
+        length = sum(float(np.ptp(log.time)) for log in mine)
+        if length < 3.0 * BLOCK_S:
+            reason = f"{length:.3g} s, less than {3.0 * BLOCK_S:g}" if mine else reasons[0]
+            flags |= dict.fromkeys(chain, f"torque not used: {reason}")
             continue
         by_drive: dict[Drive, list[str]] = {}
         for name in chain:
@@ -389,46 +396,47 @@ def joint_fits(
     Joints that were not fitted by position have the gains of the robot's file, and the armature and
     dry friction that torque identifies.
     """
-    out = dict(fits)
-    for name in (name for name in robot.joint_names if name in drives):
-        known, own = robot.joint(name), drives[name]
-        armature, dry = (own[term].value if own[term].identified else None for term in _BOTH)
+    out = {}
+    for known in robot.joints:
+        name, own = known.name, drives.get(known.name, {})
         found = [flags[name]] if name in flags else []
-        if name in fits:
-            for term, (parameter, unit) in _BOTH.items():
-                value, one = getattr(fits[name], parameter), own[term]
-                apart = abs(one.value - value) > _AGREE * value and parameter in fits[name].ci95
-                if one.identified and apart and not one.ci95[0] <= value <= one.ci95[1]:
+        told = {term: own[term].value for term in _BOTH if term in own and own[term].identified}
+        fit = fits.get(name)
+        if fit:
+            for term, value in told.items():
+                parameter, unit = _BOTH[term]
+                other, (low, high) = getattr(fit, parameter), own[term].ci95
+                apart = not low <= other <= high and abs(value - other) > _AGREE * other
+                if parameter in fit.ci95 and apart:
                     found.append(
-                        f"{parameter} {value:.3g} {unit} by position, {one.value:.3g} by torque"
+                        f"{parameter} {other:.3g} {unit} by position, {value:.3g} by torque"
                     )
         elif any(one.identified for one in own.values()):
-            out[name] = JointFit(
+            fit = JointFit(
                 joint=name,
                 stiffness=known.stiffness,
                 damping=known.damping,
-                armature=known.drive.armature if armature is None else armature,
-                frictionloss=np.nan if dry is None else dry,
+                armature=told.get("armature", known.drive.armature),
+                frictionloss=told.get("dry", np.nan),
                 covariance=np.zeros((2, 2)),
             )
-            held = ["stiffness", "damping", *["armature"] * (armature is None)]
+            held = ["stiffness", "damping", *["armature"] * ("armature" not in told)]
             found.append(f"{', '.join(held)}: not fitted but those of the robot's file")
-        if name in out:
-            out[name] = replace(out[name], torque=own, flags=(*out[name].flags, *found))
-    return {name: out[name] for name in robot.joint_names if name in out}
+        if fit:
+            out[name] = replace(fit, torque=own, flags=(*fit.flags, *found))
+    return out
 
 
-def _usable(log: JointLog, chain: Sequence[str]) -> bool:
-    """True if a log has torque with its sign, fast enough, of joints in radians."""
-    if log.torque is None or log.rate_hz < 4.0 * MOTION_HZ:
-        return False
-    torque = log.torque[:, [log.column(name) for name in chain]]
-    # Torques that are never negative are magnitudes.
-    return (
-        bool(torque.min() < 0.0)
-        and all(log.unit(name) == "rad" for name in chain)
-        and bool(motion(log, chain).moves().any())
-    )
+def _unusable(log: JointLog, chain: Sequence[str]) -> str:
+    """Why the torques of a log cannot be used."""
+    assert log.torque is not None
+    if log.rate_hz < 4.0 * MOTION_HZ:
+        return f"{log.rate_hz:.0f} Hz, fewer than {4.0 * MOTION_HZ:.0f}"
+    if log.torque[:, [log.column(name) for name in chain]].min() >= 0.0:
+        return "no torque is negative, so they are magnitudes"
+    if any(log.unit(name) != "rad" for name in chain):
+        return "a joint of the chain is not in radians"
+    return "" if motion(log, chain).moves().any() else "no joint moves enough"
 
 
 def _solve(

@@ -220,12 +220,12 @@ def drives_table(result: MatchResult) -> Sheet:
             known = np.isfinite(value)
             cells = (f"{value:.4g}", "{:.4g} to {:.4g}".format(*ends)) if known else ("-", "-")
             rows.append((joint_words(name), f"{term} [{unit}]", *cells, words))
-    return table(
-        "joint | parameter | value | 95 % | by",
-        rows,
+    note = (
         "scale: torque column over the joint's torque. dry and viscous: friction of the joint. "
-        "Where the scale is not identified, values by torque are in the column's unit of torque.",
+        "Where the scale is not identified, values by torque are in the column's unit of torque."
     )
+    by_torque = any(joint.torque for joint in result.gains.joints.values())
+    return table("joint | parameter | value | 95 % | by", rows, *[note] * by_torque)
 
 
 def _held_out_table(result: MatchResult) -> Sheet:
