@@ -33,6 +33,7 @@ KNOWN = {
         "damping": 0.75 + 0.1 * i,
         "armature": 0.02 + 0.004 * i,
         "frictionloss": 0.1 + 0.05 * i,
+        "stribeck": 0.15 * i,
         "delay": 0.008 + 0.002 * i,
     }
     for i, name in enumerate(JOINTS)
@@ -76,12 +77,33 @@ def test_known_drives_are_recovered_from_all_joints_moving_at_once() -> None:
         assert joint.damping == pytest.approx(known["damping"], rel=0.03)
         assert joint.armature == pytest.approx(known["armature"], rel=0.08)
         assert joint.frictionloss == pytest.approx(known["frictionloss"], rel=0.05)
+        assert joint.stribeck == pytest.approx(known["stribeck"], abs=0.08)
         assert joint.delay_s == pytest.approx(known["delay"], abs=1e-3)
         assert joint.rmse < 1e-3 < joint.published_rmse
 
 
+@pytest.mark.parametrize("speed", [0.05, 0.15, 0.6])
+def test_dry_friction_falls_with_speed(speed: float) -> None:
+    stiffness, damping, dry, share = 18.0, 1.5, 0.2, 0.8
+    drive = {"stiffness": stiffness, "damping": damping, "frictionloss": dry, "stribeck": share}
+    lag = []
+    for sign in (1.0, -1.0):  # gravity, which hardly loads this joint, pulls one way
+        log = commands(4.0, (0.2, 3.0), 0.0)
+        command = log.command.copy()
+        command[:, -1] = sign * speed * log.time
+        with ChainSimulation(ARM, [replace(log, command=command)]) as bench:
+            position = bench.run([{"wrist_roll": drive}])[0][0][:, 0]
+        lag.append(sign * (command[-1, -1] - position[-1]))
+    falls = 1.0 - share * (
+        1.0 - np.exp(-((speed / ARM.joint("wrist_roll").drive.stribeck_speed) ** 2))
+    )
+    # Each command is held for four steps of 5 ms: on average it is 7.5 ms old at their starts.
+    torque = stiffness * (np.mean(lag) - 0.0075 * speed) - damping * speed
+    assert torque == pytest.approx(dry * falls, abs=0.01)
+
+
 def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
-    log = recorded_with_known_drives(commands(65.0, (0.05, 0.4), 0.1))
+    log = recorded_with_known_drives(commands(65.0, (0.03, 0.2), 0.1))
     with pytest.raises(IdentifiabilityError, match=r"armature.*a sweep to higher frequencies"):
         fit_together([log], ARM, DRIVE_MODE, most_held=0)
 

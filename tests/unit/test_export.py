@@ -8,10 +8,13 @@ import pytest
 
 from pronk.actuator.model import torque_limits
 from pronk.errors import PronkError
+from pronk.logs.joint_log import JointLog
 from pronk.match.export import EXPORTS, export_text, group_drives
 from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.predict import drives_of
 from pronk.match.ranges import group_gains
 from pronk.robots import load_robot
+from pronk.simulators.chain import ChainSimulation
 from pronk.simulators.simulator import SimulatorInfo
 
 ROBOT = load_robot("mini_cheetah")
@@ -133,3 +136,32 @@ def test_unknown_target_and_foreign_robot_are_refused() -> None:
         export_text(matched(), "gazebo")
     with pytest.raises(PronkError, match="so101"):
         group_drives(matched(), load_robot("so101"))
+
+
+def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> None:
+    arm, gains = load_robot("so101"), matched("so101", frictionloss=0.2, stribeck=0.6)
+    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf"))
+    drives = drives_of(arm, gains)
+    for name, group in gains.groups.items():
+        drives[name] |= {"stiffness": group.stiffness, "damping": group.damping}
+    start = np.array([joint.default_position for joint in arm.joints])
+    time = arm.timestep_s * np.arange(400)
+    command = start + 0.2 * np.sin(2.0 * np.pi * time[:, None] * np.linspace(0.5, 1.0, len(start)))
+    log = JointLog(
+        robot="so101",
+        joints=arm.joint_names,
+        time=time,
+        command=command,
+        position=np.tile(start, (len(time), 1)),
+    )
+    with ChainSimulation(arm, [log], threads=1) as chain:
+        expected = chain.run([drives])[0][0]
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    for target, position in zip(command, expected, strict=True):
+        assert data.qpos == pytest.approx(position, abs=1e-5)
+        data.ctrl[:] = target
+        mujoco.mj_step(model, data)
+    for target in ("mjlab", "isaaclab"):
+        assert "elbow_flex 0.6" in export_text(gains, target)
+        assert "elbow_flex 0.6" not in export_text(matched("so101"), target)

@@ -32,7 +32,7 @@ from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
 from pronk.response.estimate import estimate as estimate_response
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import ChainSimulation, branches, published
+from pronk.simulators.chain import ChainSimulation, branches, has_stribeck, published
 from pronk.simulators.mujoco import Drives
 
 Array = NDArray[np.float64]
@@ -50,7 +50,9 @@ _PLAIN = ("stiffness", "damping", "delay")
 _ROUNDS = 15
 _SETTLED = 1e-3
 """Relative change of cost or parameters that ends the search: far below the intervals."""
-_HOLD_FIRST = ("armature", "stiffness", "delay", "offset", "frictionloss", "damping")
+_HOLD_FIRST = (
+    *("stribeck", "armature", "stiffness", "delay", "offset", "frictionloss", "damping"),
+)
 """Of several parameters that cannot be distinguished, the first of these is held."""
 _COHERENT = 0.95
 _SEGMENT_S = 5.0
@@ -217,10 +219,19 @@ def _fit_chain(
         problem = ArmProblem(arm, used, names, nominal, begin, count_runs)
         return problem, solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
 
+    free = {
+        j: tuple(
+            n
+            for n in PARAMETERS
+            if n in names
+            or (n == "stribeck" and "frictionloss" in names and has_stribeck(arm.robot, j))
+        )
+        for j in arm.joints
+    }
     held: dict[str, tuple[str, ...]] = dict.fromkeys(arm.joints, ())
     found: dict[str, dict[str, float]] = {}
     while True:
-        fitted = {j: tuple(n for n in names if n not in held[j]) for j in arm.joints}
+        fitted = {j: tuple(n for n in free[j] if n not in held[j]) for j in arm.joints}
         problem, solution = fit(fitted, found, masks)
         estimates = _estimates(problem, solution, blocks)
         unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
@@ -234,13 +245,11 @@ def _fit_chain(
             held[joint] = (*held[joint], worst)
             found[joint][worst] = nominal[joint][worst]
     drives: list[Drives] = [nominal]
-    for few in (("delay",), _PLAIN, names):
-        free = {j: [n for n in few if n not in held[j]] for j in arm.joints}
-        begin = {j: nominal[j] | {n: found[j][n] for n in free[j]} for j in arm.joints}
-        if few == names:
-            begin = found
-        if any(free.values()):
-            trial, best = fit(free, begin, kept)
+    for few in (("delay",), _PLAIN, tuple(PARAMETERS)):
+        some = {j: [n for n in fitted[j] if n in few] for j in arm.joints}
+        begin = {j: nominal[j] | {n: found[j][n] for n in some[j]} for j in arm.joints}
+        if any(some.values()):
+            trial, best = fit(some, begin, kept)
             begin = trial.values(best.x)
         drives.append(begin)
     left = [mask & out[:, None] for mask, out in zip(masks, out_of_fit, strict=True)]
@@ -352,7 +361,7 @@ def _estimates(
         flags = tuple(
             f"{name} at the bound of the search, {found.values[name]:.3g} {PARAMETERS[name].unit}"
             for name, i in zip(names, mine, strict=True)
-            if solution.at_bound[i] and name != "delay"  # no delay is a possible result
+            if solution.at_bound[i] and (name, found.values[name]) != ("stribeck", 0.0)
         )
         out[joint] = replace(found, flags=flags)
     return out

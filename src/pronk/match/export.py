@@ -7,7 +7,7 @@ whole steps where a simulator has no other delay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -40,6 +40,8 @@ class GroupDrive:
     """Limits and friction; the dry friction is the matched one where it was fitted."""
     delay_steps: int
     """Command delay in physics steps."""
+    stribeck: float
+    """Share of the dry friction that motion takes away."""
 
 
 def group_drives(gains: MatchedGains, robot: RobotSpec) -> list[GroupDrive]:
@@ -69,6 +71,7 @@ def group_drives(gains: MatchedGains, robot: RobotSpec) -> list[GroupDrive]:
                 armature=float(np.mean(armature)),
                 drive=replace(drive, frictionloss=float(np.mean(dry or [drive.frictionloss]))),
                 delay_steps=round(delay / gains.simulator.timestep_s),
+                stribeck=float(np.mean([j.stribeck for j in matched] or [0.0])),
             )
         )
     if not out:
@@ -112,7 +115,7 @@ def mjlab_text(gains: MatchedGains, robot: RobotSpec) -> str:
         for index, drive in enumerate(drives)
     )
     return (
-        f"{_comment(_header(gains))}\n\n"
+        f"{_comment(_header(gains) + _without_stribeck(drives))}\n\n"
         "from mjlab.actuator import DcMotorActuatorCfg\n"
         "from mjlab.envs.mdp import dr\n"
         "from mjlab.managers.event_manager import EventTermCfg\n"
@@ -128,7 +131,8 @@ def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
     effort limit. MuJoCo treats native drives explicitly under Euler only, so the integrator is
     Euler: it gives the trajectories of the training simulator (see `pronk.robots.model`). Joints
     that were not matched have the robot's published gains. MuJoCo has no delay of a position
-    command in its drives; a matched delay is named in the comment.
+    command in its drives; a matched delay is named in the comment. Dry friction that falls with
+    speed is the LuGre friction of the drive.
     """
     drives = group_drives(gains, robot)
     by_joint = {joint: drive for drive in drives for joint in drive.joints}
@@ -144,6 +148,7 @@ def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
         robot.joint_names,
         stiffness={name: drive.stiffness for name, drive in by_joint.items()},
         damping={name: drive.damping for name, drive in by_joint.items()},
+        stribeck={name: drive.stribeck for name, drive in by_joint.items() if drive.stribeck},
     )
     spec.compile()
     late = [f"{d.group} {d.delay_steps} steps" for d in drives if d.delay_steps]
@@ -158,13 +163,14 @@ def isaaclab_text(gains: MatchedGains, robot: RobotSpec) -> str:
 
     Isaac Lab runs PhysX; its first line is a warning that the gains must be matched there anew.
     """
+    drives = group_drives(gains, robot)
     entries = "".join(
         f'    "{drive.group}": DCMotorCfg(\n'
         f"        joint_names_expr={list(drive.joints)!r},\n"
         f"{_fields(drive, 'friction')}"
         f"    ),  # draw stiffness from {_pair(drive.stiffness_range)}, "
         f"damping from {_pair(drive.damping_range)}\n"
-        for drive in group_drives(gains, robot)
+        for drive in drives
     )
     warning = (
         "NOT MATCHED IN THIS SIMULATOR. Isaac Lab runs PhysX, whose integrator and joint friction "
@@ -172,7 +178,7 @@ def isaaclab_text(gains: MatchedGains, robot: RobotSpec) -> str:
         "start, sweep the joints in\nIsaac Lab with the log's own commands, and match again."
     )
     return (
-        f"{_comment(f'{warning}{chr(10) * 2}{_header(gains)}')}\n\n"
+        f"{_comment(f'{warning}{chr(10) * 2}{_header(gains)}' + _without_stribeck(drives))}\n\n"
         f"from isaaclab.actuators import DCMotorCfg\n\nACTUATORS = {{\n{entries}}}\n"
     )
 
@@ -225,6 +231,17 @@ def _header(gains: MatchedGains) -> str:
         lines.append("The logs came from pronk's virtual robot, not from hardware.")
     lines += [f"Log {name}, SHA-256 {digest}" for name, digest in gains.logs.items()]
     return "\n".join(lines)
+
+
+def _without_stribeck(drives: Sequence[GroupDrive]) -> str:
+    """Name friction that falls with speed where the simulator's does not."""
+    shares = [f"{one.group} {one.stribeck:.2g}" for one in drives if one.stribeck]
+    if not shares:
+        return ""
+    return (
+        "\nDry friction is that at rest. In motion the matched joints lose this share of it, which "
+        f"this file\ndoes not have: {', '.join(shares)}."
+    )
 
 
 def _comment(text: str) -> str:

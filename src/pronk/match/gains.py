@@ -70,6 +70,8 @@ class JointGains:
     """Largest relative change of stiffness between amplitudes; NaN with one amplitude."""
     frictionloss: float = NAN
     """Dry friction that goes with the gains [N m]; NaN: that of the robot's drive."""
+    stribeck: float = 0.0
+    """Share of it that motion takes away, at the Stribeck speed of the robot's drive."""
     delay_s: float = 0.0
     """Command delay that goes with the gains [s]."""
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
@@ -138,7 +140,7 @@ def _omitted(name: str, value: Any) -> bool:
         return True
     if name in ("frictionloss", "stiffness_total95", "damping_total95"):
         return bool(np.isnan(value).any())
-    return bool(name == "delay_s" and value == 0.0)
+    return bool(name in ("delay_s", "stribeck") and value == 0.0)
 
 
 def _line(data: object) -> _Flow:

@@ -51,6 +51,14 @@ PARAMETERS: Mapping[str, Parameter] = {
         *(1e-3, 3.0, "N m", 0.03, 0.2),
         "a second, smaller amplitude gives the dry friction",
     ),
+    "stribeck": Parameter(
+        # Beyond the bound MuJoCo's bristles no longer follow a start from rest at a step of 5 ms.
+        *(0.0, 0.95, "of the frictionloss", 0.02, 0.3),
+        "slow motion that sticks and slips, or starts from rest, gives the share of the dry "
+        "friction that motion takes away",
+        sd_max=0.15,
+        log=False,
+    ),
     "delay": Parameter(
         # Known if known to a physics step of the training simulator. Below zero where the log has
         # the command later than the drive had it.

@@ -149,6 +149,7 @@ def drives_of(robot: RobotSpec, gains: MatchedGains) -> dict[str, dict[str, floa
             "damping": joint.damping,
             "armature": joint.armature,
             "frictionloss": joint.frictionloss,
+            "stribeck": joint.stribeck,
             "delay": joint.delay_s,
         }
         known = {n: value for n, value in found.items() if not np.isnan(value)}

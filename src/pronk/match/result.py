@@ -49,6 +49,8 @@ class JointFit:
     """[kg m^2]"""
     frictionloss: float = float("nan")
     """Fitted dry friction [N m]; NaN: that of the robot's drive."""
+    stribeck: float = 0.0
+    """Share of the dry friction that motion takes away."""
     delay_s: float = 0.0
     """Command delay [s]."""
     ci95: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -104,6 +106,7 @@ class JointFit:
             damping=found.values["damping"],
             armature=found.values["armature"],
             frictionloss=found.values["frictionloss"],
+            stribeck=found.values.get("stribeck", 0.0),
             delay_s=max(found.values["delay"], 0.0),
             ci95=found.ci95,
             covariance=found.covariance,

@@ -58,6 +58,7 @@ class DriveEntry(_Entry, frozen=True):
     phases: int = 3
     frictionloss: _Least = 0.0
     viscous_damping: _Least = 0.0
+    stribeck_speed: _Least = 0.0
 
     def drive(self, source: str) -> Drive:
         """Make the drive; a RobotError names what is missing of its torque-speed line."""
@@ -95,6 +96,7 @@ class DriveEntry(_Entry, frozen=True):
             bus_voltage=volts,
             resistance=resistance,
             torque_constant=constant,
+            stribeck_speed=self.stribeck_speed,
         )
 
 

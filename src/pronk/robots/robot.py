@@ -36,11 +36,15 @@ class Drive:
     """Winding resistance, phase, motor side [ohm]."""
     torque_constant: float
     """Torque per ampere, motor side [N m/A]."""
+    stribeck_speed: float = 0.0
+    """Speed V of dry friction `F (1 - share (1 - exp(-(speed / V)^2)))`, whose share a match of
+    whole chains fits [rad/s]; 0: the dry friction F does not depend on speed."""
 
     def __post_init__(self) -> None:
         """Refuse values that must be positive and are not, and negative friction."""
         positive = ("gear_ratio", "stall_torque", "no_load_speed", "effort_limit", "bus_voltage")
-        for name in (*positive, "rotor_inertia", "frictionloss", "viscous_damping"):
+        least = ("rotor_inertia", "frictionloss", "viscous_damping", "stribeck_speed")
+        for name in (*positive, *least):
             value = getattr(self, name)
             if not (value > 0.0 if name in positive else value >= 0.0):
                 expected = "positive" if name in positive else "0 or more"

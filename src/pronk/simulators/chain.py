@@ -7,14 +7,16 @@ default position.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.response.grid import held_mean
+from pronk.robots.model import bench_spec, set_stribeck
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import Chain, Drives
 from pronk.simulators.simulator import Closing
@@ -37,9 +39,15 @@ def published(robot: RobotSpec, joint: str) -> dict[str, float]:
         "damping": known.damping,
         "armature": known.drive.armature,
         "frictionloss": known.drive.frictionloss,
+        "stribeck": 0.0,
         "delay": 0.0,
         "offset": 0.0,
     }
+
+
+def has_stribeck(robot: RobotSpec, joint: str) -> bool:
+    """True if the dry friction of a joint's drive depends on speed."""
+    return robot.joint(joint).drive.stribeck_speed > 0.0
 
 
 def branches(logs: Sequence[JointLog], robot: RobotSpec) -> list[tuple[str, ...]]:
@@ -100,6 +108,23 @@ def moves_together(log: JointLog) -> bool:
     return int(moving.sum()) > 1
 
 
+class _StribeckChain(Chain):
+    """A chain in which friction of drives with a Stribeck speed falls with speed."""
+
+    def __init__(self, robot: RobotSpec, joint: str, *, threads: int) -> None:
+        shares = {n: 0.0 for n in robot.joint(joint).chain if has_stribeck(robot, n)}
+        spec = bench_spec(robot, joint, stribeck=shares)
+        super().__init__(robot, joint, spec=spec, threads=threads)
+
+    def _set(self, model: mujoco.MjModel, name: str, values: Mapping[str, float]) -> None:
+        if not has_stribeck(self.robot, name):
+            return super()._set(model, name, values)
+        drive, values = self.robot.joint(name).drive, dict(values)
+        dry = values.pop("frictionloss", drive.frictionloss)
+        set_stribeck(model, name, drive, dry, values.get("stribeck", 0.0))
+        return super()._set(model, name, values)
+
+
 class ChainSimulation(Closing):
     """The chain with the commands of one or more logs, for many sets of drives."""
 
@@ -138,7 +163,7 @@ class ChainSimulation(Closing):
                 f"{self.logs[0].source or 'log'}: {', '.join(self.joints)} move together but no "
                 f"chain of {robot.name} holds them all; excite the joints of one chain at a time."
             )
-        self._chain = Chain(robot, root.name, threads=threads)
+        self._chain = _StribeckChain(robot, root.name, threads=threads)
 
     def close(self) -> None:
         """Stop the threads."""
