@@ -8,6 +8,7 @@ Times are CLOCK_MONOTONIC in seconds, the same for all processes of a computer.
 
 from __future__ import annotations
 
+import os
 import signal
 import zlib
 from contextlib import suppress
@@ -15,17 +16,21 @@ from dataclasses import dataclass, fields
 from enum import IntEnum
 from multiprocessing import shared_memory
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from pronk.errors import HardwareError
 from pronk.links.machine import State
 from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.runtime.safety import FilterAction, Reason
 
 Record = np.ndarray[Any, Any] | np.void
+_FOLDER = Path("/dev/shm")
+"""Of shared memory, on Linux."""
 
 
 def block(record: np.dtype[Any], slots: int) -> np.dtype[Any]:
@@ -338,6 +343,29 @@ def serve(process: Any, shared: Shared, end: Connection) -> None:
         shared.close()
 
 
+def _allocated(size: int) -> shared_memory.SharedMemory:
+    """Make shared memory of which every page exists; HardwareError if there is too little.
+
+    A page of a file system that has become full since would end the process that touches it.
+    """
+    memory = None
+    try:
+        memory = shared_memory.SharedMemory(create=True, size=size)
+        file = _FOLDER / memory.name
+        if file.exists():
+            with file.open("r+b") as pages:
+                os.posix_fallocate(pages.fileno(), 0, size)
+    except OSError as error:
+        if memory is not None:
+            memory.close()
+            memory.unlink()
+        raise HardwareError(
+            f"{size / 1e6:.1f} MB of shared memory cannot be allocated ({error.strerror}); free "
+            f"{_FOLDER}, or make it larger (of a container: --shm-size 64m)."
+        ) from None
+    return memory
+
+
 class Shared:
     """The shared memory of a run, made by its first process and attached by the others."""
 
@@ -356,7 +384,10 @@ class Shared:
     """Servo to operator."""
 
     def __init__(self, name: str | None = None, joints: int = JOINTS) -> None:
-        """Make it, or attach to the one of this name; `joints` of the robot."""
+        """Make it, or attach to the one of this name; `joints` of the robot.
+
+        HardwareError if there is too little memory to make it.
+        """
         mailboxes = {"state": state_dtype(joints), "actions": ACTIONS, "operator": OPERATOR}
         rings = {"ticks": (TICK, 2048), "samples": (sample_dtype(joints), 2048)}
         rings |= {"steps": (STEP, 256)}
@@ -367,10 +398,10 @@ class Shared:
         layout = np.dtype(blocks, align=True)
         # A child shares its parent's resource tracker, so nothing is removed when it ends.
         self._memory = (
-            shared_memory.SharedMemory(create=True, size=layout.itemsize)
-            if name is None
-            else shared_memory.SharedMemory(name=name)
+            _allocated(layout.itemsize) if name is None else shared_memory.SharedMemory(name=name)
         )
+        # Map every page now: the loop takes no page faults later.
+        np.ndarray(layout.itemsize, np.uint8, buffer=self._memory.buf)[::4096].max()
         self._owner = name is None
         self.name = self._memory.name
         """Other processes attach by it."""

@@ -89,6 +89,9 @@ class Servo:
         """Open the machine, tick until stopped, damp, close."""
         try:
             machine = self.plan.link(self._clamp)
+            inner = getattr(machine, "inner", None)
+            if inner is not None and self.plan.capture is None:
+                inner.capture_rate_hz = None  # else a second takes 0.7 MB
             self._open(machine)
             while not self._over():
                 self._tick(machine)

@@ -109,7 +109,9 @@ class VirtualRobot:
         self._sim_params, self._seed = sim_params, seed
         self._ground = (ground or sim_params.ground) if base == "ground" else None
         self._start = start or Start()
-        self._rate, self._capture_rate, self._dt = log_rate_hz, capture_rate_hz, timestep_s
+        self._rate, self._dt = log_rate_hz, timestep_s
+        self.capture_rate_hz = capture_rate_hz
+        """Has an effect until connected."""
         self._plant = Plant(robot, sim_params, legs or known, timestep_s, self._ground)
         self._recorder: Recorder | None = None
         self._open = False
@@ -129,8 +131,8 @@ class VirtualRobot:
         self._recorder = self._physics.recorder = None
         if self._ground is not None:
             self._ground.set_down(plant.model, self._physics.data, plant.feet, self._start)
-            if self._capture_rate is not None:
-                self._recorder = Recorder(plant, 1.0 / self._capture_rate)
+            if self.capture_rate_hz is not None:
+                self._recorder = Recorder(plant, 1.0 / self.capture_rate_hz)
                 self._physics.recorder = self._recorder
         self._physics.apply(replace(hold_of(robot), position=pose))
         self._now = 0.0
