@@ -118,6 +118,7 @@ def shortened(log: JointLog, seconds: float) -> JointLog:
 def test_torque_that_cannot_be_used_is_named(logs: list[JointLog]) -> None:
     for log, reason in (
         (replace(logs[0], torque=np.abs(logs[0].torque)), "magnitudes"),  # type: ignore[arg-type]
+        (replace(logs[0], metadata={"torque": "computed"}), "not measured"),
         (replace(logs[0], time=5.0 * logs[0].time), "Hz, fewer than 160"),
         (replace(logs[0], position=0.0 * logs[0].position), "no joint moves"),
         (shortened(logs[0], 7.0), "less than 7.5"),

@@ -222,7 +222,8 @@ def drives_table(result: MatchResult) -> Sheet:
             rows.append((joint_words(name), f"{term} [{unit}]", *cells, words))
     note = (
         "scale: torque column over the joint's torque. dry and viscous: friction of the joint. "
-        "Where the scale is not identified, values by torque are in the column's unit of torque."
+        "Where the scale is not identified, values by torque are in the column's unit of torque. "
+        "The column is taken for measured torque; a commanded one is not what the drive gave."
     )
     by_torque = any(joint.torque for joint in result.gains.joints.values())
     return table("joint | parameter | value | 95 % | by", rows, *[note] * by_torque)
