@@ -69,6 +69,10 @@ _SD_MAX = 0.3
 _PLACES = (0.0, 1.0, -1.0)
 """Point masses that span the inertia of a body: places on the line from its joint through its
 centre of mass, in units of that distance."""
+_METHOD = 0.025
+"""Relative error of the method itself, part of every interval: on ten simulated rigs of two joints
+without any error of the model it was up to 2.3 %, from the filters, and the blocks alone covered
+55 of 80 parameters."""
 _LINKS_HOLD = 1.05
 """Residual with the model's links over that with fitted links up to which the model's hold. On
 simulated logs: 1.002 or less with the right links, 1.14 and more with a link 2 % too heavy, which
@@ -530,6 +534,7 @@ def _parameters(
             reason = "negative: the model does not hold"
         elif term == "scale" and value * apart < dry:
             reason = f"dry friction, {dry:.2g} N m, hides {value * apart:.2g} N m of the links"
-        ends = float(value - quantile * sd), float(value + quantile * sd)
+        half = float(np.hypot(quantile * sd, _METHOD * value))
+        ends = float(value - half), float(value + half)
         out[term] = TorqueParameter(value=float(value), ci95=ends, reason=reason)
     return out
