@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.logs.joint_log import JointLog
-from pronk.match import plausibility
 from pronk.match.arm import fit_together
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
@@ -26,6 +25,7 @@ from pronk.match.measured_joint import (
     with_drive_gains,
 )
 from pronk.match.parameters import DRIVE_MODE, FREE, GAINS, GAINS_MODE, PARAMETERS, checked_names
+from pronk.match.plausibility import findings, require_plausible
 from pronk.match.ranges import matched_gains
 from pronk.match.response_fit import (
     Fit,
@@ -121,7 +121,7 @@ def match_logs(
         info = mujoco_info(robot)
         gains = {name: joint.gains() for name, joint in joints.items()}
         return MatchResult(gains=matched_gains(robot, gains, logs, info), joints={})
-    plausibility.require_plausible(logs_by_joint(logs, robot), robot)
+    require_plausible(logs_by_joint(logs, robot), robot)
     excluded: Mapping[str, str] = {}
     rate = float("nan")
     if any(moves_together(log) for log in logs):
@@ -136,7 +136,7 @@ def match_logs(
                 logs, robot, names, threads=chosen.threads, progress=clock.report
             )
         for name, fit in joints.items():
-            wrong = plausibility.flags(logs, fit, robot)
+            wrong = map(str, findings(logs, name, robot, fit=fit))
             joints[name] = replace(fit, flags=(*fit.flags, *wrong))
     else:
         fitted = checked_names(free or DRIVE_MODE, FREE)
@@ -152,7 +152,8 @@ def match_logs(
                 joints, fits, rate = _match_gains(rigs, logs, found, on_drive, chosen, clock)
             with clock.stage("plausibility"):
                 for name, fit in joints.items():
-                    wrong = plausibility.flags(logs, fit, robot, fits.get(name))
+                    own = fits.get(name)
+                    wrong = map(str, findings(logs, name, robot, fit=fit, time_fit=own))
                     joints[name] = replace(fit, flags=(*fit.flags, *wrong))
     joints = joint_fits(robot, joints, drives, remarks)
     gains = {name: joint.gains() for name, joint in joints.items()}
