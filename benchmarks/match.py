@@ -11,6 +11,10 @@ robot, and gives drive parameters of the training simulator. These are judged tw
   Bias is the mean of the gains of the sweep over these, less 1, and coverage how many of the
   sweep's 95 % intervals of stiffness and damping contain them.
 
+With `--arm FOLDER` the logs are recordings of a real SO-101 whose joints move together, judged on
+two more. The plain fit is there given pronk's dry friction at rest, and all use the samples that
+pronk uses.
+
 Robots are taken one after the other; an interrupt ends with the table of those that are done.
 """
 
@@ -29,20 +33,26 @@ from rich.table import Table
 from benchmarks.random_robots import HELD_OUT, ROBOT, Recorded, recorded
 from benchmarks.runner import Progress, finish, machine
 from benchmarks.time_fit import (
+    FREE,
+    fit_arm,
     fit_mujoco_sysid,
     fit_plain,
     recordings,
     search_cma,
+    search_cma_arm,
     simulated,
     start_values,
 )
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.logs.joint_log import JointLog
+from pronk.logs.readers import read_log
 from pronk.match.pipeline import match_logs
 from pronk.match.predict import drives_of
 from pronk.match.settings import MatchSettings
 from pronk.robots import load_robot
+from pronk.simulators.chain import ChainSimulation
+from pronk.simulators.mujoco import Drives
 from pronk.simulators.simulator import JointRigs, joint_rigs
 
 Kind = Literal["hip_roll", "hip_pitch", "knee"]
@@ -52,6 +62,9 @@ NOMINAL = "nominal with delay"
 PLAIN = "plain fit"
 PRONK = "pronk"
 PAPER = "pronk, paper's method"
+FITTED = ("chirp_sweep", "multisine", "backlash_detection")
+RECORDED = ("step_response", "sinusoidal_sweep")
+"""Recordings of the SO-101 that give the drives, and that judge them."""
 Intervals = Mapping[str, tuple[float, float]]
 
 
@@ -151,6 +164,69 @@ def run(
             yield rows
 
 
+def on_recordings(folder: Path, report: Progress) -> list[dict[str, Any]]:
+    """Rows of the SO-101: `FITTED` give the drives, `RECORDED` judge them.
+
+    Raises:
+        LogError: A recording is missing.
+    """
+    robot = load_robot("so101")
+    logs, held_out = (
+        [read_log(folder / name, robot=robot) for name in names] for names in (FITTED, RECORDED)
+    )
+    rows: list[dict[str, Any]] = []
+    with (
+        ChainSimulation(robot, logs, threads=1) as arm,
+        ChainSimulation(robot, held_out, joints=arm.joints, threads=1) as judge,
+    ):
+        nominal = {name: start_values(robot, name) for name in arm.joints}
+        found: Drives = {}
+
+        def pronk(_: Drives) -> Drives:
+            result = match_logs(
+                logs, robot, settings=MatchSettings(threads=1), drive_gains="default"
+            )
+            return drives_of(robot, result.gains)
+
+        def given(pronks: Drives) -> Drives:
+            return {
+                name: drive | {"frictionloss": pronks[name]["frictionloss"]}
+                for name, drive in nominal.items()
+            }
+
+        dry = ("stiffness", "damping", "frictionloss", "delay")
+        chosen: dict[str, Callable[[Drives], Drives]] = {
+            PRONK: pronk,
+            NOMINAL: lambda _: fit_arm(arm, ("delay",), nominal),
+            PLAIN: lambda pronks: fit_arm(arm, FREE, given(pronks)),
+            f"{PLAIN}, friction free": lambda pronks: fit_arm(arm, dry, given(pronks)),
+            "CMA-ES, friction free": lambda pronks: search_cma_arm(arm, dry, given(pronks), 0),
+        }
+        for k, (method, fit) in enumerate(chosen.items()):
+            begin = time.perf_counter()
+            drives = fit(found)
+            seconds = time.perf_counter() - begin
+            found = found or drives
+            report("fit", (k + 1) / len(chosen))
+            errors = [
+                simulated - measured
+                for simulated, measured in zip(
+                    judge.run([drives])[0], judge.measured(), strict=True
+                )
+            ]
+            for i, joint in enumerate(arm.joints):
+                own = {
+                    name: error[:, i]
+                    for name, error in zip(RECORDED, errors, strict=True)
+                    if np.isfinite(error[:, i]).all()
+                }
+                row = {"robot": 0, "joint": joint, "method": method, "seconds": seconds}
+                row |= {"values": drives[joint]}
+                row |= {"rmse": {s: float(np.sqrt(np.mean(e**2))) for s, e in own.items()}}
+                rows.append(row | {"moving": {s: float(e.std()) for s, e in own.items()}})
+    return rows
+
+
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Summarize each method over its joints; NaN where there is no number.
 
@@ -160,12 +236,15 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     by: dict[str, dict[tuple[int, str], Mapping[str, Any]]] = {}
     for row in rows:
         by.setdefault(row["method"], {})[row["robot"], row["joint"]] = row
+    signals = tuple(dict.fromkeys(s for row in rows for s in row.get("rmse", ())))
     out = []
     for name, mine in by.items():
         good = {key: row for key, row in mine.items() if "rmse" in row}
-        ratios = _ratios(good, by.get(NOMINAL, {}))
-        plain, moving = (_ratios(good, by.get(PLAIN, {}), kind) for kind in ("rmse", "moving"))
-        joint = np.exp(np.log(ratios).mean(axis=1)) if len(ratios) else np.array([np.nan])
+        ratios = _ratios(good, by.get(NOMINAL, {}), signals)
+        plain, moving = (
+            _ratios(good, by.get(PLAIN, {}), signals, kind) for kind in ("rmse", "moving")
+        )
+        joint = np.exp(np.nanmean(np.log(ratios), axis=1)) if len(ratios) else np.array([np.nan])
         both = [row for row in good.values() if "exact" in row]
         bias = [[100.0 * (r["values"][g] / r["exact"][g] - 1.0) for g in GAINS] for r in both]
         one: dict[str, Any] = {
@@ -175,11 +254,11 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             "below": int((joint < 1.0).sum()),
             "cells_below": int((ratios < 1.0).sum()),
             "median": float(np.median(joint)),
-            "signals": dict(zip(HELD_OUT, np.median(ratios, axis=0).tolist(), strict=True))
+            "signals": dict(zip(signals, np.nanmedian(ratios, axis=0).tolist(), strict=True))
             if len(ratios)
             else {},
-            "over_plain": float(np.exp(np.log(plain).mean())) if len(plain) else float("nan"),
-            "moving": float(np.exp(np.log(moving).mean())) if len(moving) else float("nan"),
+            "over_plain": float(np.exp(np.nanmean(np.log(plain)))) if len(plain) else float("nan"),
+            "moving": float(np.exp(np.nanmean(np.log(moving)))) if len(moving) else float("nan"),
             "bias": np.mean(bias, axis=0).tolist() if bias else [float("nan")] * 2,
             "absolute": np.median(np.abs(bias), axis=0).tolist() if bias else [float("nan")] * 2,
             "seconds": float(np.mean([r["seconds"] for r in good.values()] or [float("nan")])),
@@ -207,17 +286,25 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def _ratios(
     mine: Mapping[Any, Mapping[str, Any]],
     other: Mapping[Any, Mapping[str, Any]],
+    signals: Sequence[str],
     kind: str = "rmse",
 ) -> Any:
-    """RMSE over that of another method, shape (joints that both have, signals)."""
+    """RMSE over that of another method, shape (joints that both have, signals).
+
+    NaN where a signal does not excite a joint.
+    """
     both = [key for key in mine if kind in other.get(key, {})]
-    ratios = [[mine[k][kind][s] / other[k][kind][s] for s in HELD_OUT] for k in both]
-    return np.array(ratios).reshape(-1, len(HELD_OUT))
+    ratios = [
+        [mine[k][kind].get(s, np.nan) / other[k][kind].get(s, np.nan) for s in signals]
+        for k in both
+    ]
+    return np.array(ratios).reshape(-1, len(signals))
 
 
 def show(summaries: Sequence[Mapping[str, Any]], title: str, caption: str) -> Table:
     """Make the table of `summary`."""
-    columns = ["method", "joints", "below", "median", *HELD_OUT, "over plain", "moving", "bias [%]"]
+    signals = next((one["signals"] for one in summaries if one["signals"]), HELD_OUT)
+    columns = ["method", "joints", "below", "median", *signals, "over plain", "moving", "bias [%]"]
     columns += ["|bias| [%]", "repeat 95 %", "total 95 %", "fit [s]"]
     made = console.table(title, columns, caption=caption)
 
@@ -227,17 +314,18 @@ def show(summaries: Sequence[Mapping[str, Any]], title: str, caption: str) -> Ta
         return f"{one['covered']} of {one['intervals']} (+-{one['half_width']:.2f} %)"
 
     for one in summaries:
+        known = np.isfinite(one["bias"]).all()
         refused = f", {one['refused']} refused" if one["refused"] else ""
         made.add_row(
             one["method"],
             f"{one['joints']}{refused}",
             f"{one['below']}",
             f"{one['median']:.2f}",
-            *(f"{one['signals'].get(name, float('nan')):.2f}" for name in HELD_OUT),
+            *(f"{one['signals'].get(name, float('nan')):.2f}" for name in signals),
             f"{one['over_plain']:.3f}",
             f"{one['moving']:.3f}",
-            "{:+.1f} / {:+.1f}".format(*one["bias"]),
-            "{:.1f} / {:.1f}".format(*one["absolute"]),
+            "{:+.1f} / {:+.1f}".format(*one["bias"]) if known else "none",
+            "{:.1f} / {:.1f}".format(*one["absolute"]) if known else "none",
             coverage(one["repeat"]),
             coverage(one["total"]),
             f"{one['seconds']:.1f}",
@@ -251,6 +339,7 @@ def match(
     joints: tuple[Kind, ...] = JOINTS,
     method: tuple[str, ...] = (),
     cache: Path | None = None,
+    arm: Path | None = None,
 ) -> console.Outcome:
     """Match virtual robots drawn at random by pronk and its peers; held-out error, coverage.
 
@@ -260,16 +349,21 @@ def match(
         joints: Joints of one leg.
         method: Methods beside the nominal gains and the plain fit; repeat it. All if left out.
         cache: Folder of the recorded logs; in the system's temporary folder if left out.
+        arm: Folder of the recordings of a real SO-101, which are matched instead, by all methods
+            but mujoco.sysid, whose rig here is one joint.
     """
     begin, known = time.perf_counter(), methods()
     if unknown := set(method) - set(known):
         raise PronkError(f"methods {', '.join(unknown)}; expected some of {', '.join(known)}.")
+    if arm and method:
+        raise PronkError(f"--method {method[0]} with --arm; the recordings go to all methods.")
     wanted = {NOMINAL, PLAIN, *(method or known)}
     chosen = {name: fit for name, fit in known.items() if name in wanted}
     rows: list[dict[str, Any]] = []
     with console.progress() as report:
         try:
-            for more in run(robots, seed, report, joints=joints, chosen=chosen, folder=cache):
+            virtual = run(robots, seed, report, joints=joints, chosen=chosen, folder=cache)
+            for more in [on_recordings(arm, report)] if arm else virtual:
                 rows += more
         except KeyboardInterrupt:
             console.warn("interrupted")
@@ -282,7 +376,9 @@ def match(
         "machine": (computer := machine("mujoco")),
         "seconds": time.perf_counter() - begin,
     }
-    title = f"{found['robots']} virtual robots, seed {seed}, {', '.join(joints)} of one leg each"
+    title = "a real SO-101, fitted to " + ", ".join(FITTED)
+    if not arm:
+        title = f"{found['robots']} virtual robots, seed {seed}, {', '.join(joints)} of one leg"
     caption = (
         "joints: with a result. below: joints whose held-out RMSE (geometric mean over the "
         "signals) is below that of the nominal gains with delay; median and medians of each "

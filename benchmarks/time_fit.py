@@ -18,9 +18,12 @@ from scipy.optimize import least_squares
 
 from benchmarks.peers import SIGMA, Estimate, fit_sysid, import_peers
 from pronk.logs.joint_log import JointLog, Segment
+from pronk.match.arm import ArmProblem, trusted
+from pronk.match.fit import solve
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.chain import published
+from pronk.simulators.chain import ChainSimulation, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
+from pronk.simulators.mujoco import Drives
 from pronk.simulators.simulator import JointRigs
 
 Array = NDArray[np.float64]
@@ -143,6 +146,43 @@ def fit_plain(
         ftol=1e-6,
     )
     return problem.values(found.x)
+
+
+def arm_problem(arm: ChainSimulation, free: Sequence[str], start: Drives) -> ArmProblem:
+    """Residuals of a whole arm in time, over the samples that pronk uses."""
+    fitted = dict.fromkeys(arm.joints, tuple(free))
+    return ArmProblem(arm, trusted(arm)[0], fitted, start, start, lambda _: None)
+
+
+def fit_arm(arm: ChainSimulation, free: Sequence[str], start: Drives) -> Drives:
+    """Nonlinear least squares over parameters of all joints of an arm."""
+    problem = arm_problem(arm, free, start)
+    return problem.values(solve(problem, tolerance=1e-4, rounds=30).x)
+
+
+def search_cma_arm(arm: ChainSimulation, free: Sequence[str], start: Drives, seed: int) -> Drives:
+    """CMA-ES of each joint of an arm with its own residuals, all joints changed at once."""
+    _, cma = import_peers()
+    problem, count = arm_problem(arm, free, start), len(free)
+    low, half = problem.low, 0.5 * (problem.high - problem.low)
+    options = {"bounds": [-1.0, 1.0], "popsize": POPULATION, "verbose": -9}
+    searches = [
+        cma.CMAEvolutionStrategy(unit, SIGMA, options | {"seed": seed + 1 + k})
+        for k, unit in enumerate(((problem.begin - low) / half - 1.0).reshape(-1, count))
+    ]
+    for _ in range(GENERATIONS):
+        asked = [search.ask() for search in searches]
+        costs = []
+        for one in zip(*asked, strict=True):
+            unit = np.clip(np.concatenate(one), -1.0, 1.0)
+            residual = problem.residual(low + half * (unit + 1.0))
+            costs.append([float(np.mean(residual[problem.block(j)] ** 2)) for j in arm.joints])
+        for search, units, column in zip(searches, asked, np.transpose(costs), strict=True):
+            search.tell(units, column.tolist())
+        if all(np.ptp(column) < SPREAD * np.mean(column) for column in np.transpose(costs)):
+            break
+    best = np.concatenate([search.result.xfavorite for search in searches])
+    return problem.values(low + half * (np.clip(best, -1.0, 1.0) + 1.0))
 
 
 def search_cma(rigs: JointRigs, log: JointLog, joint: str, *, seed: int) -> dict[str, float]:

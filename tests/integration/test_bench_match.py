@@ -137,6 +137,18 @@ def test_coverage_counts_the_gains_of_the_noise_free_sweep() -> None:
     assert one["bias"] == pytest.approx([100 * (20 / 20.5 - 1), 100 * (0.5 / 0.55 - 1)])
 
 
+def test_a_joint_is_judged_on_the_signals_that_excite_it() -> None:
+    rows = [
+        {"robot": 0, "joint": joint, "method": method, "seconds": 1.0, "rmse": rmse, "moving": rmse}
+        for method, factor in ((match.NOMINAL, 4.0), (match.PLAIN, 2.0), (match.PRONK, 1.0))
+        for joint, rmse in (("a", {"steps": factor, "sweep": factor**2}), ("b", {"steps": factor}))
+    ]
+    *_, pronk = match.summary(rows)
+    assert pronk["signals"] == pytest.approx({"steps": 1 / 4, "sweep": 1 / 16})
+    assert pronk["median"] == pytest.approx(np.median([1 / 8, 1 / 4]))
+    assert pronk["over_plain"] == pytest.approx((1 / 2 * 1 / 4 * 1 / 2) ** (1 / 3))
+
+
 def test_an_impossible_run_is_refused() -> None:
     with pytest.raises(PronkError, match="0 robots"):
         next(match.run(0, 0, lambda _stage, _share: None))

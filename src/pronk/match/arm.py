@@ -187,7 +187,7 @@ def _fit_chain(
     progress: Callable[[float], None],
 ) -> dict[str, JointFit]:
     """Fit the joints of one chain: first without every fourth block, then to everything."""
-    masks, limit_hz = _trusted(arm)
+    masks, limit_hz = trusted(arm)
     blocks = _blocks(arm.logs)
     if (count := len(np.unique(blocks))) < MIN_BLOCKS:
         raise LogError(
@@ -313,7 +313,7 @@ def trusted_samples(log: JointLog, joint: str) -> tuple[Mask, float]:
     return np.asarray(share <= _AT_LIMIT * np.maximum(whole, 0.0)), limit
 
 
-def _trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
+def trusted(arm: ChainSimulation) -> tuple[list[Mask], dict[str, float]]:
     """Samples to use, shape (n, joints) a recording, and each joint's trusted frequency [Hz].
 
     The frequency is infinite where no recording ran out of coherence.
