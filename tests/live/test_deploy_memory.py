@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -52,3 +54,37 @@ def test_nothing_is_kept_of_a_virtual_robot_that_is_not_captured(tmp_path: Path)
                 machine.inner.capture()
         else:
             assert capture.exists()
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process runs; one that ended and was not waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux") or (os.cpu_count() or 1) < 2,
+    reason="prctl is of Linux, and one core needs one process",
+)
+def test_the_processes_of_a_killed_sweep_end_too(tmp_path: Path) -> None:
+    words = ["sweep", "mini_cheetah", "--out", str(tmp_path / "logs")]
+    running = subprocess.Popen(
+        [sys.executable, "-m", "pronk.cli.main", *words], stdout=subprocess.DEVNULL
+    )
+    family = Path(f"/proc/{running.pid}/task/{running.pid}/children")
+    until = time.monotonic() + 120.0
+    children: list[int] = []
+    # Two that sweep, and the tracker of what they share.
+    while len(children) < 3 and time.monotonic() < until:
+        time.sleep(0.05)
+        children = [int(word) for word in family.read_text().split()]
+    time.sleep(1.0)
+    running.kill()
+    running.wait()
+    assert len(children) >= 3
+    until = time.monotonic() + 20.0
+    while any(map(_alive, children)) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not [pid for pid in children if _alive(pid)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import threading
 import time
 from collections import Counter
@@ -18,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy_runs import DAMPED_S, PATIENT, QUICK, free_port, hold, simulated
+from deploy_runs import DAMPED_S, PATIENT, QUICK, free_port, hold, met, simulated
 from hopper import write_hopper
 from pronk.errors import HardwareError
 from pronk.links.address import Address
@@ -183,6 +184,7 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
         limits=PATIENT | {"hold_s": 1.0},
         action_valid_s=2.0,
         operator_timeout_s=2.0,
+        standby_s=2.0,
         ignore_latency=True,
     )
     # It is there before: nothing is written, and one line says why.
@@ -223,3 +225,43 @@ def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
     assert found.time[struck] - wire.began <= DAMPED_S
     assert found.damped[struck:].all()
     assert found.mode[struck - 5] == Mode.POLICY
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_the_standby_damps_after_a_servo_that_stopped(
+    reached: tuple[Address, Wire], tmp_path: Path, number: signal.Signals
+) -> None:
+    address, wire = reached
+    plan = Plan(
+        link=PatientLink(address=address),
+        policy=write_hopper(tmp_path / "policy.onnx", strength=0.2),
+        timing=QUICK,
+        limits=PATIENT | {"hold_s": 1.0},
+        action_valid_s=2.0,
+        operator_timeout_s=2.0,
+        ignore_latency=True,
+    )
+    late = []
+    # A computer that is busy may be late once, or stop the servo by itself.
+    for _ in range(3):
+        with Deployment(plan) as deployment:
+            if not met(deployment, 20.0, (Mode.STAND,), OperatorRequest.STAND):
+                continue
+            hold(deployment, 0.2)
+            struck = time.monotonic()
+            os.kill(deployment.servo.pid or 0, number)
+            hold(deployment, 20.0, Mode.ENDED)
+        assert deployment.summary.standby
+        assert deployment.summary.servo == {}
+        time.sleep(0.2)
+        when, damps = wire.received()
+        after = when > struck + 0.002
+        assert damps[after].any()
+        first = when[after & damps][0]
+        # From there on nothing but damping, for long enough to come to rest.
+        assert damps[when >= first].all()
+        assert when[-1] - first > 2.0
+        late.append(first - struck)
+        if late[-1] <= DAMPED_S:
+            break
+    assert min(late) <= DAMPED_S, late

@@ -37,6 +37,7 @@ from pronk.evaluation.jumps import JumpRules, measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.results import JUMPS, SUMMARY, TABLE, Kind, Results, Row, Subject, save
 from pronk.files import sha256
+from pronk.links.realtime import die_with_parent
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.robots import load_robot
@@ -235,7 +236,9 @@ def in_processes(
         if processes > 1 and len(jobs) > 1:
             # A fork of a process that has threads can deadlock.
             context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context)
+            pool = ProcessPoolExecutor(
+                min(processes, len(jobs)), mp_context=context, initializer=die_with_parent
+            )
             run = stack.enter_context(pool).map
         try:
             for result in run(work, jobs):

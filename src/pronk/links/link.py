@@ -378,6 +378,13 @@ class NetworkLink(ABC):
         if self._writer is not None:
             self._writer.damp()
 
+    def open_damper(self) -> Callable[[], None] | None:
+        """Open the wire for writing only, and return what writes damping, once a call.
+
+        For a process beside the one that commands. None where the wire has one writer.
+        """
+        return None
+
     def close(self) -> None:
         """Leave the robot damped and at rest (1 to 3 s if anything was sent), and close."""
         writer = self._writer

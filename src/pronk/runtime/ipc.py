@@ -200,6 +200,9 @@ ACTIONS = np.dtype(
 )
 """Policy to servo: joint targets, and the `entry` of the state record they were computed from."""
 
+STANDBY = np.dtype(_fields("f8", "time"))
+"""Standby process to operator: when it began to damp (CLOCK_MONOTONIC) [s]."""
+
 OPERATOR = np.dtype(
     _fields("f8", "time")
     + _fields("i8", "request requests held jump")
@@ -372,6 +375,7 @@ class Shared:
     state: Mailbox
     actions: Mailbox
     operator: Mailbox
+    standby: Mailbox
     ticks: Ring
     """Four seconds of them fit."""
     samples: Ring
@@ -389,6 +393,7 @@ class Shared:
         HardwareError if there is too little memory to make it.
         """
         mailboxes = {"state": state_dtype(joints), "actions": ACTIONS, "operator": OPERATOR}
+        mailboxes |= {"standby": STANDBY}
         rings = {"ticks": (TICK, 2048), "samples": (sample_dtype(joints), 2048)}
         rings |= {"steps": (STEP, 256)}
         rings |= dict.fromkeys(("events", "policy_events", "events_seen"), (EVENT, 256))

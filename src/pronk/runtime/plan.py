@@ -16,11 +16,11 @@ from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.safety import Limits
 from pronk.runtime.state_machine import Timing
-from pronk.runtime.sweep import SweepTask
+from pronk.runtime.sweep import STALE_S, SweepTask
 from pronk.virtual.robot import VirtualRobot
 
-SERVO_PRIORITY, POLICY_PRIORITY = 60, 50
-"""Of SCHED_FIFO: the servo before the policy, both below the kernel's own threads at 99."""
+SERVO_PRIORITY, STANDBY_PRIORITY, POLICY_PRIORITY = 60, 55, 50
+"""Of SCHED_FIFO: the servo first, all below the kernel's own threads at 99."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +109,8 @@ class Plan:
     """How long an action of the policy is repeated: two and a half steps [s]."""
     operator_timeout_s: float = 0.3
     """How long the operator's program may be silent [s]."""
+    standby_s: float = 0.04
+    """Silence of the servo after which the standby process damps the joints [s]."""
     ignore_latency: bool = False
     """Start the policy even if the measured latency exceeds its training range."""
     real_time: bool = True
@@ -117,7 +119,7 @@ class Plan:
     def __post_init__(self) -> None:
         if (self.policy is None) == (self.sweep is None):
             raise HardwareError("a run needs either a policy or a sweep.")
-        for name in ("servo_rate_hz", "action_valid_s", "operator_timeout_s"):
+        for name in ("servo_rate_hz", "action_valid_s", "operator_timeout_s", "standby_s"):
             if not getattr(self, name) > 0.0:
                 raise HardwareError(f"Plan.{name} is {getattr(self, name)}; it must be positive.")
 
@@ -131,6 +133,11 @@ class Plan:
         if self.sweep is not None:
             return self.sweep.limits(torque_kind, **self.limits)
         return Limits.of(self.robot, **self.limits)
+
+    @property
+    def silence_s(self) -> float:
+        """Silence of the servo that is a fault; in a sweep that of the states, which is longer."""
+        return self.standby_s if self.sweep is None else max(self.standby_s, STALE_S)
 
     def wanted(self, priority: int, core: int) -> Wanted:
         """What a process requests of the operating system."""

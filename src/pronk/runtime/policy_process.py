@@ -21,7 +21,7 @@ import numpy as np
 
 from pronk.errors import PronkError
 from pronk.links.machine import State
-from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
+from pronk.links.realtime import Histogram, Pace, die_with_parent, enter, leave, sleep_until
 from pronk.policy.contract import Contract
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy
@@ -68,6 +68,7 @@ def warm_up_until(deadline: float, act: Callable[[], object]) -> int:
 def serve_policy(plan: Plan, name: str, end: Connection) -> None:
     """Body of the policy's process."""
     leave()
+    die_with_parent()
     assert plan.policy is not None
     shared = Shared(name, len(plan.robot.joints))
     process = PolicyProcess(plan, shared, load_policy(plan.policy))

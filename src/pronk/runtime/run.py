@@ -16,6 +16,7 @@ import orjson
 
 from pronk import __version__
 from pronk.errors import HardwareError, LogError, PronkError
+from pronk.links.address import SIM
 from pronk.links.link import ClampOperator
 from pronk.links.realtime import Interrupts, sleep_until, terminal_blocked
 from pronk.policy.contract import check
@@ -25,6 +26,7 @@ from pronk.runtime.log import READY, write_log
 from pronk.runtime.plan import Plan
 from pronk.runtime.policy_process import serve_policy
 from pronk.runtime.servo import serve_robot
+from pronk.runtime.standby import serve_standby
 from pronk.runtime.teleop import BenchOperator, Operator, OperatorCommand
 
 _RATE_HZ = 50.0
@@ -48,6 +50,8 @@ class RunSummary:
     events_seen: list[Event] = field(default_factory=list)
     log_error: str = ""
     """Why the log could not be written to its end."""
+    standby: bool = False
+    """Whether the standby process damped the joints, because the servo was silent."""
     interrupted: bool = False
     """Whether a signal ended it: the interrupt key, or the end of the terminal."""
     trained_delay_s: tuple[float, float] = (0.0, 0.0)
@@ -84,6 +88,7 @@ class RunSummary:
             "trained_delay_s": list(self.trained_delay_s),
             "faults": self.faults,
             "refusals": self.refusals,
+            "standby": self.standby,
             "interrupted": self.interrupted,
         }
 
@@ -112,6 +117,8 @@ class Deployment:
         self.servo: BaseProcess
         self.policy: BaseProcess | None = None
         self.logger: BaseProcess | None = None
+        self.standby: BaseProcess | None = None
+        """Of a robot behind a network."""
         self._record = np.zeros((), dtype=OPERATOR)
         self._open = False
         self._interrupts = Interrupts()
@@ -136,15 +143,20 @@ class Deployment:
             self.policy = process("policy", serve_policy, plan, name, policy_end)
         if plan.log is not None or plan.sweep is not None:
             self.logger = process("log", write_log, plan, self._header, name, talk)
+        if plan.link.address.kind != SIM:
+            self._standby_end, standby_end = context.Pipe(duplex=False)
+            self.standby = process("standby", serve_standby, plan, name, standby_end)
         self._interrupts.__enter__()
         self._open = True
         try:
             with terminal_blocked():
-                for started in (self.policy, self.logger):
+                for started in (self.policy, self.logger, self.standby):
                     if started is not None:
                         started.start()
             if self.logger is not None:
                 self._await_logger(self.logger)
+            if self.standby is not None:
+                self._await_standby(self.standby)
             # Last, so that its first tick is logged.
             with terminal_blocked():
                 self.servo.start()
@@ -161,8 +173,9 @@ class Deployment:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the servo; `ENDED` too if its process is gone."""
-        return (self.shared.mode or Mode.IDLE) if self.servo.is_alive() else Mode.ENDED
+        """Mode of the servo; `ENDED` too if its process is gone or the standby took over."""
+        gone = not self.servo.is_alive() or self.shared.standby.written > 0
+        return Mode.ENDED if gone else self.shared.mode or Mode.IDLE
 
     def events_seen(self) -> list[Event]:
         """Events of the servo since the last call; the summary keeps them too."""
@@ -225,6 +238,10 @@ class Deployment:
         try:
             if self.servo.pid is not None:
                 self._stop_servo()
+            if self.standby is not None and self.standby.pid is not None:
+                self.summary.standby = self.shared.standby.written > 0
+                self.standby.terminate()
+                self.standby.join(_END_S)
             self.summary.servo = _received(self._servo_end)
             if self.policy is not None:
                 if self.policy.pid is not None:
@@ -235,7 +252,7 @@ class Deployment:
             if self.logger is not None and self.logger.pid is not None:
                 self._stop_logger(self.logger)
         finally:
-            for process in (self.servo, self.policy, self.logger):
+            for process in (self.servo, self.policy, self.logger, self.standby):
                 if process is not None and process.is_alive():
                     process.kill()
                     process.join()
@@ -244,6 +261,10 @@ class Deployment:
 
     def _stop_servo(self) -> None:
         """Request the end; commands continue meanwhile, because their absence is a fault."""
+        if self.shared.standby.written:
+            self.servo.kill()  # it is stopped, or was for so long that the joints are damped
+            self.servo.join()
+            return
         until = time.monotonic() + _END_S
         self.write(_QUIT)
         while self.servo.is_alive() and time.monotonic() < until:
@@ -277,6 +298,13 @@ class Deployment:
         if reply != READY:
             raise LogError(reply.decode())
 
+    def _await_standby(self, standby: BaseProcess) -> None:
+        until = time.monotonic() + _START_S
+        while not self._standby_end.poll(0.05):
+            self.write(OperatorCommand())
+            if standby.exitcode is not None or time.monotonic() > until:
+                raise HardwareError("the process that damps in place of the servo did not start.")
+
     def _await_servo(self) -> None:
         until = time.monotonic() + _START_S
         while self.shared.state.written == 0:
@@ -305,8 +333,15 @@ def run(plan: Plan, operator: Operator, notify: Callable[[Event], None]) -> RunS
     with Deployment(plan) as deployment:
         summary = deployment.run(operator, notify)
     if not summary.servo:
-        raise PronkError("the servo's process was killed; the robot's own watchdog had to stop it.")
+        raise PronkError(f"the servo's process was killed; {_who_damped(summary)}.")
     return summary
+
+
+def _who_damped(summary: RunSummary) -> str:
+    """What damped the joints after the servo had been killed."""
+    if summary.standby:
+        return "the standby process damped the joints"
+    return "only the robot's own watchdog damps the joints now: secure them before anything else"
 
 
 def _header(plan: Plan, policy: Policy) -> dict[str, Any]:
@@ -359,10 +394,7 @@ def run_sweep(
         summary = deployment.run(operator, notify, progress)
     servo = summary.servo
     if not servo:
-        raise HardwareError(
-            "the servo's process was killed; only the robot's own watchdog damps the joints now: "
-            "secure them before anything else."
-        )
+        raise HardwareError(f"the servo's process was killed; {_who_damped(summary)}.")
     if summary.interrupted:
         raise KeyboardInterrupt
     if operator.error is not None:

@@ -8,6 +8,7 @@ and sent goes into a queue that never makes it wait. Whatever ends it, the joint
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 import time
@@ -20,7 +21,7 @@ import numpy as np
 
 from pronk.errors import HardwareError, PronkError
 from pronk.links.machine import Command, Machine, State
-from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
+from pronk.links.realtime import Histogram, Pace, die_with_parent, enter, leave, sleep_until
 from pronk.runtime import ipc
 from pronk.runtime.ipc import Mode, OperatorRequest, Shared
 from pronk.runtime.plan import SERVO_PRIORITY, Plan
@@ -41,6 +42,7 @@ def serve_robot(plan: Plan, name: str, trained: tuple[float, float], end: Connec
     `trained` are the command delays that the policy was trained for [s].
     """
     leave()  # the operator's process decides
+    die_with_parent(signal.SIGTERM)  # damp and end
     shared = Shared(name, len(plan.robot.joints))
     ipc.serve(Servo(plan, shared, trained), shared, end)
 

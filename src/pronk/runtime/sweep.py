@@ -42,7 +42,7 @@ _STIFFEN_S = 1.0
 """Time in which stiffness grows on a machine in real time [s]."""
 _PROGRESS_TICKS = 25
 """Ticks between two reports of progress."""
-_STALE_S = 0.1
+STALE_S = 0.1
 """Age of the newest state that ends a sweep [s]."""
 
 
@@ -102,7 +102,7 @@ class SweepTask:
         is measured must keep within the effort limits too. `changed` gives other scalar values.
         """
         robot = self.plan.robot
-        scalars = dict.fromkeys(("hold_s", "damp_s", "latch_s"), _STALE_S) | {
+        scalars = dict.fromkeys(("hold_s", "damp_s", "latch_s"), STALE_S) | {
             "tilt": np.inf,
             "margin": 1e-6,
             "overrun": 1e-9,

@@ -16,6 +16,7 @@ import contextlib
 import json
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -32,6 +33,7 @@ from pronk.errors import HardwareError
 from pronk.links.dds import codec
 from pronk.links.dds.codec import STATE_RATE_HZ, StateDecoder, encode_command, joint_map
 from pronk.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_domain
+from pronk.links.machine import damping_command
 from pronk.robots.robot import RobotSpec
 
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
@@ -266,6 +268,14 @@ class DdsMachine(NetworkLink):
         self._damping = self._joints.sink_damping
         self._network = DdsNetwork(interface=interface, domain=domain)
         self._command_topic, self._address = COMMANDS, f"{STATES} in {self._network}"
+
+    def open_damper(self) -> Callable[[], None]:
+        """Join the domain by itself, and return what writes damping."""
+        own = Participant(self._network)
+        out = own.writer(COMMANDS, codec.LowCmd)
+        damping = damping_command(len(self._robot.joints), self._damping)
+        data = encode_command(self._joints, damping)
+        return lambda: write(out, data, self.counts)
 
     def _open(self) -> tuple[Encode, Publish]:
         self._decoder = StateDecoder(self._joints, self.counts)

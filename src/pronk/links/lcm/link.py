@@ -15,6 +15,7 @@ import ipaddress
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from pronk.links.lcm.codec import (
     read_clamp_message,
 )
 from pronk.links.link import RESPONSE_S, Encode, NetworkLink, Publish, port_or_domain, wait_for
+from pronk.links.machine import damping_command
 from pronk.robots.robot import RobotSpec
 
 # LCM's multicast group and port, those of every robot too.
@@ -120,6 +122,12 @@ class LcmMachine(NetworkLink):
         self._interface = interface
         self._url = url_of(port=port, interface=interface)
         self._address = f"{known.joints.channel} and {known.attitude.channel} at {self._url}"
+
+    def open_damper(self) -> Callable[[], None]:
+        """Open a handle of its own, and return what writes damping."""
+        out = open_lcm(self._url)
+        data = encode_command(self._layout, damping_command(len(self._robot.joints), self._damping))
+        return lambda: out.publish(self._command_topic, data)
 
     def _open(self) -> tuple[Encode, Publish]:
         layout = self._layout
