@@ -17,7 +17,7 @@ import pytest
 
 from command_line import invoke
 from deploy_faults import FaultyLink, writes
-from deploy_runs import DAMPED_S, QUICK, hold, met, notified
+from deploy_runs import DAMPED_S, PATIENT, QUICK, hold, met, notified
 from hopper import write_hopper
 from pronk.errors import ArtefactError, HardwareError
 from pronk.runtime.ipc import Mode, OperatorRequest
@@ -183,6 +183,38 @@ def test_a_plan_that_cannot_run_is_refused_before_anything_starts(
         Deployment(Plan(link=link, policy=other))
     with pytest.raises(HardwareError, match="action_valid_s"):
         Plan(link=link, policy=policy, action_valid_s=0.0)
+
+
+def test_an_operator_that_is_late_is_not_gone_and_one_that_is_stuck_is(
+    policy: Path, events: dict[str, Any], tmp_path: Path
+) -> None:
+    plan = Plan(
+        link=FaultyLink(wire=tmp_path / "wire.txt", **events),
+        policy=policy,
+        timing=QUICK,
+        limits=PATIENT,
+        operator_timeout_s=0.3,
+        ignore_latency=True,
+    )
+    with Deployment(plan) as deployment:
+        slept = 1.0
+        # On a busy computer a sleep may last too long itself.
+        for _ in range(5):
+            if deployment.mode is Mode.FAULT:
+                hold(deployment, 1.1)
+                hold(deployment, 5.0, Mode.DAMP, OperatorRequest.RESET)
+            hold(deployment, 10.0, Mode.STAND, OperatorRequest.STAND)
+            begun = time.monotonic()
+            time.sleep(0.5)
+            mode, slept = deployment.mode, time.monotonic() - begun
+            if slept < 0.6:
+                break
+        assert slept < 0.6
+        assert mode is Mode.STAND
+        time.sleep(1.5)
+        assert deployment.mode is Mode.FAULT
+        found = [event for event in deployment.events_seen() if event.kind == "fault"]
+        assert [event.reason for event in found] == [Reason.ENDED.name]
 
 
 # --- From the command line ----------------------------------------------------------------------

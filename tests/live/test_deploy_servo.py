@@ -16,13 +16,15 @@ import numpy as np
 import pytest
 
 from deploy_faults import FaultyLink
+from deploy_runs import PATIENT
 from pronk.errors import HardwareError
 from pronk.links.address import Address
 from pronk.links.machine import Machine
-from pronk.runtime.ipc import OPERATOR, TICK, Mode, OperatorRequest, Shared
+from pronk.runtime.ipc import ACTIONS, OPERATOR, TICK, Mode, OperatorRequest, Shared, fill
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.servo import Servo
 from pronk.runtime.state_machine import Timing
+from virtual_robot import POSE
 
 QUICK = Timing(damp_s=0.05, fold_s=0.1, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
 NOWHERE = Path("policy.onnx")
@@ -186,3 +188,30 @@ def test_a_full_disk_does_not_keep_the_link_open(tmp_path: Path) -> None:
     assert run.servo.machine is not None
     with pytest.raises(HardwareError, match="connect"):
         run.servo.machine.latest()
+
+
+def test_a_pause_of_the_servo_is_no_clock_that_disagrees(faults: FaultyLink) -> None:
+    number, paused = 0, False
+    with flown(faults, limits=PATIENT, ignore_latency=True) as run:
+
+        def action() -> np.ndarray | None:
+            """The policy acts during a pause of 15 ms, in the middle of the servo's tick."""
+            nonlocal number
+            if paused:
+                time.sleep(0.015)
+            number += 1
+            record = np.zeros((), ACTIONS)
+            state, now = run.shared.state.read(), time.monotonic()
+            if state is None:
+                return None
+            fill(record, sequence=number, state_sequence=state["sequence"], made=now)
+            fill(record, entry=run.servo.modes.entry, position=POSE, valid_for=2.0, state_time=now)
+            return record
+
+        run.shared.actions.read = action  # type: ignore[method-assign]
+        run.mode(Mode.DAMP)
+        run.mode(Mode.STAND, OperatorRequest.STAND)
+        run.mode(Mode.POLICY, OperatorRequest.WALK)
+        paused, begun = True, number
+        run.until(lambda: number > begun + 30 or bool(run.texts("fault")))
+        assert run.texts("fault") == []

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -23,7 +26,7 @@ from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
 from pronk.runtime.ipc import OPERATOR, Event, Mode, OperatorRequest, Shared, fill
 from pronk.runtime.log import READY, write_log
-from pronk.runtime.plan import Plan
+from pronk.runtime.plan import SERVO_PRIORITY, Plan
 from pronk.runtime.policy_process import serve_policy
 from pronk.runtime.servo import serve_robot
 from pronk.runtime.standby import serve_standby
@@ -31,6 +34,11 @@ from pronk.runtime.teleop import BenchOperator, Operator, OperatorCommand
 
 _RATE_HZ = 50.0
 """Of the operator's program."""
+_BEAT_S = 0.01
+"""Between two heartbeats of the operator's program [s]."""
+_STALL_S = 0.7
+"""Longest that the operator's program may be late, on a busy computer or at a slow terminal, before
+its heartbeat ends; `Plan.operator_timeout_s` follows [s]."""
 _START_S = 30.0
 """In which the servo must have opened the link."""
 _END_S = 10.0
@@ -120,6 +128,8 @@ class Deployment:
         self.standby: BaseProcess | None = None
         """Of a robot behind a network."""
         self._record = np.zeros((), dtype=OPERATOR)
+        self._written, self._beating = threading.Event(), False
+        self._heart = threading.Thread(target=self._beat, name="pronk heartbeat", daemon=True)
         self._open = False
         self._interrupts = Interrupts()
 
@@ -130,6 +140,9 @@ class Deployment:
             self.shared = Shared(joints=len(plan.robot.joints))
         name = self.shared.name
         self.write(OperatorCommand())
+        self._beating = True
+        with terminal_blocked():
+            self._heart.start()
         self._servo_end, servo_end = context.Pipe(duplex=False)
         self._policy_end, policy_end = context.Pipe(duplex=False)
         self._logger_end, talk = context.Pipe()
@@ -191,13 +204,28 @@ class Deployment:
         """
         if self._open:
             self._interrupts.check()
-        record = self._record
+        record = self._record.copy()
         if command.request is not OperatorRequest.NONE:
             record["request"] = command.request
             record["requests"] += 1
         fill(record, time=time.monotonic(), held=command.held, jump=command.jump)
         record["command"] = command.command
-        self.shared.operator.write(record)
+        # Replaced as a whole; the heartbeat alone writes to the mailbox.
+        self._record = record
+        self._written.set()
+
+    def _beat(self) -> None:
+        """Body of a thread: write the newest command with the time, as promptly as the servo."""
+        if self.plan.real_time:
+            with suppress(AttributeError, OSError):  # of this thread alone
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVO_PRIORITY))
+        while self._beating:
+            self._written.clear()
+            record, now = self._record.copy(), time.monotonic()
+            if now - float(record["time"]) <= _STALL_S:
+                record["time"] = now
+                self.shared.operator.write(record)
+            self._written.wait(_BEAT_S)
 
     def run(
         self,
@@ -256,6 +284,8 @@ class Deployment:
                 if process is not None and process.is_alive():
                     process.kill()
                     process.join()
+            self._beating = False
+            self._heart.join()
             self.shared.close()
             self._interrupts.__exit__(None, None, None)
 

@@ -258,6 +258,8 @@ class Servo:
         action, before = self.shared.actions.read(), self.action
         fresh = action is not None and (before is None or action["sequence"] != before["sequence"])
         self.action = action if fresh else before
+        # An action may be younger than the begin of a tick that was interrupted.
+        now = time.monotonic()
         if link_error:
             self.safety.fault(FilterAction.LATCH, Reason.LINK, begun)
         if gone and mode not in (Mode.IDLE, Mode.PREFLIGHT):
@@ -266,7 +268,7 @@ class Servo:
         if mode is Mode.STAND and not self.plan.ignore_latency:
             measured = self.latency.quantile(0.95), self.latency.count
             objection = delay_objection(*measured, self.trained)
-        desired = self.modes.step(begun, state.position, self.safety, self.action, objection)
+        desired = self.modes.step(now, state.position, self.safety, self.action, objection)
         if self.modes.notice:
             self._report("notice", self.modes.notice)
         self._publish(begun)
@@ -275,7 +277,7 @@ class Servo:
             sent, decision = None, self.safety.damped()
         else:
             states = self._met or [state]
-            sent, decision = self.safety.judge(states, desired.command, begun, held=held)
+            sent, decision = self.safety.judge(states, desired.command, now, held=held)
         why = self._send(machine, sent) or link_error
         done = time.monotonic()
         if why:
@@ -283,7 +285,7 @@ class Servo:
         self._act_on_faults(level, begun, why or (decision.detail and decision.text))
         if self._sweep is not None and mode is Mode.SWEEP:
             if sent is not None:
-                self._sweep.sent(begun, sent.position)
+                self._sweep.sent(now, sent.position)
             if self.modes.mode is not Mode.SWEEP:
                 self._end_sweep()
         if self.modes.mode is not mode:
