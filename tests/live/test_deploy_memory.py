@@ -1,4 +1,4 @@
-"""Memory of a run: a small /dev/shm is refused, and the servo's does not grow."""
+"""What a run takes of the system: shared memory, the disk, memory of the servo, processes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,35 @@ from pronk.runtime.servo import Servo
 pytestmark = pytest.mark.live
 
 
-def test_too_little_shared_memory_is_one_sentence(tmp_path: Path) -> None:
+def deployed_with(folder: str, size: str, tmp_path: Path, *words: str) -> Any:
+    """`pronk deploy` where a folder is a file system of a small size."""
     pytest.importorskip("onnxruntime")
-    small = "mount -t tmpfs -o size=64k tmpfs /dev/shm && exec "
+    small = f"mount -t tmpfs -o size={size} tmpfs {folder} && exec "
     unshare = ["unshare", "--mount", "--map-root-user", "sh", "-c"]
     if shutil.which("unshare") is None or subprocess.run([*unshare, small + "true"]).returncode:
         pytest.skip("file systems cannot be mounted here")
     policy = write_hopper(tmp_path / "policy.onnx")
-    words = f"{sys.executable} -m pronk.cli.main deploy {policy} --script 0,0"
-    done = subprocess.run([*unshare, small + words], capture_output=True, text=True)
+    given = f"{sys.executable} -m pronk.cli.main deploy {policy} --script 0,0 {' '.join(words)}"
+    return subprocess.run([*unshare, small + given], capture_output=True, text=True)
+
+
+def test_too_little_shared_memory_is_one_sentence(tmp_path: Path) -> None:
+    done = deployed_with("/dev/shm", "64k", tmp_path)
     assert done.returncode == 2, done.stdout + done.stderr
     assert "/dev/shm" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_log_that_ends_on_a_full_disk_is_a_failure(tmp_path: Path) -> None:
+    folder = tmp_path / "small"
+    folder.mkdir()
+    log = folder / "run.mcap"
+    done = deployed_with(
+        str(folder), "256k", tmp_path, "--log", str(log), "--seconds", "0.5", "--base", "bench"
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert f"{log} ends" in " ".join(done.stderr.split())
+    assert "No space left" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -126,6 +126,8 @@ def test_loss_and_killed_processes(running: tuple[Deployment, Path, Path]) -> No
     assert any(fault.startswith(old) for fault in deployment.summary.faults), notified(deployment)
     assert deployment.summary.servo["states_lost"] > 100
     assert deployment.summary.policy == {}
+    assert "was killed" in deployment.summary.log_error
+    assert f"{log} ends" in deployment.summary.log_error
 
 
 @pytest.mark.parametrize("running", [0.0], indirect=True)

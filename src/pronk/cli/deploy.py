@@ -91,10 +91,13 @@ def deploy(
     _report(summary)
     lost = any(event.kind == "lost" for event in summary.events_seen)
     again = f"pronk deploy {policy} --link {machine.link} --log run.mcap   # keeps everything"
-    failed = bool(summary.faults or summary.refusals or lost)
+    if summary.log_error:
+        console.warn(f"{summary.log_error}.")
+    failed = bool(summary.faults or summary.refusals or lost or summary.log_error)
+    whole = None if summary.log_error else log
     return console.Outcome(
         figures=summary.figures(),
-        wrote=[path for path in (log, None if lost else capture) if path is not None],
+        wrote=[path for path in (whole, None if lost else capture) if path is not None],
         following=[again if log is None else f"pronk report {log}"],
         status=1 if failed else 130 if summary.interrupted else 0,
     )

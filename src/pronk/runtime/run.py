@@ -97,6 +97,7 @@ class RunSummary:
             "faults": self.faults,
             "refusals": self.refusals,
             "standby": self.standby,
+            "log_error": self.log_error,
             "interrupted": self.interrupted,
         }
 
@@ -309,14 +310,27 @@ class Deployment:
         figures = summary.figures()
         if not summary.servo:
             figures["reason"] = "the servo's process was killed"
+        ended = time.time()
         try:
-            if self._logger_end.poll():
+            if not self._logger_end.poll():
+                self._logger_end.send_bytes(orjson.dumps(figures))
+                logger.join(_END_S)
+            if self._logger_end.poll():  # an error, or the end of the process
                 summary.log_error = self._logger_end.recv_bytes().decode()
-            self._logger_end.send_bytes(orjson.dumps(figures))
-        except (OSError, EOFError):
-            summary.log_error = summary.log_error or "the process that writes the log was killed"
-            return  # what it flushed is there
-        logger.join(_END_S)
+            elif logger.exitcode is None:
+                summary.log_error = f"the log was not ended within {_END_S:.0f} s"
+        except EOFError:
+            if logger.exitcode != 0:
+                summary.log_error = "the process that writes the log was killed"
+        except OSError:
+            summary.log_error = "the process that writes the log was killed"
+        dropped = sum(summary.servo.get("dropped", {}).values())
+        if dropped and not summary.log_error:
+            summary.log_error = f"the log lacks {dropped} records: its process was too slow"
+        elif summary.log_error and self.plan.log is not None and self.plan.log.exists():
+            lacking = ended - self.plan.log.stat().st_mtime
+            where = f"{self.plan.log} ends {max(lacking, 0.0):.1f} s before the run"
+            summary.log_error = f"{summary.log_error.rstrip('.')}; {where}"
 
     def _await_logger(self, logger: BaseProcess) -> None:
         until = time.monotonic() + _START_S
