@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.wrong_inputs import CORRUPTIONS, Case, bare, judged
+from benchmarks.wrong_inputs import CORRUPTIONS, SETTINGS, Case, bare, judged
 from pronk.evaluation.virtual_sweep import sweep_virtual
 from pronk.excitation.plan import make_plan
+from pronk.logs.joint_log import JointLog
 from pronk.logs.readers import read_logs
+from pronk.match.pipeline import match_logs
 from pronk.match.plausibility import findings, require_plausible
 from pronk.robots import load_robot
 from pronk.virtual.sim_params import SimParams
@@ -46,6 +48,40 @@ def test_named_or_refused(case: Case, name: str, seed: int) -> None:
 def test_right_inputs_pass(case: Case, kind: str) -> None:
     right = case if kind == "sweep" else replace(case, log=bare(case.log))
     assert judged(right)[0] == set()
+
+
+def bare_log(case: Case, **columns: np.ndarray) -> JointLog:
+    return replace(bare(case.log), **columns)
+
+
+@pytest.mark.parametrize("name", ["encoder scale 1.05", "position filtered"])
+def test_position_and_command_alone_show_a_wrong_position(case: Case, name: str) -> None:
+    change, causes = CORRUPTIONS[name]
+    assert change is not None
+    wrong = change(replace(case, log=bare_log(case)), np.random.default_rng(0))
+    found, words = judged(wrong)
+    assert found & causes, words
+
+
+def test_a_command_column_later_than_the_joint_is_named(case: Case) -> None:
+    late = round(0.02 * case.log.rate_hz)
+    command = np.concatenate([np.repeat(case.log.command[:1], late, 0), case.log.command[:-late]])
+    assert judged(replace(case, log=bare_log(case, command=command)))[0] == {"command delay"}
+
+
+def test_stated_gains_change_no_matched_gains(case: Case) -> None:
+    log = bare_log(case)
+    assert log.stiffness is not None
+    logs = log, replace(log, stiffness=1.25 * log.stiffness)
+    right, wrong = (match_logs([one], ROBOT, settings=SETTINGS).joints[JOINT] for one in logs)
+    assert wrong.stiffness == pytest.approx(right.stiffness, rel=0.01)
+    assert wrong.damping == pytest.approx(right.damping, rel=0.01)
+
+
+def test_a_position_without_counts_of_an_encoder_passes(case: Case) -> None:
+    noise = 1e-6 * np.random.default_rng(0).standard_normal(case.log.position.shape)
+    log = bare_log(case, position=case.log.position + noise)
+    assert judged(replace(case, log=log))[0] == set()
 
 
 @pytest.mark.parametrize("factor", [3.0, 1.0 / 3.0])

@@ -232,11 +232,10 @@ def findings(
     if wrong <= {"drive gains", "torque column"}:
         if time_fit is not None and not settled:
             found += _response(time_fit, robot, logs)
-        dry, model = (
-            np.nan if fit is None else fit.frictionloss,
-            robot.joint(joint).drive.frictionloss,
-        )
-        if not FRICTION[0] <= dry / max(model, 1e-3) <= FRICTION[1] and np.isfinite(dry):
+        model = robot.joint(joint).drive.frictionloss
+        dry = np.nan if fit is None else fit.frictionloss
+        ratio = dry / max(model, 1e-3)
+        if ratio < FRICTION[0] or ratio > FRICTION[1]:
             what = f"friction: {dry:.2g} N m of dry friction fit where the model has {model:.2g}"
             found.append(_finding(what, "friction"))
     return list({one.causes: one for one in reversed(found)}.values())[::-1]
@@ -290,7 +289,7 @@ def _spectra(own: _Recorded, top_hz: float) -> dict[str, ComplexArray]:
     """Spectra of the columns of a joint where its command has power, parts one after another.
 
     Beside command, position, and torque if it is there, `s`, which is i omega [rad/s]; each of
-    shape (f,), of each part a multiple of `GROUP` between `LOW_HZ` and `top_hz`.
+    shape (f,).
     """
     names, torque, rows = ["command", "position"], own.log.torque, []
     if torque is not None and np.ptp(torque[:, own.column]) > 0.0:
@@ -299,7 +298,7 @@ def _spectra(own: _Recorded, top_hz: float) -> dict[str, ComplexArray]:
         columns = [getattr(part, name)[:, own.column] for name in names]
         both = _transformed(part.time, columns, top_hz)
         power = np.abs(both[1])
-        rows.append(_grouped(both[:, power > COMMAND_POWER * power.max(initial=0.0)]))
+        rows.append(both[:, power > COMMAND_POWER * power.max(initial=0.0)])
     return dict(zip(["s", *names], np.hstack(rows), strict=True))
 
 
@@ -311,11 +310,6 @@ def _transformed(time: Array, columns: Sequence[Array], top_hz: float) -> Comple
     inside = (hz >= LOW_HZ) & (hz <= top_hz)
     spectra = np.fft.rfft(even - even.mean(axis=1)[:, None])
     return np.vstack([2j * np.pi * hz, spectra])[:, inside]
-
-
-def _grouped(rows: ComplexArray) -> ComplexArray:
-    """The first columns of rows, a multiple of `GROUP`."""
-    return rows[:, : rows.shape[1] // GROUP * GROUP]
 
 
 def _dead(own: _Recorded) -> Iterator[Finding]:
@@ -434,7 +428,8 @@ def _torque(own: _Recorded, stated: tuple[float, float]) -> list[Finding] | None
         sent, read = undone[name](size)
         sent, read = np.exp(-s * delay) * sent, q * read
         off = (stiffness * (sent - read) - damping * s * read) * np.exp(-s * lag) - t
-        return np.concatenate([off.real, off.imag]) / stated[0]
+        # The last row holds a size that changes nothing.
+        return np.concatenate([off.real / stated[0], off.imag / stated[0], [1e-3 * size]])
 
     start = np.array([*stated, 0.005, 0.0005, 0.0])
     scale = np.array([0.1 * stated[0], 0.1 * max(stated[1], 1e-3), 2e-3, 5e-4, 0.01])
@@ -572,7 +567,8 @@ def response_test(fit: TimeFit, robot: RobotSpec) -> ResponseTest | None:
     names += [name for name in problem.fitted if name not in names]
     for repeat, own in zip(repeats, parts, strict=True):
         columns = [*(own / repeat.weight[:, None]).T, repeat.position]
-        s, residual, *fitted, q = _grouped(_transformed(repeat.time, columns, top_hz))
+        spectra = _transformed(repeat.time, columns, top_hz)
+        s, residual, *fitted, q = spectra[:, : spectra.shape[1] // GROUP * GROUP]
         by_name = dict(zip(problem.fitted, fitted, strict=True))
         soft = -by_name["damping"] / (drive["damping"] * s)
         link = gravity + (inertia - joint.drive.armature) * s**2
@@ -630,6 +626,8 @@ def _response(fit: TimeFit, robot: RobotSpec, logs: Sequence[JointLog]) -> Itera
                 "encoder scale": scaled,
                 "position filter": not counted,
                 "command filter": True,
+                "drive gains": "stiffness" not in fit.problem.fitted,
+                "torque constant": "stiffness" not in fit.problem.fitted,
             }
             yield _finding(
                 f"no joint of the model responds so (position {1.0 + test.scale:.3f} times, rotor "
