@@ -20,6 +20,7 @@ from benchmarks.peers import SIGMA, Estimate, fit_sysid, import_peers
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.match.arm import ArmProblem, trusted
 from pronk.match.fit import solve
+from pronk.match.parameters import PARAMETERS
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
@@ -163,26 +164,36 @@ def fit_arm(arm: ChainSimulation, free: Sequence[str], start: Drives) -> Drives:
 def search_cma_arm(arm: ChainSimulation, free: Sequence[str], start: Drives, seed: int) -> Drives:
     """CMA-ES of each joint of an arm with its own residuals, all joints changed at once."""
     _, cma = import_peers()
-    problem, count = arm_problem(arm, free, start), len(free)
-    low, half = problem.low, 0.5 * (problem.high - problem.low)
+    problem, kinds = arm_problem(arm, free, start), [PARAMETERS[name] for name in free]
+    low, high = (np.array([k.scaled(getattr(k, end)) for k in kinds]) for end in ("low", "high"))
+
+    def drives(units: Sequence[Array]) -> dict[str, dict[str, float]]:
+        points = [low + 0.5 * (high - low) * (np.clip(unit, -1.0, 1.0) + 1.0) for unit in units]
+        return {
+            joint: {
+                **start[joint],
+                **{n: k.unscaled(v) for n, k, v in zip(free, kinds, at, strict=True)},
+            }
+            for joint, at in zip(arm.joints, points, strict=True)
+        }
+
     options = {"bounds": [-1.0, 1.0], "popsize": POPULATION, "verbose": -9}
-    searches = [
-        cma.CMAEvolutionStrategy(unit, SIGMA, options | {"seed": seed + 1 + k})
-        for k, unit in enumerate(((problem.begin - low) / half - 1.0).reshape(-1, count))
-    ]
+    searches = []
+    for k, joint in enumerate(arm.joints):
+        first = np.array([one.scaled(start[joint][n]) for n, one in zip(free, kinds, strict=True)])
+        unit = 2.0 * (first - low) / (high - low) - 1.0
+        searches.append(cma.CMAEvolutionStrategy(unit, SIGMA, options | {"seed": seed + 1 + k}))
     for _ in range(GENERATIONS):
         asked = [search.ask() for search in searches]
         costs = []
-        for one in zip(*asked, strict=True):
-            unit = np.clip(np.concatenate(one), -1.0, 1.0)
-            residual = problem.residual(low + half * (unit + 1.0))
+        for units in zip(*asked, strict=True):
+            residual = problem.residuals(arm.run([drives(units)])[0])
             costs.append([float(np.mean(residual[problem.block(j)] ** 2)) for j in arm.joints])
         for search, units, column in zip(searches, asked, np.transpose(costs), strict=True):
             search.tell(units, column.tolist())
         if all(np.ptp(column) < SPREAD * np.mean(column) for column in np.transpose(costs)):
             break
-    best = np.concatenate([search.result.xfavorite for search in searches])
-    return problem.values(low + half * (np.clip(best, -1.0, 1.0) + 1.0))
+    return drives([search.result.xfavorite for search in searches])
 
 
 def search_cma(rigs: JointRigs, log: JointLog, joint: str, *, seed: int) -> dict[str, float]:

@@ -34,7 +34,7 @@ KNOWN = {
         "armature": 0.02 + 0.004 * i,
         "frictionloss": 0.1 + 0.05 * i,
         "stribeck": 0.15 * i,
-        "delay": 0.008 + 0.002 * i,
+        "delay": 0.012,
     }
     for i, name in enumerate(JOINTS)
 }
@@ -183,11 +183,13 @@ def test_recorded_arm_steps_are_predicted_better_than_with_published_figures(
 
 @recorded
 def test_what_the_recording_does_not_identify_is_held_and_flagged(matched: MatchResult) -> None:
-    # No gravity about shoulder_pan: only the ratios of its parameters can be seen.
-    assert "stiffness" in matched.joints["shoulder_pan"].held
-    pan = matched.gains.joints["shoulder_pan"]
-    assert pan.stiffness == ARM.joint("shoulder_pan").stiffness
-    assert any("stiffness held at 17.8" in f for f in pan.flags)
+    # Commands go out together, so no joint has a delay of its own to pass for stiffer gains: the
+    # servos, all alike, come out alike, also those that gravity does not load.
+    stiffness = [joint.stiffness for joint in matched.gains.joints.values()]
+    assert max(stiffness) < 1.25 * min(stiffness)
+    for joint in matched.gains.joints.values():
+        assert joint.delay_s == 0.0
+        assert any("delay held at 0" in f for f in joint.flags)
     for name in ("shoulder_lift", "elbow_flex"):
         low, high = matched.gains.joints[name].stiffness_ci95
         assert high - low < 0.3 * matched.gains.joints[name].stiffness

@@ -4,7 +4,8 @@ Responses of single joints would be mixed up with each other there, and dry fric
 which dominates the servos of small arms, has no frequency response. Residuals are simulated less
 recorded positions over the samples that the drives could follow. One joint's parameters move its
 own position far more than its neighbours', so the Jacobian is taken block-diagonal: one simulation
-per parameter, in which that of every joint is changed at once.
+per parameter, in which that of every joint is changed at once. The delay is one for the chain: its
+commands go out together, and a joint without gravity cannot tell a delay from stiffer gains.
 
 What the recordings identify is fitted; what they do not is held at the published value, and a flag
 names it. Blocks of the jackknife are pieces of 2.5 to 20 s, an eighth of all recordings; every
@@ -83,12 +84,34 @@ class ArmProblem(Problem):
         `found` holds drives from an earlier fit, the `nominal` ones where a joint is missing;
         `progress` is called with the number of simulations done.
         """
-        super().__init__({**nominal, **found}, fitted, refitted=found)
+        self.late = tuple(joint for joint, names in fitted.items() if "delay" in names)
+        """Joints whose common delay is fitted; it has the slot of the first."""
+        super().__init__(
+            {**nominal, **found},
+            {
+                j: [n for n in names if n != "delay" or j == self.late[0]]
+                for j, names in fitted.items()
+            },
+            refitted=found,
+        )
         self.arm, self.fitted, self.masks, self.nominal = arm, fitted, masks, nominal
         self.measured = arm.measured()
         self._kinds = [name for name in PARAMETERS if name in {name for _, name in self.slots}]
         self._progress = progress
         self._last: tuple[Array, Array] | None = None
+
+    def values(self, x: Array) -> dict[str, dict[str, float]]:
+        """Parameters by joint that some searched numbers stand for."""
+        out = super().values(x)
+        for joint in self.late:
+            out[joint]["delay"] = out[self.late[0]]["delay"]
+        return out
+
+    def columns(self, joint: str) -> list[int]:
+        """Places of a joint's fitted parameters among the searched numbers."""
+        first = self.late[0] if joint in self.late else joint
+        slots = [(first if n == "delay" else joint, n) for n in self.fitted[joint]]
+        return [self.slots.index(slot) for slot in slots]
 
     def residual(self, x: Array) -> Array:
         """Simulated less measured [rad], 0 where not trusted, one joint after another."""
@@ -97,7 +120,7 @@ class ArmProblem(Problem):
         return self._last[1]
 
     def jacobian(self, x: Array) -> Array:
-        """Derivative of `residual`, block-diagonal, shape (joints * rows, p)."""
+        """Derivative of `residual`, shape (joints * rows, p); block-diagonal but for the delay."""
         step = np.array([PARAMETERS[name].step for _, name in self.slots])
         step = np.where(x + step <= self.high, step, -step)
         moved = np.clip(x + step, self.low, self.high)
@@ -108,9 +131,11 @@ class ArmProblem(Problem):
             sets.append(self.values(np.where(mine, moved, x)))
         before, after = self.residual(x), self._simulated(sets)
         out = np.zeros((len(before), len(x)))
-        for i, (joint, name) in enumerate(self.slots):
+        for joint in self.fitted:
             block = self.block(joint)
-            out[block, i] = (after[self._kinds.index(name)][block] - before[block]) / step[i]
+            for i in self.columns(joint):
+                moved_by = after[self._kinds.index(self.slots[i][1])]
+                out[block, i] = (moved_by[block] - before[block]) / step[i]
         return out
 
     def block(self, joint: str) -> slice:
@@ -235,11 +260,17 @@ def _fit_chain(
         problem, solution = fit(fitted, found, masks)
         estimates = _estimates(problem, solution, blocks)
         unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
+        open_delay = most_held and any("delay" in lost for lost in unknown.values())
         found = problem.values(solution.x)
+        if open_delay or any(map(_may_be_none, estimates.values())):
+            for joint in problem.late:
+                held[joint] = (*held[joint], "delay")
+                found[joint]["delay"] = nominal[joint]["delay"]
+            continue
         if not unknown:
             break
         for joint, lost in unknown.items():
-            if len(held[joint]) == most_held or len(fitted[joint]) == 1:
+            if len({*held[joint]} - {"delay"}) >= most_held or len(fitted[joint]) == 1:
                 _refuse(unknown)
             worst = min(lost, key=_HOLD_FIRST.index)
             held[joint] = (*held[joint], worst)
@@ -350,21 +381,29 @@ def _estimates(
 ) -> dict[str, Estimate]:
     """Values and intervals of every joint; those at a bound are flagged."""
     out, values = {}, problem.values(solution.x)
-    for (joint, names), mask in zip(
-        problem.fitted.items(), np.concatenate(problem.masks).T, strict=True
-    ):
-        rows = problem.block(joint)
-        mine = [i for i, (name, _) in enumerate(problem.slots) if name == joint]
-        jacobian = solution.jacobian[rows][:, mine][mask]
-        moves = block_moves(jacobian, solution.residual[rows][mask], blocks[mask])
-        found = estimate(names, solution.x[mine], jackknife(moves), len(moves) - 1, values[joint])
+    used = np.concatenate(problem.masks).T.ravel()
+    numbers = np.tile(blocks, len(problem.arm.joints))[used]
+    moves = block_moves(solution.jacobian[used], solution.residual[used], numbers)
+    covariance = jackknife(moves)
+    for joint, names in problem.fitted.items():
+        mine = problem.columns(joint)
+        own = covariance[np.ix_(mine, mine)]
+        found = estimate(names, solution.x[mine], own, len(moves) - 1, values[joint])
         flags = tuple(
             f"{name} at the bound of the search, {found.values[name]:.3g} {PARAMETERS[name].unit}"
             for name, i in zip(names, mine, strict=True)
-            if solution.at_bound[i] and (name, found.values[name]) != ("stribeck", 0.0)
+            if solution.at_bound[i]
+            # That motion takes away no friction is a possible result.
+            and not (name == "stribeck" and found.values[name] < 0.5)
         )
         out[joint] = replace(found, flags=flags)
     return out
+
+
+def _may_be_none(found: Estimate) -> bool:
+    """True for a delay below zero, which no simulator has, whose interval reaches zero."""
+    low, high = found.ci95.get("delay", (0.0, 0.0))
+    return low < 0.0 < high and found.values["delay"] < 0.0
 
 
 def _refuse(unknown: Mapping[str, tuple[str, ...]]) -> None:

@@ -53,7 +53,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     ),
     "stribeck": Parameter(
         # Beyond the bound MuJoCo's bristles no longer follow a start from rest at a step of 5 ms.
-        *(0.0, 0.95, "of the frictionloss", 0.02, 0.3),
+        *(0.0, 0.9, "of the frictionloss", 0.02, 0.3),
         "slow motion that sticks and slips, or starts from rest, gives the share of the dry "
         "friction that motion takes away",
         sd_max=0.15,

@@ -36,9 +36,9 @@ _BRISTLE, _FRICTION = slice(5, 7), slice(3, 6)
 """Where it packs lugre[:2] in actuator_dynprm and lugre[2:] in actuator_biasprm."""
 _BRISTLE_ANGLE = 0.5
 """Radians that the bristles of dry friction with a Stribeck speed turn a physics step, at a damping
-ratio of a half, with the inertia of the drive alone. They are as stiff as an explicit step allows:
-at 5 ms 280 N m/rad for the servo of the SO-101, and a step of 0.1 rad is within 2 mrad of that with
-bristles a hundred times as stiff at a twentieth of the step."""
+ratio of a half, with the inertia of the joint. They are as stiff as an explicit step allows: of a
+servo of the SO-101 280 N m/rad at 5 ms, which is within 2 mrad of bristles a hundred times as stiff
+at a twentieth of the step over a step of the command of 0.1 rad."""
 
 Values = Mapping[str, float]
 
@@ -140,6 +140,7 @@ def add_drives(
     """
     for name in (*(stiffness or {}), *(damping or {})):
         robot.joint(name)
+    model = spec.compile() if stribeck else None
     for name in joint_names:
         joint = robot.joint(name)
         drive = joint.drive
@@ -150,10 +151,11 @@ def add_drives(
             (damping or {}).get(name, joint.damping),
         )
         friction = {}
-        if stribeck and name in stribeck:
+        if model and stribeck and name in stribeck:
             hinge = spec.joint(name)
             friction["lugre"] = lugre(
-                drive, hinge.frictionloss, stribeck[name], spec.option.timestep
+                *(drive, float(model.joint(name).M0[0]), hinge.frictionloss),
+                *(stribeck[name], spec.option.timestep),
             )
             hinge.frictionloss = 0.0
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -175,13 +177,15 @@ def set_drive_gains(
     model.actuator_gainprm[index, [_KP, _KD]] = _voltage_gains(drive, stiffness, damping)
 
 
-def lugre(drive: Drive, frictionloss: float, stribeck: float, timestep: float) -> list[float]:
+def lugre(
+    drive: Drive, inertia: float, frictionloss: float, stribeck: float, timestep: float
+) -> list[float]:
     """Parameters `lugre` of MuJoCo's dcmotor for dry friction that falls with speed.
 
     Stiffness [N m/rad] and damping [N m s/rad] of the bristles, friction in motion and at rest
     [N m], Stribeck speed [rad/s]. `stribeck` is the share of `frictionloss` that motion takes away.
     """
-    damping = drive.armature * _BRISTLE_ANGLE / timestep
+    damping = inertia * _BRISTLE_ANGLE / timestep
     stiffness = damping * _BRISTLE_ANGLE / timestep
     return [
         stiffness,
@@ -197,7 +201,8 @@ def set_stribeck(
 ) -> None:
     """Change the dry friction of a joint whose drive was added with `stribeck`, as `lugre`."""
     index = _index(model, "actuator", model.nu, joint_name)
-    values = lugre(drive, frictionloss, stribeck, model.opt.timestep)
+    inertia = float(model.dof_M0[model.jnt_dofadr[_index(model, "joint", model.njnt, joint_name)]])
+    values = lugre(drive, inertia, frictionloss, stribeck, model.opt.timestep)
     model.actuator_dynprm[index, _BRISTLE] = values[:2]
     model.actuator_biasprm[index, _FRICTION] = values[2:]
 

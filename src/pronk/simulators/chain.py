@@ -117,12 +117,13 @@ class _StribeckChain(Chain):
         super().__init__(robot, joint, spec=spec, threads=threads)
 
     def _set(self, model: mujoco.MjModel, name: str, values: Mapping[str, float]) -> None:
-        if not has_stribeck(self.robot, name):
-            return super()._set(model, name, values)
-        drive, values = self.robot.joint(name).drive, dict(values)
-        dry = values.pop("frictionloss", drive.frictionloss)
-        set_stribeck(model, name, drive, dry, values.get("stribeck", 0.0))
-        return super()._set(model, name, values)
+        values = dict(values)
+        dry = values.pop("frictionloss", None) if has_stribeck(self.robot, name) else None
+        super()._set(model, name, values)
+        if has_stribeck(self.robot, name):
+            drive = self.robot.joint(name).drive
+            dry = drive.frictionloss if dry is None else dry
+            set_stribeck(model, name, drive, dry, values.get("stribeck", 0.0))
 
 
 class ChainSimulation(Closing):
