@@ -16,6 +16,7 @@ SUMMARIES = {
     "wrong-inputs": "How often wrong inputs are named, and right ones flagged.",
     "latency": "Lateness of the control loop, and policy latency.",
     "supervision": "False alarms and detection times of the sensors' supervision.",
+    "sensor-faults": "From a sensor's fault to damping, over LCM and DDS in real time.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",
 }

@@ -103,6 +103,10 @@ def test_specifications_are_parsed_or_refused() -> None:
         after=2.0,
     )
     assert parse_faults("") == Faults()
+    assert parse_faults("sensor=3s:gyro-zero") == Faults(sensor=("gyro-zero", 3.0))
+    for word in ("sensor=3s", "sensor=3s:nose", "sensor=gyro-zero:3s", "sensor=x:gyro-zero"):
+        with pytest.raises(PronkError, match="fault"):
+            parse_faults(word)
     for word in ("los=0.3", "motor.loss=0.3", "loss=a", "loss", "delay=nan", "freeze=3"):
         with pytest.raises(PronkError, match=word):
             parse_faults(f"after=1,{word}")

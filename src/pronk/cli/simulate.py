@@ -59,7 +59,8 @@ def simulate(
         port: UDP port on this computer (LCM); 7768 if left out.
         domain: Domain on this computer (DDS); 77 if left out, never 0.
         faults: What goes wrong, for instance 'loss=0.3,state.delay=5ms,jitter=2ms,nan=0.01,
-            flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=4s,after=2s'.
+            flip=0.001,duplicate=0.1,reorder=0.1,freeze=3s:0.5s,clock=5s:0.2s,rival=4s,after=2s,
+            sensor=9s:gyro-zero'.
         silence: What the drives do when commands stop.
         silence_after: Time without a command after which they do it, in s.
         mode: The robot's own controller that holds the joints at first; released if left out. LCM:

@@ -130,6 +130,9 @@ class RobotServer:
         self._frozen: State | None = None
         self._sound: State | None = None
         """The last state before a sensor's fault."""
+        self._sensor = known.sensor
+        self.damped_s: float | None = None
+        """From the begin of a sensor's fault to the first damping; None before that [s]."""
         self._slipped, self._worked = 0.0, time.process_time()
         self._late = Histogram()
         wire.corrupt_in = partial(self._flip, self._commands)
@@ -144,6 +147,9 @@ class RobotServer:
             self._last_command = until
             self._machine.send(command)
             self.counts["commands applied"] += 1
+            began = math.inf if self._sensor is None else self._sensor[1]
+            if self.damped_s is None and until >= began and not command.stiffness.any():
+                self.damped_s = until - began
         if (
             until - self._last_command > self._watchdog.silence_after
             and self._watchdog.silence != "hold"
@@ -165,6 +171,11 @@ class RobotServer:
             self._states.put(self._reported(state), until)
         for state in self._states.due(until):
             self._wire.publish(state)
+
+    def spoil(self, fault: str | None) -> None:
+        """Begin a fault of `SENSOR_FAULTS` now, or end it."""
+        self._sensor = None if fault is None else (fault, self._now)
+        self.damped_s = None
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Run in real time until `stop()` is true, at most one tick after that."""
@@ -196,6 +207,7 @@ class RobotServer:
             "command_faults": dict(self._commands.counts),
             "state_faults": dict(self._states.counts),
             "slipped_s": self._slipped,
+            "damped_s": self.damped_s,
             "cpu_share": (time.process_time() - self._worked) / max(self._now, TICK_S),
             "lateness": self._late.figures(),
         }
@@ -219,10 +231,10 @@ class RobotServer:
             state = replace(self._frozen, time=state.time, sequence=state.sequence)
         else:
             self._frozen = None
-        if faults.sensor is not None and now < faults.sensor[1]:
+        if self._sensor is None or now < self._sensor[1]:
             self._sound = state
-        elif faults.sensor is not None:
-            state = spoiled(faults.sensor[0], self._sound or state, state)
+        else:
+            state = spoiled(self._sensor[0], self._sound or state, state)
         if self._states.strikes("nan", now):
             name = _BROKEN_FIELDS[self._states.pick(len(_BROKEN_FIELDS))]
             values = getattr(state, name).copy()
