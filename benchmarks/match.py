@@ -21,7 +21,7 @@ Robots are taken one after the other; an interrupt ends with the table of those 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -62,6 +62,9 @@ NOMINAL = "nominal with delay"
 PLAIN = "plain fit"
 PRONK = "pronk"
 PAPER = "pronk, paper's method"
+DRY, CMA = "plain fit, friction free", "CMA-ES, friction free"
+ON_ARM = (PRONK, NOMINAL, PLAIN, DRY, CMA)
+"""Methods for joints that move together."""
 FITTED = ("chirp_sweep", "multisine", "backlash_detection")
 RECORDED = ("step_response", "sinusoidal_sweep")
 """Recordings of the SO-101 that give the drives, and that judge them."""
@@ -164,7 +167,7 @@ def run(
             yield rows
 
 
-def on_recordings(folder: Path, report: Progress) -> list[dict[str, Any]]:
+def on_recordings(folder: Path, report: Progress, wanted: Collection[str]) -> list[dict[str, Any]]:
     """Rows of the SO-101: `FITTED` give the drives, `RECORDED` judge them.
 
     Raises:
@@ -199,9 +202,10 @@ def on_recordings(folder: Path, report: Progress) -> list[dict[str, Any]]:
             PRONK: pronk,
             NOMINAL: lambda _: fit_arm(arm, ("delay",), nominal),
             PLAIN: lambda pronks: fit_arm(arm, FREE, given(pronks)),
-            f"{PLAIN}, friction free": lambda pronks: fit_arm(arm, dry, given(pronks)),
-            "CMA-ES, friction free": lambda pronks: search_cma_arm(arm, dry, given(pronks), 0),
+            DRY: lambda pronks: fit_arm(arm, dry, given(pronks)),
+            CMA: lambda pronks: search_cma_arm(arm, dry, given(pronks), 0),
         }
+        chosen = {name: fit for name, fit in chosen.items() if name in {PRONK, *wanted}}
         for k, (method, fit) in enumerate(chosen.items()):
             begin = time.perf_counter()
             drives = fit(found)
@@ -353,17 +357,16 @@ def match(
             but mujoco.sysid, whose rig here is one joint.
     """
     begin, known = time.perf_counter(), methods()
-    if unknown := set(method) - set(known):
-        raise PronkError(f"methods {', '.join(unknown)}; expected some of {', '.join(known)}.")
-    if arm and method:
-        raise PronkError(f"--method {method[0]} with --arm; the recordings go to all methods.")
-    wanted = {NOMINAL, PLAIN, *(method or known)}
+    names = ON_ARM if arm else tuple(known)
+    if unknown := set(method) - set(names):
+        raise PronkError(f"methods {', '.join(unknown)}; expected some of {', '.join(names)}.")
+    wanted = {NOMINAL, PLAIN, *(method or names)}
     chosen = {name: fit for name, fit in known.items() if name in wanted}
     rows: list[dict[str, Any]] = []
     with console.progress() as report:
         try:
             virtual = run(robots, seed, report, joints=joints, chosen=chosen, folder=cache)
-            for more in [on_recordings(arm, report)] if arm else virtual:
+            for more in [on_recordings(arm, report, wanted)] if arm else virtual:
                 rows += more
         except KeyboardInterrupt:
             console.warn("interrupted")

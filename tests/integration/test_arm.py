@@ -108,6 +108,16 @@ def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
         fit_together([log], ARM, DRIVE_MODE, most_held=0)
 
 
+def test_named_parameters_alone_are_fitted() -> None:
+    log = recorded_with_known_drives(commands(20.0, (0.2, 3.0), 0.2))
+    found = match_logs([log], ARM, mode="drive", free=("damping",), drive_gains="default")
+    for joint in found.joints.values():
+        assert set(joint.ci95) == {"damping"}
+        assert joint.stiffness == 17.8
+    with pytest.raises(PronkError, match="offset"):
+        match_logs([log], ARM, mode="drive", free=("offset",), drive_gains="default")
+
+
 def test_too_short_and_misspelled_are_refused() -> None:
     log = commands(5.0, (0.2, 3.0), 0.2)
     with pytest.raises(LogError, match="at least 3"):

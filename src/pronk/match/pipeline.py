@@ -130,7 +130,8 @@ def match_logs(
                 f"simulator {chosen.simulator}: several joints of these logs move at once, which "
                 "only simulator mujoco matches; record one joint at a time."
             )
-        info, names = mujoco_info(robot), GAINS_MODE if mode == "gains" else DRIVE_MODE
+        info = mujoco_info(robot)
+        names = GAINS_MODE if mode == "gains" else checked_names(free or DRIVE_MODE, FREE)
         with clock.stage("fit"):
             joints, excluded = fit_together(
                 logs, robot, names, threads=chosen.threads, progress=clock.report
