@@ -108,6 +108,15 @@ def test_slow_motion_does_not_tell_armature_from_delay_and_is_refused() -> None:
         fit_together([log], ARM, DRIVE_MODE, most_held=0)
 
 
+def test_command_that_is_logged_late_is_flagged() -> None:
+    log = recorded_with_known_drives(commands(30.0, (0.2, 6.0), 0.3))
+    late = np.concatenate([log.command[:1], log.command[:-1]])
+    joints, _ = fit_together([replace(log, command=late)], ARM, DRIVE_MODE)
+    for joint in joints.values():
+        assert joint.delay_s == 0.0
+        assert any("delay -8.0 ms" in flag and "command later" in flag for flag in joint.flags)
+
+
 def test_named_parameters_alone_are_fitted() -> None:
     log = recorded_with_known_drives(commands(20.0, (0.2, 3.0), 0.2))
     found = match_logs([log], ARM, mode="drive", free=("damping",), drive_gains="default")

@@ -437,6 +437,11 @@ def _joint_fits(
             f"{PARAMETERS[one].remedy}"
             for one in held[name]
         ]
+        if found.values["delay"] < 0.0:
+            flags.append(
+                f"delay {1e3 * found.values['delay']:.1f} ms: the log has the command later than "
+                "the drive had it; 0 in the gains, which hold for earlier commands"
+            )
         if np.isfinite(limit_hz[name]):
             share = mask.sum() / sum(len(p) for p in problem.measured if np.isfinite(p[0, i]))
             flags.append(
