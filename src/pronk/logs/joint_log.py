@@ -142,16 +142,17 @@ class JointLog:
 
     def cut(self, segment: Segment) -> JointLog:
         """The part of the log inside one segment, as a log of its own (same clock)."""
-        inside = (self.time >= segment.start - 1e-9) & (self.time <= segment.stop + 1e-9)
-        if int(inside.sum()) < 2:
+        first = int(np.searchsorted(self.time, segment.start - 1e-9))
+        last = int(np.searchsorted(self.time, segment.stop + 1e-9, side="right"))
+        if last - first < 2:
             raise LogError(
                 f"{self.source or 'log'}: segment {segment.start:.3f} to {segment.stop:.3f} s "
-                f"holds {int(inside.sum())} samples; the log spans {self.time[0]:.3f} to "
+                f"holds {max(last - first, 0)} samples; the log spans {self.time[0]:.3f} to "
                 f"{self.time[-1]:.3f} s."
             )
         names = ("time", "command", "position", "velocity", "torque", "frequency")
         rows = {name: getattr(self, name) for name in names}
-        part: dict[str, Any] = {n: None if v is None else v[inside] for n, v in rows.items()}
+        part: dict[str, Any] = {n: None if v is None else v[first:last] for n, v in rows.items()}
         return replace(self, segments=(segment,), **part)
 
 

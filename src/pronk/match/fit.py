@@ -20,8 +20,6 @@ from pronk.match.parameters import PARAMETERS
 Array = NDArray[np.float64]
 
 _AT_BOUND = 1e-3
-_LONGEST = 0.3
-"""Longest step of one round of `solve_together`."""
 _SETTLED = 3e-4
 """A problem of `solve_together` whose next step is shorter is done: 0.03 % of a gain."""
 _ROUNDS = 12
@@ -127,12 +125,18 @@ P = TypeVar("P", bound=Problem)
 
 
 def solve_together(
-    problems: Sequence[P], evaluate: Callable[[Sequence[tuple[P, Array]]], None]
+    problems: Sequence[P],
+    evaluate: Callable[[Sequence[tuple[P, Array]]], None] = lambda points: None,
+    *,
+    tolerance: float = 0.0,
+    longest: float = 0.3,
 ) -> list[Solution]:
-    """Solve small problems by damped Gauss-Newton, in step, from points near their optima.
+    """Solve small problems by damped Gauss-Newton within their bounds, in step.
 
     In step because the simulator is fastest with many simulations at once: `evaluate` prepares all
-    residuals and Jacobians of one round, each problem at its point. Bounds are not used.
+    residuals and Jacobians of one round, each problem at its point. A problem is done when its next
+    step, which is no longer than `longest`, is short, or promises to reduce the sum of squares by
+    less than `tolerance` of it: near the optimum the chatter of dry friction hides more.
     """
     points = [problem.begin for problem in problems]
     best, steps = list(points), [np.full(len(point), np.inf) for point in points]
@@ -143,22 +147,39 @@ def solve_together(
             break
         evaluate([(problems[i], points[i]) for i in active])
         for i in active.copy():
-            residual, jacobian = problems[i].residual(points[i]), problems[i].jacobian(points[i])
-            cost = float(residual @ residual)
-            if not np.isfinite(cost) or not cost <= costs[i] * (1.0 + 1e-9):
+            residual = problems[i].residual(points[i])
+            cost, short = float(residual @ residual), np.abs(steps[i]).max() < _SETTLED
+            if np.isfinite(cost) and cost <= costs[i] * (1.0 + 1e-9):
+                costs[i], best[i] = cost, points[i]
+                steps[i] = _step(problems[i], points[i], longest)
+                short = np.abs(steps[i]).max() < _SETTLED
+            else:
                 # Worse (or diverged): go back half the way. A step too short to matter that no
                 # longer helps has reached the optimum.
-                if costs[i] == np.inf or np.abs(steps[i]).max() < _SETTLED:
-                    settled[i] = costs[i] < np.inf
-                    active.remove(i)
-                else:
-                    steps[i] = steps[i] / 2.0
-                    points[i] = best[i] + steps[i]
-                continue
-            change = np.linalg.lstsq(jacobian.T @ jacobian, jacobian.T @ residual, rcond=None)[0]
-            steps[i] = np.clip(-change, -_LONGEST, _LONGEST)
-            costs[i], best[i], points[i] = cost, points[i], points[i] + steps[i]
-            if np.abs(steps[i]).max() < _SETTLED:
-                settled[i] = True
+                steps[i] = steps[i] / 2.0
+            points[i] = best[i] + steps[i]
+            if costs[i] == np.inf or short or _promised(problems[i], best[i], steps[i]) < tolerance:
+                settled[i] = costs[i] < np.inf
                 active.remove(i)
     return [Solution.at(*one) for one in zip(problems, best, settled, strict=True)]
+
+
+def _step(problem: Problem, x: Array, longest: float) -> Array:
+    """Gauss-Newton step from a point, within the bounds, shape (p,)."""
+    residual, jacobian = problem.residual(x), problem.jacobian(x)
+    free = np.ones(len(x), dtype=bool)
+    while True:
+        own, step = jacobian[:, free], np.zeros(len(x))
+        step[free] = -np.linalg.lstsq(own.T @ own, own.T @ residual, rcond=None)[0]
+        step = np.clip(x + np.clip(step, -longest, longest), problem.low, problem.high) - x
+        stuck = free & (step == 0.0) & ((x == problem.low) | (x == problem.high))
+        if not stuck.any() or stuck[free].all():
+            return step
+        free &= ~stuck
+
+
+def _promised(problem: Problem, x: Array, step: Array) -> float:
+    """Share of the sum of squares that a step from a point takes away, to first order."""
+    residual = problem.residual(x)
+    after = residual + problem.jacobian(x) @ step
+    return 1.0 - float(after @ after) / float(residual @ residual)

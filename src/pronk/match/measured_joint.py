@@ -7,8 +7,9 @@ windows and segments that the log went through.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ from pronk.response.estimate import (
     log_rate,
     operator,
 )
-from pronk.response.response import FrequencyResponse
+from pronk.response.response import Estimator, FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
 
@@ -52,14 +53,11 @@ class MeasuredJoint:
     sign: float
     """Between this joint's coordinate and that of the joint simulated in its place."""
     measured: FrequencyResponse
-    matrix: ComplexArray
-    """From position about the pose at the start of each step to response, shape (steps, f)."""
+    operator: Callable[[Array], ComplexArray]
+    """From instants on the clock of the log, shape (n,), to the map of positions then to the
+    response, shape (n, f)."""
     fit_mask: NDArray[np.bool_]
     """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
-    fit_matrix: Array
-    """The part of `matrix` that the fit needs, real and imaginary columns side by side (one real
-    product is faster than one of complex numbers), shape (steps, 2 inside). The estimator
-    gets nothing of these frequencies from later steps, so they need not be simulated."""
     warnings: tuple[str, ...] = ()
     """What could not be used beside it."""
 
@@ -72,6 +70,27 @@ class MeasuredJoint:
     def omega(self) -> Array:
         """Angular frequencies of the fit [rad/s], shape (inside,)."""
         return self.measured.omega[self.fit_mask]
+
+    @cached_property
+    def matrix(self) -> ComplexArray:
+        """From position about the pose at the start of each step to response, shape (steps, f)."""
+        return self.operator(self.trace.time)
+
+    @cached_property
+    def fit_matrix(self) -> Array:
+        """The part of `matrix` that the fit needs, shape (steps, 2 inside).
+
+        Real and imaginary columns side by side: one real product is faster than one of complex
+        numbers. A chirp leaves the band long before it ends; the windows of the segments after
+        that hold next to nothing of the band's frequencies. The rows end where all remaining
+        positions together move no gain by `_TAIL`, judged by a joint that follows its command
+        perfectly, so later steps need not be simulated.
+        """
+        chosen, command = self.matrix[:, self.fit_mask], self.trace.command - self.trace.command[0]
+        tail = np.abs(np.cumsum((chosen * command[:, None])[::-1], axis=0)[::-1]).max(axis=1)
+        loud = np.nonzero(tail > _TAIL)[0]
+        steps = min(int(loud[-1]) + 2, len(chosen)) if len(loud) else len(chosen)
+        return np.hstack([chosen[:steps].real, chosen[:steps].imag])
 
     @property
     def steps(self) -> int:
@@ -231,15 +250,13 @@ def measured_joints(
                 raise
             warnings.append(f"the response at {response.amplitude:.3g} rad is left out: {error}")
             continue
-        matrix = operator(part, joint, settings.estimator, rate_hz).matrix(trace.time)
         found.append(
             MeasuredJoint(
                 trace=trace,
                 sign=known.original[1],
                 measured=response,
-                matrix=matrix,
+                operator=partial(_matrix, part, joint, settings.estimator, rate_hz),
                 fit_mask=inside,
-                fit_matrix=_fit_matrix(matrix, inside, trace.excitation(robot)[1]),
             )
         )
     found[0] = replace(found[0], warnings=tuple(warnings))
@@ -285,11 +302,14 @@ def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
     )
     # Only frequencies that are coherent in all logs.
     inside = np.logical_and.reduce([goal.fit_mask for goal in goals])
-    first = goals[0]
-    kept = inside[first.fit_mask]
-    matrix = first.fit_matrix[:, np.concatenate([kept, kept])]
     warnings = tuple(dict.fromkeys(one for goal in goals for one in goal.warnings))
-    return replace(first, measured=measured, fit_mask=inside, fit_matrix=matrix, warnings=warnings)
+    return replace(goals[0], measured=measured, fit_mask=inside, warnings=warnings)
+
+
+def _matrix(
+    part: JointLog, joint: str, estimator: Estimator, rate_hz: float, time: Array
+) -> ComplexArray:
+    return operator(part, joint, estimator, rate_hz).matrix(time)
 
 
 def _inside(
@@ -317,17 +337,3 @@ def _inside(
             "Hz; repeat the sweep with a larger amplitude, a stiffer base or more repeats."
         )
     return coherent
-
-
-def _fit_matrix(matrix: ComplexArray, inside: NDArray[np.bool_], command: Array) -> Array:
-    """Rows and columns of the matrix that the fit needs (`MeasuredJoint.fit_matrix`).
-
-    A chirp leaves the band long before it ends; the windows of the segments after that hold next
-    to nothing of the band's frequencies. The rows end where all remaining positions together move
-    no gain by `_TAIL`, judged by a joint that follows its command perfectly.
-    """
-    chosen = matrix[:, inside]
-    tail = np.abs(np.cumsum((chosen * command[:, None])[::-1], axis=0)[::-1]).max(axis=1)
-    loud = np.nonzero(tail > _TAIL)[0]
-    steps = min(int(loud[-1]) + 2, len(matrix)) if len(loud) else len(matrix)
-    return np.hstack([chosen[:steps].real, chosen[:steps].imag])

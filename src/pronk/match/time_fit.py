@@ -24,7 +24,7 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 from pronk.logs.joint_log import JointLog
-from pronk.match.fit import Problem, Solution, solve
+from pronk.match.fit import Problem, Solution, solve_together
 from pronk.match.parameters import GAINS, PARAMETERS
 from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
 from pronk.response.estimate import excitations
@@ -40,11 +40,10 @@ Masks = Sequence[Sequence[Mask]]
 TIME_FIT = ("stiffness", "damping", "frictionloss", "delay")
 """What is fitted where the armature is known."""
 _PLAIN = ("stiffness", "damping", "delay")
-_ROUNDS = 20
-_SETTLED = 1e-4
-"""Relative change of cost or parameters that ends the search of the result."""
-_ROUGH = 1e-3
-"""The same where fits are compared on what was kept aside."""
+_SETTLED = 1e-3
+"""Relative change of the cost, to come, that ends a search: half as much of an error."""
+_LONGEST = 1.0
+"""Longest step of the logarithm of a parameter: friction may be a hundred times off."""
 _LOWEST_HZ = 0.3
 """Frequencies below count alike: a chirp is ramped up there and the joint follows one to one."""
 _BLOCKS = 8
@@ -280,7 +279,7 @@ def fit_joint(
         if not names:
             return dict(begin)
         problem = TimeProblem(simulations, names, begin, kept)
-        return problem.drive(solve(problem, tolerance=_ROUGH, rounds=_ROUNDS).x)
+        return problem.drive(_solved(problem).x)
 
     trained, plain = fit(fitted, start), [name for name in _PLAIN if name in fitted]
     drives = {
@@ -291,7 +290,7 @@ def fit_joint(
     }
     errors = {name: simulations.rmse(drive, aside) for name, drive in drives.items()}
     problem = TimeProblem(simulations, fitted, trained)
-    solution = solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
+    solution = _solved(problem)
     found, by_amplitude = _estimate(problem, solution), _by_amplitude(problem, solution)
     return TimeFit(
         estimate=found,
@@ -303,6 +302,10 @@ def fit_joint(
         problem=problem,
         solution=solution,
     )
+
+
+def _solved(problem: TimeProblem) -> Solution:
+    return solve_together([problem], tolerance=_SETTLED, longest=_LONGEST)[0]
 
 
 def _split(records: Sequence[Recorded]) -> tuple[list[list[Mask]], list[list[Mask]]]:
