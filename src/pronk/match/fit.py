@@ -158,7 +158,12 @@ def solve_together(
                 # longer helps has reached the optimum.
                 steps[i] = steps[i] / 2.0
             points[i] = best[i] + steps[i]
-            if costs[i] == np.inf or short or _promised(problems[i], best[i], steps[i]) < tolerance:
+            # A step that was cut short in one number may promise nothing; it is tried all the same.
+            if (
+                costs[i] == np.inf
+                or short
+                or 0.0 <= _promised(problems[i], best[i], steps[i]) < tolerance
+            ):
                 settled[i] = costs[i] < np.inf
                 active.remove(i)
     return [Solution.at(*one) for one in zip(problems, best, settled, strict=True)]
