@@ -123,6 +123,12 @@ def test_named_parameters_alone_are_fitted() -> None:
     for joint in found.joints.values():
         assert set(joint.ci95) == {"damping"}
         assert joint.stiffness == 17.8
+    (delay,) = {
+        joint.ci95["delay"]
+        for joint in fit_together([log], ARM, ("delay",))[0].values()
+        if set(joint.ci95) == {"delay"}
+    }
+    assert delay[0] < delay[1]
     with pytest.raises(PronkError, match="offset"):
         match_logs([log], ARM, mode="drive", free=("offset",), drive_gains="default")
 

@@ -96,7 +96,6 @@ class ArmProblem(Problem):
         )
         self.arm, self.fitted, self.masks, self.nominal = arm, fitted, masks, nominal
         self.measured = arm.measured()
-        self._kinds = [name for name in PARAMETERS if name in {name for _, name in self.slots}]
         self._progress = progress
         self._last: tuple[Array, Array] | None = None
 
@@ -124,18 +123,15 @@ class ArmProblem(Problem):
         step = np.array([PARAMETERS[name].step for _, name in self.slots])
         step = np.where(x + step <= self.high, step, -step)
         moved = np.clip(x + step, self.low, self.high)
-        step = moved - x
-        sets = []
-        for kind in self._kinds:
-            mine = np.array([name == kind for _, name in self.slots])
-            sets.append(self.values(np.where(mine, moved, x)))
-        before, after = self.residual(x), self._simulated(sets)
+        kinds = np.array([name for _, name in self.slots])
+        sets = {kind: self.values(np.where(kinds == kind, moved, x)) for kind in np.unique(kinds)}
+        before = self.residual(x)
+        after = dict(zip(sets, self._simulated(list(sets.values())), strict=True))
         out = np.zeros((len(before), len(x)))
         for joint in self.fitted:
             block = self.block(joint)
             for i in self.columns(joint):
-                moved_by = after[self._kinds.index(self.slots[i][1])]
-                out[block, i] = (moved_by[block] - before[block]) / step[i]
+                out[block, i] = (after[kinds[i]][block] - before[block]) / (moved[i] - x[i])
         return out
 
     def block(self, joint: str) -> slice:
@@ -173,7 +169,8 @@ def fit_together(
     Args:
         logs: Recordings of one robot whose base is fixed; several joints may move at once.
         robot: The robot.
-        names: Parameters to fit, out of `PARAMETERS`.
+        names: Parameters to fit, out of `PARAMETERS`; `stribeck` goes with `frictionloss` where the
+            drive has a Stribeck speed.
         most_held: How many parameters of a joint may be held at the published value, one after
             the other, because the recordings do not identify them.
         threads: Threads of the simulator.
@@ -190,7 +187,7 @@ def fit_together(
     """
     if not logs:
         raise LogError("no recordings; the fit of an arm needs at least one.")
-    names = checked_names(names, tuple(PARAMETERS))
+    names = checked_names(names, [name for name in PARAMETERS if name != "stribeck"])
     fits: dict[str, JointFit] = {}
     excluded: dict[str, str] = {}
     chains = branches(logs, robot)
@@ -234,9 +231,9 @@ def _fit_chain(
     aside = blocks % 4 == 3
     if not aside.any():
         aside = blocks == blocks.max()
-    edges = np.cumsum([len(mask) for mask in masks])[:-1]
-    out_of_fit = np.split(aside, edges)
-    kept = [mask & ~out[:, None] for mask, out in zip(masks, out_of_fit, strict=True)]
+    parts = np.split(aside, np.cumsum([len(mask) for mask in masks])[:-1])
+    kept = [mask & ~part[:, None] for mask, part in zip(masks, parts, strict=True)]
+    left = [mask & part[:, None] for mask, part in zip(masks, parts, strict=True)]
 
     def fit(
         names: Mapping[str, Sequence[str]], begin: Drives, used: Sequence[Mask]
@@ -244,15 +241,8 @@ def _fit_chain(
         problem = ArmProblem(arm, used, names, nominal, begin, count_runs)
         return problem, solve(problem, tolerance=_SETTLED, rounds=_ROUNDS)
 
-    free = {
-        j: tuple(
-            n
-            for n in PARAMETERS
-            if n in names
-            or (n == "stribeck" and "frictionloss" in names and has_stribeck(arm.robot, j))
-        )
-        for j in arm.joints
-    }
+    falling = ("stribeck",) if "frictionloss" in names else ()
+    free = {j: (*names, *(falling if has_stribeck(arm.robot, j) else ())) for j in arm.joints}
     held: dict[str, tuple[str, ...]] = dict.fromkeys(arm.joints, ())
     found: dict[str, dict[str, float]] = {}
     while True:
@@ -260,9 +250,10 @@ def _fit_chain(
         problem, solution = fit(fitted, found, masks)
         estimates = _estimates(problem, solution, blocks)
         unknown = {j: e.unidentified for j, e in estimates.items() if e.unidentified}
-        open_delay = most_held and any("delay" in lost for lost in unknown.values())
+        lost_delay = most_held and any("delay" in lost for lost in unknown.values())
+        none_late = any(map(_may_be_none, estimates.values()))
         found = problem.values(solution.x)
-        if open_delay or any(map(_may_be_none, estimates.values())):
+        if (lost_delay or none_late) and all(len(fitted[j]) > 1 for j in problem.late):
             for joint in problem.late:
                 held[joint] = (*held[joint], "delay")
                 found[joint]["delay"] = nominal[joint]["delay"]
@@ -283,7 +274,6 @@ def _fit_chain(
             trial, best = fit(some, begin, kept)
             begin = trial.values(best.x)
         drives.append(begin)
-    left = [mask & out[:, None] for mask, out in zip(masks, out_of_fit, strict=True)]
     judge = ArmProblem(arm, left, fitted, nominal, found, count_runs)
     used = np.concatenate(left)
     errors = [judge.residuals(positions) for positions in arm.run(drives)]
