@@ -592,10 +592,11 @@ def response_test(fit: TimeFit, robot: RobotSpec) -> tuple[float, float, float] 
 def _in_counts(position: Array) -> bool:
     """Whether a position moves by whole counts of an encoder; rounded decimals are none."""
     moves = np.abs(np.diff(position))
-    if len(moves := moves[moves > 0.0]) < FEW:
+    count = float(moves[moves > 0.0].min(initial=np.inf))
+    few = moves[(moves > 0.0) & (moves < 20.0 * count)] / count
+    if len(few) < FEW:
         return False
-    decimals = np.log10([moves.min(), np.rad2deg(moves.min())])
-    few = moves[moves < 20.0 * moves.min()] / moves.min()
+    decimals = np.log10([count, np.rad2deg(count)])
     whole = float(np.mean(np.abs(few - np.round(few)) < 0.05)) > 0.99
     return whole and bool(np.abs(decimals - np.round(decimals)).min() > 1e-3)
 
