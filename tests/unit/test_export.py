@@ -12,7 +12,7 @@ from pronk.logs.joint_log import JointLog
 from pronk.match.export import EXPORTS, export_text, group_drives
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.predict import drives_of
-from pronk.match.ranges import group_gains
+from pronk.match.randomization import group_gains
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation
 from pronk.simulators.simulator import SimulatorInfo

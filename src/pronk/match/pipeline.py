@@ -26,7 +26,7 @@ from pronk.match.measured_joint import (
 )
 from pronk.match.parameters import DRIVE_MODE, FREE, GAINS, GAINS_MODE, PARAMETERS, checked_names
 from pronk.match.plausibility import findings, require_plausible
-from pronk.match.ranges import matched_gains
+from pronk.match.randomization import matched_gains
 from pronk.match.response_fit import (
     Fit,
     Pair,

@@ -377,20 +377,28 @@ def _by_amplitude(problem: TimeProblem, solution: Solution) -> Array:
 def _total(
     problem: TimeProblem, solution: Solution, found: Estimate, by_amplitude: Array
 ) -> dict[str, tuple[float, float]]:
-    """Intervals that cover what the model does not explain."""
+    """Intervals that cover what the model does not explain.
+
+    Repeats and parts of the excitations in quadrature. The gains of several amplitudes show that
+    better than the parts, which then count with their deviation alone; no interval is narrower
+    than the change between amplitudes.
+    """
     part = _numbers(problem.records)[2]
     moves = block_moves(solution.jacobian, solution.residual, part)
     spread = np.sqrt(np.diag(jackknife(moves)))
     out = {}
     for name, at, sd in zip(problem.fitted, solution.x, spread, strict=True):
-        kind = PARAMETERS[name]
-        low, high = (kind.scaled(max(end, 1e-9)) - at for end in found.ci95[name])
-        blocks = stats.t.ppf(0.975, len(moves) - 1) * sd
-        change = 0.0
-        if name in GAINS:
+        kind, change = PARAMETERS[name], 0.0
+        ends = [max(end, 1e-9) if kind.log else end for end in found.ci95[name]]
+        if name in GAINS and len(by_amplitude) > 1:
             own = [kind.scaled(value) - at for value in by_amplitude[:, 1 + GAINS.index(name)]]
             change = float(np.abs(own).max())
-        half = [min(float(np.sqrt(end**2 + blocks**2 + change**2)), 20.0) for end in (low, high)]
-        bottom, top = kind.unscaled(at - half[0]), kind.unscaled(at + half[1])
-        out[name] = (bottom, top)
+        else:
+            sd *= stats.t.ppf(0.975, len(moves) - 1)
+        half = [max(np.hypot(kind.scaled(end) - at, sd), change) for end in ends]
+        low, high = (
+            kind.unscaled(at + sign * min(h, 20.0))
+            for sign, h in zip((-1.0, 1.0), half, strict=True)
+        )
+        out[name] = (low, high)
     return out

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pronk.errors import RobotError
 from pronk.match.gains import JointGains
-from pronk.match.ranges import characteristic_frequency, enclosing, group_gains
+from pronk.match.randomization import characteristic_frequency, enclosing, group_gains
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
