@@ -165,11 +165,14 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     paper, joints = gains.robot == ROBOT, gains.joints.values()
     delays = any(one.delay_s > 0.0 for one in joints)
     friction = any(np.isfinite(one.frictionloss) for one in joints)
+    falls = any(one.stribeck > 0.0 for one in joints)
     total = any(np.isfinite(one.stiffness_total95).all() for one in joints)
     interval = "repeat 95 %;2 | total 95 %;2" if total else "95 %;2"
     columns = f"joint | stiffness [N m/rad];2 | {interval} | damping [N m s/rad] | "
     columns += interval.replace(";2", "")
-    columns += " | friction [N m]" * friction + " | delay [ms];1" * delays
+    columns += (
+        " | friction [N m]" * friction + " | in motion [N m]" * falls + " | delay [ms];1" * delays
+    )
     columns += " | by magnitude alone" * total + " | paper, Table I" * paper
     columns += " | nominal error [dB];2 | error [dB];2 | lowest coherence"
     rows = []
@@ -177,7 +180,8 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
         row: list[Any] = [joint_words(name) + " (flagged)" * bool(one.flags)]
         row += [one.stiffness, one.stiffness_ci95] + [one.stiffness_total95] * total
         row += [one.damping, one.damping_ci95] + [one.damping_total95] * total
-        row += [one.frictionloss] * friction + [1000.0 * one.delay_s] * delays
+        row += [one.frictionloss] * friction + [one.frictionloss * (1.0 - one.stribeck)] * falls
+        row += [1000.0 * one.delay_s] * delays
         row += [f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}"] * total
         row += [" / ".join(map(str, TABLE_I.get(name, ("-",))))] * paper
         rows.append([*row, one.naive_error_db, one.error_db, one.coherence_min])
