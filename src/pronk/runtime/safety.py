@@ -155,13 +155,13 @@ class Limits:
     """Longest that attitude, gyro or accelerometer may repeat: an attitude of LCM may be 20 ms old.
     Also the time from which a constant position or velocity counts [s]."""
     attitude: float = 0.06
-    """Between attitude and integral of the gyro; twice the largest [rad]."""
+    """Between attitude and integral of the gyro; 1.7 times the largest of an hour [rad]."""
     turned: float = 0.03
     """Integral of the gyro from which the attitude must have moved too, by a quarter of it; the
     least is nine tenths [rad]."""
     upright: float = 0.5
-    """Between the mean specific force and the attitude's vertical; twice the largest of 15 minutes
-    that include falls [rad]."""
+    """Between the mean specific force and the attitude's vertical; twice the largest of an hour
+    [rad]."""
     encoder: float = 0.18
     """Between position and integral of velocity; the largest is 0.09 with a third of the states
     lost, 0.01 with all of them [rad]."""
