@@ -109,11 +109,10 @@ def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
     collocation = BSpline.design_matrix(time, knots, degree)
     onto_grid = BSpline.design_matrix(np.clip(grid.times, time[0], time[-1]), knots, degree)
     # Real arithmetic: the spline is real, and the solver takes one kind of number.
-    parts = np.concatenate([weights.real, weights.imag], axis=1)
+    parts = np.ascontiguousarray(weights).view(np.float64)
     on_knots: Any = onto_grid.T @ parts
     solved = splu(sparse.csc_matrix(collocation.T)).solve(on_knots)
-    width = weights.shape[1]
-    return np.asarray(solved[:, :width] + 1j * solved[:, width:], dtype=np.complex128)
+    return np.ascontiguousarray(solved).view(np.complex128)
 
 
 def hold(omega: Array, rate_hz: float) -> ComplexArray:

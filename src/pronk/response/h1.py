@@ -274,9 +274,10 @@ class H1Operator:
         before = max(0, -int(where.starts[0]))
         after = max(0, int(where.starts[-1]) + len(where.window) - grid.count)
         spread = np.zeros((before + grid.count + after, len(where.omega)), dtype=np.complex128)
+        term = np.empty_like(kernel)
         for start, row in zip(where.starts + before, conjugate, strict=True):
-            spread[start : start + len(where.window)] += kernel * row
-        weights = spread[before : before + grid.count].copy()
+            spread[start : start + len(where.window)] += np.multiply(kernel, row, out=term)
+        weights = spread[before : before + grid.count]
         weights[0] += spread[:before].sum(axis=0)
         weights[-1] += spread[before + grid.count :].sum(axis=0)
         times = np.asarray(time, dtype=np.float64)
