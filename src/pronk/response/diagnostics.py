@@ -72,9 +72,11 @@ def fit_delay(response: FrequencyResponse) -> float:
 
     def residual(parameters: Array) -> Array:
         log_ratio, log_natural, log_zeta, delay = parameters
-        x = 1j * omega / np.exp(log_natural)
-        joint = np.exp(log_ratio - 1j * omega * delay) / (x**2 + 2.0 * np.exp(log_zeta) * x + 1.0)
-        off = np.log(values / joint)
+        # A step that is far too long overflows; the search then takes a shorter one.
+        with np.errstate(all="ignore"):
+            x = 1j * omega / np.exp(log_natural)
+            second_order = x**2 + 2.0 * np.exp(log_zeta) * x + 1.0
+            off = np.log(values / (np.exp(log_ratio - 1j * omega * delay) / second_order))
         return np.asarray(np.concatenate([weight * off.real, weight * off.imag]))
 
     found = least_squares(residual, start, x_scale=[0.1, 0.1, 0.1, 1e-3], method="trf")
