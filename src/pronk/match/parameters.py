@@ -40,7 +40,7 @@ class Parameter:
 _POSE = "a pose or a payload in which gravity loads the joint, or a torque channel, gives the "
 _SWEEP = "a sweep to higher frequencies at an amplitude that the drive can follow, or a second "
 PARAMETERS: Mapping[str, Parameter] = {
-    "stiffness": Parameter(0.5, 200.0, "N m/rad", 0.02, 0.5, f"{_POSE}stiffness"),
+    "stiffness": Parameter(0.01, 200.0, "N m/rad", 0.02, 0.01, f"{_POSE}stiffness"),
     "damping": Parameter(
         *(0.005, 20.0, "N m s/rad", 0.02, 0.005),
         "a faster sweep, or another damping on the drive, gives the damping",

@@ -39,6 +39,8 @@ class ResponseProblem(Problem):
         """Begin at some stiffness and damping."""
         super().__init__({goal.joint: dict(zip(GAINS, start, strict=True))}, {goal.joint: GAINS})
         self.begin = np.log(np.asarray(start))
+        # Near the optimum from the start, and as weak as any drive.
+        self.low, self.high = np.full(2, -np.inf), np.full(2, np.inf)
         self.goal, self._rigs = goal, rigs
         self._steps = np.array([PARAMETERS[name].step for name in GAINS])
         self._cache: dict[bytes, tuple[Array, Array]] = {}
