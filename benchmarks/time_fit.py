@@ -184,12 +184,12 @@ def search_cma_arm(arm: ChainSimulation, free: Sequence[str], start: Drives, see
         unit = 2.0 * (first - low) / (high - low) - 1.0
         searches.append(cma.CMAEvolutionStrategy(unit, SIGMA, options | {"seed": seed + 1 + k}))
     for _ in range(GENERATIONS):
-        asked = [search.ask() for search in searches]
+        candidates = [search.ask() for search in searches]
         costs = []
-        for units in zip(*asked, strict=True):
+        for units in zip(*candidates, strict=True):
             residual = problem.residuals(arm.run([drives(units)])[0])
             costs.append([float(np.mean(residual[problem.block(j)] ** 2)) for j in arm.joints])
-        for search, units, column in zip(searches, asked, np.transpose(costs), strict=True):
+        for search, units, column in zip(searches, candidates, np.transpose(costs), strict=True):
             search.tell(units, column.tolist())
         if all(np.ptp(column) < SPREAD * np.mean(column) for column in np.transpose(costs)):
             break

@@ -6,7 +6,7 @@ the recorded log. Two kinds of log: `sweep` has all that `pronk sweep` writes (v
 frequency, rate of the commands), `bare` only time, command, position and the drive's gains.
 
 The delay of a match is that behind the command column: where that column is late by less than the
-joint is, the right number is what remains, and nothing in a `bare` log tells.
+joint is, the right number is what remains, and nothing in a `bare` log shows it.
 
 A case counts as named if a finding holds the true cause, as refused if reading, estimating or
 matching the log raises an error; `other` is a finding of other causes alone, `silent` none.

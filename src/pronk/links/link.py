@@ -446,7 +446,7 @@ class NetworkLink(ABC):
 
     @property
     def sources(self) -> int:
-        """Senders of states since the link was opened; 1 where the wire does not tell."""
+        """Senders of states since the link was opened; 1 where the wire does not identify them."""
         return 1
 
     @property

@@ -5,7 +5,7 @@ which dominates the servos of small arms, has no frequency response. Residuals a
 recorded positions over the samples that the drives could follow. One joint's parameters move its
 own position far more than its neighbours', so the Jacobian is taken block-diagonal: one simulation
 per parameter, in which that of every joint is changed at once. The delay is one for the chain: its
-commands go out together, and a joint without gravity cannot tell a delay from stiffer gains.
+commands go out together, and a joint without gravity cannot separate a delay from stiffer gains.
 
 What the recordings identify is fitted; what they do not is held at the published value, and a flag
 names it. Blocks of the jackknife are pieces of 2.5 to 20 s, an eighth of all recordings; every

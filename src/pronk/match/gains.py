@@ -34,7 +34,7 @@ class TorqueParameter:
 
     @property
     def identified(self) -> bool:
-        """True if the recordings tell it."""
+        """True if the recordings identify it."""
         return not self.reason
 
 

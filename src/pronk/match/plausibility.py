@@ -616,7 +616,7 @@ def _response(fit: TimeFit, robot: RobotSpec, logs: Sequence[JointLog]) -> Itera
         soft = (compliance - 1.0) / _PRIOR["compliance"] - rotor / _PRIOR["armature"]
         scaled = not RESPONSE_SCALE[0] < scale < RESPONSE_SCALE[1]
         if scaled or not RESPONSE_SOFT[0] < soft < RESPONSE_SOFT[1 + counted]:
-            # Gain and phase of a drive with unknown inertia and belt do not tell them apart.
+            # Gain and phase of a drive with unknown inertia and belt do not separate them.
             unlike = {
                 "encoder scale": scaled,
                 "position filter": not counted,

@@ -406,10 +406,12 @@ def joint_fits(
     for known in robot.joints:
         name, own = known.name, drives.get(known.name, {})
         found = [flags[name]] if name in flags else []
-        told = {term: own[term].value for term in _BOTH if term in own and own[term].identified}
+        identified = {
+            term: own[term].value for term in _BOTH if term in own and own[term].identified
+        }
         fit = fits.get(name)
         if fit:
-            for term, value in told.items():
+            for term, value in identified.items():
                 parameter, unit = _BOTH[term]
                 other, (low, high) = getattr(fit, parameter), own[term].ci95
                 apart = not low <= other <= high and abs(value - other) > _AGREE * other
@@ -422,11 +424,11 @@ def joint_fits(
                 joint=name,
                 stiffness=known.stiffness,
                 damping=known.damping,
-                armature=told.get("armature", known.drive.armature),
-                frictionloss=told.get("dry", np.nan),
+                armature=identified.get("armature", known.drive.armature),
+                frictionloss=identified.get("dry", np.nan),
                 covariance=np.zeros((2, 2)),
             )
-            held = ["stiffness", "damping", *["armature"] * ("armature" not in told)]
+            held = ["stiffness", "damping", *["armature"] * ("armature" not in identified)]
             found.append(f"{', '.join(held)}: not fitted but those of the robot's file")
         if fit:
             out[name] = replace(fit, torque=own, flags=(*fit.flags, *found))
@@ -524,7 +526,7 @@ def _parameters(
         reason = ""
         if open_share[at] > _NULL:
             reason = (
-                "the motion does not tell it from the links' inertia (joints whose drives are "
+                "the motion does not separate it from the links' inertia (joints whose drives are "
                 "equal in robot.yaml share one armature)"
             )
             value = sd = np.nan

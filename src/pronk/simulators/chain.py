@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
+from pronk.logs.excitations import MOVED_RAD
 from pronk.logs.joint_log import JointLog
 from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_stribeck
@@ -22,9 +23,6 @@ from pronk.simulators.mujoco import Chain, Drives
 from pronk.simulators.simulator import Closing
 
 Array = NDArray[np.float64]
-
-MOVED_RAD = 1e-3
-"""Least travel of a command that excites a joint: two counts of a 12-bit encoder."""
 
 
 def published(robot: RobotSpec, joint: str) -> dict[str, float]:
