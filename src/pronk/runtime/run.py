@@ -268,9 +268,9 @@ class Deployment:
             if self.servo.pid is not None:
                 self._stop_servo()
             if self.standby is not None and self.standby.pid is not None:
-                self.summary.standby = self.shared.standby.written > 0
                 self.standby.terminate()
                 self.standby.join(_END_S)
+                self.summary.standby = self.shared.standby.written > 0
             self.summary.servo = _received(self._servo_end)
             if self.policy is not None:
                 if self.policy.pid is not None:

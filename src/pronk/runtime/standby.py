@@ -56,7 +56,8 @@ def serve_standby(plan: Plan, name: str, end: Connection) -> None:
         mode = None if seen is None else Mode(int(seen["mode"]))
         orphan = os.getppid() != parent
         if begun is None:
-            if mode is Mode.ENDED or stopping or (orphan and mode not in DRIVEN):
+            # A servo that drove the joints and has not ended may yet fall silent.
+            if mode is Mode.ENDED or ((stopping or orphan) and mode not in DRIVEN):
                 break
             if seen is not None and mode in DRIVEN and now - float(seen["now"]) > plan.silence_s:
                 begun = record["time"] = now
