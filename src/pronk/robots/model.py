@@ -9,7 +9,8 @@ held over the step, integrator implicitfast. The bench gets the very same trajec
 native model with no Python in the loop, so `mujoco.rollout` can run it on every core:
 
 - Integrator Euler. Like implicitfast it treats passive joint damping implicitly; unlike it, it
-  leaves the forces of native actuators explicit, which is what a torque computed outside is.
+  leaves the forces of native actuators explicit, which is what a torque computed outside is. The
+  implicit laws of other simulators (`RobotSpec.law`) are implicitfast at the step of the law.
 - One native `dcmotor` a joint, in joint-side units with voltage as the control variable:
   K = V / no_load_speed and R = K V / stall_torque put the torque-speed line where it belongs.
   Torque is K/R times voltage less back-EMF, so the controller gain kp_V = R stiffness / K gives
@@ -26,6 +27,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from pronk.actuator.law import EXPLICIT, DriveLaw
 from pronk.actuator.model import motor_constants
 from pronk.errors import RobotError
 from pronk.robots.robot import Drive, Joint, RobotSpec
@@ -78,8 +80,12 @@ def bench_spec(
     """
     joint = robot.joint(joint_name)
     spec = robot.build_spec()
-    spec.option.timestep = robot.timestep_s
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.timestep = robot.law.substep(robot.timestep_s)
+    spec.option.integrator = (
+        mujoco.mjtIntegrator.mjINT_EULER
+        if robot.law.kind == "explicit"
+        else mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    )
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     remove_geoms(spec)
     base = spec.body(robot.base_body)
@@ -145,11 +151,12 @@ def add_drives(
         joint = robot.joint(name)
         drive = joint.drive
         constant, resistance = _constants(drive)
-        kp, kd = _voltage_gains(
-            drive,
-            (stiffness or {}).get(name, joint.stiffness),
-            (damping or {}).get(name, joint.damping),
+        own = (stiffness or {}).get(name, joint.stiffness)
+        both = (
+            own,
+            robot.law.damping(own, (damping or {}).get(name, joint.damping), spec.option.timestep),
         )
+        kp, kd = _voltage_gains(drive, *both)
         friction = {}
         if model and stribeck and name in stribeck:
             hinge = spec.joint(name)
@@ -170,10 +177,16 @@ def add_drives(
 
 
 def set_drive_gains(
-    model: mujoco.MjModel, joint_name: str, drive: Drive, stiffness: float, damping: float
+    model: mujoco.MjModel,
+    joint_name: str,
+    drive: Drive,
+    stiffness: float,
+    damping: float,
+    law: DriveLaw = EXPLICIT,
 ) -> None:
     """Change the gains of one drive in a compiled model, exactly as compiling anew would."""
     index = _index(model, "actuator", model.nu, joint_name)
+    damping = law.damping(stiffness, damping, model.opt.timestep)
     model.actuator_gainprm[index, [_KP, _KD]] = _voltage_gains(drive, stiffness, damping)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from pronk.actuator.law import EXPLICIT, DriveLaw
 from pronk.errors import RobotError
 
 if TYPE_CHECKING:
@@ -114,6 +115,8 @@ class RobotSpec:
     """Physics step of the training simulator."""
     decimation: int = 4
     """Physics steps per policy step."""
+    law: DriveLaw = EXPLICIT
+    """How the simulator applies stiffness and damping."""
     grid_stiffness: tuple[float, float] = (13.0, 27.0)
     """Stiffness axis of the grid search [N m/rad] (paper F7)."""
     grid_damping: tuple[float, float] = (0.1, 0.7)

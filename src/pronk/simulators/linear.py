@@ -2,15 +2,17 @@
 
 The 5 ms step about the pose is differentiated by MuJoCo (`mjd_transitionFD`) with a torque in
 place of the excited joint's drive. That gives the discrete transfer functions from torque to
-position `P_q(z)` and speed `P_v(z)`; the explicit PD of the training simulator then gives
+position `P_q(z)` and speed `P_v(z)`; explicit PD then gives
 
-    H(z) = kp P_q / (1 + kp P_q + (kd + c) P_v),    z = exp(j omega timestep)
+    H(z) = kp P_q / (1 + kp P_q + kd P_v + c z P_v),    z = exp(j omega timestep)
 
-for a whole grid of gains without simulating anything. `c = 4 f / (pi |speed|)` is the describing
-function of the joint's dry friction `f` (Gelb and Vander Velde, *Multiple-Input Describing
-Functions*, 1968, table of appendix B: ideal relay), iterated with the amplitude of the response.
-What it leaves out (coupling through held joints that slip, the estimator's leakage, friction near
-sticking) is a smooth ratio that simulations at the optimum correct.
+for a whole grid of gains without simulating anything. Where damping is implicit
+(`pronk.actuator.law`) it acts on the speed at the end of the step, `z P_v`.
+`c = 4 f / (pi |speed|)` is the describing function of the joint's dry friction `f` (Gelb and
+Vander Velde, *Multiple-Input Describing Functions*, 1968, table of appendix B: ideal relay),
+iterated with the amplitude of the response. What it leaves out (coupling through held joints that
+slip, the estimator's leakage, friction near sticking) is a smooth ratio that simulations at the
+optimum correct.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pronk.actuator.law import DriveLaw
 from pronk.simulators.mujoco import JointTestRig
 
 Array = NDArray[np.float64]
@@ -43,9 +46,10 @@ class Plant:
     speed: ComplexArray
     """P_v [rad/s/(N m)], shape (f,)."""
     timestep: float
-    """[s]"""
+    """Of the integration [s]."""
     frictionloss: float
     """Dry friction of the excited joint [N m]."""
+    law: DriveLaw
 
     def response(
         self, stiffness: ArrayLike, damping: ArrayLike, *, amplitude: float = float("nan")
@@ -60,12 +64,13 @@ class Plant:
         # The sampled command is a staircase of physics steps; take that hold out.
         half = self.omega * self.timestep / 2.0
         hold = np.exp(-1j * half) * np.sinc(half / np.pi)
+        after = self.speed * np.exp(1j * self.omega * self.timestep)
+        kd = self.law.damping(kp, kd, self.timestep)
         direct = kp * self.position
-        open_loop = 1.0 + direct + kd * self.speed
+        open_loop = 1.0 + direct + kd * (self.speed if self.law.kind == "explicit" else after)
         closed = direct / open_loop
         if self.frictionloss > 0.0 and np.isfinite(amplitude):
             # MuJoCo's dry friction is implicit: it opposes the speed at the end of the step.
-            after = self.speed * np.exp(1j * self.omega * self.timestep)
             speed = amplitude * np.abs(closed) * self.omega
             for _ in range(_FRICTION_ROUNDS):
                 viscous = 4.0 * self.frictionloss / (np.pi * np.maximum(speed, 1e-9))
@@ -98,4 +103,5 @@ def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
         speed=states[:, model.nv + rig.index],
         timestep=float(model.opt.timestep),
         frictionloss=float(rig.model.dof_frictionloss[rig.index]),
+        law=rig.robot.law,
     )

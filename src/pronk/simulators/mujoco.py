@@ -75,8 +75,8 @@ class Chain(Closing):
     def _set(self, model: mujoco.MjModel, name: str, values: Mapping[str, float]) -> None:
         """Give a model parameters of a joint; the robot's own where one is missing."""
         joint, dof = self.robot.joint(name), self.joints.index(name)
-        gains = {"stiffness": joint.stiffness, "damping": joint.damping} | dict(values)
-        set_drive_gains(model, name, joint.drive, gains["stiffness"], gains["damping"])
+        gains = {n: values.get(n, getattr(joint, n)) for n in ("stiffness", "damping")}
+        set_drive_gains(model, name, joint.drive, **gains, law=self.robot.law)
         for parameter in ("armature", "frictionloss"):
             array, own = (getattr(m, f"dof_{parameter}") for m in (model, self.model))
             value = values.get(parameter, float(own[dof]))
@@ -121,18 +121,20 @@ class Chain(Closing):
             first[run] = (
                 self.rest_position(command[run, 0], stiffness) if start is None else start[run]
             )
-        control = np.zeros((*command.shape[:2], model.nu))
-        control[..., self._columns] = command
+        parts = self.robot.law.iterations
+        control = np.zeros((len(command), parts * command.shape[1], model.nu))
+        control[..., self._columns] = np.repeat(command, parts, axis=1)
         state = full_states(model, first)
         after, _ = self._pool.rollout(
             models,
             self._data,
             state,
             control,
-            nstep=command.shape[1],
+            nstep=control.shape[1],
             skip_checks=False,
             control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
         )
+        after = after[:, parts - 1 :: parts]
         return np.concatenate([state[:, None], after], axis=1)[..., 1 : 1 + model.nq]
 
 
@@ -168,7 +170,7 @@ class JointTestRig(Chain):
         self.joint, self.index = robot.joint(joint), self.joints.index(joint)
         self.actuator = int(self._columns[self.index])
         """Column of the excited joint's command."""
-        self.chunk, self.steps = chunk, 0
+        self.chunk, self.steps = max(1, chunk // robot.law.iterations), 0
         self._sensor = int(self.model.sensor_adr[self.model.sensor("excited").id])
         self._models: list[mujoco.MjModel] = []
 
@@ -203,11 +205,11 @@ class JointTestRig(Chain):
     ) -> Iterator[tuple[slice, Array]]:
         """Yield the excited joint's positions a chunk at a time; see `JointRigs.run`."""
         total = len(values["stiffness"])
-        size = min(self.chunk, total)
+        size, parts = min(self.chunk, total), self.robot.law.iterations
         while len(self._models) < size:
             self._models.append(copy.copy(self.model))
-        control = np.empty((size, steps, self.model.nu))
-        sensor = np.empty((size, steps, self.model.nsensordata))
+        control = np.empty((size, parts * steps, self.model.nu))
+        sensor = np.empty((size, parts * steps, self.model.nsensordata))
         initial = full_states(self.model, np.zeros((size, self.model.nq)))
         centre = np.empty(size)
         shared = len(traces) == 1
@@ -223,7 +225,7 @@ class JointTestRig(Chain):
                     pose, command = traces[0 if shared else i].excitation(self.robot, steps)
                     centre[row] = pose[self.index]
                     control[row][:, self._columns] = pose
-                    control[row][:, self.actuator] += command
+                    control[row][:, self.actuator] += np.repeat(command, parts)
                 if not shared or kp not in rest:
                     rest[kp] = self.equilibrium(control[row][0, self._columns], kp)
                 initial[row, 1 : 1 + self.model.nq] = rest[kp]
@@ -233,12 +235,12 @@ class JointTestRig(Chain):
                 initial[:n],
                 control[:n],
                 sensordata=sensor[:n],
-                nstep=steps,
+                nstep=parts * steps,
                 skip_checks=True,
                 control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
             )
             self.steps += n * steps
-            yield part, sensor[:n, :, self._sensor] - centre[:n, None]
+            yield part, sensor[:n, ::parts, self._sensor] - centre[:n, None]
 
 
 def rig_on(device: str) -> Callable[..., JointTestRig]:

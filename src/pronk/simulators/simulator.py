@@ -39,6 +39,8 @@ CHUNK = 100
 class SimulatorInfo:
     """The simulator that gains hold for. In another one the same numbers give another joint."""
 
+    profile: str = ""
+    """A name in `profiles.yaml`; empty for a simulator without one."""
     engine: str = "mujoco"
     version: str = ""
     timestep_s: float = 0.005
@@ -47,6 +49,10 @@ class SimulatorInfo:
     actuator: str = "dc_motor_pd"
     """Explicit PD on position and velocity at the start of each physics step, clipped by the
     torque-speed curve (mjlab's DcMotorActuator)."""
+    law: str = "explicit"
+    """`DriveLaw.kind`."""
+    iterations: int = 1
+    """`DriveLaw.iterations`."""
 
 
 @runtime_checkable

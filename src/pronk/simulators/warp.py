@@ -12,6 +12,8 @@ A step costs a GPU about the same for one simulation as for thousands. So the gr
 there, and runs of fewer than `LEAST` simulations (the refinement, which takes differences between
 neighbouring gains) stay on the processor, in double precision.
 
+Implicit drive laws are simulated on the processor too.
+
 Imported only when used: it needs the extra `pronk[train]`.
 """
 
@@ -103,7 +105,8 @@ class WarpTestRig(JointTestRig):
     ) -> Iterator[tuple[slice, Array]]:
         """Yield the excited joint's positions a chunk at a time; see `JointRigs.run`."""
         total = len(values["stiffness"])
-        if total < self._least or set(values) != {"stiffness", "damping"}:
+        gains_alone = set(values) == {"stiffness", "damping"}
+        if total < self._least or not gains_alone or self.robot.law.kind != "explicit":
             yield from super().run(traces, values, steps)
             return
         for begin in range(0, total, MOST):

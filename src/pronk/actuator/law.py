@@ -1,0 +1,63 @@
+"""The drive law: how an engine applies stiffness and damping of a joint over a physics step.
+
+With inertia `J`, other torques `g`, command `u`, position `q`, velocity `v` and the step `h` the
+velocity changes by
+
+    explicit            h (kp (u - q) - kd v + g) / J
+    implicit_damping    h (kp (u - q) - kd v + g) / (J + h kd)
+    implicit            h (kp (u - q - h v) - kd v + g) / (J + h kd + h^2 kp)
+
+and then `q += h v`. Law `implicit` does so N times a step, with `h` the N-th part of it (the
+position iterations of PhysX). It is `implicit_damping` of damping `kd + h kp`, because
+`q + h v` is the position that the old velocity leads to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.errors import PronkError
+
+Value = TypeVar("Value", float, NDArray[np.float64])
+LAWS = ("explicit", "implicit_damping", "implicit")
+"""Values of `DriveLaw.kind`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveLaw:
+    """One drive law."""
+
+    kind: Literal["explicit", "implicit_damping", "implicit"] = "explicit"
+    iterations: int = 1
+    """Parts of a physics step that law `implicit` computes one after the other."""
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown law, and iterations of a law without any."""
+        if self.kind not in LAWS:
+            raise PronkError(f"drive law {self.kind!r}; expected one of {', '.join(LAWS)}.")
+        if self.iterations < 1 or (self.iterations > 1 and self.kind != "implicit"):
+            raise PronkError(
+                f"drive law {self.kind} with {self.iterations} iterations; expected 1, or 1 or "
+                "more of law implicit."
+            )
+
+    @property
+    def label(self) -> str:
+        """Short name: E, IF or I with the number of iterations."""
+        return {"explicit": "E", "implicit_damping": "IF"}.get(self.kind, f"I{self.iterations}")
+
+    def substep(self, timestep: float) -> float:
+        """Step of the integration within a physics step [s]."""
+        return timestep / self.iterations
+
+    def damping(self, stiffness: Value, damping: Value, substep: float) -> Value:
+        """Damping [N m s/rad] that gives this law where only damping is implicit."""
+        return damping + substep * stiffness if self.kind == "implicit" else damping
+
+
+EXPLICIT = DriveLaw()
+"""A torque computed before the step: mjlab's DcMotorActuator."""
