@@ -26,6 +26,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "sweep": ("pronk.cli.sweep:sweep", "Plan a sweep, check it against the limits, record it."),
     "response": ("pronk.cli.response:response", "Estimate frequency responses; Bode plots."),
     "match": ("pronk.cli.match:match", "Find the gains with which the simulator responds alike."),
+    "profiles": ("pronk.cli.match:profiles", "List the frameworks that gains can be matched for."),
     "predict": ("pronk.cli.match:predict", "Replay logs that the fit has not used."),
     "export": ("pronk.cli.match:export", "Write gains as configuration of a simulator."),
     "train": ("pronk.cli.train:train", "Train a policy that walks and jumps."),

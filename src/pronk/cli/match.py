@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -36,6 +36,7 @@ def match(
     zero_armature: bool = True,
     free: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
     simulator: str = "mujoco",
+    frameworks: Annotated[tuple[str, ...], tyro.conf.arg(name="for")] = (),
     device: str = "cpu",
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
@@ -55,6 +56,8 @@ def match(
         zero_armature: Repeat the paper's search without rotor inertia (--method paper).
         free: drive: fit this instead; repeat it. What the sweeps cannot separate is refused.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
+        frameworks: Match for this framework too, into a folder of its name beside the gains file;
+            repeat it. A name that `pronk profiles` lists, or NAME,timestep_s=S,iterations=N.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
             pronk[train]).
         reading: How logs are read.
@@ -62,7 +65,7 @@ def match(
     from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
-    from pronk.match.pipeline import match_logs
+    from pronk.match.pipeline import match_frameworks
     from pronk.match.result import NOT_BETTER
     from pronk.match.settings import MatchSettings
     from pronk.report.match_page import write_page
@@ -82,20 +85,26 @@ def match(
         simulator=simulator,
     )
     with console.progress() as report:
-        result = match_logs(
+        results = match_frameworks(
             logs,
             known,
+            frameworks,
             mode=mode,
             free=free,
             drive_gains=given,
             settings=settings,
             progress=report,
         )
-        gains_file.save(out, result.gains)
-        result_file.save(out.parent / "match.npz", result)
-        report("page", 0.0)
-        page, part = write_page(out.parent, gains=out.name)
-        report("page", 1.0)
+        result, wrote, pages = results[""], [], []
+        for name, one in results.items():
+            folder = out.parent / name
+            gains_file.save(folder / out.name, one.gains)
+            result_file.save(folder / "match.npz", one)
+            report(f"{name} page".strip(), 0.0)
+            pages.append(write_page(folder, gains=out.name))
+            report(f"{name} page".strip(), 1.0)
+            wrote += [folder / out.name, folder / "match.npz", pages[-1][0]]
+    page, part = pages[0]
     found = part.figures
     errors = (
         f" Gain error in the compared band, RMS over the joints: {found['naive_error_db']:.2f} dB "
@@ -123,15 +132,61 @@ def match(
         figures["mode"] = mode
         figures["held"] = {name: joint.held for name, joint in joints if joint.held}
         figures["rmse"] = {name: {"published": a, "matched": b} for name, a, b in rows}
+    if frameworks:
+        means = framework_rows(results)
+        columns = "framework | group | stiffness [N m/rad] | damping [N m s/rad]"
+        sheet = table(
+            f"{columns} | friction [N m] | delay [s];4 | error [dB] | flagged",
+            [list(row.values()) for row in means],
+            title="The same joints in every framework, means of each group",
+        )
+        console.show_sheet(sheet)
+        figures["frameworks"] = means
     following = [
         f"open {page} in a browser",
         f"pronk predict FRESH_LOG --robot {robot} --gains {out}",
         f"pronk export {out} --to mjlab --out actuators.py",
     ]
-    wrote = [out, out.parent / "match.npz", page]
-    worse = any(f.startswith(NOT_BETTER) for joint in result.joints.values() for f in joint.flags)
+    flags = [f for one in results.values() for j in one.joints.values() for f in j.flags]
+    worse = any(flag.startswith(NOT_BETTER) for flag in flags)
     status = WARNING_STATUS if worse else 0
     return console.Outcome(figures=figures, wrote=wrote, following=following, status=status)
+
+
+def framework_rows(results: Mapping[str, MatchResult]) -> list[dict[str, Any]]:
+    """Means over the joints of each group in each framework, for the table and for JSON."""
+    from pronk.report.match_page import group_members
+
+    rows = []
+    for name, result in results.items():
+        for group, members in group_members(result.gains).items():
+            own = [result.gains.joints[member] for member in members]
+            names = ("stiffness", "damping", "frictionloss", "delay_s", "error_db")
+            means = {n: float(np.mean([getattr(one, n) for one in own])) for n in names}
+            means["flagged"] = sum(bool(one.flags) for one in own)
+            rows.append({"framework": name or "own", "group": group, **means})
+    return rows
+
+
+def profiles() -> console.Outcome:
+    """List the frameworks that gains can be matched for."""
+    from pronk.evaluation.tables import table
+    from pronk.simulators import profiles as known
+
+    found = known.profiles().values()
+    fields = ("decimation", "delay", "friction", "source")
+    rows = [
+        [p.name, p.framework, p.drive_law.label, 1e3 * p.timestep_s]
+        + [getattr(p, field) for field in fields]
+        for p in found
+    ]
+    columns = "name | framework | law | step [ms];1 | decimation | delay | friction | source"
+    laws = (
+        "law E: explicit; IF: implicit damping; In: implicit stiffness and damping, n iterations.",
+        "Gains of one law do not give the same joint in another; see docs/simulators.md.",
+    )
+    console.show_sheet(table(columns, rows, *laws, title="Frameworks"))
+    return console.Outcome(figures={"profiles": [vars(p) for p in found]})
 
 
 def summary(result: MatchResult) -> dict[str, Any]:

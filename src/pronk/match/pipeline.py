@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,11 +51,13 @@ from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together, published
 from pronk.simulators.mujoco import MujocoSimulator, mujoco_info
-from pronk.simulators.simulator import JointRigs, joint_rigs
+from pronk.simulators.profiles import profile
+from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Progress = Callable[[str, float], None]
+Mode = Literal["gains", "drive"]
 
 NO_MATCH_DB = 1.0
 """Error in the band above which the best gains are no match [dB]: twice the 0.5 dB that a match
@@ -75,7 +77,7 @@ def match_logs(
     logs: Sequence[JointLog],
     robot: RobotSpec,
     *,
-    mode: Literal["gains", "drive"] = "gains",
+    mode: Mode = "gains",
     free: Sequence[str] = (),
     drive_gains: DriveGains | None = None,
     settings: MatchSettings | None = None,
@@ -103,12 +105,49 @@ def match_logs(
             cannot be identified.
         PronkError: The device or simulator of the settings cannot be used here.
     """
+    more: Any = {"mode": mode, "free": free, "drive_gains": drive_gains}
+    return match_frameworks(logs, robot, (), settings=settings, progress=progress, **more)[""]
+
+
+def match_frameworks(
+    logs: Sequence[JointLog],
+    robot: RobotSpec,
+    names: Sequence[str],
+    *,
+    mode: Mode = "gains",
+    free: Sequence[str] = (),
+    drive_gains: DriveGains | None = None,
+    settings: MatchSettings | None = None,
+    progress: Progress | None = None,
+) -> dict[str, MatchResult]:
+    """Match for several frameworks from one set of logs; arguments and errors as of `match_logs`.
+
+    Args:
+        logs: As of `match_logs`.
+        robot: The robot.
+        names: Profiles, as `pronk.simulators.profiles.profile` takes them; for mode `gains`.
+        mode: As of `match_logs`.
+        free: The same.
+        drive_gains: The same.
+        settings: The same.
+        progress: The same.
+
+    Returns:
+        Results by name; that of the robot's own simulator, where the logs are checked, by "".
+    """
     chosen, clock = settings or MatchSettings(), _Clock(progress)
+    frameworks = {name: profile(name) for name in names}
+    robots = {name: framework.robot(robot) for name, framework in frameworks.items()}
     logs = with_drive_gains(logs, robot, drive_gains)
     if mode not in ("gains", "drive"):
         raise PronkError(f"mode {mode!r}; expected gains or drive.")
     if free and mode != "drive":
         raise PronkError("parameters to fit can be named in mode drive only.")
+    if names and (mode == "drive" or chosen.simulator != "mujoco"):
+        raise PronkError(
+            f"profile {', '.join(names)} in mode {mode} with simulator {chosen.simulator}; "
+            "expected mode gains and simulator mujoco."
+        )
     drives, remarks = fit_drives(logs, robot) if mode == "drive" else ({}, {})
     logs, every = [log for log in logs if excited_joints(log)] or logs, logs
     if (drives or remarks) and not any(map(excited_joints, logs)):
@@ -118,61 +157,122 @@ def match_logs(
                 f"{len(logs)} logs excite no joint by a commanded position and identify no drive "
                 f"by torque: {reasons or 'record larger or faster motions'}."
             )
-        info = mujoco_info(robot)
         gains = {name: joint.gains() for name, joint in joints.items()}
-        return MatchResult(gains=matched_gains(robot, gains, logs, info), joints={})
+        found = matched_gains(robot, gains, logs, mujoco_info(robot))
+        return {"": MatchResult(gains=found, joints={})}
     require_plausible(logs_by_joint(logs, robot), robot)
+    fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
+    own = _matched(logs, robot, chosen, mode, fitted, clock)
+    joints = joint_fits(own.robot, own.joints, drives, remarks)
+    out = {"": replace(own, joints=joints).result(every, own.info, clock)}
+    done = {_kind(own.robot): own}
+    for name, framework in frameworks.items():
+        clock, kind = _Clock(progress, f"{name} "), _kind(robots[name])
+        if kind not in done:
+            names_ = [n for n in fitted if n != "frictionloss" or framework.friction == "N m"]
+            done[kind] = _matched(logs, robots[name], chosen, mode, names_, clock, own)
+        info = replace(framework.info, decimation=robots[name].decimation)
+        out[name] = done[kind].result(every, info, clock)
+    return out
+
+
+def _kind(robot: RobotSpec) -> tuple[object, ...]:
+    """What distinguishes the joints of one framework from those of another."""
+    return (robot.law, robot.timestep_s, robot.decimation, *(j.drive for j in robot.joints))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Matched:
+    """The joints of a robot in one simulator."""
+
+    robot: RobotSpec
+    """As it is simulated."""
+    info: SimulatorInfo
+    joints: dict[str, JointFit]
+    wrong: Mapping[str, tuple[str, ...]]
+    """What contradicts the logs of each joint."""
+    excluded: Mapping[str, str]
+    rate: float
+    """Physics steps per second of the grid search."""
+
+    def result(self, logs: Sequence[JointLog], info: SimulatorInfo, clock: _Clock) -> MatchResult:
+        """The result for a simulator with these joints."""
+        joints = {
+            name: replace(fit, flags=(*fit.flags, *self.wrong.get(name, ())))
+            for name, fit in self.joints.items()
+        }
+        gains = {name: joint.gains() for name, joint in joints.items()}
+        return MatchResult(
+            gains=matched_gains(self.robot, gains, logs, info),
+            joints={name: joint for name, joint in joints.items() if joint.responses},
+            seconds=clock.seconds,
+            grid_steps_per_second=self.rate,
+            excluded=self.excluded,
+        )
+
+
+def _matched(
+    logs: Sequence[JointLog],
+    robot: RobotSpec,
+    settings: MatchSettings,
+    mode: Mode,
+    fitted: Sequence[str],
+    clock: _Clock,
+    base: _Matched | None = None,
+) -> _Matched:
+    """Match the joints in one simulator; those of the `base` were matched in the robot's own."""
     excluded: Mapping[str, str] = {}
-    rate = float("nan")
+    rate, info = float("nan"), mujoco_info(robot)
+    fits: Mapping[str, TimeFit] = {}
+
+    def wrong(joints: Mapping[str, JointFit]) -> dict[str, tuple[str, ...]]:
+        with clock.stage("plausibility"):
+            return {
+                name: tuple(map(str, findings(logs, name, robot, fit=fit, time_fit=fits.get(name))))
+                for name, fit in joints.items()
+            }
+
     if any(moves_together(log) for log in logs):
-        if chosen.simulator != "mujoco":
+        if settings.simulator != "mujoco":
             raise PronkError(
-                f"simulator {chosen.simulator}: several joints of these logs move at once, which "
-                "only simulator mujoco matches; record one joint at a time."
+                f"simulator {settings.simulator}: several joints of these logs move at once, "
+                "which only simulator mujoco matches; record one joint at a time."
             )
-        info = mujoco_info(robot)
-        names = GAINS_MODE if mode == "gains" else checked_names(free or DRIVE_MODE, FREE)
         with clock.stage("fit"):
             joints, excluded = fit_together(
-                logs, robot, names, threads=chosen.threads, progress=clock.report
+                logs, robot, fitted, threads=settings.threads, progress=clock.report
             )
-        for name, fit in joints.items():
-            wrong = map(str, findings(logs, name, robot, fit=fit))
-            joints[name] = replace(fit, flags=(*fit.flags, *wrong))
+        causes = base.wrong if base else wrong(joints)
     else:
-        fitted = checked_names(free or DRIVE_MODE, FREE)
         # The simulator first: a device that is missing must not cost the user an estimate.
         with joint_rigs(
-            chosen.simulator, robot, threads=chosen.threads, device=chosen.device
+            settings.simulator, robot, threads=settings.threads, device=settings.device
         ) as rigs:
+            if mode == "gains" and "frictionloss" not in fitted:
+                rigs.parameters -= {"frictionloss"}
             robot, info = rigs.robot, rigs.info
-            found, on_drive = _measured(logs, robot, chosen, clock)
+            found, on_drive = _measured(logs, robot, settings, clock)
             if mode == "drive":
                 joints, fits = _match_drives(rigs, logs, found, on_drive, fitted, clock)
             else:
-                joints, fits, rate = _match_gains(rigs, logs, found, on_drive, chosen, clock)
-            with clock.stage("plausibility"):
-                for name, fit in joints.items():
-                    own = fits.get(name)
-                    wrong = map(str, findings(logs, name, robot, fit=fit, time_fit=own))
-                    joints[name] = replace(fit, flags=(*fit.flags, *wrong))
-    joints = joint_fits(robot, joints, drives, remarks)
-    gains = {name: joint.gains() for name, joint in joints.items()}
-    return MatchResult(
-        gains=matched_gains(robot, gains, every, info),
-        joints={name: joint for name, joint in joints.items() if joint.responses},
-        seconds=clock.seconds,
-        grid_steps_per_second=rate,
-        excluded=excluded,
+                near = {} if base is None else base.joints
+                start = {name: (fit.stiffness, fit.damping) for name, fit in near.items()}
+                joints, fits, rate = _match_gains(
+                    rigs, logs, found, on_drive, settings, clock, start
+                )
+            causes = base.wrong if base else wrong(joints)
+    return _Matched(
+        robot=robot, info=info, joints=joints, wrong=causes, excluded=excluded, rate=rate
     )
 
 
 class _Clock:
     """Wall time of each stage, and reports of progress."""
 
-    def __init__(self, progress: Progress | None) -> None:
+    def __init__(self, progress: Progress | None, prefix: str = "") -> None:
         self.seconds: dict[str, float] = {}
         self._progress = progress or (lambda stage, share: None)
+        self._prefix = prefix
         self._stage = ""
 
     @contextmanager
@@ -187,7 +287,7 @@ class _Clock:
 
     def report(self, share: float) -> None:
         """Report the share of the stage that is done."""
-        self._progress(self._stage, share)
+        self._progress(self._prefix + self._stage, share)
 
 
 Found = Mapping[str, Sequence[MeasuredJoint]]
@@ -212,7 +312,7 @@ def _match_drives(
     logs: Sequence[JointLog],
     found: Found,
     on_drive: Mapping[str, Pair],
-    fitted: tuple[str, ...],
+    fitted: Sequence[str],
     clock: _Clock,
 ) -> tuple[dict[str, JointFit], dict[str, TimeFit]]:
     """Mode drive: fit the drive of every joint, if the sweeps can separate its parameters."""
@@ -265,44 +365,50 @@ def _match_gains(
     on_drive: Mapping[str, Pair],
     settings: MatchSettings,
     clock: _Clock,
+    start: Mapping[str, Pair],
 ) -> tuple[dict[str, JointFit], dict[str, TimeFit], float]:
     """Search by the paper's magnitude and, with method `time`, fit in time from there.
 
-    Also returns the fits in time by joint, and physics steps per second of the grid; NaN where it
-    was not searched whole.
+    Other frameworks begin at the gains of the robot's own simulator, `start`, which the fit in time
+    takes in place of a search. Also returns the fits in time by joint, and physics steps per second
+    of the grid; NaN where it was not searched whole.
     """
     main = [goals[0] for goals in found.values()]
     grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
-    if isinstance(rigs, MujocoSimulator) and not settings.exhaustive:
-        with clock.stage("quick search"):
-            grids, fits = quick_search(rigs, main, *grid)
-    else:
-        with clock.stage("grid"):
-            begin = time.perf_counter()
-            grids = search_all(rigs, main, *grid, clock.report)
-            # Everything the search does counts, not the simulator alone.
-            rate = rigs.steps / (time.perf_counter() - begin)
-        with clock.stage("refine"):
-            fits = refine(rigs, main, [one.gains for one in grids])
-    best = {fit.target.joint: fit for fit in fits}
+    grids: dict[str, GridSearch] = {}
+    by_amplitude: dict[str, list[Fit]] = {}
+    if not start or settings.method == "paper":
+        if isinstance(rigs, MujocoSimulator) and not settings.exhaustive:
+            with clock.stage("quick search"):
+                searched, fits = quick_search(rigs, main, *grid)
+        else:
+            with clock.stage("grid"):
+                begin = time.perf_counter()
+                searched = search_all(rigs, main, *grid, clock.report)
+                # Everything the search does counts, not the simulator alone.
+                rate = rigs.steps / (time.perf_counter() - begin)
+            with clock.stage("refine"):
+                fits = refine(rigs, main, [one.gains for one in searched])
+        grids = dict(zip(found, searched, strict=True))
+        by_amplitude = {name: [fit] for name, fit in zip(found, fits, strict=True)}
+    gains = {name: fits[0].gains for name, fits in by_amplitude.items()} or start
     fitted: dict[str, TimeFit] = {}
-    by_amplitude = {name: [fit] for name, fit in best.items()}
     if settings.method == "time":
         with clock.stage("time fit"):
-            for name, fit in best.items():
+            for name in found:
                 pair = on_drive[name]
-                fitted[name] = _fit_in_time(rigs, logs, name, TIME_FIT, pair, fit.gains)
-                clock.report(len(fitted) / len(best))
+                fitted[name] = _fit_in_time(rigs, logs, name, TIME_FIT, pair, gains[name])
+                clock.report(len(fitted) / len(found))
     else:
         with clock.stage("amplitudes"):
             others = [goal for goals in found.values() for goal in goals[1:]]
-            for fit in refine(rigs, others, [best[goal.joint].gains for goal in others]):
+            for fit in refine(rigs, others, [gains[goal.joint] for goal in others]):
                 by_amplitude[fit.target.joint].append(fit)
     with clock.stage("responses"):
         requests = [
             SimRequest(goal, **_drive(rigs, fitted[goal.joint].estimate.values))
             if goal.joint in fitted
-            else SimRequest(goal, *best[goal.joint].gains)
+            else SimRequest(goal, *gains[goal.joint])
             for goal in main
         ]
         matched = responses(rigs, requests, whole=True)
@@ -310,24 +416,20 @@ def _match_gains(
             rigs, [SimRequest(goal, *on_drive[goal.joint]) for goal in main], whole=True
         )
     zero: dict[str, tuple[float, ComplexArray]] = {}
-    wanted = settings.zero_armature and settings.method == "paper"
+    wanted = settings.zero_armature and settings.method == "paper" and not start
     if wanted and "armature" in rigs.parameters:
         with clock.stage("zero armature"):
             zero = _without_armature(rigs, main, *grid, clock)
     joints = {}
-    for k, (name, goals) in enumerate(found.items()):
-        both = matched[k], naive[k]
+    for (name, goals), match, nominal in zip(found.items(), matched, naive, strict=True):
         if name in fitted:
-            joints[name] = _time_joint_fit(rigs.robot, goals, fitted[name], *both, grids[k])
+            joints[name] = _time_joint_fit(
+                rigs.robot, goals, fitted[name], match, nominal, grids.get(name)
+            )
         else:
+            own = by_amplitude[name]
             joints[name] = _joint_fit(
-                rigs.robot,
-                goals,
-                by_amplitude[name],
-                grids[k],
-                matched[k],
-                naive[k],
-                zero.get(name),
+                rigs.robot, goals, own, grids[name], match, nominal, zero.get(name)
             )
     return joints, fitted, rate
 

@@ -27,6 +27,7 @@ from pronk.response.grid import held_mean
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, branches, moves_together, published
 from pronk.simulators.command_trace import CommandTrace, command_trace
+from pronk.simulators.profiles import profile_of
 from pronk.simulators.simulator import JointRigs, joint_rigs
 
 Array = NDArray[np.float64]
@@ -121,6 +122,8 @@ def predict(
     """
     if gains.robot != robot.name:
         raise LogError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    if simulator == "mujoco" and gains.simulator.profile:
+        robot = profile_of(gains.simulator).robot(robot)
     (log,) = with_drive_gains([log], robot, drive_gains)
     if moves_together(log):
         if simulator != "mujoco":

@@ -126,7 +126,7 @@ def refine(rigs: JointRigs, targets: Sequence[MeasuredJoint], start: Sequence[Pa
 
 
 def require_sweeps(
-    robot: RobotSpec, joint: str, goals: Sequence[MeasuredJoint], free: tuple[str, ...]
+    robot: RobotSpec, joint: str, goals: Sequence[MeasuredJoint], free: Sequence[str]
 ) -> None:
     """Refuse what sweeps cannot separate before anything is fitted (`require_identifiable`)."""
     first, nominal = bench_experiment(robot, joint)

@@ -111,8 +111,8 @@ def part(path: Path, gains: str | None = None) -> Part:
     result = result_file.load(path, gains_file.load(gains_path))
     own, found, drives = result.gains, verdict(result), drives_table(result)
     fits = {name: fit for name, fit in result.joints.items() if fit.responses}
-    # Without a grid several joints moved at once and were fitted in time.
-    in_time = not any(fit.grid_error.size for fit in result.joints.values())
+    in_time = any(np.isfinite(fit.rmse) for fit in result.joints.values())
+    searched = any(fit.grid_error.size for fit in result.joints.values())
     order = figures.knees_first(list(fits))
     members = group_members(own)
     drive = {name: (one.stiffness, one.damping) for name, one in robot_joints(own).items()}
@@ -128,7 +128,7 @@ def part(path: Path, gains: str | None = None) -> Part:
         "held_out": _held_out_table(result),
         "overview": picture(figures.overview(fits)) if fits else None,
         "bode": {name: picture(figures.bode(fits[name])) for name in order},
-        "maps": None if in_time else picture(figures.error_maps(result, drive)),
+        "maps": picture(figures.error_maps(result, drive)) if searched else None,
         "ranges": picture(figures.ranges(own, members)) if members else None,
         "ranges_table": ranges_table(own, members),
         "bare": picture(figures.zero_armature(fits[bare[0]])) if bare else None,
@@ -162,18 +162,19 @@ def part(path: Path, gains: str | None = None) -> Part:
 
 def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     """Return the matched gains of each joint, beside the paper's for its robot."""
-    paper, joints = gains.robot == ROBOT, gains.joints.values()
+    paper, joints = _comparable(gains), gains.joints.values()
     delays = any(one.delay_s > 0.0 for one in joints)
     friction = any(np.isfinite(one.frictionloss) for one in joints)
     falls = any(one.stribeck > 0.0 for one in joints)
     total = any(np.isfinite(one.stiffness_total95).all() for one in joints)
+    searched = total and any(np.isfinite(one.grid_stiffness) for one in joints)
     interval = "repeat 95 %;2 | total 95 %;2" if total else "95 %;2"
     columns = f"joint | stiffness [N m/rad];2 | {interval} | damping [N m s/rad] | "
     columns += interval.replace(";2", "")
     columns += (
         " | friction [N m]" * friction + " | in motion [N m]" * falls + " | delay [ms];1" * delays
     )
-    columns += " | by magnitude alone" * total + " | paper, Table I" * paper
+    columns += " | by magnitude alone" * searched + " | paper, Table I" * paper
     columns += " | nominal error [dB];2 | error [dB];2 | lowest coherence"
     rows = []
     for name, one in gains.joints.items():
@@ -182,7 +183,7 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
         row += [one.damping, one.damping_ci95] + [one.damping_total95] * total
         row += [one.frictionloss] * friction + [one.frictionloss * (1.0 - one.stribeck)] * falls
         row += [1000.0 * one.delay_s] * delays
-        row += [f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}"] * total
+        row += [f"{one.grid_stiffness:.2f} / {one.grid_damping:.3f}"] * searched
         row += [" / ".join(map(str, TABLE_I.get(name, ("-",))))] * paper
         rows.append([*row, one.naive_error_db, one.error_db, one.coherence_min])
     simulator = gains.simulator
@@ -193,7 +194,7 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
     if total:
         notes.append(
             "repeat: spread of the repeats. total: also the change between amplitudes and between "
-            "parts of the excitation. by magnitude alone: the paper's grid."
+            "parts of the excitation." + " by magnitude alone: the paper's grid." * searched
         )
     else:
         notes.append(f"95 % intervals over {'blocks of the recordings' if in_time else 'repeats'}.")
@@ -205,6 +206,11 @@ def gains_table(gains: MatchedGains, in_time: bool) -> Sheet:
             "set so that a match by magnitude lands near it."
         )
     return table(columns, rows, *notes)
+
+
+def _comparable(gains: MatchedGains) -> bool:
+    """True for the paper's robot in a simulator with the paper's drive law."""
+    return gains.robot == ROBOT and gains.simulator.law == "explicit"
 
 
 def drives_table(result: MatchResult) -> Sheet:
@@ -251,7 +257,7 @@ def _held_out_table(result: MatchResult) -> Sheet:
 
 def ranges_table(gains: MatchedGains, members: Mapping[str, list[str]]) -> Sheet:
     """Return the range that training draws from for each joint group."""
-    paper, rows = gains.robot == ROBOT, []
+    paper, rows = _comparable(gains), []
     for name, one in gains.groups.items():
         row = [joint_words(name), f"{one.stiffness:.2f} ± {one.stiffness_range:.2f}"]
         row.append(f"{one.damping:.3f} ± {one.damping_range:.3f}")

@@ -44,7 +44,10 @@ single precision. `warp-cpu`: MuJoCo Warp on the processor, slow, to compare pre
 def mujoco_info(robot: RobotSpec) -> SimulatorInfo:
     """Describe the training simulator of a robot."""
     return SimulatorInfo(
-        version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
+        profile="mjlab",
+        version=mujoco.__version__,
+        timestep_s=robot.timestep_s,
+        decimation=robot.decimation,
     )
 
 

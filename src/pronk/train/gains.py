@@ -12,13 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import mujoco
-
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import sha256
 from pronk.match.gains import GroupGains, MatchedGains, load
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.simulator import SimulatorInfo
+from pronk.simulators.mujoco import mujoco_info
 
 NAIVE = "naive"
 """The choice of gains that needs no file."""
@@ -147,12 +145,9 @@ def _matched(path: Path, robot: RobotSpec) -> MatchedGains:
         )
     # Gains hold for the simulator that they were matched in, and for no other; patches of MuJoCo
     # keep its physics.
-    trains = SimulatorInfo(
-        version=mujoco.__version__, timestep_s=robot.timestep_s, decimation=robot.decimation
-    )
     used, got = (
-        vars(info) | {"version": ".".join(info.version.split(".")[:2])}
-        for info in (trains, gains.simulator)
+        vars(info) | {"version": ".".join(info.version.split(".")[:2]), "profile": ""}
+        for info in (mujoco_info(robot), gains.simulator)
     )
     differing = [name for name in used if got[name] != used[name]]
     if differing:
@@ -161,7 +156,7 @@ def _matched(path: Path, robot: RobotSpec) -> MatchedGains:
         )
         raise ArtefactError(
             f"{path}: gains matched in a simulator with {has}; training uses {needs}, where they "
-            "mean another joint: match the logs again with this pronk."
+            "mean another joint: match the logs again with this pronk, or `pronk translate` them."
         )
     missing = [group for group in robot.groups if group not in gains.groups]
     if missing:
