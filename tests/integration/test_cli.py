@@ -161,7 +161,7 @@ def test_predict_replays_a_fresh_log_and_warns_of_a_fitted_one(matched, tmp_path
     assert "warning" in done.stderr
 
 
-@pytest.mark.parametrize("target", ["mjlab", "mjcf", "isaaclab"])
+@pytest.mark.parametrize("target", ["mjlab", "mjcf", "isaaclab-dcmotor"])
 def test_export(matched, tmp_path, target):
     accepted("export", matched / "gains.yaml", "--to", target, "--out", tmp_path / "exported")
     assert len((tmp_path / "exported").read_text()) > 200

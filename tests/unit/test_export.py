@@ -1,29 +1,51 @@
-"""Exports: the text runs where it is meant to, and the torque is the PD law."""
+"""Exports: the text runs where it is meant to, and the torque is the drive law's."""
 
 from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from typing import Any, get_args
 
 import mujoco
 import numpy as np
 import pytest
 
 from pronk.actuator.model import torque_limits
+from pronk.cli.export import Target
 from pronk.errors import PronkError
 from pronk.logs.joint_log import JointLog
-from pronk.match.export import EXPORTS, export_text, group_drives
+from pronk.match.export import TARGETS, Per, actuators, export_text, stability_share
 from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.predict import drives_of
 from pronk.match.randomization import group_gains
 from pronk.robots import load_robot
 from pronk.simulators.chain import ChainSimulation
-from pronk.simulators.simulator import SimulatorInfo
+from pronk.simulators.mujoco import Chain
+from pronk.simulators.profiles import profile, profiles
 
 ROBOT = load_robot("mini_cheetah")
+_ISAACLAB = {"joint_names_expr", "stiffness", "damping", "armature"} | {
+    *("friction", "dynamic_friction", "viscous_friction"),
+    *("saturation_effort", "min_delay", "max_delay"),
+}
+ISAACLAB = {
+    # actuator_base_cfg.py and actuator_pd_cfg.py of v2.3.2.
+    "2.3": _ISAACLAB | {"effort_limit", "velocity_limit", "effort_limit_sim", "velocity_limit_sim"},
+    # The same files of release 3.0.0; names that it deprecates are left out.
+    "3.0": _ISAACLAB
+    | {"actuator_effort_limit", "actuator_velocity_limit"}
+    | {"joint_effort_limit", "joint_velocity_limit"},
+}
 
 
-def matched(robot_name: str = "mini_cheetah", **extra: float) -> MatchedGains:
+def matched(
+    robot_name: str = "mini_cheetah", simulator: str = "mjlab", only: str = "", **extra: float
+) -> MatchedGains:
     robot = load_robot(robot_name)
     joints = {}
     for i, joint in enumerate(robot.joints):
+        if only and not joint.name.endswith(only):
+            continue
         kp, kd = joint.stiffness + 0.3 * i, joint.damping + 0.004 * i
         joints[joint.name] = JointGains(
             stiffness=kp,
@@ -36,7 +58,7 @@ def matched(robot_name: str = "mini_cheetah", **extra: float) -> MatchedGains:
         )
     return MatchedGains(
         robot=robot.name,
-        simulator=SimulatorInfo(version=mujoco.__version__),
+        simulator=profile(simulator).info,
         joints=joints,
         groups=group_gains(robot, joints),
         logs={"FR_knee.mcap": "ab" * 32},
@@ -44,27 +66,37 @@ def matched(robot_name: str = "mini_cheetah", **extra: float) -> MatchedGains:
     )
 
 
+def evaluated(text: str) -> dict[str, Any]:
+    space: dict[str, Any] = {}
+    exec(text, space)
+    return space
+
+
+def for_target(target: str, **extra: Any) -> MatchedGains:
+    return matched(simulator=TARGETS[target].profile or "isaaclab-implicit", **extra)
+
+
 @pytest.mark.train
-def test_mjlab_text_builds_the_actuators_and_events() -> None:
+@pytest.mark.parametrize("target", ["mjlab", "mjlab-idealpd", "mjlab-builtin"])
+def test_mjlab_text_builds_the_actuators_and_events(target: str) -> None:
     pytest.importorskip("mjlab")
-    space: dict[str, object] = {}
-    exec(export_text(matched(frictionloss=0.15, delay_s=0.011), "mjlab"), space)
-    actuators, events = space["ACTUATORS"], space["EVENTS"]
-    assert isinstance(actuators, tuple)
-    assert isinstance(events, dict)
-    groups = matched().groups
-    assert len(actuators) == len(events) == len(groups)
+    gains = for_target(target, frictionloss=0.15, delay_s=0.011)
+    space = evaluated(export_text(gains, target))
+    found, events = space["ACTUATORS"], space["EVENTS"]
+    assert len(found) == len(events) == len(gains.groups)
     for i, (cfg, event, (name, group)) in enumerate(
-        zip(actuators, events.values(), groups.items(), strict=True)
+        zip(found, events.values(), gains.groups.items(), strict=True)
     ):
         drive = ROBOT.group(name)[0].drive
+        assert type(cfg).__name__ == TARGETS[target].call
         assert cfg.target_names_expr == tuple(j.name for j in ROBOT.group(name))
         assert (cfg.stiffness, cfg.damping) == (group.stiffness, group.damping)
         assert cfg.armature == pytest.approx(drive.armature)
         assert cfg.frictionloss == 0.15
         assert cfg.effort_limit == pytest.approx(drive.effort_limit)
-        assert cfg.saturation_effort == pytest.approx(drive.stall_torque)
-        assert cfg.velocity_limit == pytest.approx(drive.no_load_speed)
+        if target == "mjlab":
+            assert cfg.saturation_effort == pytest.approx(drive.stall_torque)
+            assert cfg.velocity_limit == pytest.approx(drive.no_load_speed)
         assert (cfg.delay_min_lag, cfg.delay_max_lag) == (2, 2)
         assert event.params["asset_cfg"].actuator_ids == [i]
         assert event.params["operation"] == "abs"
@@ -74,24 +106,117 @@ def test_mjlab_text_builds_the_actuators_and_events() -> None:
 
 
 @pytest.mark.train
-def test_mjlab_actuators_attach_to_the_robot() -> None:
+@pytest.mark.parametrize("per", get_args(Per))
+@pytest.mark.parametrize("target", ["mjlab", "mjlab-idealpd", "mjlab-builtin"])
+def test_mjlab_actuators_attach_to_the_robot(target: str, per: Per) -> None:
     pytest.importorskip("mjlab")
     from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
     from mjlab.entity.entity import Entity
 
     from pronk.robots.model import free_spec
 
-    space: dict[str, object] = {}
-    exec(export_text(matched(), "mjlab"), space)
-    entity = Entity(
-        EntityCfg(
-            spec_fn=lambda: free_spec(ROBOT),
-            articulation=EntityArticulationInfoCfg(actuators=space["ACTUATORS"]),  # type: ignore[arg-type]
-        )
-    )
+    gains = for_target(target)
+    found = evaluated(export_text(gains, target, per=per))["ACTUATORS"]
+    articulation = EntityArticulationInfoCfg(actuators=found)
+    entity = Entity(EntityCfg(spec_fn=lambda: free_spec(ROBOT), articulation=articulation))
     model = entity.spec.compile()
-    assert model.nu == 12
-    assert {model.actuator(i).name.split("/")[-1] for i in range(12)} == set(ROBOT.joint_names)
+    assert {model.actuator(i).name.split("/")[-1] for i in range(model.nu)} == {*ROBOT.joint_names}
+    if per == "joint" and target == "mjlab-builtin":
+        for i in range(model.nu):
+            own = gains.joints[model.actuator(i).name.split("/")[-1]]
+            assert model.actuator_gainprm[i, 0] == pytest.approx(own.stiffness)
+            assert model.actuator_biasprm[i, 2] == pytest.approx(-own.damping)
+
+
+@pytest.mark.parametrize("target", [name for name in TARGETS if name.startswith("isaaclab")])
+def test_isaaclab_text_has_the_arguments_of_its_release(target: str) -> None:
+    gains = for_target(target, frictionloss=0.15, delay_s=0.011)
+    text = export_text(gains, target)
+    calls = [
+        node
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    ]
+    assert len(calls) == len(gains.groups)
+    for call, group in zip(calls, gains.groups.values(), strict=True):
+        values = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
+        assert set(values) <= ISAACLAB["2.3" if target.endswith("2.3") else "3.0"]
+        assert any("effort_limit" in str(name) for name in values)
+        assert values["stiffness"] == group.stiffness
+        assert values["friction"] == 0.15
+        assert values.get("dynamic_friction", 0.15) == 0.15
+        assert values.get("max_delay", 2) == 2
+        newton = target == "isaaclab-newton"  # without viscous friction of its own
+        assert values["damping"] == pytest.approx(group.damping + 0.01 * newton)
+    assert ("2.2 steps" in text.replace("\n# ", " ")) == (not target.startswith("isaaclab-delayed"))
+
+
+def test_genesis_text_sets_every_parameter_of_every_joint() -> None:
+    gains = for_target("genesis", robot_name="go2")
+    space = evaluated(export_text(gains, "genesis", per="joint"))
+    called = {}
+
+    class Robot:
+        def get_joint(self, name: str) -> Any:
+            index = list(space["JOINTS"]).index(name)
+            return type("Joint", (), {"dofs_idx_local": [6 + index]})
+
+        def __getattr__(self, name: str) -> Any:
+            return lambda *values: called.update({name: values})
+
+    space["apply"](Robot())
+    robot = load_robot("go2")
+    order = [gains.joints[name] for name in robot.joint_names]
+    assert list(space["JOINTS"])[:3] == ["FR_hip_joint", "FL_hip_joint", "RR_hip_joint"]
+    assert called["set_dofs_kp"][1] == list(range(6, 18))
+    names = [f"{leg}_{part}" for part in robot.groups for leg in robot.legs]
+    expected = [gains.joints[name].stiffness for name in names]
+    assert called["set_dofs_kp"][0] == pytest.approx(expected)
+    assert called["set_dofs_armature"][0][0] == pytest.approx(order[0].armature)
+    low, high, _ = called["set_dofs_force_range"]
+    assert high == [-value for value in low]
+    assert {*called} == {f"set_dofs_{name}" for name in TARGETS["genesis"].arguments}
+
+
+def test_playground_text_gives_a_model_the_explicit_law() -> None:
+    gains = for_target("playground", only="knee")
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><inertial mass="0.2" pos="0 0 -0.1" diaginertia="1e-3 1e-3
+        1e-3"/><joint name="FR_knee" axis="0 1 0" damping="3"/></body></worldbody>
+        <actuator><position joint="FR_knee" kp="1" kv="2"/></actuator></mujoco>"""
+    )
+    space = evaluated(export_text(gains, "playground", per="joint"))
+    space["JOINTS"] = {"FR_knee": space["JOINTS"]["FR_knee"] | {"frictionloss": 0.0}}
+    space["apply"](model)
+    own, drive = gains.joints["FR_knee"], ROBOT.joint("FR_knee").drive
+    data, speed, angle = mujoco.MjData(model), 0.0, 0.0
+    inertia = 1e-3 + 0.2 * 0.1**2 + drive.armature
+    data.ctrl[:] = 0.3
+    for _ in range(100):
+        torque = (
+            np.clip(own.stiffness * (0.3 - angle), -26.435, 26.435)
+            - (own.damping + drive.viscous_damping) * speed
+        )
+        speed += 0.004 * (torque - 0.2 * 9.81 * 0.1 * np.sin(angle)) / inertia
+        angle += 0.004 * speed
+        mujoco.mj_step(model, data)
+        assert data.qpos[0] == pytest.approx(angle, abs=1e-6)
+
+
+def test_newton_text_is_a_usd_layer_in_radians_and_degrees(tmp_path: Any) -> None:
+    gains = matched("go2", "isaaclab-explicit", delay_s=0.01)
+    text = export_text(gains, "newton-usd")
+    assert text.startswith("#usda 1.0\n")
+    assert text.count("def NewtonActuator") == 12
+    assert "rel newton:targets = </Robot/joints/FR_calf_joint>" in text
+    assert f"float newton:kp = {gains.groups['hip_roll'].stiffness}" in text
+    assert f"float newton:damping = {np.radians(0.1):.7g}" in text
+    assert "int newton:delaySteps = 2" in text
+    sdf = pytest.importorskip("pxr.Sdf")
+    layer = sdf.Layer.CreateAnonymous(".usda")
+    assert layer.ImportFromString(text)
+    prim = layer.GetPrimAtPath("/Robot/Actuators/FR_calf_joint_actuator")
+    assert prim.typeName == "NewtonActuator"
 
 
 @pytest.mark.parametrize("robot", ["mini_cheetah", "so101"])
@@ -121,21 +246,128 @@ def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law(robot: str) -> None:
             assert model.dof_armature[at.dofadr[0]] == pytest.approx(drive.armature, rel=1e-4)
 
 
-@pytest.mark.parametrize("target", list(EXPORTS))
-def test_every_export_names_its_simulator_and_logs(target: str) -> None:
-    text = export_text(matched(), target)
-    for words in (f"mujoco {mujoco.__version__}", "0.005", "dc_motor_pd", "virtual", "ab" * 32):
+@pytest.mark.parametrize("name", list(profiles()))
+def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
+    holds, arm = profile(name), load_robot("so101")
+    drives = [replace(joint.drive, stribeck_speed=0.0) for joint in arm.joints]
+    joints = tuple(replace(a, drive=b) for a, b in zip(arm.joints, drives, strict=True))
+    arm = replace(arm, joints=joints)
+    # A history of parts of a step is interpolated between the parts.
+    delay = 2.0 * holds.timestep_s if holds.iterations > 1 else 0.0123
+    gains, known = matched("so101", name, delay_s=delay), holds.robot(arm)
+    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf", arm, per="joint"))
+    snippet = export_text(gains, "mjcf-snippet", arm, per="joint")
+    assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
+    start = np.array([joint.default_position for joint in arm.joints])
+    time = holds.timestep_s * np.arange(150)
+    command = 0.2 * np.sin(2.0 * np.pi * time[:, None] * np.linspace(0.5, 1.0, len(start)))
+    log = JointLog(
+        robot="so101",
+        joints=arm.joint_names,
+        time=time,
+        command=start + command,
+        position=np.tile(start, (len(time), 1)),
+    )
+    with ChainSimulation(known, [log], threads=1) as chain:
+        expected = chain.run([drives_of(known, gains)])[0][0]
+    data = mujoco.MjData(model)
+    data.qpos[:] = expected[0]
+    length = int(model.actuator_history[0, 0])
+    past = model.opt.timestep * np.arange(-length, 0)
+    for i in range(model.nu):
+        mujoco.mj_initCtrlHistory(model, data, i, past, np.full(length, start[i]))
+    for target, position in zip(start + command, expected, strict=True):
+        assert data.qpos == pytest.approx(position, abs=1e-6)
+        data.ctrl[:] = target
+        mujoco.mj_step(model, data, known.law.iterations)
+
+
+@pytest.mark.parametrize("target", list(TARGETS))
+def test_every_export_says_what_it_holds_for(target: str) -> None:
+    text = export_text(for_target(target, only="_knee"), target)
+    text = text.replace("\n# ", " ").replace("\n", " ")
+    holds = profile(TARGETS[target].profile or "isaaclab-implicit")
+    law = f"drive law {holds.drive_law.label}, timestep {holds.timestep_s:g}"
+    for words in (holds.name, law, "virtual", "ab" * 32, "NOT MATCHED"):
         assert words in text
-    if target == "isaaclab":
-        assert text.startswith("# NOT MATCHED")
-        compile(text, target, "exec")
+    assert ("stability limit" in text) == (holds.law != "implicit")
+
+
+def test_unmatched_joints_have_the_gains_of_their_group() -> None:
+    gains = matched(only="FR_knee")
+    (knee,) = actuators(gains, ROBOT)
+    assert knee.unmatched == ("FL_knee", "HR_knee", "HL_knee")
+    for one in actuators(gains, ROBOT, "joint"):
+        own = gains.joints["FR_knee"] if one.name == "FR_knee" else gains.groups["knee"]
+        assert (one.stiffness, one.damping) == (own.stiffness, own.damping)
+
+
+def test_gains_of_another_drive_law_are_refused() -> None:
+    for name, target in (("mjlab", "mjlab-builtin"), ("isaaclab-implicit", "isaaclab-dcmotor")):
+        with pytest.raises(PronkError, match=r"pronk translate GAINS --to"):
+            export_text(matched(simulator=name), target)
+    assert "DCMotorCfg" in export_text(matched(simulator="mjlab"), "isaaclab-dcmotor")
+    assert "ImplicitActuatorCfg" in export_text(
+        matched(simulator="mjlab-builtin"), "isaaclab-newton"
+    )
+
+
+@pytest.mark.parametrize("name", ["mjlab", "mjlab-builtin"])
+def test_stability_share_is_one_where_the_law_diverges(name: str) -> None:
+    arm = load_robot("so101")
+    loss = {"frictionloss": 0.0, "stribeck_speed": 0.0, "effort_limit": 1e6, "stall_torque": 1e6}
+    joints = [
+        replace(one, drive=replace(one.drive, **loss, no_load_speed=1e6)) for one in arm.joints
+    ]
+    robot = replace(profile(name).robot(arm), joints=tuple(joints))
+    drives = actuators(matched("so101", name), robot, "joint")
+    # Only a large stiffness makes the law with implicit damping diverge.
+    field = "damping" if name == "mjlab" else "stiffness"
+    low, high = 0.1, 1e3
+    while high / low > 1.001:
+        scale = np.sqrt(low * high)
+        scaled = [replace(one, **{field: scale * getattr(one, field)}) for one in drives]
+        low, high = (low, scale) if stability_share(robot, scaled) > 1.0 else (scale, high)
+    rest = np.array([joint.default_position for joint in joints])
+    with Chain(robot, "gripper", threads=1) as chain:
+        order = [arm.joint_names.index(joint) for joint in chain.joints]
+        sets = [
+            {one.name: {"stiffness": one.stiffness, "damping": one.damping} for one in drives}
+            for _ in range(2)
+        ]
+        for part, share in zip(sets, (0.97, 1.03), strict=True):
+            for values in part.values():
+                values[field] *= share * low
+        start = np.stack(
+            [
+                chain.rest_position(
+                    rest[order], np.array([part[joint]["stiffness"] for joint in chain.joints])
+                )
+                for part in sets
+            ]
+        )
+        command = np.broadcast_to(rest[order], (2, 400, len(order)))
+        moved = chain.rollout(command, sets, start + 1e-7) - start[:, None]
+    assert np.abs(moved[0, -1]).max() < 1e-6
+    assert not np.abs(moved[1, -1]).max() < 1e-5
+
+
+def test_unstable_gains_are_refused() -> None:
+    gains = matched("go2")
+    joints = {n: JointGains(**(vars(one) | {"damping": 25.0})) for n, one in gains.joints.items()}
+    groups = group_gains(load_robot("go2"), joints)
+    with pytest.raises(PronkError, match="times the limit of drive law E"):
+        export_text(replace(gains, joints=joints, groups=groups), "mjlab")
 
 
 def test_unknown_target_and_foreign_robot_are_refused() -> None:
-    with pytest.raises(PronkError, match="mjlab, mjcf, isaaclab"):
+    assert get_args(Target) == tuple(TARGETS)
+    with pytest.raises(PronkError, match="mjcf-snippet"):
         export_text(matched(), "gazebo")
     with pytest.raises(PronkError, match="so101"):
-        group_drives(matched(), load_robot("so101"))
+        actuators(matched(), load_robot("so101"))
+    with pytest.raises(PronkError, match="--robot PATH"):
+        export_text(replace(matched(), robot="mine"), "mjlab")
 
 
 def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> None:
@@ -162,6 +394,7 @@ def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> 
         assert data.qpos == pytest.approx(position, abs=1e-5)
         data.ctrl[:] = target
         mujoco.mj_step(model, data)
-    for target in ("mjlab", "isaaclab"):
-        assert "elbow_flex 0.6" in export_text(gains, target)
-        assert "elbow_flex 0.6" not in export_text(matched("so101"), target)
+    assert "elbow_flex 0.6" in export_text(gains, "mjlab").replace("\n# ", " ")
+    assert "elbow_flex" not in export_text(matched("so101"), "mjlab").partition("import")[0]
+    static = export_text(gains, "isaaclab-dcmotor")
+    assert "friction=0.2,\n        dynamic_friction=0.08," in static

@@ -28,7 +28,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "match": ("pronk.cli.match:match", "Find the gains with which the simulator responds alike."),
     "profiles": ("pronk.cli.match:profiles", "List the frameworks that gains can be matched for."),
     "predict": ("pronk.cli.match:predict", "Replay logs that the fit has not used."),
-    "export": ("pronk.cli.match:export", "Write gains as configuration of a simulator."),
+    "export": ("pronk.cli.export:export", "Write gains as configuration of a simulator."),
     "train": ("pronk.cli.train:train", "Train a policy that walks and jumps."),
     "evaluate": ("pronk.cli.evaluate:evaluate", "Evaluate a policy in the training simulator."),
     "trial": ("pronk.cli.trial:trial", "Measure the paper's jumps on the virtual robot."),

@@ -1,4 +1,4 @@
-"""`pronk match`, `pronk predict` and `pronk export`: gains, replays with them, export."""
+"""`pronk match` and `pronk predict`: gains, and replays with them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ Mode = Literal["gains", "drive"]
 Method = Literal["time", "paper"]
 WARNING_STATUS = 3
 """Exit status of a match that is no better than less fitting, on what was kept aside."""
-Target = Literal["mjlab", "mjcf", "isaaclab"]
 
 
 def match(
@@ -277,27 +276,3 @@ def prediction_rows(found: Iterable[JointPrediction]) -> list[dict[str, Any]]:
     """Figures of replays, for the table and for JSON."""
     names = ("joint", "signal", "unit", "rmse_naive", "rmse_naive_delayed", "rmse_matched")
     return [{n: getattr(one, n) for n in (*names, "r2_naive", "r2_matched")} for one in found]
-
-
-def export(
-    gains: tyro.conf.Positional[Path],
-    to: Target,
-    out: Path,
-    robot: str | None = None,
-) -> console.Outcome:
-    """Write matched gains as actuator configuration of mjlab, MuJoCo or Isaac Lab.
-
-    Args:
-        gains: gains.yaml of `pronk match`.
-        to: What reads the file.
-        out: The file to write.
-        robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
-    """
-    from pronk.files import write_text
-    from pronk.match import gains as gains_file
-    from pronk.match.export import export_text
-    from pronk.robots import load_robot
-
-    text = export_text(gains_file.load(gains), to, load_robot(robot) if robot else None)
-    write_text(out, text)
-    return console.Outcome(figures={"written": out, "to": to}, wrote=[out])

@@ -1,31 +1,53 @@
 """Matched gains as configuration of a simulator, as text to read and to paste.
 
-Every export names the simulator the gains hold for: the same numbers in another engine, at
-another timestep or with another actuator law are another joint. Delays are rounded to physics
-whole steps where a simulator has no other delay.
+Gains hold for one drive law at one step (`pronk.simulators.profiles`): a target with another law or
+step is refused. Every text says what must be set beside it, which joints were not matched, which
+delay and friction it does not have, and how far the drives are from the law's stability limit.
+
+Arguments of other frameworks, with their sources (read in November 2026):
+
+- mjlab 1.6: `mjlab.actuator`, installed with `pronk[train]`.
+- Isaac Lab: `isaaclab/actuators/actuator_base_cfg.py` and `actuator_pd_cfg.py` of v2.3.2 and of
+  release 3.0.0, which has new names for limits and drops the old ones in 4.0.
+- Newton: `generatedSchema.usda` of newton-usd-schemas 0.6.0. A `NewtonActuator` is in radians, a
+  `NewtonJointAPI` in degrees.
+- Genesis: `set_dofs_*` of `RigidEntity`, as its example `locomotion/go2_env.py` calls them.
+- MuJoCo Playground: Go1, whose derivative gain is `dof_damping` under Euler without eulerdamp.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+import textwrap
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
 
 import mujoco
 import numpy as np
+import scipy.linalg
 
-from pronk.errors import PronkError
+from pronk.errors import PronkError, RobotError
 from pronk.match.gains import MatchedGains
 from pronk.robots import load_robot
 from pronk.robots.model import add_drives, free_spec
-from pronk.robots.robot import Drive, RobotSpec
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.profiles import Profile, profile, profile_of
+
+Per = Literal["group", "joint"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class GroupDrive:
-    """One joint group as every export needs it."""
+class Actuator:
+    """Joints with the same parameters: a group, or one joint."""
 
-    group: str
+    name: str
     joints: tuple[str, ...]
+    own_joints: tuple[str, ...]
+    """The same in the models of the robot's maker."""
+    unmatched: tuple[str, ...]
+    """Those without a match of their own; they have the group's gains."""
     stiffness: float
     """[N m/rad]"""
     damping: float
@@ -36,216 +58,630 @@ class GroupDrive:
     """Lowest and highest of the uniform randomization, not below 0 [N m s/rad]."""
     armature: float
     """[kg m^2]"""
-    drive: Drive
-    """Limits and friction; the dry friction is the matched one where it was fitted."""
-    delay_steps: int
-    """Command delay in physics steps."""
+    frictionloss: float
+    """Dry friction at rest [N m]."""
     stribeck: float
-    """Share of the dry friction that motion takes away."""
+    """Share of it that motion takes away."""
+    viscous_damping: float
+    """Passive viscous friction [N m s/rad]."""
+    effort_limit: float
+    """[N m]"""
+    stall_torque: float
+    """[N m]"""
+    no_load_speed: float
+    """[rad/s]"""
+    delay_s: float
+    """Command delay [s]."""
+
+    @property
+    def sliding_friction(self) -> float:
+        """Dry friction in motion [N m]."""
+        return self.frictionloss * (1.0 - self.stribeck)
+
+    @property
+    def all_damping(self) -> float:
+        """Damping and viscous friction, for an engine with one parameter for both [N m s/rad]."""
+        return self.damping + self.viscous_damping
+
+    @property
+    def viscous_per_degree(self) -> float:
+        """Passive viscous friction [N m s/degree]."""
+        return math.radians(self.viscous_damping)
 
 
-def group_drives(gains: MatchedGains, robot: RobotSpec) -> list[GroupDrive]:
-    """The matched groups, in the robot's order. Fitted friction and delay are averaged.
+def actuators(gains: MatchedGains, robot: RobotSpec, per: Per = "group") -> list[Actuator]:
+    """The matched groups or their joints, in the robot's order; a group has its joints' means.
 
     Raises:
         PronkError: The gains are of another robot, or hold no group.
     """
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
-    out = []
-    for name in (name for name in robot.groups if name in gains.groups):
-        group, members = gains.groups[name], robot.group(name)
-        drive = members[0].drive
-        matched = [gains.joints[j.name] for j in members if j.name in gains.joints]
-        armature = [j.armature for j in matched] or [drive.armature]
-        dry = [j.frictionloss for j in matched if not np.isnan(j.frictionloss)]
-        delay = float(np.mean([j.delay_s for j in matched] or [0.0]))
-        out.append(
-            GroupDrive(
-                group=name,
-                joints=tuple(j.name for j in members),
-                stiffness=group.stiffness,
-                damping=group.damping,
-                stiffness_range=_about(group.stiffness, group.stiffness_range),
-                damping_range=_about(group.damping, group.damping_range),
-                armature=float(np.mean(armature)),
-                drive=replace(drive, frictionloss=float(np.mean(dry or [drive.frictionloss]))),
-                delay_steps=round(delay / gains.simulator.timestep_s),
-                stribeck=float(np.mean([j.stribeck for j in matched] or [0.0])),
-            )
-        )
-    if not out:
+    if not gains.groups:
         raise PronkError(
             f"the gains of {gains.robot} hold no joint group; match some joints first."
         )
+    out = []
+    for group_name in (name for name in robot.groups if name in gains.groups):
+        group, members = gains.groups[group_name], robot.group(group_name)
+        for part in [members] if per == "group" else [(one,) for one in members]:
+            matched = [gains.joints[j.name] for j in part if j.name in gains.joints]
+            of_group = [gains.joints[j.name] for j in members if j.name in gains.joints]
+            drive = part[0].drive
+            known = matched or of_group
+            dry = [j.frictionloss for j in known if not np.isnan(j.frictionloss)]
+            centre = matched[0] if per == "joint" and matched else group
+            out.append(
+                Actuator(
+                    name=group_name if per == "group" else part[0].name,
+                    joints=tuple(j.name for j in part),
+                    own_joints=tuple(j.own_name or j.name for j in part),
+                    unmatched=tuple(j.name for j in part if j.name not in gains.joints),
+                    stiffness=centre.stiffness,
+                    damping=centre.damping,
+                    stiffness_range=_about(centre.stiffness, group.stiffness_range),
+                    damping_range=_about(centre.damping, group.damping_range),
+                    armature=_mean([j.armature for j in known], drive.armature),
+                    frictionloss=_mean(dry, drive.frictionloss),
+                    stribeck=_mean([j.stribeck for j in known], 0.0),
+                    delay_s=_mean([j.delay_s for j in known], 0.0),
+                    viscous_damping=drive.viscous_damping,
+                    effort_limit=drive.effort_limit,
+                    stall_torque=drive.stall_torque,
+                    no_load_speed=drive.no_load_speed,
+                )
+            )
     return out
 
 
-def mjlab_text(gains: MatchedGains, robot: RobotSpec) -> str:
-    """Python source for mjlab: `ACTUATORS`, a tuple of configs, and `EVENTS`, a dict of events.
+def stability_share(robot: RobotSpec, drives: Sequence[Actuator]) -> float:
+    """How much of the drive law's stability limit the drives use, all joints together; 1 is it.
 
-    The events draw absolute gains for every environment (D3, D4); they address the actuators by
-    their place in `ACTUATORS`, so keep the order.
+    With mass matrix M, damping D and stiffness K, and the step h of `DriveLaw`, a pole reaches -1
+    where the largest eigenvalue of (2 h D + h^2 K) x = l B x is 4; B is M, and M + h D where
+    damping is implicit. For one joint of law E this is 2 h kd / J + h^2 kp / J < 4. Law I has no
+    limit. The robot floats in its default pose, where its joints feel the least inertia.
     """
-    drives = group_drives(gains, robot)
-    actuators = "".join(
-        f"    DcMotorActuatorCfg(  # {drive.group}\n"
-        f"        target_names_expr={_names(drive.joints)},\n"
-        f"{_fields(drive, 'frictionloss', viscous_damping='viscous_damping')}"
-        + (
-            f"        delay_min_lag={drive.delay_steps},  # physics steps\n"
-            f"        delay_max_lag={drive.delay_steps},\n"
-            if drive.delay_steps
-            else ""
-        )
-        + "    ),\n"
-        for drive in drives
+    spec = free_spec(robot)
+    for one in drives:
+        for name in one.joints:
+            spec.joint(name).armature = one.armature
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
+    mujoco.mj_forward(model, data)
+    mass, step = np.zeros((model.nv, model.nv)), robot.law.substep(robot.timestep_s)
+    mujoco.mj_fullM(model, data, mass)
+    stiffness, damping = np.zeros(model.nv), np.zeros(model.nv)
+    for one in drives:
+        for name in one.joints:
+            dof = model.joint(name).dofadr[0]
+            stiffness[dof] = one.stiffness
+            damping[dof] = robot.law.damping(one.stiffness, one.damping, step)
+    implicit = model.dof_damping + (0.0 if robot.law.kind == "explicit" else damping)
+    return float(
+        scipy.linalg.eigh(
+            np.diag(2.0 * step * damping + step**2 * stiffness),
+            mass + step * np.diag(implicit),
+            eigvals_only=True,
+        )[-1]
+        / 4.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """What reads an exported text."""
+
+    profile: str = ""
+    """The profile that gains must hold for, up to frameworks of the same law and step; empty for
+    any."""
+    body: Callable[[Target, list[Actuator], Profile, RobotSpec], str]
+    settings: str
+    """What must be set beside the text; {timestep}, {decimation}, {iterations} are filled in."""
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    """Name of an argument to a field of `Actuator`."""
+    call: str = ""
+    """Class of the configuration."""
+    delay: tuple[str, ...] = ()
+    """Arguments that take a delay in physics steps."""
+    delay_seconds: bool = False
+    """True if it takes delays in seconds."""
+    no_delay: str = "delay the actions in the environment"
+    """What to do about a delay that the target cannot express."""
+    stribeck: bool = False
+    """True if friction can fall with speed."""
+    comment: tuple[str, str] = ("# ", "")
+    """Before every line of the header, or (open, close) around it."""
+
+
+def _fields(target: Target, one: Actuator, indent: str = "        ", form: str = "{}={},") -> str:
+    """The arguments of an actuator, one a line."""
+    return "".join(
+        f"{indent}{form.format(argument, _number(getattr(one, name)))}\n"
+        for argument, name in target.arguments.items()
+    )
+
+
+def _delay(target: Target, one: Actuator, profile: Profile) -> str:
+    steps = round(one.delay_s / profile.timestep_s)
+    return "".join(f"        {name}={steps},\n" for name in target.delay) if steps else ""
+
+
+def _mjlab(target: Target, drives: list[Actuator], profile: Profile, _robot: RobotSpec) -> str:
+    """`ACTUATORS`, a tuple of configs, and `EVENTS`, which draw absolute gains (D3, D4).
+
+    The events address the actuators by their place in `ACTUATORS`, so their order matters.
+    """
+    entries = "".join(
+        f"    {target.call}(  # {one.name}\n"
+        f"        target_names_expr={_names(one.own_joints)},\n"
+        f"{_fields(target, one)}{_delay(target, one, profile)}    ),\n"
+        for one in drives
     )
     events = "".join(
-        f'    "{drive.group}_gains": EventTermCfg(\n'
+        f'    "{one.name}_gains": EventTermCfg(\n'
         f"        func=dr.pd_gains,\n"
         f'        mode="startup",\n'
         f"        params={{\n"
         f'            "asset_cfg": SceneEntityCfg("robot", actuator_ids=[{index}]),\n'
-        f'            "kp_range": {_pair(drive.stiffness_range)},\n'
-        f'            "kd_range": {_pair(drive.damping_range)},\n'
+        f'            "kp_range": {_pair(one.stiffness_range)},\n'
+        f'            "kd_range": {_pair(one.damping_range)},\n'
         f'            "operation": "abs",\n'
         f"        }},\n"
         f"    ),\n"
-        for index, drive in enumerate(drives)
+        for index, one in enumerate(drives)
     )
     return (
-        f"{_comment(_header(gains) + _without_stribeck(drives))}\n\n"
-        "from mjlab.actuator import DcMotorActuatorCfg\n"
+        f"from mjlab.actuator import {target.call}\n"
         "from mjlab.envs.mdp import dr\n"
         "from mjlab.managers.event_manager import EventTermCfg\n"
         "from mjlab.managers.scene_entity_config import SceneEntityCfg\n\n"
-        f"ACTUATORS = (\n{actuators})\n\nEVENTS = {{\n{events}}}\n"
+        f"ACTUATORS = (\n{entries})\n\nEVENTS = {{\n{events}}}\n"
     )
 
 
-def mjcf_text(gains: MatchedGains, robot: RobotSpec) -> str:
-    """The whole robot as MJCF with a native `dcmotor` for every joint.
+def _isaaclab(target: Target, drives: list[Actuator], profile: Profile, _robot: RobotSpec) -> str:
+    """`ACTUATORS`, a dict of configs by group."""
+    entries = "".join(
+        f'    "{one.name}": {target.call}(\n'
+        f"        joint_names_expr={list(one.own_joints)!r},\n"
+        f"{_fields(target, one)}{_delay(target, one, profile)}"
+        f"    ),  # draw stiffness from {_pair(one.stiffness_range)}, "
+        f"damping from {_pair(one.damping_range)}\n"
+        for one in drives
+    )
+    return f"from isaaclab.actuators import {target.call}\n\nACTUATORS = {{\n{entries}}}\n"
 
-    Its torque is the PD law with the groups' gains, clipped by the torque-speed line and the
-    effort limit. MuJoCo treats native drives explicitly under Euler only, so the integrator is
-    Euler: it gives the trajectories of the training simulator (see `pronk.robots.model`). Joints
-    that were not matched have the robot's published gains. MuJoCo has no delay of a position
-    command in its drives; a matched delay is named in the comment. Dry friction that falls with
-    speed is the LuGre friction of the drive.
+
+def _by_joint(target: Target, drives: list[Actuator]) -> str:
+    """`JOINTS`, a dict of parameters by joint name."""
+    lines = "".join(
+        f'    "{name}": dict({_fields(target, one, "", "{}={},").replace(chr(10), " ").strip()}),\n'
+        for one in drives
+        for name in one.own_joints
+    )
+    return f"JOINTS = {{\n{lines}}}\n"
+
+
+def _genesis(target: Target, drives: list[Actuator], _p: Profile, _robot: RobotSpec) -> str:
+    """`apply`, to be called after `scene.build`."""
+    setters = "".join(
+        f'    robot.set_dofs_{name}([one["{name}"] for one in JOINTS.values()], dofs)\n'
+        for name in target.arguments
+        if name != "force_range"
+    )
+    return (
+        f"{_by_joint(target, drives)}\n\n"
+        "def apply(robot):\n"
+        '    """Give an entity its drives; call it after scene.build()."""\n'
+        "    dofs = [robot.get_joint(name).dofs_idx_local[0] for name in JOINTS]\n"
+        '    limits = [one["force_range"] for one in JOINTS.values()]\n'
+        f"{setters}    robot.set_dofs_force_range([-limit for limit in limits], limits, dofs)\n"
+    )
+
+
+def _playground(target: Target, drives: list[Actuator], profile: Profile, _r: RobotSpec) -> str:
+    """`apply`, for an MjModel with a position actuator a joint."""
+    return (
+        f"import mujoco\n\n{_by_joint(target, drives)}\n\n"
+        "def apply(model):\n"
+        '    """Set drives and step of an MjModel; call it before mjx.put_model(model)."""\n'
+        f"    model.opt.timestep = {profile.timestep_s!r}\n"
+        "    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER\n"
+        "    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP\n"
+        "    for name, one in JOINTS.items():\n"
+        "        joint = model.joint(name)\n"
+        "        dof = joint.dofadr[0]\n"
+        '        for field in ("damping", "armature", "frictionloss"):\n'
+        '            getattr(model, "dof_" + field)[dof] = one[field]\n'
+        "        (drive,) = (model.actuator_trnid[:, 0] == joint.id).nonzero()[0]\n"
+        '        model.actuator_gainprm[drive, :3] = one["kp"], 0.0, 0.0\n'
+        '        model.actuator_biasprm[drive, :3] = 0.0, -one["kp"], 0.0\n'
+        "        model.actuator_forcelimited[drive] = 1\n"
+        '        model.actuator_forcerange[drive] = -one["effort_limit"], one["effort_limit"]\n'
+        "    mujoco.mj_setConst(model, mujoco.MjData(model))\n"
+    )
+
+
+def _newton(target: Target, drives: list[Actuator], profile: Profile, _robot: RobotSpec) -> str:
+    """A USD layer: an actuator prim and the passive parameters of every joint."""
+    passive = {"armature": "armature", "friction": "frictionloss", "damping": "viscous_per_degree"}
+    joints, prims = "", ""
+    for one in drives:
+        steps = round(one.delay_s / profile.timestep_s)
+        late = f"            int newton:delaySteps = {steps}\n" if steps else ""
+        schemas = '"NewtonPDControlAPI", "NewtonDCMotorClampingAPI"'
+        schemas += ', "NewtonActuatorDelayAPI"' if steps else ""
+        for name in one.own_joints:
+            values = "".join(
+                f"            float newton:{key} = {_number(getattr(one, attribute))}\n"
+                for key, attribute in passive.items()
+            )
+            joints += (
+                f'        over "{name}" (\n            prepend apiSchemas = ["NewtonJointAPI"]\n'
+                f"        )\n        {{\n{values}        }}\n"
+            )
+            prims += (
+                f'        def NewtonActuator "{name}_actuator" (\n'
+                f"            prepend apiSchemas = [{schemas}]\n        )\n        {{\n"
+                f"            rel newton:targets = </Robot/joints/{name}>\n"
+                f"{_fields(target, one, ' ' * 12, 'float newton:{} = {}')}{late}        }}\n"
+            )
+    return (
+        'over "Robot"\n{\n    over "joints"\n    {\n'
+        f'{joints}    }}\n\n    def Scope "Actuators"\n    {{\n{prims}    }}\n}}\n'
+    )
+
+
+def _mjcf_spec(drives: list[Actuator], robot: RobotSpec) -> mujoco.MjSpec:
+    """The whole robot with a native `dcmotor` a joint, of any drive law.
+
+    Joints that were not matched have the robot's published gains.
     """
-    drives = group_drives(gains, robot)
-    by_joint = {joint: drive for drive in drives for joint in drive.joints}
+    by_joint = {joint: one for one in drives for joint in one.joints}
     spec = free_spec(robot)
-    for name, drive in by_joint.items():
-        spec.joint(name).armature = drive.armature
-        spec.joint(name).frictionloss = drive.drive.frictionloss
-    spec.option.timestep = gains.simulator.timestep_s
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.timestep = robot.law.substep(robot.timestep_s)
+    if robot.law.kind == "explicit":
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    for name, one in by_joint.items():
+        spec.joint(name).armature = one.armature
+        spec.joint(name).frictionloss = one.frictionloss
     add_drives(
         spec,
         robot,
         robot.joint_names,
-        stiffness={name: drive.stiffness for name, drive in by_joint.items()},
-        damping={name: drive.damping for name, drive in by_joint.items()},
-        stribeck={name: drive.stribeck for name, drive in by_joint.items() if drive.stribeck},
+        stiffness={name: one.stiffness for name, one in by_joint.items()},
+        damping={name: one.damping for name, one in by_joint.items()},
+        stribeck={name: one.stribeck for name, one in by_joint.items() if one.stribeck},
     )
+    for name, one in by_joint.items():
+        if one.delay_s:
+            # Linear between steps is the mean of a held command over a step (`held_mean`).
+            actuator = spec.actuator(name)
+            actuator.delay, actuator.interp = one.delay_s, 1
+            actuator.nsample = math.ceil(one.delay_s / spec.option.timestep) + 1
     spec.compile()
-    late = [f"{d.group} {d.delay_steps} steps" for d in drives if d.delay_steps]
-    comment = _header(gains)
-    if late:
-        comment += "\nCommand delays that this file does not have: " + ", ".join(late) + "."
-    return f"<!--\n{comment}\n-->\n{spec.to_xml()}"
+    return spec
 
 
-def isaaclab_text(gains: MatchedGains, robot: RobotSpec) -> str:
-    """Python source for Isaac Lab: `ACTUATORS`, a dict of `DCMotorCfg` by group.
+def _mjcf(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) -> str:
+    return str(_mjcf_spec(drives, robot).to_xml())
 
-    Isaac Lab runs PhysX; its first line is a warning that the gains must be matched there anew.
-    """
-    drives = group_drives(gains, robot)
-    entries = "".join(
-        f'    "{drive.group}": DCMotorCfg(\n'
-        f"        joint_names_expr={list(drive.joints)!r},\n"
-        f"{_fields(drive, 'friction')}"
-        f"    ),  # draw stiffness from {_pair(drive.stiffness_range)}, "
-        f"damping from {_pair(drive.damping_range)}\n"
-        for drive in drives
+
+def _snippet(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) -> str:
+    """What a model of one's own needs: option, joint attributes, and actuators."""
+    root = ET.fromstring(_mjcf_spec(drives, robot).to_xml())
+    own = dict(zip(_flat(drives, "joints"), _flat(drives, "own_joints"), strict=True))
+    integrator = "Euler" if robot.law.kind == "explicit" else "implicitfast"
+    step = robot.law.substep(robot.timestep_s)
+    lines = [f'<option timestep="{step!r}" integrator="{integrator}"/>']
+    for joint in root.iter("joint"):
+        if (name := joint.get("name", "")) in own:
+            passive = [f'{n}="{joint.get(n, 0)}"' for n in ("damping", "armature", "frictionloss")]
+            lines.append(f'<joint name="{own[name]}" {" ".join(passive)}/>')
+    lines.append("<actuator>")
+    for actuator in root.iterfind("actuator/*"):
+        if (name := actuator.get("joint", "")) in own:
+            actuator.set("name", own[name])
+            actuator.set("joint", own[name])
+            actuator.tail = None
+            lines.append(f"  {ET.tostring(actuator, encoding='unicode')}")
+    return "\n".join([*lines, "</actuator>", ""])
+
+
+_GAINS = {name: name for name in ("stiffness", "damping", "armature")}
+_MOTOR = {
+    "effort_limit": "effort_limit",
+    "saturation_effort": "stall_torque",
+    "velocity_limit": "no_load_speed",
+}
+_FRICTION = {
+    "friction": "frictionloss",
+    "dynamic_friction": "sliding_friction",
+    "viscous_friction": "viscous_damping",
+}
+_LIMITS_3 = {"effort_limit": "actuator_effort_limit", "velocity_limit": "actuator_velocity_limit"}
+"""Names of limits since Isaac Lab 3.0."""
+_STEP = "Set sim.dt to {timestep} s and decimation to {decimation}"
+_TGS = f"{_STEP}, PhysX's solver to TGS"
+_EFFORT = "Friction is a torque since Isaac Sim 5.0; before it was a coefficient."
+
+
+def _isaaclab_targets() -> Iterator[tuple[str, Target]]:
+    """Isaac Lab's actuators, in the words of release 3.0 and of 2.3."""
+    forces = f"{_TGS}, enable_external_forces_every_iteration to False. {_EFFORT}"
+    implicit = (
+        f"{_TGS}, solver_position_iteration_count to {{iterations}} and the count of velocity "
+        f"iterations to 0. {_EFFORT}"
     )
-    warning = (
-        "NOT MATCHED IN THIS SIMULATOR. Isaac Lab runs PhysX, whose integrator and joint friction "
-        "are not MuJoCo's:\nwith the same numbers the joints respond differently. Take them as a "
-        "start, sweep the joints in\nIsaac Lab with the log's own commands, and match again."
-    )
-    return (
-        f"{_comment(f'{warning}{chr(10) * 2}{_header(gains)}' + _without_stribeck(drives))}\n\n"
-        f"from isaaclab.actuators import DCMotorCfg\n\nACTUATORS = {{\n{entries}}}\n"
-    )
-
-
-def _fields(drive: GroupDrive, friction: str, **extra: str) -> str:
-    """Arguments of an actuator, by the simulator's names, one a line."""
-    own = {name: getattr(drive, name) for name in ("stiffness", "damping", "armature")}
-    names = {
-        friction: "frictionloss",
-        **extra,
-        "effort_limit": "effort_limit",
-        "saturation_effort": "stall_torque",
-        "velocity_limit": "no_load_speed",
+    lag, motor = ("min_delay", "max_delay"), _GAINS | _MOTOR | _FRICTION
+    plain = {name: value for name, value in motor.items() if name in _GAINS | _FRICTION}
+    shapes = {
+        "implicit": ("ImplicitActuatorCfg", "effort_limit_sim", plain, (), implicit),
+        "dcmotor": ("DCMotorCfg", "", motor, (), forces),
+        "delayed": (
+            "DelayedPDActuatorCfg",
+            "effort_limit",
+            plain,
+            lag,
+            f"{forces} DelayedPDActuator has no torque-speed line.",
+        ),
     }
-    own |= {name: getattr(drive.drive, field) for name, field in names.items()}
-    return "".join(f"        {name}={_number(value)},\n" for name, value in own.items())
+    for name, (call, limit, arguments, delay, settings) in shapes.items():
+        law = "isaaclab-implicit" if name == "implicit" else "isaaclab-explicit"
+        for release in ("", "-2.3"):
+            words = arguments | ({limit: "effort_limit"} if limit else {})
+            if not release:
+                new = _LIMITS_3 | {"effort_limit_sim": "joint_effort_limit"}
+                words = {new.get(word, word): value for word, value in words.items()}
+            yield (
+                f"isaaclab-{name}{release}",
+                Target(
+                    profile=law,
+                    body=_isaaclab,
+                    call=call,
+                    arguments=words,
+                    delay=delay,
+                    settings=f"Isaac Lab {release[1:] or '3.0'}. {settings}",
+                    stribeck=True,
+                    no_delay="delay the actions in the environment"
+                    + ", or take isaaclab-delayed" * (name == "dcmotor"),
+                ),
+            )
 
 
-EXPORTS: Mapping[str, Callable[[MatchedGains, RobotSpec], str]] = {
-    "mjlab": mjlab_text,
-    "mjcf": mjcf_text,
-    "isaaclab": isaaclab_text,
+_MJLAB_DELAY = ("delay_min_lag", "delay_max_lag")
+_MJLAB = {"frictionloss": "frictionloss", "viscous_damping": "viscous_damping"}
+TARGETS: Mapping[str, Target] = {
+    "mjlab": Target(
+        profile="mjlab",
+        body=_mjlab,
+        call="DcMotorActuatorCfg",
+        arguments=_GAINS | _MJLAB | _MOTOR,
+        delay=_MJLAB_DELAY,
+        settings=f"{_STEP}.",
+    ),
+    "mjlab-idealpd": Target(
+        profile="mjlab",
+        body=_mjlab,
+        call="IdealPdActuatorCfg",
+        arguments=_GAINS | _MJLAB | {"effort_limit": "effort_limit"},
+        delay=_MJLAB_DELAY,
+        settings=f"{_STEP}. IdealPdActuator has no torque-speed line.",
+    ),
+    "mjlab-builtin": Target(
+        profile="mjlab-builtin",
+        body=_mjlab,
+        call="BuiltinPositionActuatorCfg",
+        arguments=_GAINS | _MJLAB | {"effort_limit": "effort_limit"},
+        delay=_MJLAB_DELAY,
+        settings=f"{_STEP}, the integrator to implicitfast.",
+    ),
+    **dict(_isaaclab_targets()),
+    "isaaclab-newton": Target(
+        profile="isaaclab-newton",
+        body=_isaaclab,
+        call="ImplicitActuatorCfg",
+        arguments=_GAINS
+        | {"damping": "all_damping"}
+        | {"joint_effort_limit": "effort_limit", "friction": "frictionloss"},
+        settings=f"Isaac Lab 3.0, physics=newton_mjwarp. {_STEP}, the integrator to implicitfast. "
+        "Damping includes the viscous friction.",
+    ),
+    "newton-usd": Target(
+        profile="isaaclab-explicit",
+        body=_newton,
+        arguments={
+            "kp": "stiffness",
+            "kd": "damping",
+            "maxMotorEffort": "effort_limit",
+            "saturationEffort": "stall_torque",
+            "velocityLimit": "no_load_speed",
+        },
+        delay=("newton:delaySteps",),
+        settings="Replace /Robot/joints by the path of the joints. Actuators must step with the "
+        "physics, each {timestep} s; commands are held for {decimation} steps. XPBD, VBD and "
+        "SemiImplicit of Newton have no armature: another joint. Joint damping is per degree.",
+    ),
+    "genesis": Target(
+        profile="genesis",
+        body=_genesis,
+        arguments={
+            "kp": "stiffness",
+            "kv": "damping",
+            "armature": "armature",
+            "frictionloss": "frictionloss",
+            "damping": "viscous_damping",
+            "force_range": "effort_limit",
+        },
+        settings="Set SimOptions(dt={period}, substeps={decimation}), and command by "
+        "control_dofs_position. Without apply() a URDF's joints have an armature of 0.1 kg m^2.",
+    ),
+    "playground": Target(
+        profile="playground",
+        body=_playground,
+        arguments={
+            "kp": "stiffness",
+            "damping": "all_damping",
+            "armature": "armature",
+            "frictionloss": "frictionloss",
+            "effort_limit": "effort_limit",
+        },
+        settings="Set sim_dt to {timestep} s and ctrl_dt to {period} s. Joint damping is the "
+        "derivative gain and the viscous friction.",
+    ),
+    "mjcf": Target(
+        body=_mjcf,
+        delay_seconds=True,
+        stribeck=True,
+        settings="Step and integrator are those of the drive law (E needs Euler); commands are "
+        "held for {substeps} steps. Joints that were not matched have the robot's published gains.",
+        comment=("<!--\n", "\n-->"),
+    ),
+    "mjcf-snippet": Target(
+        body=_snippet,
+        delay_seconds=True,
+        stribeck=True,
+        settings="Put these attributes into your model; commands are held for {substeps} steps.",
+        comment=("<!--\n", "\n-->"),
+    ),
 }
 """What `export_text` can write."""
 
 
-def export_text(gains: MatchedGains, target: str, robot: RobotSpec | None = None) -> str:
-    """The gains as text for one of `EXPORTS`; the robot is found by its name if not given.
+def export_text(
+    gains: MatchedGains, target: str, robot: RobotSpec | None = None, *, per: Per = "group"
+) -> str:
+    """The gains as text for one of `TARGETS`; the robot is found by its name if not given.
 
     Raises:
-        PronkError: The target is unknown, or the gains hold no group.
+        PronkError: The target is unknown or has another drive law or step than the gains, or the
+            gains hold no group or are not stable.
         RobotError: The robot is unknown.
     """
-    if target not in EXPORTS:
-        raise PronkError(f"no export to {target!r}; expected one of {', '.join(EXPORTS)}.")
-    return EXPORTS[target](gains, robot or load_robot(gains.robot))
-
-
-def _header(gains: MatchedGains) -> str:
-    """What every export begins with."""
-    simulator = gains.simulator
-    lines = [
-        f"Gains of {gains.robot}, matched by pronk.",
-        f"They hold for {simulator.engine} {simulator.version}, timestep "
-        f"{simulator.timestep_s:g} s, decimation {simulator.decimation},",
-        f"integrator {simulator.integrator}, actuator law {simulator.actuator}. In any other "
-        "simulator match again.",
-    ]
-    if gains.virtual:
-        lines.append("The logs came from pronk's virtual robot, not from hardware.")
-    lines += [f"Log {name}, SHA-256 {digest}" for name, digest in gains.logs.items()]
-    return "\n".join(lines)
-
-
-def _without_stribeck(drives: Sequence[GroupDrive]) -> str:
-    """Name friction that falls with speed where the simulator's does not."""
-    shares = [f"{one.group} {one.stribeck:.2g}" for one in drives if one.stribeck]
-    if not shares:
-        return ""
-    return (
-        "\nDry friction is that at rest. In motion the matched joints lose this share of it, which "
-        f"this file\ndoes not have: {', '.join(shares)}."
+    if target not in TARGETS:
+        raise PronkError(f"no export to {target!r}; expected one of {', '.join(TARGETS)}.")
+    chosen, holds = TARGETS[target], profile_of(gains.simulator)
+    check_target(target, holds)
+    if robot is None:
+        try:
+            robot = load_robot(gains.robot)
+        except RobotError:
+            raise PronkError(
+                f"the robot {gains.robot!r} of the gains is none that pronk knows by name; give "
+                "--robot PATH, the robot.yaml or model that they were matched with."
+            ) from None
+    known = holds.robot(robot)
+    drives = actuators(gains, known, per)
+    share = stability_share(known, drives)
+    if share >= 1.0:
+        raise PronkError(
+            f"the gains of {gains.robot} are not stable in {holds.name}: at "
+            f"{1000.0 * holds.timestep_s:g} ms they are {share:.2f} times the limit of drive law "
+            f"{holds.drive_law.label}; match again with a smaller step, as --for "
+            f"{holds.name},timestep_s={holds.timestep_s / 2.0:g} does."
+        )
+    text = "\n".join(
+        textwrap.fill(line, 98, break_long_words=False, break_on_hyphens=False)
+        for line in _header(gains, chosen, holds, known, drives, share)
     )
+    begin, end = chosen.comment
+    if end:
+        head = f"{begin}{text.replace('--', '-')}{end}"
+    else:
+        head = "\n".join(f"{begin}{line}".rstrip() for line in text.splitlines())
+    if target == "newton-usd":
+        head = f"#usda 1.0\n{head}"
+    return f"{head}\n\n{chosen.body(chosen, drives, holds, known)}"
 
 
-def _comment(text: str) -> str:
-    return "\n".join(f"# {line}".rstrip() for line in text.splitlines())
+def check_target(target: str, holds: Profile) -> None:
+    """Refuse gains that hold for another joint than the target's.
+
+    Raises:
+        PronkError: Another drive law or step, with the way out.
+    """
+    if not (name := TARGETS[target].profile) or name == holds.name:
+        return
+    wanted = profile(name)
+    if (wanted.drive_law, wanted.timestep_s) != (holds.drive_law, holds.timestep_s):
+        raise PronkError(
+            f"the gains hold for {holds.name} (drive law {holds.drive_law.label} at "
+            f"{1000.0 * holds.timestep_s:g} ms), and {target} has drive law "
+            f"{wanted.drive_law.label} at {1000.0 * wanted.timestep_s:g} ms, with which they are "
+            f"another joint; give `pronk match LOGS --for {name}`, or without logs "
+            f"`pronk translate GAINS --to {name}`."
+        )
+
+
+def _header(
+    gains: MatchedGains,
+    target: Target,
+    holds: Profile,
+    robot: RobotSpec,
+    drives: list[Actuator],
+    share: float,
+) -> Iterator[str]:
+    """What every export begins with."""
+    law, info, step = holds.drive_law, gains.simulator, holds.timestep_s
+    yield f"Gains of {gains.robot}, matched by pronk for {holds.name} ({holds.framework})."
+    engine = f"{info.engine} {info.version}".strip()
+    yield (
+        f"They hold for {engine}, {info.actuator}, drive law {law.label}, timestep {step:g} s, "
+        f"decimation {robot.decimation}."
+    )
+    yield target.settings.format(
+        timestep=f"{step:g}",
+        decimation=robot.decimation,
+        period=f"{step * robot.decimation:g}",
+        iterations=law.iterations,
+        substeps=robot.decimation * law.iterations,
+    )
+    if law.kind != "implicit":
+        yield f"The drives use {100.0 * share:.0f} % of the law's stability limit."
+    late = {one.name: one.delay_s for one in drives if one.delay_s > 1e-6}
+    if late and target.delay:
+        yield "Command delays, as steps and what steps leave: " + ", ".join(
+            f"{name} {1000.0 * delay:.1f} ms = {round(delay / step)} steps and "
+            f"{1000.0 * (delay - step * round(delay / step)):+.1f} ms"
+            for name, delay in late.items()
+        )
+    elif late and target.delay_seconds:
+        yield "Commands before the first are 0 rad for the delay; mj_initCtrlHistory sets others."
+    elif late:
+        delays = ", ".join(
+            f"{name} {1000.0 * delay:.1f} ms ({delay / step:.1f} steps)"
+            for name, delay in late.items()
+        )
+        yield f"Command delays that this file does not have: {delays}; {target.no_delay}."
+    falling = [f"{one.name} {one.stribeck:.2g}" for one in drives if one.stribeck]
+    if falling and not target.stribeck:
+        yield (
+            "Dry friction is that at rest. In motion the joints lose this share of it, which this "
+            f"file does not have: {', '.join(falling)}."
+        )
+    if holds.friction != "N m":
+        yield f"No dry friction: {holds.framework} has none in N m."
+    own = [f"{a} = {b}" for one in drives for a, b in zip(one.own_joints, one.joints, strict=True)]
+    if _flat(drives, "joints") != _flat(drives, "own_joints"):
+        yield f"Joint names of the maker, and in pronk: {', '.join(own)}."
+    if some := _flat(drives, "unmatched"):
+        yield f"NOT MATCHED, with the gains of their group: {', '.join(some)}."
+    if rest := [name for name in robot.joint_names if name not in _flat(drives, "joints")]:
+        yield f"NOT MATCHED, and without gains here: {', '.join(rest)}."
+    if gains.virtual:
+        yield "The logs came from pronk's virtual robot, not from hardware."
+    for name, digest in gains.logs.items():
+        yield f"Log {name}, SHA-256 {digest}"
+
+
+def _flat(drives: Sequence[Actuator], name: str) -> list[str]:
+    return [joint for one in drives for joint in getattr(one, name)]
+
+
+def _mean(values: Sequence[float], default: float) -> float:
+    return float(np.mean(values)) if values else default
 
 
 def _about(centre: float, half: float) -> tuple[float, float]:

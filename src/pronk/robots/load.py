@@ -111,6 +111,9 @@ class GroupEntry(_Entry, frozen=True):
     band_hz: _Band | None = None
     clamped: tuple[str, ...] = ()
     """Patterns of joints of the same limb that are fixed while one of these is excited."""
+    own_names: str | None = None
+    """Names in the models of the robot's maker: a pattern whose star stands for what that of
+    `joints` does."""
 
 
 class SymmetryEntry(_Entry, frozen=True):
@@ -300,8 +303,17 @@ def _joint(
                 f"{source}: poses.{pose} puts {name} at {angle:g} rad, outside its range of "
                 f"{low:g} to {high:g} rad."
             )
+    pattern, own = file.groups[group].joints or group, file.groups[group].own_names
+    if own and not pattern.count("*") == own.count("*") == 1:
+        raise RobotError(
+            f"{source}: groups.{group}.own_names is {own!r} for joints {pattern!r}; expected one "
+            "star in both."
+        )
+    before, _, after = pattern.partition("*")
+    stem = name.removeprefix(before).removesuffix(after)
     return Joint(
         name=name,
+        own_name=own.replace("*", stem) if own else "",
         group=group,
         drive=file.drives[drive].drive(f"{source}: drives.{drive}"),
         range=(float(low), float(high)) if limited else (-math.pi, math.pi),

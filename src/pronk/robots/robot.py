@@ -89,6 +89,8 @@ class Joint:
     With a fixed base, `position(self | command) == sign * position(mirror | sign * command)`.
     None for the original of each family.
     """
+    own_name: str = ""
+    """Its name in the models of the robot's maker, for exports; empty if it is `name`."""
 
     @property
     def original(self) -> tuple[str, float]:

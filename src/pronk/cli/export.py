@@ -1,0 +1,54 @@
+"""`pronk export`: matched gains as configuration of a simulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from pronk.cli import console
+
+Target = Literal[
+    "mjlab",
+    "mjlab-idealpd",
+    "mjlab-builtin",
+    "isaaclab-implicit",
+    "isaaclab-implicit-2.3",
+    "isaaclab-dcmotor",
+    "isaaclab-dcmotor-2.3",
+    "isaaclab-delayed",
+    "isaaclab-delayed-2.3",
+    "isaaclab-newton",
+    "newton-usd",
+    "genesis",
+    "playground",
+    "mjcf",
+    "mjcf-snippet",
+]
+
+
+def export(
+    gains: tyro.conf.Positional[Path],
+    to: Target,
+    out: Path,
+    robot: str | None = None,
+    per: Literal["group", "joint"] = "group",
+) -> console.Outcome:
+    """Write matched gains as actuator configuration of a simulator.
+
+    Args:
+        gains: gains.yaml of `pronk match` or `pronk translate`.
+        to: What reads the file; it must have the drive law and the step that the gains hold for.
+        out: The file to write.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF; the gains' if left out.
+        per: One actuator per joint group, with the group's gains, or per joint, with its own.
+    """
+    from pronk.files import write_text
+    from pronk.match import gains as gains_file
+    from pronk.match.export import export_text
+    from pronk.robots import load_robot
+
+    known = load_robot(robot) if robot else None
+    write_text(out, export_text(gains_file.load(gains), to, known, per=per))
+    return console.Outcome(figures={"written": out, "to": to}, wrote=[out])
