@@ -29,6 +29,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "profiles": ("pronk.cli.match:profiles", "List the frameworks that gains can be matched for."),
     "predict": ("pronk.cli.match:predict", "Replay logs that the fit has not used."),
     "export": ("pronk.cli.export:export", "Write gains as configuration of a simulator."),
+    "translate": (
+        "pronk.cli.translate:translate",
+        "Translate gains for a framework of another drive law.",
+    ),
     "train": ("pronk.cli.train:train", "Train a policy that walks and jumps."),
     "evaluate": ("pronk.cli.evaluate:evaluate", "Evaluate a policy in the training simulator."),
     "trial": ("pronk.cli.trial:trial", "Measure the paper's jumps on the virtual robot."),
@@ -51,7 +55,6 @@ RENAMED = {
     "--any-delay": "`--any-delay` is now `--ignore-latency-check`.",
     "--blend": "`--blend` is now `--blend-time-s`.",
     "--like": "`--like` is now `--ranges-from`.",
-    "--from": "`--from` is now `--init-checkpoint`.",
 }
 """Names of the release before, each with the hint that replaces it."""
 _JSON = "json_file"

@@ -564,15 +564,7 @@ def export_text(
         raise PronkError(f"no export to {target!r}; expected one of {', '.join(TARGETS)}.")
     chosen, holds = TARGETS[target], profile_of(gains.simulator)
     check_target(target, holds)
-    if robot is None:
-        try:
-            robot = load_robot(gains.robot)
-        except RobotError:
-            raise PronkError(
-                f"the robot {gains.robot!r} of the gains is none that pronk knows by name; give "
-                "--robot PATH, the robot.yaml or model that they were matched with."
-            ) from None
-    known = holds.robot(robot)
+    known = holds.robot(robot or robot_of(gains))
     drives = actuators(gains, known, per)
     share = stability_share(known, drives)
     if share >= 1.0:
@@ -594,6 +586,21 @@ def export_text(
     if target == "newton-usd":
         head = f"#usda 1.0\n{head}"
     return f"{head}\n\n{chosen.body(chosen, drives, holds, known)}"
+
+
+def robot_of(gains: MatchedGains) -> RobotSpec:
+    """Load the robot of some gains by its name.
+
+    Raises:
+        PronkError: There is none of the name.
+    """
+    try:
+        return load_robot(gains.robot)
+    except RobotError:
+        raise PronkError(
+            f"the robot {gains.robot!r} of the gains is none that pronk knows by name; give "
+            "--robot PATH, the robot.yaml or model that they were matched with."
+        ) from None
 
 
 def check_target(target: str, holds: Profile) -> None:

@@ -161,6 +161,22 @@ DriveGains = Mapping[str, Pair] | Literal["default"]
 `default`: those of the robot's file."""
 
 
+def gains_by_joint(robot: RobotSpec, given: DriveGains) -> dict[str, Pair]:
+    """Gains by joint from those by joint or group; PronkError if a name is neither."""
+    if given == "default":
+        return {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints}
+    by_joint: dict[str, Pair] = {}
+    for name, pair in given.items():
+        if name not in (*robot.joint_names, *robot.groups):
+            raise PronkError(
+                f"drive gains of {name!r}; expected a joint ({', '.join(robot.joint_names)}) or a "
+                f"joint group ({', '.join(robot.groups)})."
+            )
+        members = robot.group(name) if name in robot.groups else (robot.joint(name),)
+        by_joint |= {joint.name: pair for joint in members}
+    return by_joint
+
+
 def with_drive_gains(
     logs: Sequence[JointLog], robot: RobotSpec, given: DriveGains | None = None
 ) -> list[JointLog]:
@@ -170,15 +186,7 @@ def with_drive_gains(
         LogError: A log has no gains and none are given for a joint of it, or they contradict it.
         PronkError: A given name is no joint and no joint group of the robot.
     """
-    by_joint: dict[str, Pair] = {}
-    for name, pair in ({} if given is None or given == "default" else given).items():
-        if name not in (*robot.joint_names, *robot.groups):
-            raise PronkError(
-                f"drive gains of {name!r}; expected a joint ({', '.join(robot.joint_names)}) or a "
-                f"joint group ({', '.join(robot.groups)})."
-            )
-        members = robot.group(name) if name in robot.groups else (robot.joint(name),)
-        by_joint |= {joint.name: pair for joint in members}
+    by_joint = {} if given is None or given == "default" else gains_by_joint(robot, given)
     out = []
     for log in map(with_segments, logs):
         where, moved, pairs = log.source or "log", excited_joints(log), []

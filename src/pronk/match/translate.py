@@ -1,0 +1,181 @@
+"""Gains of one framework as gains of another in which the joint responds alike, without a log.
+
+Both responses are closed forms of the robot's own model (`pronk.simulators.linear`). Stiffness
+and damping give the magnitude in the band; the phase that is left is a delay. Dry friction stays
+what it is, so it has to be a torque in both frameworks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from pronk.errors import PronkError
+from pronk.match.export import actuators, stability_share
+from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.measured_joint import DB
+from pronk.match.randomization import group_gains
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.linear import Plant, plant
+from pronk.simulators.mujoco import JointTestRig
+from pronk.simulators.profiles import Profile, profile_of
+
+Array = NDArray[np.float64]
+Pair = tuple[float, float]
+
+LOW_HZ = 1.0
+"""Lowest frequency compared: below it a joint follows its command in every drive law."""
+POINTS = 60
+"""Frequencies compared, evenly spaced."""
+NOT_ALIKE_DB = 0.5
+"""Error above which the joints are not alike: what a match should reach (`NO_MATCH_DB` / 2)."""
+NOT_ALIKE = "not alike"
+"""Beginning of the flag of a joint that the other framework cannot give."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTranslation:
+    """One joint in both frameworks."""
+
+    before: Pair
+    """Stiffness [N m/rad] and damping [N m s/rad] in the first framework."""
+    after: Pair
+    """The same in the other one."""
+    before_db: float
+    """Magnitude of the other joint over the first with the same gains, root mean square [dB]."""
+    after_db: float
+    """The same with the translated gains."""
+    lead_s: float
+    """How much earlier the other joint responds with the translated gains [s]."""
+    rest_s: float
+    """What is left of it because a delay cannot be negative [s]; below 0."""
+
+
+def translate(
+    gains: MatchedGains, robot: RobotSpec, to: Profile
+) -> tuple[MatchedGains, dict[str, JointTranslation]]:
+    """Translate gains for another framework, and what changed by joint.
+
+    Raises:
+        PronkError: The gains hold for no profile, are of another robot or not stable there, or the
+            period of the robot's commands is no multiple of the profile's step.
+    """
+    if gains.robot != robot.name:
+        raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
+    begin = profile_of(gains.simulator)
+    source, target = begin.robot(robot), to.robot(robot)
+    dry = begin.friction == to.friction == "N m"
+    joints, found = {}, {}
+    for name, joint in gains.joints.items():
+        first, other = (_plant(one, name, joint) for one in (source, target))
+        found[name] = one = translated(
+            first, other, (joint.stiffness, joint.damping), joint.delay_s
+        )
+        flags = tuple(flag for flag in joint.flags if not flag.startswith(NOT_ALIKE))
+        if one.after_db > NOT_ALIKE_DB:
+            flags += (f"{NOT_ALIKE}: {one.after_db:.2f} dB from {begin.name}",)
+        kp, kd = one.after[0] / joint.stiffness, one.after[1] / joint.damping
+        (kk, kv), (vk, vv) = joint.covariance
+        joints[name] = replace(
+            joint,
+            stiffness=one.after[0],
+            damping=one.after[1],
+            stiffness_ci95=_scaled(joint.stiffness_ci95, kp),
+            damping_ci95=_scaled(joint.damping_ci95, kd),
+            stiffness_total95=_scaled(joint.stiffness_total95, kp),
+            damping_total95=_scaled(joint.damping_total95, kd),
+            covariance=((kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)),
+            grid_stiffness=float("nan"),
+            grid_damping=float("nan"),
+            frictionloss=joint.frictionloss if dry else 0.0,
+            stribeck=joint.stribeck if dry else 0.0,
+            delay_s=max(joint.delay_s + one.lead_s, 0.0),
+            flags=flags,
+        )
+    info = replace(to.info, decimation=target.decimation)
+    out = replace(gains, simulator=info, joints=joints, groups=group_gains(target, joints))
+    share = stability_share(target, actuators(out, target, "joint"))
+    if share >= 1.0:
+        raise PronkError(
+            f"in {to.name} at {1000.0 * to.timestep_s:g} ms the translated gains are {share:.2f} "
+            f"times the stability limit of its drive law; give a smaller step, as {to.name},"
+            f"timestep_s={to.timestep_s / 2.0:g}."
+        )
+    return out, found
+
+
+def translated(first: Plant, other: Plant, gains: Pair, delay_s: float = 0.0) -> JointTranslation:
+    """Find the gains with which one plant responds like another, at the same frequencies."""
+    goal = first.response(*gains)[0]
+
+    def error(x: Array) -> Array:
+        with np.errstate(over="ignore"):
+            return np.asarray(DB * np.log(np.abs(other.response(*np.exp(x))[0] / goal)))
+
+    start = np.log(np.maximum(gains, 1e-6))
+    best = least_squares(error, start, x_scale=0.1, xtol=1e-10, ftol=1e-12)
+    after = float(np.exp(best.x[0])), float(np.exp(best.x[1]))
+    phase = np.unwrap(np.angle(other.response(*after)[0] / goal))
+    lead = float(phase @ first.omega / (first.omega @ first.omega))
+    return JointTranslation(
+        before=gains,
+        after=after,
+        before_db=_rms(error(start)),
+        after_db=_rms(best.fun),
+        lead_s=lead,
+        rest_s=min(delay_s + lead, 0.0),
+    )
+
+
+def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile) -> MatchedGains:
+    """Gains of a framework that no log was matched with, by joint; those are taken for exact."""
+    known = begin.robot(robot)
+    joints = {
+        name: JointGains(
+            stiffness=kp,
+            damping=kd,
+            armature=robot.joint(name).drive.armature,
+            band_hz=robot.joint(name).band_hz,
+        )
+        for name, (kp, kd) in by_joint.items()
+    }
+    return MatchedGains(
+        robot=robot.name,
+        simulator=replace(begin.info, decimation=known.decimation),
+        joints=joints,
+        groups=group_gains(known, joints),
+    )
+
+
+def _plant(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
+    """Linearize a joint about the default pose, with its matched armature."""
+    first = robot.joint(robot.joint(name).original[0])
+    drive = replace(
+        first.drive,
+        rotor_inertia=gains.armature / first.drive.gear_ratio**2,
+        frictionloss=0.0,
+    )
+    own = replace(
+        robot,
+        joints=tuple(
+            replace(one, drive=drive) if one.name == first.name else one for one in robot.joints
+        ),
+    )
+    low, high = gains.band_hz if np.isfinite(gains.band_hz).all() else first.band_hz
+    hz = np.linspace(max(low, min(LOW_HZ, 0.5 * high)), high, POINTS)
+    pose = np.array([robot.joint(joint).default_position for joint in first.chain])
+    with JointTestRig(own, first.name, threads=1) as rig:
+        order = [first.chain.index(joint) for joint in rig.joints]
+        return plant(rig, pose[order], 2.0 * np.pi * hz)
+
+
+def _scaled(interval: Pair, factor: float) -> Pair:
+    return factor * interval[0], factor * interval[1]
+
+
+def _rms(values: Sequence[float] | Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,147 @@
+"""Gains translated between drive laws: known pairs, back again, in simulation, refusals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic_log import Excitation, synthetic_log
+from command_line import accepted, refused
+from pronk.errors import PronkError
+from pronk.excitation.signals import Chirp
+from pronk.match.gains import load, save
+from pronk.match.translate import NOT_ALIKE, stated_gains, translate
+from pronk.response.estimate import estimate
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.profiles import profile
+
+PENDULUM = """<mujoco><worldbody><body><joint name="swing" axis="0 1 0"/>
+<inertial pos="0 0 -0.1" mass="0.2" diaginertia="0.001 0.001 0.001"/></body></worldbody></mujoco>"""
+FILE = """schema: pronk/robot/1
+name: pendulum
+model: pendulum.xml
+drives: {motor: {effort_limit: 100, stall_torque: 100, no_load_speed: 1000, armature: 0.0063}}
+groups: {swing: {drive: motor, stiffness: 17, damping: 0.4, band_hz: [1, 15]}}
+poses: {default: {swing: 0}}
+"""
+EXACT = "mjlab,timestep_s=0.0001"
+# Matched to the drive at 0.1 ms from 1 to 15 Hz, confirmed in MuJoCo, Drake, SAPIEN and PyBullet:
+# stiffness, damping, RMS before and after [dB], delay that is missing [ms].
+KNOWN = {
+    "mjlab": (15.00, 0.356, 0.70, 0.031, 2.27),
+    "mjlab-builtin": (18.59, 0.442, 0.41, 0.036, 2.32),
+    "drake": (18.59, 0.349, 1.25, 0.036, 2.32),
+    "isaaclab-implicit": (17.48, 0.390, 0.35, 0.004, 0.57),
+    "isaaclab-implicit,iterations=10": (17.22, 0.397, 0.14, 0.001, 0.20),
+    "mjlab,timestep_s=0.01": (12.79, 0.312, None, 0.14, None),
+    "genesis": (19.33, 0.473, None, 0.14, None),
+    "playground": (15.41, 0.365, None, None, None),
+    "isaaclab-implicit,timestep_s=0.01": (17.85, 0.377, None, None, None),
+}
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> RobotSpec:
+    (tmp_path / "pendulum.xml").write_text(PENDULUM)
+    (tmp_path / "robot.yaml").write_text(FILE)
+    return load_robot(tmp_path / "robot.yaml")
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_known_gains_of_a_pendulum(pendulum: RobotSpec, name: str) -> None:
+    gains, changes = translate(
+        stated_gains(pendulum, {"swing": (17.0, 0.4)}, profile(EXACT)), pendulum, profile(name)
+    )
+    kp, kd, before, after, delay = KNOWN[name]
+    joint, change = gains.joints["swing"], changes["swing"]
+    assert joint.stiffness == pytest.approx(kp, rel=0.01)
+    assert joint.damping == pytest.approx(kd, rel=0.01)
+    if before:
+        assert change.before_db == pytest.approx(before, abs=0.08)
+    if after:
+        assert change.after_db == pytest.approx(after, abs=0.02)
+    if delay:
+        assert 1000.0 * joint.delay_s == pytest.approx(delay, abs=0.15)
+
+
+@pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
+def test_gains_return_and_the_joints_stay(name: str) -> None:
+    robot = load_robot(name)
+    pairs = {joint.name: (joint.stiffness, joint.damping) for joint in robot.joints[:3]}
+    first = stated_gains(robot, pairs, profile("mjlab"))
+    joints = {joint: replace(own, delay_s=0.003) for joint, own in first.joints.items()}
+    first = gains = replace(first, joints=joints)
+    for step in ("mjlab-builtin", "isaaclab-implicit", "mjlab"):
+        gains, changes = translate(gains, robot, profile(step))
+        assert max(one.after_db for one in changes.values()) < 0.05
+    for joint, own in first.joints.items():
+        back = gains.joints[joint]
+        assert back.stiffness == pytest.approx(own.stiffness, rel=0.005)
+        assert back.damping == pytest.approx(own.damping, rel=0.005)
+        assert back.delay_s == pytest.approx(own.delay_s, abs=1e-4)
+
+
+def test_the_simulated_joints_respond_alike() -> None:
+    robot, begin, end = load_robot("mini_cheetah"), profile("isaaclab-implicit"), profile("mjlab")
+    first = stated_gains(robot, {"FR_knee": (17.0, 0.4)}, begin)
+    first = replace(first, joints={"FR_knee": replace(first.joints["FR_knee"], frictionloss=0.0)})
+    found, _ = translate(first, robot, end)
+    chirp = replace(Chirp(length_s=12.0), amplitude=0.1)
+
+    def gain_db(target: str, kp: float, kd: float) -> np.ndarray:
+        known = profile(target).robot(robot)
+        free = [replace(j, drive=replace(j.drive, frictionloss=0.0)) for j in known.joints]
+        known = replace(known, joints=tuple(free))
+        log = synthetic_log(known, "FR_knee", [Excitation(offsets=chirp.samples())], kp, kd)
+        response = estimate(log, "FR_knee")[0]
+        inside = (response.frequency_hz > 1.0) & (response.frequency_hz < 12.0)
+        return 20.0 * np.log10(response.gain[inside])
+
+    goal = gain_db("isaaclab-implicit", 17.0, 0.4)
+    joint = found.joints["FR_knee"]
+    apart = gain_db("mjlab", joint.stiffness, joint.damping) - goal
+    untranslated = gain_db("mjlab", 17.0, 0.4) - goal
+    assert np.sqrt(np.mean(apart**2)) < 0.05
+    assert np.sqrt(np.mean(untranslated**2)) > 10.0 * np.sqrt(np.mean(apart**2))
+
+
+def test_what_another_framework_cannot_give_is_refused_or_flagged(pendulum: RobotSpec) -> None:
+    stiff = stated_gains(pendulum, {"swing": (600.0, 0.4)}, profile("isaaclab-implicit"))
+    try:
+        gains, _ = translate(stiff, pendulum, profile("mjlab,timestep_s=0.01"))
+    except PronkError as error:
+        assert "timestep_s=0.005" in str(error)  # noqa: PT017
+    else:
+        assert gains.joints["swing"].flags[-1].startswith(NOT_ALIKE)
+    late = stated_gains(pendulum, {"swing": (17.0, 0.4)}, profile("mjlab"))
+    gains, changes = translate(late, pendulum, profile("isaaclab-implicit"))
+    assert gains.joints["swing"].delay_s == 0.0
+    assert changes["swing"].rest_s == pytest.approx(-1.7e-3, abs=1.5e-4)
+    with pytest.raises(PronkError, match="not of go2"):
+        translate(late, load_robot("go2"), profile("drake"))
+
+
+def test_command_line(tmp_path: Path, pendulum: RobotSpec) -> None:
+    out, figures = tmp_path / "out.yaml", tmp_path / "figures.json"
+    stated = ("--robot", pendulum.source, "--from", EXACT, "--drive-gains", "swing=17,.4")
+    accepted("translate", *stated, "--to", "mjlab", "--out", out, "--json", figures)
+    assert load(out).joints["swing"].stiffness == pytest.approx(15.0, rel=0.01)
+    assert json.loads(figures.read_text())["translated"]["mjlab"]["swing"]["after_db"] < 0.05
+    robot = ("--robot", pendulum.source)
+    accepted("translate", out, *robot, "--to", "genesis", "--to", "drake", "--out", out)
+    assert load(tmp_path / "genesis" / "out.yaml").simulator.profile == "genesis"
+    assert load(tmp_path / "drake" / "out.yaml").simulator.law == "implicit"
+    again = tmp_path / "drake" / "out.yaml"
+    assert "not for mjlab" in refused(
+        "translate", again, *robot, "--from", "mjlab", "--to", "drake"
+    )
+    assert "--drive-gains" in refused("translate", *robot, "--to", "mjlab")
+    assert "isaaclab-newton" in refused("translate", out, *robot, "--to", "isaac")
+    with_file = replace(load(out), robot="mine")
+    save(out, with_file)
+    assert "--robot" in refused("translate", out, "--to", "drake")
