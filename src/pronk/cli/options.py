@@ -137,16 +137,16 @@ def _pairs(option: str, entries: Sequence[str], kind: Callable[[str], Any] = str
 
 
 def drive_gains(
-    entries: Sequence[str],
+    entries: Sequence[str], option: str = "--drive-gains"
 ) -> dict[str, tuple[float, float]] | Literal["default"] | None:
-    """Gains on the real drives from `--drive-gains`; None where it was not given.
+    """Gains of joints from an option of the command line; None where it was not given.
 
     Raises:
         PronkError: An entry is neither `default` nor NAME=STIFFNESS,DAMPING.
     """
     if tuple(entries) == ("default",):
         return "default"
-    return _pairs("--drive-gains", entries, _gains) or None
+    return _pairs(option, entries, _gains) or None
 
 
 def _gains(text: str) -> tuple[float, float]:
