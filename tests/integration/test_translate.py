@@ -20,15 +20,6 @@ from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.profiles import profile
 
-PENDULUM = """<mujoco><worldbody><body><joint name="swing" axis="0 1 0"/>
-<inertial pos="0 0 -0.1" mass="0.2" diaginertia="0.001 0.001 0.001"/></body></worldbody></mujoco>"""
-FILE = """schema: pronk/robot/1
-name: pendulum
-model: pendulum.xml
-drives: {motor: {effort_limit: 100, stall_torque: 100, no_load_speed: 1000, armature: 0.0063}}
-groups: {swing: {drive: motor, stiffness: 17, damping: 0.4, band_hz: [1, 15]}}
-poses: {default: {swing: 0}}
-"""
 EXACT = "mjlab,timestep_s=0.0001"
 # Matched to the drive at 0.1 ms from 1 to 15 Hz, confirmed in MuJoCo, Drake, SAPIEN and PyBullet:
 # stiffness, damping, RMS before and after [dB], delay that is missing [ms].
@@ -46,10 +37,8 @@ KNOWN = {
 
 
 @pytest.fixture
-def pendulum(tmp_path: Path) -> RobotSpec:
-    (tmp_path / "pendulum.xml").write_text(PENDULUM)
-    (tmp_path / "robot.yaml").write_text(FILE)
-    return load_robot(tmp_path / "robot.yaml")
+def pendulum() -> RobotSpec:
+    return load_robot(Path(__file__).parents[2] / "examples" / "pendulum")
 
 
 @pytest.mark.parametrize("name", KNOWN)
