@@ -73,6 +73,9 @@ def test_gains_return_and_the_joints_stay(name: str) -> None:
         assert back.stiffness == pytest.approx(own.stiffness, rel=0.005)
         assert back.damping == pytest.approx(own.damping, rel=0.005)
         assert back.delay_s == pytest.approx(own.delay_s, abs=1e-4)
+    for group, stated in first.groups.items():
+        assert gains.groups[group].stiffness == pytest.approx(stated.stiffness, rel=0.005)
+        assert gains.groups[group].damping == pytest.approx(stated.damping, rel=0.005)
 
 
 def test_the_simulated_joints_respond_alike() -> None:

@@ -366,6 +366,9 @@ def test_unknown_target_and_foreign_robot_are_refused() -> None:
         export_text(matched(), "gazebo")
     with pytest.raises(PronkError, match="so101"):
         actuators(matched(), load_robot("so101"))
+    own = replace(matched().simulator, profile="", engine="bullet")
+    with pytest.raises(PronkError, match="simulator bullet, whose drive law"):
+        export_text(replace(matched(), simulator=own), "mjlab")
     with pytest.raises(PronkError, match="--robot PATH"):
         export_text(replace(matched(), robot="mine"), "mjlab")
 

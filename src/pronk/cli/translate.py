@@ -36,10 +36,10 @@ def translate(
     from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match import translate as translation
-    from pronk.match.export import robot_of
+    from pronk.match.export import profile_held, robot_of
     from pronk.match.measured_joint import gains_by_joint
     from pronk.robots import load_robot
-    from pronk.simulators.profiles import profile, profile_of, profiles
+    from pronk.simulators.profiles import profile, profiles
 
     stated = options.drive_gains(drive_gains)
     if gains is None:
@@ -55,11 +55,12 @@ def translate(
             raise PronkError("give a gains file or --drive-gains, not both.")
         first = gains_file.load(gains)
         known = load_robot(robot) if robot else robot_of(first)
-        if begin and profile(begin) != profile_of(first.simulator):
+        if begin and profile(begin) != (held := profile_held(first)):
             raise PronkError(
-                f"{gains} holds for {profile_of(first.simulator).name} at "
+                f"{gains} holds for {held.name} at "
                 f"{1000.0 * first.simulator.timestep_s:g} ms, not for {begin}; leave --from out."
             )
+    origin = profile_held(first)
     names = [name for one in to for name in (profiles() if one == "all" else [one])]
     rows: list[list[Any]] = []
     wrote, figures = [], {}
@@ -81,9 +82,10 @@ def translate(
         for joint, one in found.joints.items():
             for flag in one.flags:
                 console.warn(f"{name}, {joint}: {flag}.")
-        if profile_of(first.simulator).friction != target.friction:
-            console.warn(f"{name}: dry friction is left out; the other joints have it in N m.")
-    origin = profile_of(first.simulator)
+        if origin.friction == "N m" != target.friction:
+            console.warn(f"{name} has no dry friction in N m: the joints lose theirs.")
+        elif target.friction == "N m" != origin.friction:
+            console.warn(f"the gains hold without dry friction: set none in {name}.")
     sheet = table(
         "framework | law | step [ms];1 | group | stiffness [N m/rad] | damping [N m s/rad] | "
         "untranslated [dB] | translated [dB] | responds earlier [ms];2 | left early [ms];2",

@@ -21,7 +21,7 @@ import math
 import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import mujoco
@@ -33,7 +33,7 @@ from pronk.match.gains import MatchedGains
 from pronk.robots import load_robot
 from pronk.robots.model import add_drives, free_spec
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.profiles import Profile, profile, profile_of
+from pronk.simulators.profiles import Profile, profile, profile_of, profiles
 
 Per = Literal["group", "joint"]
 
@@ -391,74 +391,64 @@ def _snippet(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) 
 
 
 _GAINS = {name: name for name in ("stiffness", "damping", "armature")}
-_MOTOR = {
-    "effort_limit": "effort_limit",
-    "saturation_effort": "stall_torque",
-    "velocity_limit": "no_load_speed",
-}
 _FRICTION = {
     "friction": "frictionloss",
     "dynamic_friction": "sliding_friction",
     "viscous_friction": "viscous_damping",
 }
-_LIMITS_3 = {"effort_limit": "actuator_effort_limit", "velocity_limit": "actuator_velocity_limit"}
-"""Names of limits since Isaac Lab 3.0."""
+_OLD_LIMITS = {
+    "actuator_effort_limit": "effort_limit",
+    "actuator_velocity_limit": "velocity_limit",
+    "joint_effort_limit": "effort_limit_sim",
+}
+"""Names in Isaac Lab 3.0: those in 2.3."""
 _STEP = "Set sim.dt to {timestep} s and decimation to {decimation}"
-_TGS = f"{_STEP}, PhysX's solver to TGS"
-_EFFORT = "Friction is a torque since Isaac Sim 5.0; before it was a coefficient."
-
-
-def _isaaclab_targets() -> Iterator[tuple[str, Target]]:
-    """Isaac Lab's actuators, in the words of release 3.0 and of 2.3."""
-    forces = f"{_TGS}, enable_external_forces_every_iteration to False. {_EFFORT}"
-    implicit = (
-        f"{_TGS}, solver_position_iteration_count to {{iterations}} and the count of velocity "
-        f"iterations to 0. {_EFFORT}"
-    )
-    lag, motor = ("min_delay", "max_delay"), _GAINS | _MOTOR | _FRICTION
-    plain = {name: value for name, value in motor.items() if name in _GAINS | _FRICTION}
-    shapes = {
-        "implicit": ("ImplicitActuatorCfg", "effort_limit_sim", plain, (), implicit),
-        "dcmotor": ("DCMotorCfg", "", motor, (), forces),
-        "delayed": (
-            "DelayedPDActuatorCfg",
-            "effort_limit",
-            plain,
-            lag,
-            f"{forces} DelayedPDActuator has no torque-speed line.",
-        ),
-    }
-    for name, (call, limit, arguments, delay, settings) in shapes.items():
-        law = "isaaclab-implicit" if name == "implicit" else "isaaclab-explicit"
-        for release in ("", "-2.3"):
-            words = arguments | ({limit: "effort_limit"} if limit else {})
-            if not release:
-                new = _LIMITS_3 | {"effort_limit_sim": "joint_effort_limit"}
-                words = {new.get(word, word): value for word, value in words.items()}
-            yield (
-                f"isaaclab-{name}{release}",
-                Target(
-                    profile=law,
-                    body=_isaaclab,
-                    call=call,
-                    arguments=words,
-                    delay=delay,
-                    settings=f"Isaac Lab {release[1:] or '3.0'}. {settings}",
-                    stribeck=True,
-                    no_delay="delay the actions in the environment"
-                    + ", or take isaaclab-delayed" * (name == "dcmotor"),
-                ),
-            )
-
-
+_PHYSX = f"{_STEP}, PhysX's solver to TGS. Friction is a torque since Isaac Sim 5.0; before it was "
+_PHYSX += "a coefficient."
+_ONCE = f"{_PHYSX} Set enable_external_forces_every_iteration to False."
+_EFFORT = {"actuator_effort_limit": "effort_limit"}
+_PHYSX_TARGETS = {
+    "isaaclab-implicit": Target(
+        profile="isaaclab-implicit",
+        body=_isaaclab,
+        call="ImplicitActuatorCfg",
+        arguments=_GAINS | _FRICTION | {"joint_effort_limit": "effort_limit"},
+        settings=f"{_PHYSX} Set solver_position_iteration_count to {{iterations}}, that of "
+        "velocity to 0.",
+        stribeck=True,
+    ),
+    "isaaclab-dcmotor": Target(
+        profile="isaaclab-explicit",
+        body=_isaaclab,
+        call="DCMotorCfg",
+        arguments=_GAINS
+        | _FRICTION
+        | _EFFORT
+        | {"saturation_effort": "stall_torque", "actuator_velocity_limit": "no_load_speed"},
+        settings=_ONCE,
+        stribeck=True,
+        no_delay="delay the actions in the environment, or take isaaclab-delayed",
+    ),
+    "isaaclab-delayed": Target(
+        profile="isaaclab-explicit",
+        body=_isaaclab,
+        call="DelayedPDActuatorCfg",
+        arguments=_GAINS | _FRICTION | _EFFORT,
+        delay=("min_delay", "max_delay"),
+        settings=f"{_ONCE} DelayedPDActuator has no torque-speed line.",
+        stribeck=True,
+    ),
+}
 _MJLAB_DELAY = ("delay_min_lag", "delay_max_lag")
-_MJLAB = {"frictionloss": "frictionloss", "viscous_damping": "viscous_damping"}
+_MJLAB = {name: name for name in ("frictionloss", "viscous_damping", "effort_limit")}
 TARGETS: Mapping[str, Target] = {
     "mjlab": Target(
         profile="mjlab",
         body=_mjlab,
         call="DcMotorActuatorCfg",
-        arguments=_GAINS | _MJLAB | _MOTOR,
+        arguments=_GAINS
+        | _MJLAB
+        | {"saturation_effort": "stall_torque", "velocity_limit": "no_load_speed"},
         delay=_MJLAB_DELAY,
         settings=f"{_STEP}.",
     ),
@@ -466,7 +456,7 @@ TARGETS: Mapping[str, Target] = {
         profile="mjlab",
         body=_mjlab,
         call="IdealPdActuatorCfg",
-        arguments=_GAINS | _MJLAB | {"effort_limit": "effort_limit"},
+        arguments=_GAINS | _MJLAB,
         delay=_MJLAB_DELAY,
         settings=f"{_STEP}. IdealPdActuator has no torque-speed line.",
     ),
@@ -474,11 +464,17 @@ TARGETS: Mapping[str, Target] = {
         profile="mjlab-builtin",
         body=_mjlab,
         call="BuiltinPositionActuatorCfg",
-        arguments=_GAINS | _MJLAB | {"effort_limit": "effort_limit"},
+        arguments=_GAINS | _MJLAB,
         delay=_MJLAB_DELAY,
         settings=f"{_STEP}, the integrator to implicitfast.",
     ),
-    **dict(_isaaclab_targets()),
+    **_PHYSX_TARGETS,
+    **{
+        f"{name}-2.3": replace(
+            one, arguments={_OLD_LIMITS.get(n, n): v for n, v in one.arguments.items()}
+        )
+        for name, one in _PHYSX_TARGETS.items()
+    },
     "isaaclab-newton": Target(
         profile="isaaclab-newton",
         body=_isaaclab,
@@ -562,7 +558,7 @@ def export_text(
     """
     if target not in TARGETS:
         raise PronkError(f"no export to {target!r}; expected one of {', '.join(TARGETS)}.")
-    chosen, holds = TARGETS[target], profile_of(gains.simulator)
+    chosen, holds = TARGETS[target], profile_held(gains)
     check_target(target, holds)
     known = holds.robot(robot or robot_of(gains))
     drives = actuators(gains, known, per)
@@ -586,6 +582,21 @@ def export_text(
     if target == "newton-usd":
         head = f"#usda 1.0\n{head}"
     return f"{head}\n\n{chosen.body(chosen, drives, holds, known)}"
+
+
+def profile_held(gains: MatchedGains) -> Profile:
+    """The profile that gains hold for.
+
+    Raises:
+        PronkError: They hold for a simulator without one.
+    """
+    try:
+        return profile_of(gains.simulator)
+    except PronkError:
+        raise PronkError(
+            f"the gains hold for simulator {gains.simulator.engine}, whose drive law pronk does "
+            f"not know; match with --for NAME, one of {', '.join(profiles())}."
+        ) from None
 
 
 def robot_of(gains: MatchedGains) -> RobotSpec:

@@ -33,13 +33,13 @@ from pronk.excitation.signals import Chirp, Signal
 from pronk.files import write_text
 from pronk.logs.excitations import with_segments
 from pronk.logs.joint_log import JointLog
+from pronk.match.export import profile_held
 from pronk.match.gains import MatchedGains
 from pronk.match.measured_joint import DB, MeasuredJoint, logs_by_joint, measured_joints, merged
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import MujocoSimulator
-from pronk.simulators.profiles import profile_of
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -159,7 +159,7 @@ def goals_of(
     """
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
-    known, settings = profile_of(gains.simulator).robot(robot), MatchSettings()
+    known, settings = profile_held(gains).robot(robot), MatchSettings()
     logs, out = [with_segments(log) for log in logs], {}
     with MujocoSimulator(known, threads=settings.threads) as rigs:
         for name, sources in logs_by_joint(logs, known).items():

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pronk.errors import PronkError
-from pronk.match.export import actuators, stability_share
-from pronk.match.gains import JointGains, MatchedGains
+from pronk.match.export import actuators, profile_held, stability_share
+from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.match.measured_joint import DB
-from pronk.match.randomization import group_gains
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant, plant
 from pronk.simulators.mujoco import JointTestRig
-from pronk.simulators.profiles import Profile, profile_of
+from pronk.simulators.profiles import Profile
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
@@ -66,7 +65,7 @@ def translate(
     """
     if gains.robot != robot.name:
         raise PronkError(f"the gains are those of {gains.robot}, not of {robot.name}.")
-    begin = profile_of(gains.simulator)
+    begin = profile_held(gains)
     source, target = begin.robot(robot), to.robot(robot)
     dry = begin.friction == to.friction == "N m"
     joints, found = {}, {}
@@ -97,7 +96,22 @@ def translate(
             flags=flags,
         )
     info = replace(to.info, decimation=target.decimation)
-    out = replace(gains, simulator=info, joints=joints, groups=group_gains(target, joints))
+    groups = {}
+    for name, group in gains.groups.items():
+        own = [found[joint.name] for joint in robot.group(name) if joint.name in found]
+        kp, kd = np.mean([np.divide(one.after, one.before) for one in own], axis=0).tolist()
+        (kk, kv), (vk, vv) = group.ellipsoid
+        groups[name] = replace(
+            group,
+            stiffness=kp * group.stiffness,
+            damping=kd * group.damping,
+            stiffness_range=kp * group.stiffness_range,
+            damping_range=kd * group.damping_range,
+            frictionloss=group.frictionloss if dry else 0.0,
+            ellipsoid=((kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)),
+            ellipsoid_center=(kp * group.ellipsoid_center[0], kd * group.ellipsoid_center[1]),
+        )
+    out = replace(gains, simulator=info, joints=joints, groups=groups)
     share = stability_share(target, actuators(out, target, "joint"))
     if share >= 1.0:
         raise PronkError(
@@ -132,7 +146,7 @@ def translated(first: Plant, other: Plant, gains: Pair, delay_s: float = 0.0) ->
 
 
 def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile) -> MatchedGains:
-    """Gains of a framework that no log was matched with, by joint; those are taken for exact."""
+    """Gains of a framework that no log was matched with, by joint; they are taken for exact."""
     known = begin.robot(robot)
     joints = {
         name: JointGains(
@@ -143,12 +157,19 @@ def stated_gains(robot: RobotSpec, by_joint: Mapping[str, Pair], begin: Profile)
         )
         for name, (kp, kd) in by_joint.items()
     }
-    return MatchedGains(
-        robot=robot.name,
-        simulator=replace(begin.info, decimation=known.decimation),
-        joints=joints,
-        groups=group_gains(known, joints),
-    )
+    groups = {}
+    for group in robot.groups:
+        pairs = [by_joint[one.name] for one in robot.group(group) if one.name in by_joint]
+        if pairs:
+            middle, spread = np.mean(pairs, axis=0), np.ptp(pairs, axis=0) / 2.0
+            groups[group] = GroupGains(
+                stiffness=float(middle[0]),
+                damping=float(middle[1]),
+                stiffness_range=float(spread[0]),
+                damping_range=float(spread[1]),
+            )
+    info = replace(begin.info, decimation=known.decimation)
+    return MatchedGains(robot=robot.name, simulator=info, joints=joints, groups=groups)
 
 
 def _plant(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
