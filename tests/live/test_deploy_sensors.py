@@ -1,4 +1,4 @@
-"""Each fault of a sensor damps the walking virtual robot, over LCM and over DDS.
+"""Each fault of a sensor damps the walking virtual robot, over LCM or over DDS, in turns.
 
 The rows of the table of faults in docs/hardware.md; times are on the virtual robot's own clock.
 """
@@ -25,9 +25,10 @@ that a busy one passes."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("link", ["lcm", "dds"])
-def test_each_fault_of_a_sensor_damps(link: str) -> None:
-    found = measure(POLICY, link, FAULTS, 1, lambda _stage, _share: None)
+@pytest.mark.parametrize(("link", "faults"), [("lcm", FAULTS[::2]), ("dds", FAULTS[1::2])])
+def test_each_fault_of_a_sensor_damps(link: str, faults: tuple[str, ...]) -> None:
+    found = measure(POLICY, link, faults, 1, lambda _stage, _share: None)
+    assert set(found) == set(faults)
     for fault, row in found.items():
         (seconds,), (reason,) = row["times_s"], row["reasons"]
         of_trunk = fault.split("-")[0] in IMU

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -146,7 +146,7 @@ def _matched(path: Path, robot: RobotSpec) -> MatchedGains:
     # Gains hold for the simulator that they were matched in, and for no other; patches of MuJoCo
     # keep its physics.
     used, got = (
-        vars(info) | {"version": ".".join(info.version.split(".")[:2]), "profile": ""}
+        asdict(info) | {"version": ".".join(info.version.split(".")[:2]), "profile": ""}
         for info in (mujoco_info(robot), gains.simulator)
     )
     differing = [name for name in used if got[name] != used[name]]
