@@ -79,27 +79,31 @@ def test_gains_return_and_the_joints_stay(name: str) -> None:
 
 
 def test_the_simulated_joints_respond_alike() -> None:
-    robot, begin, end = load_robot("mini_cheetah"), profile("isaaclab-implicit"), profile("mjlab")
-    first = stated_gains(robot, {"FR_knee": (17.0, 0.4)}, begin)
-    first = replace(first, joints={"FR_knee": replace(first.joints["FR_knee"], frictionloss=0.0)})
-    found, _ = translate(first, robot, end)
-    chirp = replace(Chirp(length_s=12.0), amplitude=0.1)
+    robot, hz = load_robot("mini_cheetah"), (1.0, 12.0)
+    first = stated_gains(robot, {"FR_knee": (17.0, 0.4)}, profile("isaaclab-implicit"))
+    found = translate(first, robot, profile("mjlab"))[0].joints["FR_knee"]
+    signals = [
+        Excitation(offsets=replace(Chirp(length_s=12.0), amplitude=a).samples()) for a in (0.2, 0.1)
+    ]
 
-    def gain_db(target: str, kp: float, kd: float) -> np.ndarray:
+    def gain_db(target: str, kp: float, kd: float, friction: float) -> np.ndarray:
         known = profile(target).robot(robot)
-        free = [replace(j, drive=replace(j.drive, frictionloss=0.0)) for j in known.joints]
-        known = replace(known, joints=tuple(free))
-        log = synthetic_log(known, "FR_knee", [Excitation(offsets=chirp.samples())], kp, kd)
-        response = estimate(log, "FR_knee")[0]
-        inside = (response.frequency_hz > 1.0) & (response.frequency_hz < 12.0)
-        return 20.0 * np.log10(response.gain[inside])
+        log = synthetic_log(known, "FR_knee", signals, kp, kd, frictionloss=friction)
+        gains = [
+            one.gain[(one.frequency_hz > hz[0]) & (one.frequency_hz < hz[1])]
+            for one in estimate(log, "FR_knee")
+        ]
+        return 20.0 * np.log10(np.concatenate(gains))
 
-    goal = gain_db("isaaclab-implicit", 17.0, 0.4)
-    joint = found.joints["FR_knee"]
-    apart = gain_db("mjlab", joint.stiffness, joint.damping) - goal
-    untranslated = gain_db("mjlab", 17.0, 0.4) - goal
-    assert np.sqrt(np.mean(apart**2)) < 0.05
-    assert np.sqrt(np.mean(untranslated**2)) > 10.0 * np.sqrt(np.mean(apart**2))
+    def apart(*values: float) -> float:
+        return float(np.sqrt(np.mean((gain_db("mjlab", *values) - goal) ** 2)))
+
+    own = robot.joint("FR_knee").drive.frictionloss
+    goal = gain_db("isaaclab-implicit", 17.0, 0.4, own)
+    translated = apart(found.stiffness, found.damping, found.frictionloss)
+    assert translated < 0.1
+    assert translated < 0.5 * apart(found.stiffness, found.damping, own)
+    assert translated < 0.15 * apart(17.0, 0.4, own)
 
 
 def test_what_another_framework_cannot_give_is_refused_or_flagged(pendulum: RobotSpec) -> None:

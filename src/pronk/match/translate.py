@@ -1,8 +1,9 @@
 """Gains of one framework as gains of another in which the joint responds alike, without a log.
 
 Both responses are closed forms of the robot's own model (`pronk.simulators.linear`). Stiffness
-and damping give the magnitude in the band; the phase that is left is a delay. Dry friction stays
-what it is, so it has to be a torque in both frameworks.
+and damping give the magnitude in the band; the phase that is left is a delay. Dry friction has to
+be a torque in both frameworks. It goes with the stiffness: where friction stops a joint, and how it
+damps a motion of given amplitude, depend on the ratio of both.
 """
 
 from __future__ import annotations
@@ -78,6 +79,8 @@ def translate(
         if one.after_db > NOT_ALIKE_DB:
             flags += (f"{NOT_ALIKE}: {one.after_db:.2f} dB from {begin.name}",)
         kp, kd = one.after[0] / joint.stiffness, one.after[1] / joint.damping
+        drive = source.joint(name).drive
+        friction = drive.frictionloss if np.isnan(joint.frictionloss) else joint.frictionloss
         (kk, kv), (vk, vv) = joint.covariance
         joints[name] = replace(
             joint,
@@ -90,7 +93,7 @@ def translate(
             covariance=((kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)),
             grid_stiffness=float("nan"),
             grid_damping=float("nan"),
-            frictionloss=joint.frictionloss if dry else 0.0,
+            frictionloss=kp * friction if dry else 0.0,
             stribeck=joint.stribeck if dry else 0.0,
             delay_s=max(joint.delay_s + one.lead_s, 0.0),
             flags=flags,
@@ -98,7 +101,8 @@ def translate(
     info = replace(to.info, decimation=target.decimation)
     groups = {}
     for name, group in gains.groups.items():
-        own = [found[joint.name] for joint in robot.group(name) if joint.name in found]
+        members = [joint for joint in robot.group(name) if joint.name in found]
+        own = [found[joint.name] for joint in members]
         kp, kd = np.mean([np.divide(one.after, one.before) for one in own], axis=0).tolist()
         (kk, kv), (vk, vv) = group.ellipsoid
         groups[name] = replace(
@@ -107,7 +111,7 @@ def translate(
             damping=kd * group.damping,
             stiffness_range=kp * group.stiffness_range,
             damping_range=kd * group.damping_range,
-            frictionloss=group.frictionloss if dry else 0.0,
+            frictionloss=float(np.mean([joints[j.name].frictionloss for j in members])),
             ellipsoid=((kp * kp * kk, kp * kd * kv), (kp * kd * vk, kd * kd * vv)),
             ellipsoid_center=(kp * group.ellipsoid_center[0], kd * group.ellipsoid_center[1]),
         )
