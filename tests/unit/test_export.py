@@ -9,6 +9,7 @@ from typing import Any, get_args
 import mujoco
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pronk.actuator.model import torque_limits
 from pronk.cli.export import Target
@@ -19,10 +20,12 @@ from pronk.match.gains import JointGains, MatchedGains
 from pronk.match.predict import drives_of
 from pronk.match.randomization import group_gains
 from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation
 from pronk.simulators.mujoco import Chain
 from pronk.simulators.profiles import profile, profiles
 
+Array = NDArray[np.float64]
 ROBOT = load_robot("mini_cheetah")
 _ISAACLAB = {"joint_names_expr", "stiffness", "damping", "armature"} | {
     *("friction", "dynamic_friction", "viscous_friction"),
@@ -246,40 +249,79 @@ def test_mjcf_compiles_and_its_torque_is_the_clipped_pd_law(robot: str) -> None:
             assert model.dof_armature[at.dofadr[0]] == pytest.approx(drive.armature, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", list(profiles()))
-def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
-    holds, arm = profile(name), load_robot("so101")
+def smooth_arm() -> RobotSpec:
+    """The SO-101 with dry friction that does not fall with speed."""
+    arm = load_robot("so101")
     drives = [replace(joint.drive, stribeck_speed=0.0) for joint in arm.joints]
     joints = tuple(replace(a, drive=b) for a, b in zip(arm.joints, drives, strict=True))
-    arm = replace(arm, joints=joints)
-    # A history of parts of a step is interpolated between the parts.
-    delay = 2.0 * holds.timestep_s if holds.iterations > 1 else 0.0123
-    gains, known = matched("so101", name, delay_s=delay), holds.robot(arm)
-    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf", arm, per="joint"))
-    snippet = export_text(gains, "mjcf-snippet", arm, per="joint")
-    assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
+    return replace(arm, joints=joints)
+
+
+def motion(arm: RobotSpec, name: str, gains: MatchedGains) -> tuple[Array, Array]:
+    """Commands of all joints, and the positions with which a profile follows, (150, 6)."""
+    known, holds = profile(name).robot(arm), profile(name)
     start = np.array([joint.default_position for joint in arm.joints])
     time = holds.timestep_s * np.arange(150)
-    command = 0.2 * np.sin(2.0 * np.pi * time[:, None] * np.linspace(0.5, 1.0, len(start)))
+    command = start + 0.2 * np.sin(2.0 * np.pi * time[:, None] * np.linspace(0.5, 1.0, len(start)))
     log = JointLog(
         robot="so101",
         joints=arm.joint_names,
         time=time,
-        command=start + command,
+        command=command,
         position=np.tile(start, (len(time), 1)),
     )
     with ChainSimulation(known, [log], threads=1) as chain:
-        expected = chain.run([drives_of(known, gains)])[0][0]
+        return command, chain.run([drives_of(known, gains)])[0][0]
+
+
+@pytest.mark.parametrize("name", list(profiles()))
+def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
+    holds, arm = profile(name), smooth_arm()
+    # A history of parts of a step is interpolated between the parts.
+    delay = 2.0 * holds.timestep_s if holds.iterations > 1 else 0.0123
+    gains = matched("so101", name, delay_s=delay)
+    model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf", arm, per="joint"))
+    snippet = export_text(gains, "mjcf-snippet", arm, per="joint")
+    assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
+    command, expected = motion(arm, name, gains)
     data = mujoco.MjData(model)
     data.qpos[:] = expected[0]
     length = int(model.actuator_history[0, 0])
     past = model.opt.timestep * np.arange(-length, 0)
     for i in range(model.nu):
-        mujoco.mj_initCtrlHistory(model, data, i, past, np.full(length, start[i]))
-    for target, position in zip(start + command, expected, strict=True):
+        mujoco.mj_initCtrlHistory(model, data, i, past, np.full(length, command[0, i]))
+    for target, position in zip(command, expected, strict=True):
         assert data.qpos == pytest.approx(position, abs=1e-6)
         data.ctrl[:] = target
-        mujoco.mj_step(model, data, known.law.iterations)
+        mujoco.mj_step(model, data, holds.iterations)
+
+
+@pytest.mark.train
+def test_joints_of_mjlab_move_as_its_profile_does() -> None:
+    pytest.importorskip("mjlab")
+    from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+    from mjlab.entity.entity import Entity
+
+    from pronk.robots.model import free_spec
+
+    arm, name = smooth_arm(), "mjlab-builtin"
+    gains = matched("so101", name)
+    found = evaluated(export_text(gains, name, arm, per="joint"))["ACTUATORS"]
+    articulation = EntityArticulationInfoCfg(actuators=found)
+    entity = Entity(EntityCfg(spec_fn=lambda: free_spec(arm), articulation=articulation))
+    model = entity.spec.compile()
+    # As mjlab's SimulationCfg sets them.
+    model.opt.timestep = profile(name).timestep_s
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    command, expected = motion(arm, name, gains)
+    data = mujoco.MjData(model)
+    data.qpos[:] = expected[0]
+    order = [model.actuator(i).name.split("/")[-1] for i in range(model.nu)]
+    columns = [arm.joint_names.index(joint) for joint in order]
+    for target, position in zip(command, expected, strict=True):
+        assert data.qpos == pytest.approx(position, abs=1e-6)
+        data.ctrl[:] = target[columns]
+        mujoco.mj_step(model, data)
 
 
 @pytest.mark.parametrize("target", list(TARGETS))
