@@ -42,8 +42,6 @@ _VERIFIED = 3
 _IMPLICIT = 2.0
 """Gains of implicit drive laws over those of the explicit law that answer alike, at most: 1.9 at a
 knee of the Mini Cheetah at 10 ms."""
-_STEP = 1e-3
-"""Step of the closed form's derivative in the logarithm of a gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,12 +262,20 @@ def _around(maps: Array, reach: int, stride: int) -> NDArray[np.bool_]:
 
 
 def quick_search(
-    rigs: JointRigs, targets: Sequence[MeasuredJoint], stiffness: Array, damping: Array
+    rigs: JointRigs,
+    targets: Sequence[MeasuredJoint],
+    stiffness: Array,
+    damping: Array,
+    *,
+    exact: bool = True,
+    start: Sequence[tuple[float, float]] = (),
 ) -> tuple[list[GridSearch], list[Fit]]:
     """Search the grid linearized everywhere and simulated where it matters.
 
-    1. The closed form (`pronk.simulators.linear`) over the whole grid gives a first cell.
-    2. Gauss-Newton with the simulator goes from there to the optimum off the grid.
+    1. The closed form (`pronk.simulators.linear`) over the whole grid gives a first cell, where
+       there is no gain pair of each target to `start` at.
+    2. Gauss-Newton with the simulator goes from there to the optimum off the grid; not `exact`
+       with the slope of the closed form (see `refine`).
     3. The simulated value and slope there correct the closed form (manifold space mapping: Bandler
        et al., *Space mapping: the state of the art*, IEEE Trans. MTT 52(1), 2004), and the
        corrected map is searched again. Its best few nodes are simulated, and the simulator decides
@@ -287,15 +293,17 @@ def quick_search(
             "the grid."
         )
     kp, kd = (axis.ravel() for axis in np.meshgrid(stiffness, damping, indexing="ij"))
-    plants, logs, start = [], [], []
+    plants, logs, first = [], [], []
     for goal in targets:
         pose = goal.trace.excitation(rigs.robot)[0]
         plants.append(plant(rigs.rig(goal.joint), pose, goal.omega))
         response = plants[-1].response(kp, kd, amplitude=goal.trace.amplitude)
         logs.append(np.log(np.abs(response)))
-        first = int(np.argmin(mean_square(goal, np.exp(logs[-1]).astype(np.complex128))))
-        start.append((float(kp[first]), float(kd[first])))
-    fits = refine(rigs, targets, start)
+        best = int(np.argmin(mean_square(goal, np.exp(logs[-1]).astype(np.complex128))))
+        first.append((float(kp[best]), float(kd[best])))
+    fits = refine(rigs, targets, start or first, plants)
+    if exact:
+        fits = refine(rigs, targets, [fit.gains for fit in fits])
     maps, requests = [], []
     for goal, p, log, fit in zip(targets, plants, logs, fits, strict=True):
         corrected = log + _correction(p, fit, kp, kd)
@@ -304,12 +312,12 @@ def quick_search(
     simulated = responses(rigs, requests)
     grids = []
     for i, (goal, error) in enumerate(zip(targets, maps, strict=True)):
-        best = np.argsort(error)[:_VERIFIED]
+        nodes = np.argsort(error)[:_VERIFIED]
         mine = simulated[_VERIFIED * i : _VERIFIED * (i + 1)]
         verified = [float(mean_square(goal, response)) for response in mine]
         # The simulator decides among them; no node without a simulation may win.
         error = np.maximum(error, min(verified) * (1.0 + 1e-9))
-        error[best] = verified
+        error[nodes] = verified
         error = error.reshape(len(stiffness), len(damping))
         grids.append(GridSearch(stiffness=stiffness, damping=damping, error=error))
     return grids, fits
@@ -319,12 +327,10 @@ def _correction(linear: Plant, fit: Fit, stiffness: Array, damping: Array) -> Ar
     """Log gain of the simulator over that of the closed form, to first order, shape (b, f)."""
     goal = fit.target
     amplitude = goal.trace.amplitude
-    at = np.array(fit.gains)
-    near = at * np.exp(_STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-    closed = np.log(np.abs(linear.response(near[:, 0], near[:, 1], amplitude=amplitude)))
+    closed = np.log(np.abs(linear.response(*fit.gains, amplitude=amplitude)))[0]
     simulated = fit.solution.jacobian * goal.deviation_db()[:, None] / DB
-    slope = simulated - (closed[1:] - closed[0]).T / _STEP
+    slope = simulated - linear.slope(*fit.gains, amplitude=amplitude)
     measured = np.log(np.abs(goal.measured.response[goal.fit_mask]))
-    value = fit.gain_db / DB + measured - closed[0]
-    away = np.log(np.column_stack([stiffness, damping])) - np.log(at)
+    value = fit.gain_db / DB + measured - closed
+    away = np.log(np.column_stack([stiffness, damping])) - np.log(fit.gains)
     return np.asarray(value + away @ slope.T)

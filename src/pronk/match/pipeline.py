@@ -45,11 +45,13 @@ from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.match.time_fit import TIME_FIT, TimeFit, fit_joint, recorded
 from pronk.match.torque import fit_drives, joint_fits
+from pronk.match.translate import translated
 from pronk.match.uncertainty import gain_interval
 from pronk.response.estimate import excited_joints
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together, published
+from pronk.simulators.linear import plant
 from pronk.simulators.mujoco import MujocoSimulator, mujoco_info
 from pronk.simulators.profiles import profile
 from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
@@ -162,7 +164,8 @@ def match_frameworks(
         return {"": MatchResult(gains=found, joints={})}
     require_plausible(logs_by_joint(logs, robot), robot)
     fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
-    own = _matched(logs, robot, chosen, mode, fitted, clock)
+    measured: dict[tuple[float, int], tuple[Found, dict[str, Pair]]] = {}
+    own = _matched(logs, robot, chosen, mode, fitted, clock, measured)
     joints = joint_fits(own.robot, own.joints, drives, remarks)
     out = {"": replace(own, joints=joints).result(every, own.info, clock)}
     done = {_kind(own.robot): own}
@@ -170,7 +173,7 @@ def match_frameworks(
         clock, kind = _Clock(progress, f"{name} "), _kind(robots[name])
         if kind not in done:
             names_ = [n for n in fitted if n != "frictionloss" or framework.friction == "N m"]
-            done[kind] = _matched(logs, robots[name], chosen, mode, names_, clock, own)
+            done[kind] = _matched(logs, robots[name], chosen, mode, names_, clock, measured, own)
         info = replace(framework.info, decimation=robots[name].decimation)
         out[name] = done[kind].result(every, info, clock)
     return out
@@ -218,9 +221,13 @@ def _matched(
     mode: Mode,
     fitted: Sequence[str],
     clock: _Clock,
+    measured: dict[tuple[float, int], tuple[Found, dict[str, Pair]]],
     base: _Matched | None = None,
 ) -> _Matched:
-    """Match the joints in one simulator; those of the `base` were matched in the robot's own."""
+    """Match the joints in one simulator; those of the `base` were matched in the robot's own.
+
+    `measured` keeps the measured responses by timestep and decimation.
+    """
     excluded: Mapping[str, str] = {}
     rate, info = float("nan"), mujoco_info(robot)
     fits: Mapping[str, TimeFit] = {}
@@ -251,12 +258,16 @@ def _matched(
             if mode == "gains" and "frictionloss" not in fitted:
                 rigs.parameters -= {"frictionloss"}
             robot, info = rigs.robot, rigs.info
-            found, on_drive = _measured(logs, robot, settings, clock)
+            timing = robot.timestep_s, robot.decimation
+            if timing not in measured:
+                measured[timing] = _measured(logs, robot, settings, clock)
+            found, on_drive = measured[timing]
             if mode == "drive":
                 joints, fits = _match_drives(rigs, logs, found, on_drive, fitted, clock)
             else:
-                near = {} if base is None else base.joints
-                start = {name: (fit.stiffness, fit.damping) for name, fit in near.items()}
+                start = {}
+                if base is not None and isinstance(rigs, MujocoSimulator):
+                    start = _translated(base, rigs, found)
                 joints, fits, rate = _match_gains(
                     rigs, logs, found, on_drive, settings, clock, start
                 )
@@ -305,6 +316,17 @@ def _measured(
             on_drive[name] = gains_on_drive(sources[0], name, robot)
             clock.report(len(found) / len(where))
     return found, on_drive
+
+
+def _translated(base: _Matched, rigs: MujocoSimulator, found: Found) -> dict[str, Pair]:
+    """Gains with which the linearized joints respond like those of the `base`."""
+    out = {}
+    with MujocoSimulator(base.robot, threads=1) as first:
+        for name, (goal, *_) in found.items():
+            pose, fit = goal.trace.excitation(rigs.robot)[0], base.joints[name]
+            own, other = (plant(one.rig(name), pose, goal.omega) for one in (first, rigs))
+            out[name] = translated(own, other, (fit.stiffness, fit.damping)).after
+    return out
 
 
 def _match_drives(
@@ -369,9 +391,9 @@ def _match_gains(
 ) -> tuple[dict[str, JointFit], dict[str, TimeFit], float]:
     """Search by the paper's magnitude and, with method `time`, fit in time from there.
 
-    Other frameworks begin at the gains of the robot's own simulator, `start`, which the fit in time
-    takes in place of a search. Also returns the fits in time by joint, and physics steps per second
-    of the grid; NaN where it was not searched whole.
+    Other frameworks begin at the gains of the robot's own simulator, translated (`start`), which
+    the fit in time takes in place of a search. Also returns the fits in time by joint, and physics
+    steps per second of the grid; NaN where it was not searched whole.
     """
     main = [goals[0] for goals in found.values()]
     grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
@@ -380,7 +402,9 @@ def _match_gains(
     if not start or settings.method == "paper":
         if isinstance(rigs, MujocoSimulator) and not settings.exhaustive:
             with clock.stage("quick search"):
-                searched, fits = quick_search(rigs, main, *grid)
+                exact = settings.method == "paper" and not start
+                near = [start[name] for name in found] if start else ()
+                searched, fits = quick_search(rigs, main, *grid, exact=exact, start=near)
         else:
             with clock.stage("grid"):
                 begin = time.perf_counter()
@@ -399,7 +423,7 @@ def _match_gains(
                 pair = on_drive[name]
                 fitted[name] = _fit_in_time(rigs, logs, name, TIME_FIT, pair, gains[name])
                 clock.report(len(fitted) / len(found))
-    else:
+    elif not start:
         with clock.stage("amplitudes"):
             others = [goal for goals in found.values() for goal in goals[1:]]
             for fit in refine(rigs, others, [gains[goal.joint] for goal in others]):

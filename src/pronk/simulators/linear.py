@@ -31,6 +31,8 @@ ComplexArray = NDArray[np.complex128]
 
 _EPS = 1e-6
 """Perturbation of the finite differences: the best of central differences in float64."""
+_STEP = 1e-3
+"""Step of `Plant.slope` in the logarithm of a gain."""
 _FRICTION_ROUNDS = 12
 """Rounds of the describing function; halved steps settle it below 1e-3 of the gain."""
 
@@ -78,6 +80,12 @@ class Plant:
                 # Halved steps: near sticking the plain iteration hops between two amplitudes.
                 speed = 0.5 * (speed + amplitude * np.abs(closed) * self.omega)
         return np.asarray(closed / hold)
+
+    def slope(self, stiffness: float, damping: float, *, amplitude: float) -> Array:
+        """Derivative of the log gain by the log of stiffness and of damping, shape (f, 2)."""
+        near = np.exp(np.log([stiffness, damping]) + _STEP * np.array([[0, 0], [1, 0], [0, 1]]))
+        logs = np.log(np.abs(self.response(near[:, 0], near[:, 1], amplitude=amplitude)))
+        return np.asarray((logs[1:] - logs[0]).T / _STEP)
 
 
 def plant(rig: JointTestRig, pose: Array, omega: Array) -> Plant:
