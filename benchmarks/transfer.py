@@ -48,7 +48,7 @@ from pronk.train.tasks.jump_env_cfg import DELAY_STEPS
 if TYPE_CHECKING:
     from mjlab.entity import Entity
 
-LAWS = ("mjlab-builtin", "isaaclab-implicit", "drake", "genesis,timestep_s=0.005")
+LAWS = ("mjlab-builtin", "isaaclab-implicit", "drake")
 _UNLIMITED = 1e6
 """Of the part of the torque that stiffness gives; the sum is limited by the actuator [N m]."""
 
@@ -127,7 +127,11 @@ def translated(
         for joint in robot.joints
     }
     stated: MatchedGains = stated_gains(robot, by_joint, trained)
-    joints = {n: replace(one, delay_s=gains.delay_s) for n, one in stated.joints.items()}
+    joints = {}
+    for name, one in stated.joints.items():
+        dry, drive = gains.groups[robot.joint(name).group].frictionloss, robot.joint(name).drive
+        dry = drive.frictionloss if np.isnan(dry) else dry
+        joints[name] = replace(one, delay_s=gains.delay_s, frictionloss=dry)
     found, _ = translate(replace(stated, joints=joints), robot, to)
     groups = {}
     for group, own in gains.groups.items():
@@ -136,6 +140,7 @@ def translated(
             own,
             stiffness=float(np.mean([joint.stiffness for joint in members])),
             damping=float(np.mean([joint.damping for joint in members])),
+            frictionloss=float(np.mean([joint.frictionloss for joint in members])),
             stiffness_range=0.0,
             damping_range=0.0,
         )
