@@ -1,0 +1,159 @@
+"""Drive laws beside the real engines: SAPIEN (PhysX), Drake and PyBullet, where installed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pronk.actuator.law import DriveLaw
+from pronk.errors import PronkError
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.engines.drake import Drake
+from pronk.simulators.engines.engine import EngineSimulator
+from pronk.simulators.engines.pybullet import PyBullet
+from pronk.simulators.engines.sapien import Sapien
+from pronk.simulators.mujoco import Chain
+
+Array = NDArray[np.float64]
+PENDULUM = Path(__file__).parents[2] / "examples" / "pendulum"
+BAND = (1.0, 15.0)
+CASES: list[tuple[type[EngineSimulator], DriveLaw]] = [
+    (Sapien, DriveLaw()),
+    *((Sapien, DriveLaw(kind="implicit", iterations=n)) for n in (1, 4, 10)),
+    (Drake, DriveLaw()),
+    (Drake, DriveLaw(kind="implicit")),
+    (PyBullet, DriveLaw()),
+]
+engines = pytest.mark.parametrize(
+    ("engine", "law"), CASES, ids=[f"{engine.__name__}-{law.label}" for engine, law in CASES]
+)
+
+
+def prepared(name: str | Path, law: DriveLaw, **drive: float) -> RobotSpec:
+    """A robot with a law, without dry friction; `drive` replaces values of its drives."""
+    robot = load_robot(name)
+    new = {"frictionloss": 0.0, **drive}
+    joints = tuple(replace(one, drive=replace(one.drive, **new)) for one in robot.joints)
+    return replace(robot, law=law, joints=joints)
+
+
+LINEAR = {"effort_limit": 1e4, "stall_torque": 1e4, "no_load_speed": 1e4}
+
+
+def chirp(step: float, *, amplitude: float = 0.25, seconds: float = 20.0) -> Array:
+    """0.1 to 25 Hz, held for 20 ms."""
+    time = 0.02 * np.arange(round(seconds / 0.02))
+    wave = amplitude * np.sin(2.0 * np.pi * (0.1 + 24.9 / (2.0 * seconds) * time) * time)
+    return np.repeat(wave, round(0.02 / step))
+
+
+def both(
+    engine: type[EngineSimulator], robot: RobotSpec, joint: str, wave: Array
+) -> tuple[Array, Array, Array, Sequence[str]]:
+    """Command, positions by the law and by the engine, shape (T, n), and the n joints."""
+    pytest.importorskip(engine.module, reason=f"{engine.package} is not installed")
+    command = np.tile([one.default_position for one in robot.joints], (len(wave), 1))
+    command[:, robot.joint_names.index(joint)] += wave
+    with Chain(robot, joint, threads=1) as chain:
+        columns = [robot.joint_names.index(name) for name in chain.joints]
+        expected = chain.rollout(command[None][..., columns], [{}])[0, :-1]
+    locked = [name for name in robot.joint_names if name != joint]
+    got = engine(robot, law=robot.law).rollout(command[None], {}, locked=locked)[0]
+    return command[:, columns], expected, got[:, columns], chain.joints
+
+
+def level(command: Array, position: Array, step: float) -> Array:
+    """Magnitude of the response to a chirp in half-hertz bins of BAND [dB]."""
+    spectra = [np.fft.rfft(one - one[0], 1 << 15) for one in (command, position)]
+    hertz = np.fft.rfftfreq(1 << 15, step)
+    out = []
+    for centre in np.arange(*BAND, 0.5):
+        part = np.abs(hertz - centre) <= 0.25
+        u, y = (spectrum[part] for spectrum in spectra)
+        out.append(20.0 * np.log10(abs(np.vdot(u, y)) / np.vdot(u, u).real))
+    return np.array(out)
+
+
+@engines
+def test_one_joint_follows_the_law(engine: type[EngineSimulator], law: DriveLaw) -> None:
+    robot = prepared(PENDULUM, law, **LINEAR)
+    command, expected, got, _ = both(engine, robot, "swing", chirp(robot.timestep_s))
+    u, law_db = command[:, 0], level(command[:, 0], expected[:, 0], robot.timestep_s)
+    assert np.ptp(law_db) > 5.0
+    assert np.abs(level(u, got[:, 0], robot.timestep_s) - law_db).max() < 0.02
+    for hertz in (3.0, 8.0):
+        time = robot.timestep_s * np.arange(800)
+        sine = 0.25 * np.sin(2.0 * np.pi * hertz * time)
+        _, expected, got, _ = both(engine, robot, "swing", sine)
+        spin = np.exp(-2j * np.pi * hertz * time[400:])
+        ratio = (got[400:, 0] @ spin) / (expected[400:, 0] @ spin)
+        assert abs(20.0 * np.log10(abs(ratio))) < 0.02
+        assert abs(np.angle(ratio)) < 1e-3
+
+
+@engines
+@pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
+def test_a_leg_with_held_joints(name: str, engine: type[EngineSimulator], law: DriveLaw) -> None:
+    robot = prepared(name, law, **LINEAR)
+    if engine is PyBullet:  # No armature in chains: stable at 1 ms; its passive damping is E too.
+        robot = replace(
+            prepared(name, law, **LINEAR, rotor_inertia=0.0, viscous_damping=0.0),
+            **{"timestep_s": 0.001, "decimation": 20},
+        )
+    step = robot.timestep_s
+    command, expected, got, joints = both(engine, robot, "FR_hip_pitch", chirp(step))
+    assert len(joints) == 3
+    # Drake solves all joints of a chain at once, as the law does; PhysX joint by joint.
+    exact = law.kind == "explicit" or engine is Drake
+    for k, joint in enumerate(joints):
+        u = command[:, joints.index("FR_hip_pitch")]
+        ours, law_db = level(u, got[:, k], step), level(u, expected[:, k], step)
+        if exact or joint == "FR_hip_pitch":
+            assert np.abs(ours - law_db).max() < (0.01 if exact else 0.1), joint
+        else:  # Followers: of the command's amplitude.
+            assert np.abs(10.0 ** (ours / 20.0) - 10.0 ** (law_db / 20.0)).max() < 0.02, joint
+
+
+@pytest.mark.parametrize("engine", [Sapien, Drake, PyBullet])
+def test_explicit_drives_have_the_motors_limits(engine: type[EngineSimulator]) -> None:
+    limits = {"effort_limit": 1.0, "stall_torque": 1.4, "no_load_speed": 12.0}
+    robot = prepared(PENDULUM, DriveLaw(), **limits)
+    _, expected, got, _ = both(engine, robot, "swing", chirp(robot.timestep_s, seconds=4.0))
+    _, free, _, _ = both(
+        engine, prepared(PENDULUM, DriveLaw(), **LINEAR), "swing", chirp(0.005, seconds=4.0)
+    )
+    assert np.abs(expected - free).max() > 0.02
+    assert np.abs(expected - got).max() < 1e-4
+
+
+@pytest.mark.parametrize("engine", [Sapien, Drake, PyBullet])
+def test_parameters_of_each_run_are_set(engine: type[EngineSimulator]) -> None:
+    pytest.importorskip(engine.module, reason=f"{engine.package} is not installed")
+    robot = prepared(PENDULUM, DriveLaw(), **LINEAR)
+    command = np.tile(chirp(0.005, seconds=4.0)[None, :, None], (2, 1, 1))
+    names = ("stiffness", "damping", "armature")
+    values = dict(
+        zip(names, np.array([[[12], [20]], [[0.3], [0.5]], [[0.01], [0.002]]]), strict=True)
+    )
+    got = engine(robot).rollout(command, {**values, "delay": np.array([[0.0], [0.01]])})
+    late = np.pad(command[1], ((2, 0), (0, 0)))[: command.shape[1]]
+    with Chain(robot, "swing", threads=1) as chain:
+        sets = [{"swing": {n: v[run, 0] for n, v in values.items()}} for run in range(2)]
+        expected = chain.rollout(np.stack([command[0], late]), sets)[:, :-1]
+    assert np.abs(got - expected).max() < 1e-4
+    with pytest.raises(PronkError, match="frictionloss"):
+        engine(robot).rollout(command, {"frictionloss": np.zeros((2, 1))})
+
+
+def test_pybullet_refuses_a_chain_with_armature() -> None:
+    robot = load_robot("mini_cheetah")
+    pytest.importorskip("pybullet", reason="pybullet is not installed")
+    command = np.zeros((1, 2, len(robot.joints)))
+    with pytest.raises(PronkError, match="armature"):
+        PyBullet(robot).rollout(command, {})

@@ -1,0 +1,91 @@
+"""Chains as numbers, and delays, beside what MuJoCo and the match compute."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from pronk.errors import PronkError, RobotError
+from pronk.response.grid import held_mean
+from pronk.robots import load_robot
+from pronk.robots.model import bench_spec
+from pronk.simulators.engines.engine import delayed
+from pronk.simulators.engines.links import (
+    along_x,
+    links_of,
+    principal,
+    quaternion,
+    rotation,
+)
+from pronk.simulators.engines.sapien import Sapien
+from pronk.simulators.mujoco import Chain
+
+
+@pytest.mark.parametrize(
+    ("name", "joint"),
+    [("mini_cheetah", "FR_hip_roll"), ("go2", "RL_hip_pitch"), ("so101", "shoulder_pan")],
+)
+def test_gravity_and_rest_are_those_of_the_bench_model(name: str, joint: str) -> None:
+    robot = load_robot(name)
+    links, model = links_of(robot, joint), bench_spec(robot, joint).compile()
+    data = mujoco.MjData(model)
+    for position in np.random.default_rng(0).uniform(-1.0, 1.0, (5, model.nq)):
+        data.qpos[:] = position
+        mujoco.mj_forward(model, data)
+        assert np.ptp(data.qfrc_bias) > 1e-3
+        np.testing.assert_allclose(links.gravity_torque(position), -data.qfrc_bias, atol=1e-12)
+    with Chain(robot, joint, threads=1) as chain:
+        target, stiffness = np.full(model.nq, 0.3), np.full(model.nq, 20.0)
+        expected = chain.rest_position(target, stiffness)
+        np.testing.assert_allclose(links.rest(target, stiffness), expected, atol=1e-12)
+
+
+def test_a_slide_is_refused(tmp_path: Path) -> None:
+    model = tmp_path / "slide.xml"
+    model.write_text(
+        "<mujoco><worldbody><body name='base'><inertial pos='0 0 0' mass='1' "
+        "diaginertia='1 1 1'/><body name='a'><joint name='turn' axis='0 1 0'/>"
+        "<joint name='more' axis='1 0 0'/><inertial pos='0 0 -.1' mass='1' "
+        "diaginertia='.1 .1 .1'/></body></body></worldbody></mujoco>"
+    )
+    robot = load_robot(model)
+    with pytest.raises(RobotError, match="hinges"):
+        links_of(robot, robot.joint_names[0])
+
+
+def test_delays_of_any_length_are_those_of_the_match() -> None:
+    generator = np.random.default_rng(1)
+    command, steps = generator.normal(size=(3, 40, 2)), generator.uniform(0.0, 5.0, (3, 2))
+    edges = 0.005 * np.arange(41)
+    got = delayed(command, steps)
+    for run in range(3):
+        for joint in range(2):
+            expected = held_mean(
+                edges[:-1], command[run, :, joint], edges - 0.005 * steps[run, joint]
+            )
+            np.testing.assert_allclose(got[run, :, joint], expected, atol=1e-12)
+
+
+def test_rotations() -> None:
+    generator = np.random.default_rng(2)
+    for _ in range(20):
+        axis = generator.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        turn = rotation(axis, generator.uniform(-3.0, 3.0))
+        again = np.empty(9)
+        mujoco.mju_quat2Mat(again, quaternion(turn))
+        np.testing.assert_allclose(again.reshape(3, 3), turn, atol=1e-12)
+        np.testing.assert_allclose(along_x(axis) @ [1.0, 0.0, 0.0], axis, atol=1e-12)
+        assert np.linalg.det(along_x(axis)) == pytest.approx(1.0)
+        moments, axes = principal(turn @ np.diag([1.0, 2.0, 2.5]) @ turn.T)
+        np.testing.assert_allclose(moments, [1.0, 2.0, 2.5])
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+def test_an_engine_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Sapien, "module", "an_engine_that_is_missing")
+    with pytest.raises(PronkError, match=r"pronk\[physx\]"):
+        Sapien(load_robot("mini_cheetah"))
