@@ -35,6 +35,7 @@ def match(
     zero_armature: bool = True,
     free: Annotated[tuple[str, ...], tyro.conf.arg(name="fit")] = (),
     simulator: str = "mujoco",
+    simulator_python: Path | None = None,
     frameworks: Annotated[tuple[str, ...], tyro.conf.arg(name="for")] = (),
     device: str = "cpu",
     reading: Reading = Reading(),  # noqa: B008
@@ -55,6 +56,7 @@ def match(
         zero_armature: Repeat the paper's search without rotor inertia (--method paper).
         free: drive: fit this instead; repeat it. What the sweeps cannot separate is refused.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
+        simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         frameworks: Match for this framework too, into a folder of its name beside the gains file;
             repeat it. A name that `pronk profiles` lists, or NAME,timestep_s=S,iterations=N.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
@@ -82,6 +84,7 @@ def match(
         zero_armature=zero_armature,
         device=device,
         simulator=simulator,
+        simulator_python=simulator_python,
     )
     with console.progress() as report:
         results = match_frameworks(
@@ -213,6 +216,7 @@ def predict(
     out: Path | None = None,
     drive_gains: tuple[str, ...] = (),
     simulator: str = "mujoco",
+    simulator_python: Path | None = None,
     reading: Reading = Reading(),  # noqa: B008
 ) -> console.Outcome:
     """Replay logs in the simulator with nominal and with matched gains; RMSE and R2 per joint.
@@ -224,6 +228,7 @@ def predict(
         out: Folder for replays and figures; beside the gains.
         drive_gains: As of `pronk match`.
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
+        simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         reading: How logs are read.
     """
     from pronk.evaluation.tables import table
@@ -243,7 +248,12 @@ def predict(
     with console.progress() as report:
         done = report.bar("predict")
         for i, log in enumerate(logs):
-            found = predict_log(log, known, matched, drive_gains=given, simulator=simulator)
+            found = predict_log(
+                *(log, known, matched),
+                drive_gains=given,
+                simulator=simulator,
+                simulator_python=simulator_python,
+            )
             excluded |= found.excluded
             stem = Path(log.source or "log").stem
             path = folder / f"{stem}.prediction.npz"

@@ -253,7 +253,11 @@ def _matched(
     else:
         # The simulator first: a device that is missing must not cost the user an estimate.
         with joint_rigs(
-            settings.simulator, robot, threads=settings.threads, device=settings.device
+            settings.simulator,
+            robot,
+            threads=settings.threads,
+            device=settings.device,
+            python=settings.simulator_python,
         ) as rigs:
             if mode == "gains" and "frictionloss" not in fitted:
                 rigs.parameters -= {"frictionloss"}

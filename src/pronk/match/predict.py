@@ -110,6 +110,7 @@ def predict(
     drive_gains: DriveGains | None = None,
     threads: int = 2,
     simulator: str = "mujoco",
+    simulator_python: Path | None = None,
 ) -> Prediction:
     """Simulate a log with naive and with matched gains.
 
@@ -133,7 +134,7 @@ def predict(
             )
         joints, excluded = _together(log, robot, gains, threads)
     else:
-        with joint_rigs(simulator, robot, threads=threads) as rigs:
+        with joint_rigs(simulator, robot, threads=threads, python=simulator_python) as rigs:
             joints, excluded = _joint_by_joint(log, rigs, gains)
     if not joints:
         reasons = " ".join(excluded.values()) or "no joint is excited in it."

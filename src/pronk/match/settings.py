@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from pronk.errors import PronkError
@@ -33,6 +34,8 @@ class MatchSettings:
     GPU; needs `pronk[train]`), or `warp-cpu` (the same arithmetic on the processor, slow)."""
     simulator: str = "mujoco"
     """`mujoco`, `FILE.py:NAME` or an entry point in `pronk.simulators` (see `load_simulator`)."""
+    simulator_python: Path | None = None
+    """Interpreter that the simulator runs in; this one if None."""
     estimator: Estimator = field(default_factory=Estimator)
     """Estimator, the same for the log and the simulation."""
 

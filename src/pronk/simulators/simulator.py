@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,10 @@ from numpy.typing import NDArray
 from pronk import plugins
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
-from pronk.simulators.command_trace import CommandTrace
+
+if TYPE_CHECKING:
+    # It needs SciPy, which a simulator in another Python has not.
+    from pronk.simulators.command_trace import CommandTrace
 
 Array = NDArray[np.float64]
 Values = Mapping[str, Array]
@@ -142,6 +145,11 @@ class RolloutRigs(JointRigs):
         self.parameters = simulator.parameters
         self._simulator = simulator
 
+    def close(self) -> None:
+        """Close the simulator, if it can be closed."""
+        if isinstance(self._simulator, Closing):
+            self._simulator.close()
+
     def run(
         self, traces: Sequence[CommandTrace], values: Values, steps: int
     ) -> Iterator[tuple[slice, Array]]:
@@ -191,22 +199,39 @@ class RolloutRigs(JointRigs):
 
 
 def load_simulator(
-    choice: str, robot: RobotSpec, *, threads: int = 2, device: str = "cpu"
+    choice: str,
+    robot: RobotSpec,
+    *,
+    threads: int = 2,
+    device: str = "cpu",
+    python: Path | None = None,
 ) -> Simulator:
     """Make a simulator of a robot.
 
     The choice is `mujoco`, `FILE.py:NAME`, or an entry point in `pronk.simulators`; what it names
     is called with the robot and returns a `Simulator`. Threads are those of MuJoCo; its large runs
-    are simulated on `device`, one of `pronk.simulators.mujoco.DEVICES`. A PronkError says that
+    are simulated on `device`, one of `pronk.simulators.mujoco.DEVICES`. With `python`, the path of
+    an interpreter, the simulator is made there (`pronk.simulators.remote`). A PronkError says that
     there is no such simulator, or that it lacks what the protocol needs.
     """
+    if choice == "mujoco" and python is not None:
+        raise PronkError(
+            "simulator mujoco runs in this Python only; leave --simulator-python out, or name "
+            "another with --simulator."
+        )
     if choice == "mujoco":
         from pronk.simulators.mujoco import MujocoSimulator
 
         return MujocoSimulator(robot, threads=threads, device=device)
     if device != "cpu":
         raise PronkError(f"device {device!r} is for simulator mujoco; {choice} has its own.")
-    simulator: Simulator = _factory(choice)(robot)
+    simulator: Simulator
+    if python is None:
+        simulator = factory(choice)(robot)
+    else:
+        from pronk.simulators.remote import RemoteSimulator
+
+        simulator = RemoteSimulator(choice, robot, python)
     members = ("info", "joints", "parameters", "rollout")
     if lacking := [name for name in members if not hasattr(simulator, name)]:
         raise PronkError(f"simulator {choice} has no {', '.join(lacking)}; see Simulator.")
@@ -219,16 +244,21 @@ def load_simulator(
 
 
 def joint_rigs(
-    choice: str, robot: RobotSpec, *, threads: int = 2, device: str = "cpu"
+    choice: str,
+    robot: RobotSpec,
+    *,
+    threads: int = 2,
+    device: str = "cpu",
+    python: Path | None = None,
 ) -> JointRigs:
     """Rigs of a robot's joints in a simulator; arguments and errors are `load_simulator`'s."""
     from pronk.simulators.mujoco import MujocoSimulator
 
-    simulator = load_simulator(choice, robot, threads=threads, device=device)
+    simulator = load_simulator(choice, robot, threads=threads, device=device, python=python)
     return simulator if isinstance(simulator, MujocoSimulator) else RolloutRigs(simulator, robot)
 
 
-def _factory(choice: str) -> Any:
+def factory(choice: str) -> Any:
     """The callable that a path or entry point names."""
     file, colon, name = choice.rpartition(":")
     if not (colon and file.endswith(".py")):

@@ -6,7 +6,8 @@ link's hinge. Joints then need no rotation, and inertias are those about the wor
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,14 @@ class Links:
         return position
 
 
+@dataclass(frozen=True, kw_only=True)
+class SentRobot(RobotSpec):
+    """A robot without its MuJoCo model, in another Python (`pronk.simulators.remote`)."""
+
+    links: Mapping[str, Links] = field(repr=False)
+    """Chain of each joint; joints that have none as `Links` are missing."""
+
+
 def rotation(axis: Array, angle: float) -> Array:
     """Matrix that turns by an angle [rad] about a unit vector (Rodrigues), shape (3, 3)."""
     x, y, z = axis
@@ -103,6 +112,11 @@ def links_of(robot: RobotSpec, joint: str) -> Links:
     Raises:
         RobotError: A joint of the chain is no hinge, or a body has more than one.
     """
+    unlike = RobotError(f"the chain of {joint} has joints that are no hinges, or two on a body.")
+    if isinstance(robot, SentRobot):
+        if joint not in robot.links:
+            raise unlike
+        return robot.links[joint]
     import mujoco
 
     from pronk.robots.model import bench_spec
@@ -112,7 +126,7 @@ def links_of(robot: RobotSpec, joint: str) -> Links:
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
     if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE) or np.any(model.body_jntnum > 1):
-        raise RobotError(f"the chain of {joint} has joints that are no hinges, or two on a body.")
+        raise unlike
     count, bodies = model.njnt, range(1, model.nbody)
     link = [-1] * model.nbody
     """Link that each body belongs to: the nearest one with a hinge, itself included."""

@@ -1,0 +1,186 @@
+"""Simulators in another Python: an environment of its own that has NumPy and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic_log import Excitation, synthetic_log
+from log_files import write_mcap
+from pronk.cli.main import run
+from pronk.cli.match import WARNING_STATUS
+from pronk.errors import PronkError
+from pronk.excitation.signals import Chirp
+from pronk.match.gains import load
+from pronk.robots import load_robot
+from pronk.simulators.engines.links import links_of
+from pronk.simulators.simulator import joint_rigs, load_simulator
+from pronk.testing import check_simulator
+
+ROBOT = load_robot("mini_cheetah")
+EXAMPLE = f"{Path(__file__).parents[2] / 'examples' / 'my_simulator.py'}:Pendulum"
+ADAPTERS = '''
+import os, time
+import numpy as np
+from pronk.errors import PronkError
+from pronk.simulators.engines.links import links_of
+from pronk.simulators.simulator import SimulatorInfo
+
+class Resting:
+    """Positions at rest of one chain."""
+    info, joints = SimulatorInfo(engine="rest"), ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
+    parameters = frozenset({"stiffness", "damping"})
+
+    def __init__(self, robot):
+        print("an engine prints")
+        self.links = links_of(robot, "FR_hip_roll")
+
+    def rollout(self, command, values, *, locked=()):
+        os.write(1, b"more than once")
+        return np.array([[self.links.rest(q, k) for q in run]
+                         for run, k in zip(command, values["stiffness"])])
+
+class Modelled(Resting):
+    def __init__(self, robot):
+        robot.build_spec()
+
+class Failing(Resting):
+    def rollout(self, command, values, *, locked=()):
+        if locked:
+            raise PronkError("a sentence.")
+        return 1 / 0
+
+class Ending(Resting):
+    def rollout(self, command, values, *, locked=()):
+        os.write(2, b"a last word\\n")
+        os._exit(7)
+
+class Endless(Resting):
+    def rollout(self, command, values, *, locked=()):
+        open(os.environ["PID_FILE"], "w").write(f"{os.getpid()}\\n")
+        while True:
+            time.sleep(0.01)
+'''
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Python that can import NumPy, not SciPy or MuJoCo."""
+    folder = tmp_path_factory.mktemp("other")
+    venv.create(folder / "venv", symlinks=True)
+    site = folder / "venv" / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    for found in Path(np.__file__).parents[1].glob("numpy*"):
+        (site / "site-packages" / found.name).symlink_to(found)
+    program = folder / "venv" / "bin" / "python"
+    ask = "import importlib.util as u; print([bool(u.find_spec(n)) for n in ('numpy', 'mujoco')])"
+    said = subprocess.run([program, "-c", ask], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "[True, False]"
+    return program
+
+
+@pytest.fixture(scope="module")
+def adapters(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("adapters") / "adapters.py"
+    file.write_text(ADAPTERS, encoding="utf-8")
+    return file
+
+
+def test_it_gives_the_same_positions_to_the_last_bit(python: Path) -> None:
+    here = load_simulator(EXAMPLE, ROBOT)
+    generator = np.random.default_rng(0)
+    command = 0.1 * generator.normal(size=(3, 50, 12)).cumsum(axis=1)
+    values = {name: generator.uniform(1.0, 2.0, (3, 12)) for name in ("stiffness", "damping")}
+    with joint_rigs(EXAMPLE, ROBOT, python=python) as rigs:
+        assert rigs.info == here.info
+        there = load_simulator(EXAMPLE, ROBOT, python=python)
+        assert (there.joints, there.parameters) == (here.joints, here.parameters)
+        got = there.rollout(command, values, locked=("FL_knee",))
+        assert np.array_equal(got, here.rollout(command, values, locked=("FL_knee",)))
+        check_simulator(there)
+        there.close()  # type: ignore[attr-defined]
+
+
+def test_commands_give_the_same_gains_and_replays(python: Path, tmp_path: Path) -> None:
+    chirp = Excitation(offsets=Chirp(length_s=8.0).samples())
+    rigs = joint_rigs(EXAMPLE, ROBOT)
+    log = synthetic_log(ROBOT, "FR_knee", [chirp], 19.3, 0.41, simulator=rigs)
+    write_mcap(tmp_path / "log.mcap", log)
+    gains, figures = tmp_path / "gains.yaml", tmp_path / "figures.json"
+    here = [str(tmp_path / "log.mcap"), "--robot", ROBOT.name, "--simulator", EXAMPLE]
+    there = [*here, "--simulator-python", str(python)]
+    assert run(["match", *there, "--out", str(gains)]) in (0, WARNING_STATUS)
+    assert load(gains).joints["FR_knee"].stiffness == pytest.approx(19.3, rel=2e-3)
+    replays = []
+    for line in (here, there):
+        assert run(["predict", *line, "--gains", str(gains), "--json", str(figures)]) == 0
+        replays.append(json.loads(figures.read_text()))
+    assert replays[0] == replays[1]
+
+
+def test_chains_arrive_as_they_are_and_prints_do_no_harm(python: Path, adapters: Path) -> None:
+    command, stiffness = np.full((2, 4, 3), 0.3), np.array([[10.0] * 3, [20.0] * 3])
+    with load_simulator(f"{adapters}:Resting", ROBOT, python=python) as there:  # type: ignore[attr-defined]
+        got = there.rollout(command, {"stiffness": stiffness, "damping": stiffness})
+    links = links_of(ROBOT, "FR_hip_roll")
+    expected = [links.rest(command[0, 0], one) for one in stiffness]
+    assert np.array_equal(got, np.repeat(np.array(expected)[:, None], 4, axis=1))
+    assert np.ptp(got) > 1e-3
+
+
+def test_what_fails_there_is_one_sentence_here(python: Path, adapters: Path) -> None:
+    command = np.zeros((1, 2, 3))
+    failing = load_simulator(f"{adapters}:Failing", ROBOT, python=python)
+    for _ in range(2):  # It goes on after an error.
+        with pytest.raises(PronkError, match=r"Failing in .*python: a sentence\."):
+            failing.rollout(command, {}, locked=("FR_knee",))
+        with pytest.raises(PronkError, match="ZeroDivisionError"):
+            failing.rollout(command, {})
+    ending = load_simulator(f"{adapters}:Ending", ROBOT, python=python)
+    with pytest.raises(PronkError, match="status 7: a last word"):
+        ending.rollout(command, {})
+    for choice, words in (
+        (f"{adapters}:Modelled", "links_of"),
+        (f"{adapters}:Missing", "Resting"),
+        (f"{python.parent}/no.py:Name", "no file"),
+        ("mujoco", "--simulator"),
+    ):
+        with pytest.raises(PronkError, match=words):
+            load_simulator(choice, ROBOT, python=python)
+    for program, words in (("no/python", "cannot be started"), ("/bin/false", "status 1")):
+        with pytest.raises(PronkError, match=words):
+            load_simulator(EXAMPLE, ROBOT, python=Path(program))
+
+
+def test_it_ends_with_a_killed_parent(python: Path, adapters: Path, tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    code = (
+        "import numpy as np; from pathlib import Path; from pronk.robots import load_robot\n"
+        "from pronk.simulators.simulator import load_simulator\n"
+        f"s = load_simulator({str(adapters) + ':Endless'!r}, load_robot('mini_cheetah'),\n"
+        f"    python=Path({str(python)!r}))\n"
+        "s.rollout(np.zeros((1, 2, 3)), {})\n"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "PID_FILE": pid_file}
+    )
+    while not (pid_file.exists() and pid_file.read_text().endswith("\n")):
+        assert parent.poll() is None
+        time.sleep(0.02)
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    child = Path(f"/proc/{pid_file.read_text().strip()}/stat")
+    for _ in range(1500):
+        # A zombie of a container without an init has ended too.
+        if not child.exists() or child.read_text().rsplit(")", 1)[1].split()[0] == "Z":
+            return
+        time.sleep(0.02)
+    pytest.fail("the simulator outlived its parent")
