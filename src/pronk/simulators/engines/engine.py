@@ -57,7 +57,7 @@ class EngineSimulator(ABC):
     """
 
     extra: ClassVar[str]
-    """Extra of pronk that installs the engine."""
+    """Extra of pronk that installs the engine; empty if pronk's MuJoCo excludes it."""
     module: ClassVar[str]
     """What is imported to see that the engine is installed."""
     package: ClassVar[str]
@@ -81,9 +81,10 @@ class EngineSimulator(ABC):
         try:
             self.engine: Any = importlib.import_module(self.module)
         except ImportError as error:
+            ours = f"pip install 'pronk[{self.extra}]', or " if self.extra else ""
             raise PronkError(
-                f"{self.package} cannot be imported ({error}); pip install 'pronk[{self.extra}]', "
-                "or name a Python that has it with --simulator-python."
+                f"{self.package} cannot be imported ({error}); {ours}name a Python that has it "
+                "with --simulator-python."
             ) from None
         self.info = SimulatorInfo(
             engine=self.package,
