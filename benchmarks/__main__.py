@@ -17,6 +17,7 @@ SUMMARIES = {
     "latency": "Lateness of the control loop, and policy latency.",
     "supervision": "False alarms and detection times of the sensors' supervision.",
     "sensor-faults": "From a sensor's fault to damping, over LCM and DDS in real time.",
+    "probe": "Laws, parameters and faults of simulators drawn at random, named blind.",
     "transfer": "A policy in training simulators of other drive laws.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",

@@ -166,6 +166,9 @@ def delayed(command: Array, steps: Array) -> Array:
     """
     whole = np.floor(steps).astype(np.int64)
     share = (steps - whole)[:, None]
-    at = np.arange(command.shape[1])[None, :, None] - whole[:, None]
-    late, later = (np.take_along_axis(command, np.maximum(at - more, 0), axis=1) for more in (0, 1))
+    last = command.shape[1] - 1
+    at = np.arange(last + 1)[None, :, None] - whole[:, None]
+    late, later = (
+        np.take_along_axis(command, np.clip(at - more, 0, last), axis=1) for more in (0, 1)
+    )
     return np.asarray((1.0 - share) * late + share * later)

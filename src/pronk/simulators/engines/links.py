@@ -40,20 +40,43 @@ class Links:
     gravity: Array
     """[m/s^2], shape (3,)."""
 
-    def gravity_torque(self, position: Array) -> Array:
-        """Torque of gravity about each hinge at positions [rad], both of shape (n,) [N m]."""
+    def _moved(self, position: Array) -> tuple[Array, Array]:
+        """Rotations and hinges [m] of the links at positions, shapes (n, 3, 3) and (n, 3)."""
         count = len(self.joints)
-        turn, hinge, torque = np.empty((count, 3, 3)), np.empty((count, 3)), np.zeros(count)
+        turn, hinge = np.empty((count, 3, 3)), np.empty((count, 3))
         for i, up in enumerate(self.parent):
             before = turn[up] if up >= 0 else np.eye(3)
             hinge[i] = (hinge[up] if up >= 0 else 0.0) + before @ self.offset[i]
             turn[i] = before @ rotation(self.axis[i], float(position[i]))
-            load, at = self.mass[i] * self.gravity, hinge[i] + turn[i] @ self.centre[i]
-            j = i
-            while j >= 0:
-                torque[j] += turn[j] @ self.axis[j] @ np.cross(at - hinge[j], load)
-                j = self.parent[j]
+        return turn, hinge
+
+    def _carried(self, link: int) -> list[int]:
+        """A link and those that it carries."""
+        out = [link]
+        for i, up in enumerate(self.parent):
+            if up in out:
+                out.append(i)
+        return out
+
+    def gravity_torque(self, position: Array) -> Array:
+        """Torque of gravity about each hinge at positions [rad], both of shape (n,) [N m]."""
+        turn, hinge = self._moved(position)
+        torque = np.zeros(len(self.joints))
+        for j in range(len(torque)):
+            for i in self._carried(j):
+                arm = hinge[i] + turn[i] @ self.centre[i] - hinge[j]
+                torque[j] += turn[j] @ self.axis[j] @ np.cross(arm, self.mass[i] * self.gravity)
         return torque
+
+    def inertia_about(self, joint: int, position: Array) -> float:
+        """Inertia of what a joint carries, about its axis, at positions [rad] [kg m^2]."""
+        turn, hinge = self._moved(position)
+        axis, total = turn[joint] @ self.axis[joint], 0.0
+        for i in self._carried(joint):
+            arm = np.cross(axis, hinge[i] + turn[i] @ self.centre[i] - hinge[joint])
+            along = turn[i].T @ axis
+            total += along @ self.inertia[i] @ along + self.mass[i] * arm @ arm
+        return float(total)
 
     def rest(self, target: Array, stiffness: Array) -> Array:
         """Positions at rest under drives with a target [rad] and stiffness, shapes (n,)."""

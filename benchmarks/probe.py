@@ -1,0 +1,297 @@
+"""`python -m benchmarks probe`: name the laws, parameters and faults of random simulators, blind.
+
+A simulator is drawn with its law, step, armature, friction, delay and hold, and half of them with a
+fault. It is an integrator of its own in NumPy, MuJoCo, or an engine of `pronk.simulators.engines`
+that is installed. `pronk.simulators.probe` sees the `Simulator` only.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.runner import finish
+from pronk.actuator.law import DriveLaw
+from pronk.cli import console
+from pronk.errors import PronkError
+from pronk.robots import load_robot
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.engines.drake import Drake
+from pronk.simulators.engines.engine import EngineSimulator, delayed
+from pronk.simulators.engines.links import links_of
+from pronk.simulators.engines.pybullet import PyBullet
+from pronk.simulators.engines.sapien import Sapien
+from pronk.simulators.mujoco import Chain
+from pronk.simulators.probe import Probe
+from pronk.simulators.probe import probe as look
+from pronk.simulators.simulator import Simulator, SimulatorInfo
+
+Array = NDArray[np.float64]
+ROBOTS = (
+    (str(Path(__file__).parents[1] / "examples" / "pendulum"), "swing"),
+    ("mini_cheetah", "FR_knee"),
+    ("go2", "RL_knee"),
+)
+ENGINES: tuple[type[EngineSimulator], ...] = (Sapien, Drake, PyBullet)
+FAULTS = ("ignored", "armature", "twice", "degrees", "law", "beside", "hold")
+"""Words of `Probe.wrong`; each second simulator has one of them."""
+DEFAULT_ARMATURE = 0.1
+"""Genesis's, of a URDF that names none [kg m^2]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """What is drawn."""
+
+    kind: str
+    robot: RobotSpec
+    joint: str
+    law: DriveLaw
+    stated: DriveLaw
+    armature: float
+    """That acts [kg m^2]."""
+    frictionloss: float
+    delay_s: float
+    hold: int
+    scale: float
+    """Gains that act over those that are set."""
+    fault: str
+
+
+class Drawn:
+    """A `Simulator` as it was drawn: faults, delay and hold about `moved`."""
+
+    def __init__(self, truth: Truth) -> None:
+        robot, self.truth = truth.robot, truth
+        self.joints, self.parameters = robot.joint_names, frozenset({"stiffness", "damping"})
+        self.parameters |= {"armature"}
+        self.info = SimulatorInfo(
+            engine="unknown",
+            timestep_s=robot.timestep_s,
+            decimation=robot.decimation,
+            law=truth.stated.kind,
+            iterations=truth.stated.iterations,
+        )
+
+    def rollout(
+        self, command: Array, values: Mapping[str, Array], *, locked: Sequence[str] = ()
+    ) -> Array:
+        """Positions of the joint; see `Simulator.rollout`."""
+        truth = self.truth
+        column = self.joints.index(truth.joint)
+        assert truth.joint not in locked
+        hold = np.arange(command.shape[1]) // truth.hold * truth.hold
+        late = np.full((len(command), len(self.joints)), truth.delay_s / self.info.timestep_s)
+        seen = delayed(command[:, hold], late)
+        own = truth.robot.joint(truth.joint)
+        kp, kd = (values[n][:, column] * truth.scale for n in ("stiffness", "damping"))
+        armature = np.full(len(command), own.drive.armature)
+        if "armature" in values:
+            armature = values["armature"][:, column].copy()
+        if truth.fault == "ignored":
+            armature[:] = truth.armature
+        elif truth.fault == "armature":
+            armature += DEFAULT_ARMATURE
+        moved = {"numpy": self._numpy, "mujoco": self._mujoco}.get(truth.kind, self._engine)
+        out = np.repeat(command[:, :1], command.shape[1], axis=1)
+        out[..., column] = moved(seen, kp, kd, armature)
+        return out
+
+    def _numpy(self, command: Array, kp: Array, kd: Array, armature: Array) -> Array:
+        """The laws of `pronk.actuator.law` for one joint with Coulomb friction, shape (B, T)."""
+        truth, drive = self.truth, self.truth.robot.joint(self.truth.joint).drive
+        links = links_of(truth.robot, truth.joint)
+        arm = np.cross(links.axis[0], links.centre[0])
+        inertia = links.axis[0] @ links.inertia[0] @ links.axis[0] + links.mass[0] * arm @ arm
+        inertia = inertia + armature
+        u = command[..., self.joints.index(truth.joint)]
+        law, h = truth.law, truth.robot.timestep_s / truth.law.iterations
+        explicit = law.kind == "explicit" or truth.fault == "beside"
+        viscous, friction = drive.viscous_damping, truth.frictionloss
+        q, v, out = u[:, 0].copy(), np.zeros(len(u)), np.empty(u.shape)
+        for k in range(u.shape[1]):
+            out[:, k] = q
+            before = kp * (u[:, k] - q) - kd * v if explicit else np.zeros(len(u))
+            for _ in range(law.iterations):
+                gravity = np.array([links.gravity_torque(np.array([angle]))[0] for angle in q])
+                force, mass = before + gravity - viscous * v, inertia + h * viscous
+                if law.kind != "explicit":
+                    force, mass = force + kp * (u[:, k] - q) - kd * v, mass + h * kd
+                if law.kind == "implicit":
+                    force, mass = force - h * kp * v, mass + h * h * kp
+                v = v + h * force / mass
+                v = np.sign(v) * np.maximum(np.abs(v) - h * friction / mass, 0.0)
+                q = q + h * v
+        return out
+
+    def _mujoco(self, command: Array, kp: Array, kd: Array, armature: Array) -> Array:
+        truth = self.truth
+        robot = replace(truth.robot, law=truth.law)
+        names = ("stiffness", "damping", "armature")
+        sets = [
+            {
+                truth.joint: {
+                    **dict(zip(names, map(float, one), strict=True)),
+                    "frictionloss": truth.frictionloss,
+                }
+            }
+            for one in zip(kp, kd, armature, strict=True)
+        ]
+        column = self.joints.index(truth.joint)
+        with Chain(robot, truth.joint, threads=1) as chain:
+            return chain.rollout(command[..., [column]], sets)[:, :-1, 0]
+
+    def _engine(self, command: Array, kp: Array, kd: Array, armature: Array) -> Array:
+        truth, column = self.truth, self.joints.index(self.truth.joint)
+        engine = next(one for one in ENGINES if one.__name__ == truth.kind)
+        values = {}
+        for name, one in (("stiffness", kp), ("damping", kd), ("armature", armature)):
+            values[name] = np.ones((len(command), len(self.joints)))
+            values[name][:, column] = one
+        locked = [name for name in self.joints if name != truth.joint]
+        out = engine(truth.robot, law=truth.law).rollout(command, values, locked=locked)
+        return np.asarray(out[..., column])
+
+
+def drawn(generator: np.random.Generator, kind: str, fault: str) -> Truth:
+    """Draw one simulator of a kind with a fault, or none."""
+    name, joint = ROBOTS[generator.integers(len(ROBOTS))]
+    robot = load_robot(name)
+    step = float(generator.choice([0.001, 0.002, 0.004, 0.005]))
+    robot = replace(robot, timestep_s=step, decimation=round(0.02 / step))
+    laws = [DriveLaw(), DriveLaw(kind="implicit_damping")]
+    laws += [DriveLaw(kind="implicit", iterations=n) for n in (1, 4, 10)]
+    if kind in ("Drake", "PyBullet", "Sapien"):
+        engine = next(one for one in ENGINES if one.__name__ == kind)
+        laws = [one for one in laws if one.kind in engine.laws]
+        laws = laws if kind == "Sapien" else [one for one in laws if one.iterations == 1]
+    if fault == "beside":
+        laws = [one for one in laws if one.kind != "explicit"]
+    law = laws[generator.integers(len(laws))]
+    others = [one for one in laws if one != law] or [DriveLaw(kind="implicit_damping")]
+    stated = others[generator.integers(len(others))] if fault == "law" else law
+    own = robot.joint(joint)
+    armature = own.drive.armature * float(generator.uniform(0.6, 1.8))
+    own = replace(
+        own,
+        drive=replace(own.drive, rotor_inertia=armature / own.drive.gear_ratio**2),
+        stiffness=own.stiffness * float(generator.uniform(0.6, 1.3)),
+        damping=own.damping * float(generator.uniform(0.5, 1.2)),
+    )
+    robot = replace(robot, joints=tuple(own if j.name == joint else j for j in robot.joints))
+    scale = 1.0
+    if fault == "degrees":
+        scale = float(generator.choice([180.0 / np.pi, np.pi / 180.0]))
+    elif fault == "twice":
+        scale = 2.0
+    acts = own.drive.armature
+    if fault == "ignored":
+        acts = 0.0 if generator.random() < 0.5 else 0.5 * armature
+    elif fault == "armature":
+        acts += DEFAULT_ARMATURE
+    still = kind in ("Drake", "PyBullet", "Sapien") or scale < 0.1
+    return Truth(
+        kind=kind,
+        robot=robot,
+        joint=joint,
+        law=law,
+        stated=stated,
+        armature=acts,
+        frictionloss=0.0 if still else float(generator.choice([0.0, generator.uniform(0.02, 0.3)])),
+        delay_s=float(generator.choice([0.0, generator.uniform(0.0, 0.02)])),
+        hold=int(generator.choice([2, 4, 5])) if fault == "hold" else 1,
+        scale=scale,
+        fault=fault,
+    )
+
+
+def rows(seed: int, count: int, kinds: Sequence[str]) -> list[tuple[Truth, Probe, float]]:
+    """Draw simulators and probe them; the seconds that each probe took."""
+    generator, out = np.random.default_rng(seed), []
+    with console.progress() as report:
+        for k in range(count):
+            kind = kinds[k % len(kinds)]
+            fault = FAULTS[k // 2 % len(FAULTS)] if generator.random() < 0.5 else ""
+            if fault == "beside":
+                kind = "numpy"
+            truth = drawn(generator, kind, fault)
+            simulator: Simulator = Drawn(truth)
+            begin = time.perf_counter()
+            out.append(
+                (truth, look(simulator, truth.robot, truth.joint), time.perf_counter() - begin)
+            )
+            report("probe", (k + 1) / count)
+    return out
+
+
+def score(truth: Truth, found: Probe) -> dict[str, float | bool | str]:
+    """How far an answer is from the truth."""
+    # A joint that is not stable with its gains is no fault that was drawn.
+    named = set(found.wrong) - {"unstable"}
+    inertia = (
+        truth.armature if truth.armature > 0.0 else truth.robot.joint(truth.joint).drive.armature
+    )
+    return {
+        "kind": truth.kind,
+        "joint": truth.joint,
+        "law": truth.law.label,
+        "found": found.law.label,
+        "law_right": (found.law, found.beside_explicit) == (truth.law, truth.fault == "beside"),
+        "armature_error": abs(found.armature - truth.armature) / inertia,
+        "delay_error_s": abs(found.delay_s - truth.delay_s),
+        "friction_error": abs(found.frictionloss - truth.frictionloss),
+        "hold_right": found.hold == truth.hold,
+        "fault": truth.fault,
+        "named": " ".join(sorted(named)),
+        "fault_right": named == ({truth.fault} if truth.fault else set()),
+        "left": found.left,
+    }
+
+
+def probe(seed: int = 0, count: int = 50) -> console.Outcome:
+    """Name the law, parameters and faults of random simulators.
+
+    Args:
+        seed: Of the draw.
+        count: Simulators; a quarter of them in each engine that is installed, at most.
+    """
+    installed = [
+        one.__name__ for one in ENGINES if importlib.util.find_spec(one.module.split(".")[0])
+    ]
+    if count < 1:
+        raise PronkError(f"--count {count}; expected 1 or more.")
+    kinds = ["numpy", "mujoco", *installed]
+    probed = rows(seed, count, kinds)
+    scores = [score(truth, found) for truth, found, _ in probed]
+    seconds = [one for *_, one in probed]
+
+    def right(name: str) -> str:
+        return f"{sum(bool(one[name]) for one in scores)} of {count}"
+
+    def errors(name: str, factor: float) -> str:
+        values = np.array([float(one[name]) for one in scores]) * factor
+        return f"{np.median(values):.2g} (largest {values.max():.2g})"
+
+    faulty = sum(bool(one["fault"]) for one in scores)
+    cells = [
+        ("law", right("law_right")),
+        ("hold", right("hold_right")),
+        (f"faults named and no others; {faulty} have one", right("fault_right")),
+        ("armature, error [%]", errors("armature_error", 100.0)),
+        (
+            "armature within 2 %",
+            f"{sum(float(s['armature_error']) < 0.02 for s in scores)} of {count}",
+        ),
+        ("delay, error [ms]", errors("delay_error_s", 1000.0)),
+        ("dry friction, error [N m]", errors("friction_error", 1.0)),
+        ("time [s]", f"{np.median(seconds):.1f} (largest {max(seconds):.1f})"),
+    ]
+    title = f"Random simulators, seed {seed}: {', '.join(kinds)}"
+    figures = {str(k): one for k, one in enumerate(scores)}
+    return finish(figures, console.table(title, ["of the joint", "probe"], cells))

@@ -1,0 +1,62 @@
+"""`pronk probe`: what a simulator makes of the settings of a joint."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import tyro
+
+from pronk.cli import console
+
+
+def probe(
+    simulator: tyro.conf.Positional[str],
+    robot: str,
+    joint: str | None = None,
+) -> console.Outcome:
+    """Excite one joint of a simulator; name its drive law and what acts otherwise than it is set.
+
+    Args:
+        simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
+        robot: A name, or a path to a robot.yaml, MJCF or URDF.
+        joint: The joint; the first one that moves no other if left out.
+    """
+    from pronk.evaluation.tables import table
+    from pronk.robots import load_robot
+    from pronk.simulators.probe import probe as look
+    from pronk.simulators.simulator import load_simulator
+
+    known = load_robot(robot)
+    made = load_simulator(simulator, known, threads=1)
+    found = look(made, known, joint)
+    info, one = made.info, known.joint(found.joint)
+    names = {"explicit": "E", "implicit_damping": "IF"}
+    beside = "E, beside it " if found.beside_explicit else ""
+    rows: list[list[Any]] = [
+        ["law", names.get(info.law, f"I{info.iterations}"), beside + found.law.label],
+        ["stiffness [N m/rad]", one.stiffness, one.stiffness * found.stiffness_factor],
+        ["damping [N m s/rad]", one.damping, one.damping * found.damping_factor],
+        ["armature [kg m^2]", found.armature_set, found.armature],
+        [
+            "passive damping [N m s/rad]",
+            one.drive.viscous_damping,
+            round(found.viscous_damping, 6) + 0.0,
+        ],
+        ["dry friction [N m]", one.drive.frictionloss, found.frictionloss],
+        ["gravity [of the model's]", 1.0, max(found.gravity, 0.0)],
+        ["delay [ms]", 0.0, round(1000.0 * found.delay_s, 4) + 0.0],
+        ["hold [steps]", 1, found.hold],
+    ]
+    console.show_sheet(
+        table(
+            "of the joint | set;4 | acts;4",
+            rows,
+            f"Steps of {1000.0 * info.timestep_s:g} ms. Left: {100.0 * found.left:.2g} % of the "
+            "motion.",
+            title=f"{found.joint} in {info.engine} {info.version}",
+        )
+    )
+    for sentence in found.wrong.values():
+        console.warn(f"{found.joint}: {sentence}.")
+    return console.Outcome(figures={"probe": asdict(found)})

@@ -1,0 +1,505 @@
+"""Name how a simulator drives a joint, from the response of the joint alone.
+
+Two experiments on one joint, all others held at their default positions:
+
+- Steps of the command at successive instants. The step in which each begins to act gives the number
+  of steps that the simulator holds a command for, and the whole steps of delay.
+- Chirps at three pairs of gains, and one with another armature where it can be set. One pair is not
+  enough: explicit drives of inertia `J + h kd` respond as drives of inertia `J` with implicit
+  damping do. How the response changes with the gains separates the laws of `pronk.actuator.law`,
+  and an implicit drive that acts beside the explicit torque.
+
+A joint with friction is fitted to each law; the one that leaves least is the answer. Gravity and
+the inertia of the links are the robot's, which is what makes the gains absolute.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pronk.actuator.law import DriveLaw
+from pronk.errors import PronkError
+from pronk.robots.robot import RobotSpec
+from pronk.simulators.engines.engine import delayed
+from pronk.simulators.engines.links import links_of
+from pronk.simulators.simulator import Simulator
+
+Array = NDArray[np.float64]
+
+AMPLITUDE = 0.2
+"""Of the commands [rad]; less where the drive's effort limit asks for it."""
+_REST = 8
+"""Steps before the command moves."""
+_HOLDS = 40
+"""Longest hold that is looked for [steps]."""
+_ITERATIONS = (1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 32)
+_SCALES = (1.0, 2.0, 180.0 / math.pi, math.pi / 180.0)
+"""Factors on gains that have a usual cause."""
+_HALVINGS = 7
+"""Of the gains, until the simulator is stable."""
+_ROUNDS = 25
+_IMPEDANCE, _RATE = 0.9, 2.0 / (0.95 * 0.02)
+"""Of MuJoCo's dry friction: solimp 0.9 to 0.95, and the rate [1/s] of solref's 0.02 s (MuJoCo,
+Computation, Solver parameters)."""
+_LEFT = 0.01
+"""Share of the motion that a right answer leaves at most."""
+_NAMES = ("stiffness", "damping", "armature", "viscous", "friction", "delay", "applied", "gravity")
+"""Fitted: factors on both gains, armature, passive damping, dry friction, delay in steps, and the
+shares of gravity and of a change of the armature that act."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probe:
+    """What a joint responds like."""
+
+    joint: str
+    law: DriveLaw
+    beside_explicit: bool
+    """True if a drive of this law acts beside an explicit torque of the same gains."""
+    stiffness_factor: float
+    """Stiffness that acts over the one that is set."""
+    damping_factor: float
+    armature: float
+    """[kg m^2]."""
+    armature_set: float
+    armature_applied: float | None
+    """Share of a change of the armature that acts; None where it cannot be set."""
+    viscous_damping: float
+    """[N m s/rad]."""
+    frictionloss: float
+    """Dry friction [N m]."""
+    soft_friction: bool
+    """True if it is MuJoCo's soft constraint, in which a joint that is held creeps."""
+    gravity: float
+    """Share of gravity that acts."""
+    delay_s: float
+    hold: int
+    """Steps that a command is held for."""
+    stable_share: float
+    """Share of the gains at which the simulator is stable: 1, or less."""
+    left: float
+    """RMS of the motion that the answer leaves, as a share of the motion."""
+    wrong: Mapping[str, str] = field(default_factory=dict)
+    """What acts otherwise than it is set: a word, and a sentence. The words are law, beside, twice,
+    degrees, stiffness, damping, armature, ignored, gravity,
+    hold, early, unstable and left."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Runs:
+    """What is fitted: R runs of T steps."""
+
+    command: Array
+    """Of each step as it acts without delay [rad], shape (T, R)."""
+    position: Array
+    """[rad], shape (T, R)."""
+    stiffness: Array
+    damping: Array
+    armature_change: Array
+    """Shape (R,)."""
+    timestep: float
+    inertia: float
+    """Of the links about the joint [kg m^2]."""
+    gravity: tuple[float, float]
+    """Torque of gravity `gravity[0] cos q + gravity[1] sin q` [N m]."""
+
+
+@dataclass(frozen=True)
+class _Law:
+    drive: DriveLaw
+    beside: bool = False
+    soft: bool = False
+
+
+def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> Probe:
+    """Name the drive law and the parameters that act at one joint.
+
+    Args:
+        simulator: Any simulator of the robot's joints.
+        robot: The robot; gains and armature are set to its own.
+        joint: The joint; the first one that moves no other if None.
+
+    Raises:
+        PronkError: There is no such joint, it does not move, or the simulator diverges even with
+            small gains.
+    """
+    if joint is None:
+        joint = min(robot.joints, key=lambda one: len(one.chain)).name
+    one = robot.joint(joint)
+    if joint not in simulator.joints:
+        raise PronkError(
+            f"the simulator has no joint {joint!r}; its joints are {', '.join(simulator.joints)}."
+        )
+    bench = _Bench(simulator, robot, joint)
+    share = stable = bench.stable_share()
+    settable = "armature" in simulator.parameters
+    answers: list[tuple[float, Array, _Law, int, _Runs]] = []
+    for _ in range(3):
+        try:
+            whole, hold, phase = bench.latency(share)
+        except PronkError:
+            if not answers:
+                raise
+            break  # Friction holds the joint against smaller gains.
+        runs = bench.chirps(share, hold, phase)
+        best, left, law = _best(runs, whole, settable)
+        answers.append((left, best, law, hold, runs))
+        if left > _LEFT:
+            share /= 8.0  # A limit of the torque leaves motion; smaller gains stay clear of it.
+        elif share * best[0] < 0.2:
+            # Laws differ by step times gains over inertia: with so soft a joint, by nothing.
+            answers.clear()
+            share /= best[0]
+        else:
+            break
+    left, best, law, hold, runs = min(
+        answers or [(left, best, law, hold, runs)], key=lambda a: a[0]
+    )
+    fitted = dict(zip(_NAMES, best.tolist(), strict=True))
+    found = Probe(
+        joint=joint,
+        law=law.drive,
+        beside_explicit=law.beside,
+        stiffness_factor=fitted["stiffness"],
+        damping_factor=fitted["damping"],
+        armature=fitted["armature"],
+        armature_set=one.drive.armature,
+        armature_applied=fitted["applied"] if "armature" in simulator.parameters else None,
+        viscous_damping=fitted["viscous"],
+        frictionloss=fitted["friction"],
+        soft_friction=law.soft,
+        gravity=fitted["gravity"],
+        delay_s=fitted["delay"] * runs.timestep,
+        hold=hold,
+        stable_share=stable,
+        left=left,
+    )
+    return replace(found, wrong=dict(_wrong(found, simulator, runs)))
+
+
+class _Bench:
+    """Excitation of one joint of a simulator."""
+
+    def __init__(self, simulator: Simulator, robot: RobotSpec, joint: str) -> None:
+        self.simulator, self.joint, self.robot = simulator, robot.joint(joint), robot
+        self.column = simulator.joints.index(joint)
+        self.step = simulator.info.timestep_s
+        self.pose = np.array([robot.joint(n).default_position for n in simulator.joints])
+        self.locked = tuple(name for name in simulator.joints if name != joint)
+        effort = min(self.joint.drive.effort_limit, self.joint.drive.stall_torque)
+        self.amplitude = min(AMPLITUDE, 0.3 * effort / self.joint.stiffness)
+
+    def run(self, command: Array, **values: Array) -> Array:
+        """Positions of the joint [rad], shape (B, T), with a command about the pose, (B, T)."""
+        full = np.tile(self.pose, (*command.shape, 1))
+        full[..., self.column] += command
+        names = self.simulator.joints
+        sent = {}
+        for name, value in values.items():
+            own = [getattr(self.robot.joint(n), name, 0.0) for n in names]
+            if name == "armature":
+                own = [self.robot.joint(n).drive.armature for n in names]
+            sent[name] = np.tile(own, (len(command), 1)).astype(np.float64)
+            sent[name][:, self.column] = value
+        with np.errstate(all="ignore"):
+            out = np.asarray(self.simulator.rollout(full, sent, locked=self.locked))
+        if out.shape != full.shape:
+            raise PronkError(
+                f"the simulator's rollout returned shape {out.shape}; expected {full.shape}."
+            )
+        return np.asarray(out[..., self.column])
+
+    def gains(self, share: Array) -> dict[str, Array]:
+        """Both gains, shares of the robot's, shape (B,)."""
+        return {"stiffness": self.joint.stiffness * share, "damping": self.joint.damping * share}
+
+    def chirp(self) -> Array:
+        """The command about the pose [rad], shape (T,): another value each step."""
+        count = round(min(max(0.8 / self.step, 160.0), 400.0))
+        time = self.step * np.arange(count - _REST)
+        low, high = 1.0 / time[-1], min(25.0, 0.1 / self.step)
+        phase = 2.0 * np.pi * (low + (high - low) * time / (2.0 * time[-1])) * time
+        return np.concatenate([np.zeros(_REST), self.amplitude * (np.sin(phase) + 0.3)])
+
+    def stable_share(self) -> float:
+        """The largest share of the gains, a power of 1/2, with which the joint stays near."""
+        command = self.chirp()
+        for halvings in range(_HALVINGS + 1):
+            share = 0.5**halvings
+            position = self.run(command[None], **self.gains(np.array([share])))[0]
+            motion = position - position[0]
+            if np.isfinite(motion).all() and np.abs(motion).max() < 12.0 * self.amplitude:
+                if np.ptp(motion) < 1e-3 * self.amplitude:
+                    raise PronkError(
+                        f"{self.joint.name} does not move when it is commanded by "
+                        f"{self.amplitude:.2g} rad; check the order of the simulator's joints."
+                    )
+                return share
+        raise PronkError(
+            f"{self.joint.name} diverges even with 1/{2**_HALVINGS} of {self.joint.stiffness:g} "
+            f"N m/rad and {self.joint.damping:g} N m s/rad; check the units and the timestep."
+        )
+
+    def latency(self, share: float) -> tuple[int, int, int]:
+        """Whole steps of delay, steps of a hold, and the instant of a hold's first step."""
+        first = np.arange(_REST, _REST + 2 * _HOLDS)
+        length = _REST + 4 * _HOLDS
+        command = np.zeros((len(first) + 1, length))
+        command[1:] = self.amplitude * (np.arange(length)[None] >= first[:, None])
+        moved = self.run(command, **self.gains(np.full(len(command), share)))
+        apart = np.abs(moved[1:] - moved[:1]) > 1e-5 * self.amplitude
+        if not apart.any(axis=1).all():
+            raise PronkError(
+                f"{self.joint.name} does not respond to a step of {self.amplitude:.2g} rad within "
+                f"{2 * _HOLDS} steps."
+            )
+        # Position is read at the start of a step: it is apart one step after the command acts.
+        acts = apart.argmax(axis=1) - 1
+        late = acts - first
+        instants = np.unique(acts)
+        hold = int(np.diff(instants).max()) if len(instants) > 1 else 1
+        return int(late.min()), hold, int(first[late.argmin()])
+
+    def chirps(self, share: float, hold: int, phase: int) -> _Runs:
+        """Chirps with three pairs of gains, and with another armature."""
+        kp = np.array([1.0, 1.0, 0.5, 1.0]) * self.joint.stiffness * share
+        kd = np.array([1.0, 0.5, 0.5, 1.0]) * self.joint.damping * share
+        links = links_of(self.robot, self.joint.name)
+        index = links.joints.index(self.joint.name)
+        pose = np.array([self.robot.joint(n).default_position for n in links.joints])
+        inertia = links.inertia_about(index, pose)
+        own = self.joint.drive.armature
+        change = np.array([0.0, 0.0, 0.0, own + 0.5 * inertia])
+        values = {"stiffness": kp, "damping": kd}
+        if "armature" in self.simulator.parameters:
+            values["armature"] = own + change
+        else:
+            kp, kd, change = kp[:3], kd[:3], change[:3]
+            values = {"stiffness": kp, "damping": kd}
+        command = np.tile(self.chirp(), (len(kp), 1))
+        position = self.run(command, **values)
+        at = np.arange(command.shape[1])
+        seen = np.maximum((at - phase) // hold * hold + phase, 0)
+        held = command[0, np.minimum(seen, at)] + self.pose[self.column]
+        torque = []
+        for angle in (0.0, 0.5 * np.pi):
+            pose[index] = angle
+            torque.append(float(links.gravity_torque(pose)[index]))
+        return _Runs(
+            command=np.tile(held[:, None], (1, len(kp))),
+            position=position.T,
+            stiffness=kp,
+            damping=kd,
+            armature_change=change,
+            timestep=self.step,
+            inertia=inertia,
+            gravity=(torque[0], torque[1]),
+        )
+
+
+def _simulated(runs: _Runs, law: _Law, theta: Array) -> Array:
+    """Positions with sets of parameters, shape (P, 8): (P, T, R); see `pronk.actuator.law`."""
+    stiff, damp, armature, viscous, friction, delay, applied, weight = theta.T[:, :, None]
+    kp, kd = stiff * runs.stiffness, damp * runs.damping
+    inertia = np.maximum(
+        runs.inertia + armature + applied * runs.armature_change, 0.05 * runs.inertia
+    )
+    command = np.tile(runs.command, (len(theta), 1, 1))
+    command = delayed(command, np.broadcast_to(delay, kp.shape)).transpose(1, 0, 2)
+    q = np.broadcast_to(runs.position[0], kp.shape).copy()
+    v, out = np.zeros(kp.shape), np.empty((len(command), *kp.shape))
+    parts, kind = law.drive.iterations, law.drive.kind
+    h = runs.timestep / parts
+    explicit = law.beside or kind == "explicit"
+    # The drive's part of damping, of law `implicit` with what stiffness adds.
+    drive = 0.0 * kd if kind == "explicit" else law.drive.damping(kp, kd, h)
+    within = inertia + h * (viscous + drive)
+    gain, loss = h / within, h * friction / within
+    total, spring = drive + viscous, 0.0 * kp if kind == "explicit" else kp
+    cosine, sine = (weight * one for one in runs.gravity)
+    for k, target in enumerate(command):
+        out[k] = q
+        torque = kp * (target - q) - kd * v if explicit else 0.0
+        for _ in range(parts):
+            pull = torque + spring * (target - q) - total * v + cosine * np.cos(q)
+            pull += sine * np.sin(q)
+            if law.soft:
+                hold = _IMPEDANCE * (pull + _RATE * inertia * v)
+                v = v + gain * (pull - np.clip(hold, -friction, friction))
+            else:
+                v = v + gain * pull
+                v = v - np.clip(v, -loss, loss)
+            q = q + h * v
+    return out.transpose(1, 0, 2)
+
+
+def _fit(
+    runs: _Runs, law: _Law, start: Array, fixed: frozenset[str], rounds: int
+) -> tuple[Array, float]:
+    """Parameters of least squares and the RMS [rad] (Levenberg and Marquardt)."""
+    free = [i for i, name in enumerate(_NAMES) if name not in fixed]
+    torque = float(runs.stiffness.max()) * AMPLITUDE * start[0]
+    size = np.array(
+        [start[0], start[1], runs.inertia, runs.damping.max(), 0.1 * torque, *np.ones(3)]
+    )
+    size[2] += abs(start[2])
+    size[3] *= start[1]
+    low = np.array([0.0, 0.0, -0.9 * runs.inertia, -np.inf, 0.0, -1.0, -0.5, -0.5])
+    high = np.array([np.inf] * 5 + [start[5] + 2.0, 2.0, 2.0])
+    theta, trust = start, 1e-3
+    with np.errstate(all="ignore"):
+        off = _simulated(runs, law, theta[None])[0] - runs.position
+        cost = float(np.mean(off * off))
+        for _ in range(rounds):
+            moved = np.tile(theta, (len(free), 1))
+            moved[np.arange(len(free)), free] += 1e-6 * size[free]
+            jacobian = (_simulated(runs, law, moved) - runs.position - off).reshape(len(free), -1)
+            jacobian *= 1e6
+            square, pull = jacobian @ jacobian.T, jacobian @ off.ravel()
+            if not (np.isfinite(square).all() and np.isfinite(cost)):
+                break
+            # One call for all trials costs as much as one for one.
+            trusts = trust * np.array([1e-3, 0.1, 1.0, 30.0, 1e3])
+            floor = np.diag(square) + 1e-12 * np.trace(square)
+            trials = np.tile(theta, (len(trusts), 1))
+            for trial, damped in zip(trials, trusts, strict=True):
+                found = np.linalg.lstsq(square + damped * np.diag(floor), pull, rcond=None)[0]
+                trial[free] -= size[free] * found
+            trials = np.clip(trials, low, high)
+            after = _simulated(runs, law, trials) - runs.position
+            costs = np.nan_to_num(np.mean(after**2, axis=(1, 2)), nan=np.inf)
+            k = int(costs.argmin())
+            if costs[k] >= cost:
+                if trust > 1e6:
+                    break
+                trust *= 1e3
+                continue
+            gained = 1.0 - costs[k] / cost
+            theta, off, cost, trust = trials[k], after[k], float(costs[k]), max(trusts[k], 1e-12)
+            if gained < 1e-4:
+                break
+    return theta, float(np.sqrt(cost)) if np.isfinite(cost) else np.inf
+
+
+def _best(runs: _Runs, whole: int, settable: bool) -> tuple[Array, float, _Law]:
+    """Parameters, what they leave as a share of the motion, and the law."""
+    fixed = frozenset[str]() if settable else frozenset({"applied", "gravity"})
+    motion = float(np.std(runs.position - runs.position[0]))
+    starts = np.array(
+        [
+            [scale, scale, runs.inertia * armature, 0.0, 0.0, float(whole), 1.0, 1.0]
+            for scale in _SCALES
+            for armature in (0.0, 0.5, 1.0, 3.0, 10.0, 40.0)
+        ]
+    )
+    tried: list[tuple[float, Array, _Law]] = []
+    friction: Array | None = None
+
+    def screen(law: _Law, start: Array | None, rounds: int) -> tuple[float, Array, _Law]:
+        if start is None:
+            with np.errstate(all="ignore"):
+                off = _simulated(runs, law, starts) - runs.position
+                square = np.nan_to_num(np.mean(off**2, axis=(1, 2)), nan=np.inf)
+            start = starts[square.argmin()]
+        theta, rms = _fit(runs, law, start, fixed, rounds)
+        tried.append((rms, theta, law))
+        return tried[-1]
+
+    for soft in (False, True):
+        if soft and (friction is None or min(tried, key=lambda one: one[0])[0] < 1e-5 * motion):
+            break
+        screen(_Law(DriveLaw(), soft=soft), friction, 10)
+        for beside in (False, True):
+            screen(_Law(DriveLaw(kind="implicit_damping"), beside, soft), friction, 10)
+            near: tuple[float, Array, _Law] | None = None
+            worse = 0
+            for n in _ITERATIONS:
+                law = _Law(DriveLaw(kind="implicit", iterations=n), beside, soft)
+                before = near
+                near = screen(law, near[1] if near else friction, 5 if near else 10)
+                # What is left has one minimum over the iterations.
+                worse = worse + 1 if before and near[0] > before[0] else 0
+                if worse == 2:
+                    break
+        # Whether friction is soft shows where there is some.
+        _, theta, _ = min(tried, key=lambda one: one[0])
+        friction = theta if theta[4] > 0.002 * float(runs.stiffness.max()) * AMPLITUDE else None
+    tried.sort(key=lambda one: one[0])
+    final = []
+    for _, begin, law in tried[:3]:
+        free, rms = _fit(runs, law, begin, fixed, _ROUNDS)
+        scaled = []
+        for scale in _SCALES:
+            start = free.copy()
+            start[:2] = scale
+            ratio = scale / free[0] if free[0] else 1.0
+            start[2] = (runs.inertia + free[2]) * ratio - runs.inertia
+            start[3:5] *= ratio
+            scaled.append(_fit(runs, law, start, fixed | {"stiffness", "damping"}, _ROUNDS))
+        least = min(rms for _, rms in scaled)
+        # Gains, inertia and gravity of any common scale move alike: the plainest is taken.
+        alike = [one for one in scaled if one[1] <= 3.0 * least + 1e-9 * motion]
+        usual, least = min(alike, key=lambda one: float(np.abs(one[0][-2:] - 1.0).sum()))
+        # A factor without a usual cause must explain more.
+        final.append((rms, free, law) if rms < least / 3.0 else (least, usual, law))
+        if rms < 1e-6 * motion:
+            break
+    rms, theta, law = min(final, key=lambda one: one[0])
+    return theta, rms / motion, law
+
+
+def _wrong(found: Probe, simulator: Simulator, runs: _Runs) -> Iterator[tuple[str, str]]:
+    """Settings that act otherwise than they are set; see `Probe.wrong`."""
+    info = simulator.info
+    stated = DriveLaw(kind=info.law, iterations=info.iterations)  # type: ignore[arg-type]
+    if found.beside_explicit:
+        yield (
+            "beside",
+            f"a drive of law {found.law.label} acts beside the explicit torque; set the gains of "
+            "the engine's own drive to 0",
+        )
+    elif found.law != stated:
+        yield "law", f"law {stated.label} is stated, the joint responds by {found.law.label}"
+    factors = {name: getattr(found, f"{name}_factor") for name in ("stiffness", "damping")}
+    causes = {
+        2.0: ("twice", "torques act twice: the effort is submitted two times"),
+        180.0 / math.pi: ("degrees", "gains per degree act as if they were per radian"),
+        math.pi / 180.0: ("degrees", "gains per radian act as if they were per degree"),
+    }
+    for scale, (word, sentence) in causes.items():
+        if all(abs(factor / scale - 1.0) < 0.05 for factor in factors.values()):
+            yield word, f"{sentence}, {scale:.3g} times the gains that are set"
+            break
+    else:
+        for name, factor in factors.items():
+            if abs(factor - 1.0) > 0.05:
+                yield name, f"the {name} that acts is {factor:.3g} times the one that is set"
+    if found.armature_applied is not None and found.armature_applied < 0.5:
+        yield "ignored", "a change of the armature changes nothing: the engine ignores it"
+    elif abs(found.armature - found.armature_set) > 0.03 * (runs.inertia + found.armature_set):
+        yield (
+            "armature",
+            f"an armature of {found.armature:.4g} kg m^2 acts, {found.armature_set:.4g} is set",
+        )
+    if abs(found.gravity - 1.0) > 0.1 and math.hypot(*runs.gravity) > 0.005 * runs.stiffness.max():
+        yield "gravity", f"{max(found.gravity, 0.0):.2f} of the gravity acts that the model has"
+    if found.hold > 1:
+        yield "hold", f"the simulator holds each command for {found.hold} steps"
+    if found.delay_s < -0.5 * runs.timestep:
+        yield "early", "positions are those at the end of each step, one step early"
+    if found.stable_share < 1.0:
+        yield (
+            "unstable",
+            f"the joint diverges with its gains; it was probed with {found.stable_share:g} of them",
+        )
+    if found.left > _LEFT:
+        yield (
+            "left",
+            f"{100.0 * found.left:.1f} % of the motion is left: the joint follows none of the "
+            "laws, or others move with it",
+        )
