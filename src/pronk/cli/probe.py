@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -14,6 +15,7 @@ def probe(
     simulator: tyro.conf.Positional[str],
     robot: str,
     joint: str | None = None,
+    simulator_python: Path | None = None,
 ) -> console.Outcome:
     """Excite one joint of a simulator; name its drive law and what acts otherwise than it is set.
 
@@ -21,6 +23,7 @@ def probe(
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         joint: The joint; the first one that moves no other if left out.
+        simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
     """
     from pronk.evaluation.tables import table
     from pronk.robots import load_robot
@@ -28,7 +31,7 @@ def probe(
     from pronk.simulators.simulator import load_simulator
 
     known = load_robot(robot)
-    made = load_simulator(simulator, known, threads=1)
+    made = load_simulator(simulator, known, threads=1, python=simulator_python)
     found = look(made, known, joint)
     info, one = made.info, known.joint(found.joint)
     names = {"explicit": "E", "implicit_damping": "IF"}

@@ -73,6 +73,7 @@ class Probe:
     """[N m s/rad]."""
     frictionloss: float
     """Dry friction [N m]."""
+    frictionloss_set: float
     soft_friction: bool
     """True if it is MuJoCo's soft constraint, in which a joint that is held creeps."""
     gravity: float
@@ -86,8 +87,8 @@ class Probe:
     """RMS of the motion that the answer leaves, as a share of the motion."""
     wrong: Mapping[str, str] = field(default_factory=dict)
     """What acts otherwise than it is set: a word, and a sentence. The words are law, beside, twice,
-    degrees, stiffness, damping, armature, ignored, gravity,
-    hold, early, unstable and left."""
+    degrees, stiffness, damping, armature, ignored, friction,
+    gravity, hold, early, unstable and left."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +173,7 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
         armature_applied=fitted["applied"] if "armature" in simulator.parameters else None,
         viscous_damping=fitted["viscous"],
         frictionloss=fitted["friction"],
+        frictionloss_set=one.drive.frictionloss,
         soft_friction=law.soft,
         gravity=fitted["gravity"],
         delay_s=fitted["delay"] * runs.timestep,
@@ -486,6 +488,16 @@ def _wrong(found: Probe, simulator: Simulator, runs: _Runs) -> Iterator[tuple[st
             "armature",
             f"an armature of {found.armature:.4g} kg m^2 acts, {found.armature_set:.4g} is set",
         )
+    if "frictionloss" in simulator.parameters:
+        apart = abs(found.frictionloss - found.frictionloss_set)
+        if apart > max(
+            0.1 * found.frictionloss_set, 0.005 * float(runs.stiffness.max()) * AMPLITUDE
+        ):
+            yield (
+                "friction",
+                f"dry friction of {found.frictionloss:.3g} N m acts, "
+                f"{found.frictionloss_set:.3g} is set",
+            )
     if abs(found.gravity - 1.0) > 0.1 and math.hypot(*runs.gravity) > 0.005 * runs.stiffness.max():
         yield "gravity", f"{max(found.gravity, 0.0):.2f} of the gravity acts that the model has"
     if found.hold > 1:
