@@ -1,10 +1,13 @@
 """Drive laws beside the real engines: SAPIEN (PhysX), Drake, PyBullet, where installed; MuJoCo.
 
-Runs of MJX and Newton are recorded in docs/simulators.md.
+With ENGINE_PYTHON=PATH the engines run in that Python, as with `--simulator-python`, MJX and Newton
+too (docs/simulators.md has the results).
 """
 
 from __future__ import annotations
 
+import inspect
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +22,12 @@ from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.drake import Drake
 from pronk.simulators.engines.engine import EngineSimulator
-from pronk.simulators.engines.mujoco import Mujoco
+from pronk.simulators.engines.mujoco import Mjx, Mujoco
+from pronk.simulators.engines.newton import Newton
 from pronk.simulators.engines.pybullet import PyBullet
 from pronk.simulators.engines.sapien import Sapien
 from pronk.simulators.mujoco import Chain
+from pronk.simulators.simulator import Closing, load_simulator
 
 Array = NDArray[np.float64]
 PENDULUM = Path(__file__).parents[2] / "examples" / "pendulum"
@@ -35,6 +40,11 @@ CASES: list[tuple[type[EngineSimulator], DriveLaw]] = [
     (PyBullet, DriveLaw()),
     (Mujoco, DriveLaw()),
     (Mujoco, DriveLaw(kind="implicit_damping")),
+    (Mjx, DriveLaw()),
+    (Mjx, DriveLaw(kind="implicit_damping")),
+    (Newton, DriveLaw()),
+    (Newton, DriveLaw(kind="implicit_damping")),
+    (Newton, DriveLaw(kind="implicit")),
 ]
 engines = pytest.mark.parametrize(
     ("engine", "law"), CASES, ids=[f"{engine.__name__}-{law.label}" for engine, law in CASES]
@@ -63,14 +73,24 @@ def both(
     engine: type[EngineSimulator], robot: RobotSpec, joint: str, wave: Array
 ) -> tuple[Array, Array, Array, Sequence[str]]:
     """Command, positions by the law and by the engine, shape (T, n), and the n joints."""
-    pytest.importorskip(engine.module, reason=f"{engine.package} is not installed")
+    if other := os.environ.get("ENGINE_PYTHON"):
+        choice = f"{inspect.getfile(engine)}:{engine.__name__}"
+        try:
+            simulator = load_simulator(choice, robot, python=Path(other))
+        except PronkError as error:
+            pytest.skip(str(error))
+    else:
+        pytest.importorskip(engine.module, reason=f"{engine.package} is not installed")
+        simulator = engine(robot)
     command = np.tile([one.default_position for one in robot.joints], (len(wave), 1))
     command[:, robot.joint_names.index(joint)] += wave
     with Chain(robot, joint, threads=1) as chain:
         columns = [robot.joint_names.index(name) for name in chain.joints]
         expected = chain.rollout(command[None][..., columns], [{}])[0, :-1]
     locked = [name for name in robot.joint_names if name != joint]
-    got = engine(robot, law=robot.law).rollout(command[None], {}, locked=locked)[0]
+    got = simulator.rollout(command[None], {}, locked=locked)[0]
+    if isinstance(simulator, Closing):
+        simulator.close()
     return command[:, columns], expected, got[:, columns], chain.joints
 
 
@@ -112,11 +132,13 @@ def test_a_leg_with_held_joints(name: str, engine: type[EngineSimulator], law: D
             prepared(name, law, **LINEAR, rotor_inertia=0.0, viscous_damping=0.0),
             **{"timestep_s": 0.001, "decimation": 20},
         )
+    elif engine is Newton and law.kind != "implicit_damping":
+        robot = prepared(name, law, **LINEAR, viscous_damping=0.0)
     step = robot.timestep_s
     command, expected, got, joints = both(engine, robot, "FR_hip_pitch", chirp(step))
     assert len(joints) == 3
-    # Drake solves all joints of a chain at once, as the law does; PhysX joint by joint.
-    exact = law.kind != "implicit" or engine is Drake
+    # PhysX solves joint by joint, the others all joints of a chain at once, as the law does.
+    exact = law.kind != "implicit" or engine is not Sapien
     for k, joint in enumerate(joints):
         u = command[:, joints.index("FR_hip_pitch")]
         ours, law_db = level(u, got[:, k], step), level(u, expected[:, k], step)

@@ -67,12 +67,12 @@ class EngineSimulator(ABC):
     parameters = frozenset({"stiffness", "damping", "armature", "delay"})
 
     def __init__(self, robot: RobotSpec, *, law: DriveLaw | None = None) -> None:
-        """Import the engine; without a law the drives are explicit.
+        """Import the engine; without a law the drives have that of the robot.
 
         Raises:
             PronkError: It is not installed, or has no such law.
         """
-        self.robot, self.law, self.joints = robot, law or DriveLaw(), robot.joint_names
+        self.robot, self.law, self.joints = robot, law or robot.law, robot.joint_names
         if self.law.kind not in self.laws:
             raise PronkError(
                 f"{self.package} has no drives of law {self.law.kind}; expected one of "

@@ -1,7 +1,7 @@
 """Newton: joint drives in the solvers MuJoCo (law IF), Featherstone (E) and Steel (I1).
 
 Newton needs MuJoCo 3.17, pronk 3.11, so it runs in another Python (`--simulator-python`), on the
-processor in single precision.
+processor in single precision. Featherstone and Steel take passive damping explicitly.
 """
 
 from __future__ import annotations
