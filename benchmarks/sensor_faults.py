@@ -50,7 +50,8 @@ WALK_S = 1.0
 """Before a fault begins [s]."""
 TRIES = 4
 """For each run."""
-RISE_S = Timing().fold_s + Timing().rise_s + 0.2
+TIMING = Timing(damp_s=0.3, fold_s=0.5, check_s=0.0, rise_s=0.8)
+RISE_S = TIMING.fold_s + TIMING.rise_s + 0.2
 """In which the robot stands up [s]."""
 
 
@@ -181,6 +182,7 @@ def measure(
                 link=Link(robot=ROBOT, address=address),
                 policy=policy,
                 limits=limits or {},
+                timing=TIMING,
                 ignore_latency=True,
             )
             rows = strike(plan, robot, left)

@@ -16,7 +16,9 @@ from pronk.runtime.run import Deployment
 from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import OperatorCommand
 
-QUICK = Timing(damp_s=0.05, fold_s=0.3, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3)
+QUICK = Timing(
+    damp_s=0.05, fold_s=0.3, check_s=0.0, rise_s=0.3, ramp_s=0.1, blend_s=0.1, halt_s=0.1, sit_s=0.3
+)
 PATIENT = {"held_s": 100.0, "damp_s": 2.0, "latch_s": 4.0, "expiry_s": 2.0, "lag": 2000.0}
 """A busy computer must not look like a fault."""
 DAMPED_S = 0.060

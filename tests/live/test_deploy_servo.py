@@ -26,7 +26,7 @@ from pronk.runtime.servo import Servo
 from pronk.runtime.state_machine import Timing
 from virtual_robot import POSE
 
-QUICK = Timing(damp_s=0.05, fold_s=0.1, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
+QUICK = Timing(damp_s=0.05, fold_s=0.1, check_s=0.0, rise_s=0.1, ramp_s=0.1, sit_s=0.1)
 NOWHERE = Path("policy.onnx")
 """The servo knows nothing of the policy but its actions."""
 

@@ -242,6 +242,7 @@ def test_a_killed_servo_is_reported_and_the_log_ends(
     with Listener(port) as listener, pytest.raises(HardwareError, match="was killed"):
         swept(plan_of("FR_hip_roll"), tmp_path, port, progress=early(kill))
     log = cut(tmp_path, "was killed")
+    assert listener.damped  # by the standby
     # To the last of what it did.
     assert listener.commanded - log.time[-1] < 0.1
     assert "FR_hip_roll.mcap" in capsys.readouterr().err

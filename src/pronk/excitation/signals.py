@@ -12,7 +12,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import chirp
 
 from pronk.errors import PlanError
 
@@ -139,15 +138,14 @@ class Chirp(Signal):
 
     def _samples(self, rate_hz: float) -> Array:
         time = self._time(rate_hz)
-        wave = chirp(
-            time,
-            f0=self.start_hz,
-            t1=self.length_s,
-            f1=self.stop_hz,
-            method="linear" if self.kind == "chirp" else "logarithmic",
-            phi=-90.0,  # a sine: it begins at zero
-        )
+        # Integral of the frequency. A sine: it begins at zero.
+        cycles = self._cycles(time / self.length_s) * self.length_s
+        wave = np.sin(2.0 * np.pi * cycles)
         return np.asarray(self.amplitude * wave * ramps(len(time), round(self.ramp_s * rate_hz)))
+
+    def _cycles(self, share: Array) -> Array:
+        """Integral of the frequency over the share of the length [Hz]."""
+        return share * (self.start_hz + 0.5 * (self.stop_hz - self.start_hz) * share)
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
         """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""
@@ -160,6 +158,10 @@ class LogChirp(Chirp):
     """Logarithmic chirp: the same time in every octave, so far more of it at low frequency."""
 
     kind = "log_chirp"
+
+    def _cycles(self, share: Array) -> Array:
+        ratio = np.log(self.stop_hz / self.start_hz)
+        return np.asarray(self.start_hz * np.expm1(ratio * share) / ratio)
 
     def frequency(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
         """Instantaneous frequency at the ticks [Hz], shape (ticks,)."""

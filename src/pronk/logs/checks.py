@@ -8,7 +8,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
@@ -214,6 +213,8 @@ def correlation_note(time: Array, command: Array, joints: Sequence[str]) -> str:
     Commands are held from each timestamp [s] to the next, shape (n, joints); one that never changes
     correlates with nothing.
     """
+    from scipy.signal import correlate  # slow to import
+
     # The command is held, so reading it on a uniform grid moves no edge by more than a sample.
     rate_hz = (len(time) - 1) / float(time[-1] - time[0])
     grid = time[0] + np.arange(len(time)) / rate_hz

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from pronk.logs.joint_log import JointLog, Segment
 
@@ -163,6 +162,8 @@ def _apart(log: JointLog, mine: Sequence[_Motion], motions: Sequence[_Motion]) -
 
 def _alike(log: JointLog, one: _Motion, other: _Motion) -> bool:
     """True if two motions follow one signal, repeated or scaled by a positive factor."""
+    from scipy.signal import correlate  # slow to import
+
     pair = []
     for motion in (one, other):
         time = log.time[motion.first : motion.last + 1]
