@@ -46,6 +46,7 @@ class Faulty:
         assert isinstance(inner, Paced)
         self.inner, self.link = inner, link
         self.robot, self.virtual, self.torque_kind = inner.robot, True, inner.torque_kind
+        self.state_rate_hz = inner.state_rate_hz
         self._rng = np.random.default_rng(0)
         self._last: State | None = None
 

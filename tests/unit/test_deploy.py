@@ -57,6 +57,9 @@ from pronk.runtime.state_machine import (
     stand_up,
 )
 from pronk.runtime.teleop import Gamepad, Keyboard, OperatorCommand, ScriptedOperator, TimeLimit
+from pronk.virtual.faults import spoiled
+from pronk.virtual.robot import VirtualRobot
+from pronk.virtual.sim_params import load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
 LIMITS = Limits.of(ROBOT)
@@ -253,8 +256,8 @@ def test_an_arm_has_no_folded_pose_and_a_time_is_not_negative() -> None:
 class Run:
     """A state machine on a clock of its own."""
 
-    def __init__(self, **times: float) -> None:
-        self.machine = StateMachine(ROBOT, Timing(**times))
+    def __init__(self, *, check_s: float = 0.0, **times: float) -> None:
+        self.machine = StateMachine(ROBOT, Timing(check_s=check_s, **times))
         self.safety = SafetyFilter(limits=LIMITS)
         self.t = 0.0
         self.action: Any = None
@@ -292,6 +295,26 @@ class Run:
         self.tick(2.5)
         assert self.mode is Mode.STAND
         return self
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_swapped_legs_are_found_before_the_robot_rises(swapped: bool) -> None:
+    robot = VirtualRobot(ROBOT, load_sim_params(), base="ground", capture_rate_hz=None)
+    robot.connect()
+    run = Run(check_s=0.15, damp_s=0.5, fold_s=0.5)
+    run.machine.preflighted((), 0.0)
+    run.machine.request(OperatorRequest.STAND)
+    while run.t < 2.5 and run.mode is not Mode.FAULT:
+        state = robot.wait(run.t + 0.002)[-1]
+        seen = spoiled("legs-swapped", state, state) if swapped else state
+        command = run.tick(0.002, q=seen.position).command
+        if command is None:
+            robot.damp()
+        else:
+            robot.send(command)
+    assert run.safety.reason is (Reason.SWAPPED if swapped else Reason.NONE)
+    assert run.safety.level is (FilterAction.LATCH if swapped else FilterAction.PASS)
+    assert run.mode is (Mode.FAULT if swapped else Mode.STAND)
 
 
 def test_nothing_is_sent_before_and_without_the_checks() -> None:

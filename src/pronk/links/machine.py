@@ -106,6 +106,8 @@ class Machine(Protocol):
     virtual: bool
     torque_kind: TorqueKind
     """`State.torque` is measured, computed from the command, or absent (zeros)."""
+    state_rate_hz: float
+    """States per second."""
 
     def now(self) -> float:
         """The machine's clock [s]."""

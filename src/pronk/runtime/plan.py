@@ -65,6 +65,7 @@ class Paced:
         self.inner = inner
         self.robot = inner.robot
         self.torque_kind: TorqueKind = inner.torque_kind
+        self.state_rate_hz = inner.state_rate_hz
         self.send, self.clamp = inner.send, inner.clamp
         self.damp, self.close = inner.damp, inner.close
         self.now = time.monotonic

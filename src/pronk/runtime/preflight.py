@@ -16,10 +16,8 @@ from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import projected_gravity
 from pronk.runtime.safety import Limits, tilt
 
-RATE_HZ = 500.0
-"""States per second of a robot."""
 RATE_SHARE = 0.6
-"""Least share of those that must arrive: with a third lost, a robot still walks."""
+"""Least share of the states that must arrive: with a third lost, a robot still walks."""
 GRAVITY = 9.81
 GRAVITY_SLACK = 1.0
 """Of the median specific force of a robot at rest [m/s^2]."""
@@ -36,26 +34,36 @@ BATTERY_SHARE = 0.85
 
 
 def refusals(
-    states: Sequence[State], robot: RobotSpec, limits: Limits, *, now: float, seconds: float
+    states: Sequence[State],
+    robot: RobotSpec,
+    limits: Limits,
+    *,
+    now: float,
+    seconds: float,
+    state_rate_hz: float = 500.0,
 ) -> tuple[str, ...]:
     """Why the robot must not move; empty if it may.
 
-    `states` were received in the last `seconds` before `now`, oldest first, while nothing was sent.
+    `states` were received in the last `seconds` before `now`, oldest first, while nothing was sent;
+    the robot sends `state_rate_hz` a second.
     """
     if len(states) < 2:
         return (
             f"{len(states)} states in {seconds:.1f} s; check the link, the network interface and "
             "that the robot's program runs.",
         )
-    checks = (_stream(states, limits, now, seconds), _attitude(states, limits))
+    stream = _stream(states, limits, now, seconds, state_rate_hz)
+    checks = (stream, _attitude(states, limits))
     return tuple(chain(*checks, _joints_and_battery(states, robot, limits)))
 
 
-def _stream(states: Sequence[State], limits: Limits, now: float, seconds: float) -> Iterator[str]:
+def _stream(
+    states: Sequence[State], limits: Limits, now: float, seconds: float, expected: float
+) -> Iterator[str]:
     rate = len(states) / seconds
-    if rate < RATE_SHARE * RATE_HZ:
+    if rate < RATE_SHARE * expected:
         yield (
-            f"{rate:.0f} states per second, expected {RATE_HZ:.0f}; the link loses or delays too "
+            f"{rate:.0f} states per second, expected {expected:.0f}; the link loses or delays too "
             "many, use a cable or another interface."
         )
     age = now - states[-1].time

@@ -86,6 +86,7 @@ class Reason(IntEnum):
     ENCODER = 25, "a joint's position and velocity contradict each other or its load"
     HELD = 26, "states were too old, and the last target held, for too much of a second"
     CLIPPED = 27, "a joint's target was beyond its torque for too long; the joint may be blocked"
+    SWAPPED = 28, "another leg moved than the one that was swung; two legs' encoders are swapped"
 
 
 Array = NDArray[np.float64]
@@ -442,6 +443,8 @@ _STUCK = 0.25
 """Least path of an attitude, as a share of the integral of the gyro."""
 _ALL = 0.5
 """Share of a joint's limit that holds where all joints are constant."""
+LAG_RATE_HZ = 500.0
+"""States per second of which `Limits.lag` counts."""
 LEAST_DAMPING_S = 1.0
 """Shortest time that a fault damps [s]."""
 
@@ -464,6 +467,8 @@ class SafetyFilter:
     """Limits, and what lasts from one tick to the next. Times are on the machine's clock [s]."""
 
     limits: Limits
+    state_rate_hz: float = LAG_RATE_HZ
+    """States per second of the robot."""
     level: FilterAction = FilterAction.PASS
     """`DAMP` or `LATCH` while a fault lasts."""
     reason: Reason = Reason.NONE
@@ -483,7 +488,7 @@ class SafetyFilter:
 
     def __post_init__(self) -> None:
         """Begin without a state."""
-        self.supervision = Supervision(len(self.limits.joints))
+        self.supervision = Supervision(len(self.limits.joints), self.state_rate_hz)
 
     @property
     def faulted(self) -> bool:
@@ -580,7 +585,9 @@ class SafetyFilter:
             damping=_rows([command.damping], n),
             command_age=t - command.made,
             valid_for=float(command.valid_for),
-            lag=newest.sequence - command.state_sequence if command.state_sequence >= 0 else 0,
+            lag=(newest.sequence - command.state_sequence) * LAG_RATE_HZ / self.state_rate_hz
+            if command.state_sequence >= 0
+            else 0.0,
             last=measured["position"][-1:] if self.last is None else self.last[None],
             held=held,
         )

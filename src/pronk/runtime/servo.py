@@ -167,7 +167,9 @@ class Servo:
         sys.setswitchinterval(_SWITCH_S)
         machine.connect()
         self.machine = machine
-        self.safety.limits = self.plan.safety(machine.torque_kind)
+        self.safety = SafetyFilter(
+            limits=self.plan.safety(machine.torque_kind), state_rate_hz=machine.state_rate_hz
+        )
         self._report("robot", ipc.VIRTUAL if machine.virtual else ipc.REAL)
         # The states' clock may be another; everything here is on CLOCK_MONOTONIC.
         self._offset = time.monotonic() - machine.now()
@@ -227,7 +229,12 @@ class Servo:
         if seconds < PREFLIGHT_S:
             return
         self.refusals = refusals(
-            self._preflight_states, self.plan.robot, self.safety.limits, now=now, seconds=seconds
+            self._preflight_states,
+            self.plan.robot,
+            self.safety.limits,
+            now=now,
+            seconds=seconds,
+            state_rate_hz=self.safety.state_rate_hz,
         )
         self._preflight_states.clear()
         for sentence in self.refusals:

@@ -31,6 +31,11 @@ PREFLIGHT_S = 0.5
 """How long states are checked before anything is sent [s]."""
 VALID_S = 0.05
 """How long a target of the servo's own may be repeated [s]."""
+SWING = 0.15
+"""Of each leg's last joint towards the default pose, so that its encoder is known to be its own
+[rad]. In the folded pose on the ground it moves by 0.009 to 0.023, those of other legs by 0.002."""
+STRAY = 0.005
+"""Largest motion of another leg's last joint meanwhile, or twice its own [rad]."""
 FIRST_ACTION_S = 0.2
 """In which the policy must give its first action [s]."""
 
@@ -46,6 +51,8 @@ class Timing:
     """Least time in damping before the robot stands up; it sinks to the ground meanwhile."""
     fold_s: float = 1.0
     """From the measured pose to the folded pose."""
+    check_s: float = 0.15
+    """Of each half swing of a leg in the folded pose, before the first rise; 0 for no check."""
     rise_s: float = 1.5
     """From there to the default pose."""
     ramp_s: float = 0.5
@@ -103,6 +110,12 @@ class Path:
         return t >= self.began + sum(self.seconds)
 
 
+def last_joints(robot: RobotSpec) -> list[int]:
+    """Number of each leg's last joint."""
+    names = robot.joint_names
+    return [max(i for i, n in enumerate(names) if n.startswith(f"{leg}_")) for leg in robot.legs]
+
+
 def folded_pose(robot: RobotSpec) -> Array:
     """[rad], (joints,); RobotError if the robot file gives none."""
     pose = [joint.folded_position for joint in robot.joints]
@@ -114,13 +127,25 @@ def folded_pose(robot: RobotSpec) -> Array:
     return np.array(pose, dtype=float)
 
 
-def stand_up(robot: RobotSpec, measured: Array, began: float, timing: Timing) -> Path:
-    """From the measured pose through the folded to the default pose, with growing stiffness."""
+def stand_up(
+    robot: RobotSpec, measured: Array, began: float, timing: Timing, *, swing: bool = False
+) -> Path:
+    """From the measured pose through the folded to the default pose, with growing stiffness.
+
+    With `swing` each leg's last joint swings by `SWING` in the folded pose, one leg after another.
+    """
     default = np.array([joint.default_position for joint in robot.joints])
+    folded = folded_pose(robot)
+    poses, seconds = [measured.copy(), folded], [timing.fold_s]
+    for i in last_joints(robot) if swing else ():
+        swung = folded.copy()
+        swung[i] += math.copysign(SWING, default[i] - folded[i])
+        poses += [swung, folded]
+        seconds += [timing.check_s, timing.check_s]
     return Path(
         began=began,
-        poses=(measured.copy(), folded_pose(robot), default),
-        seconds=(timing.fold_s, timing.rise_s),
+        poses=(*poses, default),
+        seconds=(*seconds, timing.rise_s),
         ramp_s=timing.ramp_s,
     )
 
@@ -160,6 +185,11 @@ class StateMachine:
         self._kp = np.array([joint.stiffness for joint in robot.joints])
         self._kd = np.array([joint.damping for joint in robot.joints])
         self._path: Path | None = None
+        self._last = last_joints(robot)
+        self._known = timing.check_s == 0.0 or not self._last
+        """Whether the encoders of the legs are known to be their own."""
+        self._swings = np.full((2, len(self._last), len(self._last)), np.nan)
+        """Least and largest position of each last joint during each leg's swing [rad]."""
         self._blending: float | None = None
         self._first_entry = 0
         self._request = OperatorRequest.NONE
@@ -222,6 +252,9 @@ class StateMachine:
         if self._path is not None and self.mode in (Mode.POLICY, Mode.HALT):
             return self._follow(t, self._path.target(t), action, safety)
         if self._path is not None and self.mode in (Mode.STAND, Mode.SIT):
+            if self.mode is Mode.STAND and not self._known and self._swapped(t, position):
+                safety.fault(FilterAction.LATCH, Reason.SWAPPED, t)
+                return DesiredCommand()
             if self.mode is Mode.STAND or not self._path.done(t):
                 return self._pose(t, self._path.target(t), self._path.stiffness(t))
             self.enter(Mode.DAMP, t)
@@ -249,7 +282,8 @@ class StateMachine:
                 self._request = OperatorRequest.NONE
         elif request is stand and mode is Mode.DAMP:
             if t - self.since >= self.timing.damp_s:
-                self._path = stand_up(self.robot, position, t, self.timing)
+                self._path = stand_up(self.robot, position, t, self.timing, swing=not self._known)
+                self._swings[:] = np.nan
                 self._request = OperatorRequest.NONE
                 self.enter(Mode.STAND, t)
         elif request is OperatorRequest.WALK and mode is Mode.STAND and risen:
@@ -264,6 +298,25 @@ class StateMachine:
     def _sit(self, t: float, position: Array) -> None:
         self._path = sit_down(self.robot, position, t, self.timing)
         self.enter(Mode.SIT, t)
+
+    def _swapped(self, t: float, position: Array) -> bool:
+        """Note the position while legs swing; whether another leg than the commanded one moved."""
+        assert self._path is not None
+        leg = math.floor((t - self._path.began - self.timing.fold_s) / (2.0 * self.timing.check_s))
+        if leg < 0:
+            return False
+        if leg < len(self._last):
+            seen = self._swings[:, leg]
+            seen[0], seen[1] = (
+                np.fmin(seen[0], position[self._last]),
+                np.fmax(seen[1], position[self._last]),
+            )
+            return False
+        moved = self._swings[1] - self._swings[0]
+        own = np.diag(moved)[:, None]
+        wrong = (moved > np.maximum(STRAY, 2.0 * own))[~np.eye(len(own), dtype=bool)].any()
+        self._known = not wrong
+        return bool(wrong)
 
     def _pose(self, t: float, target: Array, share: float) -> DesiredCommand:
         command = Command(

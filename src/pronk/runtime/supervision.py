@@ -5,11 +5,11 @@
 Each source is judged by itself, because the noise of one hides that another has stopped:
 
 - The inertial unit's attitude, gyro and accelerometer never repeat to the last bit for long.
-- Attitude against gyro: over 30 states, the rotation of the attitude less the integral of the rate.
+- Attitude against gyro: over 60 ms, the rotation of the attitude less the integral of the rate.
   An attitude that is stuck moves far less in all than the rate says, even if it is not constant.
 - Attitude against accelerometer: the specific force in the world's frame, averaged over a second,
   points up. Legs accelerate the trunk, but never for as long.
-- Position against velocity of a joint: over 30 states, the change of the one less the integral of
+- Position against velocity of a joint: over 60 ms, the change of the one less the integral of
   the other. A step is found in the state in which it occurs.
 - A position that does not change in one bit has no velocity, and the reverse; least of all where
   no joint's does.
@@ -35,10 +35,8 @@ from pronk.links.machine import State
 
 Array = NDArray[np.float64]
 
-STATES = 30
-"""Over which attitude and position are compared with their rates: 60 ms at 500 Hz."""
-PERIOD_S = 0.002
-"""Between two states [s]."""
+WINDOW_S = 0.06
+"""Over which attitude and position are compared with their rates [s]."""
 AVERAGE_S = 1.0
 """Time constant of the mean specific force [s]."""
 _LONGEST_S = 0.05
@@ -50,8 +48,10 @@ _IMU = ("orientation", "gyro", "accelerometer")
 class Supervision:
     """What the states so far say about each other."""
 
-    def __init__(self, joints: int) -> None:
-        """Begin without a state; `joints` of the robot."""
+    def __init__(self, joints: int, state_rate_hz: float = 500.0) -> None:
+        """Begin without a state; `joints` of the robot, and its states per second."""
+        self._period = 1.0 / state_rate_hz
+        self._states = max(2, round(WINDOW_S * state_rate_hz))
         self.repeated = dict.fromkeys(_IMU, 0.0)
         """Time for which each source of the inertial unit has not changed in one bit [s]."""
         self.attitude = 0.0
@@ -100,7 +100,7 @@ class Supervision:
         if before is None or not 0.0 < seconds <= _LONGEST_S:
             self._restart(state)
             return
-        self._late += seconds - PERIOD_S * (state.sequence - before.sequence)
+        self._late += seconds - self._period * (state.sequence - before.sequence)
         self._lates.append(self._late)
         self._spread = max(self._lates) - min(self._lates)
         self._observe_trunk(before, state, seconds)
@@ -109,11 +109,13 @@ class Supervision:
     def _restart(self, state: State) -> None:
         n = self._joints
         self._late = self._spread = 0.0
-        self._lates: deque[float] = deque([0.0], maxlen=STATES + 1)
-        self._rates: deque[float] = deque(maxlen=STATES)
-        self._gone: deque[tuple[float, float]] = deque([(0.0, 0.0)], maxlen=STATES + 1)
-        self._turns: deque[tuple[float, float, float]] = deque([(0.0, 0.0, 0.0)], maxlen=STATES)
-        self._drifts, self._speeds = np.zeros((2, STATES, n))
+        self._lates: deque[float] = deque([0.0], maxlen=self._states + 1)
+        self._rates: deque[float] = deque(maxlen=self._states)
+        self._gone: deque[tuple[float, float]] = deque([(0.0,) * 2], maxlen=self._states + 1)
+        self._turns: deque[tuple[float, float, float]] = deque(
+            [(0.0, 0.0, 0.0)], maxlen=self._states
+        )
+        self._drifts, self._speeds = np.zeros((2, self._states, n))
         self._row = 0
         self.repeated = dict.fromkeys(_IMU, 0.0)
         self.attitude, self.paths, self.force = 0.0, (0.0, 0.0), (0.0, 0.0, _GRAVITY)
@@ -149,10 +151,10 @@ class Supervision:
         path = (0.5 * seconds) * (before.velocity + v)
         self._travel = self._travel + path
         last = self._drifts[self._row]
-        self._row = (self._row + 1) % STATES
+        self._row = (self._row + 1) % self._states
         oldest = self._drifts[self._row].copy()
         step = q - before.position - path
-        if seconds > 1.5 * PERIOD_S:
+        if seconds > 1.5 * self._period:
             slack = (0.5 * seconds) * np.abs(v - before.velocity)
             step = step - np.clip(step, -slack, slack)
         self._drifts[self._row] = drift = last + step

@@ -458,7 +458,9 @@ def record(
     machine.connect()
     try:
         states = [machine.latest()]
-        safety = SafetyFilter(limits=task.limits(machine.torque_kind))
+        safety = SafetyFilter(
+            limits=task.limits(machine.torque_kind), state_rate_hz=machine.state_rate_hz
+        )
         controller = SweepController(
             task,
             machine,

@@ -109,7 +109,7 @@ class VirtualRobot:
         self._sim_params, self._seed = sim_params, seed
         self._ground = (ground or sim_params.ground) if base == "ground" else None
         self._start = start or Start()
-        self._rate, self._dt = log_rate_hz, timestep_s
+        self.state_rate_hz, self._dt = log_rate_hz, timestep_s
         self.capture_rate_hz = capture_rate_hz
         """Has an effect until connected."""
         self._plant = Plant(robot, sim_params, legs or known, timestep_s, self._ground)
@@ -123,7 +123,9 @@ class VirtualRobot:
         settle = _SETTLE_S
         if self._ground is not None:
             pose, settle = pose + self._start.offset(len(pose)), self._start.settle_s
-        self._sensors = Sensors(robot, self._sim_params, plant, rate_hz=self._rate, seed=self._seed)
+        self._sensors = Sensors(
+            robot, self._sim_params, plant, rate_hz=self.state_rate_hz, seed=self._seed
+        )
         self._transport = Transport(len(pose), machine.command_delay_s, self._dt)
         # Steps are counted from the clock's zero; settling happens before it.
         first_step = -round(settle / self._dt)
@@ -158,7 +160,7 @@ class VirtualRobot:
             return []
         self._now = until
         # States with nominal times up to `until`; the slack forgives binary fractions.
-        count = math.floor(until * self._rate + 1e-6) + 1 - self._sensors.sequence
+        count = math.floor(until * self.state_rate_hz + 1e-6) + 1 - self._sensors.sequence
         states = self._run(count) if count > 0 else []
         if states:
             self._latest = states[-1]
@@ -220,7 +222,7 @@ class VirtualRobot:
     def _run(self, count: int) -> list[State]:
         """Advance over the next `count` ticks and return their states."""
         first = self._sensors.sequence
-        ticks = np.arange(first, first + count) / self._rate
+        ticks = np.arange(first, first + count) / self.state_rate_hz
         # A state was measured some time before its timestamp.
         delay = self._sim_params.machine.measurement_delay_s
         steps = np.rint((ticks - delay) / self._dt).astype(int)
