@@ -12,7 +12,6 @@ SUMMARIES = {
     "known": "pronk, mujoco.sysid and CMA-ES on logs with known gains.",
     "grid": "The paper's grid beside a bare mujoco.rollout loop.",
     "engine": "The same drive at 0.25 ms and at 5 ms.",
-    "frameworks": "Gains of each framework in its real engine.",
     "coverage": "How often the 95 % intervals hold.",
     "wrong-inputs": "How often wrong inputs are named, and right ones flagged.",
     "latency": "Lateness of the control loop, and policy latency.",
