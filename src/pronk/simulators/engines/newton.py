@@ -20,7 +20,10 @@ from pronk.simulators.engines.links import Links
 Array = NDArray[np.float64]
 _SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {
     "explicit": ("SolverFeatherstone", {"angular_damping": 0.0}),
-    "implicit_damping": ("SolverMuJoCo", {"integrator": "implicitfast", "use_mujoco_cpu": True, "disable_contacts": True}),
+    "implicit_damping": (
+        "SolverMuJoCo",
+        {"integrator": "implicitfast", "use_mujoco_cpu": True, "disable_contacts": True},
+    ),
     "implicit": ("SolverSteel", {}),
 }
 """Solver of each law, and its options."""
