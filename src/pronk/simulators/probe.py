@@ -46,6 +46,9 @@ _ROUNDS = 25
 _IMPEDANCE, _RATE = 0.9, 2.0 / (0.95 * 0.02)
 """Of MuJoCo's dry friction: solimp 0.9 to 0.95, and the rate [1/s] of solref's 0.02 s (MuJoCo,
 Computation, Solver parameters)."""
+_FAR = 30.0
+"""A law that leaves so many times what another leaves is not followed further: iterations change
+what is left by less."""
 _LEFT = 0.01
 """Share of the motion that a right answer leaves at most."""
 _NAMES = ("stiffness", "damping", "armature", "viscous", "friction", "delay", "applied", "gravity")
@@ -426,7 +429,8 @@ def _best(runs: _Runs, whole: int, settable: bool) -> tuple[Array, float, _Law]:
                 near = screen(law, near[1] if near else friction, 5 if near else 10)
                 # What is left has one minimum over the iterations.
                 worse = worse + 1 if before and near[0] > before[0] else 0
-                if worse == 2:
+                least = min(one[0] for one in tried)
+                if worse == 2 or (n >= 4 and near[0] > _FAR * least):
                     break
         # Whether friction is soft shows where there is some.
         _, theta, _ = min(tried, key=lambda one: one[0])
@@ -449,7 +453,7 @@ def _best(runs: _Runs, whole: int, settable: bool) -> tuple[Array, float, _Law]:
         usual, least = min(alike, key=lambda one: float(np.abs(one[0][-2:] - 1.0).sum()))
         # A factor without a usual cause must explain more.
         final.append((rms, free, law) if rms < least / 3.0 else (least, usual, law))
-        if rms < 1e-6 * motion:
+        if rms < 1e-6 * motion or tried[len(final)][0] > _FAR * final[0][0]:
             break
     rms, theta, law = min(final, key=lambda one: one[0])
     return theta, rms / motion, law
