@@ -208,13 +208,21 @@ def test_a_second_robot_on_the_port_is_refused(servers: dict[str, Process]) -> N
     other.start()
     machine = LcmMachine(ROBOT, port=process.port, fresh=Freshness(share=0.02, longest_gap_s=10.0))
     try:
-        with pytest.raises(HardwareError, match="600 states a second"):
+        with pytest.raises(HardwareError, match="2 robots"):
             machine.connect()
     finally:
         done.set()
         other.join()
     assert machine.counts["commands"] == 0
+    # One that begins later stops the commands with its first state.
     machine.connect()
+    machine.send(HOLD)
+    wire.publish(next(states))
+    until = time.monotonic() + LIMIT_S
+    while machine.sources == 1 and time.monotonic() < until:
+        time.sleep(0.002)
+    with pytest.raises(HardwareError, match="2 robots"):
+        machine.send(HOLD)
     machine.close()
 
 

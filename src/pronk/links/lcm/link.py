@@ -6,12 +6,14 @@ it from other users of LCM here. LCM itself cannot choose an interface: the syst
 the route is looked up and must lead out of the interface that was named.
 
 One handle receives, in a thread of its own, because polling one message per tick from LCM's queue
-yields data hundreds of milliseconds old; the other publishes.
+yields data hundreds of milliseconds old; the other publishes. LCM does not tell who sent a message;
+a socket beside it, in the same multicast group, does.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import socket
 import threading
 import time
 from collections import deque
@@ -97,6 +99,43 @@ def open_lcm(url: str) -> Any:
         ) from None
 
 
+class Senders:
+    """Addresses that publish on each channel of a port, without their messages.
+
+    A small message of LCM is `LC02`, a number of four bytes, the channel, a zero byte, and data.
+    """
+
+    def __init__(self, port: int, channels: tuple[str, ...]) -> None:
+        """Join the multicast group."""
+        self._found = {name.encode(): set[object]() for name in channels}
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._socket.bind((GROUP, port))
+        group = socket.inet_aton(GROUP) + socket.inet_aton("0.0.0.0")
+        self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+        self._socket.setblocking(False)
+
+    @property
+    def most(self) -> int:
+        """Largest number of senders on one channel."""
+        return max(map(len, self._found.values()))
+
+    def look(self) -> None:
+        """Note the senders of what has come."""
+        while True:
+            try:
+                head, sender = self._socket.recvfrom(64)
+            except BlockingIOError:
+                return
+            channel = self._found.get(head[8:].partition(b"\0")[0])
+            if channel is not None and head.startswith(b"LC02"):
+                channel.add(sender)
+
+    def close(self) -> None:
+        """Leave the group."""
+        self._socket.close()
+
+
 class LcmMachine(NetworkLink):
     """A robot with twelve joints behind LCM. Implements `Machine`."""
 
@@ -121,6 +160,7 @@ class LcmMachine(NetworkLink):
         self._command_topic = known.command.channel
         self._interface = interface
         self._url = url_of(port=port, interface=interface)
+        self._port = int(self._url.partition("?")[0].rpartition(":")[2])
         self._address = f"{known.joints.channel} and {known.attitude.channel} at {self._url}"
 
     def open_damper(self) -> Callable[[], None]:
@@ -139,6 +179,7 @@ class LcmMachine(NetworkLink):
         self._own: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._publishing, self._remembering = threading.Lock(), threading.Lock()
         self._in, self._out = open_lcm(self._url), open_lcm(self._url)
+        self._senders = Senders(self._port, (layout.joints.channel, layout.attitude.channel))
         for channel, handler in (
             (layout.attitude.channel, lambda data: decoder.attitude(data, time.monotonic())),
             (layout.joints.channel, lambda data: decoder.joints(data, time.monotonic())),
@@ -153,10 +194,17 @@ class LcmMachine(NetworkLink):
         return partial(encode_command, layout), self._command
 
     def _shut(self) -> None:
+        self._senders.close()
         del self._in, self._out
 
     def _receive(self) -> None:
         self._in.handle_timeout(50)
+        self._senders.look()
+
+    @property
+    def sources(self) -> int:
+        """Senders of states since the link was opened."""
+        return self._senders.most
 
     def _publish(self, channel: str, data: bytes) -> None:
         # The handle belongs to one thread at a time.
