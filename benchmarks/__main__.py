@@ -18,6 +18,7 @@ SUMMARIES = {
     "supervision": "False alarms and detection times of the sensors' supervision.",
     "sensor-faults": "From a sensor's fault to damping, over LCM and DDS in real time.",
     "probe": "Laws, parameters and faults of simulators drawn at random, named blind.",
+    "frameworks": "Gains matched for frameworks, in the engines themselves, beside the logs.",
     "transfer": "A policy in training simulators of other drive laws.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",

@@ -80,7 +80,13 @@ def test_profiles_are_named_with_other_steps_and_iterations() -> None:
     assert (found.timestep_s, found.iterations, found.name) == (0.0025, 8, "isaaclab-implicit")
     assert found.robot(ROBOT).decimation == 8
     assert profile_of(found.info) == found
-    for text in ("isaac", "drake,step=1", "drake,timestep_s=x", "drake,timestep_s=-1"):
+    for text in (
+        "isaac",
+        "drake,step=1",
+        "drake,timestep_s=x",
+        "drake,timestep_s=-1",
+        "genesis,friction=low",
+    ):
         with pytest.raises(PronkError, match="expected"):
             profile(text)
     with pytest.raises(PronkError, match="iterations"):

@@ -58,7 +58,7 @@ def match(
         simulator: mujoco, FILE.py:NAME, or the name of an installed simulator.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         frameworks: Match for this framework too, into a folder of its name beside the gains file;
-            repeat it. A name that `pronk profiles` lists, or NAME,timestep_s=S,iterations=N.
+            repeat it. A name of `pronk profiles`, or NAME,timestep_s=S,iterations=N,friction=none.
         device: Where the grid is simulated: cpu, or cuda (MuJoCo Warp on a GPU; needs
             pronk[train]).
         reading: How logs are read.

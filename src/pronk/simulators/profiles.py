@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import yaml
 
@@ -21,6 +21,7 @@ from pronk.files import converted
 from pronk.robots.robot import Joint, RobotSpec
 from pronk.simulators.simulator import SimulatorInfo
 
+Friction = Literal["N m", "coefficient", "none"]
 FILE = Path(__file__).with_name("profiles.yaml")
 _NO_CURVE = 1e4
 """No-load speed of a drive whose torque does not depend on its speed [rad/s]."""
@@ -42,7 +43,7 @@ class Profile:
     """Steps of a command as the framework's tasks have it; a match takes the robot's."""
     delay: Literal["steps", "none"]
     """Delay of a command that can be set: whole physics steps, or none."""
-    friction: Literal["N m", "coefficient", "none"]
+    friction: Friction
     """Dry friction of a joint: a torque, PhysX's coefficient of the joint's constraint force, or
     not there. Only a torque is matched."""
     speed_curve: bool = False
@@ -110,7 +111,7 @@ def profiles() -> Mapping[str, Profile]:
 
 
 def profile(text: str) -> Profile:
-    """One of `profiles`; the text is NAME, or NAME,timestep_s=S,iterations=N with other values.
+    """One of `profiles`: NAME, or NAME,timestep_s=S,iterations=N,friction=none with other values.
 
     Raises:
         PronkError: Unknown name or setting, or a value out of range.
@@ -119,7 +120,7 @@ def profile(text: str) -> Profile:
     if name not in profiles():
         raise PronkError(f"profile {name!r}; expected one of {', '.join(profiles())}.")
     found = profiles()[name]
-    kinds = {"timestep_s": float, "iterations": int}
+    kinds: dict[str, Any] = {"timestep_s": float, "iterations": int, "friction": str}
     for setting in settings:
         key, _, value = setting.partition("=")
         if key not in kinds:
@@ -129,6 +130,10 @@ def profile(text: str) -> Profile:
         except ValueError:
             raise PronkError(f"profile {text}: {key} {value!r}; expected a number.") from None
         found = replace(found, **{key: number})
+        if found.friction not in get_args(Friction):
+            raise PronkError(
+                f"profile {text}: friction {value!r}; expected {', '.join(get_args(Friction))}."
+            )
     return found
 
 
