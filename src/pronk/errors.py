@@ -5,9 +5,22 @@ The command line prints them and ends with exit status 2.
 
 from __future__ import annotations
 
+_MOST_LETTERS = 2000
+"""Longest message; a damaged file can have a name or a list of names of any length."""
+
+
+def printable(text: str) -> str:
+    """Text with control characters as escapes, so that no file can steer a terminal."""
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+
 
 class PronkError(Exception):
     """Base of every error that the caller can fix."""
+
+    def __str__(self) -> str:
+        """The message, printable and of limited length."""
+        text = super().__str__()
+        return printable(text if len(text) < _MOST_LETTERS else f"{text[:_MOST_LETTERS]} ...")
 
 
 class LogError(PronkError):

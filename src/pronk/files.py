@@ -1,4 +1,4 @@
-"""Whole files or none: write aside, then rename."""
+"""Files: written whole or not at all, read within limits of size, depth and names."""
 
 from __future__ import annotations
 
@@ -6,17 +6,123 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+import zipfile
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+import yaml
 
-from pronk.errors import ArtefactError
+from pronk.errors import ArtefactError, PronkError
 
 T = TypeVar("T")
+
+LIMIT = "PRONK_MOST_MIB"
+"""Environment variable: the most that a log or artefact may unpack to [MiB]."""
+_MOST_MIB = 1024
+_YAML_BYTES, _YAML_NODES, _YAML_DEPTH, _YAML_SCALAR = 2**19, 2**16, 32, 4096
+"""Largest YAML file (500 joints in `gains.yaml`), most nodes with aliases followed, deepest
+nesting, longest scalar."""
+_MOST_NAMES, _NAME_BYTES = 1000, 120
+"""Most joints; longest name, which with an ending is a file name of at most 255 bytes."""
+_NOT_IN_NAMES = frozenset('/\\$<>|*?"`')
+
+
+def most_bytes() -> int:
+    """The most that a log or artefact may unpack to [bytes], by `LIMIT`."""
+    text = os.environ.get(LIMIT, str(_MOST_MIB))
+    if not text.isdecimal() or not 0 < len(text) < 9:
+        raise PronkError(f"{LIMIT} is {text!r}; expected a number of MiB, as in {_MOST_MIB}.")
+    return int(text) << 20
+
+
+def check_size(path: Path, size: int, kind: type[PronkError]) -> None:
+    """Refuse what takes or unpacks to more bytes than `most_bytes`."""
+    if size > (most := most_bytes()):
+        raise kind(
+            f"{path}: it unpacks to more than {most >> 20} MiB; split it, or set {LIMIT} to more "
+            f"than {size >> 20}."
+        )
+
+
+def check_archive(path: Path, kind: type[PronkError]) -> None:
+    """Refuse a zip archive that claims to unpack to more than `most_bytes`; zipfile holds it so."""
+    with zipfile.ZipFile(path) as archive:
+        check_size(path, sum(info.file_size for info in archive.infolist()), kind)
+
+
+def check_names(names: Iterable[str], where: str, kind: type[PronkError]) -> None:
+    """Refuse names of joints and robots that cannot be file names or cannot be printed."""
+    for count, name in enumerate(names, 1):
+        size = len(name.encode(errors="replace"))
+        if count > _MOST_NAMES:
+            raise kind(f"{where}: more than {_MOST_NAMES} names; expected those of joints.")
+        bad = _NOT_IN_NAMES.intersection(name) or not name.isprintable() or name[:1] in ".-"
+        if not 0 < size <= _NAME_BYTES or bad or name != name.strip():
+            raise kind(
+                f"{where}: the name {name[:40]!r} cannot be used; expected 1 to {_NAME_BYTES} "
+                f"printable characters without {' '.join(sorted(_NOT_IN_NAMES))}, and no space, "
+                "dot or dash in front; rename it."
+            )
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """The safe loader, which also refuses keys that are there twice."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if len(set(keys)) < len(keys):
+            twice = next(key for key in keys if keys.count(key) > 1)
+            raise yaml.constructor.ConstructorError(None, None, f"{twice[:40]!r} is there twice")
+        found: dict[Hashable, Any] = super().construct_mapping(node, deep)
+        return found
+
+
+def read_yaml(path: Path, kind: type[PronkError] = ArtefactError, missing: str = "") -> Any:
+    """Read a YAML file of limited size and depth; `missing` is the way out where there is none."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(_YAML_BYTES + 1)
+        if len(data) > _YAML_BYTES:
+            raise ValueError(f"larger than {_YAML_BYTES >> 10} KiB")
+        text = data.decode()
+        _check_yaml(text)
+        return yaml.load(text, _Loader)
+    except FileNotFoundError:
+        raise kind(f"{path}: no such file{missing and f'; {missing}'}.") from None
+    except (OSError, ValueError, OverflowError, AttributeError, yaml.YAMLError) as error:
+        reason = getattr(error, "strerror", None) or getattr(error, "problem", None) or error
+        words = " ".join(str(reason).split())[:120].rstrip(".")
+        raise kind(f"{path}: cannot be read as YAML ({words}).") from None
+
+
+def _check_yaml(text: str) -> None:
+    """Refuse depth and size, with aliases followed, before anything is built; a ValueError."""
+    sizes, anchors, total = [0], dict[str, int](), 0
+    names: list[str | None] = []
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            names.append(event.anchor)
+            sizes.append(1)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            size = sizes.pop()
+            if anchor := names.pop():
+                anchors[anchor] = size
+            sizes[-1] += size
+        elif isinstance(event, yaml.AliasEvent):
+            sizes[-1] += anchors.get(event.anchor or "", 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            sizes[-1] += 1
+            if len(event.value) > _YAML_SCALAR:
+                raise ValueError(f"a value of {len(event.value)} characters")
+        total = max(total, sizes[-1])
+        if len(sizes) > _YAML_DEPTH:
+            raise ValueError(f"nested deeper than {_YAML_DEPTH} levels")
+        if total > _YAML_NODES:
+            raise ValueError(f"more than {_YAML_NODES} values")
 
 
 @contextmanager
@@ -69,6 +175,7 @@ def stored_arrays(
     failed; it names `what` the file is (as in `a match file`) and the command that writes one.
     """
     try:
+        check_archive(path, ArtefactError)
         with np.load(path, allow_pickle=False) as stored:
             header = json.loads(str(stored["header"]))
             if header.get("schema") != schema:

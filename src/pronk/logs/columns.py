@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
+from pronk.files import check_names
 from pronk.logs.checks import TIME_UNITS, check_unit, correlation_note
 from pronk.logs.joint_log import JointLog, check_increasing
 from pronk.robots.robot import RobotSpec
@@ -162,7 +163,9 @@ def _named(
             f"{where}: --joint-names renames {', '.join(unknown)}; the joints are "
             f"{', '.join(stated)}."
         )
-    return tuple((names or {}).get(joint, joint) for joint in stated)
+    named = tuple((names or {}).get(joint, joint) for joint in stated)
+    check_names(named, f"{where} (--joint-names THEIRS=OURS renames joints)", LogError)
+    return named
 
 
 def ordered(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,22 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.files import sha256
+from pronk.files import check_archive, check_size, sha256
 from pronk.logs.columns import Columns
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
 QUANTITIES = ("command", "position", "velocity", "torque")
-MOST_BYTES = 2**30
-"""Largest CSV file, and largest size that the arrays of an NPZ may unpack to [bytes]."""
+_MOST_COLUMNS = 4096
+_CELL_BYTES = 64
+"""What a cell of a CSV file takes in memory, about [bytes]."""
 
 
 def read_text(path: Path) -> str:
     """Read a text file, UTF-8 with or without byte order mark."""
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise LogError(f"{path}: larger than {MOST_BYTES >> 20} MiB; split the recording.")
+        check_size(path, path.stat().st_size, LogError)
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
@@ -42,6 +41,7 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     """
     text = read_text(path)
     delimiter = max(",;\t", key=text.split("\n", 1)[0].count)
+    check_size(path, _CELL_BYTES * (text.count(delimiter) + text.count("\n")), LogError)
     try:
         rows = [row for row in csv.reader(text.splitlines(), delimiter=delimiter) if row]
     except csv.Error as error:
@@ -49,6 +49,8 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     if len(rows) < 2:
         raise LogError(f"{path}: {len(rows)} rows; expected a header and samples below it.")
     header = [name.strip() for name in rows[0]]
+    if len(header) > _MOST_COLUMNS:
+        raise LogError(f"{path}: {len(header)} columns; expected {_MOST_COLUMNS} at most.")
     for i, row in enumerate(rows[1:]):
         if len(row) != len(header):
             raise LogError(
@@ -124,11 +126,14 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     `command` need not be.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(info.file_size for info in archive.infolist()) > MOST_BYTES:
-                raise LogError(f"{path}: it unpacks to more than {MOST_BYTES >> 20} MiB.")
+        check_archive(path, LogError)
         with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+            arrays = {
+                name: stored[name]
+                for name in ("time", *QUANTITIES, "joints")
+                if name in stored.files
+            }
+            others = stored.files
     except LogError:
         raise
     except OSError as error:
@@ -141,8 +146,9 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
     needed = ("time", "position", *["command"] * ("torque" not in arrays))
     if missing := [name for name in needed if name not in arrays]:
         raise LogError(
-            f"{path}: no array {', '.join(missing)}; it holds {', '.join(arrays) or 'none'}."
+            f"{path}: no array {', '.join(missing)}; it holds {', '.join(others) or 'none'}."
         )
+    check_size(path, sum(8 * array.size for array in arrays.values()), LogError)
     try:
         found = {
             n: np.asarray(arrays[n], dtype=np.float64) for n in ("time", *QUANTITIES) if n in arrays
@@ -157,9 +163,12 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
                 "(n, joints)."
             )
         found[name] = values.reshape(len(time), -1) if len(time) else values
+    names = arrays.get("joints", np.empty(0)).reshape(-1)
+    if len(names) > _MOST_COLUMNS:
+        raise LogError(f"{path}: {len(names)} joints; expected {_MOST_COLUMNS} at most.")
     return Columns(
         where=str(path),
-        joints=tuple(str(name) for name in arrays.get("joints", np.empty(0)).reshape(-1)),
+        joints=tuple(map(str, names)),
         time=time,
         sha256=sha256(path),
         **({"command": None} | found),  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
+from pronk.files import check_names
 
 Array = NDArray[np.float64]
 
@@ -98,6 +99,7 @@ class JointLog:
         """Refuse wrong shapes, numbers that are not finite, and time that does not increase."""
         where = self.source or "log"
         n, width = len(self.time), len(self.joints)
+        check_names(self.joints, where, LogError)
         check_increasing(self.time, where, "sample {}".format)
         if width == 0:
             raise LogError(f"{where}: no joints.")

@@ -22,6 +22,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from pronk.errors import LogError
+from pronk.files import LIMIT, most_bytes
 
 NUMBER: dict[str, Any] = {"type": "number"}
 INTEGER: dict[str, Any] = {"type": "integer"}
@@ -30,9 +31,9 @@ BOOLEAN: dict[str, Any] = {"type": "boolean"}
 NUMBERS: dict[str, Any] = {"type": "array", "items": NUMBER}
 STRINGS: dict[str, Any] = {"type": "array", "items": STRING}
 
-MOST_BYTES = 2 * 2**30
-"""Largest size that all chunks of a file may unpack to by default [bytes]."""
-_MOST_CHUNK = 256 * 2**20
+_RECORD_BYTES = 400
+"""What a message takes in memory beside its data, about [bytes]."""
+_MOST_CHUNK = 32 * 2**20
 """Largest size of one unpacked chunk [bytes]; writers use 1 to 8 MiB."""
 
 
@@ -82,6 +83,10 @@ class DamagedError(Exception):
     """The rest of the file cannot be read; what came before can."""
 
 
+class TooLargeError(DamagedError):
+    """The file takes more memory than the limit."""
+
+
 @dataclass(frozen=True, slots=True)
 class Record:
     """One message."""
@@ -95,13 +100,13 @@ class Record:
     data: bytes
 
 
-def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[list[Record]]:
+def records(stream: IO[bytes], size: int, most: int | None = None) -> Iterator[list[Record]]:
     """Messages of a file, chunk by chunk, in the order written.
 
     Args:
         stream: The file.
         size: Its length [bytes]; no record can be longer.
-        most: Largest size that all its chunks may unpack to [bytes].
+        most: Largest size that all its messages may take [bytes]; `most_bytes` if left out.
 
     Raises:
         DamagedError: The file ends early, or a chunk's checksum does not fit. What was yielded
@@ -109,7 +114,7 @@ def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[li
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    unpacked = 0
+    unpacked, most = 0, most or most_bytes()
     reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
     try:
         for record in reader.records:
@@ -117,9 +122,9 @@ def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[li
             if isinstance(record, Chunk):
                 unpacked += record.uncompressed_size
                 if unpacked > most:
-                    raise DamagedError(f"its chunks unpack to more than {most >> 20} MiB")
+                    raise TooLargeError(f"its chunks unpack to more than {most >> 20} MiB")
                 inside = breakup_chunk(_unpacked(record), validate_crc=True)
-            batch = []
+            batch: list[Record] = []
             for item in inside:
                 if isinstance(item, Channel):
                     channels[item.id] = item
@@ -132,6 +137,9 @@ def records(stream: IO[bytes], size: int, most: int = MOST_BYTES) -> Iterator[li
                     schema = schemas.get(channel.schema_id)
                     encoding = channel.message_encoding
                     batch.append(Record(channel.topic, encoding, schema, item.log_time, item.data))
+            unpacked += _RECORD_BYTES * len(batch)
+            if unpacked > most:
+                raise TooLargeError(f"its messages take more than {most >> 20} MiB")
             yield batch
     except DamagedError:
         raise
@@ -165,7 +173,7 @@ def read_records(path: Path) -> tuple[list[Record], str]:
     """Every readable message of a file, and what ended the reading early ("" if nothing did).
 
     Raises:
-        LogError: There is no such file, or no message in it.
+        LogError: There is no such file, no message in it, or it is larger than the limit.
     """
     found: list[Record] = []
     damage = ""
@@ -175,6 +183,8 @@ def read_records(path: Path) -> tuple[list[Record], str]:
                 found += batch
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error}).") from None
+    except TooLargeError as error:
+        raise LogError(f"{path}: {error}; split it, or set {LIMIT} to more.") from None
     except DamagedError as error:
         damage = str(error)
     if not found:

@@ -103,7 +103,7 @@ def readers() -> dict[str, Reader]:
     return found
 
 
-_NO_LOGS = (".response.npz", ".prediction.npz", "match.npz")
+_NO_LOGS = (".response.npz", ".prediction.npz", "/match.npz")
 """What pronk writes beside logs."""
 _WORTH_PROCESSES = 4
 """Fewest logs for which starting processes pays."""
@@ -214,7 +214,7 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
         inside = sorted(
             p
             for p in path.iterdir()
-            if is_sage(p) or (p.suffix.lower() in suffixes and not p.name.endswith(_NO_LOGS))
+            if is_sage(p) or (p.suffix.lower() in suffixes and not f"/{p.name}".endswith(_NO_LOGS))
         )
         if not inside:
             raise LogError(

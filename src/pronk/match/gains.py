@@ -14,11 +14,18 @@ import numpy as np
 import yaml
 
 from pronk.errors import ArtefactError
-from pronk.files import converted, write_text
+from pronk.files import check_names, converted, read_yaml, write_text
 from pronk.simulators.simulator import SimulatorInfo
 
 SCHEMA = "pronk/gains/1"
 NAN = float("nan")
+_BOUNDS = {
+    **dict.fromkeys(("stiffness", "damping", "armature", "frictionloss"), (0.0, 1e6)),
+    **dict.fromkeys(("stiffness_range", "damping_range"), (0.0, 1e6)),
+    "stribeck": (0.0, 1.0),
+    "delay_s": (0.0, 1.0),
+}
+"""Smallest and largest value that is read, in units of the fields; 1e6 is beyond any joint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,16 +172,24 @@ def load(path: Path) -> MatchedGains:
     """Read `gains.yaml`.
 
     Raises:
-        ArtefactError: Missing, not YAML, of another schema, or with fields missing or misspelled.
+        ArtefactError: Missing, not YAML, of another schema, with fields missing or misspelled, or
+            with a name or a value that cannot be.
     """
-    try:
-        body = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ArtefactError(f"{path}: no such file; `pronk match` writes one.") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ArtefactError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from error
+    body = read_yaml(path, missing="`pronk match` writes one")
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         got = body.get("schema") if isinstance(body, dict) else type(body).__name__
         raise ArtefactError(f"{path}: schema {got!r}; this pronk reads {SCHEMA!r}.")
     del body["schema"]
-    return converted(body, MatchedGains, path)
+    gains = converted(body, MatchedGains, path)
+    check_names((gains.robot, *gains.joints, *gains.groups), str(path), ArtefactError)
+    for kind, entries in (("joints", gains.joints), ("groups", gains.groups)):
+        for name, entry in entries.items():
+            for key, (low, high) in _BOUNDS.items():
+                value = getattr(entry, key, NAN)
+                optional = key == "frictionloss" and np.isnan(value)
+                if hasattr(entry, key) and not (optional or low <= value <= high):
+                    raise ArtefactError(
+                        f"{path}: {key} of {kind}.{name} is {value:g}; expected {low:g} to "
+                        f"{high:g}."
+                    )
+    return gains

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pronk.errors import PronkError
-from pronk.files import load_artefact, save_artefact
+from pronk.errors import ArtefactError, PronkError
+from pronk.files import check_names, load_artefact, save_artefact
 
 SCHEMA = "pronk/response/2"
 
@@ -100,6 +100,20 @@ class FrequencyResponse:
     """Response at three times the excited frequency over that at it: the friction detector."""
     virtual: bool = False
     source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a name, shapes and frequencies that no estimate gives."""
+        where = self.source or "response"
+        check_names([self.joint], where, ArtefactError)
+        shape = np.shape(self.omega)
+        fits = all(np.shape(v) == shape for v in (self.response, self.coherence, self.averages))
+        if len(shape) != 1 or 0 in shape or not fits or np.shape(self.repeats)[1:] != shape:
+            raise ArtefactError(f"{where}: the response of {self.joint} has contradictory shapes.")
+        omega = np.asarray(self.omega)
+        if omega.dtype.kind not in "fi" or not (np.diff(omega, prepend=-1e-12) > 0.0).all():
+            raise ArtefactError(
+                f"{where}: frequencies of {self.joint} that do not increase from 0."
+            )
 
     @property
     def frequency_hz(self) -> Array:

@@ -73,6 +73,11 @@ def file_of_model(path: Path) -> RobotFile:
                 effort = gear * float(model.actuator_ctrlrange[i, 1])
             if model.actuator_forcelimited[i]:
                 effort = gear * float(model.actuator_forcerange[i, 1])
+        if not effort > 0.0:
+            raise RobotError(
+                f"{path}: the effort limit of {name} is {effort:g} N m; expected a positive one "
+                "(effort in a URDF, forcerange or actuatorfrcrange in MJCF)."
+            )
         drives[name] = DriveEntry(
             effort_limit=_short(effort),
             armature=float(model.dof_armature[dof]),

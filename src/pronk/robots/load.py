@@ -19,11 +19,11 @@ from typing import Annotated, Any
 import msgspec
 import mujoco
 import numpy as np
-import yaml
 from msgspec import Meta
 
 from pronk.actuator.model import no_load_speed, stall_torque
 from pronk.errors import RobotError
+from pronk.files import read_yaml
 from pronk.robots.model import set_inertia
 from pronk.robots.robot import Drive, Joint, RobotSpec
 
@@ -200,10 +200,7 @@ def read_model(path: Path) -> Model:
 
 def read_robot(path: Path) -> RobotSpec:
     """Read a `robot.yaml`; a RobotError names what is wrong in it."""
-    try:
-        body = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise RobotError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from None
+    body = read_yaml(path, RobotError)
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         raise RobotError(f"{path}: not a robot file; its schema must be {SCHEMA!r}.")
     try:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pronk.actuator.law import EXPLICIT, DriveLaw
 from pronk.errors import RobotError
+from pronk.files import check_names
 
 if TYPE_CHECKING:
     import mujoco
@@ -127,6 +128,7 @@ class RobotSpec:
     def __post_init__(self) -> None:
         """Check that names are unique and every reference resolves."""
         names = self.joint_names
+        check_names((self.name, *names, *self.groups), self.source or "robot", RobotError)
         if len(set(names)) != len(names):
             raise RobotError(f"{self.name}: a joint is named twice in {', '.join(names)}.")
         for joint in self.joints:

@@ -13,11 +13,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import yaml
-
 from pronk.actuator.law import DriveLaw
 from pronk.errors import PronkError
-from pronk.files import converted
+from pronk.files import converted, read_yaml
 from pronk.robots.robot import Joint, RobotSpec
 from pronk.simulators.simulator import SimulatorInfo
 
@@ -106,7 +104,7 @@ class Profile:
 @cache
 def profiles() -> Mapping[str, Profile]:
     """All profiles by name, in the order of their file."""
-    data = yaml.safe_load(FILE.read_text(encoding="utf-8"))
+    data = read_yaml(FILE)
     return {n: converted({**one, "name": n}, Profile, FILE) for n, one in data.items()}
 
 

@@ -19,10 +19,10 @@ from typing import Annotated, Any
 import msgspec
 import mujoco
 import numpy as np
-import yaml
 from msgspec import Meta
 
 from pronk.errors import RobotError
+from pronk.files import read_yaml
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Joint, RobotSpec
 from pronk.virtual.bounds import Bounded, read
@@ -242,12 +242,7 @@ def load_sim_params(path: Path | str | None = None, robot: RobotSpec | None = No
     if path is None and robot is not None and robot.name != SHIPPED_ROBOT:
         return default_sim_params(robot)
     path = SHIPPED if path is None else Path(path)
-    try:
-        body = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise RobotError(f"{path}: no such sim_params file; copy {SHIPPED} and edit it.") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise RobotError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from error
+    body = read_yaml(path, RobotError, f"copy {SHIPPED} and edit it")
     return parse_sim_params(body, str(path))
 
 

@@ -1,0 +1,207 @@
+"""Hostile files: refused in one printable sentence, before memory or time is taken."""
+
+from __future__ import annotations
+
+import io
+import resource
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pronk.errors import ArtefactError, LogError, PronkError, RobotError
+from pronk.files import LIMIT, check_names, read_yaml
+from pronk.logs.mcap import McapWriter
+from pronk.logs.mcap_log import TOPICS
+from pronk.logs.readers import find_logs, read_log
+from pronk.match import gains
+from pronk.response.response import FrequencyResponse
+from pronk.robots import load_robot
+from pronk.robots.bare import file_of_model
+from pronk.robots.load import read_robot
+from pronk.virtual.sim_params import load_sim_params
+
+GAINS = """
+schema: pronk/gains/1
+robot: r
+virtual: false
+simulator: {engine: mujoco, version: '3', timestep_s: 0.005}
+joints:
+  knee: {stiffness: 20.0, damping: 0.5, armature: 0.01}
+groups: {}
+"""
+BOMB = "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 30)
+)
+YAML = {
+    "alias bomb": BOMB,
+    "deep flow": "[" * 100_000 + "]" * 100_000,
+    "deep block": "".join(" " * i + "a:\n" for i in range(500)),
+    "long integer": f"a: {'9' * 6000}",
+    "sexagesimal": f"a: 1{':10' * 1300}",
+    "large": "a: 1\n" * 200_000,
+    "key twice": "a: 1\na: 2\n",
+    "date": "a: 2001-13-45\n",
+    "binary": "a: !!binary x\n",
+    "object": "!!python/object/apply:os.system ['true']",
+    "no text": "\xff\x00",
+    "recursive": "&a [*a]",
+}
+
+
+@pytest.mark.parametrize("kind", YAML)
+def test_a_hostile_yaml_file_is_refused_by_every_reader(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(YAML[kind], encoding="latin-1")
+    before = resource.getrusage(resource.RUSAGE_SELF)
+    for read in (gains.load, read_robot, load_sim_params):
+        with pytest.raises(PronkError) as error:
+            read(path)
+        assert str(error.value).isprintable()
+        assert len(str(error.value)) < 500
+    after = resource.getrusage(resource.RUSAGE_SELF)
+    assert after.ru_maxrss - before.ru_maxrss < 100 << 10
+    # Processor time, which other work on the machine does not take.
+    assert after.ru_utime - before.ru_utime < 3.0
+
+
+def test_anchors_and_merge_keys_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\n")
+    assert read_yaml(tmp_path / "a.yaml")["b"] == {"x": 1, "y": 3}
+
+
+@pytest.mark.parametrize(
+    "value", ["-1.0", "[1.0]", "stiff", ".nan", ".inf", "1.0e+30", "{}", "null", "0x" + "f" * 4000]
+)
+@pytest.mark.parametrize("field", ["stiffness: 20.0", "damping: 0.5", "armature: 0.01"])
+def test_gains_that_cannot_be_are_refused(tmp_path: Path, field: str, value: str) -> None:
+    path = tmp_path / "gains.yaml"
+    path.write_text(GAINS)
+    assert gains.load(path).joints["knee"].stiffness == 20.0
+    path.write_text(GAINS.replace(field, f"{field.split(':')[0]}: {value}"))
+    with pytest.raises(ArtefactError):
+        gains.load(path)
+
+
+NAMES = ["x/../../../w_evil", "..", "$", "a\0b", "a\x1b[31mred", "n" * 300, "", "a\u202eb", "-rf"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_checked_where_they_are_read(tmp_path: Path, name: str) -> None:
+    t = np.arange(1000) / 500.0
+    arrays = {"time": t, "command": np.sin(t)[:, None], "position": np.sin(t)[:, None]}
+    np.savez(tmp_path / "a.npz", joints=np.array([name]), **arrays)
+    (tmp_path / "gains.yaml").write_text(GAINS)
+    body = read_yaml(tmp_path / "gains.yaml")
+    body["joints"] = {name: body["joints"]["knee"]}
+    (tmp_path / "gains.yaml").write_text(yaml.safe_dump(body))
+    with pytest.raises(LogError) as caught:
+        read_log(tmp_path / "a.npz", unit="rad")
+    with pytest.raises(ArtefactError) as other:
+        gains.load(tmp_path / "gains.yaml")
+    with pytest.raises(ArtefactError):
+        response(joint=name)
+    for error in (caught.value, other.value):
+        assert str(error).isprintable()
+        assert len(str(error)) < 600
+
+
+def test_names_of_real_robots_pass() -> None:
+    check_names(
+        ["FR_calf_joint", "left hip 1", "arm.joint-2", "Gelenk_ä", "1"], "names", RobotError
+    )
+
+
+def bomb(path: Path, rows: int) -> None:
+    """Write an NPZ of zeros that unpacks to 8 bytes a row."""
+    data = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        data, {"descr": "|b1", "fortran_order": False, "shape": (rows,)}
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("time", "command", "position"):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                file.write(data.getvalue())
+                for _ in range(rows >> 20):
+                    file.write(bytes(1 << 20))
+
+
+def test_bombs_are_refused_and_the_error_names_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(LIMIT, "16")
+    bomb(tmp_path / "declared.npz", 16 << 20)
+    bomb(tmp_path / "converted.npz", 4 << 20)
+    (tmp_path / "cells.csv").write_text("time,a\n" + "0,0\n" * 200_000)
+    writer = McapWriter(tmp_path / "messages.mcap", TOPICS)
+    for _ in range(60_000):
+        writer.put("/sweep/end", 0.0, {})
+    writer.close()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for path in sorted(tmp_path.iterdir()):
+        with pytest.raises(LogError, match=LIMIT):
+            read_log(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 << 10
+    monkeypatch.setenv(LIMIT, "lots")
+    with pytest.raises(PronkError, match=LIMIT):
+        read_log(tmp_path / "cells.csv")
+
+
+def test_many_columns_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "wide.csv"
+    path.write_text(",".join(map(str, range(100_000))) + "\n" + ",".join(["0"] * 100_000))
+    with pytest.raises(LogError, match="columns"):
+        read_log(path, unit="rad")
+
+
+def response(**changed: object) -> FrequencyResponse:
+    omega = np.arange(1.0, 5.0)
+    values: dict[str, object] = {
+        "joint": "knee",
+        "amplitude": 0.1,
+        "omega": omega,
+        "response": np.ones(4, complex),
+        "coherence": np.ones(4),
+        "averages": np.ones(4),
+        "repeats": np.ones((2, 4), complex),
+        "estimator": "H1",
+        "window": "hann",
+        "segment_s": 8.0,
+    }
+    return FrequencyResponse(**values | changed)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"omega": np.arange(3.0)},
+        {"omega": np.arange(4.0)[::-1]},
+        {"omega": np.array(["a"] * 4)},
+        {"omega": np.empty(0)},
+        {"repeats": np.ones(4)},
+        {"coherence": np.ones((4, 1))},
+    ],
+)
+def test_a_damaged_response_is_refused(changed: dict[str, object]) -> None:
+    assert response().joint == "knee"
+    with pytest.raises(ArtefactError):
+        response(**changed)
+
+
+def test_logs_whose_names_end_like_those_of_pronk_are_found(tmp_path: Path) -> None:
+    for name in ("FL_knee_rematch.npz", "match.npz", "a.response.npz", "fresh.prediction.npz"):
+        (tmp_path / name).touch()
+    assert [path.name for path in find_logs([tmp_path])] == ["FL_knee_rematch.npz"]
+
+
+def test_a_model_whose_joint_has_no_effort_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.xml"
+    path.write_text(
+        "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>"
+        "<actuator><motor joint='j' ctrlrange='-1 0'/></actuator></mujoco>"
+    )
+    for read in (file_of_model, load_robot):
+        with pytest.raises(RobotError, match="effort"):
+            read(path)
