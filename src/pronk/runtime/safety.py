@@ -166,9 +166,9 @@ class Limits:
     encoder: float = 0.18
     """Between position and integral of velocity; the largest is 0.09 with a third of the states
     lost, 0.01 with all of them [rad]."""
-    moved: float = 0.01
-    """Integral of velocity at a constant position, or the reverse; half of it where all are
-    constant [rad]."""
+    moved: float = 0.005
+    """Range of the integral of velocity at a constant position, or the reverse: three steps of an
+    encoder of 12 bits [rad]."""
     expiry_s: float = 0.05
     """Longest that any command is repeated, whatever its own validity [s]."""
     lag: int = 30
@@ -627,7 +627,7 @@ def _contradiction(seen: Supervision, limits: Limits) -> tuple[Reason, str] | No
     if not constant.any():
         return None
     share = np.where(constant.all(axis=1), _ALL, 1.0)[:, None]
-    excess = np.where(constant, seen.moved.reshape(2, n) / (limits.moved * share), 0.0)
+    excess = np.where(constant, seen.moved.reshape(2, n) / limits.moved, 0.0)
     if (excess > 1.0).any():
         kind, i = divmod(int(np.argmax(excess)), n)
         which = ("position", "velocity")[kind]
