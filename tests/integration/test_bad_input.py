@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import log_files
 from command_line import refused
-from pronk.errors import LogError, PronkError, RobotError
+from pronk.errors import LogError, PronkError
 from pronk.logs.readers import read_log, read_logs
 from pronk.robots import load_robot
 
@@ -424,6 +424,6 @@ def test_names_in_a_file_cannot_break_the_sentence(tmp_path: Path) -> None:
     path, time = tmp_path / "a.npz", np.arange(50) / 500.0
     wave = np.sin(time)[:, None]
     np.savez(path, time=time, command=wave, position=wave, joints=np.array(["FR\nknee"]))
-    with pytest.raises(RobotError) as caught:
+    with pytest.raises(LogError) as caught:
         read_log(path, unit="rad", robot=ROBOT)
     assert "\n" not in str(caught.value)

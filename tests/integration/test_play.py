@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable
 from contextlib import closing
@@ -184,6 +185,12 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
         assert page.server.get_host() == "127.0.0.1"
         with urllib.request.urlopen(page.address) as reply:
             assert b"<html" in reply.read()[:2000].lower()
+        for header in ({"Host": "evil.example:18765"}, {"Origin": "http://evil.example"}):
+            request = urllib.request.Request(page.address, headers=header)
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(request)
+        with pytest.raises(pytest.importorskip("websockets").InvalidStatus):
+            client.connect(page.address.replace("http", "ws"), origin="http://evil.example")
         address, protocol = page.address.replace("http", "ws"), [f"viser-v{viser.__version__}"]
         with client.connect(address, subprotocols=protocol, max_size=None) as browser:
 

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from hopper import DEFAULT, ROBOT, contract
+from hopper import DEFAULT, ROBOT, contract, write_hopper
 from pronk.errors import ArtefactError, PronkError
 from pronk.policy.contract import METADATA_KEY, check, from_json, measured_layout, to_json
 from pronk.policy.observation import MEASURED, MEASURED_SIZE, History, Measurement, finite
@@ -334,3 +334,41 @@ def test_without_onnx_runtime_its_extra_is_named(
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(PronkError, match=r"pip install 'pronk\[policy\]'"):
         load_policy(path)
+
+
+@pytest.mark.parametrize("kind", ["Loop", "ConstantOfShape", "Expand", "If", "domain", "function"])
+def test_a_network_with_other_operators_is_refused_unseen(tmp_path: Path, kind: str) -> None:
+    onnx = pytest.importorskip("onnx")
+    path = write_hopper(tmp_path / "policy.onnx")
+    load_policy(path)
+    model = onnx.load(path)
+    if kind == "function":
+        made = [onnx.helper.make_node("Add", ["x", "x"], ["y"])]
+        opset = [onnx.helper.make_opsetid("", 17)]
+        model.functions.append(onnx.helper.make_function("", "Add", ["x"], ["y"], made, opset))
+    elif kind == "domain":
+        model.graph.node[0].domain = "evil"
+    else:
+        model.graph.node.append(onnx.helper.make_node(kind, ["one"], ["large"]))
+    onnx.save(model, path)
+    with pytest.raises(ArtefactError, match="may use"):
+        load_policy(path)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"action_scale": (1e6,) * 12},
+        {"delay_range_s": (0.0, 10.0)},
+        {"delay_range_s": (-0.1, 0.0)},
+        {"stiffness": (1e9,) * 12},
+        {"damping": (float("nan"),) * 12},
+        {"default_position": (1e3,) * 12},
+        {"lift_off_velocity": 1e3},
+        {"command_ranges": {"vx": (-300.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}},
+        {"joint_names": ("x/../../y", *(f"j{i}" for i in range(11)))},
+    ],
+)
+def test_a_contract_beyond_every_robot_is_refused(changed: dict[str, Any]) -> None:
+    with pytest.raises(ArtefactError):
+        contract(**changed)

@@ -11,8 +11,10 @@ import re
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from pronk.errors import ArtefactError
+from pronk.files import check_names
 from pronk.policy.observation import ACTIONS, HISTORY, MEASURED
 from pronk.robots.robot import RobotSpec
 
@@ -22,6 +24,13 @@ GAINS = ("matched", "naive")
 """Where the gains of training came from: `gains.yaml`, or the nominal gains of the real drive."""
 COMMANDS = ("vx", "vy", "yaw_rate")
 """The command in order: forward and left [m/s], about the trunk's z [rad/s]."""
+
+_LARGEST = {
+    **{"default_position": 10.0, "action_scale": 10.0, "stiffness": 1e4, "damping": 1e3},
+    **{"policy_rate_hz": 1e3, "timestep_s": 0.1, "decimation": 1e3, "delay_range_s": 0.5},
+    **{"command_ranges": 20.0, "lift_off_velocity": 10.0},
+}
+"""Largest magnitude of each field, in its unit; all beyond what legged robots do."""
 
 _UNITS = {
     "angular_velocity": "rad/s",
@@ -115,6 +124,14 @@ class Contract(
     def __post_init__(self) -> None:
         """Refuse contradictions; the ArtefactError names the field."""
         n = len(self.joint_names)
+        check_names((self.robot, *self.joint_names), "the contract", ArtefactError)
+        for name, most in _LARGEST.items():
+            value = getattr(self, name)
+            value = tuple(value.values()) if isinstance(value, dict) else value
+            numbers = np.ravel(0.0 if value is None else value)
+            met = bool((np.abs(numbers) <= most).all())
+            _demand(met, name, value, f"finite and within {most:g} of 0")
+        _demand(self.delay_range_s[0] >= 0.0, "delay_range_s", self.delay_range_s, "not negative")
         for name in ("default_position", "action_scale", "stiffness", "damping"):
             values = getattr(self, name)
             _demand(len(values) == n, name, values, f"one number for each of the {n} joints")

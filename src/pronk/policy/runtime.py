@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -25,6 +27,16 @@ from pronk.policy.observation import (
 )
 
 WRITER = "`pronk train` writes one"
+_OPERATORS = frozenset(
+    (
+        *("Add", "Cast", "Clip", "Concat", "Constant", "Div", "Elu", "Gather", "Gemm", "Identity"),
+        *("LeakyRelu", "MatMul", "Mul", "Relu", "Reshape", "Selu", "Shape", "Sigmoid", "Slice"),
+        *("Softplus", "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze"),
+    )
+)
+"""What feed-forward networks need: no loops, no branches, no tensors made of a number."""
+_MOST_BYTES, _MOST_S = 64 * 2**20, 10.0
+"""Largest file [bytes], and longest first inference [s]; pronk's own take 0.5 MB and 1 ms."""
 _OUTPUTS = {"action": JOINTS, **ESTIMATE}
 """Names and sizes."""
 
@@ -145,6 +157,7 @@ def load_policy(path: Path | str) -> Policy:
         raise ArtefactError(f"{path}: no such file; {WRITER}.") from None
     except OSError as error:
         raise ArtefactError(f"{path}: cannot be read ({error.strerror}).") from None
+    _check_operators(data, path)
     session = _session(data, path)
     text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
     if text is None:
@@ -158,6 +171,7 @@ def load_policy(path: Path | str) -> Policy:
     inputs = {"measured": MEASURED_SIZE} | ({"jump": 1} if contract.jump else {})
     _check_graph(path, "inputs", session.get_inputs(), inputs)
     _check_graph(path, "outputs", session.get_outputs(), _OUTPUTS)
+    _first(session, inputs, path)
     return Policy(session, contract, sha256=hashlib.sha256(data).hexdigest())
 
 
@@ -174,12 +188,85 @@ def _session(data: bytes, path: Path) -> Any:
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors come as exceptions
+    options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:
         raise ArtefactError(
             f"{path}: not a network that ONNX Runtime can run ({type(error).__name__}); {WRITER}."
         ) from error
+
+
+def _fields(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Number and content of each field of a protobuf message that has a length."""
+    at = 0
+
+    def number() -> int:
+        nonlocal at
+        value = 0
+        for shift in range(0, 70, 7):
+            value, at = value | (data[at] & 127) << shift, at + 1
+            if data[at - 1] < 128:
+                return value
+        raise ValueError
+
+    while at < len(data):
+        key = number()
+        size = {0: 0, 1: 8, 2: 0, 5: 4}[key & 7]
+        if key & 7 == 2:
+            size = number()
+            yield key >> 3, data[at : at + size]
+        elif key & 7 == 0:
+            number()
+        at += size
+
+
+def _check_operators(data: bytes, path: Path) -> None:
+    """Refuse a large file, and operators beside `_OPERATORS`, before ONNX Runtime sees them."""
+    found: set[str] = set()
+    try:
+        if len(data) > _MOST_BYTES:
+            raise ValueError
+        # ModelProto.graph is 7 and .functions 25, GraphProto.node 1, NodeProto.op_type 4,
+        # .attribute 5 (whose .g 6 and .graphs 11 are graphs) and .domain 7 (onnx.proto).
+        for field, content in _fields(memoryview(data)):
+            if field == 25:
+                found.add("a function")
+            nodes = [one for k, one in _fields(content) if k == 1] if field == 7 else []
+            for node in nodes:
+                for part, value in _fields(node):
+                    if part == 4 or (part == 7 and bytes(value) != b"ai.onnx" and value):
+                        found.add(bytes(value).decode())
+                    if part == 5 and any(k in (6, 11) for k, _ in _fields(value)):
+                        found.add("a subgraph")
+    except (ValueError, IndexError, KeyError):
+        raise ArtefactError(
+            f"{path}: not an ONNX network of at most {_MOST_BYTES >> 20} MiB; {WRITER}."
+        ) from None
+    if unknown := sorted(found - _OPERATORS):
+        raise ArtefactError(
+            f"{path}: its network uses {', '.join(unknown)[:200]}; a policy may use "
+            f"{', '.join(sorted(_OPERATORS))}."
+        )
+
+
+def _first(session: Any, sizes: dict[str, int], path: Path) -> None:
+    """Run the network once, under a time limit."""
+    import onnxruntime
+
+    options = onnxruntime.RunOptions()
+    timer = threading.Timer(_MOST_S, setattr, (options, "terminate", True))
+    timer.daemon = True
+    timer.start()
+    try:
+        feeds = {name: np.zeros((1, size), np.float32) for name, size in sizes.items()}
+        session.run(list(_OUTPUTS), feeds, options)
+    except Exception as error:
+        raise ArtefactError(
+            f"{path}: its network cannot be run within {_MOST_S:g} s ({type(error).__name__})."
+        ) from error
+    finally:
+        timer.cancel()
 
 
 def _check_graph(path: Path, what: str, nodes: Any, sizes: dict[str, int]) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import errno
 import io
+import ipaddress
 import math
 import socket
 import time
-from contextlib import redirect_stdout
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from types import ModuleType
 from typing import Any
+from urllib.parse import urlsplit
 
 import mujoco
 import numpy as np
@@ -70,6 +73,47 @@ def free_port(host: str, port: int) -> int:
     raise PronkError(f"ports {port} to {last - 1} are all taken; name another with --port.")
 
 
+def _own(host: str, headers: Mapping[str, str]) -> bool:
+    """Whether a request is for this server by an address, and from a page of this server.
+
+    A page of another server can reach it by a name that it has resolve to this machine (then the
+    Host is a name), or by the right address (then the Origin is another).
+    """
+    try:
+        at, origin = headers.get("Host", ""), headers.get("Origin")
+        name = urlsplit(f"//{at}").hostname or ""
+        if name not in ("localhost", host):
+            ipaddress.ip_address(name)
+        return origin is None or urlsplit(origin).netloc == at
+    except (ValueError, LookupError):  # no address; a header that is there twice
+        return False
+
+
+@contextmanager
+def _only_own_pages(host: str) -> Iterator[None]:
+    """While a viser server starts, make it refuse requests that are not `_own`.
+
+    viser has no hook for it; it passes a function of its own to `websockets`.
+    """
+    import websockets.asyncio.server as server
+
+    original = server.serve
+
+    def serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            if not _own(host, request.headers):
+                return connection.respond(403, "another Host or Origin than this page's\n")
+            return process_request(connection, request)
+
+        return original(*args, process_request=checked, **options)
+
+    server.serve = serve  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        server.serve = original  # type: ignore[misc]
+
+
 class WebPage:
     """A server with one robot in it. Implements `play.Page`."""
 
@@ -96,7 +140,7 @@ class WebPage:
         self._data: Any = mujoco.MjData(self._model)
         self._joints = np.array([self._model.joint(n).qposadr[0] for n in robot.joint_names])
         self._drawn = self._written = -math.inf
-        with redirect_stdout(io.StringIO()):  # viser prints
+        with redirect_stdout(io.StringIO()), _only_own_pages(host):  # viser prints
             self.server: Any = viser.ViserServer(host=host, port=port, label="pronk", verbose=False)
         self._scene = mjviser.ViserMujocoScene(self.server, self._model, num_envs=1)
         self.server.initial_camera.position = (0.45, -1.35, 0.6)
