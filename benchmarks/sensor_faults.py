@@ -162,9 +162,9 @@ def measure(
     faults: tuple[str, ...],
     runs: int,
     progress: Progress,
-    limits: dict[str, float] | None = None,
+    **more: Any,
 ) -> dict[str, dict[str, Any]]:
-    """Times to damping [s] and reasons of each fault over a link.
+    """Times to damping [s] and reasons of each fault over a link; `more` is of the `Plan`.
 
     Raises:
         HardwareError: A fault was not found in `TRIES` deployments in a row.
@@ -181,9 +181,9 @@ def measure(
             plan = Plan(
                 link=Link(robot=ROBOT, address=address),
                 policy=policy,
-                limits=limits or {},
                 timing=TIMING,
                 ignore_latency=True,
+                **more,
             )
             rows = strike(plan, robot, left)
         for fault, seconds, reason in rows:

@@ -16,6 +16,7 @@ pytest.importorskip("lcm")
 pytest.importorskip("cyclonedds")
 
 from benchmarks.sensor_faults import FAULTS, measure
+from deploy_runs import PATIENT
 
 POLICY = Path(pronk.__file__).parents[2] / "policies" / "matched" / "policy.onnx"
 IMU = ("imu", "attitude", "gyro", "accelerometer")
@@ -27,7 +28,9 @@ that a busy one passes."""
 @pytest.mark.slow
 @pytest.mark.parametrize(("link", "faults"), [("lcm", FAULTS[::2]), ("dds", FAULTS[1::2])])
 def test_each_fault_of_a_sensor_damps(link: str, faults: tuple[str, ...]) -> None:
-    found = measure(POLICY, link, faults, 1, lambda _stage, _share: None)
+    patient = {"limits": PATIENT | {"hold_s": 1.0}, "action_valid_s": 2.0}
+    patient |= {"operator_timeout_s": 2.0, "standby_s": 2.0}
+    found = measure(POLICY, link, faults, 1, lambda _stage, _share: None, **patient)
     assert set(found) == set(faults)
     for fault, row in found.items():
         (seconds,), (reason,) = row["times_s"], row["reasons"]
