@@ -30,7 +30,7 @@ from pronk.simulators.engines.sapien import Sapien
 from pronk.simulators.mujoco import Chain
 from pronk.simulators.probe import Probe
 from pronk.simulators.probe import probe as look
-from pronk.simulators.simulator import Simulator, SimulatorInfo
+from pronk.simulators.simulator import SimulatorInfo
 
 Array = NDArray[np.float64]
 ROBOTS = (
@@ -213,7 +213,8 @@ def drawn(generator: np.random.Generator, kind: str, fault: str) -> Truth:
 
 def rows(seed: int, count: int, kinds: Sequence[str]) -> list[tuple[Truth, Probe, float]]:
     """Draw simulators and probe them; the seconds that each probe took."""
-    generator, out = np.random.default_rng(seed), []
+    generator = np.random.default_rng(seed)
+    out: list[tuple[Truth, Probe, float]] = []
     with console.progress() as report:
         for k in range(count):
             kind = kinds[k % len(kinds)]
@@ -221,11 +222,9 @@ def rows(seed: int, count: int, kinds: Sequence[str]) -> list[tuple[Truth, Probe
             if fault == "beside":
                 kind = "numpy"
             truth = drawn(generator, kind, fault)
-            simulator: Simulator = Drawn(truth)
             begin = time.perf_counter()
-            out.append(
-                (truth, look(simulator, truth.robot, truth.joint), time.perf_counter() - begin)
-            )
+            found = look(Drawn(truth), truth.robot, truth.joint)
+            out.append((truth, found, time.perf_counter() - begin))
             report("probe", (k + 1) / count)
     return out
 

@@ -106,3 +106,14 @@ def test_the_command_names_law_and_faults(
     assert found["wrong"] == {}
     assert run(["probe", "mujoco", "--robot", PENDULUM, "--joint", "knee"]) == 2
     assert "swing" in capsys.readouterr().err
+
+
+def test_one_scale_of_gains_inertia_and_gravity_is_not_taken_for_another() -> None:
+    robot = load_robot(ROBOTS[1][0])
+    robot = replace(robot, timestep_s=0.002, decimation=10)
+    armature = robot.joint("FR_knee").drive.armature
+    known = truth(robot=robot, joint="FR_knee", armature=armature, frictionloss=0.0, delay_s=0.0)
+    found = probe(Drawn(known), robot, "FR_knee")
+    assert found.law == DriveLaw()
+    assert found.stiffness_factor == pytest.approx(1.0, rel=1e-3)
+    assert not found.wrong

@@ -143,11 +143,11 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
     share = stable = bench.stable_share()
     settable = "armature" in simulator.parameters
     answers: list[tuple[float, Array, _Law, int, _Runs]] = []
-    for _ in range(3):
+    for turn in range(3):
         try:
             whole, hold, phase = bench.latency(share)
         except PronkError:
-            if not answers:
+            if turn == 0:
                 raise
             break  # Friction holds the joint against smaller gains.
         runs = bench.chirps(share, hold, phase)
@@ -255,12 +255,14 @@ class _Bench:
         first = np.arange(_REST, _REST + 2 * _HOLDS)
         length = _REST + 4 * _HOLDS
         command = np.zeros((len(first) + 1, length))
-        command[1:] = self.amplitude * (np.arange(length)[None] >= first[:, None])
+        # Of smaller gains a larger step, which friction does not hold.
+        height = self.amplitude * min(max(1.0 / share, 1.0), 5.0)
+        command[1:] = height * (np.arange(length)[None] >= first[:, None])
         moved = self.run(command, **self.gains(np.full(len(command), share)))
         apart = np.abs(moved[1:] - moved[:1]) > 1e-5 * self.amplitude
         if not apart.any(axis=1).all():
             raise PronkError(
-                f"{self.joint.name} does not respond to a step of {self.amplitude:.2g} rad within "
+                f"{self.joint.name} does not respond to a step of {height:.2g} rad within "
                 f"{2 * _HOLDS} steps."
             )
         # Position is read at the start of a step: it is apart one step after the command acts.
@@ -411,7 +413,7 @@ def _best(runs: _Runs, whole: int, settable: bool) -> tuple[Array, float, _Law]:
                 off = _simulated(runs, law, starts) - runs.position
                 square = np.nan_to_num(np.mean(off**2, axis=(1, 2)), nan=np.inf)
             start = starts[square.argmin()]
-        theta, rms = _fit(runs, law, start, fixed, rounds)
+        theta, rms = _fit(runs, law, start, fixed | {"gravity"}, rounds)
         tried.append((rms, theta, law))
         return tried[-1]
 
@@ -438,7 +440,7 @@ def _best(runs: _Runs, whole: int, settable: bool) -> tuple[Array, float, _Law]:
     tried.sort(key=lambda one: one[0])
     final = []
     for _, begin, law in tried[:3]:
-        free, rms = _fit(runs, law, begin, fixed, _ROUNDS)
+        free, rms = _fit(runs, law, begin, fixed | {"gravity"}, _ROUNDS)
         scaled = []
         for scale in _SCALES:
             start = free.copy()
@@ -449,10 +451,11 @@ def _best(runs: _Runs, whole: int, settable: bool) -> tuple[Array, float, _Law]:
             scaled.append(_fit(runs, law, start, fixed | {"stiffness", "damping"}, _ROUNDS))
         least = min(rms for _, rms in scaled)
         # Gains, inertia and gravity of any common scale move alike: the plainest is taken.
-        alike = [one for one in scaled if one[1] <= 3.0 * least + 1e-9 * motion]
+        alike = [one for one in scaled if one[1] <= 3.0 * least + 1e-6 * motion]
         usual, least = min(alike, key=lambda one: float(np.abs(one[0][-2:] - 1.0).sum()))
         # A factor without a usual cause must explain more.
-        final.append((rms, free, law) if rms < least / 3.0 else (least, usual, law))
+        plain = rms >= least / 3.0 - 1e-6 * motion
+        final.append((least, usual, law) if plain else (rms, free, law))
         if rms < 1e-6 * motion or tried[len(final)][0] > _FAR * final[0][0]:
             break
     rms, theta, law = min(final, key=lambda one: one[0])
