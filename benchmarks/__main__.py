@@ -20,6 +20,7 @@ SUMMARIES = {
     "probe": "Laws, parameters and faults of simulators drawn at random, named blind.",
     "frameworks": "Gains matched for frameworks, in the engines themselves, beside the logs.",
     "transfer": "A policy in training simulators of other drive laws.",
+    "fuzz": "Mutated files of every reader: tracebacks, hangs, other numbers.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",
 }

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from benchmarks.fuzz import fuzz
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
 from pronk.files import LIMIT, check_names, read_yaml
 from pronk.logs.mcap import McapWriter
@@ -205,3 +206,9 @@ def test_a_model_whose_joint_has_no_effort_is_refused(tmp_path: Path) -> None:
     for read in (file_of_model, load_robot):
         with pytest.raises(RobotError, match="effort"):
             read(path)
+
+
+def test_mutated_files_give_no_traceback_and_no_other_numbers() -> None:
+    outcome = fuzz(count=280, seed=7)
+    assert outcome.status == 0
+    assert sum(n for name, n in outcome.figures.items() if name.endswith("refused")) > 100
