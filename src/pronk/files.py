@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, read within limits of size, depth and names."""
+"""Files: written whole or not at all, read within limits of size and depth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 import zipfile
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,9 +26,6 @@ _MOST_MIB = 1024
 _YAML_BYTES, _YAML_NODES, _YAML_DEPTH, _YAML_SCALAR = 2**19, 2**16, 32, 4096
 """Largest YAML file (500 joints in `gains.yaml`), most nodes with aliases followed, deepest
 nesting, longest scalar."""
-_MOST_NAMES, _NAME_BYTES = 1000, 120
-"""Most joints; longest name, which with an ending is a file name of at most 255 bytes."""
-_NOT_IN_NAMES = frozenset('/\\$<>|*?"`')
 
 
 def most_bytes() -> int:
@@ -52,21 +49,6 @@ def check_archive(path: Path, kind: type[PronkError]) -> None:
     """Refuse a zip archive that claims to unpack to more than `most_bytes`; zipfile holds it so."""
     with zipfile.ZipFile(path) as archive:
         check_size(path, sum(info.file_size for info in archive.infolist()), kind)
-
-
-def check_names(names: Iterable[str], where: str, kind: type[PronkError]) -> None:
-    """Refuse names of joints and robots that cannot be file names or cannot be printed."""
-    for count, name in enumerate(names, 1):
-        size = len(name.encode(errors="replace"))
-        if count > _MOST_NAMES:
-            raise kind(f"{where}: more than {_MOST_NAMES} names; expected those of joints.")
-        bad = _NOT_IN_NAMES.intersection(name) or not name.isprintable() or name[:1] in ".-"
-        if not 0 < size <= _NAME_BYTES or bad or name != name.strip():
-            raise kind(
-                f"{where}: the name {name[:40]!r} cannot be used; expected 1 to {_NAME_BYTES} "
-                f"printable characters without {' '.join(sorted(_NOT_IN_NAMES))}, and no space, "
-                "dot or dash in front; rename it."
-            )
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]

@@ -157,7 +157,7 @@ def test_policies_are_named_apart(hopper: Path, weak: Path, tmp_path: Path) -> N
         ({"timestep_s": 0.002, "decimation": 10}, "timestep_s"),
         ({"robot": "spot"}, "robot"),
         ({"jump": False}, "walk only"),
-        (None, "not a network"),
+        (None, "not an ONNX network"),
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused(

@@ -13,11 +13,12 @@ import yaml
 
 from benchmarks.fuzz import fuzz
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
-from pronk.files import LIMIT, check_names, read_yaml
+from pronk.files import LIMIT, read_yaml
 from pronk.logs.mcap import McapWriter
 from pronk.logs.mcap_log import TOPICS
 from pronk.logs.readers import find_logs, read_log
 from pronk.match import gains
+from pronk.names import check_names
 from pronk.response.response import FrequencyResponse
 from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.files import check_names
 from pronk.logs.checks import TIME_UNITS, check_unit, correlation_note
 from pronk.logs.joint_log import JointLog, check_increasing
+from pronk.names import check_names
 from pronk.robots.robot import RobotSpec
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pronk.errors import LogError
-from pronk.files import check_names
+from pronk.names import check_names
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,8 @@ import numpy as np
 import yaml
 
 from pronk.errors import ArtefactError
-from pronk.files import check_names, converted, read_yaml, write_text
+from pronk.files import converted, read_yaml, write_text
+from pronk.names import check_names
 from pronk.simulators.simulator import SimulatorInfo
 
 SCHEMA = "pronk/gains/1"

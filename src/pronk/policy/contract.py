@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from pronk.errors import ArtefactError
-from pronk.files import check_names
+from pronk.names import check_names
 from pronk.policy.observation import ACTIONS, HISTORY, MEASURED
 from pronk.robots.robot import RobotSpec
 

@@ -246,7 +246,7 @@ def _check_operators(data: bytes, path: Path) -> None:
     if unknown := sorted(found - _OPERATORS):
         raise ArtefactError(
             f"{path}: its network uses {', '.join(unknown)[:200]}; a policy may use "
-            f"{', '.join(sorted(_OPERATORS))}."
+            f"{', '.join(sorted(_OPERATORS))}; export it again with this pronk."
         )
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pronk.errors import ArtefactError, PronkError
-from pronk.files import check_names, load_artefact, save_artefact
+from pronk.files import load_artefact, save_artefact
+from pronk.names import check_names
 
 SCHEMA = "pronk/response/2"
 

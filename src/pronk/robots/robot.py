@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pronk.actuator.law import EXPLICIT, DriveLaw
 from pronk.errors import RobotError
-from pronk.files import check_names
+from pronk.names import check_names
 
 if TYPE_CHECKING:
     import mujoco

@@ -160,7 +160,7 @@ class _Exported(nn.Module):
     def forward(self, measured: Tensor, jump: Tensor | None = None) -> tuple[Tensor, ...]:
         """(N, 105) and, for policies that jump, (N, 1) to (N, 12), (N, 4), (N, 3)."""
         if jump is None:
-            jump = torch.zeros_like(measured[:, :1])
+            jump = measured[:, :1].clamp(0.0, 0.0)  # zeros of the size of the batch
         latent = self.actor.get_latent({"measured": measured, "jump": jump})
         contact = latent[:, : ESTIMATE["contact"]]
         velocity = latent[:, ESTIMATE["contact"] : ESTIMATE_SIZE]
