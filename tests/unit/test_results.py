@@ -147,11 +147,13 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     [
         ("summary.json", "pronk/trial/3", "pronk/trial/2", "pronk/trial/2"),
         ("summary.json", '"cells"', '"cellars"', "damaged"),
+        ("summary.json", '"cells": [', '"cells": ' + "[" * 100_000, "cannot be read"),
         ("summary.json", "{", "", "cannot be read"),
         ("summary.json", None, "", "no such file"),
         ("trials.csv", None, "", "cannot be read"),
         ("trials.csv", "height_m", "height_ft", "line 2"),
         ("trials.csv", ",0.4,", ",tall,", "line 2"),
+        ("trials.csv", ",0.4,", f",{'4' * 200_000},", "line 2"),
         ("trials.csv", "matched,forward 1,3", "naive,forward 1,3", "do not fit"),
         ("trials.csv", "matched,forward 1,3", "matched,forward 9,3", "line 5"),
     ],

@@ -402,7 +402,7 @@ def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
         body = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ArtefactError(f"{path}: no such file; `{writer}` writes it.") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ArtefactError(f"{path}: cannot be read ({type(error).__name__}).") from None
     found = body.get("schema") if isinstance(body, dict) else None
     if found != schema:
@@ -445,7 +445,7 @@ def load(folder: Path, kind: Kind = JUMPS) -> Results:
         raise ArtefactError(
             f"{path}: cannot be read ({error.strerror}); `{kind.writer}` writes it."
         ) from None
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ArtefactError(
             f"{path}: line {len(rows) + 2} cannot be read ({type(error).__name__}: {error}); "
             f"`{kind.writer}` writes it anew."

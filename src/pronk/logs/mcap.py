@@ -33,7 +33,7 @@ STRINGS: dict[str, Any] = {"type": "array", "items": STRING}
 
 _RECORD_BYTES = 400
 """What a message takes in memory beside its data, about [bytes]."""
-_MOST_CHUNK = 32 * 2**20
+_MOST_CHUNK = 256 * 2**20
 """Largest size of one unpacked chunk [bytes]; writers use 1 to 8 MiB."""
 
 
