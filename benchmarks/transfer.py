@@ -121,7 +121,7 @@ def implicit(drive: PositionDriveCfg, law: DriveLaw, substep: float) -> Implicit
 def translated(
     gains: TrainingGains, robot: RobotSpec, trained: Profile, to: Profile
 ) -> TrainingGains:
-    """Training gains of a framework as those of another, without their ranges."""
+    """Training gains of a framework as those of another."""
     by_joint = {
         joint.name: (gains.groups[joint.group].stiffness, gains.groups[joint.group].damping)
         for joint in robot.joints
@@ -132,20 +132,10 @@ def translated(
         dry, drive = gains.groups[robot.joint(name).group].frictionloss, robot.joint(name).drive
         dry = drive.frictionloss if np.isnan(dry) else dry
         joints[name] = replace(one, delay_s=gains.delay_s, frictionloss=dry)
-    found, _ = translate(replace(stated, joints=joints), robot, to)
-    groups = {}
-    for group, own in gains.groups.items():
-        members = [found.joints[joint.name] for joint in robot.group(group)]
-        groups[group] = replace(
-            own,
-            stiffness=float(np.mean([joint.stiffness for joint in members])),
-            damping=float(np.mean([joint.damping for joint in members])),
-            frictionloss=float(np.mean([joint.frictionloss for joint in members])),
-            stiffness_range=0.0,
-            damping_range=0.0,
-        )
+    stated = replace(stated, joints=joints, groups=gains.groups)
+    found, _ = translate(stated, robot, to)
     delay = float(np.mean([joint.delay_s for joint in found.joints.values()]))
-    return replace(gains, groups=groups, delay_s=delay)
+    return replace(gains, groups=found.groups, delay_s=delay)
 
 
 def summary(found: Evaluation) -> dict[str, float]:

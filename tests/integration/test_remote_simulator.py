@@ -81,9 +81,9 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for found in Path(np.__file__).parents[1].glob("numpy*"):
         (site / "site-packages" / found.name).symlink_to(found)
     program = folder / "venv" / "bin" / "python"
-    ask = "import importlib.util as u; print([bool(u.find_spec(n)) for n in ('numpy', 'mujoco')])"
-    said = subprocess.run([program, "-c", ask], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == "[True, False]"
+    code = "import importlib.util as u; print([bool(u.find_spec(n)) for n in ('numpy', 'mujoco')])"
+    found_there = subprocess.run([program, "-c", code], capture_output=True, text=True, check=True)
+    assert found_there.stdout.strip() == "[True, False]"
     return program
 
 

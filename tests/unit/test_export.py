@@ -257,11 +257,12 @@ def smooth_arm() -> RobotSpec:
     return replace(arm, joints=joints)
 
 
-def motion(arm: RobotSpec, name: str, gains: MatchedGains) -> tuple[Array, Array]:
-    """Commands of all joints, and the positions with which a profile follows, (150, 6)."""
-    known, holds = profile(name).robot(arm), profile(name)
+def motion(
+    arm: RobotSpec, drives: dict[str, dict[str, float]], steps: int = 150
+) -> tuple[Array, Array]:
+    """Commands of all joints, and the positions with which a robot follows, (steps, 6)."""
     start = np.array([joint.default_position for joint in arm.joints])
-    time = holds.timestep_s * np.arange(150)
+    time = arm.timestep_s * np.arange(steps)
     command = start + 0.2 * np.sin(2.0 * np.pi * time[:, None] * np.linspace(0.5, 1.0, len(start)))
     log = JointLog(
         robot="so101",
@@ -270,8 +271,8 @@ def motion(arm: RobotSpec, name: str, gains: MatchedGains) -> tuple[Array, Array
         command=command,
         position=np.tile(start, (len(time), 1)),
     )
-    with ChainSimulation(known, [log], threads=1) as chain:
-        return command, chain.run([drives_of(known, gains)])[0][0]
+    with ChainSimulation(arm, [log], threads=1) as chain:
+        return command, chain.run([drives])[0][0]
 
 
 @pytest.mark.parametrize("name", list(profiles()))
@@ -283,7 +284,8 @@ def test_the_mjcf_moves_as_the_profile_does(name: str) -> None:
     model = mujoco.MjModel.from_xml_string(export_text(gains, "mjcf", arm, per="joint"))
     snippet = export_text(gains, "mjcf-snippet", arm, per="joint")
     assert all(f'joint="{joint}"' in snippet for joint in arm.joint_names)
-    command, expected = motion(arm, name, gains)
+    known = profile(name).robot(arm)
+    command, expected = motion(known, drives_of(known, gains))
     data = mujoco.MjData(model)
     data.qpos[:] = expected[0]
     length = int(model.actuator_history[0, 0])
@@ -313,7 +315,8 @@ def test_joints_of_mjlab_move_as_its_profile_does() -> None:
     # As mjlab's SimulationCfg sets them.
     model.opt.timestep = profile(name).timestep_s
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    command, expected = motion(arm, name, gains)
+    known = profile(name).robot(arm)
+    command, expected = motion(known, drives_of(known, gains))
     data = mujoco.MjData(model)
     data.qpos[:] = expected[0]
     order = [model.actuator(i).name.split("/")[-1] for i in range(model.nu)]
@@ -421,20 +424,9 @@ def test_friction_that_falls_with_speed_is_in_the_mjcf_and_named_elsewhere() -> 
     drives = drives_of(arm, gains)
     for name, group in gains.groups.items():
         drives[name] |= {"stiffness": group.stiffness, "damping": group.damping}
-    start = np.array([joint.default_position for joint in arm.joints])
-    time = arm.timestep_s * np.arange(400)
-    command = start + 0.2 * np.sin(2.0 * np.pi * time[:, None] * np.linspace(0.5, 1.0, len(start)))
-    log = JointLog(
-        robot="so101",
-        joints=arm.joint_names,
-        time=time,
-        command=command,
-        position=np.tile(start, (len(time), 1)),
-    )
-    with ChainSimulation(arm, [log], threads=1) as chain:
-        expected = chain.run([drives])[0][0]
+    command, expected = motion(arm, drives, 400)
     data = mujoco.MjData(model)
-    data.qpos[:] = start
+    data.qpos[:] = command[0]
     for target, position in zip(command, expected, strict=True):
         assert data.qpos == pytest.approx(position, abs=1e-5)
         data.ctrl[:] = target

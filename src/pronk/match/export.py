@@ -439,33 +439,29 @@ _PHYSX_TARGETS = {
         stribeck=True,
     ),
 }
-_MJLAB_DELAY = ("delay_min_lag", "delay_max_lag")
-_MJLAB = {name: name for name in ("frictionloss", "viscous_damping", "effort_limit")}
+_IDEAL_PD = Target(
+    profile="mjlab",
+    body=_mjlab,
+    call="IdealPdActuatorCfg",
+    arguments=_GAINS | {n: n for n in ("frictionloss", "viscous_damping", "effort_limit")},
+    delay=("delay_min_lag", "delay_max_lag"),
+    settings=f"{_STEP}. IdealPdActuator has no torque-speed line.",
+)
 TARGETS: Mapping[str, Target] = {
-    "mjlab": Target(
-        profile="mjlab",
-        body=_mjlab,
+    "mjlab": replace(
+        _IDEAL_PD,
         call="DcMotorActuatorCfg",
-        arguments=_GAINS
-        | _MJLAB
-        | {"saturation_effort": "stall_torque", "velocity_limit": "no_load_speed"},
-        delay=_MJLAB_DELAY,
+        arguments={
+            **_IDEAL_PD.arguments,
+            **{"saturation_effort": "stall_torque", "velocity_limit": "no_load_speed"},
+        },
         settings=f"{_STEP}.",
     ),
-    "mjlab-idealpd": Target(
-        profile="mjlab",
-        body=_mjlab,
-        call="IdealPdActuatorCfg",
-        arguments=_GAINS | _MJLAB,
-        delay=_MJLAB_DELAY,
-        settings=f"{_STEP}. IdealPdActuator has no torque-speed line.",
-    ),
-    "mjlab-builtin": Target(
+    "mjlab-idealpd": _IDEAL_PD,
+    "mjlab-builtin": replace(
+        _IDEAL_PD,
         profile="mjlab-builtin",
-        body=_mjlab,
         call="BuiltinPositionActuatorCfg",
-        arguments=_GAINS | _MJLAB,
-        delay=_MJLAB_DELAY,
         settings=f"{_STEP}, the integrator to implicitfast.",
     ),
     **_PHYSX_TARGETS,

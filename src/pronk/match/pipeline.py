@@ -172,8 +172,9 @@ def match_frameworks(
     for name, framework in frameworks.items():
         clock, kind = _Clock(progress, f"{name} "), _kind(robots[name])
         if kind not in done:
-            names_ = [n for n in fitted if n != "frictionloss" or framework.friction == "N m"]
-            done[kind] = _matched(logs, robots[name], chosen, mode, names_, clock, measured, own)
+            dry = framework.friction == "N m"
+            known = [n for n in fitted if dry or n != "frictionloss"]
+            done[kind] = _matched(logs, robots[name], chosen, mode, known, clock, measured, own)
         info = replace(framework.info, decimation=robots[name].decimation)
         out[name] = done[kind].result(every, info, clock)
     return out

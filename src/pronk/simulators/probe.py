@@ -32,7 +32,7 @@ from pronk.simulators.simulator import Simulator
 Array = NDArray[np.float64]
 
 AMPLITUDE = 0.2
-"""Of the commands [rad]; less where the drive's effort limit asks for it."""
+"""Of the commands [rad]; less where the drive's effort limit needs it."""
 _REST = 8
 """Steps before the command moves."""
 _HOLDS = 40

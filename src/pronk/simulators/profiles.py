@@ -51,10 +51,15 @@ class Profile:
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse an impossible step or law."""
+        """Refuse an impossible step or law, and friction of an unknown kind."""
         if not 1e-5 <= self.timestep_s <= 0.05:
             raise PronkError(
                 f"profile {self.name}: timestep_s {self.timestep_s:g}; expected 1e-5 to 0.05 s."
+            )
+        if self.friction not in get_args(Friction):
+            raise PronkError(
+                f"profile {self.name}: friction {self.friction!r}; expected "
+                f"{', '.join(get_args(Friction))}."
             )
         _ = self.drive_law
 
@@ -124,14 +129,10 @@ def profile(text: str) -> Profile:
         if key not in kinds:
             raise PronkError(f"profile {text}: setting {key!r}; expected {', '.join(kinds)}.")
         try:
-            number = kinds[key](value)
+            own = kinds[key](value)
         except ValueError:
             raise PronkError(f"profile {text}: {key} {value!r}; expected a number.") from None
-        found = replace(found, **{key: number})
-        if found.friction not in get_args(Friction):
-            raise PronkError(
-                f"profile {text}: friction {value!r}; expected {', '.join(get_args(Friction))}."
-            )
+        found = replace(found, **{key: own})
     return found
 
 

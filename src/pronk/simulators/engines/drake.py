@@ -81,7 +81,7 @@ class Drake(EngineSimulator):
             data = value if explicit else np.concatenate([value, np.zeros(count)])
             fixed.GetMutableData().get_mutable_value().SetFromVector(data)
             after = plant.EvalUniquePeriodicDiscreteUpdate(context)
-            # Asked for anew each step: that is what tells the context of the change.
+            # Taking the mutable state, each step, marks what depends on it as changed.
             context.get_mutable_discrete_state().SetFrom(after)
         return out
 
