@@ -11,8 +11,7 @@ torque sensor from a factor of all masses, so the scale is fitted only with the 
 armature of a joint is apart from its link where another joint's coupling shows the link's inertia
 alone; joints with the same actuator may share one armature. What the regression leaves open is
 found by the null space of the regressor and is not reported as a number. Viscous and
-Stribeck friction that the recordings do not identify are held at zero, and the rest is fitted
-again.
+Stribeck friction have priors about zero (`_PRIOR`), which count in every interval.
 
 Velocity and acceleration are derivatives of the measured position, all low-passed alike and
 without phase shift. The torque is a measured one, as from the current. With the commanded torques
@@ -88,8 +87,10 @@ _AGREE = 0.3
 """Relative difference of one parameter by torque and by position that is no contradiction."""
 _BOTH = {"armature": ("armature", "kg m^2"), "dry": ("frictionloss", "N m")}
 """Names by position and units of what is fitted by torque as well."""
-_HELD_FIRST = ("stribeck", "viscous")
-"""Terms held at zero where they are not identified, in this order."""
+_PRIOR = {"viscous": 1.0, "stribeck": 0.3}
+"""Standard deviations about zero, of the root mean square torque of the joint's friction: all of it
+may be viscous, and geared drives break away at 1.15 to 1.45 of their Coulomb friction (those of
+the virtual robot; AK80-6 held out: the same cells are lower for 0.1 to 3)."""
 _STILL = TorqueParameter(value=np.nan, ci95=(np.nan, np.nan), reason="it does not move")
 DRIVE_TERMS = ("armature", "viscous", "dry", "stribeck")
 UNITS = {
@@ -319,22 +320,7 @@ def fit_torque(
         raise LogError(f"the recordings make {first} blocks of {BLOCK_S:g} s; intervals need 3.")
     design, goal = np.concatenate(columns), np.concatenate(torques)
     blocks = np.repeat(np.concatenate(numbers), goal.shape[1])
-    held: dict[tuple[str, str], TorqueParameter] = {}
-    while True:
-        found = _solve(model, design, goal, blocks, held)
-        unknown = [
-            (joint, term)
-            for term in _HELD_FIRST
-            for joint in model.joints
-            if (joint, term) not in held
-            and not (one := found.joints[joint][term]).identified
-            and one is not _STILL
-        ]
-        if not unknown:
-            return found
-        for joint, term in unknown:
-            if term == unknown[0][1]:
-                held[joint, term] = found.joints[joint][term]
+    return _solve(model, design, goal, blocks)
 
 
 def fit_drives(
@@ -449,19 +435,14 @@ def _unusable(log: JointLog, chain: Sequence[str]) -> str:
     return "" if motion(log, chain).moves().any() else "no joint moves enough"
 
 
-def _solve(
-    model: TorqueModel,
-    design: Array,
-    goal: Array,
-    blocks: NDArray[np.int64],
-    held: Mapping[tuple[str, str], TorqueParameter],
-) -> TorqueFit:
-    """Least squares with some parameters at zero; `held` has them as they were last fitted."""
-    design = design * np.array([name not in held for name in model.names])
+def _solve(model: TorqueModel, design: Array, goal: Array, blocks: NDArray[np.int64]) -> TorqueFit:
+    """Least squares, each joint weighted by its residual."""
     weight, counts = np.ones(goal.shape[1]), design.any(axis=2).sum(axis=0)
+    at = {name: k for k, name in enumerate(model.names)}
+    prior = np.zeros((0, design.shape[2]))
     for _ in range(_PASSES):
-        rows = (design * weight[:, None]).reshape(-1, design.shape[2])
-        sought = (goal * weight).ravel()
+        rows = np.vstack([(design * weight[:, None]).reshape(-1, design.shape[2]), prior])
+        sought = np.concatenate([(goal * weight).ravel(), np.zeros(len(prior))])
         size = np.linalg.norm(rows, axis=0)
         size[size == 0.0] = 1.0
         left, singular, right = np.linalg.svd(rows / size, full_matrices=False)
@@ -471,8 +452,22 @@ def _solve(
         x = right[:rank].T @ best / size
         rms = np.sqrt(np.sum((design @ x - goal) ** 2, axis=0) / np.maximum(counts, 1))
         weight = 1.0 / np.maximum(rms, 1e-9)
-    moves = block_moves(reduced, reduced @ best - sought, blocks)
-    spread = right[:rank].T @ jackknife(moves) @ right[:rank] / np.outer(size, size)
+        deviation = {}
+        for j, name in enumerate(model.joints):
+            terms = [at[name, term] for term in ("viscous", "dry", "stribeck")]
+            friction = np.linalg.norm(design[:, j, terms] @ x[terms])
+            for term, share in _PRIOR.items():
+                unit = np.linalg.norm(design[:, j, at[name, "dry" if term == "stribeck" else term]])
+                if unit > 0.0 and friction > 0.0:
+                    deviation[at[name, term]] = share * friction / unit
+        prior = np.eye(len(x))[list(deviation)] / np.array([*deviation.values()])[:, None]
+    known = len(rows) - goal.size
+    moves = block_moves(reduced, reduced @ best - sought, np.append(blocks, np.full(known, -1)))
+    moves = moves[min(known, 1) :]
+    # An optimum moves by this when the truth is one deviation of its prior from zero.
+    drawn = reduced[goal.size :] / singular[:rank] ** 2
+    spread = jackknife(moves) + drawn.T @ drawn
+    spread = right[:rank].T @ spread @ right[:rank] / np.outer(size, size)
     # Share of each (scaled) parameter that moves along combinations without effect.
     open_share = np.sqrt(np.maximum(1.0 - np.sum(right[:rank] ** 2, axis=0), 0.0))
     joints = {}
@@ -485,9 +480,6 @@ def _solve(
             continue
         apart = float(np.sqrt(np.sum(left**2) / counts[j]))
         joints[name] = _parameters(model, name, x, spread, open_share, len(moves), apart)
-    for (joint, term), last in held.items():
-        reason = f"held at 0: {last.reason}"
-        joints[joint][term] = replace(last, value=0.0, reason=reason)
     return TorqueFit(
         joints=joints, coefficients=x, rank=rank, rms=rms, blocks=len(moves), model=model
     )
