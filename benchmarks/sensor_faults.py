@@ -28,7 +28,7 @@ from pronk.cli import console
 from pronk.cli.simulate import _SERVERS
 from pronk.errors import HardwareError
 from pronk.links.address import Address
-from pronk.links.realtime import die_with_parent
+from pronk.processes import die_with_parent
 from pronk.robots import load_robot
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.plan import Link, Plan

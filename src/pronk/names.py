@@ -1,4 +1,4 @@
-"""Names of joints and robots, which become names of files and are printed."""
+"""Names of joints and robots, which are printed and, by `file_name`, become names of files."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from collections.abc import Iterable
 from pronk.errors import PronkError
 
 _MOST_NAMES, _NAME_BYTES = 1000, 120
-"""Most joints; longest name, which with an ending is a file name of at most 255 bytes."""
-_NOT_IN_NAMES = frozenset('/\\$<>|*?"`')
+"""Most joints; longest name of a file without its ending (file systems take 255 bytes in all)."""
+_NOT_IN_NAMES = frozenset('\\$<>|*?"`')
+
+
+def file_name(name: str) -> str:
+    """Name of a file for a checked name; other for each: `/` (of namespaced models) becomes %2F."""
+    return name.replace("%", "%25").replace("/", "%2F")
 
 
 def check_names(names: Iterable[str], where: str, kind: type[PronkError]) -> None:
-    """Refuse names of joints and robots that cannot be file names or cannot be printed."""
+    """Refuse names of joints and robots that cannot be printed or, by `file_name`, name a file."""
     for count, name in enumerate(names, 1):
-        size = len(name.encode(errors="replace"))
+        size = len(file_name(name).encode(errors="replace"))
         if count > _MOST_NAMES:
             raise kind(f"{where}: more than {_MOST_NAMES} names; expected those of joints.")
         bad = _NOT_IN_NAMES.intersection(name) or not name.isprintable() or name[:1] in ".-"

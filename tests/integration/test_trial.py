@@ -16,8 +16,9 @@ from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation import results
 from pronk.evaluation.jumps import measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case, parse_case
-from pronk.evaluation.trial import Plan, draw, in_processes, load_subjects, prepare, run_trial
+from pronk.evaluation.trial import Plan, draw, load_subjects, prepare, run_trial
 from pronk.files import sha256
+from pronk.processes import in_processes
 from pronk.runtime.script import STILL, Script
 from pronk.virtual import capture
 from pronk.virtual.sim_params import SHIPPED, load_sim_params

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import resource
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,14 @@ import pytest
 import yaml
 
 from benchmarks.fuzz import fuzz
+from pronk.cli.main import run
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
 from pronk.files import LIMIT, read_yaml
 from pronk.logs.mcap import McapWriter
 from pronk.logs.mcap_log import TOPICS
 from pronk.logs.readers import find_logs, read_log
 from pronk.match import gains
-from pronk.names import check_names
+from pronk.names import check_names, file_name
 from pronk.response.response import FrequencyResponse
 from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model
@@ -87,7 +89,7 @@ def test_gains_that_cannot_be_are_refused(tmp_path: Path, field: str, value: str
         gains.load(path)
 
 
-NAMES = ["x/../../../w_evil", "..", "$", "a\0b", "a\x1b[31mred", "n" * 300, "", "a\u202eb", "-rf"]
+NAMES = ["..", "$", "a\0b", "a\x1b[31mred", "n" * 300, "", "a\u202eb", "-rf"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -95,6 +97,7 @@ def test_names_are_checked_where_they_are_read(tmp_path: Path, name: str) -> Non
     t = np.arange(1000) / 500.0
     arrays = {"time": t, "command": np.sin(t)[:, None], "position": np.sin(t)[:, None]}
     np.savez(tmp_path / "a.npz", joints=np.array([name]), **arrays)
+    np.savez(tmp_path / "b.npz", joints=np.array(["knee"]), **arrays)
     (tmp_path / "gains.yaml").write_text(GAINS)
     body = read_yaml(tmp_path / "gains.yaml")
     body["joints"] = {name: body["joints"]["knee"]}
@@ -105,6 +108,8 @@ def test_names_are_checked_where_they_are_read(tmp_path: Path, name: str) -> Non
         gains.load(tmp_path / "gains.yaml")
     with pytest.raises(ArtefactError):
         response(joint=name)
+    with pytest.raises(LogError):
+        replace(read_log(tmp_path / "b.npz", unit="rad"), robot=name)
     for error in (caught.value, other.value):
         assert str(error).isprintable()
         assert len(str(error)) < 600
@@ -112,8 +117,27 @@ def test_names_are_checked_where_they_are_read(tmp_path: Path, name: str) -> Non
 
 def test_names_of_real_robots_pass() -> None:
     check_names(
-        ["FR_calf_joint", "left hip 1", "arm.joint-2", "Gelenk_ä", "1"], "names", RobotError
+        ["FR_calf_joint", "left hip 1", "arm.joint-2", "Gelenk_ä", "1", "go2/FR"], "n", RobotError
     )
+    assert file_name("FR_knee") == "FR_knee"
+    assert len({file_name(name) for name in ("a/b", "a%2Fb", "a_b", "ab")}) == 4
+
+
+def test_files_of_namespaced_joints_stay_in_their_folder(tmp_path: Path) -> None:
+    names, out = ("go2/knee", "x/../../../../evil"), tmp_path / "a" / "b" / "out"
+    t = np.arange(8000) / 500.0
+    wave = 0.2 * np.sin(2.0 * np.pi * 0.5 * t**2)[:, None] * [1.0, 0.5]
+    arrays = {"time": t, "command": wave, "position": wave, "joints": np.array(names)}
+    np.savez(tmp_path / "log.npz", **arrays)  # type: ignore[arg-type]
+    model = "<mujoco><worldbody><body>{}<geom size='.1'/></body></worldbody></mujoco>"
+    joints = "".join(f"<joint name='{name}'/>" for name in names)
+    (tmp_path / "model.xml").write_text(model.format(joints))
+    before = set(tmp_path.parent.rglob("*"))
+    words = ["response", tmp_path / "log.npz", "--robot", tmp_path / "model.xml", "--unit", "rad"]
+    assert run([*map(str, words), "--out", str(out)]) == 0
+    new = set(tmp_path.parent.rglob("*")) - before
+    assert {path for path in new if path.is_file()} == set(out.iterdir())
+    assert len(list(out.glob("*.svg"))) == 2
 
 
 def bomb(path: Path, rows: int) -> None:

@@ -6,9 +6,7 @@ import importlib.util
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +15,8 @@ from pronk.cli import console
 from pronk.cli.match import prediction_rows, summary
 from pronk.cli.sweep import AMPLITUDES
 from pronk.errors import PronkError
+from pronk.names import file_name
+from pronk.processes import pool
 
 if TYPE_CHECKING:
     from pronk.evaluation.results import Results
@@ -60,11 +60,8 @@ def demo(
     robot = load_robot(ROBOT)
     tried = find_policies(policies, robot)
     # The jumps need nothing of the match; their process uses the cores that it leaves idle.
-    with (
-        console.progress() as report,
-        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
-    ):
-        jumping = pool.submit(jump_and_film, tried, out / "trial", jumps, seed)
+    with console.progress() as report, pool(1) as process:
+        jumping = process.submit(jump_and_film, tried, out / "trial", jumps, seed)
         result, replays = sweep_and_match(robot, out, repeats, seed, report)
         report("jumps and film", 0.0)
         trial, films = jumping.result()
@@ -190,7 +187,7 @@ def sweep_and_match(
     gains_file.save(out / "gains.yaml", result.gains)
     result_file.save(out / "match.npz", result)
     for name, joint in result.joints.items():
-        save_responses(out / "logs" / f"{name}.response.npz", joint.responses)
+        save_responses(out / "logs" / f"{file_name(name)}.response.npz", joint.responses)
     read = read_logs(fresh, robot=robot)
     replays = [one for log in read for one in predict(log, robot, result.gains).joints]
     prediction = Prediction(joints=tuple(replays), source="fresh", virtual=True)

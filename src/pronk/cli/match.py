@@ -13,6 +13,7 @@ import tyro
 from pronk.cli import console, options
 from pronk.cli.options import Reading
 from pronk.errors import PronkError
+from pronk.names import file_name
 
 if TYPE_CHECKING:
     from pronk.match.predict import JointPrediction
@@ -260,7 +261,8 @@ def predict(
             save_prediction(path, replace(found, source=Path(log.source).name))
             written.append(path)
             for one in found.joints:
-                name = stem if stem == one.joint else f"{stem}.{one.joint}"
+                own = file_name(one.joint)
+                name = stem if stem == own else f"{stem}.{own}"
                 figure = figures.prediction(one, virtual=log.virtual)
                 written.append(style.save(figure, folder / f"{name}.prediction.svg"))
             rows += [row | {"log": log.source} for row in prediction_rows(found.joints)]

@@ -11,6 +11,7 @@ import tyro
 from pronk.cli import console
 from pronk.cli.options import Reading
 from pronk.errors import LogError
+from pronk.names import file_name
 
 if TYPE_CHECKING:
     from pronk.response.response import FrequencyResponse
@@ -55,7 +56,8 @@ def response(
                 mine = estimate(log, joint, Estimator())
                 found += mine
                 if plots:
-                    name = stem if joints == (stem,) else f"{stem}.{joint}"
+                    own = file_name(joint)
+                    name = stem if len(joints) == 1 and own == stem else f"{stem}.{own}"
                     path = folder / f"{name}.response.svg"
                     written.append(style.save(figures.responses(mine), path))
             save(folder / f"{stem}.response.npz", found)

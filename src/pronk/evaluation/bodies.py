@@ -48,6 +48,7 @@ from pronk.match.measured_joint import logs_by_joint, measured_joints
 from pronk.match.pipeline import match_logs
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
+from pronk.names import file_name
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import MujocoSimulator
 from pronk.virtual.sim_params import SCHEMA as PARAMS_SCHEMA
@@ -299,7 +300,7 @@ def match_body(
     The match reads the logs and nothing else. A folder that has the robot's gains is read. `seed`
     is of all noise; `processes` sweep legs at once; `stages` are named after `name`.
     """
-    files = [folder / LOGS / f"{joint}.mcap" for joint in robot.joint_names]
+    files = [folder / LOGS / f"{file_name(joint)}.mcap" for joint in robot.joint_names]
     same = False
     if (folder / GAINS).exists():  # written last
         with suppress(PronkError):

@@ -54,9 +54,9 @@ from pronk.evaluation.trial import (
     Setup,
     case_rng,
     finished,
-    in_processes,
     load_subjects,
 )
+from pronk.processes import in_processes
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.rollout import ticks

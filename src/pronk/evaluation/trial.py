@@ -14,19 +14,15 @@ from __future__ import annotations
 
 import hashlib
 import math
-import multiprocessing
 import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NotRequired, TypedDict, TypeVar, Unpack
+from typing import Any, Literal, NotRequired, TypedDict, Unpack
 
 import msgspec
 import numpy as np
@@ -37,9 +33,9 @@ from pronk.evaluation.jumps import JumpRules, measure
 from pronk.evaluation.protocol import PAPER_COMMANDS, RATES, Case
 from pronk.evaluation.results import JUMPS, SUMMARY, TABLE, Kind, Results, Row, Subject, save
 from pronk.files import sha256
-from pronk.links.realtime import die_with_parent
 from pronk.policy.contract import check
 from pronk.policy.runtime import Policy, load_policy
+from pronk.processes import in_processes
 from pronk.robots import load_robot
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
@@ -50,8 +46,6 @@ from pronk.virtual.ground import Start
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SHIPPED, SHIPPED_ROBOT, SimParams, load_sim_params
 
-J = TypeVar("J")
-R = TypeVar("R")
 Keep = Literal["none", "some", "all"]
 """Captures: of no jump, of the first with each command and those at `RATES`, of every jump."""
 
@@ -218,39 +212,6 @@ def cores() -> int:
     """Cores that this process may use."""
     some = getattr(os, "sched_getaffinity", None)  # not on every system
     return len(some(0)) if some else os.cpu_count() or 1
-
-
-def in_processes(
-    work: Callable[[J], R],
-    jobs: Sequence[J],
-    *,
-    processes: int = 1,
-    progress: Callable[[float], None] | None = None,
-) -> list[R]:
-    """Do every job, in this process or in several; `work` is a function of a module."""
-    if processes < 1:
-        raise PronkError(f"{processes} processes; expected 1 or more.")
-    done: list[R] = []
-    with ExitStack() as stack:
-        run: Callable[..., Iterator[R]] = map
-        if processes > 1 and len(jobs) > 1:
-            # A fork of a process that has threads can deadlock.
-            context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(
-                min(processes, len(jobs)), mp_context=context, initializer=die_with_parent
-            )
-            run = stack.enter_context(pool).map
-        try:
-            for result in run(work, jobs):
-                done.append(result)
-                if progress is not None:
-                    progress(len(done) / len(jobs))
-        except BrokenProcessPool:
-            raise PronkError(
-                "one of the processes was killed, most likely for want of memory; "
-                "try again with --processes 1."
-            ) from None
-    return done
 
 
 def plan_jobs(

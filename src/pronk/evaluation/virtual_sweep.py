@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pronk.evaluation.trial import in_processes
 from pronk.excitation.plan import SweepPlan
+from pronk.names import file_name
+from pronk.processes import in_processes
 from pronk.runtime.sweep import SweepTask, record
 from pronk.virtual.plant import leg_of, legs_of
 from pronk.virtual.robot import VirtualRobot
@@ -37,7 +38,7 @@ def sweep_virtual(
         )
         jobs += [(task, sim_params, limb, 1000 * seed + index)] if joints else []
     logs = in_processes(_sweep_limb, jobs, processes=processes, progress=progress)
-    order = {name: i for i, name in enumerate(robot.joint_names)}
+    order = {file_name(name): i for i, name in enumerate(robot.joint_names)}
     return sorted((path for paths in logs for path in paths), key=lambda path: order[path.stem])
 
 

@@ -19,7 +19,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any, Self
@@ -28,8 +28,6 @@ import numpy as np
 
 _LOCK_NOW_AND_LATER = 3
 """MCL_CURRENT | MCL_FUTURE of mlockall(2)."""
-_SET_PARENT_DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of prctl(2)."""
 _LEAST_CORES = 4
 """Fewest cores of which one can be reserved."""
 
@@ -177,15 +175,6 @@ def terminal_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def die_with_parent(number: int = signal.SIGKILL) -> None:
-    """Have the system send this process a signal when its parent ends, however that ends.
-
-    Linux only; the parent is the thread that started this process.
-    """
-    with suppress(AttributeError, OSError):
-        ctypes.CDLL(None, use_errno=True).prctl(_SET_PARENT_DEATH_SIGNAL, int(number))
 
 
 def leave() -> None:

@@ -99,7 +99,7 @@ class JointLog:
         """Refuse wrong shapes, numbers that are not finite, and time that does not increase."""
         where = self.source or "log"
         n, width = len(self.time), len(self.joints)
-        check_names(self.joints, where, LogError)
+        check_names((self.robot, *self.joints), where, LogError)
         check_increasing(self.time, where, "sample {}".format)
         if width == 0:
             raise LogError(f"{where}: no joints.")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import multiprocessing
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
@@ -25,6 +23,7 @@ from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap_log import read_mcap
 from pronk.logs.pace_reader import read_pace
 from pronk.logs.sage_reader import is_sage, read_sage
+from pronk.processes import in_processes
 from pronk.robots.robot import RobotSpec
 
 GROUP = "pronk.readers"
@@ -230,12 +229,7 @@ def read_logs(paths: Iterable[Path | str], *, processes: int = 1, **options: Any
     """Read the logs that `find_logs` finds, several at a time; `options` as for `read_log`."""
     files = find_logs(paths)
     read: Callable[[Path], JointLog] = partial(read_log, **options)
-    if processes < 2 or len(files) < _WORTH_PROCESSES:
-        return [read(path) for path in files]
-    # Threads of the simulator do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        return list(pool.map(read, files))
+    return in_processes(read, files, processes=processes if len(files) >= _WORTH_PROCESSES else 1)
 
 
 def _suffixes(known: Mapping[str, Reader]) -> dict[str, str]:

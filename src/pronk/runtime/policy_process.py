@@ -21,10 +21,11 @@ import numpy as np
 
 from pronk.errors import PronkError
 from pronk.links.machine import State
-from pronk.links.realtime import Histogram, Pace, die_with_parent, enter, leave, sleep_until
+from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
 from pronk.policy.contract import Contract
 from pronk.policy.observation import History
 from pronk.policy.runtime import Policy, load_policy
+from pronk.processes import die_with_parent
 from pronk.runtime.ipc import ACTIONS, STEP, Mode, Shared, event, fill, get_state, serve
 from pronk.runtime.plan import POLICY_PRIORITY, Plan
 from pronk.runtime.rollout import PolicyRunner, measurement

@@ -21,7 +21,8 @@ import numpy as np
 
 from pronk.errors import HardwareError, PronkError
 from pronk.links.machine import Command, Machine, State
-from pronk.links.realtime import Histogram, Pace, die_with_parent, enter, leave, sleep_until
+from pronk.links.realtime import Histogram, Pace, enter, leave, sleep_until
+from pronk.processes import die_with_parent
 from pronk.runtime import ipc
 from pronk.runtime.ipc import Mode, OperatorRequest, Shared
 from pronk.runtime.plan import SERVO_PRIORITY, Plan

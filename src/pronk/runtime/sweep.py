@@ -24,6 +24,7 @@ from pronk.excitation.plan import POSE_RAMP_S, Excitation, SweepPlan
 from pronk.links.machine import Command, Machine, State, TorqueKind
 from pronk.logs.joint_log import Segment
 from pronk.logs.mcap_log import LogHeader, McapLogWriter, reason_of
+from pronk.names import file_name
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import TEXT, Record, SampleKind, Shared, sample_dtype
 from pronk.runtime.safety import Limits, SafetyFilter
@@ -67,7 +68,7 @@ class SweepTask:
     @property
     def paths(self) -> list[Path]:
         """Of the logs."""
-        return [self.out_dir / f"{name}.mcap" for name in self.excited]
+        return [self.out_dir / f"{file_name(name)}.mcap" for name in self.excited]
 
     def excitations(self, joint: str) -> list[Excitation]:
         """Excitations of one joint's log."""
