@@ -9,7 +9,8 @@ The delay of a match is that behind the command column: where that column is lat
 joint is, the right number is what remains, and nothing in a `bare` log shows it.
 
 A case counts as named if a finding holds the true cause, as refused if reading, estimating or
-matching the log raises an error; `other` is a finding of other causes alone, `silent` none.
+matching the log raises an error, as unchecked if the match states that the log would not show the
+cause; `other` is a finding of other causes alone, `silent` none.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +53,7 @@ model's, or 0.75 to 1.33 times the model's. The numbers go into the seed."""
 WRONG_NUMBER = {"stiffness": 0.05, "damping": 0.1}
 """Relative change of a matched gain by the corruption that is a wrong number."""
 WRONG_DELAY_S = 0.002
+OUTCOMES = ("named", "refused", "unchecked", "other", "silent")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,21 +285,25 @@ CORRUPTIONS: Mapping[str, tuple[Callable[[Case, np.random.Generator], Case] | No
 SETTINGS = MatchSettings(zero_armature=False, threads=1)
 
 
-def judged(case: Case, expected: Collection[str] = ()) -> tuple[set[str], list[str]]:
-    """Causes that a match names, and its flags; {"refused"} and the message for an error.
+def judged(
+    case: Case, expected: Collection[str] = ()
+) -> tuple[set[str], list[str], tuple[str, ...]]:
+    """Causes that a match names, its flags, and what it states that the log would not show.
 
-    The fit is left out where the log alone names one of the `expected` causes.
+    {"refused"} and the message for an error. The fit is left out where the log alone names one of
+    the `expected` causes.
     """
     try:
         check_radians(case.log, case.joint)
         require_plausible({case.joint: [case.log]}, case.robot)
-        flags = [str(one) for one in findings([case.log], case.joint, case.robot)]
+        flags = [str(one) for one in findings([case.log], case.joint, case.robot)[0]]
+        unchecked: tuple[str, ...] = ()
         if not _causes(flags) & set(expected):
             found = match_logs([case.log], case.robot, settings=SETTINGS).joints[case.joint]
-            flags = list(found.flags)
+            flags, unchecked = list(found.flags), found.unchecked
     except PronkError as error:
-        return {"refused"}, [str(error)]
-    return _causes(flags), flags
+        return {"refused"}, [str(error)], ()
+    return _causes(flags), flags, unchecked
 
 
 def _causes(flags: Sequence[str]) -> set[str]:
@@ -324,24 +332,39 @@ def run(
     *,
     kinds: Sequence[str] = ("sweep", "bare"),
     corruptions: Sequence[str] = tuple(CORRUPTIONS),
+    jobs: int = 1,
 ) -> list[dict[str, Any]]:
-    """Judge `cases` logs of each corruption and kind of log; one row for each."""
-    if cases < 1:
-        raise PronkError(f"{cases} cases; expected 1 or more.")
-    robot = load_robot(ROBOT)
+    """Judge `cases` logs of each corruption and kind of log in `jobs` processes; one row for each.
+
+    An interrupt ends with the robots that are done.
+    """
+    if cases < 1 or jobs < 1:
+        raise PronkError(f"{cases} cases in {jobs} jobs; expected 1 or more of each.")
+    judge = partial(_robot, seed=seed, cache=cache, kinds=kinds, corruptions=corruptions)
     rows: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for number in range(cases):
-        for friction in FRICTION:
-            names = [n for n in corruptions if _friction_of(n) == friction]
-            if not names:
-                continue
+    with Pool(jobs) as pool:
+        try:
+            for done, found in enumerate(pool.imap_unordered(judge, range(cases))):
+                for key, one in found:
+                    rows.setdefault(key, []).append(one)
+                progress("judge", (done + 1) / cases)
+        except KeyboardInterrupt:
+            console.warn("interrupted")
+    return [{"corruption": n, "log": k, "cases": each} for (n, k), each in rows.items()]
+
+
+def _robot(
+    number: int, *, seed: int, cache: Path, kinds: Sequence[str], corruptions: Sequence[str]
+) -> list[tuple[tuple[str, str], dict[str, Any]]]:
+    """Every corruption of the logs of one number, by corruption and kind of log."""
+    robot, rows = load_robot(ROBOT), []
+    for friction in FRICTION:
+        if names := [n for n in corruptions if _friction_of(n) == friction]:
             sweep = recorded(robot, seed, number, friction, cache)
             for kind in kinds:
                 clean = sweep if kind == "sweep" else replace(sweep, log=bare(sweep.log))
-                for name in names:
-                    rows.setdefault((name, kind), []).append(_judge(clean, name, number, seed))
-        progress("judge", (number + 1) / cases)
-    return [{"corruption": n, "log": k, "cases": each} for (n, k), each in rows.items()]
+                rows += [((name, kind), _judge(clean, name, number, seed)) for name in names]
+    return rows
 
 
 def _friction_of(name: str) -> str:
@@ -354,13 +377,15 @@ def _judge(clean: Case, name: str, number: int, seed: int) -> dict[str, Any]:
     change, expected = CORRUPTIONS[name]
     rng = np.random.default_rng([seed, number, list(CORRUPTIONS).index(name)])
     case = clean if change is None else change(clean, rng)
-    causes, words = judged(case, expected)
+    causes, words, unchecked = judged(case, expected)
     outcome = "other" if causes else "silent"
     if causes == {"refused"}:
         outcome = "refused"
     elif causes & expected:
         outcome = "named"
-    wrong = outcome == "silent" and change is not None and wrong_number(clean, case)
+    elif _causes(unchecked) & expected:
+        outcome = "unchecked"
+    wrong = outcome in ("silent", "unchecked") and change is not None and wrong_number(clean, case)
     return {
         "number": number,
         "joint": case.joint,
@@ -372,7 +397,7 @@ def _judge(clean: Case, name: str, number: int, seed: int) -> dict[str, Any]:
 
 
 def wrong_inputs(
-    cases: int = 100, seed: int = 0, cache: Path = Path("wrong-inputs-logs")
+    cases: int = 100, seed: int = 0, cache: Path = Path("wrong-inputs-logs"), jobs: int = 1
 ) -> console.Outcome:
     """How often wrong inputs are named or refused, and right ones flagged.
 
@@ -380,17 +405,18 @@ def wrong_inputs(
         cases: Random virtual robots for each corruption.
         seed: Of robots, joints and corruptions.
         cache: Folder for the logs, 100 of which take 6 minutes.
+        jobs: Processes.
     """
     begin = time.perf_counter()
     with console.progress() as report:
-        rows = run(cases, seed, cache, report)
+        rows = run(cases, seed, cache, report, jobs=jobs)
     cells = []
     for row in rows:
         outcomes = [one["outcome"] for one in row["cases"]]
-        counts = [outcomes.count(each) for each in ("named", "refused", "other", "silent")]
+        counts = [outcomes.count(each) for each in OUTCOMES]
         wrong = sum(one["wrong"] for one in row["cases"])
         cells.append((row["corruption"], row["log"], *map(str, (*counts, wrong))))
-    columns = ("corruption", "log", "named", "refused", "other", "silent", "wrong number, silent")
+    columns = ("corruption", "log", *OUTCOMES, "wrong number, silent or unchecked")
     caption = f"{cases} cases a row, seed {seed}; {time.perf_counter() - begin:.0f} s"
     figures = {"schema": "pronk/bench-wrong-inputs/1", "rows": rows}
     return finish(figures, console.table("Wrong inputs", columns, cells, caption))

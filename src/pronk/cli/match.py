@@ -117,6 +117,8 @@ def match(
     console.say(part.summary + errors * bool(np.isfinite(found["error_db"])))
     for name, flags in found["flags"].items():
         console.say(f"{name}: {'; '.join(flags)}")
+    for sentence in found["unchecked"]:
+        console.say(sentence)
     shown = {"gains_table": "Matched gains", "ranges_table": "Training ranges"}
     if mode == "drive":
         # By torque alone no gains are matched.

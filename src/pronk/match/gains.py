@@ -86,6 +86,8 @@ class JointGains:
     """The drive by a torque channel (mode drive): names of `match.torque.UNITS`."""
     flags: tuple[str, ...] = ()
     """Warnings, for instance `at the edge of the grid` or `no match`."""
+    unchecked: tuple[str, ...] = ()
+    """Errors that would leave no trace in the logs, for instance wrongly stated drive gains."""
 
 
 @dataclass(frozen=True, kw_only=True)

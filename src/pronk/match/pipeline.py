@@ -25,7 +25,7 @@ from pronk.match.measured_joint import (
     with_drive_gains,
 )
 from pronk.match.parameters import DRIVE_MODE, FREE, GAINS, GAINS_MODE, PARAMETERS, checked_names
-from pronk.match.plausibility import findings, require_plausible
+from pronk.match.plausibility import CAUSES, findings, require_plausible
 from pronk.match.randomization import matched_gains
 from pronk.match.response_fit import (
     Fit,
@@ -193,18 +193,18 @@ class _Matched:
     """As it is simulated."""
     info: SimulatorInfo
     joints: dict[str, JointFit]
-    wrong: Mapping[str, tuple[str, ...]]
-    """What contradicts the logs of each joint."""
+    wrong: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]
+    """What contradicts the logs of each joint, and what would leave no trace in them."""
     excluded: Mapping[str, str]
     rate: float
     """Physics steps per second of the grid search."""
 
     def result(self, logs: Sequence[JointLog], info: SimulatorInfo, clock: _Clock) -> MatchResult:
         """The result for a simulator with these joints."""
-        joints = {
-            name: replace(fit, flags=(*fit.flags, *self.wrong.get(name, ())))
-            for name, fit in self.joints.items()
-        }
+        joints = {}
+        for name, fit in self.joints.items():
+            wrong, unchecked = self.wrong.get(name, ((), ()))
+            joints[name] = replace(fit, flags=(*fit.flags, *wrong), unchecked=unchecked)
         gains = {name: joint.gains() for name, joint in joints.items()}
         return MatchResult(
             gains=matched_gains(self.robot, gains, logs, info),
@@ -233,12 +233,13 @@ def _matched(
     rate, info = float("nan"), mujoco_info(robot)
     fits: Mapping[str, TimeFit] = {}
 
-    def wrong(joints: Mapping[str, JointFit]) -> dict[str, tuple[str, ...]]:
+    def wrong(joints: Mapping[str, JointFit]) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
+        out = {}
         with clock.stage("plausibility"):
-            return {
-                name: tuple(map(str, findings(logs, name, robot, fit=fit, time_fit=fits.get(name))))
-                for name, fit in joints.items()
-            }
+            for name, fit in joints.items():
+                found, hidden = findings(logs, name, robot, fit=fit, time_fit=fits.get(name))
+                out[name] = tuple(map(str, found)), tuple(CAUSES[cause][0] for cause in hidden)
+        return out
 
     if any(moves_together(log) for log in logs):
         if settings.simulator != "mujoco":

@@ -23,10 +23,11 @@ a wrong scale of the position would change. One least-squares step finds them. A
 position passes for a light rotor behind a soft belt, one on the command for a negative compliance;
 a position in whole counts of an encoder was not filtered.
 
-Without torque and frequency columns three errors leave no trace. Gains on the drive and a torque
-constant act as one product, which is what a match finds: wrongly stated gains change no matched
-number. A command column that is late by less than the joint's own delay leaves a smaller delay,
-which is that behind the column. The same joint of another leg responds alike.
+Without torque and frequency columns three errors leave no trace, which a match states. Gains on the
+drive and a torque constant act as one product, which is what a match finds: wrongly stated gains
+change no matched number. A command column that is late by less than the joint's own delay leaves a
+smaller delay, which is that behind the column. The same joint of another leg responds alike. A mild
+filter of a position without counts of an encoder passes for a soft belt.
 
 Thresholds lie outside the range of the same statistic on logs of 160 virtual robots without error,
 drawn at random as `python -m benchmarks wrong-inputs` draws them but with seed 1 (those of the fit
@@ -207,7 +208,7 @@ def findings(
     *,
     fit: JointFit | None = None,
     time_fit: TimeFit | None = None,
-) -> list[Finding]:
+) -> tuple[list[Finding], tuple[str, ...]]:
     """Contradictions between the logs of a joint, the robot's model and fitted parameters.
 
     Args:
@@ -216,6 +217,9 @@ def findings(
         robot: The robot.
         fit: How it was matched; its dry friction is compared with the model's.
         time_fit: Its fit in time; without it the response is not tested.
+
+    Returns:
+        The contradictions, and the causes out of `CAUSES` that would leave no trace in these logs.
     """
     found: list[Finding] = []
     settled, logs = True, [log for log in logs if joint in excited_joints(log)]
@@ -238,7 +242,16 @@ def findings(
         if ratio < FRICTION[0] or ratio > FRICTION[1]:
             what = f"friction: {dry:.2g} N m of dry friction fit where the model has {model:.2g}"
             found.append(_finding(what, "friction"))
-    return list({one.causes: one for one in reversed(found)}.values())[::-1]
+    hidden = {
+        "drive gains": not settled,
+        "other leg": not all("excited" in log.metadata for log in logs),
+        "command delay": not settled and any(log.frequency is None for log in logs),
+        "position filter": not settled and not _counted(logs, joint),
+    }
+    return (
+        list({one.causes: one for one in reversed(found)}.values())[::-1],
+        tuple(cause for cause, leaves in hidden.items() if leaves and cause not in wrong),
+    )
 
 
 def _names(own: _Recorded) -> Iterator[Finding]:
@@ -589,6 +602,11 @@ def response_test(fit: TimeFit, robot: RobotSpec) -> tuple[float, float, float] 
     return scale, lighter + rotor, compliance
 
 
+def _counted(logs: Sequence[JointLog], joint: str) -> bool:
+    """Whether all positions of a joint are in whole counts, which no filter leaves."""
+    return all(_in_counts(log.position[:, log.column(joint)]) for log in logs)
+
+
 def _in_counts(position: Array) -> bool:
     """Whether a position moves by whole counts of an encoder; rounded decimals are none."""
     moves = np.abs(np.diff(position))
@@ -612,7 +630,7 @@ def _response(fit: TimeFit, robot: RobotSpec, logs: Sequence[JointLog]) -> Itera
         return
     if test := response_test(fit, robot):
         scale, rotor, compliance = test
-        counted = all(_in_counts(log.position[:, log.column(joint)]) for log in logs)
+        counted = _counted(logs, joint)
         soft = (compliance - 1.0) / _PRIOR["compliance"] - rotor / _PRIOR["armature"]
         scaled = not RESPONSE_SCALE[0] < scale < RESPONSE_SCALE[1]
         if scaled or not RESPONSE_SOFT[0] < soft < RESPONSE_SOFT[1 + counted]:

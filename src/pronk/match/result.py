@@ -96,6 +96,8 @@ class JointFit:
     torque: Mapping[str, TorqueParameter] = field(default_factory=dict)
     """The drive by a torque channel: names of `match.torque.UNITS`."""
     flags: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
+    """Errors of the logs that would leave no trace in them."""
 
     @classmethod
     def of(cls, joint: str, found: Estimate, **more: Any) -> JointFit:

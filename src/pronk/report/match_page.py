@@ -72,7 +72,10 @@ def group_members(gains: MatchedGains) -> dict[str, list[str]]:
 def verdict(result: MatchResult) -> dict[str, Any]:
     """Return the figures of the summary, also those of `--json`."""
     joints, all_flags = result.gains.joints, {}
+    unchecked: dict[str, list[str]] = {}
     for name, joint in joints.items():
+        if joint.unchecked:
+            unchecked.setdefault(", or ".join(joint.unchecked), []).append(name)
         fit = result.joints.get(name)
         # A zero armature that is ruled out is a result, no warning.
         found = dict.fromkeys((*joint.flags, *(fit.flags if fit else ())))
@@ -89,6 +92,11 @@ def verdict(result: MatchResult) -> dict[str, Any]:
         "error_db": float(rms([one.error_db for one in joints.values()])),
         "worst": max(errors, key=lambda name: errors[name], default=""),
         "flags": all_flags,
+        "unchecked": [
+            f"{'All joints' if len(names) == len(joints) else ', '.join(names)}: these logs would "
+            f"not show if {what}."
+            for what, names in unchecked.items()
+        ],
     }
 
 
