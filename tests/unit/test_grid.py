@@ -158,7 +158,7 @@ def test_repeats_in_several_logs_are_put_together() -> None:
 def test_full_and_banded_responses_agree_and_the_horizon_changes_no_gain() -> None:
     """Steps without effect on the band are left out: 0.003 dB at most."""
     goal = known("FL_hip_roll", length_s=20.0)
-    assert goal.steps < 0.9 * len(goal.matrix)
+    assert goal.steps < 0.9 * len(goal.trace.command)
     requests = [SimRequest(goal, *g) for g in (gains_of("FL_hip_roll"), (13.0, 0.1), (27.0, 0.7))]
     with MujocoSimulator(ROBOT) as simulator:
         whole, cut = (responses(simulator, requests, whole=all_) for all_ in (True, False))

@@ -372,6 +372,9 @@ def test_operator_is_the_estimate(log: JointLog, settings: Estimator) -> None:
     each = np.array([p.position[:, 0] @ o.matrix(o.time) for o, p in zip(row, parts, strict=True)])
     weight = np.array([one.excitation for one in row])
     scale = np.abs(response.response).max()
+    for operator, part, expected in zip(row, parts, each, strict=True):
+        found = operator.response(operator.time, part.position[:, 0])
+        assert np.abs(found - expected).max() < 1e-9 * scale
     if len(each) == len(response.repeats):
         assert np.abs(each - response.repeats).max() < 1e-9 * scale
     whole = (each * weight).sum(axis=0) / weight.sum(axis=0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -26,7 +26,8 @@ from pronk.response.estimate import (
     log_rate,
     operator,
 )
-from pronk.response.response import Estimator, FrequencyResponse
+from pronk.response.h1 import H1Operator
+from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
 
@@ -53,9 +54,10 @@ class MeasuredJoint:
     sign: float
     """Between this joint's coordinate and that of the joint simulated in its place."""
     measured: FrequencyResponse
-    operator: Callable[[Array], ComplexArray]
-    """From instants on the clock of the log, shape (n,), to the map of positions then to the
-    response, shape (n, f)."""
+    operator: Callable[[], H1Operator]
+    """The way from positions to the response; computed once."""
+    command: Callable[[RobotSpec], CommandTrace]
+    """The `trace` for the step and decimation of a robot."""
     fit_mask: NDArray[np.bool_]
     """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
     warnings: tuple[str, ...] = ()
@@ -71,14 +73,13 @@ class MeasuredJoint:
         """Angular frequencies of the fit [rad/s], shape (inside,)."""
         return self.measured.omega[self.fit_mask]
 
-    @cached_property
-    def matrix(self) -> ComplexArray:
-        """From position about the pose at the start of each step to response, shape (steps, f)."""
-        return self.operator(self.trace.time)
+    def on(self, robot: RobotSpec) -> MeasuredJoint:
+        """Return the same, to be compared with simulations at another step or decimation."""
+        return replace(self, trace=self.command(robot))
 
     @cached_property
     def fit_matrix(self) -> Array:
-        """The part of `matrix` that the fit needs, shape (steps, 2 inside).
+        """From position about the pose at each step to the response, shape (steps, 2 inside).
 
         Real and imaginary columns side by side: one real product is faster than one of complex
         numbers. A chirp leaves the band long before it ends; the windows of the segments after
@@ -86,7 +87,8 @@ class MeasuredJoint:
         positions together move no gain by `_TAIL`, judged by a joint that follows its command
         perfectly, so later steps need not be simulated.
         """
-        chosen, command = self.matrix[:, self.fit_mask], self.trace.command - self.trace.command[0]
+        chosen = self.operator().matrix(self.trace.time, self.fit_mask)
+        command = self.trace.command - self.trace.command[0]
         tail = np.abs(np.cumsum((chosen * command[:, None])[::-1], axis=0)[::-1]).max(axis=1)
         loud = np.nonzero(tail > _TAIL)[0]
         steps = min(int(loud[-1]) + 2, len(chosen)) if len(loud) else len(chosen)
@@ -110,12 +112,9 @@ class MeasuredJoint:
         return np.asarray(self.sign * (pair[..., :half] + 1j * pair[..., half:]))
 
     def full_response(self, position: Array) -> ComplexArray:
-        """Response at all frequencies, shape (..., f), for positions of shape (..., all steps)."""
-        position = position[..., : len(self.matrix)]
-        # Two real products: a mixed one would first turn the positions complex.
-        return np.asarray(
-            self.sign * (position @ self.matrix.real + 1j * (position @ self.matrix.imag))
-        )
+        """Response at all frequencies, shape (f,), of positions of shape (all steps,)."""
+        time = self.trace.time
+        return np.asarray(self.sign * self.operator().response(time, position[: len(time)]))
 
     def deviation_db(self) -> Array:
         """Standard deviation of the measured gain from its coherence [dB], shape (inside,)."""
@@ -249,7 +248,7 @@ def measured_joints(
     warnings: list[str] = []
     for (part, *_), response in zip(parts, estimate(log, joint, settings.estimator), strict=True):
         # Of several repeats any one, their commands being the same.
-        trace = command_trace(part, part.segments[0], joint, robot)
+        command = partial(command_trace, part, part.segments[0], joint)
         try:
             inside = _inside(response, known.band_hz, settings.coherence_min, where)
         except IdentifiabilityError as error:
@@ -260,10 +259,11 @@ def measured_joints(
             continue
         found.append(
             MeasuredJoint(
-                trace=trace,
+                trace=command(robot),
                 sign=known.original[1],
                 measured=response,
-                operator=partial(_matrix, part, joint, settings.estimator, rate_hz),
+                operator=cache(partial(operator, part, joint, settings.estimator, rate_hz)),
+                command=command,
                 fit_mask=inside,
             )
         )
@@ -312,12 +312,6 @@ def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
     inside = np.logical_and.reduce([goal.fit_mask for goal in goals])
     warnings = tuple(dict.fromkeys(one for goal in goals for one in goal.warnings))
     return replace(goals[0], measured=measured, fit_mask=inside, warnings=warnings)
-
-
-def _matrix(
-    part: JointLog, joint: str, estimator: Estimator, rate_hz: float, time: Array
-) -> ComplexArray:
-    return operator(part, joint, estimator, rate_hz).matrix(time)
 
 
 def _inside(

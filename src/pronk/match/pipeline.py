@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -164,19 +164,21 @@ def match_frameworks(
         return {"": MatchResult(gains=found, joints={})}
     require_plausible(logs_by_joint(logs, robot), robot)
     fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
-    measured: dict[tuple[float, int], tuple[Found, dict[str, Pair]]] = {}
-    own = _matched(logs, robot, chosen, mode, fitted, clock, measured)
+    work = _Work(logs=logs, settings=chosen, mode=mode)
+    own = _matched(work, robot, fitted, clock)
     joints = joint_fits(own.robot, own.joints, drives, remarks)
     out = {"": replace(own, joints=joints).result(every, own.info, clock)}
-    done = {_kind(own.robot): own}
+    done = {_kind(own.robot): out[""]}
     for name, framework in frameworks.items():
         clock, kind = _Clock(progress, f"{name} "), _kind(robots[name])
+        info = replace(framework.info, decimation=robots[name].decimation)
         if kind not in done:
             dry = framework.friction == "N m"
             known = [n for n in fitted if dry or n != "frictionloss"]
-            done[kind] = _matched(logs, robots[name], chosen, mode, known, clock, measured, own)
-        info = replace(framework.info, decimation=robots[name].decimation)
-        out[name] = done[kind].result(every, info, clock)
+            matched = _matched(work, robots[name], known, clock, own)
+            done[kind] = matched.result(every, info, clock)
+        theirs = replace(done[kind].gains, simulator=info)
+        out[name] = replace(done[kind], gains=theirs, seconds=clock.seconds)
     return out
 
 
@@ -215,20 +217,44 @@ class _Matched:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Work:
+    """Logs to match, and how; simulators with the same step share the measured responses."""
+
+    logs: Sequence[JointLog]
+    settings: MatchSettings
+    mode: Mode
+    measured: dict[tuple[float, int], Found] = field(default_factory=dict)
+    """By timestep and decimation."""
+
+    def found(self, robot: RobotSpec, clock: _Clock) -> Found:
+        """Responses of every excited joint, in the robot's order, for the robot's timestep."""
+        timing = robot.timestep_s, robot.decimation
+        if self.measured and timing not in self.measured:
+            first = next(iter(self.measured.values()))
+            self.measured[timing] = {
+                n: [goal.on(robot) for goal in row] for n, row in first.items()
+            }
+        elif not self.measured:
+            found = {}
+            with clock.stage("estimate"):
+                for name, sources in (where := logs_by_joint(self.logs, robot)).items():
+                    each = [measured_joints(log, name, robot, self.settings) for log in sources]
+                    found[name] = merged(each)
+                    clock.report(len(found) / len(where))
+            self.measured[timing] = found
+        return self.measured[timing]
+
+
 def _matched(
-    logs: Sequence[JointLog],
+    work: _Work,
     robot: RobotSpec,
-    settings: MatchSettings,
-    mode: Mode,
     fitted: Sequence[str],
     clock: _Clock,
-    measured: dict[tuple[float, int], tuple[Found, dict[str, Pair]]],
     base: _Matched | None = None,
 ) -> _Matched:
-    """Match the joints in one simulator; those of the `base` were matched in the robot's own.
-
-    `measured` keeps the measured responses by timestep and decimation.
-    """
+    """Match the joints in one simulator; those of the `base` were matched in the robot's own."""
+    logs, settings, mode = work.logs, work.settings, work.mode
     excluded: Mapping[str, str] = {}
     rate, info = float("nan"), mujoco_info(robot)
     fits: Mapping[str, TimeFit] = {}
@@ -264,10 +290,9 @@ def _matched(
             if mode == "gains" and "frictionloss" not in fitted:
                 rigs.parameters -= {"frictionloss"}
             robot, info = rigs.robot, rigs.info
-            timing = robot.timestep_s, robot.decimation
-            if timing not in measured:
-                measured[timing] = _measured(logs, robot, settings, clock)
-            found, on_drive = measured[timing]
+            found = work.found(robot, clock)
+            where = logs_by_joint(logs, robot)
+            on_drive = {name: gains_on_drive(where[name][0], name, robot) for name in found}
             if mode == "drive":
                 joints, fits = _match_drives(rigs, logs, found, on_drive, fitted, clock)
             else:
@@ -309,19 +334,6 @@ class _Clock:
 
 Found = Mapping[str, Sequence[MeasuredJoint]]
 """Measured responses by joint; largest amplitude, the one that is matched, first."""
-
-
-def _measured(
-    logs: Sequence[JointLog], robot: RobotSpec, settings: MatchSettings, clock: _Clock
-) -> tuple[Found, dict[str, Pair]]:
-    """Responses of every excited joint, in the robot's order, and the gains on its real drive."""
-    found, on_drive = {}, {}
-    with clock.stage("estimate"):
-        for name, sources in (where := logs_by_joint(logs, robot)).items():
-            found[name] = merged([measured_joints(log, name, robot, settings) for log in sources])
-            on_drive[name] = gains_on_drive(sources[0], name, robot)
-            clock.report(len(found) / len(where))
-    return found, on_drive
 
 
 def _translated(base: _Matched, rigs: MujocoSimulator, found: Found) -> dict[str, Pair]:

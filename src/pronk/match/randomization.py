@@ -161,11 +161,14 @@ def enclosing(points: Array, *, tolerance: float = 1e-4, rounds: int = 2000) -> 
         `{x : (x - c)^T E^-1 (x - c) <= 1}`.
     """
     n, d = points.shape
-    lifted = np.vstack([points.T / np.abs(points).max(axis=0)[:, None], np.ones(n)])
+    # The ellipsoid moves and scales with the points; about their middle little is rounded away.
+    scaled = (points - points.mean(axis=0)) / points.std(axis=0)
+    lifted = np.vstack([scaled.T, np.ones(n)])
     weights = np.full(n, 1.0 / n)
+    # Of the spread of the lifted points: products of its inverse with them, kept up to date.
+    solved = np.linalg.solve((lifted * weights) @ lifted.T, lifted)
+    distance = np.einsum("ij,ij->j", lifted, solved)
     for _ in range(rounds):
-        spread = (lifted * weights) @ lifted.T
-        distance = np.einsum("ij,ij->j", lifted, np.linalg.solve(spread, lifted))
         worst = int(np.argmax(distance))
         excess = distance[worst] / (d + 1.0) - 1.0
         if excess < tolerance:
@@ -173,6 +176,11 @@ def enclosing(points: Array, *, tolerance: float = 1e-4, rounds: int = 2000) -> 
         step = (distance[worst] - d - 1.0) / ((d + 1.0) * (distance[worst] - 1.0))
         weights *= 1.0 - step
         weights[worst] += step
+        # Sherman and Morrison: the spread became (1 - step) spread + step worst worst^T.
+        along = lifted[:, worst] @ solved
+        share = step / (1.0 - step + step * distance[worst])
+        distance = (distance - share * along**2) / (1.0 - step)
+        solved = (solved - share * np.outer(solved[:, worst], along)) / (1.0 - step)
     centre = points.T @ weights
     about = points - centre
     shape = d * (about.T * weights) @ about

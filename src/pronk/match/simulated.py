@@ -52,7 +52,7 @@ def responses(
             for name in ("stiffness", "damping", "armature", "frictionloss")
             if getattr(group[0], name) is not None
         }
-        steps = max(len(r.target.matrix) if whole else r.target.steps for r in group)
+        steps = max(len(r.target.trace.command) if whole else r.target.steps for r in group)
         for part, position in rigs.run([request.target.trace for request in group], values, steps):
             for row, k in enumerate(range(part.start, part.stop)):
                 goal, delay = group[k].target, group[k].delay

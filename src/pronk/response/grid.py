@@ -98,12 +98,7 @@ def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
     cost of one banded solve, whatever number of `values` follows. LogError if the samples do not
     span the grid.
     """
-    last = grid.start + (grid.count - 1) / grid.rate_hz
-    if time[0] > grid.start + _REACH_S or time[-1] < last - _REACH_S:
-        raise LogError(
-            f"samples from {time[0]:.3f} to {time[-1]:.3f} s do not span the excitation, "
-            f"{grid.start:.3f} to {last:.3f} s; simulate or record all of it."
-        )
+    require_span(time, grid)
     degree = min(3, len(time) - 1)
     knots = make_interp_spline(time, np.zeros(len(time)), k=degree).t
     collocation = BSpline.design_matrix(time, knots, degree)
@@ -113,6 +108,16 @@ def pull_back(weights: ComplexArray, time: Array, grid: Grid) -> ComplexArray:
     on_knots: Any = onto_grid.T @ parts
     solved = splu(sparse.csc_matrix(collocation.T)).solve(on_knots)
     return np.ascontiguousarray(solved).view(np.complex128)
+
+
+def require_span(time: Array, grid: Grid) -> None:
+    """Refuse instants [s] that do not span the grid with a LogError."""
+    last = grid.start + (grid.count - 1) / grid.rate_hz
+    if time[0] > grid.start + _REACH_S or time[-1] < last - _REACH_S:
+        raise LogError(
+            f"samples from {time[0]:.3f} to {time[-1]:.3f} s do not span the excitation, "
+            f"{grid.start:.3f} to {last:.3f} s; simulate or record all of it."
+        )
 
 
 def hold(omega: Array, rate_hz: float) -> ComplexArray:

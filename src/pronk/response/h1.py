@@ -15,14 +15,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
+from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.signal import ShortTimeFFT, get_window
 
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
-from pronk.response.grid import Grid, grid_over, held_mean, hold, interpolate, pull_back
+from pronk.response.grid import (
+    Grid,
+    grid_over,
+    held_mean,
+    hold,
+    interpolate,
+    pull_back,
+    require_span,
+)
 from pronk.response.response import Estimator, FrequencyResponse
 
 Array = NDArray[np.float64]
@@ -238,7 +249,11 @@ def estimate_averaged(
 
 @dataclass(frozen=True, kw_only=True)
 class H1Operator:
-    """Linear map from the positions of one excitation to its response."""
+    """Linear map from the positions of one excitation to its response.
+
+    On the analysis grid it is the sum over segments of `scale * transform(window * segment)`, the
+    mean of the segment taken away; samples beyond the ends repeat the first and the last.
+    """
 
     omega: Array
     """[rad/s], shape (f,)."""
@@ -246,8 +261,14 @@ class H1Operator:
     """Measured timestamps of the log it was built for [s], shape (n,)."""
     grid: Grid
     """The analysis grid."""
-    weights: ComplexArray
-    """Map from positions on the grid, shape (grid.count, f)."""
+    starts: NDArray[np.intp]
+    """First sample of each segment, increasing, shape (k,)."""
+    window: Array
+    """Shape (samples,)."""
+    bins: NDArray[np.intp]
+    """Numbers of the frequencies in the transform of a segment, shape (f,)."""
+    scale: ComplexArray
+    """What the transform of each segment counts in the response, shape (k, f)."""
     excitation: Array
     """Sum of |U|^2: the weight of this excitation among repeats, shape (f,)."""
 
@@ -263,31 +284,70 @@ class H1Operator:
         grid = grid_over(time, rate_hz)
         held = held_mean(time, command, grid.edges)
         where = layout(grid, estimator, padded=rests(held, grid.rate_hz))
-        excited = where.spectra(held)
+        return cls.of(
+            time,
+            grid,
+            where.spectra(held),
+            omega=where.omega,
+            starts=where.starts,
+            window=where.window,
+            bins=where.bins,
+        )
+
+    @classmethod
+    def of(cls, time: Array, grid: Grid, excited: ComplexArray, **layout: Any) -> H1Operator:
+        """Make the map from the transforms of the command, shape (k, f), and the other fields."""
         uu = np.asarray((np.abs(excited) ** 2).sum(axis=0))
-        conjugate = np.conj(excited) / (np.maximum(uu, _TINY) * hold(where.omega, grid.rate_hz))
-        samples = np.arange(len(where.window)) / grid.rate_hz
-        kernel = where.window[:, None] * np.exp(-1j * np.outer(samples, where.omega))
+        scale = np.conj(excited) / (np.maximum(uu, _TINY) * hold(layout["omega"], grid.rate_hz))
+        times = np.asarray(time, dtype=np.float64)
+        return cls(time=times, grid=grid, scale=scale, excitation=uu, **layout)
+
+    @property
+    def _padding(self) -> tuple[int, int]:
+        """Samples that segments reach over the first and over the last."""
+        last = int(self.starts[-1]) + len(self.window)
+        return max(0, -int(self.starts[0])), max(0, last - self.grid.count)
+
+    def weights(self, chosen: NDArray[np.bool_] | slice = slice(None)) -> ComplexArray:
+        """Map from positions on the grid to the chosen frequencies, shape (grid.count, chosen)."""
+        samples = np.arange(len(self.window))
+        turn = np.exp(-2j * np.pi * samples / len(samples))
+        kernel = self.window[:, None] * turn[np.outer(samples, self.bins[chosen]) % len(samples)]
         # Taking the mean of a segment away is taking the mean of the kernel away.
         kernel -= kernel.mean(axis=0)
         # Padding repeats the first and last sample; its weights gather on them.
-        before = max(0, -int(where.starts[0]))
-        after = max(0, int(where.starts[-1]) + len(where.window) - grid.count)
-        spread = np.zeros((before + grid.count + after, len(where.omega)), dtype=np.complex128)
+        before, after = self._padding
+        count = self.grid.count
+        spread = np.zeros((before + count + after, kernel.shape[1]), dtype=np.complex128)
         term = np.empty_like(kernel)
-        for start, row in zip(where.starts + before, conjugate, strict=True):
-            spread[start : start + len(where.window)] += np.multiply(kernel, row, out=term)
-        weights = spread[before : before + grid.count]
-        weights[0] += spread[:before].sum(axis=0)
-        weights[-1] += spread[before + grid.count :].sum(axis=0)
-        times = np.asarray(time, dtype=np.float64)
-        return cls(omega=where.omega, time=times, grid=grid, weights=weights, excitation=uu)
+        for start, row in zip(self.starts + before, self.scale[:, chosen], strict=True):
+            spread[start : start + len(kernel)] += np.multiply(kernel, row, out=term)
+        out = spread[before : before + count]
+        out[0] += spread[:before].sum(axis=0)
+        out[-1] += spread[before + count :].sum(axis=0)
+        return out
 
-    def matrix(self, sample_times: Array) -> ComplexArray:
-        """Map from positions at other instants, `H = positions @ matrix`, shape (m, f).
+    def matrix(
+        self, sample_times: Array, chosen: NDArray[np.bool_] | slice = slice(None)
+    ) -> ComplexArray:
+        """Map from positions at other instants, `H = positions @ matrix`, shape (m, chosen).
 
         `sample_times` [s], shape (m,), are increasing instants on the clock of the log; the cubic
         interpolation onto the analysis grid is included. LogError if they do not span the
         excitation.
         """
-        return pull_back(self.weights, np.asarray(sample_times, dtype=np.float64), self.grid)
+        return pull_back(
+            self.weights(chosen), np.asarray(sample_times, dtype=np.float64), self.grid
+        )
+
+    def response(self, sample_times: Array, position: Array) -> ComplexArray:
+        """`position @ matrix(sample_times)`, shape (f,), by transforms: faster for a few positions.
+
+        Shapes (m,); LogError as of `matrix`.
+        """
+        require_span(sample_times, self.grid)
+        values = np.pad(interpolate(sample_times, position, self.grid), self._padding, mode="edge")
+        first = self.starts + self._padding[0]
+        parts = sliding_window_view(values, len(self.window))[first]
+        parts = (parts - parts.mean(axis=1, keepdims=True)) * self.window
+        return np.asarray((self.scale * fft.rfft(parts)[:, self.bins]).sum(axis=0))

@@ -172,17 +172,15 @@ def multisine_operator(
         LogError: Fewer than three equal periods.
     """
     found = _lines(time, command, period_s, estimator, rate_hz)
-    samples, u = found.samples, found.command
-    turns = np.outer(np.arange(samples), found.numbers) / samples
-    kernel = np.exp(-2j * np.pi * turns) / samples
-    excitation = np.asarray((np.abs(u) ** 2).sum(axis=0))
-    scale = np.conj(u) / (excitation * hold(found.omega, found.grid.rate_hz))
-    return H1Operator(
+    samples = found.samples
+    return H1Operator.of(
+        time,
+        found.grid,
+        found.command,
         omega=found.omega,
-        time=np.asarray(time, dtype=np.float64),
-        grid=found.grid,
-        weights=np.concatenate([kernel * row for row in scale]),
-        excitation=excitation,
+        starts=samples * np.arange(len(found.command)),
+        window=np.full(samples, 1.0 / samples),
+        bins=found.numbers,
     )
 
 
