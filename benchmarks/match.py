@@ -15,7 +15,7 @@ With `--arm FOLDER` the logs are recordings of a real SO-101 whose joints move t
 two more. The plain fit is there given pronk's dry friction at rest, and all use the samples that
 pronk uses.
 
-Robots are taken one after the other; an interrupt ends with the table of those that are done.
+An interrupt ends with the table of those that are done.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.random_robots import HELD_OUT, ROBOT, Recorded, recorded
-from benchmarks.runner import Progress, finish, machine
+from benchmarks.runner import Progress, finish, in_parallel, machine
 from benchmarks.time_fit import (
     FREE,
     fit_arm,
@@ -144,10 +144,11 @@ def run(
     progress: Progress,
     *,
     joints: Sequence[str] = JOINTS,
-    chosen: Mapping[str, Fit] | None = None,
+    names: Collection[str] = (),
     folder: Path | None = None,
+    jobs: int = 1,
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yield the rows of one robot after the other.
+    """Yield the rows of one robot after the other, of the methods `names` or all.
 
     Raises:
         PronkError: The number of robots or a joint is impossible.
@@ -157,14 +158,23 @@ def run(
             f"{robots} robots, joints {', '.join(joints)}; expected 1 or more of each, joints out "
             f"of {', '.join(JOINTS)}."
         )
-    chosen = chosen or methods()
+    work = partial(_robot, seed=seed, joints=joints, names=names or methods(), folder=folder)
+    for done, rows in enumerate(in_parallel(work, range(robots), jobs)):
+        progress("match", (done + 1) / robots)
+        yield rows
+
+
+def _robot(
+    number: int, *, seed: int, joints: Sequence[str], names: Collection[str], folder: Path | None
+) -> list[dict[str, Any]]:
+    """Rows of one robot."""
+    chosen = {name: fit for name, fit in methods().items() if name in names}
     with joint_rigs("mujoco", load_robot(ROBOT), threads=1) as rigs:
-        for number in range(robots):
-            rows = []
-            for logs in recorded(seed, number, joints, folder):
-                rows += [{"robot": number} | row for row in compare(rigs, logs, chosen)]
-                progress("match", (number + len(rows) / (len(joints) * len(chosen))) / robots)
-            yield rows
+        return [
+            {"robot": number} | row
+            for logs in recorded(seed, number, joints, folder)
+            for row in compare(rigs, logs, chosen)
+        ]
 
 
 def on_recordings(folder: Path, report: Progress, wanted: Collection[str]) -> list[dict[str, Any]]:
@@ -340,32 +350,35 @@ def show(summaries: Sequence[Mapping[str, Any]], title: str, caption: str) -> Ta
 def match(
     robots: int = 20,
     seed: int = 27,
-    joints: tuple[Kind, ...] = JOINTS,
+    joints: tuple[Kind, ...] = (),
     method: tuple[str, ...] = (),
     cache: Path | None = None,
     arm: Path | None = None,
+    jobs: int = 1,
 ) -> console.Outcome:
     """Match virtual robots drawn at random by pronk and its peers; held-out error, coverage.
 
     Args:
         robots: Number of robots.
         seed: Of the parameters of the robots and of the noise.
-        joints: Joints of one leg.
+        joints: Joints of one leg; all if left out.
         method: Methods beside the nominal gains and the plain fit; repeat it. All if left out.
         cache: Folder of the recorded logs; in the system's temporary folder if left out.
         arm: Folder of the recordings of a real SO-101, which are matched instead, by all methods
             but mujoco.sysid, whose rig here is one joint.
+        jobs: Processes, a robot each.
     """
     begin, known = time.perf_counter(), methods()
+    joints = joints or JOINTS
     names = ON_ARM if arm else tuple(known)
     if unknown := set(method) - set(names):
         raise PronkError(f"methods {', '.join(unknown)}; expected some of {', '.join(names)}.")
     wanted = {NOMINAL, PLAIN, *(method or names)}
-    chosen = {name: fit for name, fit in known.items() if name in wanted}
+    names = tuple(name for name in known if name in wanted)
     rows: list[dict[str, Any]] = []
     with console.progress() as report:
         try:
-            virtual = run(robots, seed, report, joints=joints, chosen=chosen, folder=cache)
+            virtual = run(robots, seed, report, joints=joints, names=names, folder=cache, jobs=jobs)
             for more in [on_recordings(arm, report, wanted)] if arm else virtual:
                 rows += more
         except KeyboardInterrupt:

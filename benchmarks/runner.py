@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
-from typing import Any
+from multiprocessing import Pool
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.table import Table
 
 from pronk.cli import console
+from pronk.errors import PronkError
 
+T = TypeVar("T")
+R = TypeVar("R")
 Progress = Callable[[str, float], None]
 """Called with the stage and the share done, 0 to 1."""
 
@@ -27,6 +31,18 @@ def in_turn(blocks: Sequence[Callable[[], float]], repeats: int) -> list[list[fl
         for k in range(len(blocks))[:: -1 if turn % 2 else 1]:
             times[k].append(blocks[k]())
     return times
+
+
+def in_parallel(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Iterator[R]:
+    """Yield the results of a picklable function for each item as they are done, by processes.
+
+    Raises:
+        PronkError: `jobs` is less than 1.
+    """
+    if jobs < 1:
+        raise PronkError(f"--jobs {jobs}; expected 1 or more.")
+    with Pool(jobs) as pool:
+        yield from pool.imap_unordered(work, items)
 
 
 def paired_ratio(ours: Sequence[float], peer: Sequence[float]) -> tuple[float, float, float]:

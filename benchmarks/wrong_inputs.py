@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from benchmarks.runner import Progress, finish
+from benchmarks.runner import Progress, finish, in_parallel
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.excitation.plan import make_plan
@@ -338,18 +337,17 @@ def run(
 
     An interrupt ends with the robots that are done.
     """
-    if cases < 1 or jobs < 1:
-        raise PronkError(f"{cases} cases in {jobs} jobs; expected 1 or more of each.")
+    if cases < 1:
+        raise PronkError(f"{cases} cases; expected 1 or more.")
     judge = partial(_robot, seed=seed, cache=cache, kinds=kinds, corruptions=corruptions)
     rows: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    with Pool(jobs) as pool:
-        try:
-            for done, found in enumerate(pool.imap_unordered(judge, range(cases))):
-                for key, one in found:
-                    rows.setdefault(key, []).append(one)
-                progress("judge", (done + 1) / cases)
-        except KeyboardInterrupt:
-            console.warn("interrupted")
+    try:
+        for done, found in enumerate(in_parallel(judge, range(cases), jobs)):
+            for key, one in found:
+                rows.setdefault(key, []).append(one)
+            progress("judge", (done + 1) / cases)
+    except KeyboardInterrupt:
+        console.warn("interrupted")
     return [{"corruption": n, "log": k, "cases": each} for (n, k), each in rows.items()]
 
 
