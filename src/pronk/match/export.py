@@ -169,6 +169,18 @@ def stability_share(robot: RobotSpec, drives: Sequence[Actuator]) -> float:
     )
 
 
+def require_stable(holds: Profile, robot: RobotSpec, drives: Sequence[Actuator]) -> float:
+    """`stability_share` of drives in a framework; PronkError if it is 1 or more."""
+    if (share := stability_share(robot, drives)) >= 1.0:
+        step = holds.timestep_s
+        raise PronkError(
+            f"the gains of {robot.name} are not stable in {holds.name}: at {1000.0 * step:g} ms "
+            f"they are {share:.2f} times the limit of drive law {holds.drive_law.label}; take a "
+            f"smaller step, as {holds.name},timestep_s={step / 2.0:g}."
+        )
+    return share
+
+
 @dataclass(frozen=True, kw_only=True)
 class Target:
     """What reads an exported text."""
@@ -558,14 +570,7 @@ def export_text(
     check_target(target, holds)
     known = holds.robot(robot or robot_of(gains))
     drives = actuators(gains, known, per)
-    share = stability_share(known, drives)
-    if share >= 1.0:
-        raise PronkError(
-            f"the gains of {gains.robot} are not stable in {holds.name}: at "
-            f"{1000.0 * holds.timestep_s:g} ms they are {share:.2f} times the limit of drive law "
-            f"{holds.drive_law.label}; match again with a smaller step, as --for "
-            f"{holds.name},timestep_s={holds.timestep_s / 2.0:g} does."
-        )
+    share = require_stable(holds, known, drives)
     text = "\n".join(
         textwrap.fill(line, 98, break_long_words=False, break_on_hyphens=False)
         for line in _header(gains, chosen, holds, known, drives, share)

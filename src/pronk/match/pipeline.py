@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.match.arm import fit_together
+from pronk.match.export import actuators, require_stable
 from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
 from pronk.match.measured_joint import (
     DriveGains,
@@ -178,6 +179,7 @@ def match_frameworks(
             matched = _matched(work, robots[name], known, clock, own)
             done[kind] = matched.result(every, info, clock)
         theirs = replace(done[kind].gains, simulator=info)
+        require_stable(framework, robots[name], actuators(theirs, robots[name], "joint"))
         out[name] = replace(done[kind], gains=theirs, seconds=clock.seconds)
     return out
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pronk.errors import PronkError
-from pronk.match.export import actuators, profile_held, stability_share
+from pronk.match.export import actuators, profile_held, require_stable
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.match.measured_joint import DB
 from pronk.robots.robot import RobotSpec
@@ -116,13 +116,7 @@ def translate(
             ellipsoid_center=(kp * group.ellipsoid_center[0], kd * group.ellipsoid_center[1]),
         )
     out = replace(gains, simulator=info, joints=joints, groups=groups)
-    share = stability_share(target, actuators(out, target, "joint"))
-    if share >= 1.0:
-        raise PronkError(
-            f"in {to.name} at {1000.0 * to.timestep_s:g} ms the translated gains are {share:.2f} "
-            f"times the stability limit of its drive law; give a smaller step, as {to.name},"
-            f"timestep_s={to.timestep_s / 2.0:g}."
-        )
+    require_stable(to, target, actuators(out, target, "joint"))
     return out, found
 
 
