@@ -15,7 +15,15 @@ from pronk.errors import IdentifiabilityError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.match.arm import fit_together
 from pronk.match.export import actuators, require_stable
-from pronk.match.grid import GridSearch, alike, axes, coarse_search, quick_search, search_all
+from pronk.match.grid import (
+    GridSearch,
+    alike,
+    axes,
+    coarse_search,
+    linearized,
+    quick_search,
+    search_all,
+)
 from pronk.match.measured_joint import (
     DriveGains,
     MeasuredJoint,
@@ -52,7 +60,7 @@ from pronk.response.estimate import excited_joints
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import moves_together, published
-from pronk.simulators.linear import plant
+from pronk.simulators.linear import Plant
 from pronk.simulators.mujoco import MujocoSimulator, mujoco_info
 from pronk.simulators.profiles import profile
 from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
@@ -202,6 +210,27 @@ class _Matched:
     excluded: Mapping[str, str]
     rate: float
     """Physics steps per second of the grid search."""
+    plants: Mapping[str, Plant]
+    """Its joints linearized, by name; none in a simulator but MuJoCo."""
+
+    def corrections(self, found: Found, robot: RobotSpec) -> list[Array]:
+        """Log gain of each joint simulated over linearized, shape (inside,), for another robot.
+
+        It is that of dry friction; without friction there is none.
+        """
+        out = []
+        for name, (goal, *_) in found.items():
+            fit, plant = self.joints[name], self.plants[name]
+            closed = plant.response(fit.stiffness, fit.damping, amplitude=goal.trace.amplitude)[0]
+            out.append(np.log(np.abs(fit.matched[goal.fit_mask] / closed)))
+            if robot.joint(name).drive.frictionloss == 0.0:
+                out[-1] = np.zeros_like(out[-1])
+        return out
+
+    def translated(self, name: str, other: Plant) -> Pair:
+        """Gains with which another joint responds like this one, both linearized."""
+        fit = self.joints[name]
+        return translated(self.plants[name], other, (fit.stiffness, fit.damping)).after
 
     def result(self, logs: Sequence[JointLog], info: SimulatorInfo, clock: _Clock) -> MatchResult:
         """The result for a simulator with these joints."""
@@ -228,14 +257,16 @@ class _Work:
     mode: Mode
     measured: dict[tuple[float, int], Found] = field(default_factory=dict)
     """By timestep and decimation."""
+    on_drive: dict[str, Pair] = field(default_factory=dict)
+    """Gains that were on the real drives, by joint."""
 
     def found(self, robot: RobotSpec, clock: _Clock) -> Found:
         """Responses of every excited joint, in the robot's order, for the robot's timestep."""
         timing = robot.timestep_s, robot.decimation
-        if self.measured and timing not in self.measured:
+        if timing not in self.measured and self.measured:
             first = next(iter(self.measured.values()))
             self.measured[timing] = {
-                n: [goal.on(robot) for goal in row] for n, row in first.items()
+                name: [goal.on(robot) for goal in goals] for name, goals in first.items()
             }
         elif not self.measured:
             found = {}
@@ -243,9 +274,24 @@ class _Work:
                 for name, sources in (where := logs_by_joint(self.logs, robot)).items():
                     each = [measured_joints(log, name, robot, self.settings) for log in sources]
                     found[name] = merged(each)
+                    self.on_drive[name] = gains_on_drive(sources[0], name, robot)
                     clock.report(len(found) / len(where))
             self.measured[timing] = found
         return self.measured[timing]
+
+    def fit_in_time(
+        self, rigs: JointRigs, name: str, fitted: Sequence[str], start: Pair | None = None
+    ) -> TimeFit:
+        """Fit one joint in time, from some gains or those that were on the drive."""
+        nominal = self.nominal(rigs.robot, name)
+        begin = nominal | dict(zip(GAINS, start or self.on_drive[name], strict=True))
+        sources = [log for log in self.logs if name in excited_joints(log)]
+        records = recorded(sources, name, rigs.robot)
+        return fit_joint(rigs, records, fitted, begin | {"delay": _START_S}, nominal)
+
+    def nominal(self, robot: RobotSpec, name: str) -> dict[str, float]:
+        """The published drive with the gains that were on it."""
+        return published(robot, name) | dict(zip(GAINS, self.on_drive[name], strict=True))
 
 
 def _matched(
@@ -260,6 +306,7 @@ def _matched(
     excluded: Mapping[str, str] = {}
     rate, info = float("nan"), mujoco_info(robot)
     fits: Mapping[str, TimeFit] = {}
+    plants: Mapping[str, Plant] = {}
 
     def wrong(joints: Mapping[str, JointFit]) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
         out = {}
@@ -293,20 +340,21 @@ def _matched(
                 rigs.parameters -= {"frictionloss"}
             robot, info = rigs.robot, rigs.info
             found = work.found(robot, clock)
-            where = logs_by_joint(logs, robot)
-            on_drive = {name: gains_on_drive(where[name][0], name, robot) for name in found}
+            if isinstance(rigs, MujocoSimulator):
+                plants = {name: linearized(rigs, goals[0]) for name, goals in found.items()}
             if mode == "drive":
-                joints, fits = _match_drives(rigs, logs, found, on_drive, fitted, clock)
+                joints, fits = _match_drives(work, rigs, found, fitted, clock)
             else:
-                start = {}
-                if base is not None and isinstance(rigs, MujocoSimulator):
-                    start = _translated(base, rigs, found)
-                joints, fits, rate = _match_gains(
-                    rigs, logs, found, on_drive, settings, clock, start
-                )
+                joints, fits, rate = _match_gains(work, rigs, found, plants, clock, base)
             causes = base.wrong if base else wrong(joints)
     return _Matched(
-        robot=robot, info=info, joints=joints, wrong=causes, excluded=excluded, rate=rate
+        robot=robot,
+        info=info,
+        joints=joints,
+        wrong=causes,
+        excluded=excluded,
+        rate=rate,
+        plants=plants,
     )
 
 
@@ -338,24 +386,8 @@ Found = Mapping[str, Sequence[MeasuredJoint]]
 """Measured responses by joint; largest amplitude, the one that is matched, first."""
 
 
-def _translated(base: _Matched, rigs: MujocoSimulator, found: Found) -> dict[str, Pair]:
-    """Gains with which the linearized joints respond like those of the `base`."""
-    out = {}
-    with MujocoSimulator(base.robot, threads=1) as first:
-        for name, (goal, *_) in found.items():
-            pose, fit = goal.trace.excitation(rigs.robot)[0], base.joints[name]
-            own, other = (plant(one.rig(name), pose, goal.omega) for one in (first, rigs))
-            out[name] = translated(own, other, (fit.stiffness, fit.damping)).after
-    return out
-
-
 def _match_drives(
-    rigs: JointRigs,
-    logs: Sequence[JointLog],
-    found: Found,
-    on_drive: Mapping[str, Pair],
-    fitted: Sequence[str],
-    clock: _Clock,
+    work: _Work, rigs: JointRigs, found: Found, fitted: Sequence[str], clock: _Clock
 ) -> tuple[dict[str, JointFit], dict[str, TimeFit]]:
     """Mode drive: fit the drive of every joint, if the sweeps can separate its parameters."""
     for name, goals in found.items():
@@ -363,7 +395,7 @@ def _match_drives(
     joints, fits = {}, {}
     with clock.stage("time fit"):
         for name, goals in found.items():
-            fit = fits[name] = _fit_in_time(rigs, logs, name, fitted, on_drive[name])
+            fit = fits[name] = work.fit_in_time(rigs, name, fitted)
             if unknown := fit.estimate.unidentified:
                 raise IdentifiabilityError(
                     f"{name}: these logs do not identify the {unknown[0]} (deviation "
@@ -372,7 +404,7 @@ def _match_drives(
                 )
             requests = [
                 SimRequest(goals[0], **_drive(rigs, fit.estimate.values)),
-                SimRequest(goals[0], **_drive(rigs, _nominal(rigs.robot, name, on_drive[name]))),
+                SimRequest(goals[0], **_drive(rigs, work.nominal(rigs.robot, name))),
             ]
             matched, naive = responses(rigs, requests, whole=True)
             joints[name] = _time_joint_fit(rigs.robot, goals, fit, matched, naive)
@@ -380,51 +412,31 @@ def _match_drives(
     return joints, fits
 
 
-def _nominal(robot: RobotSpec, name: str, on_drive: Pair) -> dict[str, float]:
-    """The published drive with the gains that were on it."""
-    return published(robot, name) | dict(zip(GAINS, on_drive, strict=True))
-
-
-def _fit_in_time(
-    rigs: JointRigs,
-    logs: Sequence[JointLog],
-    name: str,
-    fitted: Sequence[str],
-    on_drive: Pair,
-    start: Pair | None = None,
-) -> TimeFit:
-    """Fit one joint in time, from some gains or those that were on the drive."""
-    nominal = _nominal(rigs.robot, name, on_drive)
-    begin = nominal | dict(zip(GAINS, start or on_drive, strict=True)) | {"delay": _START_S}
-    sources = [log for log in logs if name in excited_joints(log)]
-    return fit_joint(rigs, recorded(sources, name, rigs.robot), fitted, begin, nominal)
-
-
 def _match_gains(
+    work: _Work,
     rigs: JointRigs,
-    logs: Sequence[JointLog],
     found: Found,
-    on_drive: Mapping[str, Pair],
-    settings: MatchSettings,
+    plants: Mapping[str, Plant],
     clock: _Clock,
-    start: Mapping[str, Pair],
+    base: _Matched | None,
 ) -> tuple[dict[str, JointFit], dict[str, TimeFit], float]:
     """Search by the paper's magnitude and, with method `time`, fit in time from there.
 
-    Other frameworks begin at the gains of the robot's own simulator, translated (`start`), which
-    the fit in time takes in place of a search. Also returns the fits in time by joint, and physics
-    steps per second of the grid; NaN where it was not searched whole.
+    Other frameworks begin at the joints of the robot's own simulator, the `base`: the search with
+    what simulations correct there, the fit in time with its gains translated, without a search.
+    Also returns the fits in time by joint, and physics steps per second of the grid; NaN where it
+    was not searched whole.
     """
+    settings, paper = work.settings, work.settings.method == "paper"
     main = [goals[0] for goals in found.values()]
     grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
     grids: dict[str, GridSearch] = {}
     by_amplitude: dict[str, list[Fit]] = {}
-    if not start or settings.method == "paper":
+    if paper or not base:
         if isinstance(rigs, MujocoSimulator) and not settings.exhaustive:
             with clock.stage("quick search"):
-                exact = settings.method == "paper" and not start
-                near = [start[name] for name in found] if start else ()
-                searched, fits = quick_search(rigs, main, *grid, exact=exact, start=near)
+                known = base.corrections(found, rigs.robot) if base else ()
+                searched, fits = quick_search(rigs, main, *grid, exact=paper, corrections=known)
         else:
             with clock.stage("grid"):
                 begin = time.perf_counter()
@@ -435,15 +447,16 @@ def _match_gains(
                 fits = refine(rigs, main, [one.gains for one in searched])
         grids = dict(zip(found, searched, strict=True))
         by_amplitude = {name: [fit] for name, fit in zip(found, fits, strict=True)}
-    gains = {name: fits[0].gains for name, fits in by_amplitude.items()} or start
+    gains = {name: fits[0].gains for name, fits in by_amplitude.items()}
+    if base and not paper:
+        gains = {name: base.translated(name, plants[name]) for name in found}
     fitted: dict[str, TimeFit] = {}
-    if settings.method == "time":
+    if not paper:
         with clock.stage("time fit"):
             for name in found:
-                pair = on_drive[name]
-                fitted[name] = _fit_in_time(rigs, logs, name, TIME_FIT, pair, gains[name])
+                fitted[name] = work.fit_in_time(rigs, name, TIME_FIT, gains[name])
                 clock.report(len(fitted) / len(found))
-    elif not start:
+    elif not base:
         with clock.stage("amplitudes"):
             others = [goal for goals in found.values() for goal in goals[1:]]
             for fit in refine(rigs, others, [gains[goal.joint] for goal in others]):
@@ -457,10 +470,10 @@ def _match_gains(
         ]
         matched = responses(rigs, requests, whole=True)
         naive = responses(
-            rigs, [SimRequest(goal, *on_drive[goal.joint]) for goal in main], whole=True
+            rigs, [SimRequest(goal, *work.on_drive[goal.joint]) for goal in main], whole=True
         )
     zero: dict[str, tuple[float, ComplexArray]] = {}
-    wanted = settings.zero_armature and settings.method == "paper" and not start
+    wanted = settings.zero_armature and paper and not base
     if wanted and "armature" in rigs.parameters:
         with clock.stage("zero armature"):
             zero = _without_armature(rigs, main, *grid, clock)

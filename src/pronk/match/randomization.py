@@ -169,7 +169,7 @@ def enclosing(points: Array, *, tolerance: float = 1e-4, rounds: int = 2000) -> 
     solved = np.linalg.solve((lifted * weights) @ lifted.T, lifted)
     distance = np.einsum("ij,ij->j", lifted, solved)
     for _ in range(rounds):
-        worst = int(np.argmax(distance))
+        worst = int(distance.argmax())
         excess = distance[worst] / (d + 1.0) - 1.0
         if excess < tolerance:
             break
@@ -180,7 +180,7 @@ def enclosing(points: Array, *, tolerance: float = 1e-4, rounds: int = 2000) -> 
         along = lifted[:, worst] @ solved
         share = step / (1.0 - step + step * distance[worst])
         distance = (distance - share * along**2) / (1.0 - step)
-        solved = (solved - share * np.outer(solved[:, worst], along)) / (1.0 - step)
+        solved = (solved - share * solved[:, worst, None] * along) / (1.0 - step)
     centre = points.T @ weights
     about = points - centre
     shape = d * (about.T * weights) @ about

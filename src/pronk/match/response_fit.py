@@ -37,28 +37,42 @@ class ResponseProblem(Problem):
     """Weighted gain of one joint's simulated response over the measured one, by its gains."""
 
     def __init__(
-        self, rigs: JointRigs, goal: MeasuredJoint, start: Pair, linear: Plant | None = None
+        self,
+        rigs: JointRigs,
+        goal: MeasuredJoint,
+        start: Pair,
+        linear: Plant | None = None,
+        correction: Array | None = None,
     ) -> None:
-        """Begin at some stiffness and damping; `linear` gives the Jacobian without simulations."""
+        """Begin at some stiffness and damping.
+
+        The `linear` drive gives the Jacobian; with the `correction` of its log gain, shape
+        (inside,), the residual as well, and nothing is simulated.
+        """
         super().__init__({goal.joint: dict(zip(GAINS, start, strict=True))}, {goal.joint: GAINS})
         self.begin = np.log(np.asarray(start))
         # Near the optimum from the start, and as weak as any drive.
         self.low, self.high = np.full(2, -np.inf), np.full(2, np.inf)
-        self.goal, self._rigs, self._linear = goal, rigs, linear
+        self.goal, self._rigs, self._linear, self._correction = goal, rigs, linear, correction
         self._steps = np.array([PARAMETERS[name].step for name in GAINS])
         self._cache: dict[bytes, tuple[Array, Array]] = {}
 
     def requests(self, x: Array) -> list[SimRequest]:
         """What to simulate for residual and Jacobian at a point."""
+        if self._correction is not None:
+            return []
         points = np.exp([x] if self._linear else [x, *(x + np.diag(self._steps))])
         return [SimRequest(self.goal, *pair) for pair in points.tolist()]
 
     def take(self, x: Array, simulated: Sequence[ComplexArray]) -> None:
         """Make residual and Jacobian at a point of the responses to `requests`."""
-        deviation = self.goal.deviation_db()
+        deviation, amplitude = self.goal.deviation_db(), self.goal.trace.amplitude
+        if self._linear and self._correction is not None:
+            closed = self._linear.response(*np.exp(x), amplitude=amplitude)
+            simulated = [*(closed * np.exp(self._correction))]
         weighted = self.goal.error_db(np.array(simulated)) / deviation
         if self._linear:
-            slope = self._linear.slope(*np.exp(x), amplitude=self.goal.trace.amplitude)
+            slope = self._linear.slope(*np.exp(x), amplitude=amplitude)
             jacobian = DB * slope / deviation[:, None]
         else:
             jacobian = (weighted[1:] - weighted[0]).T / self._steps
@@ -127,15 +141,18 @@ def refine(
     targets: Sequence[MeasuredJoint],
     start: Sequence[Pair],
     linear: Sequence[Plant] = (),
+    corrections: Sequence[Array] = (),
 ) -> list[Fit]:
     """Find the gains that minimize the weighted squared gain error, one fit a target.
 
     `start` holds the (stiffness, damping) to begin with, one a target. With the `linear` drives
     of the targets steps are a third as long to compute, and the optimum is off by the part of the
-    error that the joint cannot avoid times the error of the linear slope.
+    error that the joint cannot avoid times the error of the linear slope. With `corrections` of
+    the linear drives' log gain, shape (inside,) each, nothing is simulated.
     """
-    plants: Sequence[Plant | None] = linear or [None] * len(targets)
-    problems = [ResponseProblem(rigs, *one) for one in zip(targets, start, plants, strict=True)]
+    none = [None] * len(targets)
+    each = zip(targets, start, linear or none, corrections or none, strict=True)
+    problems = [ResponseProblem(rigs, *one) for one in each]
     solutions = solve_together(problems, lambda points: evaluate(rigs, points))
     return [Fit(target=one, solution=s) for one, s in zip(targets, solutions, strict=True)]
 

@@ -72,13 +72,17 @@ class Plant:
         open_loop = 1.0 + direct + kd * (self.speed if self.law.kind == "explicit" else after)
         closed = direct / open_loop
         if self.frictionloss > 0.0 and np.isfinite(amplitude):
-            # MuJoCo's dry friction is implicit: it opposes the speed at the end of the step.
-            speed = amplitude * np.abs(closed) * self.omega
+            # MuJoCo's dry friction is implicit: it opposes the speed at the end of the step. The
+            # rounds need |open_loop + viscous after|^2 = a + viscous (b + viscous c) alone.
+            a, c = (x.real**2 + x.imag**2 for x in (open_loop, after))
+            b = 2.0 * (open_loop.real * after.real + open_loop.imag * after.imag)
+            forced = amplitude * self.omega * np.abs(direct)
+            speed = forced / np.sqrt(a)
             for _ in range(_FRICTION_ROUNDS):
                 viscous = 4.0 * self.frictionloss / (np.pi * np.maximum(speed, 1e-9))
-                closed = direct / (open_loop + viscous * after)
                 # Halved steps: near sticking the plain iteration hops between two amplitudes.
-                speed = 0.5 * (speed + amplitude * np.abs(closed) * self.omega)
+                speed = 0.5 * (speed + forced / np.sqrt(a + viscous * (b + viscous * c)))
+            closed = direct / (open_loop + viscous * after)
         return np.asarray(closed / hold)
 
     def slope(self, stiffness: float, damping: float, *, amplitude: float) -> Array:
