@@ -151,11 +151,7 @@ def progress() -> Reporter:
 
 
 def confirm(robot: str, where: str) -> None:
-    """Have the robot's name typed before a real one moves.
-
-    Raises:
-        HardwareError: Another word was typed.
-    """
+    """Have the robot's name typed before a real one moves; HardwareError for another word."""
     say(
         f"A real {robot} at {where} is about to move. Keep people out of its reach; the first "
         "time, hang it up."
@@ -174,11 +170,7 @@ class Person:
     _fixed: tuple[str, ...] = ()
 
     def __call__(self, joints: tuple[str, ...]) -> None:
-        """Have these joints clamped and all others freed; returns when they are.
-
-        Raises:
-            HardwareError: Standard input has ended.
-        """
+        """Have these joints clamped and all others freed; returns when they are."""
         if set(joints) == set(self._fixed):
             return
         free = [name for name in self._fixed if name not in joints]

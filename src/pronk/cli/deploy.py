@@ -104,11 +104,7 @@ def deploy(
 
 
 def _scripts(text: str, contract: Contract, walk_only: bool) -> list[Script]:
-    """The commands of an unattended run.
-
-    Raises:
-        PronkError: It is no command, or none that the policy was trained for.
-    """
+    """The commands of an unattended run, those that the policy was trained for."""
     from pronk.evaluation.protocol import parse_cases
     from pronk.runtime.script import Script
 

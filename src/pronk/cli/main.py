@@ -120,12 +120,7 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], arguments: list[str], pro
 
 
 def _parse(command: Callable[..., Any], arguments: list[str], program: str) -> dict[str, Any]:
-    """Return the values of a command's parameters.
-
-    Raises:
-        PronkError: The options do not fit; one sentence.
-        SystemExit: The help was printed.
-    """
+    """Return the values of a command's parameters; SystemExit if the help was printed."""
     import tyro
 
     from pronk.cli.console import JsonFile, Outcome

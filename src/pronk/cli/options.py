@@ -50,11 +50,7 @@ class LinkOptions:
     """No confirmation before real hardware moves."""
 
     def address(self, base: Base | None = None) -> Address:
-        """The machine's address, with what belongs to its link; None as base for the link's own.
-
-        Raises:
-            HardwareError: An option is not of the link.
-        """
+        """The machine's address, with what belongs to its link; None as base for the link's own."""
         from pronk.links.address import SIM, Address
 
         options: dict[str, Any] = {"layout": self.layout, "port": self.port, "domain": self.domain}
@@ -102,12 +98,7 @@ class Reading:
     """NAME=VALUE for a reader of another package; repeat it."""
 
     def read(self, paths: Sequence[Path], robot: RobotSpec | None) -> list[JointLog]:
-        """Read every log that some paths stand for, on all cores.
-
-        Raises:
-            LogError: As `pronk.logs.readers.read_logs`.
-            RobotError: The same.
-        """
+        """Read every log that some paths stand for, on all cores."""
         from pronk.logs.readers import read_logs
 
         options = vars(self) | {
@@ -139,11 +130,7 @@ def _pairs(option: str, entries: Sequence[str], kind: Callable[[str], Any] = str
 def drive_gains(
     entries: Sequence[str], option: str = "--drive-gains"
 ) -> dict[str, tuple[float, float]] | Literal["default"] | None:
-    """Gains of joints from an option of the command line; None where it was not given.
-
-    Raises:
-        PronkError: An entry is neither `default` nor NAME=STIFFNESS,DAMPING.
-    """
+    """Gains of joints by NAME=STIFFNESS,DAMPING, or `default`; None where none was given."""
     if tuple(entries) == ("default",):
         return "default"
     return _pairs(option, entries, _gains) or None

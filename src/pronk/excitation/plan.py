@@ -110,9 +110,7 @@ class SweepPlan:
     def check(self) -> None:
         """Refuse a sweep that could exceed a limit.
 
-        Raises:
-            PlanError: Names the joint, the number, the limit, and the amplitude that would fit
-                (found by simulating it).
+        The PlanError names joint, number, limit, and the amplitude that fits in simulation.
         """
         for worst in self.forecasts:
             if not (breaches := worst.breaches()):

@@ -58,9 +58,7 @@ class Signal(ABC):
     def samples(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
         """Command offsets at the ticks [rad], shape (ticks,); the first and the last are zero.
 
-        Raises:
-            PlanError: The signal does not fit the rate: a held command carries nothing above
-                half its rate (paper F4, reading A15).
+        PlanError above half the rate: a held command carries nothing there (F4, reading A15).
         """
         if self.band_hz[1] > 0.5 * rate_hz * (1.0 + 1e-9):
             raise PlanError(
@@ -93,11 +91,7 @@ class Signal(ABC):
 
 
 def ramps(ticks: int, ramp_ticks: int) -> Array:
-    """Half a cosine up from 0, ones, half a cosine down to exactly 0, shape (ticks,).
-
-    Raises:
-        PlanError: The two ramps do not fit.
-    """
+    """Half a cosine up from 0, ones, half a cosine down to exactly 0, shape (ticks,)."""
     if 2 * ramp_ticks > ticks:
         raise PlanError(
             f"two ramps of {ramp_ticks} ticks do not fit a signal of {ticks}; shorten the ramp or "
@@ -243,11 +237,7 @@ class Multisine(Signal):
         return round(exact), round(self.ramp_s * rate_hz)
 
     def one_period(self, rate_hz: float = POLICY_RATE_HZ) -> Array:
-        """One period at the ticks, scaled to the amplitude [rad], shape (length_s * rate_hz,).
-
-        Raises:
-            PlanError: A line lies at or above half the rate, or the period is not whole ticks.
-        """
+        """One period at the ticks, scaled to the amplitude [rad], shape (length_s * rate_hz,)."""
         ticks, _ = self._ticks(rate_hz)
         numbers = np.array(self.harmonic_numbers)
         if 2 * numbers[-1] >= ticks:

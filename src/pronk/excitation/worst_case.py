@@ -112,8 +112,7 @@ class Forecast:
     def shrink(self, rest: float) -> float:
         """Factor on the amplitude that would bring everything inside, were it all linear.
 
-        Args:
-            rest: Position of the joint in its pose [rad].
+        `rest` is the position of the joint in its pose [rad].
         """
         low, high = self.range
         if not low < rest < high:
@@ -138,16 +137,11 @@ def forecast(
     uncertainty: Uncertainty | None = None,
     timestep_s: float = TIMESTEP_S,
 ) -> list[Forecast]:
-    """Simulate the bench model in every corner of the uncertainty.
+    """Simulate the bench model in every corner of the uncertainty; a forecast a joint of the chain.
 
     `offsets` of the command to a joint about the default pose [rad] have shape (ticks,);
-    `stiffness` and `damping` are those of the real drives by joint.
-
-    Returns:
-        A forecast for every joint of the chain, those that are only held included.
-
-    Raises:
-        PlanError: The simulation diverges.
+    `stiffness` and `damping` are those of the real drives by joint. PlanError if the simulation
+    diverges.
     """
     spec = bench_spec(robot, joint, stiffness=stiffness, damping=damping)
     spec.option.timestep = timestep_s

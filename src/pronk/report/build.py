@@ -49,14 +49,9 @@ def write_report(
 ) -> tuple[Path, list[Part]]:
     """Write the page of everything in `root`; return its path and its parts.
 
-    Args:
-        root: The folder, which gets `report.html`, or the log of one deployment, which gets a page
-            of its name beside it.
-        progress: Called with the stage and the share of it that is done, 0 to 1.
-
-    Raises:
-        ArtefactError: No such folder, nothing in it, or something damaged.
-        LogError: A damaged log, or a file that is not a deployment's.
+    `root` is a folder, which gets `report.html`, or the log of one deployment, which gets a page of
+    its name beside it. What is missing or damaged is an ArtefactError or LogError. `progress` is
+    called with the stage and the share of it that is done, 0 to 1.
     """
     if not root.exists():
         raise ArtefactError(

@@ -169,11 +169,7 @@ def verdict(log: DeployLog) -> str:
 
 
 def part(path: Path) -> Part:
-    """Make the part of a deployment's log.
-
-    Raises:
-        LogError: The log is damaged, or not a deployment's.
-    """
+    """Make the part of a deployment's log; LogError if it is damaged, or of something else."""
     log, robot = read_deploy_log(path), None
     with suppress(PronkError):  # drives and limits of an unknown robot are left out
         known = load_robot(str(log.header["robot"]))

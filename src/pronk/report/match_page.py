@@ -30,11 +30,7 @@ PAGE_NAME = "match.html"
 
 
 def find_gains(folder: Path) -> Path:
-    """Return the gains file of a folder: `gains.yaml`, or the only YAML file with that schema.
-
-    Raises:
-        ArtefactError: There is none, or several and none called `gains.yaml`.
-    """
+    """Return the gains file of a folder: `gains.yaml`, or the only YAML file with that schema."""
     if not folder.is_dir():
         raise ArtefactError(
             f"{folder}: no such folder; give the one that `pronk match --out` wrote to."
@@ -108,12 +104,9 @@ def write_page(folder: Path, *, gains: str | None = None) -> tuple[Path, Part]:
 
 
 def part(path: Path, gains: str | None = None) -> Part:
-    """Make the part of the match in `path`, a `match.npz`.
+    """Make the part of the match in `path`, a `match.npz`, with a gains file beside it.
 
-    `gains` is the name of its gains file, found if None.
-
-    Raises:
-        ArtefactError: There are no gains, or an artefact is missing or damaged.
+    `gains` is the name of that file, found if None.
     """
     gains_path = path.parent / gains if gains else find_gains(path.parent)
     result = result_file.load(path, gains_file.load(gains_path))

@@ -58,11 +58,7 @@ def _cut(time: Array, value: Array, start: float, end: float) -> Array:
 
 
 def traces(trial: Results, folder: Path) -> tuple[Traces, int] | None:
-    """Read the captures of a trial, and count missing ones; None if there are none.
-
-    Raises:
-        ArtefactError: A capture is damaged.
-    """
+    """Read the captures of a trial, and count missing ones; None if there are none."""
     kept = [(row, folder / row.capture) for row in trial.rows if row.capture]
     present = [(row, path) for row, path in kept if path.exists()]
     if not present:
@@ -83,11 +79,7 @@ def traces(trial: Results, folder: Path) -> tuple[Traces, int] | None:
 
 
 def films(folder: Path) -> tuple[dict[str, str], list[str]]:
-    """Return pictures in a trial's folder as caption and `data:` address, and names of films.
-
-    Raises:
-        ArtefactError: A picture is damaged.
-    """
+    """Return pictures in a trial's folder as caption and `data:` address, and names of films."""
     # A folder with a trial of its own is a part of its own.
     inner = [path for path in folder.iterdir() if path.is_dir() and not (path / SUMMARY).exists()]
     png, gif, mp4 = (
@@ -113,11 +105,7 @@ def _image(path: Path) -> str:
 
 
 def part(path: Path) -> Part:
-    """Make the part of the trial in `path`, a `summary.json`.
-
-    Raises:
-        ArtefactError: The trial, a capture or a picture is damaged.
-    """
+    """Make the part of the trial in `path`, a `summary.json`."""
     folder = path.parent
     trial = load(folder)
     where = tables.place(trial)

@@ -84,12 +84,10 @@ def fit_delay(response: FrequencyResponse) -> float:
 
 
 def third_harmonic(log: JointLog, joint: str) -> float:
-    """Third harmonic of the response to one excitation (`JointLog.cut`), at 1 to 4 Hz.
+    """RMS at 3 f over RMS at f in the response to one excitation (`JointLog.cut`), at 1 to 4 Hz.
 
-    Sine steps are read exactly, chirps by demodulation.
-
-    Returns:
-        RMS at 3 f over RMS at f; NaN where the log lacks the frequency, and for multisines.
+    Sine steps are read exactly, chirps by demodulation. NaN where the log lacks the frequency, and
+    for multisines.
     """
     if log.frequency is None or not log.segments or log.segments[0].kind == "multisine":
         return math.nan

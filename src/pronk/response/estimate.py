@@ -26,17 +26,11 @@ def excited_joints(log: JointLog) -> tuple[str, ...]:
 
 
 def excitations(log: JointLog, joint: str) -> list[list[JointLog]]:
-    """Split a log into the excitations of one joint, grouped into repeats.
+    """Split a log into the excitations of one joint: groups of repeats, largest amplitude first.
 
     Excitations of the same kind, amplitude, period, band and clamping are repeats of one another.
     Those of a log without segments are found in its command (`with_segments`); an amplitude that is
-    not known is read off the command.
-
-    Returns:
-        Groups of repeats, largest amplitude first.
-
-    Raises:
-        LogError: There is no such joint, it was not excited, or its command is constant.
+    not known is read off the command. LogError for a joint that was not excited.
     """
     column, log = log.column(joint), with_segments(log)
     where = log.source or "log"
@@ -69,17 +63,13 @@ def log_rate(groups: Sequence[Sequence[JointLog]]) -> float:
 def estimate(
     log: JointLog, joint: str, estimator: Estimator | None = None
 ) -> list[FrequencyResponse]:
-    """Responses of one joint, from its held command to its position.
+    """Responses of one joint, from its held command to its position; largest amplitude first.
 
     Chirps and excitations of unknown kind are averaged over segments (Welch); multisines and sine
     steps are read line by line. Repeats are combined by averaging their spectra, and kept one by
-    one in `repeats`. A single long excitation is one repeat: its segments are its averages.
-
-    Returns:
-        One response per amplitude (and per kind, if there are several), largest amplitude first.
-
-    Raises:
-        LogError: The joint is unknown, was not excited, or did not move; or a segment is too short.
+    one in `repeats`. A single long excitation is one repeat: its segments are its averages. Several
+    kinds of one amplitude are several responses. LogError for a joint that was not excited or did
+    not move, and for segments that are too short.
     """
     settings = estimator or Estimator()
     groups = excitations(log, joint)

@@ -140,10 +140,7 @@ def _steady_periods(command: Array, samples: int) -> tuple[int, int]:
 def read_periods(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> Spectra:
     """Spectra of the steady periods of one multisine (`JointLog.cut`) at its excited lines.
 
-    `rate_hz` is about that of the analysis grid.
-
-    Raises:
-        LogError: The segment gives no period, or fewer than three equal periods.
+    `rate_hz` is about that of the analysis grid. LogError without three equal periods.
     """
     period = log.segments[0].period_s
     if period is None:
@@ -166,11 +163,7 @@ def read_periods(log: JointLog, joint: str, estimator: Estimator, rate_hz: float
 def multisine_operator(
     time: Array, command: Array, period_s: float, estimator: Estimator, rate_hz: float
 ) -> H1Operator:
-    """`estimate_periodic` of one multisine as a matrix, for a fixed command.
-
-    Raises:
-        LogError: Fewer than three equal periods.
-    """
+    """`estimate_periodic` of one multisine as a matrix, for a fixed command."""
     found = _lines(time, command, period_s, estimator, rate_hz)
     samples = found.samples
     return H1Operator.of(
@@ -218,9 +211,7 @@ def read_steps(log: JointLog, joint: str, estimator: Estimator, rate_hz: float) 
     """Read every step of one excitation (`JointLog.cut`) inside the band.
 
     `rate_hz` is about that of the grid; each step takes a whole number of samples a period.
-
-    Raises:
-        LogError: No frequency channel, no step in the band, or steps of fewer than three periods.
+    LogError without a channel of the frequency or steps of three periods in the band.
     """
     where = log.source or "log"
     if log.frequency is None:
@@ -296,10 +287,8 @@ def estimate_periodic(
     """Response to multisines or sine steps, averaged over the periods of every excitation.
 
     `repeats` holds one row per excitation if there are three or more (other random phases are then
-    part of the scatter), one per period (of steps, per block of periods) otherwise.
-
-    Raises:
-        LogError: As `read_periods` or `read_steps`, or repeats with different frequencies.
+    part of the scatter), one per period (of steps, per block of periods) otherwise. LogError as of
+    `read_periods` and `read_steps`, and for repeats of different frequencies.
     """
     if parts[0].segments[0].kind == "multisine":
         read = [read_periods(part, joint, estimator, rate_hz) for part in parts]

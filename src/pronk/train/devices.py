@@ -41,12 +41,8 @@ def require_extra() -> None:
 def find_devices(requested: str = "auto", gpu_ids: str | None = None) -> tuple[str, ...]:
     """The GPUs to compute on, one a process, as `CUDA_VISIBLE_DEVICES` names them; () is the CPU.
 
-    Args:
-        requested: `auto`, `cpu` or `cuda`.
-        gpu_ids: Numbers of the visible GPUs, as in `0,1`, or `all`; the first alone if None.
-
-    Raises:
-        PronkError: There is no such GPU, or `gpu_ids` is malformed or names one twice.
+    `requested` is `auto`, `cpu` or `cuda`; `gpu_ids` are numbers of the visible GPUs, as in `0,1`,
+    or `all`, the first alone if None. A PronkError if there is no such GPU.
     """
     words = [] if gpu_ids is None else [word.strip() for word in gpu_ids.split(",")]
     if words != ["all"] and not (

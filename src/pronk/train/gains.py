@@ -46,11 +46,7 @@ class TrainingGains:
     """True if that file rests on pronk's virtual robot."""
 
     def __post_init__(self) -> None:
-        """Refuse gains whose ranges reach zero.
-
-        Raises:
-            PronkError: A draw could give a gain that is not positive, or the delay is negative.
-        """
+        """Refuse ranges that reach zero, and a negative delay."""
         for group, gains in self.groups.items():
             for what in ("stiffness", "damping"):
                 nominal, half = getattr(gains, what), getattr(gains, f"{what}_range")
@@ -66,19 +62,11 @@ class TrainingGains:
 def training_gains(
     choice: str | Path, robot: RobotSpec, *, like: Path | None = None
 ) -> TrainingGains:
-    """The gains to train with.
+    """The gains to train with: `naive`, or those of a `gains.yaml` for this robot and simulator.
 
-    Args:
-        choice: `naive`, or the path of a `gains.yaml`.
-        robot: The robot that is trained.
-        like: With `naive`, a `gains.yaml` whose ranges and delay are used about the naive
-            nominals, its ellipsoids moved along (reading A20). Without it the ranges are the
-            paper's (D3, D4) and the delay is 0.
-
-    Raises:
-        ArtefactError: The file is missing, damaged, of another robot, or matched in another
-            simulator than the one that trains.
-        PronkError: `like` was given with a file of gains, or a range reaches zero.
+    `like` is a `gains.yaml` whose ranges and delay are used about the naive nominals, its
+    ellipsoids moved along (reading A20). Without it the ranges of naive gains are the paper's (D3,
+    D4) and the delay is 0.
     """
     naive = str(choice) == NAIVE
     if like is not None and not naive:

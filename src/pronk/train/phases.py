@@ -116,10 +116,7 @@ TASKS: Mapping[str, Mapping[str, int]] = {
 def phase_at(iterations: Mapping[str, int], iteration: int) -> tuple[str, float]:
     """The phase of an iteration, counted from 0, and the fraction of it that is over before.
 
-    Beyond the last iteration the last phase is over.
-
-    Raises:
-        PronkError: There is no phase.
+    Beyond the last iteration the last phase is over. PronkError without any phase.
     """
     left = iteration
     present = [(name, count) for name, count in iterations.items() if count > 0]

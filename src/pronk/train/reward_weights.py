@@ -21,7 +21,7 @@ PAPER_UNIT = 20.0
 """One unit of a weight here is this many of the paper's."""
 
 
-def _term(func: Callable[..., Tensor], weight: float, **params: float) -> RewardTermCfg:
+def _term(func: Callable[..., Tensor], weight: float, **params: float | str) -> RewardTermCfg:
     return RewardTermCfg(func=func, weight=weight, params=params)
 
 
@@ -65,13 +65,13 @@ def reward_weights() -> dict[str, RewardTermCfg]:
         "torque": _term(rewards.torque, -0.0004, jump_scale=0.25),
         # Table II, phase 1.
         "dense_jump": _term(rewards.dense_jump, 0.0),
-        "sparse_jump": _term(rewards.sparse_jump, 0.0),
+        "sparse_jump": _term(rewards.gain, 0.0, of="score_gain"),  # A6
         # Not in the paper.
-        "jump_height": _term(rewards.jump_height, 0.0),
-        "flight_distance": _term(rewards.flight_distance, 0.0),
-        "clearance_gap": _term(rewards.clearance_gap, 0.0),
+        "jump_height": _term(rewards.gain, 0.0, of="travel_gain"),
+        "flight_distance": _term(rewards.gain, 0.0, of="flight_gain"),
+        "clearance_gap": _term(rewards.gain, 0.0, of="gap_gain"),
         "countermovement": _term(rewards.countermovement, 0.0),
-        "hop": _term(rewards.hop, 0.0),
+        "hop": _term(rewards.gain, 0.0, of="hop"),
         "action_rate": _term(rewards.action_rate, -0.02, jump_scale=0.25),
         "roll_pitch_rate": _term(rewards.roll_pitch_rate, -0.02),
         "slip": _term(rewards.slip, -0.1, jump_scale=0.0),

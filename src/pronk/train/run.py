@@ -35,12 +35,8 @@ def train(
 ) -> dict[str, Any]:
     """Begin or resume a run, train until it is finished or stopped, and return its provenance.
 
-    Args:
-        settings: As given.
-        report: Called with one line of text before training begins.
-
-    Raises:
-        PronkError: The settings are impossible, then nothing is written; or learning has diverged.
+    `report` is called with lines of text before training begins. Of impossible settings nothing is
+    written; learning that has diverged is a PronkError as well.
     """
     folder = RunFolder(settings.out)
     found: dict[str, Any] = {}
@@ -97,14 +93,10 @@ def _begin(folder: RunFolder, settings: TrainSettings) -> dict[str, Any]:
 
 
 def initial_state(path: Path, iterations: int) -> dict[str, Any]:
-    """The checkpoint with which the phases after walk begin.
+    """The checkpoint with which the phases after walk begin, its counters set to `iterations`.
 
-    Args:
-        path: Checkpoint of a walking policy, or the folder of a run whose phase walk is over.
-        iterations: Of the phase walk, which the counters of the checkpoint are set to.
-
-    Raises:
-        ArtefactError: There is none, or its policy already jumps.
+    `path` is the checkpoint of a policy that does not jump yet, or the folder of a run whose phase
+    walk is over; an ArtefactError for any other.
     """
     source = path / "walk.pt" if path.is_dir() else path
     if not source.is_file():
@@ -136,11 +128,7 @@ def _options(settings: TrainSettings) -> dict[str, Any]:
 
 
 def run_gains(folder: RunFolder, robot: Any) -> TrainingGains:
-    """The gains of a run, from its copy of the file.
-
-    Raises:
-        ArtefactError: The file is missing or was changed.
-    """
+    """The gains of a run, from its copy of the file, unless that was changed."""
     about = folder.read()["gains"]
     if not about["sha256"]:
         return training_gains(NAIVE, robot)

@@ -53,11 +53,7 @@ class TrainSettings:
     """Where the curves go."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range and options that do not go together.
-
-        Raises:
-            PronkError: One sentence that names them.
-        """
+        """Refuse values out of range and options that do not go together."""
         for name, least in (("envs", 2), ("seed", 0), ("save_interval", 1)):
             value = getattr(self, name)
             if value is not None and not least <= value < 2**31:
@@ -79,11 +75,7 @@ class TrainSettings:
 
     @property
     def iterations(self) -> Mapping[str, int]:
-        """PPO iterations of each phase; `walk` of the task jump is those of the walking policy.
-
-        Raises:
-            PronkError: A phase is not of the task, or has no iterations.
-        """
+        """PPO iterations of each phase; `walk` of the task jump is those of the walking policy."""
         found = dict(TASKS[self.task])
         known = [n for n in PHASES if found[n] > 0 and (n, self.task) != ("walk", "jump")]
         names = [entry.partition("=")[0] for entry in self.phase]
@@ -108,11 +100,7 @@ class TrainSettings:
         return self.ranges_from if self.gains in (None, NAIVE) else Path(self.gains)
 
     def completed(self) -> Self:
-        """With the defaults of a new run in place of None.
-
-        Raises:
-            PronkError: A new run needs an option that was left out.
-        """
+        """With the defaults of a new run in place of None; refuses what a new run lacks."""
         if self.gains is None:
             raise PronkError(
                 "a new run needs --gains: the gains.yaml of `pronk match`, or naive for the gains "
@@ -128,11 +116,7 @@ class TrainSettings:
         return replace(self, **{n: v for n, v in defaults.items() if getattr(self, n) is None})
 
     def resumed(self, stored: Mapping[str, Any]) -> Self:
-        """With the values of the run that is resumed, as of `stored_values`.
-
-        Raises:
-            PronkError: An option is given with another value than the run has.
-        """
+        """With the values of the run, as of `stored_values`; another value of it is refused."""
         for name, value in self.stored_values().items():
             if value and value != stored[name]:
                 raise PronkError(

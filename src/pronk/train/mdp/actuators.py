@@ -82,11 +82,8 @@ class PositionDrive(DcMotorActuator[PositionDriveCfg]):
 def actuators(robot: RobotSpec, gains: TrainingGains) -> tuple[PositionDriveCfg, ...]:
     """One actuator for each joint group, in the robot's order of groups.
 
-    Commands are delayed before they reach the actuators (`pronk.train.mdp.actions`).
-
-    Raises:
-        RobotError: Joints of one group have different drives.
-        PronkError: The gains are those of another robot.
+    Commands are delayed before they reach the actuators (`pronk.train.mdp.actions`). Gains of
+    another robot, and different drives in a group, are refused.
     """
     if gains.robot != robot.name:
         raise PronkError(f"gains of {gains.robot} were given for the drives of {robot.name}.")

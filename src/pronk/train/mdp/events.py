@@ -123,11 +123,7 @@ def randomize_shank_length(
 
 @requires_model_fields("body_mass", "body_inertia", recompute=RecomputeLevel.set_const)  # type: ignore[untyped-decorator]
 def randomize_base_mass(env: Any, env_ids: None, added: Range, base: SceneEntityCfg) -> None:
-    """Draw the mass of the trunk (D6); its inertia grows in proportion, its centre of mass stays.
-
-    Raises:
-        PronkError: The trunk could be left without mass.
-    """
+    """Draw the trunk's mass (D6); its inertia grows in proportion, its centre of mass stays."""
     ids = env.scene["robot"].indexing.body_ids[base.body_ids]
     mass, inertia = (env.sim.get_default_field(f)[ids] for f in ("body_mass", "body_inertia"))
     if not float(mass) + added[0] > 0.0:
@@ -155,10 +151,7 @@ def randomize_decimation(env: Any, env_ids: None, nominal: int, added: tuple[int
     """Draw the physics steps of the next policy step, once for all robots (D1, A1).
 
     The draw is a function of the step counter: the same in every process, so that GPUs need not
-    wait for one another.
-
-    Raises:
-        PronkError: A policy step could have no physics step.
+    wait for one another. PronkError if a policy step could have no physics step.
     """
     if nominal + added[0] < 1:
         raise PronkError(

@@ -31,11 +31,7 @@ def write(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def read(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint.
-
-    Raises:
-        ArtefactError: Missing, damaged, or not a checkpoint of `pronk train` or mjlab's `train`.
-    """
+    """Read a checkpoint of `pronk train` or mjlab's `train`; ArtefactError for any other file."""
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError:

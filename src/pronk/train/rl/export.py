@@ -52,19 +52,11 @@ def contract_for(
     lift_off_velocity: float | None,
     provenance: Mapping[str, Any],
 ) -> Contract:
-    """The contract of a policy that was trained on `robot`.
+    """The contract of a policy that was trained on `robot`, whose order of joints is the actions'.
 
-    Args:
-        robot: Its order of joints is that of the actions.
-        gains: Nominal gains.
-        action_scale: Position target per unit of action [rad].
-        delay_steps: Smallest and largest command delay [physics steps].
-        command_limits: Half-widths of the commands: forward, left [m/s], yaw rate [rad/s].
-        lift_off_velocity: Desired at lift-off [m/s]; None for a policy without jump input.
-        provenance: Phases, iterations, seed, run; what JSON can hold.
-
-    Raises:
-        ArtefactError: The numbers contradict each other.
+    `action_scale` is the position target per unit of action [rad], `delay_steps` the smallest and
+    largest command delay [physics steps], `command_limits` the half-widths of forward, left [m/s]
+    and yaw rate [rad/s], `lift_off_velocity` the desired one [m/s], None without jump input.
     """
     groups = [gains.groups[joint.group] for joint in robot.joints]
     low, high = delay_steps
@@ -128,10 +120,7 @@ def verify(path: Path, actor: EstimatorActor, observations: Mapping[str, Tensor]
     """Largest absolute difference of all outputs between an exported policy and its actor.
 
     Both compute on the CPU: a GPU may round matrix products to TF32. `observations` has "measured"
-    (N, 105) and, for a policy that jumps, "jump" (N, 1).
-
-    Raises:
-        ArtefactError: The file cannot be run, or an input or output is not finite.
+    (N, 105) and, for a policy that jumps, "jump" (N, 1). ArtefactError if the file cannot be run.
     """
     policy = load_policy(path)
     names = ("measured", "jump") if policy.contract.jump else ("measured",)

@@ -76,11 +76,7 @@ class EstimatorPPO(PPO):
         estimator_velocity_coef: float,
         **cfg: Any,
     ) -> None:
-        """Called by rsl_rl with the fields of `EstimatorPpoCfg`.
-
-        Raises:
-            PronkError: The environment has no group for the estimator, or a number is out of range.
-        """
+        """Called by rsl_rl with the fields of `EstimatorPpoCfg`, which are checked."""
         if TARGET_GROUP not in storage.observations.keys():  # noqa: SIM118 (a TensorDict)
             raise PronkError(
                 f"the environment gives the groups {', '.join(storage.observations.keys())};"
@@ -112,10 +108,9 @@ class EstimatorPPO(PPO):
         self.estimator_optimizer = torch.optim.Adam(estimator, lr=estimator_learning_rate, **fused)
 
     def update(self) -> dict[str, float]:
-        """Learn from the stored rollout.
+        """Learn from the stored rollout; returns mean losses by name.
 
-        Returns:
-            Mean losses by name: PPO's, `estimator_contact` [nat], `estimator_velocity` [m^2/s^2].
+        PPO's, `estimator_contact` [nat] and `estimator_velocity` [m^2/s^2].
         """
         losses: dict[str, float] = super().update()
         if isinstance(self.symmetry, _Augmentation):

@@ -122,11 +122,7 @@ class PronkRunner(MjlabOnPolicyRunner):
     def __init__(
         self, env: Any, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu"
     ) -> None:
-        """As mjlab makes its runners.
-
-        Raises:
-            PronkError: The curriculum's iterations are not as long as the runner's.
-        """
+        """As mjlab makes its runners; the curriculum's iterations must be as long as its own."""
         env_ = env.unwrapped
         StackedRewardManager.install(env_)
         self.curriculum = curriculum(env_)
@@ -162,11 +158,7 @@ class PronkRunner(MjlabOnPolicyRunner):
         return int(self.env.unwrapped.common_step_counter) // self.curriculum.steps_per_iteration
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Train on; `stop_reason` ends training after an iteration, with a checkpoint.
-
-        Raises:
-            PronkError: Learning has diverged.
-        """
+        """Train on; `stop_reason` ends training after an iteration, with a checkpoint."""
         self._begin_iteration()
         try:
             super().learn(num_learning_iterations, init_at_random_ep_len)
@@ -284,11 +276,7 @@ class PronkRunner(MjlabOnPolicyRunner):
     # --- Checkpoints -----------------------------------------------------------------------------
 
     def save(self, path: str, infos: Mapping[str, Any] | None = None) -> None:
-        """Write a checkpoint, whole or not at all.
-
-        Raises:
-            PronkError: A weight is not finite.
-        """
+        """Write a checkpoint, whole or not at all; weights that are not finite are refused."""
         state = self.alg.save()
         self._check_finite(state)
         env = self.env.unwrapped
@@ -316,9 +304,6 @@ class PronkRunner(MjlabOnPolicyRunner):
         """Resume from a checkpoint, or load parts of it; one without jump inputs is widened.
 
         Robots start anew. `load_cfg` is rsl_rl's: `actor`, `critic`, `optimizer`, `iteration`.
-
-        Raises:
-            ArtefactError: The file is no checkpoint, or its networks are others than these.
         """
         state = checkpoint.read(Path(path), map_location or self.device)
         try:

@@ -58,11 +58,7 @@ _FEET = (
 
 
 def mirrored(group: str, x: Tensor, body: Legged) -> Tensor:
-    """The mirror image of (..., size) in a group of `GROUPS`; applied twice it is the identity.
-
-    Raises:
-        PronkError: There is no such group.
-    """
+    """The mirror image of (..., size) in a group of `GROUPS`; applied twice it is the identity."""
     if group not in GROUPS:
         raise PronkError(
             f"the observation group {group!r} has no known layout; expected one of "
@@ -100,15 +96,9 @@ def _mirror(
 def with_mirror_image(
     env: Any, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
-    """A batch, then its mirror image, for rsl_rl's symmetry extension.
+    """A batch, then its mirror image, for rsl_rl's symmetry extension; None stays None.
 
-    Args:
-        env: The environment, whose command term has the robot's dimensions.
-        obs: Groups of observations, each (N, size), or None.
-        actions: (N, 12), or None.
-
-    Returns:
-        The same with 2 N rows; None stays None.
+    N rows of groups of observations, (N, size) each, and of actions, (N, 12), become 2 N.
     """
     body = motion_command(env.unwrapped).body
 

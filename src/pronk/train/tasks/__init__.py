@@ -54,12 +54,7 @@ class Task:
 
 
 def load_task(robot: str) -> Task:
-    """The task of a robot, by name or path.
-
-    Raises:
-        RobotError: There is no such robot.
-        PronkError: It has no task; the message says which robots have one.
-    """
+    """The task of a robot, by name or path; a PronkError says which robots have one."""
     spec = load_robot(robot)
     if spec.source in ROBOTS:
         return Task(robot=spec, env_cfg=ROBOTS[spec.source], rl_cfg=jump_rl_cfg)

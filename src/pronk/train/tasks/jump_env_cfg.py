@@ -58,15 +58,9 @@ def jump_env_cfg(
     num_envs: int = 4096,
     seed: int = 0,
 ) -> ManagerBasedRlEnvCfg:
-    """The environment of all phases.
+    """The environment of all phases, with their PPO iterations by name.
 
-    Args:
-        robot: The robot.
-        gains: Nominal gains and their ranges.
-        iterations: PPO iterations of each phase, by name.
-        gain_shape: Whether gains are drawn from the box or the ellipsoid of each group.
-        num_envs: Number of robots.
-        seed: Of all draws.
+    `gain_shape` is that of the ranges of each group that gains are drawn from.
     """
     delay = round(gains.delay_s / robot.timestep_s)
     return ManagerBasedRlEnvCfg(

@@ -12,11 +12,8 @@ from pronk.train.rl.ppo import EstimatorPpoCfg
 def jump_rl_cfg(*, iterations: int, seed: int = 0) -> RslRlOnPolicyRunnerCfg:
     """Actor and critic of the paper (N2), and PPO with mjlab's settings for its quadrupeds.
 
-    The phases set the entropy bonus and the estimator's learning rate (`pronk.train.phases`).
-
-    Args:
-        iterations: Of all phases.
-        seed: Of the networks and of exploration.
+    The phases set the entropy bonus and the estimator's learning rate (`pronk.train.phases`);
+    `iterations` are of all of them.
     """
     return RslRlOnPolicyRunnerCfg(
         seed=seed,
