@@ -9,8 +9,8 @@ position `P_q(z)` and speed `P_v(z)`; explicit PD then gives
 for a whole grid of gains without simulating anything. Where damping is implicit
 (`pronk.actuator.law`) it acts on the speed at the end of the step, `z P_v`.
 `c = 4 f / (pi |speed|)` is the describing function of the joint's dry friction `f` (Gelb and
-Vander Velde, *Multiple-Input Describing Functions*, 1968, table of appendix B: ideal relay),
-iterated with the amplitude of the response. What it leaves out (coupling through held joints that
+Vander Velde, *Multiple-Input Describing Functions*, 1968, table of appendix B: ideal relay) at
+the amplitude of the response. What it leaves out (coupling through held joints that
 slip, the estimator's leakage, friction near sticking) is a smooth ratio that simulations at the
 optimum correct.
 """
@@ -33,8 +33,6 @@ _EPS = 1e-6
 """Perturbation of the finite differences: the best of central differences in float64."""
 _STEP = 1e-3
 """Step of `Plant.slope` in the logarithm of a gain."""
-_FRICTION_ROUNDS = 12
-"""Rounds of the describing function; halved steps settle it below 1e-3 of the gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,16 +71,14 @@ class Plant:
         closed = direct / open_loop
         if self.frictionloss > 0.0 and np.isfinite(amplitude):
             # MuJoCo's dry friction is implicit: it opposes the speed at the end of the step. The
-            # rounds need |open_loop + viscous after|^2 = a + viscous (b + viscous c) alone.
-            a, c = (x.real**2 + x.imag**2 for x in (open_loop, after))
-            b = 2.0 * (open_loop.real * after.real + open_loop.imag * after.imag)
+            # amplitude `x` of that speed solves `|x open_loop + relay after| = forced`.
+            relay = 4.0 * self.frictionloss / np.pi
             forced = amplitude * self.omega * np.abs(direct)
-            speed = forced / np.sqrt(a)
-            for _ in range(_FRICTION_ROUNDS):
-                viscous = 4.0 * self.frictionloss / (np.pi * np.maximum(speed, 1e-9))
-                # Halved steps: near sticking the plain iteration hops between two amplitudes.
-                speed = 0.5 * (speed + forced / np.sqrt(a + viscous * (b + viscous * c)))
-            closed = direct / (open_loop + viscous * after)
+            square = open_loop.real**2 + open_loop.imag**2
+            half = relay * (open_loop.real * after.real + open_loop.imag * after.imag)
+            rest = square * ((relay * np.abs(after)) ** 2 - forced**2)
+            speed = (np.sqrt(np.maximum(half**2 - rest, 0.0)) - half) / square
+            closed = direct / (open_loop + relay / np.maximum(speed, 1e-9) * after)
         return np.asarray(closed / hold)
 
     def slope(self, stiffness: float, damping: float, *, amplitude: float) -> Array:
