@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -175,26 +176,41 @@ def match_frameworks(
     fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
     work = _Work(logs=logs, settings=chosen, mode=mode)
     own = _matched(work, robot, fitted, clock)
-    joints = joint_fits(own.robot, own.joints, drives, remarks)
-    out = {"": replace(own, joints=joints).result(every, own.info, clock)}
-    done = {_kind(own.robot): out[""]}
-    for name, framework in frameworks.items():
-        clock, kind = _Clock(progress, f"{name} "), _kind(robots[name])
-        info = replace(framework.info, decimation=robots[name].decimation)
-        if kind not in done:
-            dry = framework.friction == "N m"
+    first = {_kind(robots[name]): name for name in reversed(names)}
+    first.pop(_kind(own.robot), None)
+    for name in first.values() if work.measured else ():
+        work.found(robots[name], clock)
+    # Simulations and products of large arrays leave the interpreter to the other thread.
+    with ThreadPoolExecutor(chosen.threads) as pool:
+        wrong = pool.submit(_wrong, work, own, clock)
+
+        def matched(name: str) -> MatchResult:
+            dry, own_clock = frameworks[name].friction == "N m", _Clock(progress, f"{name} ")
             known = [n for n in fitted if dry or n != "frictionloss"]
-            matched = _matched(work, robots[name], known, clock, own)
-            done[kind] = matched.result(every, info, clock)
+            found = _matched(work, robots[name], known, own_clock, own)
+            return found.result(every, wrong.result(), own_clock)
+
+        waiting = {kind: pool.submit(matched, name) for kind, name in first.items()}
+        joints = joint_fits(own.robot, own.joints, drives, remarks)
+        out = {"": replace(own, joints=joints).result(every, wrong.result(), clock)}
+    done = {_kind(own.robot): out[""]} | {kind: one.result() for kind, one in waiting.items()}
+    for name, framework in frameworks.items():
+        kind = _kind(robots[name])
+        info = replace(framework.info, decimation=robots[name].decimation)
         theirs = replace(done[kind].gains, simulator=info)
         require_stable(framework, robots[name], actuators(theirs, robots[name], "joint"))
-        out[name] = replace(done[kind], gains=theirs, seconds=clock.seconds)
+        seconds = done[kind].seconds if first.get(kind) == name else {}
+        out[name] = replace(done[kind], gains=theirs, seconds=seconds)
     return out
 
 
 def _kind(robot: RobotSpec) -> tuple[object, ...]:
     """What distinguishes the joints of one framework from those of another."""
     return (robot.law, robot.timestep_s, robot.decimation, *(j.drive for j in robot.joints))
+
+
+Wrong = Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]
+"""What contradicts the logs of each joint, and what would leave no trace in them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,8 +221,8 @@ class _Matched:
     """As it is simulated."""
     info: SimulatorInfo
     joints: dict[str, JointFit]
-    wrong: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]
-    """What contradicts the logs of each joint, and what would leave no trace in them."""
+    fits: Mapping[str, TimeFit]
+    """Those that were fitted in time."""
     excluded: Mapping[str, str]
     rate: float
     """Physics steps per second of the grid search."""
@@ -232,15 +248,15 @@ class _Matched:
         fit = self.joints[name]
         return translated(self.plants[name], other, (fit.stiffness, fit.damping)).after
 
-    def result(self, logs: Sequence[JointLog], info: SimulatorInfo, clock: _Clock) -> MatchResult:
-        """The result for a simulator with these joints."""
+    def result(self, logs: Sequence[JointLog], wrong: Wrong, clock: _Clock) -> MatchResult:
+        """The result for the simulator with these joints."""
         joints = {}
         for name, fit in self.joints.items():
-            wrong, unchecked = self.wrong.get(name, ((), ()))
-            joints[name] = replace(fit, flags=(*fit.flags, *wrong), unchecked=unchecked)
+            flags, unchecked = wrong.get(name, ((), ()))
+            joints[name] = replace(fit, flags=(*fit.flags, *flags), unchecked=unchecked)
         gains = {name: joint.gains() for name, joint in joints.items()}
         return MatchResult(
-            gains=matched_gains(self.robot, gains, logs, info),
+            gains=matched_gains(self.robot, gains, logs, self.info),
             joints={name: joint for name, joint in joints.items() if joint.responses},
             seconds=clock.seconds,
             grid_steps_per_second=self.rate,
@@ -307,15 +323,6 @@ def _matched(
     rate, info = float("nan"), mujoco_info(robot)
     fits: Mapping[str, TimeFit] = {}
     plants: Mapping[str, Plant] = {}
-
-    def wrong(joints: Mapping[str, JointFit]) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-        out = {}
-        with clock.stage("plausibility"):
-            for name, fit in joints.items():
-                found, hidden = findings(logs, name, robot, fit=fit, time_fit=fits.get(name))
-                out[name] = tuple(map(str, found)), tuple(CAUSES[cause][0] for cause in hidden)
-        return out
-
     if any(moves_together(log) for log in logs):
         if settings.simulator != "mujoco":
             raise PronkError(
@@ -326,7 +333,6 @@ def _matched(
             joints, excluded = fit_together(
                 logs, robot, fitted, threads=settings.threads, progress=clock.report
             )
-        causes = base.wrong if base else wrong(joints)
     else:
         # The simulator first: a device that is missing must not cost the user an estimate.
         with joint_rigs(
@@ -346,16 +352,26 @@ def _matched(
                 joints, fits = _match_drives(work, rigs, found, fitted, clock)
             else:
                 joints, fits, rate = _match_gains(work, rigs, found, plants, clock, base)
-            causes = base.wrong if base else wrong(joints)
     return _Matched(
         robot=robot,
         info=info,
         joints=joints,
-        wrong=causes,
+        fits=fits,
         excluded=excluded,
         rate=rate,
         plants=plants,
     )
+
+
+def _wrong(work: _Work, own: _Matched, clock: _Clock) -> Wrong:
+    """Causes that the joints in the robot's own simulator show."""
+    out = {}
+    with clock.stage("plausibility"):
+        for name, fit in own.joints.items():
+            time_fit = own.fits.get(name)
+            found, hidden = findings(work.logs, name, own.robot, fit=fit, time_fit=time_fit)
+            out[name] = tuple(map(str, found)), tuple(CAUSES[cause][0] for cause in hidden)
+    return out
 
 
 class _Clock:
