@@ -12,25 +12,30 @@ time from its begin to damping.
 
 from __future__ import annotations
 
+import json
 import math
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
-from benchmarks.runner import Progress, finish
+from benchmarks.runner import finish
 from pronk.cli import console
 from pronk.errors import HardwareError
 from pronk.links.machine import State
-from pronk.policy.runtime import Policy, load_policy
+from pronk.policy.runtime import load_policy
+from pronk.processes import pool
 from pronk.robots import load_robot
 from pronk.runtime.ipc import ACTIONS, Mode, OperatorRequest, fill
 from pronk.runtime.rollout import PolicyRunner
-from pronk.runtime.safety import Decision, Limits, Reason, SafetyFilter
+from pronk.runtime.safety import Array, Decision, Limits, Reason, SafetyFilter
 from pronk.runtime.script import STILL, Velocity
 from pronk.runtime.state_machine import StateMachine, Timing
 from pronk.virtual.faults import SENSOR_FAULTS, spoiled
@@ -47,23 +52,48 @@ LOSS = 0.3
 FASTEST = (2.0, 0.5, 1.0)
 """Of the commands: forward, left [m/s], yaw rate [rad/s]; within the range of training. In an hour
 14 of 38 flights ended early, by a fall or a joint that was too fast."""
+Row = dict[str, Any]
+_SEEDS = 1_000_000
+"""From a seed of the benchmark to those of its flights."""
 SUPERVISED = (Reason.REPEATED, Reason.ATTITUDE, Reason.ENCODER, Reason.HELD, Reason.CLIPPED)
 LIMITS = Limits.of(load_robot("mini_cheetah"))
-QUANTITIES: dict[str, tuple[float, Callable[[Any], float]]] = {
-    "attitude less gyro [rad]": (LIMITS.attitude, lambda seen: seen.attitude),
-    "force off the vertical [rad]": (LIMITS.upright, lambda seen: seen.lean),
-    "position less velocity [rad]": (LIMITS.encoder, lambda seen: float(seen.encoder.max())),
-    "least path of the attitude, share": (
-        0.25,
-        lambda seen: seen.paths[0] / seen.paths[1] if seen.paths[1] > LIMITS.turned else math.inf,
+
+
+def _both(constant_s: Array) -> Any:
+    return constant_s.reshape(2, -1).min(axis=0)
+
+
+def _path_share(path: float, turned: float) -> float:
+    return path / turned if turned > LIMITS.turned else math.inf
+
+
+QUANTITIES: dict[str, tuple[float, Callable[[SafetyFilter], float]]] = {
+    "attitude less gyro [rad]": (LIMITS.attitude, lambda f: f.supervision.attitude),
+    "force off the vertical [rad]": (LIMITS.upright, lambda f: f.supervision.lean),
+    "position less velocity [rad]": (
+        LIMITS.encoder,
+        lambda f: float(f.supervision.encoder.max()),
     ),
-    "unit repeats [s]": (LIMITS.repeat_s, lambda seen: max(seen.repeated.values())),
+    "least path of the attitude, share": (0.25, lambda f: _path_share(*f.supervision.paths)),
+    "unit repeats [s]": (LIMITS.repeat_s, lambda f: max(f.supervision.repeated.values())),
     "moved while constant [rad]": (
         LIMITS.moved,
-        lambda seen: float(np.where(seen.constant_s > LIMITS.repeat_s, seen.moved, 0.0).max()),
+        lambda f: float(
+            np.where(f.supervision.constant_s > LIMITS.repeat_s, f.supervision.moved, 0.0).max()
+        ),
     ),
+    "others moved while constant [rad]": (
+        LIMITS.others,
+        lambda f: float(
+            np.where(
+                _both(f.supervision.constant_s) > LIMITS.repeat_s, f.supervision.others, 0.0
+            ).max()
+        ),
+    ),
+    "limited by torque without moving [s]": (LIMITS.blocked_s, lambda f: float(f.blocked.max())),
+    "limited by torque [s]": (LIMITS.clipped_s, lambda f: f.clipped),
 }
-"""Limit, and the quantity, of `Supervision`."""
+"""Limit, and the quantity, of the filter."""
 
 
 def draw_params(number: int) -> SimParams:
@@ -106,16 +136,28 @@ def draw_params(number: int) -> SimParams:
     return replace(base, machine=machine, trunk=trunk, attitude=attitude, ground=ground)
 
 
+def in_steps(state: State) -> State:
+    """A state as the Mini Cheetah's drives send it: 16 bits of 25 rad, 12 of 130 rad/s."""
+    position, velocity = 25.0 / 65535.0, 130.0 / 4095.0
+    return replace(
+        state,
+        position=position * np.rint(state.position / position),
+        velocity=velocity * (np.floor(state.velocity / velocity) + 0.5),
+    )
+
+
 @dataclass(kw_only=True)
 class Flight:
     """One run of the virtual robot, from damping."""
 
-    policy: Policy
+    policy: Path
     params: SimParams
     seed: int
     steady: Velocity | None = None
     """A command that does not change, without jumps; None for those within `FASTEST`."""
     loss: float = 0.0
+    coarse: bool = False
+    """Whether positions and velocities come in the steps of the Mini Cheetah's drives."""
     fault: str = ""
     """Of `SENSOR_FAULTS`."""
     fault_at: float = math.inf
@@ -133,7 +175,8 @@ class Flight:
 
     def run(self, seconds: float) -> None:
         """Fly until a time, or until the filter damps."""
-        robot = load_robot(self.policy.contract.robot)
+        policy = load_policy(self.policy)
+        robot = load_robot(policy.contract.robot)
         rng = np.random.default_rng([self.seed, 7])
         start = Start(yaw=float(rng.uniform(-math.pi, math.pi)))
         machine = VirtualRobot(
@@ -141,7 +184,7 @@ class Flight:
         )
         machine.connect()
         safety, modes = SafetyFilter(limits=Limits.of(robot)), StateMachine(robot, Timing())
-        runner = PolicyRunner(self.policy, robot)
+        runner = PolicyRunner(policy, robot)
         modes.enter(Mode.DAMP, 0.0)
         modes.request(OperatorRequest.STAND)
         command, jump, change = STILL, False, math.inf
@@ -152,6 +195,7 @@ class Flight:
         for tick in range(1, round(seconds * SERVO_HZ) + 1):
             t = tick / SERVO_HZ
             measured = [each for each in machine.wait(t) if rng.random() >= self.loss]
+            measured = [in_steps(each) for each in measured] if self.coarse else measured
             if t < self.fault_at:
                 sound = measured[-1] if measured else sound
             elif self.fault:
@@ -180,7 +224,7 @@ class Flight:
                 machine.send(sent)
                 for name, (_, quantity) in QUANTITIES.items():
                     more = min if name.startswith("least") else max
-                    value = quantity(safety.supervision)
+                    value = quantity(safety)
                     self.largest[name] = more(self.largest.get(name, value), value)
             if t >= change and self.steady is not None:
                 command, change = self.steady, math.inf
@@ -203,78 +247,105 @@ class Flight:
                 under_way.append((tick + LATE_TICKS, record))
 
 
-def alarms(policy: Policy, hours: float, sets: int, progress: Progress) -> dict[str, Any]:
-    """Fly without faults for a time; false alarms, falls and the largest of each quantity."""
-    largest: dict[str, float] = {}
-    ends: Counter[str] = Counter()
-    flown, jumps, number = 0.0, 0, 0
-    found: list[str] = []
-    while flown < 3600.0 * hours:
-        flight = Flight(
-            policy=policy,
-            params=draw_params(number % sets),
-            seed=number,
-            loss=LOSS if number % 3 == 2 else 0.0,
-        )
-        try:
-            flight.run(120.0)
-        except HardwareError:
-            ends["physics ran away"] += 1
-        flown, jumps, number = flown + flight.seconds, jumps + flight.jumps, number + 1
-        if flight.damped is not None:
-            ends[flight.damped.reason.name] += 1
-            if flight.damped.reason in SUPERVISED:
-                found.append(f"flight {number - 1}, {flight.damped_at:.3f} s: {flight.damped.text}")
-        for name, value in flight.largest.items():
-            more = min if name.startswith("least") else max
-            largest[name] = more(largest.get(name, value), value)
-        progress("walking and jumping", min(flown / (3600.0 * hours), 1.0))
-    return {
-        "hours": flown / 3600.0,
-        "flights": number,
-        "sets": sets,
-        "jumps": jumps,
-        "false_alarms": found,
-        "ends": dict(ends),
-        "largest": dict(largest),
-    }
-
-
 LATE = "states-30-ms-old"
 WALK = (1.0, 0.0, 0.0)
 """Forward, left [m/s], yaw rate [rad/s] at the begin of a fault."""
+FAULTS = (*SENSOR_FAULTS, LATE)
 
 
-def detection(policy: Policy, runs: int, progress: Progress) -> dict[str, dict[str, Any]]:
-    """Time from each fault to damping [s], and the reasons; NaN where the fault is not found."""
-    rows: dict[str, dict[str, Any]] = {}
-    for row, fault in enumerate((*SENSOR_FAULTS, LATE)):
-        times: list[float] = []
-        reasons: Counter[str] = Counter()
-        number = 0
-        while len(times) < runs:
-            begins, number = 7.0 + 0.137 * len(times), number + 1
-            flight = Flight(
-                policy=policy,
-                params=draw_params(number),
-                seed=1000 + number,
-                steady=WALK,
-                fault="" if fault == LATE else fault,
-                fault_at=begins,
-                delay_ticks=15 if fault == LATE else 0,
-            )
-            flight.run(begins + 3.0)
-            if flight.damped_at < begins:
-                continue  # it fell before
-            times.append(flight.damped_at - begins)
-            reasons["none" if flight.damped is None else flight.damped.reason.name] += 1
-        rows[fault] = {"times_s": times, "reasons": dict(reasons)}
-        progress("faults", (row + 1) / (len(SENSOR_FAULTS) + 1))
-    return rows
+def quiet(policy: Path, sets: int, seed: int, number: int) -> Row:
+    """Fly for two minutes without a fault."""
+    flight = Flight(
+        policy=policy,
+        params=draw_params(number % sets),
+        seed=_SEEDS * seed + number,
+        loss=LOSS if number % 3 == 2 else 0.0,
+        coarse=number // sets % 2 == 1,
+    )
+    end = "time"
+    try:
+        flight.run(120.0)
+    except HardwareError:
+        end = "physics ran away"
+    alarm = ""
+    if flight.damped is not None:
+        end = flight.damped.reason.name
+        if flight.damped.reason in SUPERVISED:
+            alarm = f"{flight.damped_at:.3f} s: {flight.damped.text}"
+    return {
+        "flight": number,
+        "seconds": flight.seconds,
+        "jumps": flight.jumps,
+        "end": end,
+        "alarm": alarm,
+        "largest": flight.largest,
+    }
+
+
+def struck(policy: Path, seed: int, job: tuple[str, int]) -> Row:
+    """Time from a fault to damping [s] and the reason; NaN where it is not found in 3 s."""
+    fault, k = job
+    begins, number = 7.0 + 0.137 * k, k
+    while True:
+        number += 1
+        flight = Flight(
+            policy=policy,
+            params=draw_params(number),
+            seed=_SEEDS * seed + 1000 + number,
+            steady=WALK,
+            fault="" if fault == LATE else fault,
+            fault_at=begins,
+            delay_ticks=15 if fault == LATE else 0,
+            coarse=k % 2 == 1,
+        )
+        flight.run(begins + 3.0)
+        if not flight.damped_at < begins:  # else it fell before
+            break
+    reason = "none" if flight.damped is None else flight.damped.reason.name
+    return {"fault": fault, "run": k, "time_s": flight.damped_at - begins, "reason": reason}
+
+
+def fly(
+    policy: Path, hours: float, sets: int, runs: int, seed: int, jobs: int, out: Path | None
+) -> Iterator[Row]:
+    """Rows of `struck`, then of `quiet` until so many hours are flown; those in `out` come first.
+
+    Each new row is appended to `out` as soon as the rows before it are there.
+    """
+    rows = [] if out is None or not out.exists() else list(map(json.loads, out.open()))
+    yield from rows
+    known = {(row.get("fault"), row["run"]) for row in rows if "run" in row}
+    faults = [(name, k) for k in range(runs) for name in FAULTS if (name, k) not in known]
+    flown = sum(row.get("seconds", 0.0) for row in rows)
+    first = sum("flight" in row for row in rows)
+    work: Iterator[Callable[[], Row]] = chain(
+        (partial(struck, policy, seed, job) for job in faults),
+        (partial(quiet, policy, sets, seed, number) for number in count(first)),
+    )
+    under_way: deque[Future[Row]] = deque()
+    left = len(faults)
+    with pool(jobs) as workers:
+        while left > 0 or flown < 3600.0 * hours:
+            while len(under_way) < 3 * jobs:
+                under_way.append(workers.submit(next(work)))
+            row = under_way.popleft().result()
+            left -= "run" in row
+            flown += row.get("seconds", 0.0)
+            if out is not None:
+                with out.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+            yield row
+        workers.shutdown(wait=False, cancel_futures=True)
 
 
 def supervision(
-    policy: tyro.conf.Positional[Path], hours: float = 0.1, sets: int = 10, runs: int = 10
+    policy: tyro.conf.Positional[Path],
+    hours: float = 0.1,
+    sets: int = 10,
+    runs: int = 10,
+    seed: int = 0,
+    jobs: int = 1,
+    out: Path | None = None,
 ) -> console.Outcome:
     """False alarms of the supervision of sensors, and the time in which it finds faults.
 
@@ -283,33 +354,49 @@ def supervision(
         hours: Of walking and jumping without a fault.
         sets: Parameter sets of the virtual robot.
         runs: With each fault, each at another moment of the gait and another parameter set.
+        seed: Of noise, commands and losses.
+        jobs: Processes.
+        out: File of rows in JSON, written as they come; a run goes on from those that are there.
     """
-    network = load_policy(policy)
+    load_policy(policy)
+    rows: list[Row] = []
     with console.progress() as report:
-        quiet = alarms(network, hours, sets, report)
-        found = detection(network, runs, report)
-    largest = [
-        (name, f"{quiet['largest'].get(name, 0.0):.4f}", f"{limit:g}")
-        for name, (limit, _) in QUANTITIES.items()
-    ]
+        for row in fly(policy, hours, sets, runs, seed, jobs, out):
+            rows.append(row)
+            done = len(rows) if "run" in row else sum(r.get("seconds", 0.0) for r in rows) / 3600.0
+            whole = len(FAULTS) * runs if "run" in row else hours
+            report("faults" if "run" in row else "walking and jumping", min(done / whole, 1.0))
+    flights = [row for row in rows if "flight" in row]
+    largest = []
+    for name, (limit, _) in QUANTITIES.items():
+        values = [row["largest"][name] for row in flights if name in row["largest"]]
+        value = (min if name.startswith("least") else max)(values, default=math.nan)
+        largest.append((name, f"{value:.4f}", f"{limit:g}"))
+    for row in flights:
+        if row["alarm"]:
+            console.say(f"flight {row['flight']}, {row['alarm']}")
+    ends = Counter(row["end"] for row in flights)
     title = (
-        f"{quiet['hours']:.2f} h, {quiet['flights']} flights of {sets} parameter sets, "
-        f"{quiet['jumps']} jumps: {len(quiet['false_alarms'])} false alarms"
+        f"{sum(row['seconds'] for row in flights) / 3600.0:.2f} h, {len(flights)} flights of "
+        f"{sets} parameter sets, {sum(row['jumps'] for row in flights)} jumps: "
+        f"{sum(bool(row['alarm']) for row in flights)} false alarms"
     )
+    caption = ", ".join(f"{name} {number}" for name, number in ends.items())
     cells = []
-    for name, row in found.items():
-        times = 1e3 * np.array(row["times_s"])
+    for name in FAULTS:
+        mine = [row for row in rows if row.get("fault") == name]
+        times = 1e3 * np.array([row["time_s"] for row in mine])
         missed = int(np.isnan(times).sum())
-        worst = "not found" if missed else f"{times.max():.0f}"
-        reasons = ", ".join(f"{reason} {count}" for reason, count in row["reasons"].items())
-        cells.append(
-            (name, f"{np.nanmedian(times):.0f}", worst, f"{runs - missed}/{runs}", reasons)
-        )
-    for line in quiet["false_alarms"]:
-        console.say(line)
+        if missed == len(mine):
+            median, worst = "", "not found"
+        else:
+            median, worst = f"{np.nanmedian(times):.0f}", f"{np.nanmax(times):.0f}"
+        reasons = Counter(row["reason"] for row in mine)
+        texts = ", ".join(f"{reason} {number}" for reason, number in reasons.items())
+        cells.append((name, median, worst, f"{len(mine) - missed}/{len(mine)}", texts))
     return finish(
-        {"alarms": quiet, "faults": found},
-        console.table(title, ["quantity", "largest", "limit"], largest),
+        {"rows": rows},
+        console.table(title, ["quantity", "largest", "limit"], largest, caption),
         console.table(
             "From a fault to damping [ms]", ["fault", "median", "worst", "found", "reasons"], cells
         ),

@@ -47,12 +47,12 @@ def moving(seconds: float, seed: int = 0) -> Iterator[State]:
 
 
 def judged(
-    states: Iterator[State], *, limits: Limits | None = None
+    states: Iterator[State], *, limits: Limits | None = None, swing: float = 0.2
 ) -> tuple[Decision, float] | None:
     """The first damping of a filter whose command swings like the joints, and when."""
     safety = SafetyFilter(limits=limits or Limits.of(ROBOT))
     for state in states:
-        wanted = POSE + 0.2 * math.sin(2.0 * math.pi * 2.5 * state.time)
+        wanted = POSE + swing * math.sin(2.0 * math.pi * 2.5 * state.time)
         command = Command(
             position=wanted, stiffness=KP, damping=KD, made=state.time, valid_for=0.05
         )
@@ -104,6 +104,41 @@ def test_a_faulty_sensor_is_found(fault: str) -> None:
     assert decision.reason in expected
     assert decision.level is FilterAction.LATCH
     assert when - BEGINS <= (0.05 if fault.endswith("repeats") else 0.1)
+
+
+def test_a_slow_joint_that_stops_is_found_by_the_others_motion() -> None:
+    def stopped(sound: State, state: State) -> State:
+        q, v = state.position.copy(), state.velocity.copy()
+        q[3], v[3] = sound.position[3], 0.01
+        return replace(state, position=q, velocity=v)
+
+    found = judged(spoil(stopped), swing=0.0)
+    assert found is not None
+    assert found[0].reason is Reason.ENCODER
+    assert found[1] - BEGINS <= 0.1
+    # On a stand the other legs may be clamped while one is excited.
+    assert judged(spoil(stopped), swing=0.0, limits=Limits.of(ROBOT, tilt=math.inf)) is None
+
+
+@pytest.mark.parametrize("speed", [0.0, 6.0])
+def test_a_joint_that_its_full_torque_does_not_move_is_blocked(speed: float) -> None:
+    safety = SafetyFilter(limits=Limits.of(ROBOT))
+    sent = None
+    for state in moving(0.2):
+        q, v = state.position.copy(), state.velocity.copy()
+        q[4], v[4] = POSE[4] + speed * (state.time - 0.1), speed + 0.01 * state.gyro[1]
+        far = POSE.copy()
+        far[4] = q[4] + 2.0 * ROBOT.joints[4].drive.effort_limit / KP[4]
+        desired = Command(position=far, stiffness=KP, damping=KD, made=state.time, valid_for=0.05)
+        state = replace(state, position=q, velocity=v)
+        sent, decision = safety.judge([state], desired, state.time)
+        if sent is None:
+            break
+    if speed == 0.0:
+        assert decision.reason is Reason.CLIPPED
+        assert 0.05 < state.time <= 0.1
+    else:
+        assert sent is not None, decision
 
 
 def test_a_gyro_that_is_off_and_a_trunk_that_lies_are_found() -> None:

@@ -152,6 +152,11 @@ class Limits:
     """Longest that targets are held in any second [s]."""
     clipped_s: float = 0.3
     """Longest that targets are limited by torque, twice the longest of a jumping policy [s]."""
+    blocked_s: float = 0.09
+    """Longest that the target of one joint is, in one direction, without its moving by `blocked`
+    [s]."""
+    blocked: float = 0.05
+    """A jump limits a joint for 0.12 s, in which it moves by 0.7 [rad]."""
     repeat_s: float = 0.04
     """Longest that attitude, gyro or accelerometer may repeat: an attitude of LCM may be 20 ms old.
     Also the time from which a constant position or velocity counts [s]."""
@@ -169,6 +174,9 @@ class Limits:
     moved: float = 0.005
     """Range of the integral of velocity at a constant position, or the reverse: three steps of an
     encoder of 12 bits [rad]."""
+    others: float = 0.05
+    """Sum of the displacements of other joints while one is constant for `repeat_s`; the largest is
+    0.003, with encoders of 12 bits without noise [rad]."""
     expiry_s: float = 0.05
     """Longest that any command is repeated, whatever its own validity [s]."""
     lag: int = 30
@@ -483,12 +491,19 @@ class SafetyFilter:
     """Time of ticks that held within the last second, and time since the tick before [s]."""
     _judged: float | None = None
     """Time of the last tick [s]; None after damping."""
-    _clipped: float = 0.0
+    blocked: Array = field(init=False)
+    """Time for which the target of each joint has been, without its moving [s]."""
+    _pushed: Array | None = None
+    """Direction in which each joint's target is limited by torque, or 0; None if none is."""
+    _anchor: Array = field(init=False)
+    """Where each of these joints has not moved from [rad]."""
+    clipped: float = 0.0
     """Time for which targets have been limited by torque [s]."""
 
     def __post_init__(self) -> None:
         """Begin without a state."""
         self.supervision = Supervision(len(self.limits.joints), self.state_rate_hz)
+        self.blocked = self._anchor = np.zeros(len(self.limits.joints))
 
     @property
     def faulted(self) -> bool:
@@ -511,7 +526,7 @@ class SafetyFilter:
         """Note a tick without a target; the next one is limited to near the measured position."""
         self.last = None
         self.supervision.begin()
-        self._judged, self._clipped = None, 0.0
+        self._judged, self._pushed, self.clipped = None, None, 0.0
         return Decision(self.level, self.reason)
 
     def judge(
@@ -531,7 +546,9 @@ class SafetyFilter:
         if level >= _DAMP:
             detail = _detail(reason, states[row], command, self.limits, t)
         elif not self.faulted:
-            wrong = self._implausible(states) or self._persistent(level, reason, t)
+            wrong = self._implausible(states) or self._persistent(
+                level, reason, t, command, states[-1]
+            )
             if wrong is not None:
                 level, reason, detail = wrong
         if self.faulted or level >= _DAMP:
@@ -552,19 +569,35 @@ class SafetyFilter:
                 return Decision(_LATCH, *found)
         return None
 
-    def _persistent(self, level: FilterAction, reason: Reason, t: float) -> Decision | None:
+    def _persistent(
+        self, level: FilterAction, reason: Reason, t: float, command: Command, state: State
+    ) -> Decision | None:
         """Note a tick that holds or limits; a fault if it has been so for too long."""
-        seconds = 0.0 if self._judged is None else t - self._judged
+        seconds, limits = 0.0 if self._judged is None else t - self._judged, self.limits
         self._judged = t
         while self._ticks and self._ticks[0][0] < t - 1.0:
             self._ticks.popleft()
         if level is FilterAction.HOLD:
             self._ticks.append((t, seconds))
-            if (held := sum(each for _, each in self._ticks)) > self.limits.held_s:
+            if (held := sum(each for _, each in self._ticks)) > limits.held_s:
                 return Decision(_DAMP, Reason.HELD, f"{1e3 * held:.0f} ms")
-        self._clipped = self._clipped + seconds if reason is Reason.TORQUE else 0.0
-        if self._clipped > self.limits.clipped_s:
-            return Decision(_LATCH, Reason.CLIPPED, f"{1e3 * self._clipped:.0f} ms")
+        if reason is not Reason.TORQUE:
+            self._pushed, self.clipped = None, 0.0
+            return None
+        self.clipped += seconds
+        q = state.position
+        torque = command.stiffness * (command.position - q) - command.damping * state.velocity
+        pushed = np.where(np.abs(torque) > limits.torque, np.sign(torque), 0.0)
+        before = np.zeros_like(pushed) if self._pushed is None else self._pushed
+        fresh = (pushed != before) | (pushed == 0.0) | (np.abs(q - self._anchor) > limits.blocked)
+        self._pushed, self._anchor = pushed, np.where(fresh, q, self._anchor)
+        self.blocked = np.where(fresh, 0.0, self.blocked + seconds)
+        i = int(np.argmax(self.blocked))
+        if self.blocked[i] > limits.blocked_s:
+            text = f"{limits.joints[i]}, for {1e3 * self.blocked[i]:.0f} ms without moving"
+            return Decision(_LATCH, Reason.CLIPPED, text)
+        if self.clipped > limits.clipped_s:
+            return Decision(_LATCH, Reason.CLIPPED, f"{1e3 * self.clipped:.0f} ms")
         return None
 
     def _input(
@@ -626,13 +659,20 @@ def _contradiction(seen: Supervision, limits: Limits) -> tuple[Reason, str] | No
     constant = (seen.constant_s > limits.repeat_s).reshape(2, n)
     if not constant.any():
         return None
+    both = constant.all(axis=0)
+    if math.isfinite(limits.tilt) and (alone := both & (seen.others > limits.others)).any():
+        i = int(np.argmax(alone))
+        return (
+            Reason.ENCODER,
+            f"{joints[i]}, constant while others moved by {seen.others[i]:.2f} rad",
+        )
     share = np.where(constant.all(axis=1), _ALL, 1.0)[:, None]
     excess = np.where(constant, seen.moved.reshape(2, n) / limits.moved, 0.0)
     if (excess > 1.0).any():
         kind, i = divmod(int(np.argmax(excess)), n)
         which = ("position", "velocity")[kind]
         return Reason.ENCODER, f"{joints[i]}, whose {which} is constant"
-    unmoved = constant.all(axis=0) & (seen.load > limits.felt * share.max())
+    unmoved = both & (seen.load > limits.felt * share.max())
     if math.isinf(limits.tilt):  # a robot on its stand may be simulated without some of its legs
         unmoved &= seen.live
     if unmoved.any():

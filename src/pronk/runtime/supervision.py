@@ -13,7 +13,8 @@ Each source is judged by itself, because the noise of one hides that another has
   the other. A step is found in the state in which it occurs.
 - A position that does not change in one bit has no velocity, and the reverse; least of all where
   no joint's does.
-- A joint of which neither changes in one bit does not feel a load that changes.
+- A joint of which neither changes in one bit does not feel a load that changes, nor, on a robot
+  that is free to move, the motion of the other joints.
 
 Times between states are the robot's own where it sends them, else of arrival. Where the number of
 states and their time of arrival differ, as in a burst after a pause, an integral is as uncertain as
@@ -72,6 +73,8 @@ class Supervision:
         uncertainty [rad]."""
         self.load = np.zeros(joints)
         """Change of the commanded torque while neither has changed in one bit [N m]."""
+        self.others = np.zeros(joints)
+        """Meanwhile: sum of the displacements of the other joints [rad]."""
         self.live = np.zeros(joints, dtype=np.bool_)
         """Whether position or velocity of a joint has ever changed."""
         self._joints = joints
@@ -127,7 +130,8 @@ class Supervision:
         self._lowest = self._highest = np.concatenate((self._travel, state.position))
         self.constant_s, self.moved = np.zeros(2 * n), np.zeros(2 * n)
         self._least = self._most = self._loads
-        self.load = np.zeros(n)
+        self.load, self.others = np.zeros((2, n))
+        self._origins = np.tile(state.position, (n, 1))
 
     def _observe_trunk(self, before: State, state: State, seconds: float) -> None:
         for name, since in self.repeated.items():
@@ -178,6 +182,8 @@ class Supervision:
         self._least = np.where(live, loads, np.minimum(self._least, loads))
         self._most = np.where(live, loads, np.maximum(self._most, loads))
         self.load = self._most - self._least
+        self._origins[live] = q
+        self.others = np.abs(q - self._origins).sum(axis=1)
 
 
 def _clock(state: State) -> float:
