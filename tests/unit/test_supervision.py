@@ -81,14 +81,24 @@ def test_lost_states_and_bursts_are_believed() -> None:
     rng = np.random.default_rng(1)
     assert judged(state for state in moving(4.0) if rng.random() >= 0.3) is None
 
-    def late(state: State) -> State:
-        """Arrived at the end of a pause of 20 ms that comes every 0.3 s."""
+    def late(state: State, pause: float) -> State:
+        """Arrived at the end of a pause that comes every 0.3 s."""
         begun = 0.3 * math.floor(state.time / 0.3)
         passed = state.time - begun
-        time = begun + 0.02 + 1e-3 * passed if passed < 0.02 else state.time
+        time = begun + pause + 1e-3 * passed if passed < pause else state.time
         return replace(state, time=time)
 
-    assert judged(late(state) for state in moving(4.0)) is None
+    for pause in (0.02, 0.045):
+        assert judged(late(state, pause) for state in moving(4.0)) is None
+
+
+def test_a_robot_that_is_slow_for_a_while_is_believed() -> None:
+    def slow(state: State) -> State:
+        """Ten states come 40 ms apart, as from a virtual robot on a busy computer."""
+        passed = min(max(state.time - 1.0, 0.0), 0.02)
+        return replace(state, time=state.time + 20.0 * passed)
+
+    assert judged(slow(state) for state in moving(2.0)) is None
 
 
 @pytest.mark.parametrize("fault", [name for name in SENSOR_FAULTS if name != "legs-swapped"])

@@ -61,7 +61,8 @@ class Supervision:
         self.attitude = 0.0
         """Attitude less integral of the gyro, beyond the uncertainty of the integral [rad]."""
         self.paths = (0.0, 0.0)
-        """Length of the path of the attitude, and of the integral of the gyro [rad]."""
+        """Length of the path of the attitude, and of the integral of the gyro less its uncertainty
+        [rad]."""
         self.force = (0.0, 0.0, _GRAVITY)
         """Mean specific force in the world's frame [m/s^2]."""
         self.encoder = np.zeros(joints)
@@ -144,10 +145,14 @@ class Supervision:
         total = (i + dx - x * seconds, j + dy - y * seconds, k + dz - z * seconds)
         rate = math.hypot(x, y, z)
         self._rates.append(rate)
-        self.attitude = math.dist(total, self._turns[0]) - max(self._rates) * self._spread
+        unsure = max(self._rates) * self._spread
+        self.attitude = math.dist(total, self._turns[0]) - unsure
         gone, turned = self._gone[-1]
         self._gone.append((gone + math.hypot(dx, dy, dz), turned + rate * seconds))
-        self.paths = self._gone[-1][0] - self._gone[0][0], self._gone[-1][1] - self._gone[0][1]
+        gone, turned = (
+            last - first for last, first in zip(self._gone[-1], self._gone[0], strict=True)
+        )
+        self.paths = gone, turned - unsure
         self._turns.append(total)
         share = min(seconds / AVERAGE_S, 1.0)
         (p, q, r), (fx, fy, fz) = self.force, _to_world(b, state.accelerometer.tolist())
