@@ -166,8 +166,8 @@ def test_what_happens_elsewhere_does_not_count() -> None:
 
 SIM_PARAMS = load_sim_params()
 CASE = Case(name="forward 2", command=FORWARD)
-LADDER = Ladder(first=0.1, step=0.1, leads=(0.0, 0.1))
-PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, practice=2, most=0.45)
+LADDER = Ladder((0.1, 0.2, 0.3, 0.4), (0.0, 0.1))
+PLAN = CrossingPlan(cases=(CASE,), ladders={"gap": LADDER}, runs=3, enough=2, practice=2)
 
 
 def climb(

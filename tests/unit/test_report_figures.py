@@ -191,8 +191,6 @@ def test_variation_gives_means_over_commands_and_shares_of_landings() -> None:
     assert high - low == pytest.approx([0.02, 0.02])
     assert extra_pages.varied_line(*of_mass, "landed")[1].tolist() == [1.0, 0.0]
     assert [panel.marks for panel in extra_pages.variation_panels(varied())] == [(0.0,)] * 3
-    assert extra_pages.mean([0.4, math.nan, 0.2]) == pytest.approx(0.3)
-    assert math.isnan(extra_pages.mean([math.nan]))
 
 
 def test_scatter_over_gain_error_of_randomized_robots(tmp_path) -> None:
@@ -211,4 +209,4 @@ def test_scatter_over_gain_error_of_randomized_robots(tmp_path) -> None:
     assert len(texts) == 3  # the robots of a policy share a look
     lines = [line for line in axes.lines if line.get_marker() == "_"]
     means = {line.get_xdata()[0]: line.get_ydata()[0] for line in lines}
-    assert means[1.2] == pytest.approx(trial_figures.std(np.array([0.38, 0.40, 0.42])), rel=0.6)
+    assert means[1.2] == pytest.approx(np.std([0.38, 0.40, 0.42], ddof=1), rel=0.6)

@@ -120,12 +120,17 @@ def show_sheet(sheet: Sheet | None, title: str = "") -> None:
             say(f"  {note}")
 
 
-def show_rows(title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Print some fields of rows: heading (and digits, as in `peak [dB];2`) to name of a field."""
+def show_table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str) -> None:
+    """Print a table; arguments are those of `pronk.evaluation.tables.table`."""
     from pronk.evaluation.tables import table
 
+    show_sheet(table(columns, rows, *notes, title=title))
+
+
+def show_rows(title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Print some fields of rows: heading (and digits, as in `peak [dB];2`) to name of a field."""
     cells = [[row[name] for name in columns.values()] for row in rows]
-    show_sheet(table(" | ".join(columns), cells, title=title))
+    show_table(" | ".join(columns), cells, title=title)
 
 
 class Reporter(Progress):

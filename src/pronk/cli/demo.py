@@ -203,7 +203,6 @@ def show_match(
     Returns:
         Distance of each joint's stiffness and damping from Table I, in cells of the grid.
     """
-    from pronk.evaluation.tables import table
     from pronk.report.paper import TABLE_I
 
     by_joint, cells, rows = {one.joint: one for one in replays}, {}, []
@@ -221,5 +220,5 @@ def show_match(
     columns += " | gain error nominal [dB];2"
     columns += " | matched [dB];2 | fresh RMSE nominal [rad];4 | matched [rad];4"
     title = "Virtual robot: matched gains beside the paper's Table I (stiffness / damping)"
-    console.show_sheet(table(columns, rows, title=title))
+    console.show_table(columns, rows, title=title)
     return cells

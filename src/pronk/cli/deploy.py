@@ -129,7 +129,6 @@ def _notify(event: Event) -> None:
 
 def _report(summary: RunSummary) -> None:
     """Print the figures of the run."""
-    from pronk.evaluation.tables import table
     from pronk.runtime.ipc import REAL, VIRTUAL
 
     servo, policy = summary.servo, summary.policy
@@ -145,7 +144,7 @@ def _report(summary: RunSummary) -> None:
     rows = [(name, *(one[key] for key in keys)) for name, one in times.items() if one and one["n"]]
     columns = "what [ms] | n | median | 95 % | 99 % | 99.9 % | largest"
     title = f"Deployment on {VIRTUAL if servo.get('virtual') else REAL}"
-    console.show_sheet(table(columns, rows, title=title))
+    console.show_table(columns, rows, title=title)
     met = ", ".join(f"{name} {count}" for name, count in servo.get("interventions", {}).items())
     console.say(f"safety filter: {met or 'no intervention'} (ticks of {servo.get('ticks', 0)})")
     if dropped := sum(servo.get("dropped", {}).values()):

@@ -64,7 +64,6 @@ def match(
             pronk[train]).
         reading: How logs are read.
     """
-    from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match import result as result_file
     from pronk.match.pipeline import match_frameworks
@@ -131,7 +130,7 @@ def match(
         rows = [(name, joint.published_rmse, joint.rmse) for name, joint in joints]
         columns = "joint | RMSE published [rad];4 | RMSE matched [rad];4"
         title = "Several joints moved at once, so the whole arm was fitted in time"
-        console.show_sheet(table(columns, rows, title=title))
+        console.show_table(columns, rows, title=title)
         for name, reason in result.excluded.items():
             console.say(f"left out: {reason if name in reason else f'{name}: {reason}'}")
         figures["mode"] = mode
@@ -140,12 +139,11 @@ def match(
     if frameworks:
         means = framework_rows(results)
         columns = "framework | group | stiffness [N m/rad] | damping [N m s/rad]"
-        sheet = table(
+        console.show_table(
             f"{columns} | friction [N m] | delay [s];4 | error [dB] | flagged",
             [list(row.values()) for row in means],
             title="The same joints in every framework, means of each group",
         )
-        console.show_sheet(sheet)
         figures["frameworks"] = means
     following = [
         f"open {page} in a browser",
@@ -175,7 +173,6 @@ def framework_rows(results: Mapping[str, MatchResult]) -> list[dict[str, Any]]:
 
 def profiles() -> console.Outcome:
     """List the frameworks that gains can be matched for."""
-    from pronk.evaluation.tables import table
     from pronk.simulators import profiles as known
 
     found = known.profiles().values()
@@ -190,7 +187,7 @@ def profiles() -> console.Outcome:
         "law E: explicit; IF: implicit damping; In: implicit stiffness and damping, n iterations.",
         "Gains of one law do not give the same joint in another; see docs/simulators.md.",
     )
-    console.show_sheet(table(columns, rows, *laws, title="Frameworks"))
+    console.show_table(columns, rows, *laws, title="Frameworks")
     return console.Outcome(figures={"profiles": [vars(p) for p in found]})
 
 
@@ -234,7 +231,6 @@ def predict(
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
         reading: How logs are read.
     """
-    from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match.predict import predict as predict_log
     from pronk.match.predict import save_prediction
@@ -273,7 +269,7 @@ def predict(
     columns = "joint | signal | unit | RMSE nominal;4 | nominal with the delay;4 | RMSE matched;4"
     cells = [list(row.values())[:-1] for row in rows]
     title = "Replayed logs of the virtual robot" if virtual else "Replayed logs"
-    console.show_sheet(table(f"{columns} | R2 nominal | R2 matched", cells, title=title))
+    console.show_table(f"{columns} | R2 nominal | R2 matched", cells, title=title)
     for source in fitted:
         console.warn(f"{source} was used by these gains: this is a check of the fit.")
     for reason in excluded.values():

@@ -25,7 +25,6 @@ def probe(
         joint: The joint; the first one that moves no other if left out.
         simulator_python: Python that the simulator runs in (3.11 or later, with NumPy).
     """
-    from pronk.evaluation.tables import table
     from pronk.robots import load_robot
     from pronk.simulators.probe import probe as look
     from pronk.simulators.simulator import load_simulator
@@ -51,14 +50,11 @@ def probe(
         ["delay [ms]", 0.0, round(1000.0 * found.delay_s, 4) + 0.0],
         ["hold [steps]", 1, found.hold],
     ]
-    console.show_sheet(
-        table(
-            "of the joint | set;4 | acts;4",
-            rows,
-            f"Steps of {1000.0 * info.timestep_s:g} ms. Left: {100.0 * found.left:.2g} % of the "
-            "motion.",
-            title=f"{found.joint} in {info.engine} {info.version}",
-        )
+    console.show_table(
+        "of the joint | set;4 | acts;4",
+        rows,
+        f"Steps of {1e3 * info.timestep_s:g} ms. Left: {100.0 * found.left:.2g} % of the motion.",
+        title=f"{found.joint} in {info.engine} {info.version}",
     )
     for sentence in found.wrong.values():
         console.warn(f"{found.joint}: {sentence}.")

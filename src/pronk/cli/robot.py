@@ -44,7 +44,6 @@ def robot(
 
 
 def _check(path: Path) -> None:
-    from pronk.evaluation.tables import table
     from pronk.robots import load_robot
     from pronk.robots.model import bench_spec
 
@@ -63,7 +62,7 @@ def _check(path: Path) -> None:
         problems += [problem for problem, met in checks.items() if not met]
     columns = "joint | group | range [rad];2 | default [rad];2 | effort limit [N m]"
     title = f"{found.name}: {len(found.joints)} joints"
-    console.show_sheet(table(f"{columns} | chain | clamped", rows, title=title))
+    console.show_table(f"{columns} | chain | clamped", rows, title=title)
     for problem in problems:
         console.warn(problem)
     console.say(f"{len(problems)} to check" if problems else "nothing is inconsistent")

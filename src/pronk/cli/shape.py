@@ -39,7 +39,6 @@ def shape(
         sim_params: Parameters of the virtual robot, instead of the shipped ones.
         reading: How logs are read.
     """
-    from pronk.evaluation.tables import table
     from pronk.evaluation.virtual_sweep import sweep_virtual
     from pronk.logs.readers import read_logs
     from pronk.match import gains as gains_file
@@ -103,7 +102,7 @@ def shape(
             virtual=virtual,
         ),
     )
-    sheet = table(
+    console.show_table(
         "joint | before [dB] | after [dB] | error before [%];1 | after [%];1 | late [ms];2 | "
         "filter up to [dB];1 | torque [N m];1 | of limit [N m];1",
         rows,
@@ -113,5 +112,4 @@ def shape(
         " Torque: worst case of the measured chirp, filtered, over what is uncertain of the robot.",
         title=f"Filtered commands, to respond like {used}" + ", virtual robot" * virtual,
     )
-    console.show_sheet(sheet)
     return console.Outcome(figures={"joints": figures}, wrote=[out])

@@ -24,19 +24,11 @@ def train(settings: TrainSettings) -> console.Outcome:
     except KeyboardInterrupt:
         console.following(again)
         raise
-    columns = ("phase", "iterations", "environment steps", "steps/s", "wall clock [s]")
-    rows = [
-        (
-            name,
-            f"{one['iterations']}",
-            f"{one['env_steps']:,}",
-            f"{one['steps_per_second']:,.0f}",
-            f"{one['seconds']:.1f}",
-        )
-        for name, one in found["phases"].items()
-    ]
+    columns = "phase | iterations | environment steps | steps/s;0 | wall clock [s];1"
+    fields = ("iterations", "env_steps", "steps_per_second", "seconds")
+    rows = [(name, *(one[f] for f in fields)) for name, one in found["phases"].items()]
     if rows:
-        console.show(console.table("Training", columns, rows))
+        console.show_table(columns, rows, title="Training")
     session = found["sessions"][-1]
     console.say(f"{session['seconds']:.0f} s, {session['build_s'] or 0.0:.0f} s of it building")
     if stopped := session["stopped"]:

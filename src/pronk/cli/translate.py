@@ -33,7 +33,6 @@ def translate(
             GROUP=STIFFNESS,DAMPING, repeat it; or default, those of the robot's file.
         out: The gains file to write.
     """
-    from pronk.evaluation.tables import table
     from pronk.match import gains as gains_file
     from pronk.match import translate as translation
     from pronk.match.export import profile_held, robot_of
@@ -86,7 +85,7 @@ def translate(
             console.warn(f"{name} has no dry friction in N m: the joints lose theirs.")
         elif target.friction == "N m" != origin.friction:
             console.warn(f"the gains hold without dry friction: set none in {name}.")
-    sheet = table(
+    console.show_table(
         "framework | law | step [ms];1 | group | stiffness [N m/rad] | damping [N m s/rad] | "
         "untranslated [dB] | translated [dB] | responds earlier [ms];2 | left early [ms];2",
         rows,
@@ -95,7 +94,6 @@ def translate(
         "What responds earlier is added to the delay of the gains file.",
         title="The same joint in other frameworks",
     )
-    console.show_sheet(sheet)
     return console.Outcome(
         figures={"translated": figures},
         wrote=wrote,

@@ -290,26 +290,17 @@ def attempt(task: Attempt) -> Row:
 # ---- many runs ----
 
 
-@dataclass(frozen=True, kw_only=True)
-class Ladder:
-    """The sizes of one kind of obstacle, and the leads."""
+class Ladder(NamedTuple):
+    """The sizes of one kind of obstacle, and the leads beyond the reach of practice [m]."""
 
-    first: float
-    """[m]"""
-    step: float
-    """[m]"""
+    sizes: tuple[float, ...]
     leads: tuple[float, ...]
-    """Added to the reach of practice [m]."""
-
-    def size(self, rung: int) -> float:
-        """Of the rung, from 0 [m]."""
-        return round(self.first + rung * self.step, 6)
 
 
 LADDERS: Mapping[Shape, Ladder] = {
-    "gap": Ladder(first=0.1, step=0.05, leads=(0.04, 0.09, 0.14)),
-    "up": Ladder(first=0.05, step=0.05, leads=(0.05, 0.15, 0.25)),
-    "down": Ladder(first=0.1, step=0.1, leads=(0.0, 0.1)),
+    "gap": Ladder(tuple(cm / 100 for cm in range(10, 151, 5)), (0.04, 0.09, 0.14)),
+    "up": Ladder(tuple(cm / 100 for cm in range(5, 151, 5)), (0.05, 0.15, 0.25)),
+    "down": Ladder(tuple(cm / 100 for cm in range(10, 151, 10)), (0.0, 0.1)),
 }
 
 
@@ -330,8 +321,6 @@ class CrossingPlan:
     """Of them must cross."""
     practice: int = 8
     """Jumps on flat ground with each command."""
-    most: float = 1.5
-    """Size at which the search ends even if nothing fails [m]."""
     seed: int = 0
     script: Script = field(default_factory=lambda: Script(command=STILL))
     """Times `stand_s`, `jump_s` and `keep_s`."""
@@ -385,12 +374,12 @@ def search(
         for (_, _, kind), (subject, case, rung, reach) in climbing.items():
             ladder = plan.ladders[kind]
             for lead in (round(reach + beyond, 4) for beyond in ladder.leads):
-                steps += attempts(subject, case, kind, ladder.size(rung), lead, plan.runs)
+                steps += attempts(subject, case, kind, ladder.sizes[rung], lead, plan.runs)
         found = run(steps)
         rows += found
         for key, (subject, case, rung, reach) in list(climbing.items()):
             tried = [r for r in found if (r.policy, r.case, r.figures.obstacle) == key]
-            higher = plan.ladders[key[2]].size(rung + 1) <= plan.most + 1e-9
+            higher = rung + 1 < len(plan.ladders[key[2]].sizes)
             if rung_of(tried).crossed >= plan.enough and higher:
                 climbing[key] = subject, case, rung + 1, reach
             else:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pronk.evaluation.criteria import JUMPS, Check, trial_checks
-from pronk.evaluation.jumps import FIGURES, SYMBOLS
+from pronk.evaluation.jumps import FIGURES, SYMBOLS, Figure
 from pronk.evaluation.protocol import PAPER_RATIOS, TABLE_III, in_paper_order
 from pronk.evaluation.results import FEWEST, Cell, Ratio, Results, Spread
 
@@ -80,13 +80,19 @@ def interval(ratio: Ratio) -> str:
     return f"{ratio.value:.2f} ({f'{ratio.low:.2f} to {ratio.high:.2f}' if known else 'too few'})"
 
 
-def landed(cells: Sequence[Cell]) -> str:
+def tally(cells: Iterable[Cell]) -> tuple[int, int]:
+    """Count the landings, and all runs."""
+    succeeded, n = zip(*((cell.succeeded, cell.n) for cell in cells), strict=True)
+    return sum(succeeded), sum(n)
+
+
+def landed(cells: Iterable[Cell]) -> str:
     """Format the count of landings among all runs."""
-    return f"{sum(cell.succeeded for cell in cells)}/{sum(cell.n for cell in cells)}"
+    return "{}/{}".format(*tally(cells))
 
 
-def place(trial: Results) -> str:
-    """Where it was measured, in words."""
+def place(trial: Any) -> str:
+    """Where results, or bodies, were measured, in words."""
     return "virtual robot" if trial.virtual else "robot"
 
 
@@ -164,24 +170,26 @@ def landings(trial: Results) -> Sheet:
 
 def more(trial: Results, policy: str) -> Sheet:
     """Every other figure of one policy, with every command."""
-    cells = [cell for cell in trial.cells if policy == cell.policy]
     elsewhere = ("height", "distance", "flights", "high_flights")
-    return Sheet(
-        title=f"Every other figure of {policy}: mean +- standard deviation",
-        columns=("figure", *(cell.case for cell in cells)),
-        rows=tuple(
-            figure_row(name, figure.unit, cells)
-            for name, figure in FIGURES.items()
-            if not figure.joints and name not in elsewhere
-        ),
-        notes=(virtual_note(trial),),
+    own = [f for name, f in FIGURES.items() if not f.joints and name not in elsewhere]
+    cells = [cell for cell in trial.cells if policy == cell.policy]
+    title = f"Every other figure of {policy}: mean +- standard deviation"
+    return of_figures(own, cells, virtual_note(trial), title=title)
+
+
+def of_figures(
+    figures: Iterable[Figure], cells: Sequence[Cell], *notes: str, title: str, digits: int = 3
+) -> Sheet:
+    """A row a figure with its unit: the spread of every cell, headed by its command."""
+    rows = (
+        (
+            f"{one.name.replace('_', ' ')} [{one.unit}]",
+            *(spread(cell.figures[one.name], digits) for cell in cells),
+        )
+        for one in figures
     )
-
-
-def figure_row(name: str, unit: str, cells: Iterable[Cell], digits: int = 3) -> tuple[str, ...]:
-    """A row of one figure: its name with the unit, and the spread of every cell."""
-    words = f"{name.replace('_', ' ')} [{unit}]"
-    return (words, *(spread(cell.figures[name], digits) for cell in cells))
+    columns = ("figure", *(cell.case for cell in cells))
+    return Sheet(title=title, columns=columns, rows=tuple(rows), notes=notes)
 
 
 def drives(trial: Results) -> Sheet:
@@ -223,10 +231,11 @@ def criteria(trial: Results) -> Sheet:
     return check_sheet(title, trial_checks(trial), "PASSED.", *few * (least < JUMPS))
 
 
-def definitions() -> Sheet:
-    """The equation of every figure."""
-    rows = ((one.name, one.unit, one.says) for one in FIGURES.values())
-    return table("figure | unit | equation", rows, SYMBOLS, title=DEFINITIONS)
+def definitions(figures: Iterable[Figure] | None = None) -> Sheet:
+    """The equation of every figure; of those of a jump if None."""
+    rows = ((one.name, one.unit, one.says) for one in figures or FIGURES.values())
+    notes = [SYMBOLS] * (figures is None)
+    return table("figure | unit | equation", rows, *notes, title=DEFINITIONS)
 
 
 def scatter(trial: Results, other: str | None = None) -> Sheet:

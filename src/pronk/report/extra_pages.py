@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,17 @@ from pronk.evaluation.bodies import Bodies, Body
 from pronk.evaluation.criteria import trial_checks
 from pronk.evaluation.crossing import CROSSING, Climb, climbs
 from pronk.evaluation.jumps import FIGURES
-from pronk.evaluation.results import Results, share_interval
-from pronk.evaluation.tables import Sheet, figure_row, number, place, table, verdict
+from pronk.evaluation.results import Results, Spread, share_interval
+from pronk.evaluation.tables import (
+    Sheet,
+    definitions,
+    number,
+    of_figures,
+    place,
+    table,
+    tally,
+    verdict,
+)
 from pronk.evaluation.variation import VARIATION, parameters_of
 from pronk.evaluation.walk import SETTLE_S, WALK, WALK_FIGURES
 from pronk.report import trial_figures as draw
@@ -36,12 +45,8 @@ _OF_POLICY = "training gains of "
 
 
 def _part(origin: Results | Bodies, content: dict[str, Any], **fields: Any) -> Part:
-    content |= {"results": origin, "where": "virtual robot" if origin.virtual else "robot"}
+    content |= {"results": origin, "where": place(origin)}
     return Part(virtual=origin.virtual, content=content, **fields)
-
-
-def _definitions(figures: Iterable[Any]) -> Sheet:
-    return table("figure | unit | equation", ((f.name, f.unit, f.says) for f in figures))
 
 
 def walk_tables(walks: Results) -> tuple[Sheet, ...]:
@@ -55,10 +60,10 @@ def walk_tables(walks: Results) -> tuple[Sheet, ...]:
     for subject in walks.subjects:
         own = [cell for cell in walks.cells if cell.policy == subject.name]
         rows = [(name, *(str(getattr(c, field)) for c in own)) for name, field in counts.items()]
-        rows += [figure_row(name, WALK_FIGURES[name].unit, own, 2) for name in _WALK_TABLE]
+        figures = [WALK_FIGURES[name] for name in _WALK_TABLE]
         title = f"{subject.name}: mean +- standard deviation"
-        columns = ("figure", *(cell.case for cell in own))
-        sheets.append(Sheet(title=title, columns=columns, rows=tuple(rows), notes=(note,)))
+        sheet = of_figures(figures, own, note, title=title, digits=2)
+        sheets.append(replace(sheet, rows=(*rows, *sheet.rows)))
     return tuple(sheets)
 
 
@@ -74,7 +79,7 @@ def walk_part(path: Path) -> Part:
         "says": WALK_FIGURES[figure].says,
         "cells": picture(draw.cells([("speed error [m/s]", trial_page.values(walks, figure), {})])),
         "tables": walk_tables(walks),
-        "definitions": _definitions(WALK_FIGURES.values()),
+        "definitions": definitions(WALK_FIGURES.values()),
     }
     summary = f"{first}, {place(walks)}: {fell} of {n} walks ended in a fall."
     fields = {"kind": "walk", "title": "Walking", "warning": fell > 0}
@@ -139,12 +144,6 @@ def crossing_part(path: Path) -> Part:
     return _part(crossings, content, summary=summary, **fields)
 
 
-def mean(values: Sequence[float]) -> float:
-    """Return the mean of the finite values; NaN without any."""
-    kept = [value for value in values if np.isfinite(value)]
-    return float(np.mean(kept)) if kept else float("nan")
-
-
 def varied_line(variation: Results, parameter: str, policy: str, figure: str) -> Array:
     """Return value, result and the ends of its bar, over the values of a parameter; (4, n).
 
@@ -155,11 +154,11 @@ def varied_line(variation: Results, parameter: str, policy: str, figure: str) ->
     points = []
     for cells in zip(*cases, strict=True):
         if figure == "landed":
-            landed, n = sum(c.succeeded for c in cells), sum(c.n for c in cells)
+            landed, n = tally(cells)
             bar = (landed / n, *share_interval(landed, n))
         else:
             spreads = [cell.figures[figure] for cell in cells]
-            y, d = mean([one.mean for one in spreads]), mean([one.std for one in spreads])
+            y, d = (Spread.of([getattr(s, of) for s in spreads]).mean for of in ("mean", "std"))
             bar = (y, y - d, y + d)
         points.append((cells[0].value, *bar))
     return np.array(points).T
@@ -188,14 +187,13 @@ def variation_part(path: Path) -> Part:
     """Make the part of the variation in `path`, a `variation.json`."""
     variation = results_file.load(path.parent, VARIATION)
     first, parameters = variation.subjects[0].name, parameters_of(variation)
-    own = [cell for cell in variation.cells if cell.policy == first]
-    landed, n = sum(c.succeeded for c in own), sum(c.n for c in own)
+    landed, n = tally(cell for cell in variation.cells if cell.policy == first)
     panels, bar = variation_panels(variation), "mean standard deviation; 95 % interval of the share"
     content = {
         "curves": picture(draw.lines(panels, columns=len(parameters), mark="nominal", bar=bar)),
         "sheet": varied.table(variation),
         "parameters": parameters,
-        "definitions": _definitions(FIGURES[name] for name in varied.VARIED_FIGURES),
+        "definitions": definitions(FIGURES[name] for name in varied.VARIED_FIGURES),
     }
     summary = f"{first}, {place(variation)}: {landed} of {n} jumps on varied robots landed."
     return _part(variation, content, kind="variation", title="Variation", summary=summary)
@@ -233,8 +231,7 @@ def bodies_part(path: Path) -> Part:
     """Make the part of the randomized robots in `path`, a `bodies.json`."""
     bodies = bodies_file.load(path.parent)
     errors = errors_db(bodies)
-    cells = [cell for body in bodies.bodies for cell in body.trial.cells]
-    landed, n = sum(c.succeeded for c in cells), sum(c.n for c in cells)
+    landed, n = tally(cell for body in bodies.bodies for cell in body.trial.cells)
     panels, figures = {}, {}
     for name in ("height", "distance"):
         label, paper = f"{name} [m]", published_jumps(name)
@@ -248,6 +245,5 @@ def bodies_part(path: Path) -> Part:
         "scatter": picture(draw.scatter_over_error(errors, panels)) if len(errors) > 1 else None,
         "cells": figures,
     }
-    where = "virtual robot" if bodies.virtual else "robot"
-    summary = f"{len(bodies.bodies)} other {where}s: {landed} of {n} jumps landed."
+    summary = f"{len(bodies.bodies)} other {place(bodies)}s: {landed} of {n} jumps landed."
     return _part(bodies, content, kind="bodies", title="Randomized robots", summary=summary)

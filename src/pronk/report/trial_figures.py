@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from pronk.evaluation.results import Spread
 from pronk.report import style
 from pronk.report.style import drawing, key, legend
 
@@ -49,12 +50,6 @@ def _keys(policies: Sequence[str], *, marks: bool = True) -> list[Line2D]:
 def offsets(count: int, width: float) -> Array:
     """Return places of `count` things about zero, `width` from first to last."""
     return np.linspace(-0.5, 0.5, count) * width if count > 1 else np.zeros(1)
-
-
-def std(values: Array) -> float:
-    """Return the standard deviation of a sample; NaN for fewer than two finite values."""
-    kept = values[np.isfinite(values)]
-    return float(np.std(kept, ddof=1)) if len(kept) > 1 else float("nan")
 
 
 def commands_of(values: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -95,12 +90,13 @@ def _cells_panel(axes: Axes, values: Values, published: Published) -> None:
             x = next(slot)
             known = np.asarray(values[name].get(command, ()), dtype=float)
             known = known[np.isfinite(known)]
+            sums = Spread.of(known)
             if len(known):
                 many: dict[str, Any] = {"linestyle": "none", "alpha": 0.45, "markersize": 4.5}
                 axes.plot(x + np.linspace(-0.05, 0.03, len(known)), known, **look, **many)
                 bar = {"capsize": 3.5, "markeredgecolor": "white", "zorder": 4}
-                spread = std(known) if len(known) > 1 else 0.0
-                axes.errorbar(x + 0.06, known.mean(), yerr=spread, **look, **bar)
+                spread = sums.std if sums.n > 1 else 0.0
+                axes.errorbar(x + 0.06, sums.mean, yerr=spread, **look, **bar)
     axes.set_xticks(range(len(commands)), commands)
     axes.set_xlim(-0.55, len(commands) - 0.45)
     axes.grid(visible=False, axis="x")
@@ -116,7 +112,7 @@ def scatter_over_error(errors_db: Mapping[str, float], panels: Mapping[str, Valu
     with drawing(1, len(panels), height=3.4) as (figure, grid):
         for axes, (label, values) in zip(grid[0], panels.items(), strict=True):
             for name, look in policies.items():
-                stds = np.array([std(one) for one in values.get(name, {}).values()])
+                stds = np.array([Spread.of(one).std for one in values.get(name, {}).values()])
                 at = np.full(len(stds), errors_db[name])
                 axes.plot(at, stds, linestyle="none", alpha=0.7, **look)
                 if np.isfinite(stds).any():

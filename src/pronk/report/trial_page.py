@@ -146,7 +146,7 @@ def _total(trial: Results, name: str) -> dict[str, float]:
     """Counts over all commands, and the share of landings [%] with its interval."""
     own = [cell for cell in trial.cells if cell.policy == name]
     counts = {of: sum(getattr(cell, of) for cell in own) for of in ("n", "found", "fell")}
-    landed, n = sum(cell.succeeded for cell in own), counts["n"]
+    landed, n = tables.tally(own)
     low, high = share_interval(landed, n)
     share = {"share": 100 * landed / n, "low": 100 * low, "high": 100 * high}
     return counts | {"landed": landed} | share
