@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 import threading
@@ -35,8 +36,9 @@ _OPERATORS = frozenset(
     )
 )
 """What feed-forward networks need: no loops, no branches, no tensors made of a number."""
-_MOST_BYTES, _MOST_S = 64 * 2**20, 10.0
-"""Largest file [bytes], and longest first inference [s]; pronk's own take 0.5 MB and 1 ms."""
+_MOST_BYTES, _MOST_NODES, _MOST_MEMORY, _MOST_S = 2**25, 2000, 2**27, 10.0
+"""Largest file [bytes], most nodes, most memory for tensors of this process's networks [bytes], and
+longest first inference [s]; pronk's own take 3 MB, 57 nodes, 4 MB and 1 ms."""
 _OUTPUTS = {"action": JOINTS, **ESTIMATE}
 """Names and sizes."""
 
@@ -189,12 +191,30 @@ def _session(data: bytes, path: Path) -> Any:
     options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors come as exceptions
     options.add_session_config_entry("session.load_model_format", "ONNX")
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    _limit_memory()
     try:
-        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(
+            data,
+            options,
+            providers=["CPUExecutionProvider"],
+            # It would build constants outside of the limit of memory.
+            disabled_optimizers=["ConstantFolding"],
+        )
     except Exception as error:
         raise ArtefactError(
             f"{path}: not a network that ONNX Runtime can run ({type(error).__name__}); {WRITER}."
         ) from error
+
+
+@functools.cache
+def _limit_memory() -> None:
+    """Limit the memory that tensors of all networks of this process take."""
+    import onnxruntime as ort
+
+    kinds = ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT
+    limit = ort.OrtArenaCfg({"max_mem": _MOST_MEMORY})
+    ort.create_and_register_allocator(ort.OrtMemoryInfo("Cpu", *kinds), limit)
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -223,25 +243,30 @@ def _fields(data: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 def _check_operators(data: bytes, path: Path) -> None:
     """Refuse a large file, and operators beside `_OPERATORS`, before ONNX Runtime sees them."""
-    found: set[str] = set()
+    found, count = set[str](), 0
     try:
         if len(data) > _MOST_BYTES:
             raise ValueError
-        # ModelProto.graph is 7 and .functions 25, GraphProto.node 1, NodeProto.op_type 4,
-        # .attribute 5 (whose .g 6 and .graphs 11 are graphs) and .domain 7 (onnx.proto).
+        # ModelProto.graph is 7 and .functions 25, GraphProto.node 1 and .initializer 5 (whose
+        # .external_data is 13), NodeProto.op_type 4, .attribute 5 (whose .g 6 and .graphs 11 are
+        # graphs) and .domain 7 (onnx.proto).
         for field, content in _fields(memoryview(data)):
             if field == 25:
                 found.add("a function")
-            nodes = [one for k, one in _fields(content) if k == 1] if field == 7 else []
-            for node in nodes:
-                for part, value in _fields(node):
+            for kind, node in _fields(content) if field == 7 else ():
+                if kind == 5 and any(k == 13 for k, _ in _fields(node)):
+                    found.add("weights of another file")
+                if (count := count + (kind == 1)) > _MOST_NODES:
+                    raise ValueError
+                for part, value in _fields(node) if kind == 1 else ():
                     if part == 4 or (part == 7 and bytes(value) != b"ai.onnx" and value):
                         found.add(bytes(value).decode())
                     if part == 5 and any(k in (6, 11) for k, _ in _fields(value)):
                         found.add("a subgraph")
     except (ValueError, IndexError, KeyError):
         raise ArtefactError(
-            f"{path}: not an ONNX network of at most {_MOST_BYTES >> 20} MiB; {WRITER}."
+            f"{path}: not an ONNX network of at most {_MOST_BYTES >> 20} MiB and {_MOST_NODES} "
+            f"nodes; {WRITER}."
         ) from None
     if unknown := sorted(found - _OPERATORS):
         raise ArtefactError(
