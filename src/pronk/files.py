@@ -112,20 +112,27 @@ def written_whole(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder; rename it to `path` when the block succeeds.
 
     A block that raises, or a process that dies, leaves `path` as it was. Missing folders are made.
+    An OSError becomes a PronkError.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    aside = Path(name)
+    aside = None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{path.name[:100]}.", suffix=path.suffix, dir=path.parent
+        )
+        os.close(handle)
+        aside = Path(name)
         yield aside
         # mkstemp makes the file private; give it the mode that open() would have given.
         umask = os.umask(0)
         os.umask(umask)
         aside.chmod(0o666 & ~umask)
         aside.replace(path)
-    except BaseException:
-        aside.unlink(missing_ok=True)
+    except BaseException as error:
+        if aside is not None:
+            aside.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise PronkError(f"{path}: cannot be written ({error.strerror or error}).") from error
         raise
 
 

@@ -15,7 +15,9 @@ import yaml
 from benchmarks.fuzz import fuzz
 from pronk.cli.main import run
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
-from pronk.files import LIMIT, read_yaml
+from pronk.evaluation import results
+from pronk.evaluation.variation import VARIATION
+from pronk.files import LIMIT, read_yaml, write_text
 from pronk.logs.mcap import McapWriter
 from pronk.logs.mcap_log import TOPICS
 from pronk.logs.readers import find_logs, read_log
@@ -26,6 +28,7 @@ from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model
 from pronk.robots.load import read_robot
 from pronk.virtual.sim_params import load_sim_params
+from report_cases import varied
 
 GAINS = """
 schema: pronk/gains/1
@@ -234,6 +237,40 @@ def test_a_model_whose_joint_has_no_effort_is_refused(tmp_path: Path) -> None:
 
 
 def test_mutated_files_give_no_traceback_and_no_other_numbers() -> None:
-    outcome = fuzz(count=280, seed=7)
+    outcome = fuzz(count=400, seed=8)
     assert outcome.status == 0
-    assert sum(n for name, n in outcome.figures.items() if name.endswith("refused")) > 100
+    assert sum(kind["refused"] for kind in outcome.figures["kinds"]) > 200
+
+
+def test_arrays_of_an_npz_log_that_are_no_text_or_no_arrays_or_not_read(tmp_path: Path) -> None:
+    t = np.arange(1000) / 500.0
+    wave, path = np.sin(t)[:, None], tmp_path / "a.npz"
+    sound = {"time": t, "command": wave, "position": wave, "joints": np.array(["knee"])}
+    np.savez(path, **sound, velocities=wave)  # type: ignore[arg-type]
+    assert any("velocities" in note for note in read_log(path, unit="rad").notes)
+    beyond = np.array([0x110000], np.uint32).view("<U1")
+    np.savez(path, **sound | {"joints": beyond})  # type: ignore[arg-type]
+    with pytest.raises(LogError):
+        read_log(path, unit="rad")
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("time", "command", "position"):
+            archive.writestr(f"{name}.npy", b"no array")
+    with pytest.raises(LogError):
+        read_log(path, unit="rad")
+
+
+def test_a_table_with_numbers_of_some_joints_is_refused(tmp_path: Path) -> None:
+    results.save(tmp_path, varied())
+    path = tmp_path / VARIATION.table
+    header, *lines = (line.split(",") for line in path.read_text().splitlines())
+    lines[0][next(i for i, name in enumerate(header) if "FR_hip_roll" in name)] = "1.0"
+    assert results.load(tmp_path, VARIATION).rows
+    path.write_text("\n".join(map(",".join, [header, *lines])))
+    with pytest.raises(ArtefactError):
+        results.load(tmp_path, VARIATION)
+
+
+def test_a_folder_in_the_place_of_the_output_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(PronkError, match="cannot be written"):
+        write_text(tmp_path / "file" / "out.txt", "x")

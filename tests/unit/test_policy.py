@@ -415,3 +415,10 @@ def test_a_network_of_many_nodes_or_other_files_is_refused_unseen(
 def test_a_contract_beyond_every_robot_is_refused(changed: dict[str, Any]) -> None:
     with pytest.raises(ArtefactError):
         contract(**changed)
+
+
+def test_metadata_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = write_hopper(tmp_path / "policy.onnx")
+    path.write_bytes(path.read_bytes().replace(b"mini_cheetah", b"mini_cheeta\xff"))
+    with pytest.raises(ArtefactError):
+        load_policy(path)

@@ -441,17 +441,18 @@ def load(folder: Path, kind: Kind = JUMPS) -> Results:
     try:
         for entry in csv.DictReader(io.StringIO(path.read_text("utf-8"))):
             rows.append(_row(entry, head))
+        results = replace(head, rows=tuple(rows))
+        found = [(cell.policy, cell.case, cell.n) for cell in results.cells]
     except OSError as error:
         raise ArtefactError(
             f"{path}: cannot be read ({error.strerror}); `{kind.writer}` writes it."
         ) from None
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ArtefactError(
-            f"{path}: line {len(rows) + 2} cannot be read ({type(error).__name__}: {error}); "
+            f"{path}: cannot be read after line {len(rows) + 1} ({type(error).__name__}: {error}); "
             f"`{kind.writer}` writes it anew."
         ) from None
-    results = replace(head, rows=tuple(rows))
-    if counts != [(cell.policy, cell.case, cell.n) for cell in results.cells]:
+    if counts != found:
         raise ArtefactError(
             f"{path}: {len(rows)} runs do not fit the counts of {kind.summary}; run the trial "
             "again."

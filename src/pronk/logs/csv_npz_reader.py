@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pronk.errors import LogError
+from pronk.errors import LogError, printable
 from pronk.files import check_archive, check_size, sha256
 from pronk.logs.columns import Columns
 from pronk.robots.robot import RobotSpec
@@ -129,11 +130,12 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
         check_archive(path, LogError)
         with np.load(path, allow_pickle=False) as stored:
             arrays = {
-                name: stored[name]
+                name: np.asarray(stored[name])
                 for name in ("time", *QUANTITIES, "joints")
                 if name in stored.files
             }
             others = stored.files
+            extra = [name for name in others if name not in arrays]
     except LogError:
         raise
     except OSError as error:
@@ -149,12 +151,17 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
             f"{path}: no array {', '.join(missing)}; it holds {', '.join(others) or 'none'}."
         )
     check_size(path, sum(8 * array.size for array in arrays.values()), LogError)
+    names = arrays.pop("joints", np.empty(0, dtype=str)).reshape(-1)
+    if len(names) > _MOST_COLUMNS:
+        raise LogError(f"{path}: {len(names)} joints; expected {_MOST_COLUMNS} at most.")
     try:
-        found = {
-            n: np.asarray(arrays[n], dtype=np.float64) for n in ("time", *QUANTITIES) if n in arrays
-        }
+        found = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items()}
+        names = np.ascontiguousarray(names, dtype=str)
+        # NumPy takes numbers beyond Unicode for characters; Python then fails anywhere.
+        if names.size and (names.view(np.uint32) > sys.maxunicode).any():
+            raise ValueError
     except (TypeError, ValueError):
-        raise LogError(f"{path}: its arrays are not numbers.") from None
+        raise LogError(f"{path}: its arrays are not numbers, or its joints no text.") from None
     time = found.pop("time")
     for name, values in found.items():
         if time.ndim != 1 or values.shape[:1] != time.shape:
@@ -163,12 +170,10 @@ def read_npz(path: Path, *, robot: RobotSpec | None = None) -> Columns:
                 "(n, joints)."
             )
         found[name] = values.reshape(len(time), -1) if len(time) else values
-    names = arrays.get("joints", np.empty(0)).reshape(-1)
-    if len(names) > _MOST_COLUMNS:
-        raise LogError(f"{path}: {len(names)} joints; expected {_MOST_COLUMNS} at most.")
     return Columns(
         where=str(path),
         joints=tuple(map(str, names)),
+        notes=(f"arrays that are not read: {printable(', '.join(extra)[:200])}",) if extra else (),
         time=time,
         sha256=sha256(path),
         **({"command": None} | found),  # type: ignore[arg-type]

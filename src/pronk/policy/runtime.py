@@ -161,7 +161,10 @@ def load_policy(path: Path | str) -> Policy:
         raise ArtefactError(f"{path}: cannot be read ({error.strerror}).") from None
     _check_operators(data, path)
     session = _session(data, path)
-    text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+    try:
+        text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+    except UnicodeDecodeError:
+        text = None
     if text is None:
         raise ArtefactError(f"{path}: a network without a contract of pronk; {WRITER}.")
     contract = from_json(text, source=path)

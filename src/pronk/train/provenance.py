@@ -96,7 +96,7 @@ class RunFolder:
             raise ArtefactError(
                 f"{self.path} holds no run (no {path.name}); leave --resume out to begin one."
             ) from None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             text = f"{path}: cannot be read as JSON ({type(error).__name__})."
             raise ArtefactError(text) from error
         if not isinstance(found, dict) or found.get("schema") != SCHEMA:
