@@ -91,7 +91,10 @@ def axes(robot: RobotSpec, points: int = 50) -> tuple[Array, Array]:
 
 def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128]) -> Array:
     """Mean square of the gain error [dB^2], shape (...), for responses of shape (..., inside)."""
-    error = goal.error_db(simulated)
+    return _mean_square(goal.error_db(simulated))
+
+
+def _mean_square(error: Array) -> Array:
     error = np.where(np.isfinite(error), np.clip(error, -DIVERGED_DB, DIVERGED_DB), DIVERGED_DB)
     count = error.shape[-1]
     return np.asarray(error**2 @ np.full(count, 1.0 / count))
@@ -327,7 +330,7 @@ def linearized(rigs: MujocoSimulator, goal: MeasuredJoint) -> Plant:
 
 def _map(goal: MeasuredJoint, log: Array) -> Array:
     """Mean squared errors of log gains, shapes (b, inside) to (b,) [dB^2]."""
-    return mean_square(goal, np.exp(log).astype(np.complex128))
+    return _mean_square(DB * (log - np.log(np.abs(goal.measured.response[goal.fit_mask]))))
 
 
 def _correction(linear: Plant, fit: Fit, stiffness: Array, damping: Array) -> Array:

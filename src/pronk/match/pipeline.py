@@ -176,10 +176,12 @@ def match_frameworks(
     fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
     work = _Work(logs=logs, settings=chosen, mode=mode)
     own = _matched(work, robot, fitted, clock)
-    first = {_kind(robots[name]): name for name in reversed(names)}
+    first: dict[tuple[object, ...], str] = {}
+    for name in names:
+        first.setdefault(_kind(robots[name]), name)
+        if work.measured:
+            work.found(robots[name], clock)
     first.pop(_kind(own.robot), None)
-    for name in first.values() if work.measured else ():
-        work.found(robots[name], clock)
     # Simulations and products of large arrays leave the interpreter to the other thread.
     with ThreadPoolExecutor(chosen.threads) as pool:
         wrong = pool.submit(_wrong, work, own, clock)
