@@ -13,7 +13,6 @@ from scipy.stats import chisquare, kstest
 pytest.importorskip("mjlab")
 
 import torch
-from torch import Tensor
 
 import training_env
 from pronk.errors import PronkError
@@ -162,19 +161,6 @@ def test_episodes_begin_about_the_initial_state(env: Any) -> None:
     assert (data.qpos == before).all(dim=1).tolist() == [False, True] * (MANY // 2)
 
 
-def test_pushes_are_mild(env: Any) -> None:
-    push = env.event_manager.get_term_cfg("push")
-    assert push.interval_range_s == (5.0, 10.0)
-    before = env.sim.data.qvel.clone()
-    push.func(env, ALL[::2], **push.params)
-    change = (env.sim.data.qvel - before).numpy()
-    assert not change[1::2].any()
-    assert not change[:, 6:].any()
-    for axis in (0, 1, 5):
-        assert_uniform(change[::2, axis], -0.3, 0.3)
-    np.testing.assert_allclose(change[:, 2:5], 0.0, atol=1e-6)
-
-
 def test_length_of_the_policy_step_is_drawn_each_step(env: Any) -> None:
     """A resumed run restores the counter and has the same draw."""
     for _ in range(6):
@@ -294,19 +280,6 @@ def test_stall_torque_is_in_proportion_to_the_voltage(batteries: Any) -> None:
         # The torque lost to speed is the same, so the no-load speed falls alike.
         slope = drive.back_emf[:2, 0].tolist()
         assert slope == pytest.approx([rated.stall_torque / rated.no_load_speed] * 2, rel=1e-5)
-
-
-def test_a_full_push_lowers_the_voltage(batteries: Any) -> None:
-    env, battery = batteries
-    give(battery, 24.0, 0.1)
-    least: Tensor = torch.ones(N)
-    for step in range(12):
-        push = torch.zeros(N, 12)
-        push[:, 2::3] = 0.0 if step < 4 else -6.0
-        env.step(push)
-        least = torch.minimum(least, battery.voltage[:, 0])
-    assert float(least[0]) == pytest.approx(1.0, rel=1e-5)
-    assert 0.5 <= float(least[1:].min()) < 0.9
 
 
 def test_physics_gone_wrong_leaves_a_battery(env: Any) -> None:

@@ -126,29 +126,6 @@ def test_the_strip_has_the_moments_of_the_jump() -> None:
     assert (np.diff(film.pose_time) > 0.0).all()
 
 
-def test_projection_of_known_points() -> None:
-    look = np.array([1.0, 2.0, 0.3])
-    ahead = np.array([0.0, math.cos(render.ELEVATION), math.sin(render.ELEVATION)])
-    points = np.array([look, [1.1, 2.0, 0.3], look + ahead, look - 3.0 * ahead])
-    pixels = render.project(points, look, 0.5 * math.pi, SIZE)
-    focal = 200.0 / math.tan(math.radians(0.5 * render.FOV_DEG))
-    assert pixels[0] == pytest.approx([320.0, 200.0])
-    assert pixels[1] == pytest.approx([320.0 + focal * 0.1 / render.DISTANCE, 200.0])
-    assert pixels[2] == pytest.approx([320.0, 200.0])
-    assert np.isnan(pixels[3]).all()  # behind the camera
-
-
-def test_tapes_lie_across_the_direction_of_travel_every_20_cm() -> None:
-    film = planned(captured(direction=0.3))
-    along = np.array([math.cos(0.3), math.sin(0.3), 0.0])
-    right, left = render.tape_points(film, -1.0), render.tape_points(film, 1.0)
-    assert 0.5 * (right[0] + left[0]) == pytest.approx([*film.origin, 0.0])
-    assert (left[3] - left[0]) @ along == pytest.approx(0.6)
-    assert (left[2] - right[2]) @ along == pytest.approx(0.0)
-    way = (film.qpos[:, :2] - film.origin) @ along[:2]
-    assert 0.2 * min(left) <= way.min() < way.max() <= 0.2 * max(left)
-
-
 def test_only_the_virtual_robot_is_labelled_virtual() -> None:
     for virtual in (True, False):
         image = Image.new("RGB", SIZE, (120, 120, 120))

@@ -15,21 +15,18 @@ from pronk.report import extra_pages, figures, style, trial_figures, trial_page
 from pronk.report.paper import published_jumps
 from report_cases import (
     CASES,
-    FLIGHTS,
     GROUPS,
-    LEGS,
     NOMINAL_GAINS,
     OMEGA,
     RATE,
     crossings,
     joint_prediction,
-    lift_off,
     match,
     varied,
     write_bodies,
     write_trial,
 )
-from seen_jump import DT, SCRIPT, Z_OFF, G
+from seen_jump import SCRIPT
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +78,6 @@ def test_bode_has_gain_in_decibel_and_phase_in_degrees(result) -> None:
         assert np.allclose(curve(phase, colour).get_ydata(), degrees)
     hz = fit.responses[0].omega / (2.0 * np.pi)
     assert np.allclose(curve(gain, style.MATCHED).get_xdata(), hz)
-
-
-def test_overview_has_a_row_per_group_and_a_column_per_leg(result) -> None:
-    rows = [[f"{leg}_{name}" for leg in LEGS] for name in GROUPS]
-    assert style.grid_of_joints(list(result.joints)) == rows
-    arm = ["Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll"]
-    assert style.grid_of_joints(arm) == [arm[:3], arm[3:]]
 
 
 def test_error_map_marks_grid_optimum_refined_gains_drive_and_paper(result) -> None:
@@ -143,22 +133,6 @@ def test_cells_draw_mean_spread_and_the_paper(tmp_path) -> None:
         for case in ("forward 1", "forward 2"):
             assert paper[gains][case] in points
     assert paper["matched"]["forward 2"] == (0.969, 0.026)
-
-
-def test_height_traces_begin_before_the_jump_input(captured) -> None:
-    time, height = captured["height"]["matched"]["forward 1"][0]
-    assert time[0] == pytest.approx(-trial_page.BEFORE_S, abs=DT)
-    assert time[-1] <= trial_page.AFTER_S + 1e-9
-    assert np.allclose(np.diff(time), 1.0 / trial_page.TRACE_RATE_HZ)
-    flight = FLIGHTS["matched"][0] / 1000.0
-    inside = (time > 0.2 + DT) & (time < 0.2 + flight - DT)
-    t = time[inside] - 0.2
-    expected = Z_OFF + lift_off(FLIGHTS["matched"][0]) * t - 0.5 * G * t**2
-    assert np.allclose(height[inside], expected, atol=1e-6)
-    drawn = {"trunk height [m]": captured["height"]}
-    axes = trial_figures.traces(drawn, x_label="time [s]", level=0.29).axes[0]
-    assert len(axes.lines) == 4
-    assert axes.lines[-1].get_ydata()[0] == 0.29
 
 
 def test_rates_are_of_the_acceleration_at_the_papers_speed(captured) -> None:

@@ -106,17 +106,16 @@ def cosine_of_tilt(orientation: Array) -> Array:
     return cosine
 
 
-def along(displacement: Array, orientation: Array, command: Sequence[float]) -> float:
-    """Part of a horizontal displacement along the commanded direction [m].
+def along(vector: Array, orientation: Array, command: Sequence[float]) -> Array:
+    """Parts of horizontal vectors (..., 2 or more) along the commanded direction. (...,).
 
-    `displacement` (2,) is in the world, `orientation` the trunk's at lift-off, `command` a velocity
-    in the trunk's frame; NaN for one without a horizontal part.
+    `vector` is in the world, `orientation` the trunk's, `command` a velocity in the trunk's frame;
+    NaN for one without a horizontal part.
     """
-    yaw, (forward, left) = float(heading(orientation)), command[:2]
-    speed = math.hypot(forward, left)
-    x = math.cos(yaw) * forward - math.sin(yaw) * left
-    y = math.sin(yaw) * forward + math.cos(yaw) * left
-    return float(displacement[0] * x + displacement[1] * y) / speed if speed else math.nan
+    forward, left = command[:2]
+    direction = heading(orientation) + math.atan2(left, forward)
+    part: Array = vector[..., 0] * np.cos(direction) + vector[..., 1] * np.sin(direction)
+    return part if math.hypot(forward, left) else np.full_like(part, np.nan)
 
 
 def steps(capture: Capture, seconds: float) -> int:
@@ -423,7 +422,7 @@ def _flight(
         "clearance": float(low.max()),
         "clearance_half": float(low[quarter : len(low) - quarter].min()),
         "distance": float(np.hypot(*displacement)),
-        "along": along(displacement, capture.orientation[up], script.command),
+        "along": float(along(displacement, capture.orientation[up], script.command)),
         "distance_minima": float(np.hypot(*(plane[after] - plane[before]))),
         "gap": _gap(capture, main),
         "lift_off_velocity": vertical,
@@ -453,13 +452,8 @@ def _run(capture: Capture, script: Script, start: int, on: int, *, mass: float) 
     travelled = float(np.hypot(*(capture.position[on, :2] - capture.position[start, :2])))
     work = float(capture.electrical_power[start:on].sum() * capture.dt)
     figures = {"cost_of_transport": work / (mass * GRAVITY * travelled)} if travelled else {}
-    forward, left = script.command[:2]
-    if math.hypot(forward, left):
-        direction = heading(capture.orientation[start:on]) + math.atan2(left, forward)
-        velocity = capture.velocity[start:on]
-        part = velocity[:, 0] * np.cos(direction) + velocity[:, 1] * np.sin(direction)
-        figures["speed"] = float(part.mean())
-    return figures
+    speed = along(capture.velocity[start:on], capture.orientation[start:on], script.command)
+    return figures | {"speed": float(speed.mean())}
 
 
 def _loads(capture: Capture, robot: RobotSpec, on: int, end: int) -> dict[str, tuple[float, ...]]:

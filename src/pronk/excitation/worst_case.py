@@ -109,22 +109,6 @@ class Forecast:
         own = robot.joint(joint)
         return replace(self, joint=joint, lowest=ends[0], highest=ends[1], range=own.range)
 
-    def shrink(self, rest: float) -> float:
-        """Factor on the amplitude that would bring everything inside, were it all linear.
-
-        `rest` is the position of the joint in its pose [rad].
-        """
-        low, high = self.range
-        if not low < rest < high:
-            return 0.0
-        shares = [
-            (high - rest) / (self.highest - rest) if self.highest > high else 1.0,
-            (rest - low) / (rest - self.lowest) if self.lowest < low else 1.0,
-            self.no_load_speed / self.speed if self.speed > self.no_load_speed else 1.0,
-            1.0 / self.torque_share if self.torque_share > 1.0 else 1.0,
-        ]
-        return float(np.clip(min(shares), 0.0, 1.0))
-
 
 def forecast(
     robot: RobotSpec,
