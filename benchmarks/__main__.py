@@ -22,6 +22,7 @@ SUMMARIES = {
     "profiles": "All profiles matched from one set of logs: time, and cells beside the grid's.",
     "transfer": "A policy in training simulators of other drive laws.",
     "fuzz": "Mutated files of every reader: tracebacks, hangs, other numbers.",
+    "kills": "Processes of commands killed and stopped: files, orphans, damping.",
     "train": "Steps per second beside mjlab's Go1 task.",
     "trial": "The trial loop beside a bare MuJoCo loop.",
 }

@@ -1,0 +1,360 @@
+"""Processes of commands killed and stopped at random moments: files, orphans, damping.
+
+Each run starts a command, kills or stops one of its processes at a moment of its time, and looks
+when it has ended: every file that is there is whole (a log is readable up to its end), no process
+is left, and where a robot was commanded over LCM, the last command damps.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from benchmarks import sensor_faults
+from pronk.cli import console
+from pronk.errors import PronkError
+from pronk.evaluation import results
+from pronk.files import read_yaml
+from pronk.links.address import Address
+from pronk.links.lcm.codec import CHEETAH, decode_command
+from pronk.links.lcm.link import url_of
+from pronk.logs.readers import read_log
+from pronk.match import gains as gains_file
+from pronk.match import result as match_file
+from pronk.runtime.log import is_deploy_log, read_deploy_log
+from pronk.runtime.plan import Link, Plan
+from pronk.runtime.run import Deployment
+from pronk.virtual import capture
+
+Program = Literal["sweep", "sweep-lcm", "match", "trial", "deploy"]
+PROGRAMS: tuple[Program, ...] = ("sweep", "sweep-lcm", "match", "trial", "deploy")
+ACTIONS = ("KILL", "TERM", "STOP CONT", "STOP KILL")
+MOVING = ("operator", "servo", "policy", "root")
+"""Processes without which the joints must be damped."""
+STOPPED_S, ENDS_S, DAMPED_S = 0.5, 10.0, 0.5
+"""How long a process is stopped; longest until the others have ended, and until damping [s]."""
+_JOINTS = ("FR_hip_pitch", "FR_knee", "FL_hip_pitch", "FL_knee")
+_EMPTY = 4096
+"""A log of at most so many bytes may hold no sample yet."""
+_POLICY = Path(__file__).parents[1] / "policies" / "matched" / "policy.onnx"
+
+
+def operate(port: int, log: str) -> None:
+    """Walk a virtual robot over LCM until SIGTERM; prints its processes when it walks."""
+    link = Link(robot=sensor_faults.ROBOT, address=Address(kind="lcm", options={"port": port}))
+    timing = sensor_faults.TIMING
+    plan = Plan(link=link, policy=_POLICY, timing=timing, ignore_latency=True, log=Path(log))
+    with Deployment(plan) as deployment:
+        if not sensor_faults._walk(deployment):
+            sys.exit("it does not walk")
+        each = ("servo", "policy", "logger", "standby")
+        pids = {name: getattr(deployment, name).pid for name in each}
+        print(json.dumps({"operator": os.getpid()} | pids), flush=True)
+        sensor_faults._until(deployment, 30.0, (), command=sensor_faults.WALK)
+
+
+def _words(program: Program, folder: Path, port: int) -> list[str]:
+    """The command line of a program."""
+    if program == "deploy":
+        return ["benchmarks.kills", str(port), str(folder / "run.mcap")]
+    logs = str(folder.parent / "logs")
+    joints = [word for joint in _JOINTS for word in ("--joints", joint)]
+    short = ["--signal", "log-chirp", "--amplitude", "0.25", "--repeats", "1"]
+    out = ["--out", str(folder / ("gains.yaml" if program == "match" else "out"))]
+    name, wire = sensor_faults.ROBOT, ["--link", "lcm", "--port", str(port), "--yes"]
+    jumps = ["--jumps", "2", "--commands", "1.5,0", "--commands", "2.25,0", "--processes", "2"]
+    commands = {
+        "sweep": ["sweep", name, *joints, *short],
+        "sweep-lcm": ["sweep", name, *wire, *joints[:2], *short],
+        "match": ["match", logs, "--robot", name, "--method", "paper"],
+        "trial": ["trial", str(_POLICY), *jumps, "--no-video"],
+    }
+    return ["pronk.cli.main", *commands[program], *out]
+
+
+def _start(words: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+
+
+@dataclass(frozen=True)
+class _Process:
+    pid: int
+    born: str
+    """Tells it from a later one of the same number."""
+    kind: str
+
+    @property
+    def alive(self) -> bool:
+        return bool(self.born) and _stat(self.pid)[2] == self.born
+
+
+def _stat(pid: int) -> tuple[int, str, str]:
+    """Parent, state and time of birth; zero and empty if there is no such process."""
+    with suppress(OSError, ValueError):
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        if fields[0] != "Z":
+            return int(fields[1]), fields[0], fields[19]
+    return 0, "", ""
+
+
+def _below(root: int, known: dict[int, _Process]) -> None:
+    """Add a process and all below it to `known`."""
+    parents = {int(p.name): _stat(int(p.name)) for p in Path("/proc").iterdir() if p.name.isdigit()}
+    for pid, (parent, _, born) in sorted(parents.items()):
+        if born and pid not in known and (pid == root or parent in known):
+            words = Path(f"/proc/{pid}/cmdline")
+            with suppress(OSError):
+                tracker = "resource_tracker" in words.read_text()
+                kind = "root" if pid == root else "tracker" if tracker else "child"
+                known[pid] = _Process(pid, born, kind)
+
+
+@contextmanager
+def _heard(port: int) -> Iterator[list[tuple[float, bool]]]:
+    """Commands on the wire: when they came [s], and whether they damp."""
+    import lcm
+
+    found: list[tuple[float, bool]] = []
+    going, wire = [True], lcm.LCM(url_of(port=port))
+
+    def hear(_: str, data: bytes) -> None:
+        found.append((time.monotonic(), not decode_command(CHEETAH, data).stiffness.any()))
+
+    def listen() -> None:
+        while going:
+            wire.handle_timeout(50)
+
+    subscription = wire.subscribe(CHEETAH.command.channel, hear)
+    subscription.set_queue_capacity(1000)
+    thread = threading.Thread(target=listen)
+    thread.start()
+    try:
+        yield found
+    finally:
+        going.clear()
+        thread.join()
+
+
+def _torn(folder: Path) -> list[str]:
+    """Files that cannot be read; a log of no sample yet may be short."""
+    found = []
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name[0] != "."):
+        try:
+            if path.suffix == ".mcap":
+                if path.stat().st_size > _EMPTY:
+                    (read_deploy_log if is_deploy_log(path) else read_log)(path)
+            elif path.name == "match.npz":
+                match_file.load(path, gains_file.load(path.with_name("gains.yaml")))
+            elif path.suffix == ".npz":
+                capture.load(path)
+            elif path.suffix == ".yaml":
+                read_yaml(path)
+            elif path.name == results.SUMMARY:
+                results.load(path.parent)
+            elif path.suffix in (".html", ".svg"):
+                end = path.read_text().rstrip().rpartition("<")[2]
+                if end != f"/{path.suffix[1:]}>":
+                    raise PronkError(f"{path} is cut")
+        except PronkError as error:
+            found.append(str(error)[:300])
+    return found
+
+
+def _wait(process: subprocess.Popen[str], known: dict[int, _Process], seconds: float) -> bool:
+    """Wait until a process has ended, and note what it starts; whether it has."""
+    until = time.monotonic() + seconds
+    while process.poll() is None and time.monotonic() < until:
+        _below(process.pid, known)
+        time.sleep(0.02)
+    return process.poll() is not None
+
+
+def _act(process: _Process, action: str) -> None:
+    for name in action.split():
+        if name != "STOP" and "STOP" in action:
+            time.sleep(STOPPED_S)
+        if process.alive:
+            with suppress(ProcessLookupError):
+                os.kill(process.pid, getattr(signal, f"SIG{name}"))
+
+
+def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> dict[str, Any]:
+    """One run; a row of figures and faults. A `length_s` of zero: nothing is killed."""
+    rng, faults = np.random.default_rng([seed, i]), list[str]()
+    row: dict[str, Any] = {"program": program, "i": i, "action": ACTIONS[i // 5 % 4]}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port = int(probe.getsockname()[1])
+    wired = program in ("sweep-lcm", "deploy")
+    base = "ground" if program == "deploy" else "bench"
+    robot = _start(["pronk.cli.main", "simulate", "--port", str(port), "--base", base])
+    if not wired:
+        robot.kill()
+    elif not any(line.startswith("ready") for line in robot.stdout or ()):
+        raise PronkError("the virtual robot did not start.")
+    folder.mkdir()
+    known: dict[int, _Process] = {}
+    with _heard(port) if wired else tempfile.TemporaryFile() as heard:
+        process = _start(_words(program, folder, port))
+        lines: list[str] = []
+        ready, text = threading.Event(), process.stdout
+        assert text is not None
+
+        def read() -> None:
+            for line in text:
+                lines.append(line)
+                if line.startswith('{"operator"'):
+                    ready.set()
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        begun = time.monotonic()
+        if program == "deploy":
+            ready.wait(60.0)
+            _below(process.pid, known)
+            if not ready.is_set():
+                process.terminate()
+        if length_s == 0.0:
+            _wait(process, known, 600.0)
+        else:
+            _wait(process, known, float(rng.uniform(0.05, 1.0)) * length_s)
+            _below(process.pid, known)
+            there = [one for one in known.values() if one.alive]
+            if program == "deploy" and ready.is_set():
+                names = json.loads(next(line for line in lines if line.startswith("{")))
+                name = list(names)[i % 5]
+                target = _Process(names[name], _stat(names[name])[2], name)
+            elif there and program != "deploy":
+                target = there[int(rng.integers(len(there)))]
+            else:
+                target = _Process(process.pid, "", "none: not walking, or ended before")
+            at = time.monotonic()
+            row |= {"target": target.kind, "at_s": at - begun}
+            _act(target, row["action"])
+            if not _wait(process, known, 4.0 if wired else 30.0 + 4.0 * length_s):
+                if wired:
+                    process.terminate()
+                if not _wait(process, known, ENDS_S):
+                    faults.append("does not end")
+        ended = time.monotonic()
+        while (left := [one for one in known.values() if one.alive]) and process.poll() is not None:
+            if time.monotonic() - ended > ENDS_S:
+                faults.append(f"left: {', '.join(one.kind for one in left)}")
+                break
+            time.sleep(0.05)
+        row["ends_s"] = time.monotonic() - ended
+        for one in known.values():
+            _act(one, "KILL")
+        process.wait()
+        reader.join()
+        time.sleep(0.2 if wired else 0.0)
+    row |= {"length_s": time.monotonic() - begun, "status": process.returncode}
+    if wired:
+        robot.kill()
+        wire: Any = heard
+        if length_s and wire:
+            damped = [when - at for when, damps in wire if damps and when > at]
+            row["damped_s"] = damped[0] if damped else None
+            gone = row["target"] in MOVING and row["action"] != "TERM"
+            before = [damps for when, damps in wire if when <= at]
+            if gone and before and not before[-1] and (not damped or damped[0] > DAMPED_S):
+                faults.append(f"damped after {row['damped_s']} s")
+            if not wire[-1][1]:
+                faults.append("the last command does not damp")
+    robot.wait()
+    faults += _torn(folder)
+    traceback = next((k for k, line in enumerate(lines) if line.startswith("Traceback")), None)
+    if traceback is not None:
+        row["printed"] = "".join(lines[traceback:])[-600:]
+    row["aside"] = sum(path.name.startswith(".") for path in folder.rglob("*"))
+    return row | {"faults": faults}
+
+
+def kills(
+    programs: tuple[Program, ...] = (),
+    count: int = 50,
+    seed: int = 0,
+    jobs: int = 1,
+    out: Path | None = None,
+) -> console.Outcome:
+    """Kill and stop processes of commands at random moments.
+
+    Args:
+        programs: Which; all if left out.
+        count: Runs of each; of deploy, of each of its five processes.
+        seed: Of moments and processes.
+        jobs: Runs at once.
+        out: JSON lines, one a run, written as it goes.
+    """
+    programs = programs or PROGRAMS
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(jobs) as threads:
+        folder = Path(name)
+        sound = folder / "sound"
+        lengths = {"sweep-lcm": 15.0, "deploy": 2.0}
+        if {"sweep", "match"} & set(programs):
+            lengths["sweep"] = _one("sweep", 0, seed, sound, 0.0)["length_s"]
+            (sound / "out").rename(folder / "logs")
+        for program in programs:
+            if program not in lengths:
+                alone = _one(program, 0, seed, folder / program, 0.0)
+                if alone["status"] or alone["faults"]:
+                    raise PronkError(f"{program} by itself: {alone}")
+                lengths[program] = alone["length_s"]
+        todo = [(p, i) for p in programs for i in range(count * (5 if p == "deploy" else 1))]
+
+        def one(job: tuple[Program, int]) -> dict[str, Any]:
+            program, i = job
+            row = _one(program, i, seed, folder / f"{program}{i}", lengths[program])
+            if out is not None:
+                with out.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+            return row
+
+        rows = list(threads.map(one, todo))
+    by = defaultdict[tuple[str, str], list[dict[str, Any]]](list)
+    for row in rows:
+        by[row["program"], row["target"]].append(row)
+    table = [
+        {"program": program, "process": target, "n": len(each)}
+        | {"faults": sum(bool(row["faults"]) for row in each)}
+        | {"damped_s": max((row.get("damped_s") or 0.0 for row in each), default=0.0)}
+        | {"ends_s": max(row["ends_s"] for row in each)}
+        | {"aside": sum(row["aside"] for row in each)}
+        | {"traceback": sum("printed" in row for row in each)}
+        for (program, target), each in sorted(by.items())
+    ]
+    columns = {name: name for name in ("program", "process", "n", "faults", "aside", "traceback")}
+    columns |= {"damped after at most [s];3": "damped_s", "all ended after at most [s];2": "ends_s"}
+    console.show_rows(f"{len(rows)} kills, seed {seed}", columns, table)
+    for row in rows:
+        if row["faults"]:
+            console.say(json.dumps(row))
+    failed = sum(bool(row["faults"]) for row in rows)
+    return console.Outcome(figures={"rows": table, "faults": failed}, status=1 if failed else 0)
+
+
+if __name__ == "__main__":
+    operate(int(sys.argv[1]), sys.argv[2])
