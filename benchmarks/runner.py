@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from importlib.metadata import version
+from itertools import chain, repeat
 from multiprocessing import Pool
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,9 +19,11 @@ from rich.table import Table
 
 from pronk.cli import console
 from pronk.errors import PronkError
+from pronk.processes import pool
 
 T = TypeVar("T")
 R = TypeVar("R")
+Row = dict[str, Any]
 Progress = Callable[[str, float], None]
 """Called with the stage and the share done, 0 to 1."""
 
@@ -41,8 +48,8 @@ def in_parallel(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Iterat
     """
     if jobs < 1:
         raise PronkError(f"--jobs {jobs}; expected 1 or more.")
-    with Pool(jobs) as pool:
-        yield from pool.imap_unordered(work, items)
+    with Pool(jobs) as workers:
+        yield from workers.imap_unordered(work, items)
 
 
 def paired_ratio(ours: Sequence[float], peer: Sequence[float]) -> tuple[float, float, float]:
@@ -75,3 +82,33 @@ def finish(figures: dict[str, Any], *tables: Table) -> console.Outcome:
     for each in tables:
         console.show(each)
     return console.Outcome(figures=figures)
+
+
+def rows_of(work: Iterable[Callable[[], list[Row]]], jobs: int, out: Path | None) -> Iterator[Row]:
+    """Do work in `jobs` processes; rows in the order of the work, each appended to `out` in JSON.
+
+    `work` may be endless; what is under way when the caller has enough is lost.
+    """
+    under_way: deque[Future[list[Row]]] = deque()
+    with pool(jobs) as workers:
+        try:
+            for call in chain(work, repeat(None)):
+                if call is not None:
+                    under_way.append(workers.submit(call))
+                elif not under_way:
+                    return
+                if call is None or len(under_way) > 3 * jobs:
+                    for row in under_way.popleft().result():
+                        if out is not None:
+                            with out.open("a", encoding="utf-8") as file:
+                                file.write(json.dumps(row) + "\n")
+                        yield row
+        finally:
+            workers.shutdown(wait=False, cancel_futures=True)
+
+
+def rows_in(out: Path | None) -> list[Row]:
+    """Rows that an earlier run has left in a file of `rows_of`."""
+    if out is None or not out.exists():
+        return []
+    return [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]

@@ -1,9 +1,11 @@
-"""`python -m benchmarks sensor-faults`: from a sensor's fault to damping on the wire.
+"""`python -m benchmarks sensor-faults`: from a fault to damping on the wire.
 
-The processes of `pronk deploy` walk the virtual robot over LCM and DDS in real time. A fault of
-`SENSOR_FAULTS` begins at a moment of the robot's choice; the time to the first command that damps
-is on the virtual robot's own clock. Then the fault ends, is reset, and the robot stands up again.
-A run in which something else damped, as on a busy computer, is repeated.
+The processes of `pronk deploy` move a virtual robot over LCM and DDS in real time: the Mini Cheetah
+walks; the Go2, for which no policy was trained, squats, sways and pitches on its feet
+(`write_swaying`). A fault of `SENSOR_FAULTS` or `PROCESSES` begins; the time to the first command
+that damps is on the virtual robot's own clock. Then the fault ends, is reset, and the robot stands
+up again. A run that ends for want of processor time (`BUSY`) is repeated. `--docs` writes the table
+of faults in docs.
 
 With `--minutes` the robot walks without a fault instead: what damps it, the memory and the handles
 of each process, and the lateness of the servo. Its link may then also be `sim`.
@@ -12,12 +14,16 @@ of each process, and the lateness of the servo. Its link may then also be `sim`.
 from __future__ import annotations
 
 import json
+import math
 import os
+import signal
 import socket
+import tempfile
 import time
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -27,7 +33,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.runner import Progress, finish
+from benchmarks.linear_policy import stiff_go2, write_swaying
+from benchmarks.runner import Progress, Row, finish, rows_in, rows_of
 from pronk.cli import console
 from pronk.cli.simulate import _PRIORITY, _SERVERS
 from pronk.errors import HardwareError
@@ -38,7 +45,7 @@ from pronk.robots import load_robot
 from pronk.runtime.ipc import Mode, OperatorRequest
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import Deployment
-from pronk.runtime.safety import Reason
+from pronk.runtime.script import STILL, Velocity
 from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import OperatorCommand
 from pronk.virtual.faults import SENSOR_FAULTS
@@ -46,11 +53,25 @@ from pronk.virtual.robot import VirtualRobot, hold_of
 from pronk.virtual.server import RobotServer
 from pronk.virtual.sim_params import load_sim_params
 
-ROBOT = "mini_cheetah"
-FAULTS = tuple(name for name in SENSOR_FAULTS if name != "legs-swapped")
-FOUND = (Reason.REPEATED.name, Reason.ATTITUDE.name, Reason.ENCODER.name)
+PROCESSES = {
+    "policy-stopped": ("policy", signal.SIGSTOP),
+    "policy-killed": ("policy", signal.SIGKILL),
+    "servo-stopped": ("servo", signal.SIGSTOP),
+    "servo-killed": ("servo", signal.SIGKILL),
+}
+"""Process of a `Deployment`, and what it gets."""
+FAULTS = (*SENSOR_FAULTS, *PROCESSES)
+SWAPPED = "legs-swapped"
+BUSY = ("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK")
+"""Reasons of a computer that is too busy."""
+BAR_S = 0.1
+"""From a fault to damping [s]."""
 WALK = (0.6, 0.0, 0.0)
 """Forward, left [m/s], yaw rate [rad/s]."""
+SWAY_HZ = (1.5, 1.1, 1.9)
+"""Of the three commands of a robot that sways."""
+SWAY = 0.5
+"""Their amplitude: joints move by 0.2 to 0.7 rad, the trunk tilts by up to 0.2."""
 WALK_S = 1.0
 """Before a fault begins [s]."""
 TRIES = 4
@@ -60,12 +81,12 @@ RISE_S = TIMING.fold_s + TIMING.rise_s + 0.2
 """In which the robot stands up [s]."""
 
 
-def _serve(link: str, options: dict[str, int], end: Connection) -> None:
+def _serve(name: str, link: str, options: dict[str, int], end: Connection) -> None:
     """Body of the robot's process; receives faults, and sends the time to damping."""
     die_with_parent()
     # A robot does not depend on how busy this computer is.
     enter(Wanted(priority=_PRIORITY, lock=False))
-    robot = load_robot(ROBOT)
+    robot = load_robot(name)
     machine = VirtualRobot(robot, load_sim_params(None, robot), base="ground", capture_rate_hz=None)
     machine.connect()
     server = RobotServer(
@@ -88,7 +109,7 @@ def _serve(link: str, options: dict[str, int], end: Connection) -> None:
 
 
 @contextmanager
-def served(link: str) -> Iterator[tuple[Address, Connection | None]]:
+def served(robot: str, link: str) -> Iterator[tuple[Address, Connection | None]]:
     """A virtual robot on the ground in a process of its own: its address, and its other end.
 
     Of the link `sim`, whose robot is in the servo's process, the address alone.
@@ -105,7 +126,7 @@ def served(link: str) -> Iterator[tuple[Address, Connection | None]]:
     context = get_context("spawn")
     end, other = context.Pipe()
     process = context.Process(
-        target=_serve, args=(link, options, other), name="virtual robot", daemon=True
+        target=_serve, args=(robot, link, options, other), name="virtual robot", daemon=True
     )
     process.start()
     try:
@@ -116,12 +137,17 @@ def served(link: str) -> Iterator[tuple[Address, Connection | None]]:
         process.join()
 
 
-def _until(deployment: Deployment, seconds: float, modes: tuple[Mode, ...], **more: Any) -> bool:
+def _until(
+    deployment: Deployment,
+    seconds: float,
+    modes: tuple[Mode, ...],
+    request: OperatorRequest = OperatorRequest.NONE,
+    command: Callable[[float], Velocity] = lambda t: STILL,
+) -> bool:
     """Hold the dead-man button until one of some modes comes; whether it came."""
     until = time.monotonic() + seconds
-    request = more.pop("request", OperatorRequest.NONE)
-    while time.monotonic() < until:
-        deployment.write(OperatorCommand(held=True, request=request, **more))
+    while (now := time.monotonic()) < until:
+        deployment.write(OperatorCommand(held=True, request=request, command=command(now)))
         request = OperatorRequest.NONE
         if deployment.mode in modes:
             return True
@@ -129,91 +155,122 @@ def _until(deployment: Deployment, seconds: float, modes: tuple[Mode, ...], **mo
     return False
 
 
+def _sway(t: float) -> Velocity:
+    x, y, z = (SWAY * math.sin(2.0 * math.pi * hz * t) for hz in SWAY_HZ)
+    return x, y, z
+
+
+def _motion(deployment: Deployment) -> Callable[[float], Velocity]:
+    """Commands of a robot at a time [s]."""
+    return (lambda t: WALK) if deployment.plan.link.robot == "mini_cheetah" else _sway
+
+
 def _walk(deployment: Deployment) -> bool:
     """From wherever it is to walking; whether it walks."""
     if deployment.mode is Mode.FAULT:
         _until(deployment, 1.1, ())
-        _until(deployment, 5.0, (Mode.DAMP,), request=OperatorRequest.RESET)
+        _until(deployment, 5.0, (Mode.DAMP,), OperatorRequest.RESET)
     for mode, request in (
         (Mode.STAND, OperatorRequest.STAND),
         (Mode.POLICY, OperatorRequest.WALK),
     ):
-        if not _until(deployment, 5.0, (mode, Mode.FAULT), request=request):
+        if not _until(deployment, 5.0, (mode, Mode.FAULT), request):
             return False
         if mode is Mode.STAND:
             _until(deployment, RISE_S, (Mode.FAULT,))
-    _until(deployment, WALK_S, (Mode.FAULT, Mode.ENDED), command=WALK)
+    _until(deployment, WALK_S, (Mode.FAULT, Mode.ENDED), command=_motion(deployment))
     return deployment.mode is Mode.POLICY
 
 
 def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, float, str]]:
     """Name, time to damping on the robot's clock [s] and reason of faults, one after the other.
 
-    Ends early where the robot does not walk, or something else damps.
+    A fault that is not found within 2 s has the time NaN. Of swapped legs the time is that from the
+    request to stand. Ends early where the robot does not walk, the computer is too busy, or a
+    process is gone.
     """
     rows: list[tuple[str, float, str]] = []
+    if faults[0] == SWAPPED:
+        plan = replace(plan, timing=replace(TIMING, check_s=Timing().check_s))
     with Deployment(plan) as deployment:
         for fault in faults:
-            if not _walk(deployment):
+            if fault == SWAPPED:
+                robot.send(fault)
+                begun = time.monotonic()
+                _until(deployment, 5.0, (Mode.FAULT, Mode.ENDED), OperatorRequest.STAND)
+                passed = time.monotonic() - begun
+            elif not _walk(deployment):
                 break
-            deployment.events_seen()
-            robot.send(fault)
-            _until(deployment, 2.0, (Mode.FAULT, Mode.ENDED), command=WALK)
+            else:
+                deployment.events_seen()
+                robot.send(fault if fault in SENSOR_FAULTS else "")
+            struck = None
+            if fault in PROCESSES:
+                name, number = PROCESSES[fault]
+                struck = getattr(deployment, name).pid
+                os.kill(struck, number)
+            if fault != SWAPPED:
+                _until(deployment, 2.0, (Mode.FAULT, Mode.ENDED), command=_motion(deployment))
             _until(deployment, 0.1, ())
+            if struck is not None and fault == "policy-stopped":
+                os.kill(struck, signal.SIGCONT)
             robot.send("damped")
-            damped = robot.recv()
+            damped: float | None = robot.recv()
             robot.send(None)
             reasons = [each.reason for each in deployment.events_seen() if each.kind == "fault"]
-            if reasons and reasons[0] in FOUND and damped is not None:
-                rows.append((fault, float(damped), reasons[0]))
-            else:
+            if fault.startswith("servo") and deployment.shared.standby.written:
+                reasons = ["STANDBY"]
+            if damped is None or not reasons:
+                rows.append((fault, math.nan, "not found"))
+                break
+            if reasons[0] in BUSY and not fault.startswith("policy"):
+                break
+            rows.append((fault, passed if fault == SWAPPED else damped, reasons[0]))
+            if fault == SWAPPED or (struck is not None and fault != "policy-stopped"):
                 break
     return rows
 
 
 def measure(
+    robot: str,
     policy: Path,
     link: str,
     faults: tuple[str, ...],
-    runs: int,
-    progress: Progress,
+    run: int,
     **more: Any,
-) -> dict[str, dict[str, Any]]:
-    """Times to damping [s] and reasons of each fault over a link; `more` is of the `Plan`.
+) -> list[Row]:
+    """Time to damping [s] and reason of each fault over a link, once; `more` is of the `Plan`.
 
-    Raises:
-        HardwareError: A fault was not found in `TRIES` deployments in a row.
+    A fault that could not begin in `TRIES` deployments, because the robot did not walk or the
+    computer was too busy, has the reason `not measured`.
     """
-    left = [fault for _ in range(runs) for fault in faults]
-    whole, failed = len(left), 0
-    found: dict[str, dict[str, Any]] = {
-        fault: {"times_s": [], "reasons": Counter()} for fault in faults
-    }
+    left, rows, failed = list(faults), list[Row](), 0
     while left:
-        rows: list[tuple[str, float, str]] = []
+        found: list[tuple[str, float, str]] = []
         # A robot of its own each time: one that has fallen may not stand up again.
-        with served(link) as (address, robot), suppress(HardwareError):
-            assert robot is not None
+        with tempfile.TemporaryDirectory() as folder, suppress(HardwareError), ExitStack() as stack:
+            known, network = robot, policy
+            if robot == "go2":
+                known = str(stiff_go2(Path(folder) / robot))
+                network = write_swaying(Path(folder) / "policy.onnx", load_robot(known))
+            address, end = stack.enter_context(served(known, link))
+            assert end is not None
             plan = Plan(
-                link=Link(robot=ROBOT, address=address),
-                policy=policy,
+                link=Link(robot=known, address=address),
+                policy=network,
                 timing=TIMING,
                 ignore_latency=True,
                 **more,
             )
-            rows = strike(plan, robot, left)
-        for fault, seconds, reason in rows:
-            left.remove(fault)
-            found[fault]["times_s"].append(seconds)
-            found[fault]["reasons"][reason] += 1
-        failed = 0 if rows else failed + 1
+            found = strike(plan, end, left)
+        failed = 0 if found else failed + 1
         if failed == TRIES:
-            raise HardwareError(
-                f"{left[0]} was not found over {link} in {TRIES} runs; see that this computer is "
-                "idle."
-            )
-        progress(link, 1.0 - len(left) / whole)
-    return found
+            found = [(left[0], math.nan, "not measured")]
+        for fault, seconds, reason in found:
+            left.remove(fault)
+            common = {"robot": robot, "link": link, "fault": fault, "run": run}
+            rows.append({**common, "time_s": seconds, "reason": reason})
+    return rows
 
 
 ROAM = (0.6, 0.2, 0.5)
@@ -236,9 +293,9 @@ def endure(
     walked, faults, rows = 0.0, list[tuple[float, str, str]](), list[dict[str, Any]]()
     runs = list[dict[str, Any]]()
     while walked < 60.0 * minutes and len(runs) < TRIES + len(faults):
-        with served(link) as (address, _):
+        with served("mini_cheetah", link) as (address, _):
             plan = Plan(
-                link=Link(robot=ROBOT, address=address),
+                link=Link(robot="mini_cheetah", address=address),
                 policy=policy,
                 timing=TIMING,
                 ignore_latency=True,
@@ -247,8 +304,14 @@ def endure(
                 while walked < 60.0 * minutes and _walk(deployment):
                     begun, due = time.monotonic(), 0.0
                     while deployment.mode is Mode.POLICY and walked < 60.0 * minutes:
-                        velocity = tuple((rng.uniform(-1.0, 1.0, 3) * ROAM).tolist())
-                        _until(deployment, 2.0, (Mode.FAULT, Mode.ENDED), command=velocity)
+                        x, y, z = (rng.uniform(-1.0, 1.0, 3) * ROAM).tolist()
+                        now: Velocity = (x, y, z)
+                        _until(
+                            deployment,
+                            2.0,
+                            (Mode.FAULT, Mode.ENDED),
+                            command=lambda t, now=now: now,  # type: ignore[misc]
+                        )
                         passed = time.monotonic() - begun
                         walked, begun = walked + passed, begun + passed
                         for event in deployment.events_seen():
@@ -298,36 +361,102 @@ def _endured(walks: list[dict[str, Any]]) -> console.Outcome:
     return finish({"walks": walks}, console.table("Walking without a fault", columns, cells))
 
 
+def page(rows: list[Row], command: str) -> str:
+    """The page of the table of faults in docs."""
+    groups = sorted({(row["robot"], row["link"]) for row in rows}, reverse=True)
+    head = ["fault", *(f"{robot}, {link}" for robot, link in groups), "reasons"]
+    table, missed = [head, ["---"] * len(head)], []
+    for fault in FAULTS:
+        cells, reasons = [], set[str]()
+        for robot, link in groups:
+            mine = [r for r in rows if (r["robot"], r["link"], r["fault"]) == (robot, link, fault)]
+            done = [row for row in mine if row["reason"] != "not measured"]
+            times = [1e3 * row["time_s"] for row in done if not math.isnan(row["time_s"])]
+            reasons |= {row["reason"] for row in done if not math.isnan(row["time_s"])}
+            lost = len(done) - len(times)
+            cell = f"{np.median(times):.0f} ({max(times):.0f})" if times else ""
+            cell += f", {lost} of {len(done)} not found" if lost else ""
+            cell += f", n = {len(done)}" if done else "not measured"
+            cells.append(cell.removeprefix(", "))
+            late = sum(each > 1e3 * BAR_S for each in times) if fault != SWAPPED else 0
+            if lost or late or not done:
+                where = f"`{fault}` ({robot}, {link})"
+                missed.append(f"{where}: {late} of {len(done)} later, {lost} not found")
+        table.append([f"`{fault}`", *cells, ", ".join(f"`{each}`" for each in sorted(reasons))])
+    lines = "\n".join("| " + " | ".join(row) + " |" for row in table)
+    bar = f"{1e3 * BAR_S:.0f} ms"
+    failures = "".join(f"- {each}\n" for each in missed) or f"All within {bar}.\n"
+    return f"""# Faults and damping
+
+Written by `{command}`; do not edit.
+
+From the begin of a fault to the first command that damps, at the virtual robot and on its clock, in
+ms: median (worst). All over loopback, in real time. The Mini Cheetah walks with the shipped policy.
+For the Go2, of which no policy was trained, a linear one squats, sways and pitches on four feet, at
+the stiffness of Unitree's stand example (60 N m/rad).
+The joint of the faults of one encoder is a hip roll, which moves and is loaded least. The time of
+`{SWAPPED}` is that from the request to stand; the robot has not risen. A stopped or killed servo is
+followed by the standby process.
+
+{lines}
+
+## Longer than {bar}, or not found
+
+{failures}
+## What cannot be seen
+
+- A constant encoder of a joint whose load does not change while no other joint moves: the robot
+  stands still. It is found once the others have moved by 0.05 rad in sum.
+- An encoder at zero whose joint rests at zero, until its velocity says that it moved by 0.005 rad.
+- Swapped legs after the robot has stood up: cables are not changed then.
+"""
+
+
 def sensor_faults(
     policy: tyro.conf.Positional[Path],
     runs: int = 10,
+    robots: str = "mini_cheetah,go2",
     links: str = "lcm,dds",
     minutes: float = 0.0,
     seed: int = 0,
+    jobs: int = 1,
     out: Path | None = None,
+    docs: Path | None = None,
 ) -> console.Outcome:
-    """Time from each sensor fault to damping on the wire, over LCM and DDS in real time.
+    """Time from each fault to damping on the wire, over LCM and DDS in real time.
 
     Args:
-        policy: policy.onnx that walks.
-        runs: With each fault and link.
+        policy: policy.onnx of the Mini Cheetah that walks.
+        runs: With each fault, robot and link.
+        robots: mini_cheetah, go2, separated by commas.
         links: lcm, dds, separated by commas; sim too with `--minutes`.
         minutes: Of walking without a fault over each link, in place of the faults.
         seed: Of the commands of that walk.
-        out: File in JSON for that walk, written as it goes.
+        jobs: Runs at a time, each of which takes two cores; more than 1 without real-time priority.
+        out: File of rows in JSON, written as they come; faults go on from those that are there.
+        docs: Page to write.
     """
     if minutes > 0.0:
         with console.progress() as report:
             walks = [endure(policy, link, minutes, seed, report, out) for link in links.split(",")]
         return _endured(walks)
-    cells, figures = [], {}
+    rows = rows_in(out)
+    known = {(row["robot"], row["link"], row["run"], row["fault"]) for row in rows}
+    work = []
+    for run in range(runs):
+        for robot in robots.split(","):
+            for link in links.split(","):
+                left = tuple(f for f in FAULTS if (robot, link, run, f) not in known)
+                part = partial(measure, robot, policy, link, left, run, real_time=jobs == 1)
+                work += [part] if left else []
+    whole = len(rows) + sum(len(part.args[3]) for part in work)
     with console.progress() as report:
-        for link in links.split(","):
-            figures[link] = rows = measure(policy, link, FAULTS, runs, report)
-            for fault, row in rows.items():
-                times = 1e3 * np.array(row["times_s"])
-                reasons = ", ".join(row["reasons"])
-                numbers = f"{np.median(times):.0f}", f"{times.max():.0f}", str(len(times))
-                cells.append((fault, link, *numbers, reasons))
-    columns = ["fault", "link", "median [ms]", "worst [ms]", "n", "reasons"]
-    return finish(figures, console.table("From a fault to damping", columns, cells))
+        for row in rows_of(work, jobs, out):
+            rows.append(row)
+            report("faults", len(rows) / whole)
+    command = f"python -m benchmarks sensor-faults POLICY --runs {runs} --docs {docs}"
+    text = page(rows, command)
+    if docs is not None:
+        docs.write_text(text, encoding="utf-8")
+    console.say(text)
+    return console.Outcome(figures={"rows": rows}, wrote=[] if docs is None else [docs])

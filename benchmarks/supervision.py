@@ -12,26 +12,23 @@ time from its begin to damping.
 
 from __future__ import annotations
 
-import json
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
-from benchmarks.runner import finish
+from benchmarks.runner import Row, finish, rows_in, rows_of
 from pronk.cli import console
 from pronk.errors import HardwareError
 from pronk.links.machine import State
 from pronk.policy.runtime import load_policy
-from pronk.processes import pool
 from pronk.robots import load_robot
 from pronk.runtime.ipc import ACTIONS, Mode, OperatorRequest, fill
 from pronk.runtime.rollout import PolicyRunner
@@ -52,10 +49,12 @@ LOSS = 0.3
 FASTEST = (2.0, 0.5, 1.0)
 """Of the commands: forward, left [m/s], yaw rate [rad/s]; within the range of training. In an hour
 14 of 38 flights ended early, by a fall or a joint that was too fast."""
-Row = dict[str, Any]
 _SEEDS = 1_000_000
 """From a seed of the benchmark to those of its flights."""
-SUPERVISED = (Reason.REPEATED, Reason.ATTITUDE, Reason.ENCODER, Reason.HELD, Reason.CLIPPED)
+SUPERVISED = (
+    *(Reason.REPEATED, Reason.ATTITUDE, Reason.ENCODER),
+    *(Reason.HELD, Reason.CLIPPED, Reason.SWAPPED),
+)
 LIMITS = Limits.of(load_robot("mini_cheetah"))
 
 
@@ -213,8 +212,11 @@ class Flight:
             if modes.mode is Mode.POLICY and math.isinf(change):
                 change = t + 1.0
             if desired.command is None:
-                safety.damped()
+                decision = safety.damped()
                 machine.damp()
+                if safety.faulted:
+                    self.damped, self.damped_at = decision, t
+                    return
             else:
                 sent, decision = safety.judge(states or [newest], desired.command, t)
                 self.seconds += 1.0 / SERVO_HZ
@@ -253,7 +255,7 @@ WALK = (1.0, 0.0, 0.0)
 FAULTS = (*SENSOR_FAULTS, LATE)
 
 
-def quiet(policy: Path, sets: int, seed: int, number: int) -> Row:
+def quiet(policy: Path, sets: int, seed: int, number: int) -> list[Row]:
     """Fly for two minutes without a fault."""
     flight = Flight(
         policy=policy,
@@ -272,20 +274,16 @@ def quiet(policy: Path, sets: int, seed: int, number: int) -> Row:
         end = flight.damped.reason.name
         if flight.damped.reason in SUPERVISED:
             alarm = f"{flight.damped_at:.3f} s: {flight.damped.text}"
-    return {
-        "flight": number,
-        "seconds": flight.seconds,
-        "jumps": flight.jumps,
-        "end": end,
-        "alarm": alarm,
-        "largest": flight.largest,
-    }
+    names = ("seconds", "jumps", "largest")
+    row = {name: getattr(flight, name) for name in names}
+    return [{"flight": number, "end": end, "alarm": alarm, **row}]
 
 
-def struck(policy: Path, seed: int, job: tuple[str, int]) -> Row:
-    """Time from a fault to damping [s] and the reason; NaN where it is not found in 3 s."""
+def struck(policy: Path, seed: int, job: tuple[str, int]) -> list[Row]:
+    """Time from a fault to damping [s] and the reason; NaN where it is not found in 4 s."""
     fault, k = job
-    begins, number = 7.0 + 0.137 * k, k
+    # Swapped legs are found before the robot rises.
+    begins, number = (0.0 if fault == "legs-swapped" else 7.0 + 0.137 * k), k
     while True:
         number += 1
         flight = Flight(
@@ -298,44 +296,30 @@ def struck(policy: Path, seed: int, job: tuple[str, int]) -> Row:
             delay_ticks=15 if fault == LATE else 0,
             coarse=k % 2 == 1,
         )
-        flight.run(begins + 3.0)
+        flight.run(begins + 4.0)
         if not flight.damped_at < begins:  # else it fell before
             break
     reason = "none" if flight.damped is None else flight.damped.reason.name
-    return {"fault": fault, "run": k, "time_s": flight.damped_at - begins, "reason": reason}
+    return [{"fault": fault, "run": k, "time_s": flight.damped_at - begins, "reason": reason}]
 
 
 def fly(
     policy: Path, hours: float, sets: int, runs: int, seed: int, jobs: int, out: Path | None
 ) -> Iterator[Row]:
-    """Rows of `struck`, then of `quiet` until so many hours are flown; those in `out` come first.
-
-    Each new row is appended to `out` as soon as the rows before it are there.
-    """
-    rows = [] if out is None or not out.exists() else list(map(json.loads, out.open()))
+    """Rows in `out`, then of `quiet` until so many hours are flown, then of `struck`."""
+    rows = rows_in(out)
     yield from rows
-    known = {(row.get("fault"), row["run"]) for row in rows if "run" in row}
-    faults = [(name, k) for k in range(runs) for name in FAULTS if (name, k) not in known]
     flown = sum(row.get("seconds", 0.0) for row in rows)
     first = sum("flight" in row for row in rows)
-    work: Iterator[Callable[[], Row]] = chain(
-        (partial(struck, policy, seed, job) for job in faults),
-        (partial(quiet, policy, sets, seed, number) for number in count(first)),
-    )
-    under_way: deque[Future[Row]] = deque()
-    left = len(faults)
-    with pool(jobs) as workers:
-        while left > 0 or flown < 3600.0 * hours:
-            while len(under_way) < 3 * jobs:
-                under_way.append(workers.submit(next(work)))
-            row = under_way.popleft().result()
-            left -= "run" in row
-            flown += row.get("seconds", 0.0)
-            if out is not None:
-                with out.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
-            yield row
-        workers.shutdown(wait=False, cancel_futures=True)
+    flights = (partial(quiet, policy, sets, seed, number) for number in count(first))
+    for row in rows_of(flights, jobs, out) if flown < 3600.0 * hours else ():
+        yield row
+        flown += row["seconds"]
+        if flown >= 3600.0 * hours:
+            break
+    known = {(row["fault"], row["run"]) for row in rows if "fault" in row}
+    faults = ((name, k) for k in range(runs) for name in FAULTS if (name, k) not in known)
+    yield from rows_of((partial(struck, policy, seed, job) for job in faults), jobs, out)
 
 
 def supervision(

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pronk.policy.contract import METADATA_KEY, Contract, measured_layout, to_json
-from pronk.policy.observation import ESTIMATE, JOINTS, MEASURED_SIZE
+from benchmarks.linear_policy import write_linear
+from pronk.policy.contract import Contract, measured_layout
+from pronk.policy.observation import JOINTS, MEASURED_SIZE
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
@@ -45,39 +46,8 @@ def contract(**changes: Any) -> Contract:
 
 def write_hopper(path: Path, strength: float = 1.0, **changes: Any) -> Path:
     """Write it as ONNX: action = jump * strength * straight / scale; contacts 1, velocity 0."""
-    onnx = pytest.importorskip("onnx")
-    helper, made = onnx.helper, contract(**changes)
-    weights = {
-        "still": np.zeros((MEASURED_SIZE, ESTIMATE["linear_velocity"])),
-        "in_air": np.zeros((MEASURED_SIZE, ESTIMATE["contact"])),
-        "one": np.ones((1, 1)),
-        "rest": np.zeros((MEASURED_SIZE, JOINTS)),
-        "straight": (strength * STRAIGHT / np.array(made.action_scale))[None],
-    }
-    nodes = [
-        helper.make_node("MatMul", ["measured", "still"], ["linear_velocity"]),
-        helper.make_node("MatMul", ["measured", "in_air"], ["none"]),
-        helper.make_node("Add", ["none", "one"], ["contact"]),
-        helper.make_node("MatMul", ["measured", "rest"], ["resting" if made.jump else "action"]),
-    ]
-    inputs = {"measured": MEASURED_SIZE}
-    if made.jump:
-        inputs["jump"] = 1
-        nodes.append(helper.make_node("MatMul", ["jump", "straight"], ["thrown"]))
-        nodes.append(helper.make_node("Add", ["resting", "thrown"], ["action"]))
-
-    def values(sizes: dict[str, int]) -> list[Any]:
-        kind = onnx.TensorProto.FLOAT
-        return [helper.make_tensor_value_info(n, kind, ["batch", s]) for n, s in sizes.items()]
-
-    graph = helper.make_graph(
-        nodes,
-        "hopper",
-        values(inputs),
-        values({"action": JOINTS, **ESTIMATE}),
-        [onnx.numpy_helper.from_array(w.astype(np.float32), name) for name, w in weights.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(model, {METADATA_KEY: to_json(made)})
-    onnx.save(model, str(path))
-    return path
+    pytest.importorskip("onnx")
+    made = contract(**changes)
+    straight = strength * STRAIGHT / np.array(made.action_scale)
+    still = np.zeros((MEASURED_SIZE, JOINTS))
+    return write_linear(path, made, still, straight if made.jump else None)

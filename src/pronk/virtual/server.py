@@ -173,7 +173,7 @@ class RobotServer:
             self._wire.publish(state)
 
     def spoil(self, fault: str | None) -> None:
-        """Begin a fault of `SENSOR_FAULTS` now, or end it."""
+        """Begin a fault of `SENSOR_FAULTS` now, or end it; "" notes the time of another fault."""
         self._sensor = None if fault is None else (fault, self._now)
         self.damped_s = None
 
@@ -231,7 +231,7 @@ class RobotServer:
             state = replace(self._frozen, time=state.time, sequence=state.sequence)
         else:
             self._frozen = None
-        if self._sensor is None or now < self._sensor[1]:
+        if self._sensor is None or not self._sensor[0] or now < self._sensor[1]:
             self._sound = state
         else:
             state = spoiled(self._sensor[0], self._sound or state, state)
