@@ -66,7 +66,7 @@ def operate(port: int, log: str) -> None:
         each = ("servo", "policy", "logger", "standby")
         pids = {name: getattr(deployment, name).pid for name in each}
         print(json.dumps({"operator": os.getpid()} | pids), flush=True)
-        sensor_faults._until(deployment, 30.0, (), command=sensor_faults.WALK)
+        sensor_faults._until(deployment, 30.0, (), command=sensor_faults._motion(deployment))
 
 
 def _words(program: Program, folder: Path, port: int) -> list[str]:

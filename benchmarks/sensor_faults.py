@@ -53,6 +53,7 @@ from pronk.virtual.robot import VirtualRobot, hold_of
 from pronk.virtual.server import RobotServer
 from pronk.virtual.sim_params import load_sim_params
 
+ROBOT = "mini_cheetah"
 PROCESSES = {
     "policy-stopped": ("policy", signal.SIGSTOP),
     "policy-killed": ("policy", signal.SIGKILL),
@@ -162,7 +163,7 @@ def _sway(t: float) -> Velocity:
 
 def _motion(deployment: Deployment) -> Callable[[float], Velocity]:
     """Commands of a robot at a time [s]."""
-    return (lambda t: WALK) if deployment.plan.link.robot == "mini_cheetah" else _sway
+    return (lambda t: WALK) if deployment.plan.link.robot == ROBOT else _sway
 
 
 def _walk(deployment: Deployment) -> bool:
@@ -250,7 +251,7 @@ def measure(
         # A robot of its own each time: one that has fallen may not stand up again.
         with tempfile.TemporaryDirectory() as folder, suppress(HardwareError), ExitStack() as stack:
             known, network = robot, policy
-            if robot == "go2":
+            if robot != ROBOT:
                 known = str(stiff_go2(Path(folder) / robot))
                 network = write_swaying(Path(folder) / "policy.onnx", load_robot(known))
             address, end = stack.enter_context(served(known, link))
@@ -293,9 +294,9 @@ def endure(
     walked, faults, rows = 0.0, list[tuple[float, str, str]](), list[dict[str, Any]]()
     runs = list[dict[str, Any]]()
     while walked < 60.0 * minutes and len(runs) < TRIES + len(faults):
-        with served("mini_cheetah", link) as (address, _):
+        with served(ROBOT, link) as (address, _):
             plan = Plan(
-                link=Link(robot="mini_cheetah", address=address),
+                link=Link(robot=ROBOT, address=address),
                 policy=policy,
                 timing=TIMING,
                 ignore_latency=True,
