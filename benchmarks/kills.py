@@ -254,6 +254,7 @@ def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> 
             at = time.monotonic()
             row |= {"target": target.kind, "at_s": at - begun}
             _act(target, row["action"])
+            acted = time.monotonic()
             if not _wait(process, known, 4.0 if wired else 30.0 + 4.0 * length_s):
                 if wired:
                     process.terminate()
@@ -278,9 +279,10 @@ def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> 
         if length_s and wire:
             damped = [when - at for when, damps in wire if damps and when > at]
             row["damped_s"] = damped[0] if damped else None
-            gone = row["target"] in MOVING and row["action"] != "TERM"
+            gone = row["target"] in MOVING and row["action"].endswith("KILL")
             before = [damps for when, damps in wire if when <= at]
-            if gone and before and not before[-1] and (not damped or damped[0] > DAMPED_S):
+            late = not damped or damped[0] > acted - at + DAMPED_S
+            if gone and before and not before[-1] and late:
                 faults.append(f"damped after {row['damped_s']} s")
             if not wire[-1][1]:
                 faults.append("the last command does not damp")

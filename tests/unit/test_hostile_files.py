@@ -25,7 +25,7 @@ from pronk.match import gains
 from pronk.names import check_names, file_name
 from pronk.response.response import FrequencyResponse
 from pronk.robots import load_robot
-from pronk.robots.bare import file_of_model
+from pronk.robots.bare import file_of_model, yaml_of_model
 from pronk.robots.load import read_robot
 from pronk.virtual.sim_params import load_sim_params
 from report_cases import varied
@@ -141,6 +141,17 @@ def test_files_of_namespaced_joints_stay_in_their_folder(tmp_path: Path) -> None
     new = set(tmp_path.parent.rglob("*")) - before
     assert {path for path in new if path.is_file()} == set(out.iterdir())
     assert len(list(out.glob("*.svg"))) == 2
+
+
+def test_a_robot_file_made_of_any_joint_names_can_be_read(tmp_path: Path) -> None:
+    """Names that YAML takes for numbers, flags or syntax, and an armature without a point."""
+    names = ("1", "no", "a: b, {c}", "go2/knee", "#x")
+    body = "<body pos='{} 0 1'><joint name='{}' armature='1e-5'/><geom size='.1'/></body>"
+    bodies = "".join(body.format(i, name) for i, name in enumerate(names))
+    path = tmp_path / "robot.xml"
+    path.write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    (tmp_path / "robot.yaml").write_text(yaml_of_model(path))
+    assert load_robot(tmp_path / "robot.yaml").joint_names == names
 
 
 def bomb(path: Path, rows: int) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import yaml
 
 from pronk.errors import RobotError
 from pronk.robots.load import SCHEMA, DriveEntry, GroupEntry, RobotFile, make_robot, read_model
@@ -113,26 +114,28 @@ def yaml_of_model(path: Path) -> str:
     """Write the `robot.yaml` of a bare model, with comments on what to check."""
     file = file_of_model(path)
     drives = "\n".join(
-        f"  {name}:\n" + "\n".join(f"    {field}: {getattr(drive, field)}" for field in _FIELDS)
+        f"  {_yaml(name)}:\n"
+        + "\n".join(f"    {field}: {_yaml(getattr(drive, field))}" for field in _FIELDS)
         for name, drive in file.drives.items()
     )
     groups = "\n".join(
-        f"  {name}: {{drive: {group.drive}, stiffness: {group.stiffness}, "
-        f"damping: {group.damping}, band_hz: {list(group.band_hz or _BAND_HZ)}}}"
+        f"  {_yaml(name)}: {{drive: {_yaml(group.drive)}, stiffness: {_yaml(group.stiffness)}, "
+        f"damping: {_yaml(group.damping)}, band_hz: {list(group.band_hz or _BAND_HZ)}}}"
         for name, group in file.groups.items()
     )
-    pose = "\n".join(f"    {name}: {value}" for name, value in file.poses["default"].items())
+    poses = file.poses["default"].items()
+    pose = "\n".join(f"    {_yaml(name)}: {_yaml(value)}" for name, value in poses)
     return f"""\
-# Robot of {path.name}. Units: rad, N m, s, kg m^2, V. Check every line marked CHECK,
+# Robot of {_yaml(path.name)}. Units: rad, N m, s, kg m^2, V. Check every line marked CHECK,
 # then run `pronk robot check` on this file.
 schema: {file.schema}
-name: {file.name}
-model: {file.model}
+name: {_yaml(file.name)}
+model: {_yaml(file.model)}
 policy_rate_hz: 50.0  # rate of the commands; timestep_s * decimation * rate must be 1
 timestep_s: 0.005     # of the simulator that is matched
 decimation: 4
-grid_stiffness: {list(file.grid_stiffness)}  # range of `pronk match`'s search
-grid_damping: {list(file.grid_damping)}
+grid_stiffness: [{", ".join(map(_yaml, file.grid_stiffness))}]  # range of `pronk match`'s search
+grid_damping: [{", ".join(map(_yaml, file.grid_damping))}]
 # legs: [FR, FL, HR, HL]  # for a robot with legs: prefixes of their joints
 
 drives:  # CHECK against the data sheet: limits, torque-speed line, rotor inertia
@@ -151,3 +154,9 @@ poses:  # CHECK: the pose of the sweep; a robot that stands up needs `folded` to
 
 def _short(value: float) -> float:
     return float(f"{value:.4g}")
+
+
+def _yaml(value: object) -> str:
+    """A name or number as YAML, quoted and with a decimal point where it needs them."""
+    made: str = yaml.safe_dump([value], default_flow_style=True, width=1000, allow_unicode=True)
+    return made.strip()[1:-1]
