@@ -8,15 +8,17 @@ that is installed. `pronk.simulators.probe` sees the `Simulator` only.
 from __future__ import annotations
 
 import importlib.util
+import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.runner import finish
+from benchmarks.runner import finish, in_parallel
 from pronk.actuator.law import DriveLaw
 from pronk.cli import console
 from pronk.errors import PronkError
@@ -211,22 +213,16 @@ def drawn(generator: np.random.Generator, kind: str, fault: str) -> Truth:
     )
 
 
-def rows(seed: int, count: int, kinds: Sequence[str]) -> list[tuple[Truth, Probe, float]]:
-    """Draw simulators and probe them; the seconds that each probe took."""
+def case(number: int, *, seed: int, kinds: Sequence[str]) -> dict[str, float | bool | str]:
+    """Draw and probe one simulator of a seed: its score, and the seconds that it took."""
     generator = np.random.default_rng(seed)
-    out: list[tuple[Truth, Probe, float]] = []
-    with console.progress() as report:
-        for k in range(count):
-            kind = kinds[k % len(kinds)]
-            fault = FAULTS[k // 2 % len(FAULTS)] if generator.random() < 0.5 else ""
-            if fault == "beside":
-                kind = "numpy"
-            truth = drawn(generator, kind, fault)
-            begin = time.perf_counter()
-            found = look(Drawn(truth), truth.robot, truth.joint)
-            out.append((truth, found, time.perf_counter() - begin))
-            report("probe", (k + 1) / count)
-    return out
+    for k in range(number + 1):
+        kind = kinds[k % len(kinds)]
+        fault = FAULTS[k // 2 % len(FAULTS)] if generator.random() < 0.5 else ""
+        truth = drawn(generator, "numpy" if fault == "beside" else kind, fault)
+    begin = time.perf_counter()
+    found = look(Drawn(truth), truth.robot, truth.joint)
+    return {"number": number, **score(truth, found), "seconds": time.perf_counter() - begin}
 
 
 def score(truth: Truth, found: Probe) -> dict[str, float | bool | str]:
@@ -236,14 +232,18 @@ def score(truth: Truth, found: Probe) -> dict[str, float | bool | str]:
     inertia = (
         truth.armature if truth.armature > 0.0 else truth.robot.joint(truth.joint).drive.armature
     )
+    armature_error = abs(found.armature - truth.armature) / inertia
+    delay_error = abs(found.delay_s - truth.delay_s)
     return {
         "kind": truth.kind,
         "joint": truth.joint,
         "law": truth.law.label,
         "found": found.law.label,
         "law_right": (found.law, found.beside_explicit) == (truth.law, truth.fault == "beside"),
-        "armature_error": abs(found.armature - truth.armature) / inertia,
-        "delay_error_s": abs(found.delay_s - truth.delay_s),
+        "armature_error": armature_error,
+        "armature_right": armature_error < 0.02,
+        "delay_error_s": delay_error,
+        "delay_right": delay_error < 5e-4,
         "friction_error": abs(found.frictionloss - truth.frictionloss),
         "hold_right": found.hold == truth.hold,
         "fault": truth.fault,
@@ -253,44 +253,50 @@ def score(truth: Truth, found: Probe) -> dict[str, float | bool | str]:
     }
 
 
-def probe(seed: int = 0, count: int = 50) -> console.Outcome:
+def probe(
+    seed: int = 0, count: int = 50, jobs: int = 1, rows: Path | None = None
+) -> console.Outcome:
     """Name the law, parameters and faults of random simulators.
 
     Args:
         seed: Of the draw.
         count: Simulators; a quarter of them in each engine that is installed, at most.
+        jobs: Processes, a simulator each.
+        rows: A file to which each simulator adds a line of JSON as it is done.
     """
-    installed = [
-        one.__name__ for one in ENGINES if importlib.util.find_spec(one.module.split(".")[0])
-    ]
+    kinds = ["numpy", "mujoco"]
+    kinds += [e.__name__ for e in ENGINES if importlib.util.find_spec(e.module.split(".")[0])]
     if count < 1:
         raise PronkError(f"--count {count}; expected 1 or more.")
-    kinds = ["numpy", "mujoco", *installed]
-    probed = rows(seed, count, kinds)
-    scores = [score(truth, found) for truth, found, _ in probed]
-    seconds = [one for *_, one in probed]
-
-    def right(name: str) -> str:
-        return f"{sum(bool(one[name]) for one in scores)} of {count}"
-
-    def errors(name: str, factor: float) -> str:
-        values = np.array([float(one[name]) for one in scores]) * factor
-        return f"{np.median(values):.2g} (largest {values.max():.2g})"
-
+    scores = []
+    work = partial(case, seed=seed, kinds=kinds)
+    with console.progress() as report:
+        for one in in_parallel(work, range(count), jobs):
+            scores.append(one)
+            if rows is not None:
+                with rows.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(one) + "\n")
+            report("probe", len(scores) / count)
     faulty = sum(bool(one["fault"]) for one in scores)
+    checks = {
+        "law": "law_right",
+        "hold": "hold_right",
+        f"faults named and no others; {faulty} have one": "fault_right",
+        "armature within 2 %": "armature_right",
+        "delay within 0.5 ms": "delay_right",
+    }
     cells = [
-        ("law", right("law_right")),
-        ("hold", right("hold_right")),
-        (f"faults named and no others; {faulty} have one", right("fault_right")),
-        ("armature, error [%]", errors("armature_error", 100.0)),
-        (
-            "armature within 2 %",
-            f"{sum(float(s['armature_error']) < 0.02 for s in scores)} of {count}",
-        ),
-        ("delay, error [ms]", errors("delay_error_s", 1000.0)),
-        ("dry friction, error [N m]", errors("friction_error", 1.0)),
-        ("time [s]", f"{np.median(seconds):.1f} (largest {max(seconds):.1f})"),
+        (name, f"{sum(bool(one[key]) for one in scores)} of {count}")
+        for name, key in checks.items()
     ]
+    for name, key, factor in (
+        ("armature, error [%]", "armature_error", 100.0),
+        ("delay, error [ms]", "delay_error_s", 1000.0),
+        ("dry friction, error [N m]", "friction_error", 1.0),
+        ("time [s]", "seconds", 1.0),
+    ):
+        values = np.array([float(one[key]) for one in scores]) * factor
+        cells.append((name, f"{np.median(values):.2g} (largest {values.max():.2g})"))
     title = f"Random simulators, seed {seed}: {', '.join(kinds)}"
-    figures = {str(k): one for k, one in enumerate(scores)}
+    figures = {str(one["number"]): one for one in scores}
     return finish(figures, console.table(title, ["of the joint", "probe"], cells))
