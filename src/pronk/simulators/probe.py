@@ -49,11 +49,16 @@ Computation, Solver parameters)."""
 _FAR = 30.0
 """A law that leaves so many times what another leaves is not followed further: iterations change
 what is left by less."""
+_CLEAR = 0.7
+"""Of what the next law leaves, the best one leaves less."""
 _LEFT = 0.01
 """Share of the motion that a right answer leaves at most."""
-_NAMES = ("stiffness", "damping", "armature", "viscous", "friction", "delay", "applied", "gravity")
-"""Fitted: factors on both gains, armature, passive damping, dry friction, delay in steps, and the
-shares of gravity and of a change of the armature that act."""
+_GRAVITY = 0.005
+"""Torque of gravity over stiffness [rad] from which on it shows."""
+_NAMES = ("damping", "inertia", "viscous", "friction", "delay", "applied", "gravity")
+"""Fitted, as gains, inertia, friction and gravity of any common factor move alike, to a stiffness
+that acts as it is set: the factor on damping, inertia, passive damping, dry friction, delay in
+steps, and the shares of a change of the armature and of gravity that act."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +125,15 @@ class _Law:
     soft: bool = False
 
 
+@dataclass(frozen=True)
+class _Fit:
+    left: float
+    """RMS, as a share of the motion."""
+    theta: Array
+    """Of `_NAMES`."""
+    law: _Law
+
+
 def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> Probe:
     """Name the drive law and the parameters that act at one joint.
 
@@ -142,7 +156,7 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
     bench = _Bench(simulator, robot, joint)
     share = stable = bench.stable_share()
     settable = "armature" in simulator.parameters
-    answers: list[tuple[float, Array, _Law, int, _Runs]] = []
+    answers: list[tuple[float, _Fit, float, int, _Runs]] = []
     for turn in range(3):
         try:
             whole, hold, phase = bench.latency(share)
@@ -151,35 +165,42 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
                 raise
             break  # Friction holds the joint against smaller gains.
         runs = bench.chirps(share, hold, phase)
-        best, left, law = _best(runs, whole, settable)
-        answers.append((left, best, law, hold, runs))
-        if left > _LEFT:
-            share /= 8.0  # A limit of the torque leaves motion; smaller gains stay clear of it.
-        elif share * best[0] < 0.2:
+        best, rival = _best(runs, whole, settable)
+        theta = best.theta
+        scale = _scale(runs, float(theta[5]) if settable else None, float(theta[6]))
+        unclear = best.left / rival
+        if best.left > _LEFT:
+            unclear += best.left
+            more = 1.0 / 8.0  # Of a limit of the torque smaller gains stay clear.
+        elif share * scale < 0.2:
             # Laws differ by step times gains over inertia: with so soft a joint, by nothing.
-            answers.clear()
-            share /= best[0]
+            unclear, more = 1.0, 1.0 / scale
+        elif unclear > _CLEAR and bench.stable(4.0 * share):
+            more = 4.0  # Rounding hides by how many iterations laws differ; of more gains less.
         else:
+            more = 0.0
+        answers.append((unclear, best, scale, hold, runs))
+        if not more:
             break
-    left, best, law, hold, runs = min(
-        answers or [(left, best, law, hold, runs)], key=lambda a: a[0]
-    )
-    fitted = dict(zip(_NAMES, best.tolist(), strict=True))
+        share *= more
+    _, best, scale, hold, runs = min(answers, key=lambda one: one[0])
+    left, law = best.left, best.law
+    damping, inertia, viscous, friction, delay, applied, gravity = best.theta.tolist()
     found = Probe(
         joint=joint,
         law=law.drive,
         beside_explicit=law.beside,
-        stiffness_factor=fitted["stiffness"],
-        damping_factor=fitted["damping"],
-        armature=fitted["armature"],
+        stiffness_factor=scale,
+        damping_factor=scale * damping,
+        armature=scale * inertia - runs.inertia,
         armature_set=one.drive.armature,
-        armature_applied=fitted["applied"] if "armature" in simulator.parameters else None,
-        viscous_damping=fitted["viscous"],
-        frictionloss=fitted["friction"],
+        armature_applied=scale * applied if settable else None,
+        viscous_damping=scale * viscous,
+        frictionloss=scale * friction,
         frictionloss_set=one.drive.frictionloss,
         soft_friction=law.soft,
-        gravity=fitted["gravity"],
-        delay_s=fitted["delay"] * runs.timestep,
+        gravity=scale * gravity,
+        delay_s=delay * runs.timestep,
         hold=hold,
         stable_share=stable,
         left=left,
@@ -231,20 +252,24 @@ class _Bench:
         phase = 2.0 * np.pi * (low + (high - low) * time / (2.0 * time[-1])) * time
         return np.concatenate([np.zeros(_REST), self.amplitude * (np.sin(phase) + 0.3)])
 
+    def stable(self, share: float) -> bool:
+        """Whether the joint stays near with a share of the gains; PronkError if it stays still."""
+        position = self.run(self.chirp()[None], **self.gains(np.array([share])))[0]
+        motion = position - position[0]
+        if not (np.isfinite(motion).all() and np.abs(motion).max() < 12.0 * self.amplitude):
+            return False
+        if np.ptp(motion) < 1e-3 * self.amplitude:
+            raise PronkError(
+                f"{self.joint.name} does not move when it is commanded by {self.amplitude:.2g} "
+                "rad; check the order of the simulator's joints."
+            )
+        return True
+
     def stable_share(self) -> float:
         """The largest share of the gains, a power of 1/2, with which the joint stays near."""
-        command = self.chirp()
         for halvings in range(_HALVINGS + 1):
-            share = 0.5**halvings
-            position = self.run(command[None], **self.gains(np.array([share])))[0]
-            motion = position - position[0]
-            if np.isfinite(motion).all() and np.abs(motion).max() < 12.0 * self.amplitude:
-                if np.ptp(motion) < 1e-3 * self.amplitude:
-                    raise PronkError(
-                        f"{self.joint.name} does not move when it is commanded by "
-                        f"{self.amplitude:.2g} rad; check the order of the simulator's joints."
-                    )
-                return share
+            if self.stable(0.5**halvings):
+                return float(0.5**halvings)
         raise PronkError(
             f"{self.joint.name} diverges even with 1/{2**_HALVINGS} of {self.joint.stiffness:g} "
             f"N m/rad and {self.joint.damping:g} N m s/rad; check the units and the timestep."
@@ -310,12 +335,11 @@ class _Bench:
 
 
 def _simulated(runs: _Runs, law: _Law, theta: Array) -> Array:
-    """Positions with sets of parameters, shape (P, 8): (P, T, R); see `pronk.actuator.law`."""
-    stiff, damp, armature, viscous, friction, delay, applied, weight = theta.T[:, :, None]
-    kp, kd = stiff * runs.stiffness, damp * runs.damping
-    inertia = np.maximum(
-        runs.inertia + armature + applied * runs.armature_change, 0.05 * runs.inertia
-    )
+    """Positions with sets of parameters, shape (P, 7): (P, T, R); see `pronk.actuator.law`."""
+    damp, inertia, viscous, friction, delay, applied, weight = theta.T[:, :, None]
+    kd = damp * runs.damping
+    kp = np.broadcast_to(runs.stiffness, kd.shape)
+    inertia = np.maximum(inertia + applied * runs.armature_change, 1e-3 * runs.inertia)
     command = np.tile(runs.command, (len(theta), 1, 1))
     command = delayed(command, np.broadcast_to(delay, kp.shape)).transpose(1, 0, 2)
     q = np.broadcast_to(runs.position[0], kp.shape).copy()
@@ -345,19 +369,13 @@ def _simulated(runs: _Runs, law: _Law, theta: Array) -> Array:
     return out.transpose(1, 0, 2)
 
 
-def _fit(
-    runs: _Runs, law: _Law, start: Array, fixed: frozenset[str], rounds: int
-) -> tuple[Array, float]:
-    """Parameters of least squares and the RMS [rad] (Levenberg and Marquardt)."""
+def _fit(runs: _Runs, law: _Law, start: Array, fixed: frozenset[str], rounds: int) -> _Fit:
+    """Parameters of least squares (Levenberg and Marquardt)."""
     free = [i for i, name in enumerate(_NAMES) if name not in fixed]
-    torque = float(runs.stiffness.max()) * AMPLITUDE * start[0]
-    size = np.array(
-        [start[0], start[1], runs.inertia, runs.damping.max(), 0.1 * torque, *np.ones(3)]
-    )
-    size[2] += abs(start[2])
-    size[3] *= start[1]
-    low = np.array([0.0, 0.0, -0.9 * runs.inertia, -np.inf, 0.0, -1.0, -0.5, -0.5])
-    high = np.array([np.inf] * 5 + [start[5] + 2.0, 2.0, 2.0])
+    torque = float(runs.stiffness.max()) * AMPLITUDE
+    size = np.array([start[0], start[1], runs.damping.max(), 0.1 * torque, *np.ones(3)])
+    low = np.array([0.0, 1e-3 * runs.inertia, -np.inf, 0.0, -1.0, -np.inf, -np.inf])
+    high = np.array([np.inf] * 4 + [start[4] + 2.0, np.inf, np.inf])
     theta, trust = start, 1e-3
     with np.errstate(all="ignore"):
         off = _simulated(runs, law, theta[None])[0] - runs.position
@@ -390,76 +408,85 @@ def _fit(
             theta, off, cost, trust = trials[k], after[k], float(costs[k]), max(trusts[k], 1e-12)
             if gained < 1e-4:
                 break
-    return theta, float(np.sqrt(cost)) if np.isfinite(cost) else np.inf
-
-
-def _best(runs: _Runs, whole: int, settable: bool) -> tuple[Array, float, _Law]:
-    """Parameters, what they leave as a share of the motion, and the law."""
-    fixed = frozenset[str]() if settable else frozenset({"applied", "gravity"})
     motion = float(np.std(runs.position - runs.position[0]))
+    return _Fit(float(np.sqrt(cost)) / motion if np.isfinite(cost) else np.inf, theta, law)
+
+
+def _best(runs: _Runs, whole: int, settable: bool) -> tuple[_Fit, float]:
+    """The law that leaves least, and what the next one leaves."""
+    fixed = frozenset[str]() if settable else frozenset({"applied"})
     starts = np.array(
         [
-            [scale, scale, runs.inertia * armature, 0.0, 0.0, float(whole), 1.0, 1.0]
+            [1.0, runs.inertia * inertia / scale, 0.0, 0.0, whole, 1.0 / scale, 1.0 / scale]
             for scale in _SCALES
-            for armature in (0.0, 0.5, 1.0, 3.0, 10.0, 40.0)
+            for inertia in (1.0, 1.5, 2.0, 4.0, 11.0, 41.0, 150.0, 500.0)
         ]
     )
-    tried: list[tuple[float, Array, _Law]] = []
+    tried: list[_Fit] = []
     friction: Array | None = None
 
-    def screen(law: _Law, start: Array | None, rounds: int) -> tuple[float, Array, _Law]:
+    def screen(law: _Law, start: Array | None, rounds: int) -> _Fit:
         if start is None:
             with np.errstate(all="ignore"):
                 off = _simulated(runs, law, starts) - runs.position
                 square = np.nan_to_num(np.mean(off**2, axis=(1, 2)), nan=np.inf)
             start = starts[square.argmin()]
-        theta, rms = _fit(runs, law, start, fixed | {"gravity"}, rounds)
-        tried.append((rms, theta, law))
+        tried.append(_fit(runs, law, start, fixed, rounds))
         return tried[-1]
 
+    def least() -> _Fit:
+        return min(tried, key=lambda one: one.left)
+
     for soft in (False, True):
-        if soft and (friction is None or min(tried, key=lambda one: one[0])[0] < 1e-5 * motion):
+        if soft and (friction is None or least().left < 1e-5):
             break
         screen(_Law(DriveLaw(), soft=soft), friction, 10)
         for beside in (False, True):
             screen(_Law(DriveLaw(kind="implicit_damping"), beside, soft), friction, 10)
-            near: tuple[float, Array, _Law] | None = None
+            near: _Fit | None = None
             worse = 0
             for n in _ITERATIONS:
                 law = _Law(DriveLaw(kind="implicit", iterations=n), beside, soft)
                 before = near
-                near = screen(law, near[1] if near else friction, 5 if near else 10)
+                near = screen(law, near.theta if near else friction, 5 if near else 10)
                 # What is left has one minimum over the iterations.
-                worse = worse + 1 if before and near[0] > before[0] else 0
-                least = min(one[0] for one in tried)
-                if worse == 2 or (n >= 4 and near[0] > _FAR * least):
+                worse = worse + 1 if before and near.left > before.left else 0
+                if worse == 2 or (n >= 4 and near.left > _FAR * least().left):
                     break
         # Whether friction is soft shows where there is some.
-        _, theta, _ = min(tried, key=lambda one: one[0])
-        friction = theta if theta[4] > 0.002 * float(runs.stiffness.max()) * AMPLITUDE else None
-    tried.sort(key=lambda one: one[0])
-    final = []
-    for _, begin, law in tried[:3]:
-        free, rms = _fit(runs, law, begin, fixed | {"gravity"}, _ROUNDS)
-        scaled = []
-        for scale in _SCALES:
-            start = free.copy()
-            start[:2] = scale
-            ratio = scale / free[0] if free[0] else 1.0
-            start[2] = (runs.inertia + free[2]) * ratio - runs.inertia
-            start[3:5] *= ratio
-            scaled.append(_fit(runs, law, start, fixed | {"stiffness", "damping"}, _ROUNDS))
-        least = min(rms for _, rms in scaled)
-        # Gains, inertia and gravity of any common scale move alike: the plainest is taken.
-        alike = [one for one in scaled if one[1] <= 3.0 * least + 1e-6 * motion]
-        usual, least = min(alike, key=lambda one: float(np.abs(one[0][-2:] - 1.0).sum()))
-        # A factor without a usual cause must explain more.
-        plain = rms >= least / 3.0 - 1e-6 * motion
-        final.append((least, usual, law) if plain else (rms, free, law))
-        if rms < 1e-6 * motion or tried[len(final)][0] > _FAR * final[0][0]:
+        theta = least().theta
+        friction = theta if theta[3] > 0.002 * float(runs.stiffness.max()) * AMPLITUDE else None
+    tried.sort(key=lambda one: one.left)
+    final: list[_Fit] = []
+    for begin in tried[:3]:
+        if final and begin.left > _FAR * final[0].left:
             break
-    rms, theta, law = min(final, key=lambda one: one[0])
-    return theta, rms / motion, law
+        free = _fit(runs, begin.law, begin.theta, fixed, _ROUNDS)
+        plain = np.array([1.0, *free.theta[1:]])
+        usual = _fit(runs, begin.law, plain, fixed | {"damping"}, _ROUNDS)
+        # A factor on one of the gains must explain more than none.
+        final.append(usual if free.left >= usual.left / 3.0 - 1e-6 else free)
+        if free.left < 1e-6:
+            break
+    final.sort(key=lambda one: one.left)
+    return final[0], final[1].left if len(final) > 1 else np.inf
+
+
+def _scale(runs: _Runs, applied: float | None, gravity: float) -> float:
+    """The factor on both gains: the one with which the armature and gravity act as they are set.
+
+    A factor with a usual cause is taken unless another one explains both.
+    """
+    shares = [] if applied is None else [applied]
+    if math.hypot(*runs.gravity) > _GRAVITY * runs.stiffness.max():
+        shares.append(gravity)
+    others = [1.0 / share for share in shares if share > 0.0]
+
+    def off(scale: float) -> float:
+        return float(sum(min(abs(scale * share - 1.0), 1.0) for share in shares))
+
+    best = min(_SCALES, key=off)
+    return min([best, *others], key=lambda one: off(one) + (0.1 if one != best else 0.0))
 
 
 def _wrong(found: Probe, simulator: Simulator, runs: _Runs) -> Iterator[tuple[str, str]]:
@@ -505,7 +532,10 @@ def _wrong(found: Probe, simulator: Simulator, runs: _Runs) -> Iterator[tuple[st
                 f"dry friction of {found.frictionloss:.3g} N m acts, "
                 f"{found.frictionloss_set:.3g} is set",
             )
-    if abs(found.gravity - 1.0) > 0.1 and math.hypot(*runs.gravity) > 0.005 * runs.stiffness.max():
+    if (
+        abs(found.gravity - 1.0) > 0.1
+        and math.hypot(*runs.gravity) > _GRAVITY * runs.stiffness.max()
+    ):
         yield "gravity", f"{max(found.gravity, 0.0):.2f} of the gravity acts that the model has"
     if found.hold > 1:
         yield "hold", f"the simulator holds each command for {found.hold} steps"
