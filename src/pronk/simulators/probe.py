@@ -53,7 +53,7 @@ _CLEAR = 0.7
 """Of what the next law leaves, the best one leaves less."""
 _LEFT = 0.01
 """Share of the motion that a right answer leaves at most."""
-_GRAVITY = 0.005
+_GRAVITY = 0.002
 """Torque of gravity over stiffness [rad] from which on it shows."""
 _NAMES = ("damping", "inertia", "viscous", "friction", "delay", "applied", "gravity")
 """Fitted, as gains, inertia, friction and gravity of any common factor move alike, to a stiffness
@@ -154,16 +154,18 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
             f"the simulator has no joint {joint!r}; its joints are {', '.join(simulator.joints)}."
         )
     bench = _Bench(simulator, robot, joint)
-    share = stable = bench.stable_share()
+    stable = bench.stable_share()
     settable = "armature" in simulator.parameters
     answers: list[tuple[float, _Fit, float, int, _Runs]] = []
-    for turn in range(3):
+    shares = [stable]
+    while shares:
+        share = shares.pop(0)
         try:
             whole, hold, phase = bench.latency(share)
         except PronkError:
-            if turn == 0:
-                raise
-            break  # Friction holds the joint against smaller gains.
+            if answers:
+                break  # Friction holds the joint against smaller gains.
+            raise
         runs = bench.chirps(share, hold, phase)
         best, rival = _best(runs, whole, settable)
         theta = best.theta
@@ -171,18 +173,20 @@ def probe(simulator: Simulator, robot: RobotSpec, joint: str | None = None) -> P
         unclear = best.left / rival
         if best.left > _LEFT:
             unclear += best.left
-            more = 1.0 / 8.0  # Of a limit of the torque smaller gains stay clear.
+            if not answers:
+                # Gravity moves a joint far whose gains act per degree; of a limit of the torque
+                # smaller gains stay clear.
+                more = _SCALES[2] * share
+                shares = [more] * bench.stable(more) + [share / 8.0, share / 64.0]
         elif share * scale < 0.2:
             # Laws differ by step times gains over inertia: with so soft a joint, by nothing.
-            unclear, more = 1.0, 1.0 / scale
-        elif unclear > _CLEAR and bench.stable(4.0 * share):
-            more = 4.0  # Rounding hides by how many iterations laws differ; of more gains less.
+            unclear, shares = 1.0, [share / scale]
+        elif unclear > _CLEAR and share <= stable and bench.stable(4.0 * share):
+            # Rounding hides by how many iterations laws differ; of larger gains less.
+            shares = [4.0 * share]
         else:
-            more = 0.0
+            shares = []
         answers.append((unclear, best, scale, hold, runs))
-        if not more:
-            break
-        share *= more
     _, best, scale, hold, runs = min(answers, key=lambda one: one[0])
     left, law = best.left, best.law
     damping, inertia, viscous, friction, delay, applied, gravity = best.theta.tolist()
@@ -419,7 +423,7 @@ def _best(runs: _Runs, whole: int, settable: bool) -> tuple[_Fit, float]:
         [
             [1.0, runs.inertia * inertia / scale, 0.0, 0.0, whole, 1.0 / scale, 1.0 / scale]
             for scale in _SCALES
-            for inertia in (1.0, 1.5, 2.0, 4.0, 11.0, 41.0, 150.0, 500.0)
+            for inertia in np.geomspace(1.0, 500.0, 18)
         ]
     )
     tried: list[_Fit] = []
@@ -480,10 +484,11 @@ def _scale(runs: _Runs, applied: float | None, gravity: float) -> float:
     shares = [] if applied is None else [applied]
     if math.hypot(*runs.gravity) > _GRAVITY * runs.stiffness.max():
         shares.append(gravity)
-    others = [1.0 / share for share in shares if share > 0.0]
+    others = [1.0 / share for share in shares if share > 0.01]
 
     def off(scale: float) -> float:
-        return float(sum(min(abs(scale * share - 1.0), 1.0) for share in shares))
+        wrong = sum(min(abs(scale * share - 1.0), 1.0) for share in shares)
+        return float(wrong + 1e-3 * abs(math.log(scale)))
 
     best = min(_SCALES, key=off)
     return min([best, *others], key=lambda one: off(one) + (0.1 if one != best else 0.0))
