@@ -379,11 +379,6 @@ def _one(kind: _Kind, path: Path, right: Any) -> tuple[str, str]:
     try:
         found = kind.read(path)
     except PronkError as error:
-        each: BaseException | None = error
-        while each is not None:
-            if isinstance(each, MemoryError):
-                return "fault", f"takes too much memory: {error}"
-            each = each.__cause__ or each.__context__
         return "refused" if str(error).isprintable() else "fault", str(error)
     except (Exception, _OutsideError) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]

@@ -233,7 +233,7 @@ def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> 
         reader.start()
         begun = time.monotonic()
         if program == "deploy":
-            ready.wait(60.0)
+            ready.wait(120.0)
             _below(process.pid, known)
             if not ready.is_set():
                 process.terminate()

@@ -62,6 +62,6 @@ def in_processes(
         except BrokenProcessPool:
             raise PronkError(
                 "one of the processes was killed, most likely for want of memory; "
-                "try again with --processes 1, or with fewer files at a time."
+                "give fewer files, joints or processes at a time."
             ) from None
     return done
