@@ -38,16 +38,6 @@ def _uniform(env: Any, span: Range, *shape: int) -> Tensor:
     return torch.empty(shape, device=env.device).uniform_(*span)
 
 
-@requires_model_fields("geom_friction")  # type: ignore[untyped-decorator]
-def randomize_friction(env: Any, env_ids: None, span: Range, feet: SceneEntityCfg) -> None:
-    """Draw one sliding friction for all feet of a robot (D2); torsion and rolling stay.
-
-    The feet have priority over the floor, so theirs is the friction of the contact.
-    """
-    ids = env.scene["robot"].indexing.geom_ids[feet.geom_ids]
-    env.sim.model.geom_friction[:, ids, 0] = _uniform(env, span, env.num_envs, 1)
-
-
 def randomize_gains(
     env: Any, env_ids: None, ranges: Mapping[str, GroupGains], shape: Shape
 ) -> None:

@@ -24,24 +24,14 @@ from mjlab.tasks.registry import register_mjlab_task
 from pronk.errors import PronkError
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
-from pronk.train.gains import NAIVE, TrainingGains, training_gains
+from pronk.train.gains import NAIVE, training_gains
 from pronk.train.phases import TASKS
 from pronk.train.rl.runner import PronkRunner
 from pronk.train.tasks.jump_env_cfg import jump_env_cfg, play_cfg
 from pronk.train.tasks.jump_rl_cfg import jump_rl_cfg
 
-
-def mini_cheetah(robot: RobotSpec, gains: TrainingGains, **options: Any) -> ManagerBasedRlEnvCfg:
-    """The shared environment with the paper's randomization; options are those of it."""
-    cfg = jump_env_cfg(robot, gains, **options)
-    cfg.events["shank_length"].params["span"] = (0.18, 0.20)  # D5 [m]
-    cfg.events["base_mass"].params["added"] = (-0.4, 1.6)  # D6 [kg]
-    cfg.events["battery"].params["voltage"] = (22.2, 25.2)  # six cells, 3.7 to 4.2 V
-    return cfg
-
-
-ROBOTS = {"mini_cheetah": mini_cheetah}
-"""Robots of this package with a task, and their environments."""
+ROBOTS = ("mini_cheetah",)
+"""Robots of this package with a task."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +47,7 @@ def load_task(robot: str) -> Task:
     """The task of a robot, by name or path; a PronkError says which robots have one."""
     spec = load_robot(robot)
     if spec.source in ROBOTS:
-        return Task(robot=spec, env_cfg=ROBOTS[spec.source], rl_cfg=jump_rl_cfg)
+        return Task(robot=spec, env_cfg=jump_env_cfg, rl_cfg=jump_rl_cfg)
     folder = Path(spec.source).parent
     path, own = folder / "env_cfgs.py", folder / "rl_cfg.py"
     if not path.is_file():

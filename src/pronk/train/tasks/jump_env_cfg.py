@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.envs.mdp import push_by_setting_velocity
+from mjlab.envs.mdp import dr, push_by_setting_velocity
 from mjlab.managers import (
     CurriculumTermCfg,
     EventTermCfg,
@@ -254,9 +254,10 @@ def _events(
             mode="reset",
             params={"place": 0.5, "speed": 0.3, "heading": math.pi, "joints": 0.1},
         ),
-        "friction": once(events.randomize_friction, span=(0.05, 3.0), feet=feet),  # D2
+        # D2, one for all feet, which have priority over the floor.
+        "friction": once(dr.geom_friction, ranges=(0.05, 3.0), shared_random=True, asset_cfg=feet),
         "gains": once(events.randomize_gains, ranges=ranges, shape=gain_shape),  # D3, D4
-        # D5 and D6 of the Mini Cheetah, in proportion.
+        # D5, .18 to .20 m, and D6, -.4 to 1.6 kg, of the Mini Cheetah, in proportion.
         "shank_length": once(
             events.randomize_shank_length,
             span=(0.18 / 0.195 * body.shank_length, 0.20 / 0.195 * body.shank_length),
