@@ -150,7 +150,7 @@ def test_a_walking_policy_stands(tmp_path: Path) -> None:
     assert slow.figures["speed_error"].mean == pytest.approx(0.1, abs=0.01)
     assert stand.figures["lasted"].mean == pytest.approx(2.4)
     reloaded(found, tmp_path)
-    path = tmp_path / walk.WALK.table
-    path.write_text(path.read_text().replace("speed_error_m", "error_m"))
+    path = tmp_path / walk.WALK.summary
+    path.write_text(path.read_text().replace('"rows"', '"lines"'))
     with pytest.raises(ArtefactError, match="--walk"):
         results.load(tmp_path, walk.WALK)

@@ -193,9 +193,8 @@ def test_missing_captures_are_counted(tmp_path: Path) -> None:
     ("name", "bytes_kept"),
     [
         ("trial/summary.json", 300),
-        ("trial/trials.csv", 2000),
         *((f"trial/{name}.json", 200) for name in ("walk", "crossing", "variation", "bodies")),
-        ("trial/bodies/body_2/trial/trials.csv", 2000),
+        ("trial/bodies/body_2/trial/summary.json", 2000),
         ("trial/captures/naive_forward_1_001.npz", 500),
         ("trial/videos/matched_forward_2.gif", 5),
         ("match.npz", 100),

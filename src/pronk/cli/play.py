@@ -72,9 +72,9 @@ def play(
                 "sets down anew)"
             )
         played = run(machine, loaded, params, joystick, page, seed=seed)
-    factor = played.simulated_s / max(played.wall_s, 1e-9)
+    simulated, wall = played["simulated_s"], played["wall_s"]
     console.say(
-        f"{played.simulated_s:.0f} s of the virtual robot in {played.wall_s:.0f} s "
-        f"({factor:.2f} x real time), {len(played.hops)} jumps"
+        f"{simulated:.0f} s of the virtual robot in {wall:.0f} s "
+        f"({simulated / max(wall, 1e-9):.2f} x real time), {len(played['hops'])} jumps"
     )
-    return console.Outcome(figures=vars(played))
+    return console.Outcome(figures=played)

@@ -192,7 +192,7 @@ class CrossingFigures:
 CROSSING = Kind(
     table="crossing.csv",
     summary="crossing.json",
-    schema="pronk/trial-crossing/3",
+    schema="pronk/trial-crossing/4",
     writer="pronk trial POLICY --crossing",
     figures=CrossingFigures,
 )

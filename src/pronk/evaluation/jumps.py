@@ -109,13 +109,11 @@ def cosine_of_tilt(orientation: Array) -> Array:
 def along(vector: Array, orientation: Array, command: Sequence[float]) -> Array:
     """Parts of horizontal vectors (..., 2 or more) along the commanded direction. (...,).
 
-    `vector` is in the world, `orientation` the trunk's, `command` a velocity in the trunk's frame;
-    NaN for one without a horizontal part.
+    `vector` is in the world, `orientation` the trunk's, `command` a velocity in the trunk's frame.
     """
-    forward, left = command[:2]
-    direction = heading(orientation) + math.atan2(left, forward)
+    direction = heading(orientation) + math.atan2(command[1], command[0])
     part: Array = vector[..., 0] * np.cos(direction) + vector[..., 1] * np.sin(direction)
-    return part if math.hypot(forward, left) else np.full_like(part, np.nan)
+    return part
 
 
 def steps(capture: Capture, seconds: float) -> int:
@@ -415,14 +413,13 @@ def _flight(
     apex = float(z[up:down].max())
     low = capture.foot_position[up:down, :, 2].min(axis=1) - foot_radius
     quarter = len(low) // 4
-    return {
+    figures = {
         "apex_gain": apex - rules.standing_height,
         "rise": float(apex - z[up]),
         "ballistic": vertical**2 / (2.0 * GRAVITY),
         "clearance": float(low.max()),
         "clearance_half": float(low[quarter : len(low) - quarter].min()),
         "distance": float(np.hypot(*displacement)),
-        "along": float(along(displacement, capture.orientation[up], script.command)),
         "distance_minima": float(np.hypot(*(plane[after] - plane[before]))),
         "gap": _gap(capture, main),
         "lift_off_velocity": vertical,
@@ -430,6 +427,9 @@ def _flight(
         "delay": (up - on) * capture.dt,
         "duration": main.samples * capture.dt,
     }
+    if any(script.command[:2]):
+        figures["along"] = float(along(displacement, capture.orientation[up], script.command))
+    return figures
 
 
 def _rates(capture: Capture, start: int, on: int) -> dict[str, float]:
@@ -452,8 +452,10 @@ def _run(capture: Capture, script: Script, start: int, on: int, *, mass: float) 
     travelled = float(np.hypot(*(capture.position[on, :2] - capture.position[start, :2])))
     work = float(capture.electrical_power[start:on].sum() * capture.dt)
     figures = {"cost_of_transport": work / (mass * GRAVITY * travelled)} if travelled else {}
-    speed = along(capture.velocity[start:on], capture.orientation[start:on], script.command)
-    return figures | {"speed": float(speed.mean())}
+    if any(script.command[:2]):
+        speed = along(capture.velocity[start:on], capture.orientation[start:on], script.command)
+        figures["speed"] = float(speed.mean())
+    return figures
 
 
 def _loads(capture: Capture, robot: RobotSpec, on: int, end: int) -> dict[str, tuple[float, ...]]:

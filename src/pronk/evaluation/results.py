@@ -1,8 +1,8 @@
-"""The results of a trial: one row a run in a CSV file, and a JSON file with what was run and sums.
+"""The results of a trial: a JSON file with what was run, every run and sums, and a CSV table.
 
 Jumps, walks, varied robots and crossings share one container, one table and one codec; a `Kind` has
-what differs. Unknown numbers are NaN, in CSV an empty cell, in JSON null. Sums are computed from
-the rows; those in the JSON file are for its readers.
+what differs. Unknown numbers are NaN, in CSV an empty cell, in JSON null. pronk reads the runs in
+the JSON file; its sums, and the table with one row a run, are for other readers.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Kind:
 JUMPS = Kind(
     table="trials.csv",
     summary="summary.json",
-    schema="pronk/trial/3",
+    schema="pronk/trial/4",
     writer="pronk trial POLICY --out FOLDER",
     figures=JumpFigures,
     compared=(
@@ -331,58 +331,30 @@ def ratio_of_scatter(
 # ---- files ----
 
 
-def _columns(kind: Kind, joint_names: Sequence[str]) -> Iterator[tuple[str, str, int | None]]:
-    """Column, field of the figures, and index of the joint, flags first."""
-    known = figures_of(kind.figures)
-    for name in (entry.name for entry in fields(kind.figures)):
-        column = known[name].column if name in known else name
-        if name in known and known[name].joints:
-            unit = column.removeprefix(name)
-            yield from ((f"{name}_{joint}{unit}", name, i) for i, joint in enumerate(joint_names))
-        else:
-            yield column, name, None
-
-
 def to_csv(results: Results) -> str:
     """One row a run; unknown figures are empty, flags 1 and 0, numbers exact."""
-    columns = list(_columns(results.kind, results.joint_names))
-    varied, table = any(row.parameter for row in results.rows), []
+    figures, table = figures_of(results.kind.figures), []
+    varied = any(row.parameter for row in results.rows)
     for row in results.rows:
         cells: dict[str, Any] = {"policy": row.policy, "command": row.case}
         cells |= {"parameter": row.parameter, "value": row.value} if varied else {}
         cells |= {"number": row.number, "seed": row.seed, "capture": row.capture}
         cells |= {"success": row.figures.success, "run_s": row.script.run_s, "began_s": row.began}
-        for column, name, joint in columns:
-            value = getattr(row.figures, name)
-            cells[column] = value if joint is None else value[joint] if value else math.nan
+        for name, value in vars(row.figures).items():
+            column = figures[name].column if name in figures else name
+            if name in figures and figures[name].joints:
+                unit = column.removeprefix(name)
+                values = value or [math.nan] * len(results.joint_names)
+                columns = [f"{name}_{joint}{unit}" for joint in results.joint_names]
+                cells |= dict(zip(columns, values, strict=True))
+            else:
+                cells[column] = value
         table.append({k: int(v) if isinstance(v, bool) else v for k, v in cells.items()})
     text = io.StringIO()
     writer = csv.DictWriter(text, list(table[0]) if table else [], lineterminator="\n")
     writer.writeheader()
     writer.writerows({k: "" if v != v else v for k, v in cells.items()} for cells in table)
     return text.getvalue()
-
-
-def _row(entry: Mapping[str, str], head: Results) -> Row:
-    figures: dict[str, Any] = {}
-    for column, name, joint in _columns(head.kind, head.joint_names):
-        if (text := entry[column]) is None:
-            raise ValueError("the line is cut off")
-        if text:
-            figures[name] = text if joint is None else (*figures.get(name, ()), text)
-    command = {case.name: case.command for case in head.cases}[entry["command"]]
-    return Row(
-        policy=entry["policy"],
-        case=entry["command"],
-        number=int(entry["number"]),
-        seed=int(entry["seed"]),
-        figures=msgspec.convert(figures, head.kind.figures, strict=False),
-        script=replace(head.script, command=command, run_s=float(entry["run_s"])),
-        capture=entry["capture"],
-        began=float(entry["began_s"]),
-        parameter=entry.get("parameter", ""),
-        value=float(entry.get("value") or "nan"),
-    )
 
 
 def save_json(path: Path, schema: str, body: Mapping[str, Any]) -> Path:
@@ -422,39 +394,30 @@ def save(folder: Path, results: Results) -> tuple[Path, Path]:
     kind = results.kind
     table = folder / kind.table
     write_text(table, to_csv(results))
-    head = {name: value for name, value in vars(results).items() if name in _HEAD}
+    head = {name: getattr(results, name) for name in _STORED}
     sums = {"cells": results.cells, "ratios": results.ratios}
     body = {**head, "definitions": figures_of(kind.figures), **sums}
     return table, save_json(folder / kind.summary, kind.schema, body)
 
 
-_HEAD = {entry.name for entry in fields(Results)} - {"kind", "rows"}
+_STORED = [entry.name for entry in fields(Results) if entry.name != "kind"]
 
 
 def load(folder: Path, kind: Kind = JUMPS) -> Results:
-    """Read what `save` wrote."""
+    """Read the summary that `save` wrote; the table is for other readers."""
     with load_json(folder / kind.summary, kind.schema, kind.writer) as body:
-        stored = {name: body[name] for name in _HEAD}
-        head = replace(msgspec.convert(stored, Results), kind=kind)
+        stored = {name: body[name] for name in _STORED}
+        stored["rows"] = [
+            _known(row) | {"figures": msgspec.convert(_known(row["figures"]), kind.figures)}
+            for row in stored["rows"]
+        ]
+        results = replace(msgspec.convert(stored, Results), kind=kind)
         counts = [(cell["policy"], cell["case"], cell["n"]) for cell in body["cells"]]
-    path, rows = folder / kind.table, []
-    try:
-        for entry in csv.DictReader(io.StringIO(path.read_text("utf-8"))):
-            rows.append(_row(entry, head))
-        results = replace(head, rows=tuple(rows))
-        found = [(cell.policy, cell.case, cell.n) for cell in results.cells]
-    except OSError as error:
-        raise ArtefactError(
-            f"{path}: cannot be read ({error.strerror}); `{kind.writer}` writes it."
-        ) from None
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise ArtefactError(
-            f"{path}: cannot be read after line {len(rows) + 1} ({type(error).__name__}: {error}); "
-            f"`{kind.writer}` writes it anew."
-        ) from None
-    if counts != found:
-        raise ArtefactError(
-            f"{path}: {len(rows)} runs do not fit the counts of {kind.summary}; run the trial "
-            "again."
-        )
-    return results
+        if counts != [(cell.policy, cell.case, cell.n) for cell in results.cells]:
+            raise ValueError("runs and sums do not fit together")
+        return results
+
+
+def _known(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out what is null: the default, NaN, means unknown as well."""
+    return {name: value for name, value in entry.items() if value is not None}

@@ -29,12 +29,8 @@ class Sheet:
 def table(columns: str, rows: Iterable[Sequence[Any]], *notes: str, title: str = "") -> Sheet:
     """Return a table; without a row it is left out of the page.
 
-    Args:
-        columns: Headers with ` | ` between them; `;2` behind one sets the digits of its numbers,
-            3 without it.
-        rows: Cells: text, numbers, and intervals as pairs of numbers; `held` for an empty one.
-        notes: Below the table.
-        title: Above it.
+    Headers in `columns` have ` | ` between them; `;2` behind one sets the digits of its numbers, 3
+    without it. Cells are text, numbers, and intervals as pairs of numbers; `held` for an empty one.
     """
     heads = [head.partition(";") for head in columns.split(" | ")]
     cells = tuple(

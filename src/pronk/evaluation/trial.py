@@ -6,7 +6,7 @@ Each jump has a new virtual robot with its own heading, joint offsets and noise,
 that rises up to `spread_s` later, so that it meets every phase of the gait. All of it is drawn from
 seed, command and number of the jump alone. Walks, crossings and varied robots run the same way.
 
-    trials.csv, summary.json    one row a jump; what was run, and the sums
+    summary.json, trials.csv    what was run, every jump and the sums; a table of the jumps
     captures/, videos/          recorded runs, and films of them
 """
 

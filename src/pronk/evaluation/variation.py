@@ -22,7 +22,7 @@ from pronk.virtual.sim_params import SimParams, with_changes
 VARIATION = Kind(
     table="variation.csv",
     summary="variation.json",
-    schema="pronk/trial-variation/3",
+    schema="pronk/trial-variation/4",
     writer="pronk trial POLICY --variation",
     figures=JumpFigures,
 )

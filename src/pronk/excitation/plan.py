@@ -160,25 +160,13 @@ def make_plan(
 ) -> SweepPlan:
     """Plan a sweep, and forecast its effect on the robot; call its `check` before anything moves.
 
-    One joint at a time (paper F1), in the order of the robot's files; each amplitude `repeats`
-    times. Joints that the robot's file clamps for an excitation are clamped (paper F6), the others
-    are held by their drives (paper F5).
+    One joint at a time (paper F1), in the order given, all in the robot's order if None. Joints
+    that the robot's file clamps for an excitation are clamped (paper F6), the others are held by
+    their drives (paper F5), with gains by joint instead of the robot's [N m/rad], [N m s/rad].
 
-    Args:
-        robot: The robot.
-        joints: Names; all of them if None.
-        signal: The excitation signal; its own amplitude is replaced. The paper's chirp if None.
-        amplitudes: Peaks of the command [rad]; two or more show friction.
-        repeats: Repeats of each amplitude, one number for all or one each; intervals need three
-            or more of the largest, which is the one matched.
-        settle_s: Rest after each excitation [s].
-        stiffness: Gains on the drives by joint, instead of the robot's [N m/rad].
-        damping: Gains on the drives by joint, instead of the robot's [N m s/rad].
-        uncertainty: How far the robot may be from its model.
-
-    Raises:
-        RobotError: A joint is unknown.
-        PlanError: The plan is empty.
+    The `signal`, the paper's chirp if None, has each of `amplitudes` [rad] as its peak, `repeats`
+    times: one number for all or one each. Two amplitudes show friction; intervals need three
+    repeats of the largest, which is the one matched. Each excitation ends with a rest.
     """
     names = robot.joint_names if joints is None else tuple(dict.fromkeys(joints))
     for name in (*names, *(stiffness or {}), *(damping or {})):

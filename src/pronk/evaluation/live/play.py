@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from threading import Lock
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -177,16 +177,6 @@ class _Sampled(VirtualRobot):
         return states
 
 
-@dataclass(frozen=True, kw_only=True)
-class Played:
-    """Figures of a run."""
-
-    simulated_s: float
-    wall_s: float
-    resets: int
-    hops: tuple[Hop, ...]
-
-
 def play(
     robot: RobotSpec,
     policy: Policy,
@@ -196,10 +186,11 @@ def play(
     *,
     seed: int = 0,
     until: Callable[[float], bool] = lambda simulated: False,
-) -> Played:
+) -> dict[str, Any]:
     """Run the robot in real time until Ctrl-C; a fallen one goes on until it is reset.
 
-    `until`, called with the simulated time [s], ends the run as well.
+    `until`, called with the simulated time [s], ends the run as well. Returns `simulated_s`,
+    `wall_s`, the number of `resets`, and `hops`.
     """
     gauge = Gauge(JumpRules.of(robot))
     machine = _Sampled(robot, sim_params, base="ground", seed=seed, capture_rate_hz=None)
@@ -227,4 +218,5 @@ def play(
     finally:
         machine.close()
     wall_s = time.perf_counter() - began
-    return Played(simulated_s=simulated, wall_s=wall_s, resets=resets, hops=tuple(gauge.hops))
+    hops = list(gauge.hops)
+    return {"simulated_s": simulated, "wall_s": wall_s, "resets": resets, "hops": hops}
