@@ -48,7 +48,7 @@ from pronk.runtime.run import Deployment
 from pronk.runtime.script import STILL, Velocity
 from pronk.runtime.state_machine import Timing
 from pronk.runtime.teleop import OperatorCommand
-from pronk.virtual.faults import SENSOR_FAULTS
+from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED
 from pronk.virtual.robot import VirtualRobot, hold_of
 from pronk.virtual.server import RobotServer
 from pronk.virtual.sim_params import load_sim_params
@@ -62,7 +62,6 @@ PROCESSES = {
 }
 """Process of a `Deployment`, and what it gets."""
 FAULTS = (*SENSOR_FAULTS, *PROCESSES)
-SWAPPED = "legs-swapped"
 BUSY = ("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK")
 """Reasons of a computer that is too busy."""
 BAR_S = 0.1
@@ -191,11 +190,11 @@ def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, 
     process is gone.
     """
     rows: list[tuple[str, float, str]] = []
-    if faults[0] == SWAPPED:
+    if faults[0] in SWAPPED:
         plan = replace(plan, timing=replace(TIMING, check_s=Timing().check_s))
     with Deployment(plan) as deployment:
         for fault in faults:
-            if fault == SWAPPED:
+            if fault in SWAPPED:
                 robot.send(fault)
                 begun = time.monotonic()
                 _until(deployment, 5.0, (Mode.FAULT, Mode.ENDED), OperatorRequest.STAND)
@@ -210,7 +209,7 @@ def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, 
                 name, number = PROCESSES[fault]
                 struck = getattr(deployment, name).pid
                 os.kill(struck, number)
-            if fault != SWAPPED:
+            if fault not in SWAPPED:
                 _until(deployment, 2.0, (Mode.FAULT, Mode.ENDED), command=_motion(deployment))
             _until(deployment, 0.1, ())
             if struck is not None and fault == "policy-stopped":
@@ -226,8 +225,8 @@ def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, 
                 break
             if reasons[0] in BUSY and not fault.startswith("policy"):
                 break
-            rows.append((fault, passed if fault == SWAPPED else damped, reasons[0]))
-            if fault == SWAPPED or (struck is not None and fault != "policy-stopped"):
+            rows.append((fault, passed if fault in SWAPPED else damped, reasons[0]))
+            if fault in SWAPPED or (struck is not None and fault != "policy-stopped"):
                 break
     return rows
 
@@ -379,7 +378,7 @@ def page(rows: list[Row], command: str) -> str:
             cell += f", {lost} of {len(done)} not found" if lost else ""
             cell += f", n = {len(done)}" if done else "not measured"
             cells.append(cell.removeprefix(", "))
-            late = sum(each > 1e3 * BAR_S for each in times) if fault != SWAPPED else 0
+            late = sum(each > 1e3 * BAR_S for each in times) if fault not in SWAPPED else 0
             if lost or late or not done:
                 where = f"`{fault}` ({robot}, {link})"
                 missed.append(f"{where}: {late} of {len(done)} later, {lost} not found")
@@ -396,8 +395,8 @@ ms: median (worst). All over loopback, in real time. The Mini Cheetah walks with
 For the Go2, of which no policy was trained, a linear one squats, sways and pitches on four feet, at
 the stiffness of Unitree's stand example (60 N m/rad).
 The joint of the faults of one encoder is a hip roll, which moves and is loaded least. The time of
-`{SWAPPED}` is that from the request to stand; the robot has not risen. A stopped or killed servo is
-followed by the standby process.
+swapped legs and joints is that from the request to stand; the robot has not risen. A stopped or
+killed servo is followed by the standby process.
 
 {lines}
 
@@ -409,7 +408,8 @@ followed by the standby process.
 - A constant encoder of a joint whose load does not change while no other joint moves: the robot
   stands still. It is found once the others have moved by 0.05 rad in sum.
 - An encoder at zero whose joint rests at zero, until its velocity says that it moved by 0.005 rad.
-- Swapped legs after the robot has stood up: cables are not changed then.
+- Hip roll and hip pitch of one leg swapped with each other: a knee swings before the robot rises.
+- Swapped encoders in a sweep, before their joint is excited.
 """
 
 

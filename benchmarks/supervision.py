@@ -35,7 +35,7 @@ from pronk.runtime.rollout import PolicyRunner
 from pronk.runtime.safety import Array, Decision, Limits, Reason, SafetyFilter
 from pronk.runtime.script import STILL, Velocity
 from pronk.runtime.state_machine import StateMachine, Timing
-from pronk.virtual.faults import SENSOR_FAULTS, spoiled
+from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED, spoiled
 from pronk.virtual.ground import Start
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import SimParams, load_sim_params
@@ -282,8 +282,7 @@ def quiet(policy: Path, sets: int, seed: int, number: int) -> list[Row]:
 def struck(policy: Path, seed: int, job: tuple[str, int]) -> list[Row]:
     """Time from a fault to damping [s] and the reason; NaN where it is not found in 4 s."""
     fault, k = job
-    # Swapped legs are found before the robot rises.
-    begins, number = (0.0 if fault == "legs-swapped" else 7.0 + 0.137 * k), k
+    begins, number = (0.0 if fault in SWAPPED else 7.0 + 0.137 * k), k
     while True:
         number += 1
         flight = Flight(

@@ -57,7 +57,7 @@ from pronk.runtime.state_machine import (
     stand_up,
 )
 from pronk.runtime.teleop import Gamepad, Keyboard, OperatorCommand, ScriptedOperator, TimeLimit
-from pronk.virtual.faults import spoiled
+from pronk.virtual.faults import SWAPPED, spoiled
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import load_sim_params
 
@@ -297,8 +297,8 @@ class Run:
         return self
 
 
-@pytest.mark.parametrize("swapped", [False, True])
-def test_swapped_legs_are_found_before_the_robot_rises(swapped: bool) -> None:
+@pytest.mark.parametrize("swapped", ["", *SWAPPED])
+def test_swapped_encoders_are_found_before_the_robot_rises(swapped: str) -> None:
     robot = VirtualRobot(ROBOT, load_sim_params(), base="ground", capture_rate_hz=None)
     robot.connect()
     run = Run(check_s=0.15, damp_s=0.5, fold_s=0.5)
@@ -306,7 +306,7 @@ def test_swapped_legs_are_found_before_the_robot_rises(swapped: bool) -> None:
     run.machine.request(OperatorRequest.STAND)
     while run.t < 2.5 and run.mode is not Mode.FAULT:
         state = robot.wait(run.t + 0.002)[-1]
-        seen = spoiled("legs-swapped", state, state) if swapped else state
+        seen = spoiled(swapped, state, state) if swapped else state
         command = run.tick(0.002, q=seen.position).command
         if command is None:
             robot.damp()

@@ -86,7 +86,7 @@ class Reason(IntEnum):
     ENCODER = 25, "a joint's position and velocity contradict each other or its load"
     HELD = 26, "states were too old, and the last target held, for too much of a second"
     CLIPPED = 27, "a joint's target was beyond its torque for too long; the joint may be blocked"
-    SWAPPED = 28, "another leg moved than the one that was swung; two legs' encoders are swapped"
+    SWAPPED = 28, "another joint moved than the one that was swung; their encoders are swapped"
 
 
 Array = NDArray[np.float64]

@@ -32,10 +32,11 @@ PREFLIGHT_S = 0.5
 VALID_S = 0.05
 """How long a target of the servo's own may be repeated [s]."""
 SWING = 0.15
-"""Of each leg's last joint towards the default pose, so that its encoder is known to be its own
-[rad]. In the folded pose on the ground it moves by 0.009 to 0.023, those of other legs by 0.002."""
-STRAY = 0.005
-"""Largest motion of another leg's last joint meanwhile, or twice its own [rad]."""
+"""Of each leg's last joint towards the default pose and back, to know that its encoder is its own
+[rad]. In the folded pose on the ground it moves by 0.010 to 0.020, any other by 0.47 of that at
+most, where the motions out and back are averaged: a robot that still sinks moves all of them."""
+STRAY, STRAY_SHARE = 0.005, 1.4
+"""Such a motion of another joint that is wrong: in rad, and as a share of that of the swung one."""
 FIRST_ACTION_S = 0.2
 """In which the policy must give its first action [s]."""
 
@@ -188,8 +189,8 @@ class StateMachine:
         self._last = last_joints(robot)
         self._known = timing.check_s == 0.0 or not self._last
         """Whether the encoders of the legs are known to be their own."""
-        self._swings = np.full((2, len(self._last), len(self._last)), np.nan)
-        """Least and largest position of each last joint during each leg's swing [rad]."""
+        self._swings = np.full((3, len(self._last), len(robot.joints)), np.nan)
+        """Positions before each leg's swing, at its largest, and after it [rad]."""
         self._blending: float | None = None
         self._first_entry = 0
         self._request = OperatorRequest.NONE
@@ -300,21 +301,21 @@ class StateMachine:
         self.enter(Mode.SIT, t)
 
     def _swapped(self, t: float, position: Array) -> bool:
-        """Note the position while legs swing; whether another leg than the commanded one moved."""
+        """Note the position while legs swing; whether another joint than the swung one moved."""
         assert self._path is not None
-        leg = math.floor((t - self._path.began - self.timing.fold_s) / (2.0 * self.timing.check_s))
+        half = math.floor((t - self._path.began - self.timing.fold_s) / self.timing.check_s)
+        leg, back = divmod(half, 2)
         if leg < 0:
             return False
         if leg < len(self._last):
             seen = self._swings[:, leg]
-            seen[0], seen[1] = (
-                np.fmin(seen[0], position[self._last]),
-                np.fmax(seen[1], position[self._last]),
-            )
+            seen[0] = np.where(np.isnan(seen[0]), position, seen[0])
+            seen[1 + back] = position
             return False
-        moved = self._swings[1] - self._swings[0]
-        own = np.diag(moved)[:, None]
-        wrong = (moved > np.maximum(STRAY, 2.0 * own))[~np.eye(len(own), dtype=bool)].any()
+        before, out, after = self._swings
+        moved = np.abs(out - 0.5 * (before + after))
+        own = moved[np.arange(len(moved)), self._last]
+        wrong = (moved > np.maximum(STRAY, STRAY_SHARE * own[:, None])).any()
         self._known = not wrong
         return bool(wrong)
 

@@ -70,11 +70,14 @@ def _stuck(last: State, state: State) -> dict[str, Any]:
     return {"orientation": attitude / np.linalg.norm(attitude)}
 
 
-def _swapped(_last: State, state: State) -> dict[str, Any]:
-    """The first leg's joints and the second's."""
-    order = [3, 4, 5, 0, 1, 2, *range(6, len(state.position))]
-    names = ("position", "velocity", "torque")
-    return {name: getattr(state, name)[order] for name in names}
+def _swapped(*joints: int) -> Callable[[State, State], dict[str, Any]]:
+    """The joints of these numbers, in place of those from 0 on."""
+
+    def swapped(_last: State, state: State) -> dict[str, Any]:
+        order = [*joints, *range(len(joints), len(state.position))]
+        return {name: getattr(state, name)[order] for name in ("position", "velocity", "torque")}
+
+    return swapped
 
 
 SENSOR_FAULTS: dict[str, Callable[[State, State], dict[str, Any]]] = {
@@ -97,9 +100,12 @@ SENSOR_FAULTS: dict[str, Callable[[State, State], dict[str, Any]]] = {
     "encoder-constant": lambda last, state: _encoder(
         last, state, position=last.position[_JOINT], velocity=last.velocity[_JOINT]
     ),
-    "legs-swapped": _swapped,
+    "legs-swapped": _swapped(3, 4, 5, 0, 1, 2),
+    "joints-swapped": _swapped(0, 2, 1),
 }
 """What a faulty sensor makes of a state, from the last state before the fault and this one."""
+SWAPPED = ("legs-swapped", "joints-swapped")
+"""The first two legs, and the last two joints of the first: found as the robot stands up."""
 
 
 @dataclass(frozen=True, kw_only=True)
