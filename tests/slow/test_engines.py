@@ -175,8 +175,27 @@ def test_parameters_of_each_run_are_set(engine: type[EngineSimulator]) -> None:
         sets = [{"swing": {n: v[run, 0] for n, v in values.items()}} for run in range(2)]
         expected = chain.rollout(np.stack([command[0], late]), sets)[:, :-1]
     assert np.abs(got - expected).max() < 1e-4
-    with pytest.raises(PronkError, match="frictionloss"):
-        engine(robot).rollout(command, {"frictionloss": np.zeros((2, 1))})
+    if not engine.dry:
+        with pytest.raises(PronkError, match="frictionloss"):
+            engine(robot).rollout(command, {"frictionloss": np.zeros((2, 1))})
+
+
+@engines
+def test_dry_friction_is_a_torque_where_the_engine_has_it(
+    engine: type[EngineSimulator], law: DriveLaw
+) -> None:
+    if law.kind not in engine.dry:
+        pytest.skip("no dry friction in N m")
+    wave = chirp(0.005, seconds=8.0)
+    free, dry = (prepared(PENDULUM, law, **LINEAR, frictionloss=f) for f in (0.0, 0.3))
+    command, without, *_ = both(engine, free, "swing", wave)
+    _, expected, got, _ = both(engine, dry, "swing", wave)
+    without_db, law_db, engine_db = (
+        level(command[:, 0], one[:, 0], 0.005) for one in (without, expected, got)
+    )
+    assert np.abs(law_db - without_db).max() > 0.7
+    # PyBullet's holds a joint at rest; MuJoCo's, the law's, is soft.
+    assert np.abs(engine_db - law_db).max() < (0.25 if engine is PyBullet else 0.01)
 
 
 def test_pybullet_refuses_a_chain_with_armature() -> None:

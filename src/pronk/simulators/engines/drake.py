@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Drake(EngineSimulator):
-    """Laws explicit, and implicit with one iteration."""
+    """Laws explicit, and implicit with one iteration; Drake's joints have no dry friction."""
 
     extra, module, package = "drake", "pydrake.all", "drake"
     laws = ("explicit", "implicit")

@@ -33,6 +33,8 @@ class Drives:
     """Passive damping of the joint, which the engine treats as it does [N m s/rad]."""
     armature: Array
     """[kg m^2]."""
+    frictionloss: Array
+    """Dry friction, 0 where the engine has none [N m]."""
     effort_limit: Array
     """[N m]."""
     stall_torque: Array
@@ -52,8 +54,8 @@ class Drives:
 class EngineSimulator(ABC):
     """Joints of a robot in another engine: a `Simulator` that builds each chain for each run.
 
-    Joints have no dry friction. Explicit drives have the torque-speed line of the motor, the
-    engines' own drives its effort limit only.
+    Explicit drives have the torque-speed line of the motor, the engines' own drives its effort
+    limit only. Dry friction is there with `dry` laws.
     """
 
     extra: ClassVar[str]
@@ -64,7 +66,8 @@ class EngineSimulator(ABC):
     """Its package."""
     laws: ClassVar[tuple[str, ...]] = ("explicit",)
     """Kinds of `DriveLaw` that the engine has."""
-    parameters = frozenset({"stiffness", "damping", "armature", "delay"})
+    dry: ClassVar[tuple[str, ...]] = ()
+    """Those with which its joints have dry friction in N m."""
 
     def __init__(self, robot: RobotSpec, *, law: DriveLaw | None = None) -> None:
         """Import the engine; without a law the drives have that of the robot.
@@ -96,6 +99,8 @@ class EngineSimulator(ABC):
             law=self.law.kind,
             iterations=self.law.iterations,
         )
+        dry = ("frictionloss",) * (self.law.kind in self.dry)
+        self.parameters = frozenset({"stiffness", "damping", "armature", "delay", *dry})
         self._links: dict[str, Links] = {}
 
     @abstractmethod
@@ -149,12 +154,14 @@ class EngineSimulator(ABC):
         def of(name: str, own: list[float]) -> Array:
             return np.array(values[name][columns] if name in values else own)
 
+        dry = float("frictionloss" in self.parameters)
         limits = ("effort_limit", "stall_torque", "no_load_speed")
         return Drives(
             stiffness=of("stiffness", [joint.stiffness for joint in joints]),
             damping=of("damping", [joint.damping for joint in joints]),
             viscous=np.array([joint.drive.viscous_damping for joint in joints]),
             armature=of("armature", [joint.drive.armature for joint in joints]),
+            frictionloss=dry * of("frictionloss", [joint.drive.frictionloss for joint in joints]),
             **{n: np.array([getattr(joint.drive, n) for joint in joints]) for n in limits},
         )
 

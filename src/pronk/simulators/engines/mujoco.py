@@ -25,7 +25,7 @@ class Mujoco(EngineSimulator):
     """Laws explicit and implicit_damping, in MuJoCo."""
 
     extra, module, package = "", "mujoco", "mujoco"
-    laws = ("explicit", "implicit_damping")
+    laws = dry = ("explicit", "implicit_damping")
 
     def simulate(self, links: Links, drives: Drives, command: Array, start: Array) -> Array:
         """See `EngineSimulator.simulate`."""
@@ -43,6 +43,7 @@ class Mujoco(EngineSimulator):
             body.mass, body.ipos = links.mass[i], links.centre[i]
             body.fullinertia = links.inertia[i][[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
             joint = body.add_joint(name=name, axis=links.axis[i], armature=drives.armature[i])
+            joint.frictionloss = drives.frictionloss[i]
             joint.damping = drives.viscous[i] * np.eye(len(joint.damping))[0]
             actuator = spec.add_actuator(
                 name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, forcelimited=True

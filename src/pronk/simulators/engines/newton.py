@@ -1,7 +1,8 @@
 """Newton: joint drives in the solvers MuJoCo (law IF), Featherstone (E) and Steel (I1).
 
 Newton needs MuJoCo 3.17, pronk 3.11, so it runs in another Python (`--simulator-python`), on the
-processor in single precision. Featherstone and Steel take passive damping explicitly.
+processor in single precision. Featherstone and Steel take passive damping explicitly and are used
+without dry friction.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Newton(EngineSimulator):
     """The solver whose drives follow the law."""
 
     extra, module, package = "", "newton", "newton"
-    laws = tuple(_SOLVERS)
+    laws, dry = tuple(_SOLVERS), ("implicit_damping",)
 
     def simulate(self, links: Links, drives: Drives, command: Array, start: Array) -> Array:
         """See `EngineSimulator.simulate`."""
@@ -59,7 +60,7 @@ class Newton(EngineSimulator):
                     damping=float(drives.viscous[i]),
                     armature=float(drives.armature[i]),
                     effort_limit=float(drives.effort_limit[i]),
-                    friction=0.0,
+                    friction=float(drives.frictionloss[i]),
                     actuator_mode=newton.JointTargetMode.POSITION,
                     label=name,
                 )

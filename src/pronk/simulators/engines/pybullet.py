@@ -2,7 +2,8 @@
 
 PyBullet has no armature: that of one joint is added to its link's inertia, which is the same thing.
 In a chain it would also turn with the parents, so chains take none. Passive damping is part of the
-explicit torque; MuJoCo, Drake and PhysX take it implicitly.
+explicit torque; MuJoCo, Drake and PhysX take it implicitly. Dry friction is a velocity motor's,
+which holds a joint at rest.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ class PyBullet(EngineSimulator):
     """Law explicit."""
 
     extra, module, package = "pybullet", "pybullet", "pybullet"
+    dry = ("explicit",)
 
     def simulate(self, links: Links, drives: Drives, command: Array, start: Array) -> Array:
         """See `EngineSimulator.simulate`; PronkError for a chain with armature."""
@@ -60,10 +62,10 @@ class PyBullet(EngineSimulator):
                     maxJointVelocity=_MAX_SPEED,
                     physicsClientId=client,
                 )
-            # Every joint has a velocity motor until it is switched off.
+            # A velocity motor of speed 0 is dry friction: every joint has one with another force.
             bullet.setJointMotorControlArray(
                 *(chain, index, bullet.VELOCITY_CONTROL),
-                forces=np.zeros(len(order)),
+                forces=drives.frictionloss[order],
                 physicsClientId=client,
             )
             drives = replace(drives, damping=drives.damping + drives.viscous, viscous=0.0 * start)
