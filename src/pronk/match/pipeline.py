@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -175,27 +175,36 @@ def match_frameworks(
     require_plausible(logs_by_joint(logs, robot), robot)
     fitted = checked_names(free, FREE) if free else DRIVE_MODE if mode == "drive" else GAINS_MODE
     work = _Work(logs=logs, settings=chosen, mode=mode)
-    own = _matched(work, robot, fitted, clock)
     first: dict[tuple[object, ...], str] = {}
     for name in names:
         first.setdefault(_kind(robots[name]), name)
-        if work.measured:
-            work.found(robots[name], clock)
-    first.pop(_kind(own.robot), None)
-    # Simulations and products of large arrays leave the interpreter to the other thread.
+    first.pop(_kind(robot), None)
+    clocks = {name: _Clock(progress, f"{name} ") for name in first.values()}
+    waiting: dict[tuple[object, ...], Future[_Matched]] = {}
+    # Simulations and products of large arrays leave the interpreter to the other threads.
     with ThreadPoolExecutor(chosen.threads) as pool:
-        wrong = pool.submit(_wrong, work, own, clock)
 
-        def matched(name: str) -> MatchResult:
-            dry, own_clock = frameworks[name].friction == "N m", _Clock(progress, f"{name} ")
-            known = [n for n in fitted if dry or n != "frictionloss"]
-            found = _matched(work, robots[name], known, own_clock, own)
-            return found.result(every, wrong.result(), own_clock)
+        def begin(base: _Base) -> None:
+            for kind, name in first.items():
+                if work.measured:
+                    work.found(robots[name], clock)
+                dry = frameworks[name].friction == "N m"
+                known = [n for n in fitted if dry or n != "frictionloss"]
+                waiting[kind] = pool.submit(
+                    _matched, work, robots[name], known, clocks[name], base=base
+                )
 
-        waiting = {kind: pool.submit(matched, name) for kind, name in first.items()}
+        try:
+            own = _matched(work, robot, fitted, clock, ready=begin)
+            wrong = _wrong(work, own, clock)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
         joints = joint_fits(own.robot, own.joints, drives, remarks)
-        out = {"": replace(own, joints=joints).result(every, wrong.result(), clock)}
-    done = {_kind(own.robot): out[""]} | {kind: one.result() for kind, one in waiting.items()}
+        out = {"": replace(own, joints=joints).result(every, wrong, clock)}
+        done = {_kind(own.robot): out[""]}
+        for kind, one in waiting.items():
+            done[kind] = one.result().result(every, wrong, clocks[first[kind]])
     for name, framework in frameworks.items():
         kind = _kind(robots[name])
         info = replace(framework.info, decimation=robots[name].decimation)
@@ -216,6 +225,35 @@ Wrong = Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Base:
+    """Joints in the robot's own simulator, at which those of other frameworks begin, by name."""
+
+    plants: Mapping[str, Plant] = field(default_factory=dict)
+    """Linearized."""
+    gains: Mapping[str, Pair] = field(default_factory=dict)
+    matched: Mapping[str, ComplexArray] = field(default_factory=dict)
+    """Simulated responses with these gains, shape (f,) each."""
+
+    def corrections(self, found: Found, robot: RobotSpec) -> list[Array]:
+        """Log gain of each joint simulated over linearized, shape (inside,), for another robot.
+
+        It is that of dry friction; without friction there is none.
+        """
+        out = []
+        for name, (goal, *_) in found.items():
+            amplitude = goal.trace.amplitude
+            closed = self.plants[name].response(*self.gains[name], amplitude=amplitude)[0]
+            out.append(np.log(np.abs(self.matched[name][goal.fit_mask] / closed)))
+            if robot.joint(name).drive.frictionloss == 0.0:
+                out[-1] = np.zeros_like(out[-1])
+        return out
+
+    def translated(self, name: str, other: Plant) -> Pair:
+        """Gains with which another joint responds like this one, both linearized."""
+        return translated(self.plants[name], other, self.gains[name]).after
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Matched:
     """The joints of a robot in one simulator."""
 
@@ -228,27 +266,6 @@ class _Matched:
     excluded: Mapping[str, str]
     rate: float
     """Physics steps per second of the grid search."""
-    plants: Mapping[str, Plant]
-    """Its joints linearized, by name; none in a simulator but MuJoCo."""
-
-    def corrections(self, found: Found, robot: RobotSpec) -> list[Array]:
-        """Log gain of each joint simulated over linearized, shape (inside,), for another robot.
-
-        It is that of dry friction; without friction there is none.
-        """
-        out = []
-        for name, (goal, *_) in found.items():
-            fit, plant = self.joints[name], self.plants[name]
-            closed = plant.response(fit.stiffness, fit.damping, amplitude=goal.trace.amplitude)[0]
-            out.append(np.log(np.abs(fit.matched[goal.fit_mask] / closed)))
-            if robot.joint(name).drive.frictionloss == 0.0:
-                out[-1] = np.zeros_like(out[-1])
-        return out
-
-    def translated(self, name: str, other: Plant) -> Pair:
-        """Gains with which another joint responds like this one, both linearized."""
-        fit = self.joints[name]
-        return translated(self.plants[name], other, (fit.stiffness, fit.damping)).after
 
     def result(self, logs: Sequence[JointLog], wrong: Wrong, clock: _Clock) -> MatchResult:
         """The result for the simulator with these joints."""
@@ -317,20 +334,26 @@ def _matched(
     robot: RobotSpec,
     fitted: Sequence[str],
     clock: _Clock,
-    base: _Matched | None = None,
+    *,
+    base: _Base | None = None,
+    ready: Callable[[_Base], None] = lambda base: None,
 ) -> _Matched:
-    """Match the joints in one simulator; those of the `base` were matched in the robot's own."""
+    """Match the joints in one simulator.
+
+    In the robot's own, `ready` is called with the `base` of other frameworks as soon as it is
+    known.
+    """
     logs, settings, mode = work.logs, work.settings, work.mode
     excluded: Mapping[str, str] = {}
     rate, info = float("nan"), mujoco_info(robot)
     fits: Mapping[str, TimeFit] = {}
-    plants: Mapping[str, Plant] = {}
     if any(moves_together(log) for log in logs):
         if settings.simulator != "mujoco":
             raise PronkError(
                 f"simulator {settings.simulator}: several joints of these logs move at once, "
                 "which only simulator mujoco matches; record one joint at a time."
             )
+        ready(_Base())
         with clock.stage("fit"):
             joints, excluded = fit_together(
                 logs, robot, fitted, threads=settings.threads, progress=clock.report
@@ -348,12 +371,10 @@ def _matched(
                 rigs.parameters -= {"frictionloss"}
             robot, info = rigs.robot, rigs.info
             found = work.found(robot, clock)
-            if isinstance(rigs, MujocoSimulator):
-                plants = {name: linearized(rigs, goals[0]) for name, goals in found.items()}
             if mode == "drive":
                 joints, fits = _match_drives(work, rigs, found, fitted, clock)
             else:
-                joints, fits, rate = _match_gains(work, rigs, found, plants, clock, base)
+                joints, fits, rate = _match_gains(work, rigs, found, clock, base, ready)
     return _Matched(
         robot=robot,
         info=info,
@@ -361,7 +382,6 @@ def _matched(
         fits=fits,
         excluded=excluded,
         rate=rate,
-        plants=plants,
     )
 
 
@@ -434,9 +454,9 @@ def _match_gains(
     work: _Work,
     rigs: JointRigs,
     found: Found,
-    plants: Mapping[str, Plant],
     clock: _Clock,
-    base: _Matched | None,
+    base: _Base | None,
+    ready: Callable[[_Base], None],
 ) -> tuple[dict[str, JointFit], dict[str, TimeFit], float]:
     """Search by the paper's magnitude and, with method `time`, fit in time from there.
 
@@ -447,6 +467,9 @@ def _match_gains(
     """
     settings, paper = work.settings, work.settings.method == "paper"
     main = [goals[0] for goals in found.values()]
+    plants: dict[str, Plant] = {}
+    if isinstance(rigs, MujocoSimulator):
+        plants = {goal.joint: linearized(rigs, goal) for goal in main}
     grid, rate = axes(rigs.robot, settings.grid_points), float("nan")
     grids: dict[str, GridSearch] = {}
     by_amplitude: dict[str, list[Fit]] = {}
@@ -474,11 +497,6 @@ def _match_gains(
             for name in found:
                 fitted[name] = work.fit_in_time(rigs, name, TIME_FIT, gains[name])
                 clock.report(len(fitted) / len(found))
-    elif not base:
-        with clock.stage("amplitudes"):
-            others = [goal for goals in found.values() for goal in goals[1:]]
-            for fit in refine(rigs, others, [gains[goal.joint] for goal in others]):
-                by_amplitude[fit.target.joint].append(fit)
     with clock.stage("responses"):
         requests = [
             SimRequest(goal, **_drive(rigs, fitted[goal.joint].estimate.values))
@@ -490,6 +508,14 @@ def _match_gains(
         naive = responses(
             rigs, [SimRequest(goal, *work.on_drive[goal.joint]) for goal in main], whole=True
         )
+    for name, time_fit in fitted.items():
+        gains[name] = time_fit.estimate.values["stiffness"], time_fit.estimate.values["damping"]
+    ready(_Base(plants=plants, gains=gains, matched=dict(zip(found, matched, strict=True))))
+    if paper and not base:
+        with clock.stage("amplitudes"):
+            others = [goal for goals in found.values() for goal in goals[1:]]
+            for fit in refine(rigs, others, [gains[goal.joint] for goal in others]):
+                by_amplitude[fit.target.joint].append(fit)
     zero: dict[str, tuple[float, ComplexArray]] = {}
     wanted = settings.zero_armature and paper and not base
     if wanted and "armature" in rigs.parameters:
