@@ -50,7 +50,7 @@ MOVING = ("operator", "servo", "policy", "root")
 STOPPED_S, ENDS_S, DAMPED_S = 0.5, 10.0, 0.5
 """How long a process is stopped; longest until the others have ended, and until damping [s]."""
 _JOINTS = ("FR_hip_pitch", "FR_knee", "FL_hip_pitch", "FL_knee")
-_EMPTY = 4096
+_EMPTY = 2**16
 """A log of at most so many bytes may hold no sample yet."""
 _POLICY = Path(__file__).parents[1] / "policies" / "matched" / "policy.onnx"
 
@@ -72,7 +72,9 @@ def operate(port: int, log: str) -> None:
 def _words(program: Program, folder: Path, port: int) -> list[str]:
     """The command line of a program."""
     if program == "deploy":
-        return ["benchmarks.kills", str(port), str(folder / "run.mcap")]
+        # Not as a module: the processes that it starts would import all of this one.
+        log = str(folder / "run.mcap")
+        return ["-c", f"from benchmarks.kills import operate; operate({port}, {log!r})"]
     logs = str(folder.parent / "logs")
     joints = [word for joint in _JOINTS for word in ("--joints", joint)]
     short = ["--signal", "log-chirp", "--amplitude", "0.25", "--repeats", "1"]
@@ -85,12 +87,12 @@ def _words(program: Program, folder: Path, port: int) -> list[str]:
         "match": ["match", logs, "--robot", name, "--method", "paper"],
         "trial": ["trial", str(_POLICY), *jumps, "--no-video"],
     }
-    return ["pronk.cli.main", *commands[program], *out]
+    return ["-m", "pronk.cli.main", *commands[program], *out]
 
 
 def _start(words: list[str]) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", *words],
+        [sys.executable, *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -210,7 +212,7 @@ def _one(program: Program, i: int, seed: int, folder: Path, length_s: float) -> 
         port = int(probe.getsockname()[1])
     wired = program in ("sweep-lcm", "deploy")
     base = "ground" if program == "deploy" else "bench"
-    robot = _start(["pronk.cli.main", "simulate", "--port", str(port), "--base", base])
+    robot = _start(["-m", "pronk.cli.main", "simulate", "--port", str(port), "--base", base])
     if not wired:
         robot.kill()
     elif not any(line.startswith("ready") for line in robot.stdout or ()):
@@ -356,7 +358,3 @@ def kills(
             console.say(json.dumps(row))
     failed = sum(bool(row["faults"]) for row in rows)
     return console.Outcome(figures={"rows": table, "faults": failed}, status=1 if failed else 0)
-
-
-if __name__ == "__main__":
-    operate(int(sys.argv[1]), sys.argv[2])
