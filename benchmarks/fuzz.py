@@ -203,15 +203,15 @@ def _kinds() -> dict[str, _Kind]:
         deploy_run.delay(found, None)
 
     def trial(kind: results.Kind) -> _Kind:
-        names = (f"tree/trial/{kind.summary}", f"tree/trial/{kind.table}")
-        return _Kind(names, lambda path: results.load(path.parent, kind))
+        path = f"tree/trial/{kind.summary}"
+        return _Kind((path,), lambda path: results.load(path.parent, kind))
 
     def command(*words: str) -> Callable[[Path], None]:
         return lambda path: _command([word.format(path, path.parent) for word in words])
 
     sage = tuple(f"sage/{name}" for name in ("state_motor.csv", "control.csv", "joint_list.txt"))
     pages = ("gains.yaml", "match.npz", "fresh.prediction.npz")
-    trials = ("summary.json", "trials.csv", "videos/matched_forward_2.png")
+    trials = ("summary.json", "videos/matched_forward_2.png")
     response = ("response", "{0}", "--unit", "rad", "--no-plots", "--out", "{1}/out")
     kinds = {
         "npz": _Kind(("a.npz",), log(unit="rad"), True),

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import orjson
 import pytest
 import yaml
 
@@ -19,10 +20,11 @@ from pronk.evaluation import results
 from pronk.evaluation.variation import VARIATION
 from pronk.files import LIMIT, read_yaml, write_text
 from pronk.logs.mcap import McapWriter
-from pronk.logs.mcap_log import TOPICS
+from pronk.logs.mcap_log import HEADER, TOPICS
 from pronk.logs.readers import find_logs, read_log
 from pronk.match import gains
 from pronk.names import check_names, file_name
+from pronk.policy.contract import from_json
 from pronk.response.response import FrequencyResponse
 from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model, yaml_of_model
@@ -141,6 +143,17 @@ def test_files_of_namespaced_joints_stay_in_their_folder(tmp_path: Path) -> None
     new = set(tmp_path.parent.rglob("*")) - before
     assert {path for path in new if path.is_file()} == set(out.iterdir())
     assert len(list(out.glob("*.svg"))) == 2
+
+
+def test_deep_json_is_refused(tmp_path: Path) -> None:
+    deep = "[" * 10_000 + "]" * 10_000
+    writer = McapWriter(tmp_path / "a.mcap", TOPICS)
+    writer.put(HEADER, 0.0, orjson.Fragment(f'{{"schema": "pronk/sweep/1", "robot": {deep}}}'))
+    writer.close()
+    with pytest.raises(LogError):
+        read_log(tmp_path / "a.mcap")
+    with pytest.raises(ArtefactError):
+        from_json(f'{{"robot": {deep}}}', source="a file")
 
 
 def test_a_robot_file_made_of_any_joint_names_can_be_read(tmp_path: Path) -> None:

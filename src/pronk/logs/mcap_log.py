@@ -173,7 +173,7 @@ def read_mcap(
         )
     try:
         return _read_sweep(path, found, damage)
-    except (msgspec.MsgspecError, ValueError) as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise LogError(f"{path}: its messages are not those of {SCHEMA} ({reason}).") from None
 

@@ -187,7 +187,7 @@ def from_json(text: str, *, source: object) -> Contract:
         return msgspec.convert(body, Contract)
     except ArtefactError as error:
         raise ArtefactError(f"{source}: {error}") from None
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise ArtefactError(
             f"{source}: not a contract of schema {SCHEMA!r}, which this pronk reads: {error}."
         ) from None
