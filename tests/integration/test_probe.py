@@ -6,17 +6,21 @@ import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from benchmarks.probe import ENGINES, ROBOTS, Drawn, Truth, drawn, score
 from pronk.actuator.law import DriveLaw
 from pronk.cli.main import run
 from pronk.errors import PronkError
 from pronk.robots import load_robot
+from pronk.simulators.engines.mujoco import Mujoco
 from pronk.simulators.probe import probe
 
+Array = NDArray[np.float64]
 PENDULUM, SWING = ROBOTS[0]
 
 
@@ -71,6 +75,30 @@ def test_what_is_wrong_is_named(fault: str, changes: dict[str, object]) -> None:
     assert found["fault_right"], found["named"]
     assert found["armature_error"] < 0.02
     assert found["delay_error_s"] < 5e-4
+
+
+class TorqueBesideDrive(Mujoco):
+    """MuJoCo's position actuator, with the same torque applied once more before each step."""
+
+    def _stepped(self, model: Any, command: Array, start: Array) -> Array:
+        kp, kd = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+        data, out = self.engine.MjData(model), np.empty(command.shape)
+        data.qpos[:] = start
+        for row, target in zip(out, command, strict=True):
+            row[:], data.ctrl[:] = data.qpos, target
+            data.qfrc_applied[:] = kp * (target - data.qpos) - kd * data.qvel
+            self.engine.mj_step(model, data)
+        return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "word"), [("implicit_damping", "beside"), ("explicit", "twice")])
+def test_torques_beside_a_drive_of_an_engine_are_named(kind: Any, word: str) -> None:
+    robot = load_robot(PENDULUM)
+    found = probe(TorqueBesideDrive(robot, law=DriveLaw(kind=kind)), robot)
+    assert set(found.wrong) - {"law"} == {word}
+    assert found.law.kind == kind
+    assert found.armature == pytest.approx(robot.joint(SWING).drive.armature, rel=0.02)
 
 
 def test_a_joint_that_does_not_move_is_refused() -> None:
