@@ -2,39 +2,50 @@
 
 Every joint of the logs is matched for each framework with pronk's own computation of its drive law.
 Then the engine simulates the recorded command with these gains, the response is estimated as the
-log's was, and the two are compared over the band of the match: magnitude, and the phase that the
-matched delay leaves, as a time. Of engines without dry friction in N m the frameworks are matched
-without it, by the magnitude of the largest amplitude.
+log's was, and engine, law and recording are compared over the band: magnitude, and the phase that
+the matched delay leaves, as a time. Of engines without dry friction in N m the frameworks are
+matched without it. Joints that were excited alone are matched by the magnitude of the largest
+amplitude, those that moved together in time.
 """
 
 from __future__ import annotations
 
+import json
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
-from benchmarks.runner import Progress, machine
+from benchmarks.runner import machine
 from pronk.cli import console
 from pronk.errors import PronkError
 from pronk.evaluation.tables import table
+from pronk.logs.joint_log import JointLog, Segment
 from pronk.logs.readers import read_logs
+from pronk.match.gains import MatchedGains
 from pronk.match.measured_joint import DB, MeasuredJoint, logs_by_joint, measured_joints, merged
 from pronk.match.pipeline import match_frameworks
-from pronk.match.result import MatchResult
+from pronk.match.predict import drives_of
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.robots import load_robot
+from pronk.simulators.chain import ChainSimulation, branches, moves_together
 from pronk.simulators.profiles import profile
-from pronk.simulators.simulator import joint_rigs
+from pronk.simulators.simulator import Closing, joint_rigs, load_simulator
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 ENGINES = {
     "mjlab": "mujoco",
     "isaaclab-explicit,friction=none": "sapien-explicit",
     "isaaclab-implicit,friction=none": "isaaclab-physx",
-    "isaaclab-newton,friction=none": "newton",
-    "playground,friction=none": "mjx",
+    "isaaclab-newton": "newton",
+    "playground": "mjx",
     "maniskill": "sapien",
     "drake": "drake",
     "newton-featherstone": "newton-featherstone",
@@ -43,25 +54,80 @@ ENGINES = {
 SETTINGS = MatchSettings(method="paper", zero_armature=False)
 
 
-def compared(
-    goals: list[MeasuredJoint], result: MatchResult, engine: str, python: Path | None, robot: Any
+BAND_HZ = (0.3, 3.4)
+"""Where joints that move together are compared: SO-101's recordings are coherent below 3.5 Hz."""
+EXCITED = 0.05
+"""Amplitude of the command at the frequencies that are compared, of its largest in the band."""
+
+
+def errors(ratio: ComplexArray, omega: Array) -> dict[str, float]:
+    """RMS of a ratio of responses [dB], and of its phase as a time [ms]."""
+    phase = np.unwrap(np.angle(ratio))
+    return {
+        "db": float(np.sqrt(np.mean((DB * np.log(np.abs(ratio))) ** 2))),
+        "ms": float(1e3 * np.sqrt(np.mean(phase**2) / np.mean(omega**2))),
+    }
+
+
+def pairs(of: dict[str, ComplexArray], omega: Array) -> dict[str, float]:
+    """`errors` of the engine beside its law and the recording, and of the law beside it."""
+    out: dict[str, float] = {}
+    for one, other in (("engine", "law"), ("engine", "recorded"), ("law", "recorded")):
+        found = errors(of[one] / of[other], omega)
+        out |= {f"{one}_{other}_{key}": value for key, value in found.items()}
+    return out
+
+
+def alone(
+    goals: list[MeasuredJoint], gains: MatchedGains, engine: str, python: Path | None, robot: Any
 ) -> list[dict[str, float]]:
-    """Errors of each joint in an engine with the gains that were matched for it."""
-    with joint_rigs(engine, robot, python=python) as rigs:
-        rows = []
+    """Joints that were excited one at a time."""
+    rows = []
+    with ExitStack() as stack:
+        law = stack.enter_context(joint_rigs("mujoco", robot, threads=1))
+        rigs = stack.enter_context(joint_rigs(engine, robot, python=python))
         for goal in goals:
-            gains = result.gains.joints[goal.joint]
-            request = SimRequest(goal, gains.stiffness, gains.damping, delay=gains.delay_s)
-            [simulated] = responses(rigs, [request])
-            ratio = simulated / goal.measured.response[goal.fit_mask]
-            phase, omega = np.unwrap(np.angle(ratio)), goal.omega
-            rows.append(
-                {
-                    "rms_db": float(np.sqrt(np.mean((DB * np.log(np.abs(ratio))) ** 2))),
-                    "late_ms": float(-1e3 * (phase @ omega) / (omega @ omega)),
-                    "phase_ms": float(1e3 * np.sqrt(np.mean(phase**2) / np.mean(omega**2))),
-                }
-            )
+            joint = gains.joints[goal.joint]
+            request = SimRequest(goal, joint.stiffness, joint.damping, delay=joint.delay_s)
+            dry = None if np.isnan(joint.frictionloss) else joint.frictionloss
+            own = dry if "frictionloss" in rigs.parameters else None
+            of = {
+                "engine": responses(rigs, [replace(request, frictionloss=own)])[0],
+                "law": responses(law, [replace(request, frictionloss=dry)])[0],
+                "recorded": goal.measured.response[goal.fit_mask],
+            }
+            rows.append(pairs(of, goal.omega))
+    return rows
+
+
+def together(
+    log: JointLog, gains: MatchedGains, engine: str, python: Path | None, robot: Any
+) -> list[dict[str, float]]:
+    """Joints that moved at once: the response to each one's own command."""
+    drives, rows = drives_of(robot, gains), []
+    simulator = load_simulator(engine, robot, python=python)
+    rate, window = (len(log.time) - 1) / np.ptp(log.time), np.hanning(len(log.time))
+    hertz = np.fft.rfftfreq(len(log.time), 1.0 / rate)
+    band = (hertz >= BAND_HZ[0]) & (hertz <= BAND_HZ[1])
+    for branch in branches([log], robot):
+        traces = {}
+        for name, other in (("law", None), ("engine", simulator)):
+            with ChainSimulation(robot, [log], joints=branch, threads=1, simulator=other) as arm:
+                traces[name], measured, joints = arm.run([drives])[0][0], arm.measured(), arm.joints
+        traces["recorded"] = measured[0]
+        for i, joint in enumerate(joints):
+            if joint not in gains.joints:
+                continue
+            spectra = {
+                n: np.fft.rfft(window * (y[:, i] - y[:, i].mean())) for n, y in traces.items()
+            }
+            command = log.command[:, log.column(joint)]
+            u = np.fft.rfft(window * (command - command.mean()))
+            there = band & (np.abs(u) >= EXCITED * np.abs(u[band]).max())
+            of = {name: (y / u)[there] for name, y in spectra.items()}
+            rows.append(pairs(of, 2.0 * np.pi * hertz[there]))
+    if isinstance(simulator, Closing):
+        simulator.close()
     return rows
 
 
@@ -69,6 +135,9 @@ def frameworks(
     paths: tyro.conf.Positional[tuple[Path, ...]],
     robot: str = "mini_cheetah",
     simulator_python: tuple[Path, ...] = (),
+    only: tuple[str, ...] = tuple(ENGINES),
+    seconds: float = float("inf"),
+    drive_gains: Literal["default"] | None = None,
 ) -> console.Outcome:
     """Gains matched for frameworks, in the engines themselves, beside the logs.
 
@@ -76,45 +145,77 @@ def frameworks(
         paths: Logs, or folders of logs, as `pronk sweep` writes them.
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         simulator_python: Pythons that have the engines, if this one lacks them; repeat it.
+        only: Frameworks; repeat it.
+        seconds: Of each log, from its begin.
+        drive_gains: `default`: the robot's gains were on its drives, of which the logs have none.
     """
     known = load_robot(robot)
-    logs = read_logs(paths, robot=known)
+    # The engines' joints have one dry friction at all speeds.
+    known = replace(
+        known,
+        joints=tuple(
+            replace(one, drive=replace(one.drive, stribeck_speed=0.0)) for one in known.joints
+        ),
+    )
+    logs = [_begin(log, seconds) for log in read_logs(paths, robot=known)]
     rows: list[dict[str, Any]] = []
     with console.progress() as report:
-        progress: Progress = report
-        found = match_frameworks(logs, known, list(ENGINES), settings=SETTINGS, progress=progress)
-        for name, engine in ENGINES.items():
-            framework = profile(name)
+        for name in only:
+            framework, engine = profile(name), ENGINES[name]
             own = framework.robot(known)
-            by_joint = logs_by_joint(logs, own)
-            goals = [
-                merged([measured_joints(log, joint, own, SETTINGS) for log in sources])[0]
-                for joint, sources in by_joint.items()
-            ]
-            errors = []
+            more: Any = {"settings": SETTINGS, "progress": report, "drive_gains": drive_gains}
+            gains = match_frameworks(logs, known, [name], **more)[name].gains
+            found: list[dict[str, float]] = []
             for python in (None, *simulator_python):
                 try:
-                    errors = compared(goals, found[name], engine, python, own)
+                    if moves_together(logs[0]):
+                        found = together(logs[0], gains, engine, python, own)
+                    else:
+                        goals = [
+                            merged([measured_joints(log, joint, own, SETTINGS) for log in sources])
+                            for joint, sources in logs_by_joint(logs, own).items()
+                        ]
+                        found = alone([one[0] for one in goals], gains, engine, python, own)
                     break
                 except PronkError as error:
                     reason = str(error)
-            if not errors:
+            if not found:
                 console.warn(f"{name}: {reason}")
                 continue
-            columns = {key: [one[key] for one in errors] for key in errors[0]}
-            rows.append(
-                {"framework": name, "law": framework.drive_law.label, "engine": engine}
-                | {"joints": len(errors), "rms_db": float(np.mean(columns["rms_db"]))}
-                | {"worst_db": max(columns["rms_db"])}
-                | {key: max(map(abs, columns[key])) for key in ("late_ms", "phase_ms")}
+            row: dict[str, Any] = {
+                "framework": name,
+                "law": framework.drive_law.label,
+                "engine": engine,
+            }
+            row |= {"joints": len(found)}
+            for key in found[0]:
+                row[key] = max(one[key] for one in found)
+            row["engine_recorded_mean_db"] = float(
+                np.mean([one["engine_recorded_db"] for one in found])
             )
+            rows.append(row)
+            print(json.dumps(row), flush=True)
             report(name, 1.0)
-    columns_ = "framework | law | engine | joints | mean [dB] | worst [dB]"
+    columns = "framework | law | engine | joints"
+    for one in ("engine, law", "engine, recorded", "law, recorded"):
+        columns += f" | {one} [dB];3 | {one} [ms];2"
     sheet = table(
-        f"{columns_} | late, worst [ms];2 | phase, worst [ms];2",
+        f"{columns} | engine, recorded, mean [dB];3",
         [list(row.values()) for row in rows],
-        title="Engines with matched gains, beside the log"
-        + " of the virtual robot" * any(log.virtual for log in logs),
+        title="Engines with matched gains beside the law and the log"
+        + " of the virtual robot" * any(log.virtual for log in logs)
+        + ", worst joint",
     )
     console.show_sheet(sheet)
     return console.Outcome(figures={"rows": rows, "machine": machine()})
+
+
+def _begin(log: JointLog, seconds: float) -> JointLog:
+    """The first seconds of a log without segments."""
+    if not np.isfinite(seconds):
+        return log
+    begin = log.time[0]
+    part = Segment(
+        kind="unknown", joints=log.joints, start=begin, stop=begin + seconds, amplitude=np.nan
+    )
+    return replace(log.cut(part), segments=())

@@ -20,7 +20,7 @@ from pronk.response.grid import held_mean
 from pronk.robots.model import bench_spec, set_stribeck
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import Chain, Drives
-from pronk.simulators.simulator import Closing
+from pronk.simulators.simulator import Closing, Simulator
 
 Array = NDArray[np.float64]
 
@@ -124,6 +124,29 @@ class _StribeckChain(Chain):
             set_stribeck(model, name, drive, dry, values.get("stribeck", 0.0))
 
 
+class _Elsewhere(Closing):
+    """A chain in any simulator, from rest."""
+
+    def __init__(self, simulator: Simulator, robot: RobotSpec, joint: str) -> None:
+        self.joints, self.robot, self.simulator = robot.joint(joint).chain, robot, simulator
+
+    def rollout(self, command: Array, sets: Sequence[Drives], start: Array) -> Array:
+        """See `Chain.rollout`; delays are in the command."""
+        names, known = self.simulator.joints, self.simulator.parameters
+        columns = [names.index(name) for name in self.joints]
+        full = np.empty((len(sets), command.shape[1] + 1, len(names)))
+        full[:] = [self.robot.joint(name).default_position for name in names]
+        full[..., columns] = np.concatenate([command, command[:, -1:]], axis=1)
+        drives = [[published(self.robot, n) | dict(one.get(n, {})) for n in names] for one in sets]
+        values: dict[str, Array] = {
+            key: np.array([[joint[key] for joint in one] for one in drives])
+            for key in ("stiffness", "damping", "armature", "frictionloss")
+            if key in known
+        }
+        locked = [name for name in names if name not in self.joints]
+        return np.asarray(self.simulator.rollout(full, values, locked=locked)[..., columns])
+
+
 class ChainSimulation(Closing):
     """The chain with the commands of one or more logs, for many sets of drives."""
 
@@ -134,10 +157,12 @@ class ChainSimulation(Closing):
         *,
         joints: Sequence[str] | None = None,
         threads: int = 2,
+        simulator: Simulator | None = None,
     ) -> None:
         """Compile the model of the chain that holds all joints that move, or the given ones.
 
-        `joints` are one of `branches`; logs in which none of them moves are left out.
+        `joints` are one of `branches`; logs in which none of them moves are left out. Another
+        `simulator` than MuJoCo starts from rest at the first command.
 
         Raises:
             LogError: Nothing moves in radians, or joints of different chains move together.
@@ -162,7 +187,11 @@ class ChainSimulation(Closing):
                 f"{self.logs[0].source or 'log'}: {', '.join(self.joints)} move together but no "
                 f"chain of {robot.name} holds them all; excite the joints of one chain at a time."
             )
-        self._chain = _StribeckChain(robot, root.name, threads=threads)
+        self._chain: _StribeckChain | _Elsewhere = (
+            _Elsewhere(simulator, robot, root.name)
+            if simulator
+            else _StribeckChain(robot, root.name, threads=threads)
+        )
 
     def close(self) -> None:
         """Stop the threads."""
