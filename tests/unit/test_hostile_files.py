@@ -17,6 +17,7 @@ from benchmarks.fuzz import fuzz
 from pronk.cli.main import run
 from pronk.errors import ArtefactError, LogError, PronkError, RobotError
 from pronk.evaluation import results
+from pronk.evaluation.training_sim.evaluation import SCHEMA, load_speed_errors
 from pronk.evaluation.variation import VARIATION
 from pronk.files import LIMIT, read_yaml, write_text
 from pronk.logs.mcap import McapWriter
@@ -154,6 +155,15 @@ def test_deep_json_is_refused(tmp_path: Path) -> None:
         read_log(tmp_path / "a.mcap")
     with pytest.raises(ArtefactError):
         from_json(f'{{"robot": {deep}}}', source="a file")
+
+
+def test_a_number_of_400_digits_is_refused(tmp_path: Path) -> None:
+    walk = {"name": "a", "figures": {"speed_error": {"mean": 0.1}}}
+    path = results.save_json(tmp_path / "a.json", SCHEMA, {"walks": [walk]})
+    assert load_speed_errors(path) == {"a": 0.1}
+    path.write_text(path.read_text().replace("0.1", "9" * 400))
+    with pytest.raises(ArtefactError):
+        load_speed_errors(path)
 
 
 def test_a_robot_file_made_of_any_joint_names_can_be_read(tmp_path: Path) -> None:

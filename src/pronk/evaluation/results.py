@@ -383,7 +383,7 @@ def load_json(path: Path, schema: str, writer: str) -> Iterator[dict[str, Any]]:
         )
     try:
         yield body
-    except (KeyError, TypeError, AttributeError, ValueError, msgspec.ValidationError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise ArtefactError(
             f"{path}: damaged ({type(error).__name__}: {error}); `{writer}` writes it anew."
         ) from error
