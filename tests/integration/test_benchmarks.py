@@ -8,6 +8,8 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import pytest
 from rich.console import Console
 
 import pronk
-from benchmarks import grid, known, latency, runner, train, trial
+from benchmarks import grid, known, latency, runner, sensor_faults, train, trial
 from benchmarks.peers import Estimate, Replay, fit_cma, fit_sysid
 from benchmarks.synthetic_log import coloured_noise
 from hopper import ROBOT as HOPPER
@@ -34,6 +36,28 @@ QUIET = known.Scenario(name="quiet", words="no noise", noise_rad=0.0)
 PEER: dict[str, Any] = {"bounds": ((13.0, 27.0), (0.1, 0.7)), "start": (17.0, 0.4)}
 SHORT: dict[str, Any] = {"repeats": 2, "length_s": 8.0}
 POLICY = Path(pronk.__file__).parents[2] / "policies" / "matched" / "policy.onnx"
+
+
+def test_rows_are_kept_in_order_as_they_come(tmp_path: Path) -> None:
+    out = tmp_path / "rows.jsonl"
+    assert runner.rows_in(out) == []
+    rows = runner.rows_of((partial(list, ({"k": k},)) for k in count()), 2, out)
+    first = list(islice(rows, 5))
+    rows.close()  # type: ignore[attr-defined]
+    assert [row["k"] for row in first] == [0, 1, 2, 3, 4]
+    assert runner.rows_in(out) == first
+
+
+def test_the_page_of_faults_names_what_is_late_or_not_found() -> None:
+    common = {"robot": "go2", "link": "dds", "run": 0, "reason": "ENCODER"}
+    times = {"gyro-zero": (0.04, 0.05), "encoder-zero": (0.04, 0.3), "encoder-jumps": (math.nan,)}
+    rows = [{**common, "fault": k, "time_s": t} for k, each in times.items() for t in each]
+    text = sensor_faults.page(rows, "command")
+    assert "`gyro-zero` | 45 (50), n = 2 |" in text
+    late = text.split("## Longer")[1]
+    assert "`encoder-zero` (go2, dds): 1 of 2 later, 0 not found" in late
+    assert "`encoder-jumps` (go2, dds): 0 of 1 later, 1 not found" in late
+    assert "gyro-zero" not in late
 
 
 def ignore(_stage: str, _share: float) -> None: ...
