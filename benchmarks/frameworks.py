@@ -135,7 +135,7 @@ def frameworks(
     paths: tyro.conf.Positional[tuple[Path, ...]],
     robot: str = "mini_cheetah",
     simulator_python: tuple[Path, ...] = (),
-    only: tuple[str, ...] = tuple(ENGINES),
+    only: tuple[str, ...] = (),
     seconds: float = float("inf"),
     drive_gains: Literal["default"] | None = None,
 ) -> console.Outcome:
@@ -145,7 +145,7 @@ def frameworks(
         paths: Logs, or folders of logs, as `pronk sweep` writes them.
         robot: A name, or a path to a robot.yaml, MJCF or URDF.
         simulator_python: Pythons that have the engines, if this one lacks them; repeat it.
-        only: Frameworks; repeat it.
+        only: Frameworks, all if none is given; repeat it.
         seconds: Of each log, from its begin.
         drive_gains: `default`: the robot's gains were on its drives, of which the logs have none.
     """
@@ -160,7 +160,7 @@ def frameworks(
     logs = [_begin(log, seconds) for log in read_logs(paths, robot=known)]
     rows: list[dict[str, Any]] = []
     with console.progress() as report:
-        for name in only:
+        for name in only or ENGINES:
             framework, engine = profile(name), ENGINES[name]
             own = framework.robot(known)
             more: Any = {"settings": SETTINGS, "progress": report, "drive_gains": drive_gains}
