@@ -194,6 +194,8 @@ def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, 
         plan = replace(plan, timing=replace(TIMING, check_s=Timing().check_s))
     with Deployment(plan) as deployment:
         for fault in faults:
+            if fault in SWAPPED and rows:
+                break  # it needs a robot that has not stood up
             if fault in SWAPPED:
                 robot.send(fault)
                 begun = time.monotonic()
