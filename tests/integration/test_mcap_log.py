@@ -46,14 +46,10 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 def test_any_log_survives(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     n, width = data.draw(st.integers(2, 40)), data.draw(st.integers(1, 4))
     matrix = arrays(float, (n, width), elements=st.floats(-1e6, 1e6, allow_nan=False))
-    names = st.lists(
-        st.from_regex(r"\w[\w. -]{0,20}\w", fullmatch=True),
-        min_size=width,
-        max_size=width,
-        unique=True,
-    )
+    name = st.from_regex(r"\w[\w. -]{0,20}\w", fullmatch=True)
+    names = st.lists(name, min_size=width, max_size=width, unique=True)
     log = JointLog(
-        robot=data.draw(st.text(max_size=20)),
+        robot=data.draw(name),
         joints=tuple(data.draw(names)),
         time=np.cumsum(data.draw(arrays(float, n, elements=st.floats(1e-6, 10.0)))),
         command=data.draw(matrix),

@@ -62,7 +62,7 @@ def times(log: JointLog, factor: float, offset: float = 0.0) -> JointLog:
 
 @formats
 def test_a_right_file_passes(swept: JointLog, tmp_path: Path, name: str) -> None:
-    found, words = judged(Case(log=read(tmp_path, name, swept), joint=JOINT, robot=ROBOT))
+    found, words, _ = judged(Case(log=read(tmp_path, name, swept), joint=JOINT, robot=ROBOT))
     assert found == set(), words
 
 
@@ -82,7 +82,7 @@ def test_a_clock_that_begins_elsewhere_changes_nothing(
 @formats
 def test_a_clock_that_runs_wrong_is_named(swept: JointLog, tmp_path: Path, name: str) -> None:
     log = read(tmp_path, name, times(swept, 1.03))
-    found, words = judged(Case(log=log, joint=JOINT, robot=ROBOT), {"time"})
+    found, words, _ = judged(Case(log=log, joint=JOINT, robot=ROBOT), {"time"})
     assert "time" in found, words
 
 
