@@ -42,7 +42,7 @@ from pronk.links.address import Address
 from pronk.links.realtime import Wanted, enter
 from pronk.processes import die_with_parent
 from pronk.robots import load_robot
-from pronk.runtime.ipc import Mode, OperatorRequest
+from pronk.runtime.ipc import Event, Mode, OperatorRequest
 from pronk.runtime.plan import Link, Plan
 from pronk.runtime.run import Deployment
 from pronk.runtime.script import STILL, Velocity
@@ -64,6 +64,10 @@ PROCESSES = {
 FAULTS = (*SENSOR_FAULTS, *PROCESSES)
 BUSY = ("NO_STATE", "STATE_LOST", "HELD", "EXPIRED", "LAG", "CLOCK", "ENDED", "LINK")
 """Reasons of a computer that is too busy."""
+FOUND_S = 3.0
+"""For which a fault is waited for [s]."""
+REFUSED = "refused"
+"""Reason of a robot that the pre-flight refuses: nothing is sent to it."""
 BAR_S = 0.1
 """From a fault to damping [s]."""
 WALK = (0.6, 0.0, 0.0)
@@ -129,6 +133,7 @@ def served(robot: str, link: str) -> Iterator[tuple[Address, Connection | None]]
         target=_serve, args=(robot, link, options, other), name="virtual robot", daemon=True
     )
     process.start()
+    other.close()
     try:
         end.recv()
         yield Address(kind=link, options=options), end
@@ -185,22 +190,30 @@ def _walk(deployment: Deployment) -> bool:
 def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, float, str]]:
     """Name, time to damping on the robot's clock [s] and reason of faults, one after the other.
 
-    A fault that is not found within 2 s has the time NaN. Of swapped legs the time is that from the
-    request to stand. Ends early where the robot does not walk, the computer is too busy, or a
-    process is gone.
+    A fault that is not found within `FOUND_S` has the time NaN. Of swapped legs the time is that
+    from the request to stand. Ends early where the robot does not walk, the computer is too busy, a
+    process is gone, or the pre-flight refuses the robot (`REFUSED`).
     """
     rows: list[tuple[str, float, str]] = []
     if faults[0] in SWAPPED:
         plan = replace(plan, timing=replace(TIMING, check_s=Timing().check_s))
     with Deployment(plan) as deployment:
         for fault in faults:
+            events = list[Event]()
             if fault in SWAPPED and rows:
                 break  # it needs a robot that has not stood up
             if fault in SWAPPED:
                 robot.send(fault)
-                begun = time.monotonic()
-                _until(deployment, 5.0, (Mode.FAULT, Mode.ENDED), OperatorRequest.STAND)
-                passed = time.monotonic() - begun
+                begun, request = time.monotonic(), OperatorRequest.STAND
+                while (passed := time.monotonic() - begun) < 5.0:
+                    over = _until(deployment, 0.02, (Mode.FAULT, Mode.ENDED), request)
+                    request = OperatorRequest.NONE
+                    events += deployment.events_seen()
+                    if any(each.kind == "refused" for each in events):
+                        rows.append((fault, passed, REFUSED))
+                        return rows
+                    if over:
+                        break
             elif not _walk(deployment):
                 break
             else:
@@ -211,15 +224,20 @@ def strike(plan: Plan, robot: Connection, faults: list[str]) -> list[tuple[str, 
                 name, number = PROCESSES[fault]
                 struck = getattr(deployment, name).pid
                 os.kill(struck, number)
-            if fault not in SWAPPED:
-                _until(deployment, 2.0, (Mode.FAULT, Mode.ENDED), command=_motion(deployment))
+            damped: float | None = None
+            due = time.monotonic() + (0.0 if fault in SWAPPED else FOUND_S)
+            while damped is None:
+                _until(deployment, 0.1, (), command=_motion(deployment))
+                robot.send("damped")
+                damped = robot.recv()
+                if time.monotonic() >= due:
+                    break
             _until(deployment, 0.1, ())
             if struck is not None and fault == "policy-stopped":
                 os.kill(struck, signal.SIGCONT)
-            robot.send("damped")
-            damped: float | None = robot.recv()
             robot.send(None)
-            reasons = [each.reason for each in deployment.events_seen() if each.kind == "fault"]
+            events += deployment.events_seen()
+            reasons = [each.reason for each in events if each.kind == "fault"]
             if fault.startswith("servo") and deployment.shared.standby.written:
                 reasons = ["STANDBY"]
             if damped is None or not reasons:
@@ -397,7 +415,8 @@ ms: median (worst). All over loopback, in real time. The Mini Cheetah walks with
 For the Go2, of which no policy was trained, a linear one squats, sways and pitches on four feet, at
 the stiffness of Unitree's stand example (60 N m/rad).
 The joint of the faults of one encoder is a hip roll, which moves and is loaded least. The time of
-swapped legs and joints is that from the request to stand; the robot has not risen. A stopped or
+swapped legs and joints is that from the request to stand; the robot has not risen. `refused` is of
+the pre-flight, after which nothing is sent. A stopped or
 killed servo is followed by the standby process.
 
 {lines}

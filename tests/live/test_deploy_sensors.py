@@ -16,7 +16,7 @@ pytest.importorskip("lcm")
 pytest.importorskip("cyclonedds")
 pytest.importorskip("onnx")
 
-from benchmarks.sensor_faults import FAULTS, PROCESSES, measure
+from benchmarks.sensor_faults import FAULTS, PROCESSES, REFUSED, measure
 from deploy_runs import PATIENT
 from pronk.virtual.faults import SWAPPED
 
@@ -48,7 +48,10 @@ def test_each_fault_damps(robot: str, link: str, faults: tuple[str, ...]) -> Non
             expected = {"STANDBY" if fault.startswith("servo") else "EXPIRED"}
         elif fault in SWAPPED:
             # Joints of one leg that are swapped do not come to their swing.
-            expected = {"SWAPPED"} if fault == "legs-swapped" else {"SWAPPED", "SPEED", "ENCODER"}
+            expected = {"SWAPPED"}
+            if fault == "joints-swapped":
+                # Found earlier where the reported positions lie outside the range of the joints.
+                expected |= {REFUSED, "CLIPPED", "SPEED", "ENCODER"}
         else:
             of_trunk = fault.split("-")[0] in IMU
             expected = {"REPEATED", "ATTITUDE"} if of_trunk else {"ENCODER"}

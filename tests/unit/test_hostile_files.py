@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import resource
 import zipfile
 from dataclasses import replace
@@ -20,8 +21,10 @@ from pronk.evaluation import results
 from pronk.evaluation.training_sim.evaluation import SCHEMA, load_speed_errors
 from pronk.evaluation.variation import VARIATION
 from pronk.files import LIMIT, read_yaml, write_text
+from pronk.logs.joint_log import Segment
 from pronk.logs.mcap import McapWriter
-from pronk.logs.mcap_log import HEADER, TOPICS
+from pronk.logs.mcap_log import HEADER, SAMPLE, TOPICS, LogHeader, McapLogWriter
+from pronk.logs.mcap_log import SCHEMA as SWEEP
 from pronk.logs.readers import find_logs, read_log
 from pronk.match import gains
 from pronk.names import check_names, file_name
@@ -31,7 +34,7 @@ from pronk.robots import load_robot
 from pronk.robots.bare import file_of_model, yaml_of_model
 from pronk.robots.load import read_robot
 from pronk.virtual.sim_params import load_sim_params
-from report_cases import varied
+from report_cases import joint_fit, varied
 
 GAINS = """
 schema: pronk/gains/1
@@ -268,6 +271,59 @@ def test_a_model_whose_joint_has_no_effort_is_refused(tmp_path: Path) -> None:
     for read in (file_of_model, load_robot):
         with pytest.raises(RobotError, match="effort"):
             read(path)
+
+
+def test_a_segment_that_an_mcap_log_holds_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = McapLogWriter(path, LogHeader(robot="r", joints=("knee",)))
+    for _ in range(2):
+        writer.segment(Segment(kind="chirp", joints=("knee",), start=0.0, stop=0.02, amplitude=0.1))
+    for k in range(20):
+        writer.sample(k / 500.0, [0.1], [0.2], segment=0)
+    writer.end()
+    with pytest.raises(LogError, match="twice"):
+        read_log(path)
+
+
+def test_an_mcap_log_whose_header_leaves_out_the_gains_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    file = McapWriter(path, TOPICS)
+    file.put(HEADER, 0.0, {"schema": SWEEP, "robot": "r", "joints": ["knee"]})
+    for k in range(20):
+        file.put(SAMPLE, k / 500.0, {"t": k / 500.0, "command": [0.1], "position": [0.2]})
+    file.close()
+    assert read_log(path).stiffness is None
+
+
+def test_a_fit_with_gains_of_another_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match="amplitude_gains"):
+        replace(joint_fit("knee"), amplitude_gains=np.ones(2))
+
+
+@pytest.mark.parametrize("axis", ["1e308 1 0", "0 1e-300 0"])
+def test_a_model_whose_axis_has_no_direction_is_refused(tmp_path: Path, axis: str) -> None:
+    path = tmp_path / "a.urdf"
+    path.write_text(
+        "<robot name='r'><link name='base'/><link name='leg'><inertial><mass value='1'/>"
+        "<inertia ixx='.1' iyy='.1' izz='.1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
+        "<joint name='knee' type='revolute'><parent link='base'/><child link='leg'/>"
+        f"<axis xyz='{axis}'/><limit lower='-1' upper='1' effort='10' velocity='20'/></joint>"
+        "</robot>"
+    )
+    with pytest.raises(RobotError):
+        load_robot(path)
+
+
+def test_more_steps_than_a_float_holds_are_refused(tmp_path: Path) -> None:
+    model, path = tmp_path / "a.xml", tmp_path / "robot.yaml"
+    model.write_text(
+        "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    text = yaml_of_model(model)
+    path.write_text(re.sub(r"decimation: \d+", f"decimation: {'9' * 400}", text))
+    assert path.read_text() != text
+    with pytest.raises(RobotError, match="decimation"):
+        read_robot(path)
 
 
 def test_mutated_files_give_no_traceback_and_no_other_numbers() -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -215,9 +215,14 @@ def _read_sweep(path: Path, found: Iterable[Record], damage: str) -> JointLog:
         values = [getattr(row, name) for row in rows]
         return None if values[0] is None else np.array(values, dtype=np.float64)
 
-    about = vars(msgspec.json.decode(header[0], type=LogHeader))
+    # Not vars: it lacks the defaults of what the file leaves out.
+    known = msgspec.json.decode(header[0], type=LogHeader)
+    about = {entry.name: getattr(known, entry.name) for entry in fields(LogHeader)}
     arrays = {name: about.pop(name) for name in ("stiffness", "damping", "pose")}
     arrays = {n: None if v is None else np.array(v, dtype=np.float64) for n, v in arrays.items()}
+    segments = [_segment(data) for data in by_topic[SEGMENT]]
+    if len(set(segments)) < len(segments):
+        raise LogError(f"{path}: damaged: it has the same segment twice; record again.")
     frequency = np.array([row.frequency for row in rows], dtype=np.float64)  # None becomes NaN.
     return JointLog(
         **about,
@@ -231,7 +236,7 @@ def _read_sweep(path: Path, found: Iterable[Record], damage: str) -> JointLog:
         # Segments that had begun by the last sample, ended there if they were cut.
         segments=tuple(
             replace(segment, stop=min(segment.stop, last))
-            for segment in map(_segment, by_topic[SEGMENT])
+            for segment in segments
             if segment.start < last
         ),
         source=str(path),

@@ -99,6 +99,18 @@ class JointFit:
     unchecked: tuple[str, ...] = ()
     """Errors of the logs that would leave no trace in them."""
 
+    def __post_init__(self) -> None:
+        """Refuse arrays of contradictory shapes."""
+        axes = len(self.grid_stiffness), len(self.grid_damping)
+        for name, shape in (
+            ("covariance", (2, 2)),
+            ("repeat_gains", (len(self.repeat_gains), 2)),
+            ("amplitude_gains", (len(self.amplitude_gains), 3)),
+            ("grid_error", axes),
+        ):
+            if (found := np.shape(getattr(self, name))) != shape:
+                raise ValueError(f"{name} of {self.joint} has shape {found}; expected {shape}")
+
     @classmethod
     def of(cls, joint: str, found: Estimate, **more: Any) -> JointFit:
         """A fit with the parameters and intervals of an estimate; `more` are the other fields."""

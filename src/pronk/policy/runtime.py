@@ -174,8 +174,11 @@ def load_policy(path: Path | str) -> Policy:
             "builds it; use the pronk it was trained with, or train again."
         )
     inputs = {"measured": MEASURED_SIZE} | ({"jump": 1} if contract.jump else {})
-    _check_graph(path, "inputs", session.get_inputs(), inputs)
-    _check_graph(path, "outputs", session.get_outputs(), _OUTPUTS)
+    try:
+        _check_graph(path, "inputs", session.get_inputs(), inputs)
+        _check_graph(path, "outputs", session.get_outputs(), _OUTPUTS)
+    except UnicodeDecodeError:
+        raise ArtefactError(f"{path}: damaged: a name in its network is not text.") from None
     _first(session, inputs, path)
     return Policy(session, contract, sha256=hashlib.sha256(data).hexdigest())
 

@@ -58,6 +58,11 @@ def file_of_model(path: Path) -> RobotFile:
     for j in hinges:
         name, dof = model.joint(j).name, model.jnt_dofadr[j]
         inertia = float(full[dof, dof])
+        if not 0.0 < inertia < math.inf:
+            raise RobotError(
+                f"{path}: the inertia about joint {name} is {inertia:g} kg m^2; expected a "
+                "positive number. Check its axis and the masses behind it."
+            )
         stiffness = inertia * (2.0 * math.pi * NATURAL_HZ) ** 2
         damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * inertia)
         effort = 2.0 * (abs(float(data.qfrc_bias[dof])) + 0.5 * stiffness)
@@ -91,8 +96,8 @@ def file_of_model(path: Path) -> RobotFile:
             drive=name, stiffness=_short(stiffness), damping=_short(damping), band_hz=_BAND_HZ
         )
         pose[name] = _short(float(data.qpos[model.jnt_qposadr[j]]))
-    kp = [group.stiffness for group in groups.values() if group.stiffness]
-    kd = [group.damping for group in groups.values() if group.damping]
+    kp = [group.stiffness or 0.0 for group in groups.values()]
+    kd = [group.damping or 0.0 for group in groups.values()]
     return RobotFile(
         schema=SCHEMA,
         name=path.stem,

@@ -149,7 +149,7 @@ class RobotFile(_Entry, frozen=True):
     legs: tuple[str, ...] = ()
     policy_rate_hz: _Positive = 50.0
     timestep_s: _Positive = 0.005
-    decimation: Annotated[int, Meta(ge=1)] = 4
+    decimation: Annotated[int, Meta(ge=1, le=1000)] = 4
     grid_stiffness: _Band = (13.0, 27.0)
     grid_damping: _Band = (0.1, 0.7)
     about: AboutEntry = AboutEntry()
@@ -192,7 +192,9 @@ def read_model(path: Path) -> Model:
         for element in (*spec.materials, *spec.textures):
             spec.delete(element)
         spec.compile()
-        return Model(spec.to_xml())
+        made = Model(spec.to_xml())
+        made().compile()  # MuJoCo writes XML that it cannot read where a number is not finite.
+        return made
     except (ValueError, OSError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise RobotError(f"{path}: not a model that MuJoCo can read ({reason}).") from None
