@@ -1,6 +1,6 @@
 """Each fault of a sensor or a process damps the moving virtual robots, over LCM or DDS, in turns.
 
-The rows of the table in docs/faults.md; times are on the virtual robot's own clock.
+The rows of the table of `python -m benchmarks sensor-faults`, on the virtual robot's own clock.
 """
 
 from __future__ import annotations

@@ -96,8 +96,8 @@ def file_of_model(path: Path) -> RobotFile:
             drive=name, stiffness=_short(stiffness), damping=_short(damping), band_hz=_BAND_HZ
         )
         pose[name] = _short(float(data.qpos[model.jnt_qposadr[j]]))
-    kp = [group.stiffness or 0.0 for group in groups.values()]
-    kd = [group.damping or 0.0 for group in groups.values()]
+    kp = [group.stiffness for group in groups.values() if group.stiffness]
+    kd = [group.damping for group in groups.values() if group.damping]
     return RobotFile(
         schema=SCHEMA,
         name=path.stem,
