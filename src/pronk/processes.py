@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TypeVar
 
 from pronk.errors import PronkError
@@ -33,10 +33,21 @@ def die_with_parent(number: int = signal.SIGKILL) -> None:
         os.kill(os.getpid(), number)
 
 
-def pool(processes: int) -> ProcessPoolExecutor:
-    """Make a pool of processes that die with this one; a fork of a program with threads hangs."""
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(processes, mp_context=context, initializer=die_with_parent)
+@contextmanager
+def pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool of processes that die with this one; a fork of a program with threads hangs.
+
+    At the end they are killed: the executor itself waits for each of them, so for ever for one that
+    was stopped, or killed while it held the lock of the queue.
+    """
+    before, context = multiprocessing.active_children(), multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context, initializer=die_with_parent) as own:
+        try:
+            yield own
+        finally:
+            for process in multiprocessing.active_children():
+                if process not in before:
+                    process.kill()
 
 
 def in_processes(

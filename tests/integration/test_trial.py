@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -137,6 +139,19 @@ def test_processes_keep_the_order_and_pass_errors_on() -> None:
         in_processes(abs, [1], processes=0)
     with pytest.raises(PronkError, match="-1,x"):
         in_processes(parse_case, ["1,0", "-1,x"], processes=2)
+
+
+def test_processes_end_though_an_idle_one_was_stopped(tmp_path: Path) -> None:
+    number, begun = tmp_path / "pid", tmp_path / "begun"
+    commands = [
+        f"echo $PPID > {number}; until [ -e {begun} ]; do sleep 0.05; done",
+        f"touch {begun}; sleep 1; kill -STOP $(cat {number})",
+    ]
+    code = (
+        "import os; from pronk.processes import in_processes; "
+        f"assert in_processes(os.system, {commands!r}, processes=2) == [0, 0]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120.0)
 
 
 # --- What is refused before the first step ------------------------------------------------------
