@@ -10,6 +10,9 @@ velocity changes by
 and then `q += h v`. Law `implicit` does so N times a step, with `h` the N-th part of it (the
 position iterations of PhysX). It is `implicit_damping` of damping `kd + h kp`, because
 `q + h v` is the position that the old velocity leads to.
+
+Passive damping `b` of a joint is implicit in most engines: `-b v` is in `g`, and `h b` beside `J`.
+Where it is explicit, `-b v` is in `g` alone.
 """
 
 from __future__ import annotations
@@ -34,15 +37,23 @@ class DriveLaw:
     kind: Literal["explicit", "implicit_damping", "implicit"] = "explicit"
     iterations: int = 1
     """Parts of a physics step that law `implicit` computes one after the other."""
+    passive_damping: Literal["implicit", "explicit"] = "implicit"
+    """How the joints' own damping acts; explicit with law `explicit` alone."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown law, and iterations of a law without any."""
+        """Refuse an unknown law, and iterations or passive damping that it does not have."""
         if self.kind not in LAWS:
             raise PronkError(f"drive law {self.kind!r}; expected one of {', '.join(LAWS)}.")
         if self.iterations < 1 or (self.iterations > 1 and self.kind != "implicit"):
             raise PronkError(
                 f"drive law {self.kind} with {self.iterations} iterations; expected 1, or 1 or "
                 "more of law implicit."
+            )
+        passive = ("implicit", "explicit") if self.kind == "explicit" else ("implicit",)
+        if self.passive_damping not in passive:
+            raise PronkError(
+                f"drive law {self.kind} with passive_damping {self.passive_damping!r}; expected "
+                f"{' or '.join(passive)}."
             )
 
     @property

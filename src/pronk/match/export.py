@@ -31,7 +31,7 @@ import scipy.linalg
 from pronk.errors import PronkError, RobotError
 from pronk.match.gains import MatchedGains
 from pronk.robots import load_robot
-from pronk.robots.model import add_drives, free_spec
+from pronk.robots.model import add_drives, free_spec, set_law
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.profiles import Profile, profile, profile_of, profiles
 
@@ -158,7 +158,8 @@ def stability_share(robot: RobotSpec, drives: Sequence[Actuator]) -> float:
             dof = model.joint(name).dofadr[0]
             stiffness[dof] = one.stiffness
             damping[dof] = robot.law.damping(one.stiffness, one.damping, step)
-    implicit = model.dof_damping + (0.0 if robot.law.kind == "explicit" else damping)
+    implicit = np.zeros(model.nv) if robot.law.kind == "explicit" else damping.copy()
+    (damping if robot.law.passive_damping == "explicit" else implicit)[:] += model.dof_damping
     return float(
         scipy.linalg.eigh(
             np.diag(2.0 * step * damping + step**2 * stiffness),
@@ -353,9 +354,7 @@ def _mjcf_spec(drives: list[Actuator], robot: RobotSpec) -> mujoco.MjSpec:
     """
     by_joint = {joint: one for one in drives for joint in one.joints}
     spec = free_spec(robot)
-    spec.option.timestep = robot.law.substep(robot.timestep_s)
-    if robot.law.kind == "explicit":
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    set_law(spec.option, robot)
     for name, one in by_joint.items():
         spec.joint(name).armature = one.armature
         spec.joint(name).frictionloss = one.frictionloss
@@ -387,7 +386,8 @@ def _snippet(_t: Target, drives: list[Actuator], _p: Profile, robot: RobotSpec) 
     own = dict(zip(_flat(drives, "joints"), _flat(drives, "own_joints"), strict=True))
     integrator = "Euler" if robot.law.kind == "explicit" else "implicitfast"
     step = robot.law.substep(robot.timestep_s)
-    lines = [f'<option timestep="{step!r}" integrator="{integrator}"/>']
+    flag = '<flag eulerdamp="disable"/>' if robot.law.passive_damping == "explicit" else ""
+    lines = [f'<option timestep="{step!r}" integrator="{integrator}">{flag}</option>']
     for joint in root.iter("joint"):
         if (name := joint.get("name", "")) in own:
             passive = [f'{n}="{joint.get(n, 0)}"' for n in ("damping", "armature", "frictionloss")]

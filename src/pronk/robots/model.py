@@ -60,6 +60,16 @@ def free_spec(robot: RobotSpec) -> mujoco.MjSpec:
     return spec
 
 
+def set_law(option: mujoco.MjOption, robot: RobotSpec) -> None:
+    """Give options the step and the integrator of a robot's drive law."""
+    law, names = robot.law, mujoco.mjtIntegrator
+    option.timestep = law.substep(robot.timestep_s)
+    explicit = law.kind == "explicit"
+    option.integrator = names.mjINT_EULER if explicit else names.mjINT_IMPLICITFAST
+    if law.passive_damping == "explicit":
+        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+
+
 def bench_spec(
     robot: RobotSpec,
     joint_name: str,
@@ -80,12 +90,7 @@ def bench_spec(
     """
     joint = robot.joint(joint_name)
     spec = robot.build_spec()
-    spec.option.timestep = robot.law.substep(robot.timestep_s)
-    spec.option.integrator = (
-        mujoco.mjtIntegrator.mjINT_EULER
-        if robot.law.kind == "explicit"
-        else mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    )
+    set_law(spec.option, robot)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     remove_geoms(spec)
     base = spec.body(robot.base_body)

@@ -36,6 +36,7 @@ class Profile:
     actuator: str
     law: Literal["explicit", "implicit_damping", "implicit"]
     iterations: int = 1
+    passive_damping: Literal["implicit", "explicit"] = "implicit"
     timestep_s: float
     decimation: int
     """Steps of a command as the framework's tasks have it; a match takes the robot's."""
@@ -66,7 +67,9 @@ class Profile:
     @property
     def drive_law(self) -> DriveLaw:
         """How stiffness and damping act over a step."""
-        return DriveLaw(kind=self.law, iterations=self.iterations)
+        return DriveLaw(
+            kind=self.law, iterations=self.iterations, passive_damping=self.passive_damping
+        )
 
     @property
     def info(self) -> SimulatorInfo:

@@ -30,6 +30,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from pronk.actuator.law import EXPLICIT
 from pronk.errors import PronkError
 from pronk.robots.model import set_drive_gains
 from pronk.robots.robot import RobotSpec
@@ -106,7 +107,7 @@ class WarpTestRig(JointTestRig):
         """Yield the excited joint's positions a chunk at a time; see `JointRigs.run`."""
         total = len(values["stiffness"])
         gains_alone = set(values) == {"stiffness", "damping"}
-        if total < self._least or not gains_alone or self.robot.law.kind != "explicit":
+        if total < self._least or not gains_alone or self.robot.law != EXPLICIT:
             yield from super().run(traces, values, steps)
             return
         for begin in range(0, total, MOST):

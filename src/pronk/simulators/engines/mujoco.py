@@ -1,6 +1,7 @@
 """MuJoCo of any version, and MJX: position actuators with Euler (law E) or implicitfast (IF).
 
-Actuators have the effort limit, not the torque-speed line; passive damping is implicit in both.
+Actuators have the effort limit, not the torque-speed line. Passive damping is implicit; with Euler,
+flag eulerdamp turned off makes it explicit where the law has it so.
 Unlike `pronk.simulators.mujoco` it needs no robot's model, so it also runs in another Python.
 """
 
@@ -36,6 +37,8 @@ class Mujoco(EngineSimulator):
         explicit = self.law.kind == "explicit"
         names = mujoco.mjtIntegrator
         spec.option.integrator = names.mjINT_EULER if explicit else names.mjINT_IMPLICITFAST
+        if self.law.passive_damping == "explicit":
+            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
         bodies: list[Any] = []
         for i, (name, up) in enumerate(zip(links.joints, links.parent, strict=True)):
             body = (bodies[up] if up >= 0 else spec.worldbody).add_body(pos=links.offset[i])

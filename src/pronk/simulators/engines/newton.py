@@ -1,8 +1,8 @@
 """Newton: joint drives in the solvers MuJoCo (law IF), Featherstone (E) and Steel (I1).
 
 Newton needs MuJoCo 3.17, pronk 3.11, so it runs in another Python (`--simulator-python`), on the
-processor in single precision. Featherstone and Steel take passive damping explicitly and are used
-without dry friction.
+processor in single precision. Featherstone and Steel take passive damping explicitly
+(`DriveLaw.passive_damping`; no law here has it with I1) and are used without dry friction.
 """
 
 from __future__ import annotations
