@@ -2,8 +2,8 @@
 
 PyBullet has no armature: that of one joint is added to its link's inertia, which is the same thing.
 In a chain it would also turn with the parents, so chains take none. Passive damping is part of the
-explicit torque (`DriveLaw.passive_damping`). Dry friction is a velocity motor's, which holds a joint
-at rest.
+explicit torque (`DriveLaw.passive_damping`). Dry friction is that of a velocity motor, which holds
+a joint at rest.
 """
 
 from __future__ import annotations
