@@ -35,6 +35,17 @@ def test_help_names_every_command_and_loads_no_heavy_library():
     assert accepted("--version").strip() == f"pronk {__version__}"
 
 
+def test_options_of_every_command_are_read_without_the_libraries_that_it_runs_with():
+    code = (
+        "import pkgutil, sys, pronk.cli.main as m;"
+        "[pkgutil.resolve_name(where) for where, _ in m.COMMANDS.values()];"
+        "heavy = ('scipy', 'matplotlib', 'mujoco', 'torch', 'mjlab', 'warp', 'onnxruntime');"
+        "print([name for name in heavy if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_every_command_has_help(command):
     printed = accepted(command, "--help")

@@ -18,7 +18,7 @@ from pronk.train.mdp import commands
 from pronk.train.mdp.commands import motion_command
 from pronk.train.mdp.motion import Motion
 from pronk.train.mdp.reward_manager import StackedRewardManager
-from pronk.train.reward_weights import reward_weights
+from pronk.train.tasks.reward_weights import reward_weights
 from training_env import N
 
 pytestmark = pytest.mark.train

@@ -16,6 +16,10 @@ def train(settings: TrainSettings) -> console.Outcome:
     Args:
         settings: What is trained.
     """
+    from pronk.train.devices import require_extra
+
+    require_extra()
+
     from pronk.train.run import train as run
 
     again = shlex.join(["pronk", "train", settings.task, "--resume", "--out", str(settings.out)])

@@ -1,10 +1,10 @@
-"""The mjlab task: from random weights to a policy that walks, runs and jumps on command."""
+"""The mjlab task: from random weights to a policy that walks, runs and jumps on command.
+
+mjlab loads `tasks` while it is itself imported. Were it imported first by a module that the tasks
+use, they would meet that module half done; so `mdp` and `rl` import it before any of theirs. The
+modules beside them, with the options of `pronk train`, do not need mjlab.
+"""
 
 import os
-from importlib.util import find_spec
 
-if find_spec("mjlab") is not None:
-    # mjlab loads the tasks of this package while it is itself imported. Were it imported first by
-    # a module of this package, the tasks would meet that module half done.
-    os.environ.setdefault("MJLAB_WARP_QUIET", "1")
-    import mjlab  # noqa: F401
+os.environ.setdefault("MJLAB_WARP_QUIET", "1")

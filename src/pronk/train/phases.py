@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pronk.errors import PronkError
-from pronk.train.mdp.commands import motion_command
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -167,6 +166,8 @@ class Curriculum:
             if name in phase.jump_scales:
                 params = {**params, "jump_scale": _between(phase.jump_scales[name], done)}
             term.params.update(params)
+        from pronk.train.mdp.commands import motion_command
+
         command = motion_command(env)
         command.state.liftoff_std = _between(phase.liftoff_std, done)
         command.cfg.jump_fraction = 0.5 if phase.jump else 0.0

@@ -20,11 +20,11 @@ import torch
 from pronk.errors import ArtefactError
 from pronk.files import sha256, written_whole
 from pronk.train import devices, provenance
-from pronk.train.gains import NAIVE, TrainingGains, training_gains
+from pronk.train.gains import TrainingGains, training_gains
 from pronk.train.phases import STEPS_PER_ITERATION
 from pronk.train.provenance import RunFolder
 from pronk.train.rl import checkpoint
-from pronk.train.settings import TrainSettings
+from pronk.train.settings import NAIVE, TrainSettings
 
 _COPIED = ("MUJOCO*", "MJLAB*", "WARP*", "WANDB*")
 """Variables of the environment that the processes get, beside torchrunx's own."""
@@ -49,7 +49,6 @@ def train(
     else:
         folder.check_fresh()
         settings = settings.completed()
-    devices.require_extra()
     gpus = devices.find_devices(settings.device, settings.gpu_ids)
     # Hide all other GPUs from this process and its children, before any uses CUDA.
     os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(gpus)

@@ -10,8 +10,10 @@ from typing import Any, Literal, Self
 import tyro
 
 from pronk.errors import PronkError
-from pronk.train.gains import NAIVE
 from pronk.train.phases import PHASES, TASKS
+
+NAIVE = "naive"
+"""The choice of gains that needs no file."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Reward terms: functions of the environment, (N,) each; `pronk.train.reward_weights` has weights.
+"""Reward terms: functions of the environment, (N,) each; `tasks.reward_weights` has their weights.
 
 A penalty's term is positive and its weight negative. Most terms are rates; an event earns its
 weight once, however long its step took. Terms take `jump_scale`, a factor in jump mode (see

@@ -37,7 +37,7 @@ from pronk.train import phases
 from pronk.train.gains import TrainingGains
 from pronk.train.mdp import actions, commands, events, observations, terminations
 from pronk.train.mdp.actuators import actuators
-from pronk.train.reward_weights import reward_weights
+from pronk.train.tasks.reward_weights import reward_weights
 
 FOOT_CONTACT = (0.0105, 1.0)
 """Time constant [s] and damping ratio of a foot on the ground. With MuJoCo's .02 the feet of a
