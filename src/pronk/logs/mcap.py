@@ -8,17 +8,19 @@ may claim to unpack to more than there is memory.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
+import msgspec
 import orjson
 import zstandard
 from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from mcap.writer import CompressionType, IndexType, Writer
 
 from pronk.errors import LogError
@@ -33,6 +35,8 @@ STRINGS: dict[str, Any] = {"type": "array", "items": STRING}
 
 _RECORD_BYTES = 400
 """What a message takes in memory beside its data, about [bytes]."""
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""Beginning of a message: opcode, length of what follows, channel, sequence, times."""
 _MOST_CHUNK = 256 * 2**20
 """Largest size of one unpacked chunk [bytes]; writers use 1 to 8 MiB."""
 
@@ -87,9 +91,8 @@ class TooLargeError(DamagedError):
     """The file takes more memory than the limit."""
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
-    """One message."""
+class Record(msgspec.Struct, frozen=True, gc=False):
+    """One message; the garbage collector skips the many of a file."""
 
     topic: str
     encoding: str
@@ -115,15 +118,15 @@ def records(stream: IO[bytes], size: int, most: int | None = None) -> Iterator[l
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     unpacked, most = 0, most or most_bytes()
-    reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
+    reader = _Reader(stream, emit_chunks=True, record_size_limit=size)
     try:
         for record in reader.records:
-            inside = [record]
+            inside: Sequence[McapRecord] = [record]
             if isinstance(record, Chunk):
                 unpacked += record.uncompressed_size
                 if unpacked > most:
                     raise TooLargeError(f"its chunks unpack to more than {most >> 20} MiB")
-                inside = breakup_chunk(_unpacked(record), validate_crc=True)
+                inside = _contents(_unpacked(record))
             batch: list[Record] = []
             for item in inside:
                 if isinstance(item, Channel):
@@ -149,6 +152,37 @@ def records(stream: IO[bytes], size: int, most: int | None = None) -> Iterator[l
         # The library raises many types on a damaged record.
         words = " ".join(str(error).split())[:120]
         raise DamagedError(f"{type(error).__name__} {words}".rstrip()) from None
+
+
+class _Reader(StreamReader):
+    """Passes over the indices of messages, which nothing here uses."""
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        if opcode != Opcode.MESSAGE_INDEX:
+            return super()._read_record(opcode, length)
+        self._stream.read2()
+        # Entries of 16 bytes, as many as it claims: blocks, as the claim may be false.
+        end = self._stream.read4() + self._stream.count
+        while (left := end - self._stream.count) > 0:
+            self._stream.read(min(-(-left // 16) * 16, 2**16))
+        return None
+
+
+def _contents(chunk: Chunk) -> Sequence[McapRecord]:
+    """The records of an unpacked chunk. Where all are whole messages, each is read in one step."""
+    get_chunk_data_stream(chunk, validate_crc=True)
+    found: list[McapRecord] = []
+    data, at = chunk.data, 0
+    while at + _MESSAGE.size <= len(data):
+        opcode, length, channel, sequence, logged, published = _MESSAGE.unpack_from(data, at)
+        first, at = at + _MESSAGE.size, at + 9 + length
+        if opcode != Opcode.MESSAGE or not first <= at <= len(data):
+            break
+        found.append(Message(channel, logged, data[first:at], published, sequence))
+    else:
+        if at == len(data):
+            return found
+    return breakup_chunk(chunk)
 
 
 def _unpacked(chunk: Chunk) -> Chunk:
