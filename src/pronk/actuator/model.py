@@ -12,9 +12,9 @@ under the bus voltage is 2 kt omega. A brushed motor has 1 and 1.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from pronk.arrays import Array
 
 
 def pd_torque(

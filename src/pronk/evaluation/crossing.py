@@ -35,8 +35,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, Mask
 from pronk.errors import PronkError
 from pronk.evaluation.jumps import (
     FALLEN_COSINE,
@@ -65,7 +65,6 @@ from pronk.virtual.capture import Capture
 from pronk.virtual.ground import Box, Ground, Start
 from pronk.virtual.sim_params import SimParams
 
-Array = NDArray[np.float64]
 Shape = Literal["flat", "gap", "up", "down"]
 
 DEPTH = 1.0
@@ -247,7 +246,7 @@ def measure_crossing(
     return CrossingFigures(why=why, **figures)
 
 
-def _stepped_in(seen: Capture, obstacle: Obstacle) -> NDArray[np.bool_]:
+def _stepped_in(seen: Capture, obstacle: Obstacle) -> Mask:
     """Samples with the centre of a foot below the floor between the edges of a gap. (T,)."""
     feet = seen.foot_position[:, :, :2] @ direction(obstacle.command)
     between = (feet > obstacle.edge) & (feet < obstacle.far)  # empty but for a gap

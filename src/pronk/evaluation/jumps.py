@@ -20,16 +20,13 @@ from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator import model as drive
+from pronk.arrays import Array, Mask
 from pronk.robots.legged import legged
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.script import Script
 from pronk.virtual.capture import Capture
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 GRAVITY = 9.81
 """[m/s^2]"""

@@ -21,15 +21,14 @@ from typing import Any, Self
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pronk.arrays import Array
 from pronk.errors import ArtefactError
 from pronk.evaluation.jumps import JumpFigures, figures_of
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.files import write_text
 from pronk.runtime.script import Script
-
-Array = NDArray[np.float64]
 
 RESAMPLES = 4999
 """Of a bootstrap."""

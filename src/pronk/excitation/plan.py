@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import PlanError
 from pronk.excitation.signals import Chirp, Signal
 from pronk.excitation.worst_case import Forecast, Uncertainty, forecast
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 POSE_RAMP_S = 2.0
 """Time to move softly to the pose before the excitations of a joint [s]."""

@@ -11,11 +11,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import PlanError
-
-Array = NDArray[np.float64]
 
 POLICY_RATE_HZ = 50.0
 """Rate of the commands (paper S4)."""

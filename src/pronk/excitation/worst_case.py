@@ -15,14 +15,12 @@ from itertools import product
 import mujoco
 import mujoco.rollout
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator.model import bus_current, electrical_power, pd_torque, torque_limits
+from pronk.arrays import Array
 from pronk.errors import PlanError
 from pronk.robots.model import bench_spec, set_drive_gains
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 TIMESTEP_S = 0.001
 """Physics step. The drives run at 40 kHz (paper S4); a test holds that peaks at this step are

@@ -27,8 +27,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError
-from pronk.links.machine import Array, Command, RefusedError, State, TorqueKind, damping_command
+from pronk.links.machine import Command, RefusedError, State, TorqueKind, damping_command
 from pronk.robots.robot import RobotSpec
 
 Encode = Callable[[Command], bytes]

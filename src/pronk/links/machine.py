@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError
 
-Array = NDArray[np.float64]
 TorqueKind = Literal["measured", "computed", "absent"]
 
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.logs.checks import TIME_UNITS, check_unit, correlation_note
 from pronk.logs.joint_log import JointLog, check_increasing
 from pronk.names import check_names
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
 """Radians in each unit of angle."""

@@ -9,14 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError, printable
 from pronk.files import check_archive, check_size, sha256
 from pronk.logs.columns import Columns
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 QUANTITIES = ("command", "position", "velocity", "torque")
 _MOST_COLUMNS = 4096

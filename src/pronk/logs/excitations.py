@@ -13,11 +13,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.logs.joint_log import JointLog, Segment
-
-Array = NDArray[np.float64]
 
 MOVED_RAD = 1e-3
 """Least travel of a command that excites a joint: two counts of a 12-bit encoder."""

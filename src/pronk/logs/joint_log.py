@@ -7,12 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.names import check_names
-
-Array = NDArray[np.float64]
 
 SIGNAL_KINDS = ("chirp", "log_chirp", "multisine", "sine_steps", "unknown")
 _PER_JOINT = ("stiffness", "damping", "pose", "units")

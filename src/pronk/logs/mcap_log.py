@@ -18,8 +18,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.joint_log import JointLog, Segment
@@ -37,7 +37,6 @@ from pronk.logs.mcap import (
 from pronk.logs.rosbag_reader import MEASURED_TOPIC, read_joint_states
 from pronk.robots.robot import RobotSpec
 
-Array = NDArray[np.float64]
 Floats = Sequence[float] | Array
 
 SCHEMA = "pronk/sweep/1"

@@ -12,16 +12,14 @@ from typing import Any
 
 import numpy as np
 from mcap_ros2.decoder import DecoderFactory
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import in_force, ordered
 from pronk.logs.joint_log import JointLog
 from pronk.logs.mcap import Record
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 MEASURED_TOPIC = "/joint_states"

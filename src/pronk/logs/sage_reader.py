@@ -12,15 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.files import sha256
 from pronk.logs.columns import Columns, in_force
 from pronk.logs.csv_npz_reader import read_rows, read_text
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 FILES = ("control.csv", "state_motor.csv", "joint_list.txt")
 """What makes a folder a SAGE recording; `event.csv` is read where it is there."""

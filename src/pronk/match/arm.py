@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from pronk.arrays import Array, Mask
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.fit import Problem, Solution, solve
@@ -35,9 +36,6 @@ from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.chain import ChainSimulation, branches, has_stribeck, published
 from pronk.simulators.mujoco import Drives
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BLOCKS_S = (2.5, 20.0)
 """Shortest and longest block of the jackknife [s]: five times the joints' memory of half a second,

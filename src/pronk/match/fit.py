@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from pronk.arrays import Array, Mask
 from pronk.match.parameters import PARAMETERS
-
-Array = NDArray[np.float64]
 
 _AT_BOUND = 1e-3
 _SETTLED = 3e-4
@@ -84,7 +82,7 @@ class Solution:
     """Shape (m,)."""
     jacobian: Array
     """Shape (m, p)."""
-    at_bound: NDArray[np.bool_]
+    at_bound: Mask
     """Which numbers ended at a bound, shape (p,)."""
     settled: bool
     """False if the rounds ran out."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import PronkError
 from pronk.match.measured_joint import DB, MeasuredJoint
 from pronk.match.response_fit import Fit, refine
@@ -25,7 +25,6 @@ from pronk.simulators.linear import Plant, plant
 from pronk.simulators.mujoco import MujocoSimulator
 from pronk.simulators.simulator import JointRigs
 
-Array = NDArray[np.float64]
 Progress = Callable[[float], None]
 
 DIVERGED_DB = 100.0
@@ -89,7 +88,7 @@ def axes(robot: RobotSpec, points: int = 50) -> tuple[Array, Array]:
     return np.linspace(a, reach * b, points), np.linspace(c, reach * d, points)
 
 
-def mean_square(goal: MeasuredJoint, simulated: NDArray[np.complex128]) -> Array:
+def mean_square(goal: MeasuredJoint, simulated: ComplexArray) -> Array:
     """Mean square of the gain error [dB^2], shape (...), for responses of shape (..., inside)."""
     return _mean_square(goal.error_db(simulated))
 
@@ -223,7 +222,7 @@ def coarse_search(
     done = np.zeros(shape, dtype=bool)
     maps = np.full((len(group), *shape), np.nan)
 
-    def simulate(nodes: NDArray[np.bool_]) -> bool:
+    def simulate(nodes: Mask) -> bool:
         i, j = np.nonzero(nodes & ~done)
         if len(i):
             maps[:, i, j] = errors(rigs, group, stiffness[i], damping[j], armature=armature)
@@ -239,7 +238,7 @@ def coarse_search(
     return [GridSearch(stiffness=stiffness, damping=damping, error=row) for row in maps]
 
 
-def _around(maps: Array, reach: int, stride: int) -> NDArray[np.bool_]:
+def _around(maps: Array, reach: int, stride: int) -> Mask:
     """Nodes every `stride` around the best of each map, closer than `reach`, shape (a, b)."""
     shape = maps.shape[1:]
     close = np.zeros(shape, dtype=bool)

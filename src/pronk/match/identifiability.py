@@ -18,15 +18,12 @@ from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, ComplexArray
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.match.parameters import FREE, GAINS, checked_names
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 SD_MAX = 0.3
 """Relative standard deviation beyond which a parameter counts as unknown: at 95 % it would reach

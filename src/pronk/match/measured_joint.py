@@ -13,8 +13,8 @@ from functools import cache, cached_property, partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import IdentifiabilityError, LogError, PronkError
 from pronk.logs.excitations import with_segments
 from pronk.logs.joint_log import JointLog
@@ -30,9 +30,6 @@ from pronk.response.h1 import H1Operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _SAME_GAINS = 0.01
 """Relative difference of gains by the log and by the user that is rounding."""
@@ -58,7 +55,7 @@ class MeasuredJoint:
     """The way from positions to the response; computed once."""
     command: Callable[[RobotSpec], CommandTrace]
     """The `trace` for the step and decimation of a robot."""
-    fit_mask: NDArray[np.bool_]
+    fit_mask: Mask
     """Frequencies that the fit looks at: in the band, coherent enough, shape (f,)."""
     warnings: tuple[str, ...] = ()
     """What could not be used beside it."""
@@ -316,7 +313,7 @@ def _together(goals: Sequence[MeasuredJoint]) -> MeasuredJoint:
 
 def _inside(
     measured: FrequencyResponse, band_hz: tuple[float, float], coherence_min: float, where: str
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Coherent frequencies of the band; refuses a band that is mostly incoherent."""
     low, high = band_hz
     band = measured.band(low, high)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, ComplexArray
 from pronk.errors import IdentifiabilityError, PronkError
 from pronk.logs.joint_log import JointLog
 from pronk.match.arm import fit_together
@@ -66,8 +66,6 @@ from pronk.simulators.mujoco import MujocoSimulator, mujoco_info
 from pronk.simulators.profiles import profile
 from pronk.simulators.simulator import JointRigs, SimulatorInfo, joint_rigs
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Progress = Callable[[str, float], None]
 Mode = Literal["gains", "drive"]
 

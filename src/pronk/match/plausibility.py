@@ -43,9 +43,9 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from pronk.arrays import Array, ComplexArray
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.identifiability import bench_inertia
@@ -55,9 +55,6 @@ from pronk.match.time_fit import TimeFit
 from pronk.response.estimate import excitations, excited_joints
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Joint, RobotSpec
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 CAUSES: Mapping[str, tuple[str, str]] = {
     "drive gains": ("the drive had other gains than stated", "state those of this recording"),

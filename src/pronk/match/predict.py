@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from pronk.arrays import Array
 from pronk.errors import LogError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.logs.joint_log import JointLog, Segment
@@ -29,8 +29,6 @@ from pronk.simulators.chain import ChainSimulation, branches, moves_together, pu
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.profiles import profile_of
 from pronk.simulators.simulator import JointRigs, joint_rigs
-
-Array = NDArray[np.float64]
 
 SCHEMA = "pronk/prediction/2"
 

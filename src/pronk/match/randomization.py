@@ -22,16 +22,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from pronk.arrays import Array
 from pronk.logs.joint_log import JointLog
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
 from pronk.match.identifiability import bench_inertia
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.simulator import SimulatorInfo
-
-Array = NDArray[np.float64]
 
 STIFFNESS_STEP = 0.5
 """Lattice of the paper's training stiffnesses: 20, 17.5, 21.5 N m/rad (Table I)."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, ComplexArray
 from pronk.errors import IdentifiabilityError
 from pronk.match.fit import Problem, Solution, solve_together
 from pronk.match.identifiability import bench_experiment, require_identifiable
@@ -24,8 +24,6 @@ from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant
 from pronk.simulators.simulator import JointRigs
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Pair = tuple[float, float]
 """Stiffness [N m/rad] and damping [N m s/rad]."""
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, ComplexArray
 from pronk.files import load_artefact, save_artefact
 from pronk.match.gains import NAN, JointGains, MatchedGains, TorqueParameter
 from pronk.match.uncertainty import Estimate
@@ -28,9 +28,6 @@ NOT_BETTER = "not better: "
 _NOT_BETTER = 1.02
 """Error kept aside over that of the best of the others from which on a match is not better: where
 the model's friction is right all fits are equal but for noise."""
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from pronk.arrays import Array, ComplexArray
 from pronk.errors import PlanError, PronkError
 from pronk.excitation.plan import SweepPlan, make_plan
 from pronk.excitation.signals import Chirp, Signal
@@ -40,9 +40,6 @@ from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import MujocoSimulator
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 SCHEMA = "pronk/shape/1"
 MOST_ERROR = 0.25

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import ComplexArray
 from pronk.match.measured_joint import MeasuredJoint
 from pronk.simulators.simulator import JointRigs
 
-ComplexArray = NDArray[np.complex128]
 T = TypeVar("T")
 
 

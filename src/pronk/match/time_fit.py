@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
+from pronk.arrays import Array, Mask
 from pronk.logs.joint_log import JointLog
 from pronk.match.fit import Problem, Solution, solve_together
 from pronk.match.parameters import GAINS, PARAMETERS
@@ -32,8 +33,6 @@ from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
 from pronk.simulators.simulator import JointRigs
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Masks = Sequence[Sequence[Mask]]
 """Samples of each repeat of each excitation."""
 

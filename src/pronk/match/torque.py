@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal, stats
 
+from pronk.arrays import Array, Mask
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.gains import TorqueParameter
@@ -39,8 +40,6 @@ from pronk.match.result import JointFit
 from pronk.match.uncertainty import block_moves, jackknife
 from pronk.robots.model import bench_spec
 from pronk.robots.robot import Drive, RobotSpec
-
-Array = NDArray[np.float64]
 
 MOTION_HZ = 40.0
 """Cutoff of position before it is differentiated [Hz]."""
@@ -138,7 +137,7 @@ class Motion:
     torque: Array
     """[N m], shape (n, joints)."""
 
-    def moves(self) -> NDArray[np.bool_]:
+    def moves(self) -> Mask:
         """Which joints move enough for their friction to be known, shape (joints,)."""
         rate_hz = 1.0 / float(self.time[1] - self.time[0])
         slow = low_passed(self.velocity, rate_hz, FIT_HZ)

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.match.export import actuators, profile_held, require_stable
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
@@ -24,7 +24,6 @@ from pronk.simulators.linear import Plant, plant
 from pronk.simulators.mujoco import JointTestRig
 from pronk.simulators.profiles import Profile
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 LOW_HZ = 1.0

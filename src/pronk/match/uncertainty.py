@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pronk.arrays import Array
 from pronk.match.fit import Solution
 from pronk.match.measured_joint import FLOOR_DB, MeasuredJoint
 from pronk.match.parameters import GAINS, PARAMETERS
-
-Array = NDArray[np.float64]
 
 _SHARED = 1.5
 """Equivalent noise bandwidth of the Hann window in bins (Harris 1978, table 1): how many

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.evaluation.tables import Sheet, table
 from pronk.report import deploy_run as run
@@ -25,8 +25,6 @@ from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import REAL, VIRTUAL, Mode
 from pronk.runtime.log import DeployLog, read_deploy_log
 from pronk.runtime.safety import FilterAction
-
-Array = NDArray[np.float64]
 
 _MODE_COLOURS = {Mode.STAND: "#dcebf5", Mode.POLICY: "#9cc9e6", Mode.HALT: "#c3deef"}
 _MODE_COLOURS |= {Mode.SIT: "#dcebf5", Mode.FAULT: "#f3b48a"}

@@ -8,15 +8,13 @@ from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array, Mask
 from pronk.report.style import rms
 from pronk.robots.robot import RobotSpec
 from pronk.runtime.ipc import Mode
 from pronk.runtime.log import DeployLog
 from pronk.runtime.safety import FilterAction, Reason
-
-Array = NDArray[np.float64]
 
 POLICY_MODES = (Mode.POLICY, Mode.HALT)
 """Modes in which the policy gives the targets."""
@@ -51,7 +49,7 @@ def seconds(log: DeployLog, time: Array | float) -> Array:
     return np.asarray(np.asarray(time, dtype=float) - log.time[0])
 
 
-def policy_active(log: DeployLog) -> NDArray[np.bool_]:
+def policy_active(log: DeployLog) -> Mask:
     """Return the ticks in which the policy gave the targets, (T,)."""
     return np.asarray(np.isin(log.mode, POLICY_MODES))
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pronk.arrays import Array
 from pronk.evaluation import bodies as bodies_file
 from pronk.evaluation import results as results_file
 from pronk.evaluation import variation as varied
@@ -34,7 +35,7 @@ from pronk.report import trial_page
 from pronk.report.page import Part
 from pronk.report.paper import GAPS, WALKS, published_jumps
 from pronk.report.style import picture
-from pronk.report.trial_figures import Array, Panel
+from pronk.report.trial_figures import Panel
 
 _OBSTACLES = {"gap": "gap", "up": "step up", "down": "step down"}
 _WALK_TABLE = (

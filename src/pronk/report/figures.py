@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch, Rectangle
 from matplotlib.ticker import LogLocator, NullLocator
-from numpy.typing import NDArray
 from scipy import stats
 
+from pronk.arrays import Array, ComplexArray, Mask
 from pronk.match.gains import MatchedGains
 from pronk.match.predict import JointPrediction
 from pronk.match.result import JointFit, MatchResult
@@ -24,8 +24,7 @@ from pronk.report.paper import RANGES, ROBOT, TABLE_I, TRAINING
 from pronk.report.style import drawing, key, legend
 from pronk.response.response import FrequencyResponse
 
-Array = NDArray[np.float64]
-_Curves = Sequence[tuple[NDArray[np.complex128], dict[str, Any]]]
+_Curves = Sequence[tuple[ComplexArray, dict[str, Any]]]
 
 _LOWEST_HZ = 0.1
 _MIN_COHERENCE = 0.5
@@ -39,7 +38,7 @@ def measured_words(virtual: bool) -> str:
     return "measured on the virtual robot" if virtual else "measured"
 
 
-def _coherent(response: FrequencyResponse) -> NDArray[np.bool_]:
+def _coherent(response: FrequencyResponse) -> Mask:
     coherent = (response.coherence >= _MIN_COHERENCE) & (response.frequency_hz > 0.0)
     return coherent if coherent.any() else response.frequency_hz > 0.0
 

@@ -10,13 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.evaluation.results import Spread
 from pronk.report import style
 from pronk.report.style import drawing, key, legend
 
-Array = NDArray[np.float64]
 Values = Mapping[str, Mapping[str, Array]]
 """By policy, then by command: one number a jump."""
 Published = Mapping[str, Mapping[str, tuple[float, float]]]

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import ArtefactError
 from pronk.evaluation import tables
 from pronk.evaluation.criteria import trial_checks
@@ -22,8 +22,6 @@ from pronk.report.paper import published_jumps
 from pronk.report.style import picture, rms
 from pronk.report.trial_figures import Values
 from pronk.virtual import capture as capture_file
-
-Array = NDArray[np.float64]
 
 BEFORE_S, AFTER_S = 0.5, 2.0
 """Window of the height traces about the jump input [s]."""

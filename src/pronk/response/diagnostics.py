@@ -20,17 +20,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.response.grid import analysis_rate
 from pronk.response.periodic import read_steps
 from pronk.response.response import Estimator, FrequencyResponse
-
-Array = NDArray[np.float64]
 
 _TOP_HZ = 25.0
 """Highest frequency that takes part in the fit of the delay [Hz]."""

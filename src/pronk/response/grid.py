@@ -17,15 +17,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.sparse.linalg import splu
 
+from pronk.arrays import Array, ComplexArray
 from pronk.errors import LogError
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _REACH_S = 0.05
 """How far the grid may reach beyond the samples, which are then held [s]: two policy ticks."""

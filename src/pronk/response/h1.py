@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import ShortTimeFFT, get_window
 
+from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.response.grid import (
@@ -35,9 +36,6 @@ from pronk.response.grid import (
     require_span,
 )
 from pronk.response.response import Estimator, FrequencyResponse
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _TINY = np.finfo(np.float64).tiny
 _SILENT = 1e-4
@@ -308,7 +306,7 @@ class H1Operator:
         last = int(self.starts[-1]) + len(self.window)
         return max(0, -int(self.starts[0])), max(0, last - self.grid.count)
 
-    def weights(self, chosen: NDArray[np.bool_] | slice = slice(None)) -> ComplexArray:
+    def weights(self, chosen: Mask | slice = slice(None)) -> ComplexArray:
         """Map from positions on the grid to the chosen frequencies, shape (grid.count, chosen)."""
         samples = np.arange(len(self.window))
         turn = np.exp(-2j * np.pi * samples / len(samples))
@@ -327,9 +325,7 @@ class H1Operator:
         out[-1] += spread[before + count :].sum(axis=0)
         return out
 
-    def matrix(
-        self, sample_times: Array, chosen: NDArray[np.bool_] | slice = slice(None)
-    ) -> ComplexArray:
+    def matrix(self, sample_times: Array, chosen: Mask | slice = slice(None)) -> ComplexArray:
         """Map from positions at other instants, `H = positions @ matrix`, shape (m, chosen).
 
         `sample_times` [s], shape (m,), are increasing instants on the clock of the log; the cubic

@@ -19,14 +19,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import get_window
 
+from pronk.arrays import Array, ComplexArray
 from pronk.errors import LogError
 from pronk.logs.joint_log import JointLog
 from pronk.response.grid import Grid, held_mean, hold, interpolate
 from pronk.response.h1 import H1Operator
 from pronk.response.response import Estimator, FrequencyResponse
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _EXCITED = 0.02
 """Share of the largest line (amplitude) above which a line counts as excited: above what jitter of

@@ -12,17 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from pronk.arrays import Array, ComplexArray, Mask
 from pronk.errors import ArtefactError, PronkError
 from pronk.files import load_artefact, save_artefact
 from pronk.names import check_names
 
 SCHEMA = "pronk/response/2"
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 WINDOWS = ("hann", "hamming", "blackman", "boxcar")
 _NYQUIST_SHARE = 0.9
@@ -167,7 +164,7 @@ class FrequencyResponse:
         half = np.arcsin(np.clip(self.relative_error(level), 0.0, 1.0))
         return self.phase - half, self.phase + half
 
-    def band(self, low_hz: float, high_hz: float, coherence: float = 0.0) -> NDArray[np.bool_]:
+    def band(self, low_hz: float, high_hz: float, coherence: float = 0.0) -> Mask:
         """Mask of the frequencies inside a band whose coherence is at least `coherence`."""
         hz = self.frequency_hz
         inside = (hz >= low_hz - 1e-9) & (hz <= high_hz + 1e-9)

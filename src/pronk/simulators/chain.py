@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.logs.excitations import MOVED_RAD
 from pronk.logs.joint_log import JointLog
@@ -21,8 +21,6 @@ from pronk.robots.model import bench_spec, set_stribeck
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.mujoco import Chain, Drives
 from pronk.simulators.simulator import Closing, Simulator
-
-Array = NDArray[np.float64]
 
 
 def published(robot: RobotSpec, joint: str) -> dict[str, float]:

@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import LogError
 from pronk.logs.columns import in_force
 from pronk.logs.joint_log import JointLog, Segment
 from pronk.robots.robot import RobotSpec
-
-Array = NDArray[np.float64]
 
 _OFF_CLOCK = 0.25
 """Largest median distance of a change from the policy's clock, as a share of a tick, with which

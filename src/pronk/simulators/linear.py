@@ -21,13 +21,11 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array, ComplexArray
 from pronk.simulators.mujoco import JointTestRig
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _EPS = 1e-6
 """Perturbation of the finite differences: the best of central differences in float64."""

@@ -20,16 +20,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.engines.engine import delayed
 from pronk.simulators.engines.links import links_of
 from pronk.simulators.simulator import Simulator
-
-Array = NDArray[np.float64]
 
 AMPLITUDE = 0.2
 """Of the commands [rad]; less where the drive's effort limit needs it."""

@@ -36,16 +36,15 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk import plugins
 from pronk.actuator.law import DriveLaw
+from pronk.arrays import Array
 from pronk.errors import PronkError, RobotError
 from pronk.robots.robot import Drive, Joint, RobotSpec
 from pronk.simulators.engines.links import Links, SentRobot, links_of
 from pronk.simulators.simulator import ENTRY_POINTS, Closing, Simulator, SimulatorInfo, factory
 
-Array = NDArray[np.float64]
 Message = tuple[dict[str, Any], dict[str, Array]]
 """Header, and arrays by name."""
 

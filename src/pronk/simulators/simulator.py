@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pronk import plugins
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.robots.robot import RobotSpec
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     # It needs SciPy, which a simulator in another Python has not.
     from pronk.simulators.command_trace import CommandTrace
 
-Array = NDArray[np.float64]
 Values = Mapping[str, Array]
 """Parameter name to values."""
 

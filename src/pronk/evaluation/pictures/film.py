@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from pronk.arrays import Array, Mask
 from pronk.evaluation.jumps import JumpEvents, heading
 from pronk.virtual.capture import Capture
 
-Array = NDArray[np.float64]
 Samples = NDArray[np.intp]
 
 FPS = 25.0
@@ -66,7 +66,7 @@ class Film:
     """(P, 7 + joints)"""
 
     @property
-    def jumping(self) -> NDArray[np.bool_]:
+    def jumping(self) -> Mask:
         """Frames in which the jump input is on. (F,)."""
         on, off = (self.events.on, self.events.off) if self.events else (math.inf, math.inf)
         return (self.time >= on) & (self.time < off)

@@ -19,15 +19,14 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.evaluation.pictures.film import FPS, SCHEMA, Film
 from pronk.files import load_artefact, written_whole
 from pronk.robots import load_robot
 
-Array = NDArray[np.float64]
 Point = tuple[float, float]
 Colour = tuple[int, int, int, int]
 

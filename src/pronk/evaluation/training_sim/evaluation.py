@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.criteria import evaluation_checks
 from pronk.evaluation.jumps import (
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from pronk.evaluation.training_sim.run import Estimate, Policy
 
 SCHEMA = "pronk/evaluation/3"
-Array = NDArray[np.float64]
 Samples = NDArray[np.int64]
 
 NEVER = 2**30

@@ -45,6 +45,7 @@ import numpy as np
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError
 from pronk.links.link import StateNumbering, unit_quaternion
 from pronk.links.machine import Command, RefusedError, State, check_command
@@ -57,8 +58,6 @@ except ImportError:
         "the DDS link needs the package cyclonedds, which is not installed; "
         "install it with: pip install 'pronk[hardware]'."
     ) from None
-
-Array = NDArray[np.float64]
 
 # --- Messages -----------------------------------------------------------------------------------
 

@@ -31,11 +31,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pronk.arrays import Array
 from pronk.errors import HardwareError
 from pronk.links.link import StateNumbering, unit_quaternion
 from pronk.links.machine import Command, RefusedError, State, TorqueKind, check_command
-
-Array = NDArray[np.float64]
 
 # --- Messages -----------------------------------------------------------------------------------
 
