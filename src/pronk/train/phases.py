@@ -160,14 +160,14 @@ class Curriculum:
 
     def apply(self, env: ManagerBasedRlEnv, phase: Phase, done: float) -> None:
         """Set a phase of which a fraction is over, whatever the step counter."""
+        from pronk.train.mdp.commands import motion_command
+
         for name, (weight, params) in self._initial.items():
             term = env.reward_manager.get_term_cfg(name)
             term.weight = _between(phase.weights.get(name, (weight, weight)), done)
             if name in phase.jump_scales:
                 params = {**params, "jump_scale": _between(phase.jump_scales[name], done)}
             term.params.update(params)
-        from pronk.train.mdp.commands import motion_command
-
         command = motion_command(env)
         command.state.liftoff_std = _between(phase.liftoff_std, done)
         command.cfg.jump_fraction = 0.5 if phase.jump else 0.0
