@@ -135,13 +135,7 @@ def jump_and_film(
     trial = run_trial(policies, Plan(jumps=jumps, seed=seed), overwrite=True, **setup)
     first = replace(trial, subjects=trial.subjects[:1])
     films = record_all(
-        first,
-        out,
-        out / VIDEOS,
-        robot=setup["robot"],
-        cases=(FILMED,),
-        slow=2.0,
-        warn=console.warn,
+        first, out, out / VIDEOS, robot=setup["robot"], cases=(FILMED,), slow=2.0, warn=console.warn
     )
     return trial, films
 

@@ -83,12 +83,7 @@ def trial(
     with console.progress() as report:
         bar = report.bar("jumping")
         found = run_trial(
-            policies,
-            plan,
-            keep_captures=keep_captures,
-            overwrite=overwrite,
-            progress=bar,
-            **setup,
+            policies, plan, keep_captures=keep_captures, overwrite=overwrite, progress=bar, **setup
         )
     sheets = list(tables.sheets(found))
     for sheet in sheets:

@@ -48,14 +48,7 @@ from pronk.evaluation.jumps import (
 )
 from pronk.evaluation.protocol import Case
 from pronk.evaluation.results import Kind, Results, Row, Subject
-from pronk.evaluation.trial import (
-    OFFSET,
-    Job,
-    Setup,
-    case_rng,
-    finished,
-    load_subjects,
-)
+from pronk.evaluation.trial import OFFSET, Job, Setup, case_rng, finished, load_subjects
 from pronk.processes import in_processes
 from pronk.robots import load_robot
 from pronk.robots.robot import RobotSpec
@@ -123,8 +116,7 @@ class Obstacle:
         x, y = (0.5 * (begin + end) * along).tolist()
         across = np.where(along != 0.0, 0.5 * (end - begin), WIDE).tolist()
         return Box(
-            center=(x, y, 0.5 * (low + high)),
-            half_size=(across[0], across[1], 0.5 * (high - low)),
+            center=(x, y, 0.5 * (low + high)), half_size=(across[0], across[1], 0.5 * (high - low))
         )
 
 

@@ -62,11 +62,7 @@ def measured_layout(policy_rate_hz: float) -> tuple[ObservationPart, ...]:
     """
     past = [-i / policy_rate_hz for i in range(max(HISTORY, ACTIONS), 0, -1)]
     samples = (*past[1 - HISTORY :], 0.0)
-    times = {
-        "joint_position": samples,
-        "joint_velocity": samples,
-        "action": tuple(past[-ACTIONS:]),
-    }
+    times = {"joint_position": samples, "joint_velocity": samples, "action": tuple(past[-ACTIONS:])}
     return tuple(
         ObservationPart(
             name=name, size=len(part), times_s=times.get(name, (0.0,)), unit=_UNITS[name]

@@ -303,9 +303,7 @@ def _prediction_section(found: Prediction) -> dict[str, Any]:
 
 
 def _scale_table(
-    gains: MatchedGains,
-    members: Mapping[str, list[str]],
-    drive: Mapping[str, tuple[float, float]],
+    gains: MatchedGains, members: Mapping[str, list[str]], drive: Mapping[str, tuple[float, float]]
 ) -> Sheet:
     """Mean ratio of matched gains and those of the real drive, by joint group."""
     rows = []

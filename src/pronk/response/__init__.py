@@ -8,15 +8,7 @@ from pronk.response.estimate import estimate, operators
 from pronk.response.h1 import H1Operator
 from pronk.response.response import Estimator, FrequencyResponse, load, save
 
-__all__ = [
-    "Estimator",
-    "FrequencyResponse",
-    "H1Operator",
-    "estimate",
-    "load",
-    "operators",
-    "save",
-]
+__all__ = ["Estimator", "FrequencyResponse", "H1Operator", "estimate", "load", "operators", "save"]
 
 
 class _Package(ModuleType):

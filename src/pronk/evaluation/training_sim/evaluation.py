@@ -27,13 +27,7 @@ from numpy.typing import NDArray
 from pronk.arrays import Array
 from pronk.errors import ArtefactError, PronkError
 from pronk.evaluation.criteria import evaluation_checks
-from pronk.evaluation.jumps import (
-    JumpRules,
-    fallen_at,
-    measure,
-    sample_at,
-    uncommanded_height,
-)
+from pronk.evaluation.jumps import JumpRules, fallen_at, measure, sample_at, uncommanded_height
 from pronk.evaluation.protocol import PAPER_COMMANDS, Case
 from pronk.evaluation.results import Spread, load_json, save_json
 from pronk.evaluation.tables import Sheet, check_sheet, number, percent, spread, table
