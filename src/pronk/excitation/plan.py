@@ -84,15 +84,10 @@ class SweepPlan:
     def rows(self) -> list[dict[str, Any]]:
         """The forecasts as a table: a row per joint, worst case over the uncertainty."""
         units = {
-            "amplitude": "rad",
-            "lowest": "rad",
-            "highest": "rad",
-            "speed": "rad_s",
-            "no_load_speed": "rad_s",
-            "torque": "nm",
-            "effort_limit": "nm",
-            "mechanical_power": "w",
-            "electrical_power": "w",
+            **dict.fromkeys(("amplitude", "lowest", "highest"), "rad"),
+            **dict.fromkeys(("speed", "no_load_speed"), "rad_s"),
+            **dict.fromkeys(("torque", "effort_limit"), "nm"),
+            **dict.fromkeys(("mechanical_power", "electrical_power"), "w"),
             "bus_current": "a",
         }
         return [

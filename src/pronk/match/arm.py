@@ -27,7 +27,7 @@ from pronk.arrays import Array, Mask
 from pronk.errors import IdentifiabilityError, LogError
 from pronk.logs.joint_log import JointLog
 from pronk.match.fit import Problem, Solution, solve
-from pronk.match.measured_joint import DB, gains_on_drive
+from pronk.match.measured_joint import DB, gains_on_drive, rms
 from pronk.match.parameters import GAINS, PARAMETERS, checked_names
 from pronk.match.result import HELD_OUT, JointFit, held_out_flags
 from pronk.match.uncertainty import Estimate, block_moves, estimate, jackknife
@@ -201,10 +201,7 @@ def fit_together(
 
 
 def _fit_chain(
-    arm: ChainSimulation,
-    names: Sequence[str],
-    most_held: int,
-    progress: Callable[[float], None],
+    arm: ChainSimulation, names: Sequence[str], most_held: int, progress: Callable[[float], None]
 ) -> dict[str, JointFit]:
     """Fit the joints of one chain: first without every fourth block, then to everything."""
     masks, limit_hz = trusted(arm)
@@ -279,7 +276,7 @@ def _fit_chain(
         joint: dict(
             zip(
                 HELD_OUT,
-                (_rms(error[judge.block(joint)][used[:, i]]) for error in errors),
+                (rms(error[judge.block(joint)][used[:, i]]) for error in errors),
                 strict=True,
             )
         )
@@ -441,8 +438,8 @@ def _joint_fits(
             name,
             found,
             held=held[name],
-            rmse=_rms(solution.residual[rows][mask]),
-            published_rmse=_rms(naive_residual[rows][mask]),
+            rmse=rms(solution.residual[rows][mask]),
+            published_rmse=rms(naive_residual[rows][mask]),
             total95=found.ci95,
             held_out=held_out.get(name, {}),
             flags=(*held_out_flags(held_out.get(name, {})), *flags, *found.flags),
@@ -476,7 +473,7 @@ def _compared(
         positions = log.position.copy()
         positions[:, log.column(joint)] = position
         responses.append(estimate_response(replace(log, position=positions), joint)[0])
-    errors = [_rms(DB * np.log(one.gain[inside] / measured.gain[inside])) for one in responses]
+    errors = [rms(DB * np.log(one.gain[inside] / measured.gain[inside])) for one in responses]
     return {
         "responses": (measured,),
         "band_hz": band,
@@ -486,7 +483,3 @@ def _compared(
         "error_db": errors[0],
         "naive_error_db": errors[1],
     }
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -114,13 +114,8 @@ def errors(
 ) -> Array:
     """Mean squared errors of targets that share one simulation [dB^2], shape (group, b).
 
-    Args:
-        rigs: The simulator.
-        group: Targets whose commands are the same after mirroring.
-        stiffness: [N m/rad], shape (b,).
-        damping: [N m s/rad], shape (b,).
-        progress: Called with the share done, 0 to 1.
-        armature: Rotor inertia [kg m^2]; the drive's if None.
+    The commands of the `group` are the same after mirroring; gains [N m/rad], [N m s/rad] have
+    shape (b,), the `armature` [kg m^2] is the drive's if None.
     """
     # One may rest longer than the others at the end.
     longest = max(

@@ -19,17 +19,14 @@ from pronk.errors import IdentifiabilityError, LogError, PronkError
 from pronk.logs.excitations import with_segments
 from pronk.logs.joint_log import JointLog
 from pronk.match.settings import MatchSettings
-from pronk.response.estimate import (
-    estimate,
-    excitations,
-    excited_joints,
-    log_rate,
-    operator,
-)
+from pronk.response.estimate import estimate, excitations, excited_joints, log_rate, operator
 from pronk.response.h1 import H1Operator
 from pronk.response.response import FrequencyResponse
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.command_trace import CommandTrace, command_trace
+
+Pair = tuple[float, float]
+"""Stiffness [N m/rad] and damping [N m s/rad]."""
 
 _SAME_GAINS = 0.01
 """Relative difference of gains by the log and by the user that is rounding."""
@@ -41,6 +38,11 @@ frequencies outvote the band, though the model itself is not better than this.""
 _TAIL = 2e-4
 """Absolute error of gain that leaving out the end of the log would cause in a joint that follows
 its command: 0.002 dB at gain 1. Over the paper's grid it was 0.001 dB; nodes differ by 0.02 dB."""
+
+
+def rms(values: Array | ComplexArray) -> float:
+    """Root mean square of magnitudes."""
+    return float(np.sqrt(np.mean(np.abs(values) ** 2)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +127,7 @@ class MeasuredJoint:
 
     def rms_db(self, simulated: ComplexArray) -> float:
         """Root mean square of `error_db`, frequencies counting alike [dB]."""
-        return float(np.sqrt(np.mean(self.error_db(simulated) ** 2)))
+        return rms(self.error_db(simulated))
 
     def measurement_error_db(self) -> float:
         """Root mean square half-width of the measured gain's own 95 % interval in the band [dB]."""
@@ -151,10 +153,8 @@ def logs_by_joint(logs: Sequence[JointLog], robot: RobotSpec) -> dict[str, list[
     return {name: where[name] for name in robot.joint_names if name in where}
 
 
-Pair = tuple[float, float]
 DriveGains = Mapping[str, Pair] | Literal["default"]
-"""Stiffness [N m/rad] and damping [N m s/rad] on the real drives, by joint or joint group, or
-`default`: those of the robot's file."""
+"""Gains on the real drives, by joint or joint group, or `default`: those of the robot's file."""
 
 
 def gains_by_joint(robot: RobotSpec, given: DriveGains) -> dict[str, Pair]:

@@ -28,6 +28,7 @@ from pronk.match.grid import (
 from pronk.match.measured_joint import (
     DriveGains,
     MeasuredJoint,
+    Pair,
     gains_on_drive,
     logs_by_joint,
     measured_joints,
@@ -37,13 +38,7 @@ from pronk.match.measured_joint import (
 from pronk.match.parameters import DRIVE_MODE, FREE, GAINS, GAINS_MODE, PARAMETERS, checked_names
 from pronk.match.plausibility import CAUSES, findings, require_plausible
 from pronk.match.randomization import matched_gains
-from pronk.match.response_fit import (
-    Fit,
-    Pair,
-    refine,
-    require_sweeps,
-    response_fit,
-)
+from pronk.match.response_fit import Fit, refine, require_sweeps, response_fit
 from pronk.match.result import (
     ZERO_ARMATURE,
     JointFit,
@@ -132,18 +127,8 @@ def match_frameworks(
 ) -> dict[str, MatchResult]:
     """Match for several frameworks from one set of logs; arguments and errors as of `match_logs`.
 
-    Args:
-        logs: As of `match_logs`.
-        robot: The robot.
-        names: Profiles, as `pronk.simulators.profiles.profile` takes them; for mode `gains`.
-        mode: As of `match_logs`.
-        free: The same.
-        drive_gains: The same.
-        settings: The same.
-        progress: The same.
-
-    Returns:
-        Results by name; that of the robot's own simulator, where the logs are checked, by "".
+    `names` are profiles, as `pronk.simulators.profiles.profile` takes them, for mode `gains`.
+    Returns results by name; that of the robot's own simulator, where the logs are checked, by "".
     """
     chosen, clock = settings or MatchSettings(), _Clock(progress)
     frameworks = {name: profile(name) for name in names}
@@ -373,14 +358,7 @@ def _matched(
                 joints, fits = _match_drives(work, rigs, found, fitted, clock)
             else:
                 joints, fits, rate = _match_gains(work, rigs, found, clock, base, ready)
-    return _Matched(
-        robot=robot,
-        info=info,
-        joints=joints,
-        fits=fits,
-        excluded=excluded,
-        rate=rate,
-    )
+    return _Matched(robot=robot, info=info, joints=joints, fits=fits, excluded=excluded, rate=rate)
 
 
 def _wrong(work: _Work, own: _Matched, clock: _Clock) -> Wrong:
@@ -550,13 +528,14 @@ def _time_joint_fit(
     """Put the findings of one joint together that was fitted in time."""
     goal, joint = goals[0], robot.joint(goals[0].joint)
     error_db = goal.rms_db(matched[goal.fit_mask])
-    found = response_fit(
+    return response_fit(
         robot,
         goals,
         fit.estimate,
         matched,
         naive,
         error_db=error_db,
+        **_grid_fields(grid),
         total95=fit.total95,
         held_out=fit.held_out,
         amplitude_gains=fit.amplitude_gains,
@@ -569,14 +548,11 @@ def _time_joint_fit(
             *goal.warnings,
         ),
     )
-    if grid is None:
-        return found
-    return replace(
-        found,
-        grid_stiffness=grid.stiffness,
-        grid_damping=grid.damping,
-        grid_error=grid.error,
-    )
+
+
+def _grid_fields(grid: GridSearch | None) -> dict[str, Array]:
+    """Fields of `JointFit` that hold a search of the grid."""
+    return {} if grid is None else {f"grid_{name}": values for name, values in vars(grid).items()}
 
 
 def _time_flags(fit: TimeFit) -> Iterator[str]:
@@ -643,9 +619,7 @@ def _joint_fit(
         matched,
         naive,
         error_db=fit.error_db,
-        grid_stiffness=grid.stiffness,
-        grid_damping=grid.damping,
-        grid_error=grid.error,
+        **_grid_fields(grid),
         zero_armature_error_db=zero_db,
         zero_armature=zero_response,
         amplitude_gains=by_amplitude,

@@ -15,7 +15,7 @@ from pronk.arrays import Array, ComplexArray
 from pronk.errors import IdentifiabilityError
 from pronk.match.fit import Problem, Solution, solve_together
 from pronk.match.identifiability import bench_experiment, require_identifiable
-from pronk.match.measured_joint import DB, MeasuredJoint
+from pronk.match.measured_joint import DB, MeasuredJoint, Pair, rms
 from pronk.match.parameters import GAINS, PARAMETERS
 from pronk.match.result import JointFit
 from pronk.match.simulated import SimRequest, responses
@@ -23,9 +23,6 @@ from pronk.match.uncertainty import Estimate
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant
 from pronk.simulators.simulator import JointRigs
-
-Pair = tuple[float, float]
-"""Stiffness [N m/rad] and damping [N m s/rad]."""
 
 _NOISE_MIN = 0.01
 """Least standard deviation of the log response to plan with: no model is better than 1 %."""
@@ -131,7 +128,7 @@ class Fit:
     @property
     def error_db(self) -> float:
         """Root mean square of `gain_db`, frequencies counting alike [dB]."""
-        return float(np.sqrt(np.mean(self.gain_db**2)))
+        return rms(self.gain_db)
 
 
 def refine(

@@ -35,7 +35,14 @@ from pronk.logs.excitations import with_segments
 from pronk.logs.joint_log import JointLog
 from pronk.match.export import profile_held
 from pronk.match.gains import MatchedGains
-from pronk.match.measured_joint import DB, MeasuredJoint, logs_by_joint, measured_joints, merged
+from pronk.match.measured_joint import (
+    DB,
+    MeasuredJoint,
+    logs_by_joint,
+    measured_joints,
+    merged,
+    rms,
+)
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
 from pronk.robots.robot import RobotSpec
@@ -169,11 +176,7 @@ def goals_of(
             goal = merged([measured_joints(log, name, known, settings) for log in sources])[0]
             friction = None if np.isnan(joint.frictionloss) else joint.frictionloss
             request = SimRequest(
-                goal,
-                joint.stiffness,
-                joint.damping,
-                frictionloss=friction,
-                delay=joint.delay_s,
+                goal, joint.stiffness, joint.damping, frictionloss=friction, delay=joint.delay_s
             )
             out[name] = goal, responses(rigs, [request])[0]
     return out
@@ -262,10 +265,10 @@ def prefilter(
         numerator=numerator,  # type: ignore[arg-type]
         denominator=denominator,  # type: ignore[arg-type]
         delay_s=delay,
-        before_db=_rms(DB * np.log(np.abs(ratio))),
-        after_db=_rms(DB * np.log(np.abs(ratio * gain(best, omega)))),
-        before_error=_rms(ratio - 1.0),
-        after_error=_rms(ratio * gain(best, omega) - 1.0),
+        before_db=rms(DB * np.log(np.abs(ratio))),
+        after_db=rms(DB * np.log(np.abs(ratio * gain(best, omega)))),
+        before_error=rms(ratio - 1.0),
+        after_error=rms(ratio * gain(best, omega) - 1.0),
         peak_db=float(DB * np.log(loudness[peak])),
         peak_hz=float(every[peak] / (2.0 * np.pi)),
         amplitude=goal.measured.amplitude,
@@ -282,7 +285,7 @@ def distance(goal: MeasuredJoint, simulated: ComplexArray) -> tuple[float, float
     ratio = goal.measured.response[goal.fit_mask] / simulated
     phase = np.unwrap(np.angle(ratio))
     late = -float(phase @ goal.omega / (goal.omega @ goal.omega))
-    return _rms(DB * np.log(np.abs(ratio))), _rms(ratio - 1.0), late
+    return rms(DB * np.log(np.abs(ratio))), rms(ratio - 1.0), late
 
 
 def as_requested(log: JointLog, signals: Mapping[str, Shaped], robot: RobotSpec) -> JointLog:
@@ -310,7 +313,3 @@ def save(path: Path, shape: Shape) -> None:
     }
     body["logs"] = dict(shape.logs)
     write_text(path, yaml.safe_dump(body, sort_keys=False, width=1000, default_flow_style=None))
-
-
-def _rms(values: Array | ComplexArray) -> float:
-    return float(np.sqrt(np.mean(np.abs(values) ** 2)))

@@ -198,14 +198,7 @@ class TimeProblem(Problem):
         start: Mapping[str, float],
         masks: Masks | None = None,
     ) -> None:
-        """Take what was recorded of one joint.
-
-        Args:
-            simulations: What was recorded, and the simulator.
-            fitted: Names of the parameters to fit.
-            start: All parameters; of those fitted, where to begin.
-            masks: Samples to use; all if None.
-        """
+        """Fit some parameters; `start` has all of them, `masks` the samples used, all if None."""
         joint = simulations.joint
         super().__init__({joint: start}, {joint: fitted}, refitted=(joint,))
         self.simulations, self.records, self.fitted = simulations, simulations.records, fitted
@@ -263,12 +256,8 @@ def fit_joint(
 ) -> TimeFit:
     """Fit some parameters of one joint's drive.
 
-    Args:
-        rigs: The simulator.
-        records: What was recorded of the joint.
-        fitted: Names of the parameters to fit.
-        start: All parameters; of those fitted, where to begin.
-        nominal: The drive as published, with the gains that were on it.
+    `start` has all parameters, of those fitted where to begin; `nominal` is the drive as published,
+    with the gains that were on it.
     """
     fitted = [n for n in fitted if n == "delay" or n in rigs.parameters]
     kept, aside = _split(records)

@@ -92,13 +92,7 @@ may be viscous, and geared drives break away at 1.15 to 1.45 of their Coulomb fr
 the virtual robot; AK80-6 held out: the same cells are lower for 0.1 to 3)."""
 _STILL = TorqueParameter(value=np.nan, ci95=(np.nan, np.nan), reason="it does not move")
 DRIVE_TERMS = ("armature", "viscous", "dry", "stribeck")
-UNITS = {
-    "armature": "kg m^2",
-    "viscous": "N m s/rad",
-    "dry": "N m",
-    "stribeck": "N m",
-    "scale": "1",
-}
+UNITS = dict(zip(DRIVE_TERMS, ("kg m^2", "N m s/rad", "N m", "N m"), strict=True)) | {"scale": "1"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,14 +185,7 @@ class TorqueModel:
         links_known: bool,
         shared: Sequence[Sequence[str]] = (),
     ) -> None:
-        """Choose what is fitted.
-
-        Args:
-            robot: Geometry, and the links' inertia if known.
-            joint: The joint whose chain is meant; the base is fixed.
-            links_known: Hold the links as the model has them, and fit the torque scale.
-            shared: Groups of joints with the same actuator: one armature for each group.
-        """
+        """Choose what is fitted; arguments as of `fit_torque`."""
         self.model = bench_spec(robot, joint).compile()
         self.joints = tuple(self.model.joint(i).name for i in range(self.model.njnt))
         self.links_known = links_known
@@ -214,7 +201,6 @@ class TorqueModel:
                     self.names += [
                         (self.model.body(body).name, f"mass_{k}") for k in range(len(_PLACES))
                     ]
-        self._rigid = len(self.names)
         for term in DRIVE_TERMS:
             for name in self.joints:
                 owner = self.armature_of[name][0] if term == "armature" else name
@@ -287,10 +273,10 @@ def fit_torque(
 
     Args:
         logs: Recordings with torque, every joint of the chain in each, the base fixed.
-        robot: The robot.
+        robot: Geometry, and the links' inertia if known.
         joint: The joint whose chain is fitted.
         links_known: Hold the links as the model has them, and fit the torque scale.
-        shared: Groups of joints with the same actuator.
+        shared: Groups of joints with the same actuator: one armature for each group.
         most_s: Beginning of each log that is used [s].
 
     Raises:

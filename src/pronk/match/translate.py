@@ -8,7 +8,7 @@ damps a motion of given amplitude, depend on the ratio of both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,13 +18,11 @@ from pronk.arrays import Array
 from pronk.errors import PronkError
 from pronk.match.export import actuators, profile_held, require_stable
 from pronk.match.gains import GroupGains, JointGains, MatchedGains
-from pronk.match.measured_joint import DB
+from pronk.match.measured_joint import DB, Pair, rms
 from pronk.robots.robot import RobotSpec
 from pronk.simulators.linear import Plant, plant
 from pronk.simulators.mujoco import JointTestRig
 from pronk.simulators.profiles import Profile
-
-Pair = tuple[float, float]
 
 LOW_HZ = 1.0
 """Lowest frequency compared: below it a joint follows its command in every drive law."""
@@ -135,8 +133,8 @@ def translated(first: Plant, other: Plant, gains: Pair, delay_s: float = 0.0) ->
     return JointTranslation(
         before=gains,
         after=after,
-        before_db=_rms(error(start)),
-        after_db=_rms(best.fun),
+        before_db=rms(error(start)),
+        after_db=rms(best.fun),
         lead_s=lead,
         rest_s=min(delay_s + lead, 0.0),
     )
@@ -173,9 +171,7 @@ def _plant(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
     """Linearize a joint about the default pose, with its matched armature."""
     first = robot.joint(robot.joint(name).original[0])
     drive = replace(
-        first.drive,
-        rotor_inertia=gains.armature / first.drive.gear_ratio**2,
-        frictionloss=0.0,
+        first.drive, rotor_inertia=gains.armature / first.drive.gear_ratio**2, frictionloss=0.0
     )
     own = replace(
         robot,
@@ -193,7 +189,3 @@ def _plant(robot: RobotSpec, name: str, gains: JointGains) -> Plant:
 
 def _scaled(interval: Pair, factor: float) -> Pair:
     return factor * interval[0], factor * interval[1]
-
-
-def _rms(values: Sequence[float] | Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

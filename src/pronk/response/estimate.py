@@ -78,21 +78,14 @@ def estimate(
     for parts in groups:
         for part in parts:
             check_motion(part, joint)
-        response = estimate_parts(parts, joint, settings, rate_hz)
+        periodic = parts[0].segments[0].kind in ("multisine", "sine_steps")
+        average = estimate_periodic if periodic else estimate_averaged
+        response = average(parts, joint, settings, rate_hz)
         third = np.array([third_harmonic(part, joint) for part in parts])
         known = third[np.isfinite(third)]
         mean = float(known.mean()) if len(known) else math.nan
         found.append(replace(response, delay_s=fit_delay(response), third_harmonic=mean))
     return found
-
-
-def estimate_parts(
-    parts: Sequence[JointLog], joint: str, estimator: Estimator, rate_hz: float
-) -> FrequencyResponse:
-    """Response over the repeats of one excitation, one log each, by the estimator of its kind."""
-    periodic = parts[0].segments[0].kind in ("multisine", "sine_steps")
-    average = estimate_periodic if periodic else estimate_averaged
-    return average(parts, joint, estimator, rate_hz)
 
 
 def operator(part: JointLog, joint: str, estimator: Estimator, rate_hz: float) -> H1Operator:
