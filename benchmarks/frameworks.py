@@ -45,6 +45,7 @@ ENGINES = {
     "isaaclab-explicit,friction=none": "sapien-explicit",
     "isaaclab-implicit,friction=none": "isaaclab-physx",
     "isaaclab-newton": "newton",
+    "genesis": "genesis",
     "playground": "mjx",
     "maniskill": "sapien",
     "drake": "drake",
