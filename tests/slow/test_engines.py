@@ -1,7 +1,7 @@
 """Drive laws beside the real engines: SAPIEN (PhysX), Drake, PyBullet, where installed; MuJoCo.
 
-With ENGINE_PYTHON=PATH the engines run in that Python, as with `--simulator-python`: MJX, Newton and
-Genesis too (docs/simulators.md has the results).
+With ENGINE_PYTHON=PATH the engines run in that Python, as with `--simulator-python`: MJX, Newton
+and Genesis too (docs/simulators.md has the results).
 """
 
 from __future__ import annotations
