@@ -1,18 +1,22 @@
-"""The Mini Cheetah's virtual robot, and its parameters with perfect sensors."""
+"""The Mini Cheetah at rest, its virtual robot, and parameters with perfect sensors."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from pronk.links.machine import State
 from pronk.robots import load_robot
 from pronk.virtual.robot import VirtualRobot
 from pronk.virtual.sim_params import AttitudeParams, SimParams, load_sim_params
 
 ROBOT = load_robot("mini_cheetah")
 POSE = np.array([joint.default_position for joint in ROBOT.joints])
+KP = np.array([joint.stiffness for joint in ROBOT.joints])
+KD = np.array([joint.damping for joint in ROBOT.joints])
 SIM_PARAMS = load_sim_params()
 _ERRORS = (
     "sampling_jitter_s",
@@ -25,6 +29,26 @@ _ERRORS = (
     "command_delay_s",
     "measurement_delay_s",
 )
+
+
+def still(**changes: Any) -> State:
+    """A state of the robot at rest in its default pose, with changes."""
+    whole: dict[str, Any] = {
+        "time": 0.0,
+        "sequence": 0,
+        "position": POSE,
+        "velocity": np.zeros(12),
+        "torque": np.zeros(12),
+        "gyro": np.zeros(3),
+        "accelerometer": np.array([0.0, 0.0, 9.81]),
+        "bus_voltage": 24.0,
+    }
+    return State(**(whole | changes))
+
+
+def rolled(angle: float) -> np.ndarray:
+    """Quaternion of a trunk that leans to its side [rad]."""
+    return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
 
 
 def quiet(**machine: Any) -> SimParams:

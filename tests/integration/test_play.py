@@ -12,7 +12,6 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from pronk.errors import PronkError
 from pronk.evaluation.jumps import JumpRules
 from pronk.evaluation.live.page import WebPage, free_port, readout
 from pronk.evaluation.live.play import JUMP_S, Gauge, Joystick, play
+from pronk.links.link import wait_for
 from pronk.policy.runtime import load_policy
 from pronk.robots.legged import legged
 from pronk.runtime.ipc import Mode, OperatorRequest
@@ -165,13 +165,6 @@ def test_the_robot_hops_and_resets_no_faster_than_real_time(
         assert again == heights[: len(again)]
 
 
-def wait_for(what: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 120.0
-    while not what():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 @pytest.mark.train
 def test_a_browser_moves_the_robot(hopper: Path) -> None:
     pytest.importorskip("mjviser")
@@ -202,10 +195,10 @@ def test_a_browser_moves_the_robot(hopper: Path) -> None:
             camera |= {"look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)}
             camera |= {"near": 0.1, "far": 10.0, "image_height": 400, "image_width": 640}
             send("ViewerCameraMessage", camera)
-            wait_for(lambda: bool(page.server.get_clients()))
+            assert wait_for(lambda: bool(page.server.get_clients()), 120.0)
             update = {"uuid": page.sliders[0]._impl.uuid, "updates": {"value": 1.25}}
             send("GuiUpdateMessage", update)
-            wait_for(lambda: joystick.commanded(0.0)[0] == (1.25, 0.0, 0.0))
+            assert wait_for(lambda: joystick.commanded(0.0)[0] == (1.25, 0.0, 0.0), 120.0)
             play(ROBOT, load_policy(hopper), sim_params, joystick, page, until=lambda t: t > 0.2)
             assert "trunk" in page.text.content
         page.reset()

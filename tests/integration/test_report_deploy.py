@@ -11,18 +11,14 @@ import pytest
 
 from command_line import invoke
 from pronk.errors import LogError
-from pronk.links.machine import State
 from pronk.report import build, deploy_page, deploy_run
 from pronk.report.deploy_page import part
 from pronk.report.deploy_run import delay, drive_delay, quantiles
-from pronk.robots import load_robot
 from pronk.runtime.ipc import EVENT, REAL, STEP, TICK, VIRTUAL, Mode, event, put_state
 from pronk.runtime.log import DeployLogWriter, read_deploy_log
 from pronk.runtime.safety import FilterAction, Reason
+from virtual_robot import KP, POSE, ROBOT, rolled, still
 
-ROBOT = load_robot("mini_cheetah")
-POSE = np.array([joint.default_position for joint in ROBOT.joints])
-KP = np.array([joint.stiffness for joint in ROBOT.joints])
 HEADER = {
     "robot": "mini_cheetah",
     "joints": list(ROBOT.joint_names),
@@ -37,19 +33,8 @@ TICK_S = 0.002
 def record(number: int, target: np.ndarray, **changes: Any) -> np.void:
     """A tick in which all goes well; the joints do not move."""
     one = np.zeros((), dtype=TICK)
-    state = State(
-        time=number * TICK_S,
-        sequence=number,
-        position=POSE,
-        velocity=np.zeros(12),
-        torque=changes.pop("torque", np.zeros(12)),
-        gyro=np.zeros(3),
-        accelerometer=np.array([0.0, 0.0, 9.81]),
-        bus_voltage=24.0,
-        orientation=changes.pop("orientation", np.array([1.0, 0.0, 0.0, 0.0])),
-        temperature=changes.pop("temperature", None),
-    )
-    put_state(one, state)
+    measured = {n: changes.pop(n) for n in ("torque", "orientation", "temperature") if n in changes}
+    put_state(one, still(time=number * TICK_S, sequence=number, **measured))
     one["tick"], one["deadline"] = number, number * TICK_S
     one["begun"], one["done"] = number * TICK_S + 1e-4, number * TICK_S + 4e-4
     one["mode"], one["latency"] = Mode.POLICY, np.nan
@@ -96,7 +81,7 @@ def faulted(path: Path, *, end: bool = True) -> Path:
         "level": FilterAction.LATCH,
         "reason": Reason.TILT,
         "mode": Mode.FAULT,
-        "orientation": np.array([math.cos(0.5), math.sin(0.5), 0.0, 0.0]),
+        "orientation": rolled(1.0),
     }
     for k in range(100):
         writer.tick(record(k, POSE + 0.01, mode=Mode.STAND))

@@ -209,16 +209,19 @@ def test_native_model_is_the_explicit_law(
     np.testing.assert_allclose(simulate(model, command), expected, atol=1e-9 if clipped else 1e-12)
 
 
-@pytest.mark.parametrize("joint", CHEETAH.joints, ids=lambda joint: joint.name)
-def test_mirror_claim_by_simulation(joint: object) -> None:
+@pytest.mark.parametrize(
+    ("robot", "name"),
+    [(robot, name) for robot in (CHEETAH, load_robot("go2")) for name in robot.joint_names],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_mirror_claim_by_simulation(robot: RobotSpec, name: str) -> None:
     """position(self | command) == sign position(mirror | sign command), about the pose."""
-    name = joint.name  # type: ignore[attr-defined]
-    original, sign = CHEETAH.joint(name).original
-    offset = held_chirp(CHEETAH, 2.0, 0.25)
-    model, mirrored = (bench_spec(CHEETAH, n).compile() for n in (name, original))
+    original, sign = robot.joint(name).original
+    offset = held_chirp(robot, 2.0, 0.25)
+    model, mirrored = (bench_spec(robot, n).compile() for n in (name, original))
     here = simulate(model, commands(model, name, offset))
     there = simulate(mirrored, commands(mirrored, original, sign * offset))
-    column = CHEETAH.joint(name).chain.index(name)
+    column = robot.joint(name).chain.index(name)
     assert np.ptp(here[:, column]) > 0.1
     np.testing.assert_allclose(here[:, column], sign * there[:, column], atol=1e-9)
 
@@ -235,10 +238,7 @@ def test_whole_arm_moves_at_once() -> None:
 
 @pytest.mark.train
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["FR_knee", "FR_hip_roll"])
-def test_bench_is_mjlab_with_its_dc_motor_actuator(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bench_is_mjlab_with_its_dc_motor_actuator(monkeypatch: pytest.MonkeyPatch) -> None:
     """The environment's own loop (targets, write, step, update) on the Warp CPU simulator."""
     pytest.importorskip("mjlab")
     monkeypatch.setenv("MJLAB_WARP_QUIET", "1")
@@ -248,6 +248,7 @@ def test_bench_is_mjlab_with_its_dc_motor_actuator(
     from mjlab.scene import Scene, SceneCfg
     from mjlab.sim.sim import MujocoCfg, Simulation, SimulationCfg
 
+    name = "FR_hip_roll"
     chain = CHEETAH.joint(name).chain
     model = bench_spec(CHEETAH, name).compile()
     command = commands(model, name, held_chirp(CHEETAH, 4.0, 0.25))

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context, shared_memory
 from pathlib import Path
 from typing import Any
@@ -58,29 +59,13 @@ from pronk.runtime.state_machine import (
 )
 from pronk.runtime.teleop import Gamepad, Keyboard, OperatorCommand, ScriptedOperator, TimeLimit
 from pronk.virtual.faults import SWAPPED, spoiled
-from pronk.virtual.robot import VirtualRobot
-from pronk.virtual.sim_params import load_sim_params
+from virtual_robot import POSE, ROBOT, connected, rolled, still
 
-ROBOT = load_robot("mini_cheetah")
 LIMITS = Limits.of(ROBOT)
-POSE = np.array([joint.default_position for joint in ROBOT.joints])
 LYING = folded_pose(ROBOT)
+state = partial(still, position=LYING)
 RANGES = {"vx": (-2.0, 3.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.0, 2.0)}
 FORWARD = (1.0, 0.0, 0.0)
-
-
-def state(**changes: Any) -> State:
-    whole: dict[str, Any] = {
-        "time": 0.0,
-        "sequence": 0,
-        "position": LYING,
-        "velocity": np.zeros(12),
-        "torque": np.zeros(12),
-        "gyro": np.zeros(3),
-        "accelerometer": np.array([0.0, 0.0, 9.81]),
-        "bus_voltage": 24.0,
-    }
-    return State(**(whole | changes))
 
 
 # --- Shared memory ------------------------------------------------------------------------------
@@ -237,6 +222,7 @@ def test_the_folded_pose_has_the_feet_under_the_hips(name: str, thigh: float, sh
     robot = load_robot(name)
     pose, limits = folded_pose(robot), Limits.of(robot)
     pitch, knee = pose[1], pose[2]
+    assert abs(knee) > abs(robot.joint("FR_knee").default_position)
     assert abs(thigh * math.sin(pitch) + shank * math.sin(pitch + knee)) < 0.03
     assert 0.09 < thigh * math.cos(pitch) + shank * math.cos(pitch + knee) < 0.16
     assert (limits.low + limits.margin < pose).all()
@@ -299,8 +285,7 @@ class Run:
 
 @pytest.mark.parametrize("swapped", ["", *SWAPPED])
 def test_swapped_encoders_are_found_before_the_robot_rises(swapped: str) -> None:
-    robot = VirtualRobot(ROBOT, load_sim_params(), base="ground", capture_rate_hz=None)
-    robot.connect()
+    robot = connected(base="ground", capture_rate_hz=None)
     run = Run(check_s=0.15, damp_s=0.5, fold_s=0.5)
     run.machine.preflighted((), 0.0)
     run.machine.request(OperatorRequest.STAND)
@@ -457,10 +442,6 @@ def found(states: list[State], now: float = 0.5) -> tuple[str, ...]:
     return refusals(states, ROBOT, LIMITS, now=now, seconds=0.5)
 
 
-def turned(angle: float) -> np.ndarray:
-    return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
-
-
 def at(index: int, value: float, values: np.ndarray = LYING) -> np.ndarray:
     array = values.copy()
     array[index] = value
@@ -481,7 +462,7 @@ def test_a_robot_at_rest_may_move() -> None:
     assert found(stream(temperature=np.full(12, 40.0), bus_voltage=0.0)) == ()
 
 
-LEANING = {"orientation": turned(1.0), "accelerometer": 9.81 * np.array([0, 0.84147, 0.54030])}
+LEANING = {"orientation": rolled(1.0), "accelerometer": 9.81 * np.array([0, 0.84147, 0.54030])}
 
 
 @pytest.mark.parametrize(
@@ -497,7 +478,7 @@ LEANING = {"orientation": turned(1.0), "accelerometer": 9.81 * np.array([0, 0.84
         (stream(orientation=np.zeros(4)), 0.5, "quaternion"),
         (stream(accelerometer=np.array([0.0, 0.0, 1.0])), 0.5, "accelerometer"),
         (stream(accelerometer=np.array([0.0, 0.0, -9.81])), 0.5, "disagree"),
-        (stream(orientation=turned(0.5)), 0.5, "disagree"),
+        (stream(orientation=rolled(0.5)), 0.5, "disagree"),
         (stream(**LEANING), 0.5, "tilted by 1.00"),
         (stream(position=at(2, 2.8)), 0.5, "FR_knee"),
         (stream(velocity=at(3, 2.0, np.zeros(12))), 0.5, "FL_hip_roll"),

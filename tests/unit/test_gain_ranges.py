@@ -12,15 +12,11 @@ from hypothesis import strategies as st
 from pronk.errors import RobotError
 from pronk.match.gains import JointGains
 from pronk.match.randomization import characteristic_frequency, enclosing, group_gains
+from pronk.report.paper import TABLE_I
 from pronk.robots import load_robot
 
 ROBOT = load_robot("mini_cheetah")
 LEGS = ("FR", "FL", "HR", "HL")
-TABLE_I = {
-    "hip_roll": ((20.6, 0.492), (18.1, 0.516), (18.5, 0.431), (21.0, 0.490)),
-    "hip_pitch": ((16.5, 0.382), (17.7, 0.406), (16.9, 0.382), (18.9, 0.431)),
-    "knee": ((21.8, 0.541), (22.0, 0.523), (22.2, 0.553), (21.8, 0.553)),
-}
 
 
 def joint(stiffness: float, damping: float, half: tuple[float, float] | None = None) -> JointGains:
@@ -35,16 +31,8 @@ def joint(stiffness: float, damping: float, half: tuple[float, float] | None = N
     )
 
 
-def table_i() -> dict[str, JointGains]:
-    return {
-        f"{leg}_{group}": joint(*gains)
-        for group, row in TABLE_I.items()
-        for leg, gains in zip(LEGS, row, strict=True)
-    }
-
-
 def test_table_i_gives_the_papers_training_gains_and_the_smallest_ranges_that_cover() -> None:
-    groups = group_gains(ROBOT, table_i())
+    groups = group_gains(ROBOT, {name: joint(*gains) for name, gains in TABLE_I.items()})
     assert {
         n: (g.stiffness, g.damping, g.stiffness_range, g.damping_range) for n, g in groups.items()
     } == {

@@ -27,23 +27,13 @@ from pronk.match.parameters import GAINS
 from pronk.match.response_fit import refine
 from pronk.match.settings import MatchSettings
 from pronk.match.simulated import SimRequest, responses
+from pronk.report.paper import TABLE_I
 from pronk.response.response import Estimator
 from pronk.robots import load_robot
 from pronk.simulators.linear import plant
 from pronk.simulators.mujoco import MujocoSimulator
 
 ROBOT = load_robot("mini_cheetah")
-TABLE_1 = {
-    "hip_roll": ((20.6, 0.492), (18.1, 0.516), (18.5, 0.431), (21.0, 0.490)),
-    "hip_pitch": ((16.5, 0.382), (17.7, 0.406), (16.9, 0.382), (18.9, 0.431)),
-    "knee": ((21.8, 0.541), (22.0, 0.523), (22.2, 0.553), (21.8, 0.553)),
-}
-"""The paper's Table I, legs FR FL HR HL."""
-
-
-def gains_of(joint: str) -> tuple[float, float]:
-    leg, _, group = joint.partition("_")
-    return TABLE_1[group][("FR", "FL", "HR", "HL").index(leg)]
 
 
 def known(
@@ -57,7 +47,7 @@ def known(
 ) -> MeasuredJoint:
     """A joint of the simulator with known gains (those of Table I), logged without noise."""
     chirp = Excitation(offsets=Chirp(length_s=length_s, stop_hz=stop_hz).samples())
-    log = synthetic_log(ROBOT, joint, [chirp], *(gains or gains_of(joint)), **options)
+    log = synthetic_log(ROBOT, joint, [chirp], *(gains or TABLE_I[joint]), **options)
     settings = MatchSettings(estimator=Estimator(segment_s=segment_s))
     return measured_joints(log, joint, ROBOT, settings)[0]
 
@@ -78,7 +68,7 @@ def test_table_1_is_found_again_by_every_joint() -> None:
     with MujocoSimulator(ROBOT) as simulator:
         grids, fits = quick_search(simulator, goals, *axes(ROBOT))
     for goal, grid, fit in zip(goals, grids, fits, strict=True):
-        stiffness, damping = gains_of(goal.joint)
+        stiffness, damping = TABLE_I[goal.joint]
         assert grid.cell == nearest(grid, (stiffness, damping)), goal.joint
         assert not grid.at_edge
         assert fit.stiffness == pytest.approx(stiffness, rel=0.005)
@@ -96,7 +86,7 @@ def test_the_whole_paper_grid_lands_on_the_nearest_cell() -> None:
         assert simulator.steps == 2500 * max(goal.steps for goal in goals)
     for goal, one in zip(goals, found, strict=True):
         assert one.error.shape == (50, 50)
-        assert one.cell == nearest(one, gains_of(goal.joint))
+        assert one.cell == nearest(one, TABLE_I[goal.joint])
         assert one.error_db < 0.1
         # Far off the error is large: the map has one valley.
         assert np.sqrt(one.error[0, 0]) > 1.0
@@ -159,7 +149,7 @@ def test_full_and_banded_responses_agree_and_the_horizon_changes_no_gain() -> No
     """Steps without effect on the band are left out: 0.003 dB at most."""
     goal = known("FL_hip_roll", length_s=20.0)
     assert goal.steps < 0.9 * len(goal.trace.command)
-    requests = [SimRequest(goal, *g) for g in (gains_of("FL_hip_roll"), (13.0, 0.1), (27.0, 0.7))]
+    requests = [SimRequest(goal, *g) for g in (TABLE_I["FL_hip_roll"], (13.0, 0.1), (27.0, 0.7))]
     with MujocoSimulator(ROBOT) as simulator:
         whole, cut = (responses(simulator, requests, whole=all_) for all_ in (True, False))
     np.testing.assert_allclose(whole[0], goal.measured.response, rtol=1e-6)

@@ -14,7 +14,7 @@ from pronk.errors import RobotError
 from pronk.logs.sage_reader import SAGE_JOINTS
 from pronk.robots import ROBOT_NAMES, load_robot
 from pronk.robots.legged import legged
-from pronk.robots.model import bench_spec, free_spec
+from pronk.robots.model import free_spec
 
 CHEETAH = legged("mini_cheetah")
 
@@ -101,15 +101,6 @@ def test_mass_and_order_of_legs(name: str, total: float, legs: tuple[str, ...]) 
     if legs:
         assert robot.joint_names[::3] == tuple(f"{leg}_hip_roll" for leg in legs)
         assert robot.joint_names[:3] == ("FR_hip_roll", "FR_hip_pitch", "FR_knee")
-
-
-@pytest.mark.parametrize("name", ["mini_cheetah", "go2"])
-def test_a_robot_rises_from_a_folded_pose_within_its_ranges(name: str) -> None:
-    for joint in load_robot(name).joints:
-        assert joint.folded_position is not None
-        assert joint.range[0] < joint.folded_position < joint.range[1]
-    knee = load_robot(name).joint("FR_knee")
-    assert abs(knee.folded_position or 0.0) > abs(knee.default_position)
 
 
 def test_feet_of_go2_are_under_the_hips_and_on_the_floor() -> None:
@@ -203,19 +194,3 @@ def test_inconsistent_file_names_the_entry(old: str, new: str, named: str, tmp_p
     (tmp_path / "robot.yaml").write_text(re.sub(old, new, (folder / "robot.yaml").read_text()))
     with pytest.raises(RobotError, match=named):
         load_robot(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["FL_hip_roll", "RR_hip_roll", "RL_hip_pitch", "RL_knee"])
-def test_other_legs_of_go2_mirror_the_front_right_one(name: str) -> None:
-    """Let fall on the bench for .1 s from the default pose, held by the drives."""
-    go2 = load_robot("go2")
-    original, sign = go2.joint(name).original
-    moved = []
-    for joint, factor in ((name, 1.0), (original, sign)):
-        model = bench_spec(go2, joint).compile()
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-        mujoco.mj_step(model, data, 20)
-        moved.append(factor * data.joint(joint).qpos[0])
-    assert moved[0] == pytest.approx(moved[1], abs=1e-9)
-    assert moved[0] != go2.joint(name).default_position

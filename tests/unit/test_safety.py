@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from hypothesis import strategies as st
 
 from pronk.errors import RobotError
 from pronk.links.machine import Command, State
-from pronk.robots import load_robot
 from pronk.runtime.safety import (
     LEAST_DAMPING_S,
     Decision,
@@ -24,27 +24,11 @@ from pronk.runtime.safety import (
     apply_rules,
     tilt,
 )
+from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
-ROBOT = load_robot("mini_cheetah")
 LIMITS = Limits.of(ROBOT)
 N = len(ROBOT.joints)
-POSE = np.array([joint.default_position for joint in ROBOT.joints])
-KP = np.array([joint.stiffness for joint in ROBOT.joints])
-KD = np.array([joint.damping for joint in ROBOT.joints])
-
-
-def state(**changes: Any) -> State:
-    whole: dict[str, Any] = {
-        "time": 0.0,
-        "sequence": 100,
-        "position": POSE,
-        "velocity": np.zeros(N),
-        "torque": np.zeros(N),
-        "gyro": np.zeros(3),
-        "accelerometer": np.array([0.0, 0.0, 9.81]),
-        "bus_voltage": 24.0,
-    }
-    return State(**(whole | changes))
+state = partial(still, sequence=100)
 
 
 def command(**changes: Any) -> Command:
@@ -71,10 +55,6 @@ def at(values: Any, value: float, index: int = -1) -> np.ndarray:
     array = np.array(values, dtype=float)
     array[index] = value
     return array
-
-
-def turned(angle: float) -> np.ndarray:
-    return np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
 
 
 def test_a_command_within_all_limits_passes_unchanged() -> None:
@@ -145,8 +125,8 @@ def test_a_command_of_another_shape_latches(shape: Any) -> None:
         (state(), command(stiffness=KP + 100.0), Reason.GAINS),
         (state(), command(damping=KD + 5.0), Reason.GAINS),
         (state(position=at(POSE, 2.76)), command(), Reason.OVERRUN),
-        (state(orientation=turned(0.81)), command(), Reason.TILT),
-        (state(orientation=turned(-3.0)), command(), Reason.TILT),
+        (state(orientation=rolled(0.81)), command(), Reason.TILT),
+        (state(orientation=rolled(-3.0)), command(), Reason.TILT),
         (state(orientation=np.zeros(4)), command(), Reason.STATE_NOT_FINITE),
         (state(velocity=at(np.zeros(N), -31.0)), command(), Reason.SPEED),
         (state(temperature=at(np.full(N, 40.0), 81.0)), command(), Reason.TEMPERATURE),
@@ -168,7 +148,7 @@ def test_faults_latch_with_their_reason(s: State, c: Command, reason: Reason) ->
 def test_just_within_the_limits_is_no_fault() -> None:
     s = state(
         position=at(POSE, 2.69),
-        orientation=turned(0.79),
+        orientation=rolled(0.79),
         velocity=at(np.zeros(N), -5.0),
         temperature=at(np.full(N, np.nan), 79.0),
         sequence=130,
@@ -255,7 +235,7 @@ def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
 
 
 def test_tilt_is_the_angle_of_the_z_axis() -> None:
-    assert tilt(turned(0.3)) == pytest.approx(0.3)
+    assert tilt(rolled(0.3)) == pytest.approx(0.3)
     assert tilt(np.array([math.cos(1.0), 0.0, 0.0, math.sin(1.0)])) == pytest.approx(0.0)
 
 

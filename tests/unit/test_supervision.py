@@ -10,14 +10,10 @@ import numpy as np
 import pytest
 
 from pronk.links.machine import Command, State
-from pronk.robots import load_robot
 from pronk.runtime.safety import Decision, FilterAction, Limits, Reason, SafetyFilter
 from pronk.virtual.faults import SENSOR_FAULTS, SWAPPED, spoiled
+from virtual_robot import KD, KP, POSE, ROBOT, rolled, still
 
-ROBOT = load_robot("mini_cheetah")
-POSE = np.array([joint.default_position for joint in ROBOT.joints])
-KP = np.array([joint.stiffness for joint in ROBOT.joints])
-KD = np.array([joint.damping for joint in ROBOT.joints])
 DT = 0.002
 BEGINS = 0.5
 
@@ -32,17 +28,15 @@ def moving(seconds: float, seed: int = 0) -> Iterator[State]:
         roll = 0.1 * math.sin(w * t)
         gyro = np.array([0.1 * w * math.cos(w * t), 0.0, 0.0])
         force = 9.81 * np.array([0.0, math.sin(roll), math.cos(roll)])
-        half = 0.5 * roll + 1e-5 * rng.standard_normal()
-        yield State(
+        measured = roll + 2e-5 * rng.standard_normal()
+        yield still(
             time=t,
             sequence=k,
             position=POSE + 0.15 * np.sin(u * t + phase) + 1e-4 * rng.standard_normal(12),
             velocity=0.15 * u * np.cos(u * t + phase) + 0.02 * rng.standard_normal(12),
-            torque=np.zeros(12),
             gyro=gyro + 1e-3 * rng.standard_normal(3),
             accelerometer=force + 0.02 * rng.standard_normal(3),
-            orientation=np.array([math.cos(half), math.sin(half), 0.0, 0.0]),
-            bus_voltage=24.0,
+            orientation=rolled(measured),
         )
 
 
