@@ -263,24 +263,6 @@ def test_broken_lcm_messages_change_no_bit_of_the_motion(layout: Layout) -> None
 # --- The command --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--faults", "los=1"], "los=1"),
-        (["--capture", "there.npz"], "--base ground"),
-        (["--silence-after", "0"], "silence_after"),
-        (["--domain", "3"], "domain"),
-        (["--link", "dds", "--port", "9000"], "port"),
-        (["--port", "7667"], "7667"),
-        (["--mode", "dance"], "dance"),
-    ],
-)
-def test_impossible_servers_are_refused(words: list[str], named: str) -> None:
-    done = invoke(["simulate", *words])
-    assert done.exit_code == 2
-    assert named in done.stderr
-
-
 def test_unknown_watchdog_actions_are_refused() -> None:
     with pytest.raises(RobotError, match="silence"):
         Watchdog(silence="sleep")  # type: ignore[arg-type]

@@ -98,7 +98,7 @@ def test_gains_that_cannot_be_are_refused(tmp_path: Path, field: str, value: str
         gains.load(path)
 
 
-NAMES = ["..", "$", "a\0b", "a\x1b[31mred", "n" * 300, "", "a\u202eb", "-rf"]
+NAMES = ["FR\nknee", "..", "$", "a\0b", "a\x1b[31mred", "n" * 300, "", "a\u202eb", "-rf"]
 
 
 @pytest.mark.parametrize("name", NAMES)
