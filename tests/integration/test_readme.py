@@ -1,4 +1,4 @@
-"""The README: its Python example runs as it stands, its commands exist, it is short."""
+"""README and docs: the Python example runs, commands, files and links exist, labels are there."""
 
 from __future__ import annotations
 
@@ -16,15 +16,28 @@ from pronk.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+LABELS = {"S": 7, "M": 5, "F": 13, "N": 3, "C": 4, "P": 2, "D": 10, "E": 7, "R": 8, "L": 4, "A": 23}
+"""Items of the paper and readings of its unclear places, by their first letter."""
 
 
 def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     monkeypatch.chdir(tmp_path)
     shutil.copytree(ROOT / "policies", "policies")
-    sweep = ["sweep", "mini_cheetah", "--joints", "FR_knee"]
-    for words in (["--out", "logs"], ["--out", "fresh", "--signal", "log-chirp", "--seed", "1"]):
-        done = invoke([*sweep, *words])
+    # Two repeats give intervals, and a replay needs one excitation.
+    fresh = [
+        "fresh",
+        "--signal",
+        "log-chirp",
+        "--seed",
+        "1",
+        "--repeats",
+        "1",
+        "--amplitude",
+        ".25",
+    ]
+    for words in (["logs", "--repeats", "2"], fresh):
+        done = invoke(["sweep", "mini_cheetah", "--joints", "FR_knee", "--out", *words])
         assert done.exit_code == 0, done.stderr
     names: dict[str, Any] = {}
     exec(compile(code, "README.md", "exec"), names)
@@ -64,3 +77,14 @@ def test_the_readme_is_at_most_900_words() -> None:
 def test_the_tables_of_robots_and_formats_are_up_to_date() -> None:
     script = [sys.executable, str(ROOT / "scripts" / "readme_tables.py"), "--check"]
     assert subprocess.run(script, check=False).returncode == 0
+
+
+def test_every_label_of_the_checklist_has_its_place() -> None:
+    text = "".join(
+        (ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("paper", "readings")
+    )
+    found = set(re.findall(r"\b([A-Z]\d+)\b", text))
+    for letter, first, last in re.findall(r"\b([A-Z])(\d+) to [A-Z](\d+)\b", text):
+        found |= {f"{letter}{i}" for i in range(int(first), int(last) + 1)}
+    wanted = {f"{letter}{i}" for letter, count in LABELS.items() for i in range(1, count + 1)}
+    assert not wanted - found

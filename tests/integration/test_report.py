@@ -141,6 +141,7 @@ def test_the_page_of_a_match(tmp_path: Path) -> None:
     for words in (*numbers, *result.gains.logs.values(), *result.joints):
         assert words.replace("_", " ") in page.text.replace("_", " ")
     less = {"zero_armature": None, "zero_armature_error_db": float("nan")}
+    result = match(legs=1)
     bare = {name: replace(fit, **less) for name, fit in result.joints.items()}
     (tmp_path / "fresh.prediction.npz").unlink()
     ids = match_report(write_match(tmp_path, replace(result, joints=bare))).ids
