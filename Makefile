@@ -18,7 +18,7 @@ test: $(VENV)/.dev
 
 # Trainings, whole trials and processes in real time.
 test-slow: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadscope -m "slow and not live"
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadgroup -m "slow and not live"
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m live
 
 lint: $(VENV)/.dev

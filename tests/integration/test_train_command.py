@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +16,7 @@ from pronk.errors import PronkError
 from pronk.train import devices
 from pronk.train.phases import TASKS
 from pronk.train.provenance import RunFolder
-from pronk.train.run import train
+from pronk.train.run import stop_signals, train
 from pronk.train.settings import TrainSettings
 from pronk.train.tasks import load_task
 
@@ -95,6 +97,17 @@ def test_settings_of_a_run_return_when_it_is_resumed(tmp_path: Path) -> None:
         changed: dict[str, Any] = {"task": "all", "out": tmp_path, "resume": True, **other}
         with pytest.raises(PronkError, match="leave it out"):
             TrainSettings(**changed).resumed(stored)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_ends_training_and_the_next_has_its_usual_effect(
+    number: signal.Signals,
+) -> None:
+    before, runner = signal.getsignal(number), SimpleNamespace(stop_reason="")
+    with stop_signals(runner):
+        signal.raise_signal(number)
+        assert (runner.stop_reason, signal.getsignal(number)) == (number.name, before)
+    assert signal.getsignal(number) is before
 
 
 # --- Devices -------------------------------------------------------------------------------------
