@@ -172,21 +172,24 @@ def reached(request: pytest.FixtureRequest) -> Iterator[tuple[Address, Wire]]:
         yield Address.parse(f"{request.param}://?{word}={number}"), wire
 
 
-def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
-    reached: tuple[Address, Wire], tmp_path: Path
-) -> None:
-    address, wire = reached
-    plan = Plan(
+def patient_plan(address: Address, folder: Path) -> Plan:
+    """A plan whose filter takes nothing for a fault that a busy computer may cause."""
+    return Plan(
         link=PatientLink(address=address),
-        policy=write_hopper(tmp_path / "policy.onnx", strength=0.2),
-        log=tmp_path / "run.mcap",
+        policy=write_hopper(folder / "policy.onnx", strength=0.2),
         timing=QUICK,
         limits=PATIENT | {"hold_s": 1.0},
         action_valid_s=2.0,
         operator_timeout_s=2.0,
-        standby_s=2.0,
         ignore_latency=True,
     )
+
+
+def test_another_writer_is_refused_before_and_damps_while_a_policy_runs(
+    reached: tuple[Address, Wire], tmp_path: Path
+) -> None:
+    address, wire = reached
+    plan = replace(patient_plan(address, tmp_path), log=tmp_path / "run.mcap", standby_s=2.0)
     # It is there before: nothing is written, and one line says why.
     wire.speak()
     refused = Deployment(plan)
@@ -233,15 +236,7 @@ def test_the_standby_damps_after_a_servo_that_stopped(
     address, wire = reached
     # A servo that is killed over LCM is in `test_sweep_link.py`.
     number = signal.SIGSTOP if address.kind == "lcm" else signal.SIGKILL
-    plan = Plan(
-        link=PatientLink(address=address),
-        policy=write_hopper(tmp_path / "policy.onnx", strength=0.2),
-        timing=QUICK,
-        limits=PATIENT | {"hold_s": 1.0},
-        action_valid_s=2.0,
-        operator_timeout_s=2.0,
-        ignore_latency=True,
-    )
+    plan = patient_plan(address, tmp_path)
     late = []
     # A computer that is busy may be late once, or stop the servo by itself.
     for _ in range(3):

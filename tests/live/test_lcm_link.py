@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deploy_runs import free_port
 from pronk.errors import HardwareError
 from pronk.links.lcm.codec import (
     CHEETAH,
@@ -43,12 +43,6 @@ LIMIT_S = 300.0
 ROBOT = load_robot("mini_cheetah")
 HOLD = hold_of(ROBOT)
 KNEE = ROBOT.joint_names.index("FL_knee")
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
 
 
 class Process:

@@ -52,7 +52,7 @@ FRESH = Freshness(share=0.02, longest_gap_s=10.0)
 @cache
 def plan_of(joint: str, name: str = ROBOT.name, amplitude: float = 0.2) -> SweepPlan:
     # The hip's is always ended early, the others' are short.
-    signal = Chirp(length_s=20.0 if joint == "FR_hip_roll" else 1.0, start_hz=0.5, stop_hz=5.0)
+    signal = Chirp(length_s=8.0 if joint == "FR_hip_roll" else 1.0, start_hz=0.5, stop_hz=5.0)
     return make_plan(
         load_robot(name), [joint], signal, amplitudes=(amplitude,), repeats=1, settle_s=0.1
     )
@@ -112,7 +112,7 @@ def early(action: Callable[[], object]) -> Callable[[float], None]:
     left = [action]
 
     def progress(share: float) -> None:
-        if share > 0.02 and left:
+        if share > 0.05 and left:
             left.pop()()
 
     return progress
